@@ -68,27 +68,23 @@ WRITERS: dict[str, Callable[[Path, list[State]], Path]] = {
 
 
 @pytest.mark.parametrize("kind", WRITERS)
-def test_joints_are_found_by_their_names_in_whatever_order_a_bag_has_them(
-    tmp_path: Path, described: RecordingMap, kind: str
-) -> None:
+def test_joints_are_found_by_their_names_in_whatever_order_a_bag_has_them(tmp_path, described, kind):
     check(read_recording(WRITERS[kind](tmp_path, states(("elbow", "pan", "lift"))), described))
 
 
-def test_the_database_of_a_bag_is_read_without_its_folder(tmp_path: Path, described: RecordingMap) -> None:
+def test_the_database_of_a_bag_is_read_without_its_folder(tmp_path, described):
     (database,) = write_rosbag2(tmp_path / "bag", states()).glob("*.db3")
     check(read_recording(database, described))
 
 
-def test_velocities_are_derived_where_a_bag_has_none(tmp_path: Path, described: RecordingMap) -> None:
+def test_velocities_are_derived_where_a_bag_has_none(tmp_path, described):
     recording = read_recording(write_mcap(tmp_path / "r.mcap", states(has_velocity=False)), described)
     check(recording, has_velocity=False)
     assert not recording.has_velocities
     assert np.abs(recording.stretches[0].record.dq).max() == pytest.approx(25.0, rel=0.05)
 
 
-def test_messages_of_a_gripper_and_joints_beyond_the_arm_are_passed_over(
-    tmp_path: Path, described: RecordingMap
-) -> None:
+def test_messages_of_a_gripper_and_joints_beyond_the_arm_are_passed_over(tmp_path, described):
     arm = states(("pan", "lift", "elbow"))
     messages = [
         message
@@ -101,7 +97,7 @@ def test_messages_of_a_gripper_and_joints_beyond_the_arm_are_passed_over(
     check(read_recording(write_mcap(tmp_path / "r.mcap", messages), described))
 
 
-def test_a_map_names_topic_joints_and_time_of_a_bag(tmp_path: Path, described: RecordingMap) -> None:
+def test_a_map_names_topic_joints_and_time_of_a_bag(tmp_path, described):
     names = tuple(f"left_{name}" for name in NAMES)
     renamed = changed(states(topic="/left/joint_states", is_stamped=False), names=names)
     path = write_mcap(tmp_path / "r.mcap", [*renamed, *states(topic="/right/joint_states")])
@@ -112,7 +108,7 @@ def test_a_map_names_topic_joints_and_time_of_a_bag(tmp_path: Path, described: R
     check(read_recording(path, read_map(tmp_path / "map.toml")))
 
 
-def test_a_span_of_a_bag_is_what_is_kept_of_it(tmp_path: Path, described: RecordingMap) -> None:
+def test_a_span_of_a_bag_is_what_is_kept_of_it(tmp_path, described):
     path = write_mcap(tmp_path / "r.mcap", states())
     part = read_recording(path, described, span=TimeWindow(0.1, 0.35)).between(0.1, 0.35)
     assert part.duration_s == pytest.approx(0.25, abs=0.008)
@@ -154,7 +150,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_a_bag_that_nothing_can_be_learnt_from_is_one_line(tmp_path: Path, described: RecordingMap, kind: str) -> None:
+def test_a_bag_that_nothing_can_be_learnt_from_is_one_line(tmp_path, described, kind):
     make, said = REFUSED[kind]
     path = write_mcap(tmp_path / "r.mcap", make())
     with pytest.raises((LogError, ConfigError)) as refusal:
@@ -163,7 +159,7 @@ def test_a_bag_that_nothing_can_be_learnt_from_is_one_line(tmp_path: Path, descr
     assert "\n" not in str(refusal.value)
 
 
-def test_a_topic_of_the_map_that_a_bag_lacks_names_the_nearest(tmp_path: Path) -> None:
+def test_a_topic_of_the_map_that_a_bag_lacks_names_the_nearest(tmp_path):
     (tmp_path / "arm.urdf").write_text(ARM)
     (tmp_path / "map.toml").write_text('[arm]\nurdf = "arm.urdf"\n[bag]\ntopic = "/joint_state"\n')
     path = write_mcap(tmp_path / "r.mcap", states())
@@ -171,7 +167,7 @@ def test_a_topic_of_the_map_that_a_bag_lacks_names_the_nearest(tmp_path: Path) -
         read_recording(path, read_map(tmp_path / "map.toml"))
 
 
-def test_damaged_and_missing_bags_are_one_line(tmp_path: Path, described: RecordingMap) -> None:
+def test_damaged_and_missing_bags_are_one_line(tmp_path, described):
     whole = write_mcap(tmp_path / "whole.mcap", states()).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "head.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(40))

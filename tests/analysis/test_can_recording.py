@@ -10,7 +10,6 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.log_files import LogError
 from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone, load_recording
 from adacd_hil.replay.replay import replay_source
-from adacd_hil.replay.replayed_outcome import Replay
 from adacd_hil.wire.codec import load_codec
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
@@ -22,7 +21,7 @@ def against(path: Path, log: Path):
     return replay_source(source, [source.settings])[0]
 
 
-def test_a_recording_comes_to_the_bits_of_its_run_whatever_its_clock(log: Path, whole: Replay, tmp_path: Path) -> None:
+def test_a_recording_comes_to_the_bits_of_its_run_whatever_its_clock(log, whole, tmp_path):
     path = tmp_path / "bus.log"
     write_candump(log, path, pace=0.31, start_s=1.79e9)
     found = against(path, log)
@@ -30,7 +29,7 @@ def test_a_recording_comes_to_the_bits_of_its_run_whatever_its_clock(log: Path, 
     assert (found.compared, found.attempts, found.notes) == (whole.compared, 2, ())
 
 
-def test_without_the_log_the_script_plays_the_user(log: Path, whole: Replay, tmp_path: Path) -> None:
+def test_without_the_log_the_script_plays_the_user(log, whole, tmp_path):
     path = tmp_path / "bus.log"
     write_candump(log, path)
     source = RecordingAlone(path, settings_of_run(), CODEC)
@@ -41,9 +40,7 @@ def test_without_the_log_the_script_plays_the_user(log: Path, whole: Replay, tmp
     assert found.notes == ()
 
 
-def test_a_recording_that_begins_later_is_found_in_its_run_and_what_it_lacks_is_said(
-    log: Path, whole: Replay, tmp_path: Path
-) -> None:
+def test_a_recording_that_begins_later_is_found_in_its_run_and_what_it_lacks_is_said(log, whole, tmp_path):
     path = tmp_path / "bus.log"
     write_candump(log, path, first=5000)
     found = against(path, log)
@@ -52,7 +49,7 @@ def test_a_recording_that_begins_later_is_found_in_its_run_and_what_it_lacks_is_
     assert any("are not in bus.log" in note for note in found.notes)
 
 
-def test_frames_after_the_last_cyclic_one_belong_to_the_next_cycle(tmp_path: Path) -> None:
+def test_frames_after_the_last_cyclic_one_belong_to_the_next_cycle(tmp_path):
     path = tmp_path / "bus.log"
     cycle = [("080", 0, "01"), ("181", 100, "00" * 8), ("182", 200, "00" * 8), ("183", 300, "00" * 6)]
     late = [
@@ -73,7 +70,7 @@ def test_frames_after_the_last_cyclic_one_belong_to_the_next_cycle(tmp_path: Pat
     assert (np.diff(recording.owner) >= 0).all()
 
 
-def test_the_counter_goes_round_and_a_gap_is_measured_by_time(tmp_path: Path) -> None:
+def test_the_counter_goes_round_and_a_gap_is_measured_by_time(tmp_path):
     path = tmp_path / "bus.log"
     cycles = [*range(235, 245), *range(800, 810)]
     path.write_text("".join(f"({k / 1000:.6f}) can0 080#{1 + k % 240:02X}\n" for k in cycles))
@@ -81,7 +78,7 @@ def test_the_counter_goes_round_and_a_gap_is_measured_by_time(tmp_path: Path) ->
     assert recording.number.tolist() == cycles
 
 
-def test_a_recording_without_sync_is_refused(tmp_path: Path) -> None:
+def test_a_recording_without_sync_is_refused(tmp_path):
     path = tmp_path / "bus.log"
     path.write_text("(0.000000) can0 181#0000000000000000\n")
     with pytest.raises(LogError, match="no SYNC"):

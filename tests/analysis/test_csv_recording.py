@@ -101,14 +101,14 @@ FORMS = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_forms_of_a_table_are_read(read: Callable[..., ForeignRecording], form: str) -> None:
+def test_forms_of_a_table_are_read(read, form):
     text, keys = FORMS[form]
     recording = read(text, *keys)
     check(recording)
     assert recording.notes == ()
 
 
-def test_a_period_stands_for_the_times(read: Callable[..., ForeignRecording]) -> None:
+def test_a_period_stands_for_the_times(read):
     text = table(lambda _, q, tau: f"{q},{tau}", "angle,torque\n")
     period = "[sampling]\nperiod_s = 0.005"
     for keys in ((period, 'time = "t"\n -> '), (period,)):
@@ -119,7 +119,7 @@ def test_a_period_stands_for_the_times(read: Callable[..., ForeignRecording]) ->
     check(cut, tolerance=2e-3)  # the row that is left out leaves its time
 
 
-def test_times_that_are_missing_without_a_period_name_the_key(read: Callable[..., ForeignRecording]) -> None:
+def test_times_that_are_missing_without_a_period_name_the_key(read):
     text = table(lambda _, q, tau: f"{q},{tau}", "angle,torque\n")
     with pytest.raises(ConfigError, match=r"no column 't'.*`sampling\.period_s`"):
         read(text)
@@ -129,7 +129,7 @@ def test_times_that_are_missing_without_a_period_name_the_key(read: Callable[...
         read(text.replace("angle", "times"), "[sampling]\nperiod_s = 0.005", 'time = "t" -> time = "tmes"')
 
 
-def test_a_row_of_units_is_compared_with_the_map(read: Callable[..., ForeignRecording]) -> None:
+def test_a_row_of_units_is_compared_with_the_map(read):
     recording = read(table(plain, "t,angle,torque\n[s],(rad),N m\n"))
     check(recording)
     assert recording.notes == ("row 2 names units ([s], (rad), N m)",)
@@ -150,7 +150,7 @@ SPOILT = {
 
 
 @pytest.mark.parametrize("kind", SPOILT)
-def test_a_spoilt_row_is_left_out_and_counted(read: Callable[..., ForeignRecording], kind: str) -> None:
+def test_a_spoilt_row_is_left_out_and_counted(read, kind):
     spoil, count, first = SPOILT[kind]
     recording = read("".join(spoil(table(plain).splitlines(keepends=True))))
     check(recording, tolerance=2e-3)
@@ -159,7 +159,7 @@ def test_a_spoilt_row_is_left_out_and_counted(read: Callable[..., ForeignRecordi
     assert first in note
 
 
-def test_many_doubled_rows_are_no_harm_and_many_spoilt_ones_end_it(read: Callable[..., ForeignRecording]) -> None:
+def test_many_doubled_rows_are_no_harm_and_many_spoilt_ones_end_it(read):
     rows = table(plain).splitlines(keepends=True)
     doubled = read("".join([rows[0], *(row for row in rows[1:] for _ in range(2))]))
     check(doubled)
@@ -206,9 +206,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_a_file_that_can_not_be_read_names_the_key_or_the_remedy(
-    read: Callable[..., ForeignRecording], kind: str
-) -> None:
+def test_a_file_that_can_not_be_read_names_the_key_or_the_remedy(read, kind):
     text, keys, said = REFUSED[kind]
     with pytest.raises((LogError, ConfigError)) as refusal:
         read(text, *keys)
@@ -216,7 +214,7 @@ def test_a_file_that_can_not_be_read_names_the_key_or_the_remedy(
     assert "\n" not in str(refusal.value)
 
 
-def test_velocities_that_nobody_filled_in_are_derived(read: Callable[..., ForeignRecording]) -> None:
+def test_velocities_that_nobody_filled_in_are_derived(read):
     head, keys = "t,angle,torque,speed\n", ('time = "t" -> time = "t"\ndq = ["speed"]',)
     idle = read(table(lambda *row: plain(*row) + ",0.0", head), *keys)
     assert idle.notes == ("the velocity of joint1 is always 0 rad/s: velocities are derived from the positions",)
@@ -228,7 +226,7 @@ def test_velocities_that_nobody_filled_in_are_derived(read: Callable[..., Foreig
 
 
 @pytest.mark.parametrize(("unit", "turn"), [("rad", 2.0 * np.pi), ("deg", 360.0)])
-def test_a_position_that_jumps_by_a_turn_goes_on(read: Callable[..., ForeignRecording], unit: str, turn: float) -> None:
+def test_a_position_that_jumps_by_a_turn_goes_on(read, unit, turn):
     def angle(k: int) -> float:
         return (0.6 + 0.04 * wave(k)[0]) * turn
 
@@ -242,19 +240,19 @@ def test_a_position_that_jumps_by_a_turn_goes_on(read: Callable[..., ForeignReco
     assert recording.notes == ("the position of joint1 jumps by a turn 3 times: it goes on instead",)
 
 
-def test_positions_that_jump_otherwise_stay_as_they_are(read: Callable[..., ForeignRecording]) -> None:
+def test_positions_that_jump_otherwise_stay_as_they_are(read):
     jumping = read(table(lambda k, q, tau: f"{0.005 * k:.3f},{4.0 * (k % 20 == 0)},{tau}"))
     assert jumping.stretches[0].record.q.max() == pytest.approx(4.0)
     assert jumping.notes == ()
 
 
-def test_times_that_jitter_are_a_note_with_the_period_that_replaces_them(read: Callable[..., ForeignRecording]) -> None:
+def test_times_that_jitter_are_a_note_with_the_period_that_replaces_them(read):
     (note,) = read(table(lambda k, q, tau: f"{0.005 * k + 0.002 * (k % 2):.3f},{q},{tau}")).notes
     assert note.startswith("rows are 3 to 7 ms apart")
     assert "`sampling.period_s` = 0.005" in note
     assert read(table(plain)).notes == ()
 
 
-def test_noise_is_at_least_that_of_rounding(read: Callable[..., ForeignRecording]) -> None:
+def test_noise_is_at_least_that_of_rounding(read):
     recording = read(table(lambda k, q, tau: f"{0.005 * k:.3f},{q},{round(tau / 0.5) * 0.5}"))
     assert recording.noise_Nm[0] == pytest.approx(0.5 / np.sqrt(12.0))

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,7 +40,7 @@ def found(search: Search) -> ExcitationSettings:
     return search.run(1, lambda _: False, iterations=20)
 
 
-def test_the_motion_is_the_one_that_the_arm_makes() -> None:
+def test_the_motion_is_the_one_that_the_arm_makes():
     settings = load_settings("certified")
     search, played = Search(settings), Excitation(settings)
     motion = search.move(np.array(settings.excitation.cosine), np.array(settings.excitation.sine))
@@ -56,7 +55,7 @@ def test_the_motion_is_the_one_that_the_arm_makes() -> None:
 
 
 @pytest.mark.long
-def test_what_a_motion_shows_is_what_the_scheme_counts() -> None:
+def test_what_a_motion_shows_is_what_the_scheme_counts():
     """Information from the equation of motion, filtered in continuous time, and the derivative by differences."""
     settings = load_settings("certified")
     search, played = Search(settings), Excitation(settings)
@@ -77,7 +76,7 @@ def test_what_a_motion_shows_is_what_the_scheme_counts() -> None:
     assert figures.condition == pytest.approx(eigenvalues[-1] / eigenvalues[0], rel=0.1)
 
 
-def test_what_is_found_begins_at_rest_in_the_corner(found: ExcitationSettings) -> None:
+def test_what_is_found_begins_at_rest_in_the_corner(found):
     played = Excitation(small_settings(excitation=found))
     q, dq, ddq = np.zeros((3, 2))
     played.evaluate(0.0, q, dq, ddq)
@@ -86,7 +85,7 @@ def test_what_is_found_begins_at_rest_in_the_corner(found: ExcitationSettings) -
     np.testing.assert_allclose(ddq, 0.0, atol=1e-3)
 
 
-def test_what_is_found_shows_more_than_the_start_within_the_limits(search: Search, found: ExcitationSettings) -> None:
+def test_what_is_found_shows_more_than_the_start_within_the_limits(search, found):
     before, after = search.figures(search.present), search.figures(found)
     assert after.excitation_Nm2s > 2.0 * before.excitation_Nm2s
     assert after.cost < before.cost
@@ -94,18 +93,18 @@ def test_what_is_found_shows_more_than_the_start_within_the_limits(search: Searc
         assert (np.array(getattr(after, name)) <= np.array(limits) * (1.0 + TOLERANCE)).all()
 
 
-def test_a_seed_is_a_result(search: Search) -> None:
+def test_a_seed_is_a_result(search):
     first, again, other = (search.run(seed, lambda climbs: climbs < 2, iterations=6) for seed in (1, 1, 2))
     assert first == again
     assert first != other
 
 
-def test_a_better_motion_is_never_given_up(search: Search, found: ExcitationSettings) -> None:
+def test_a_better_motion_is_never_given_up(search, found):
     better = Search(small_settings(excitation=found))
     assert better.figures(better.run(2, lambda climbs: climbs < 2, iterations=6)).cost <= search.figures(found).cost
 
 
-def test_without_a_model_of_the_arm_torque_has_no_limit_and_the_lag_no_column(search: Search) -> None:
+def test_without_a_model_of_the_arm_torque_has_no_limit_and_the_lag_no_column(search):
     settings = small_settings()
     blind = Search(dataclasses.replace(settings, arm=dataclasses.replace(settings.arm, cad_theta=())))
     figures = blind.figures(blind.present)
@@ -121,19 +120,19 @@ def test_without_a_model_of_the_arm_torque_has_no_limit_and_the_lag_no_column(se
         ({"excitation": ExcitationSettings(2.4, (TWO[0], ()), (NO_SINE[0], ()))}, r"\[2, 0\] harmonics"),
     ],
 )
-def test_what_leaves_nothing_to_search_is_said(changes, words: str) -> None:
+def test_what_leaves_nothing_to_search_is_said(changes, words):
     with pytest.raises(ConfigError, match=words):
         Search(small_settings(**changes))
 
 
-def test_limits_that_no_motion_keeps_are_said_in_a_line() -> None:
+def test_limits_that_no_motion_keeps_are_said_in_a_line():
     trajectory = TrajectorySettings(amplitude_deg=(1e-7, 1e-7))
     arm = dataclasses.replace(small_settings().arm, torque_limit_Nm=(0.0, 0.0))
     with pytest.raises(NoExcitationError, match="none of 1 motions keeps the limits"):
         Search(small_settings(trajectory=trajectory, arm=arm)).run(1, lambda _: False, iterations=1)
 
 
-def test_the_command_writes_a_configuration_with_what_it_found(tmp_path: Path) -> None:
+def test_the_command_writes_a_configuration_with_what_it_found(tmp_path):
     config, out = tmp_path / "small.toml", tmp_path / "found" / "mine.toml"
     small = "period_s = 2.4\ncosine = [[-0.04, 0.01], [-0.04, 0.01]]\nsine = [[0.0, 0.0], [0.0, 0.0]]\n"
     config.write_text(f"extends = 'certified'\n[certified]\nlearn_every = 20\n[excitation]\n{small}")

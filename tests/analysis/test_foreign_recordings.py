@@ -84,7 +84,7 @@ def copy_example(folder: Path, change=("", ""), urdf=("", "")) -> Path:
     return folder / "map.toml"
 
 
-def test_units_and_signs_are_those_of_the_map_period_and_noise_the_recordings(free: Path, example) -> None:
+def test_units_and_signs_are_those_of_the_map_period_and_noise_the_recordings(free, example):
     recording = read_recording(free, example)
     assert (recording.period_s, recording.duration_s) == pytest.approx((PERIOD_S, 10.0))
     assert_allclose(recording.noise_Nm, NOISE_NM, rtol=0.1)
@@ -97,7 +97,7 @@ def test_units_and_signs_are_those_of_the_map_period_and_noise_the_recordings(fr
 
 
 @pytest.mark.long
-def test_parameters_torque_and_touches_are_found(free: Path, touched: Path, example) -> None:
+def test_parameters_torque_and_touches_are_found(free, touched, example):
     found = identify(example, [read_recording(free, example)], None, [read_recording(touched, example)])
     estimates = dict(zip(found.model.parameter_names, found.estimate.theta, strict=True))
     assert estimates["Izz_1"] == pytest.approx(THETA[0] - THETA[2], rel=0.01)
@@ -114,7 +114,7 @@ def test_parameters_torque_and_touches_are_found(free: Path, touched: Path, exam
     assert contact.start_s == pytest.approx(TOUCH_S[0] - 4.5, abs=0.02)
 
 
-def test_what_is_touched_is_not_learnt(touched: Path, example) -> None:
+def test_what_is_touched_is_not_learnt(touched, example):
     recording = read_recording(touched, example)
     before, after = recording.free.stretches
     begin_s, end_s = (at_s - 4.5 for at_s in TOUCH_S)
@@ -122,7 +122,7 @@ def test_what_is_touched_is_not_learnt(touched: Path, example) -> None:
     assert free_s == pytest.approx((begin_s - recording.blur_s, end_s + recording.blur_s), abs=2 * PERIOD_S)
 
 
-def test_a_gap_and_a_missing_value_part_a_recording(tmp_path: Path, example) -> None:
+def test_a_gap_and_a_missing_value_part_a_recording(tmp_path, example):
     rows = table(2.0)
     rows[500:540, 3] = np.nan  # 80 ms
     recording = read_recording(write(tmp_path / "gap.csv", np.delete(rows, slice(200, 240), axis=0)), example)
@@ -130,7 +130,7 @@ def test_a_gap_and_a_missing_value_part_a_recording(tmp_path: Path, example) -> 
     assert [len(stretch.record.q) for stretch in recording.stretches] == [200, 260, 460]
 
 
-def test_a_test_in_two_stretches_is_judged_by_the_worse(free: Path, tmp_path: Path, example) -> None:
+def test_a_test_in_two_stretches_is_judged_by_the_worse(free, tmp_path, example):
     rows = table(4.0)
     rows[1200:, 3:5] *= 1.5
     tested = read_recording(write(tmp_path / "two.csv", np.delete(rows, slice(1100, 1200), axis=0)), example)
@@ -142,7 +142,7 @@ def test_a_test_in_two_stretches_is_judged_by_the_worse(free: Path, tmp_path: Pa
     assert (whole.residual_max_Nm > 3.0 * first.residual_max_Nm).all()
 
 
-def test_rotors_are_parameters_only_of_motors(tmp_path: Path, example) -> None:
+def test_rotors_are_parameters_only_of_motors(tmp_path, example):
     described = read_map(copy_example(tmp_path, ("[columns]", "has_rotors = true\n\n[columns]")))
     rows = table(6.0)
     acceleration = motion(rows[:, 0] * 1e-3)[2] * np.array([0.0, -0.05])
@@ -165,7 +165,7 @@ def test_rotors_are_parameters_only_of_motors(tmp_path: Path, example) -> None:
         ("detection_cutoff_rad_s", "detection_cutof_rad_s", "did you mean `scheme.detection_cutoff_rad_s`?"),
     ],
 )
-def test_a_wrong_map_is_one_line(tmp_path: Path, free: Path, old: str, new: str, line: str) -> None:
+def test_a_wrong_map_is_one_line(tmp_path, free, old, new, line):
     described = copy_example(tmp_path, (old, new))
     with pytest.raises(ConfigError) as refusal:
         read_recording(free, read_map(described))
@@ -190,7 +190,7 @@ def rows(joints: str, count: int = 60) -> str:
         (HEAD + "\n" + rows("inf,3"), "0 rows with all values, 50 needed"),
     ],
 )
-def test_a_wrong_recording_is_one_line(tmp_path: Path, example, text: str, line: str) -> None:
+def test_a_wrong_recording_is_one_line(tmp_path, example, text, line):
     (tmp_path / "bad.csv").write_text(text)
     with pytest.raises((LogError, ConfigError)) as refusal:
         read_recording(tmp_path / "bad.csv", example)
@@ -198,7 +198,7 @@ def test_a_wrong_recording_is_one_line(tmp_path: Path, example, text: str, line:
     assert "\n" not in str(refusal.value)
 
 
-def test_a_row_is_counted_over_all_blocks_that_are_read(tmp_path: Path, example, monkeypatch) -> None:
+def test_a_row_is_counted_over_all_blocks_that_are_read(tmp_path, example, monkeypatch):
     monkeypatch.setattr(recorded_columns, "BLOCK_ROWS", 25)
     for text, note in (
         ("60,1,3,4,5,0\n", "1 row with the time of the row before left out (row 62: 0.059 s once more)"),
@@ -209,7 +209,7 @@ def test_a_row_is_counted_over_all_blocks_that_are_read(tmp_path: Path, example,
         assert read_recording(tmp_path / "some.csv", example).notes == (note,)
 
 
-def test_of_a_recording_that_is_too_long_only_a_span_is_kept(free: Path, example, monkeypatch) -> None:
+def test_of_a_recording_that_is_too_long_only_a_span_is_kept(free, example, monkeypatch):
     whole = read_recording(free, example).between(4.0, 7.0)
     monkeypatch.setattr(recorded_columns, "BLOCK_ROWS", 500)
     monkeypatch.setattr(recorded_columns, "MOST_ROWS", 3000)
@@ -228,13 +228,13 @@ def test_of_a_recording_that_is_too_long_only_a_span_is_kept(free: Path, example
         read_recording(free, example, span=TimeWindow(1000.0, 2000.0))
 
 
-def test_a_period_that_would_make_too_many_samples_is_refused(tmp_path: Path, free: Path) -> None:
+def test_a_period_that_would_make_too_many_samples_is_refused(tmp_path, free):
     described = read_map(copy_example(tmp_path, ("[scheme]", "[sampling]\nperiod_s = 1e-9\n[scheme]")))
     with pytest.raises(LogError, match="more than 4000000 samples of 1e-09 s"):
         read_recording(free, described)
 
 
-def test_a_number_of_the_urdf_that_nothing_can_be_reckoned_with_is_one_line(tmp_path: Path) -> None:
+def test_a_number_of_the_urdf_that_nothing_can_be_reckoned_with_is_one_line(tmp_path):
     axis, origin = '<axis xyz="0 0 1"/>', '<origin xyz="0.35 0 0"/>'
     for old, new, said in (
         (axis, axis.replace("1", "1e300"), r"1e300 is more than 1e\+18"),
@@ -246,9 +246,7 @@ def test_a_number_of_the_urdf_that_nothing_can_be_reckoned_with_is_one_line(tmp_
     model_of(read_map(copy_example(tmp_path, urdf=largest)).urdf.chain)
 
 
-def test_the_command_says_by_its_status_whether_the_test_is_explained(
-    tmp_path: Path, free: Path, touched: Path
-) -> None:
+def test_the_command_says_by_its_status_whether_the_test_is_explained(tmp_path, free, touched):
     mapped = ("--map", str(EXAMPLE / "map.toml"), "--json")
     explained = called("identify", free, *mapped, "--out", tmp_path / "out")
     result = json.loads(explained.stdout)
@@ -260,7 +258,7 @@ def test_the_command_says_by_its_status_whether_the_test_is_explained(
     assert other.exit_code == 3
 
 
-def test_a_span_that_ends_before_it_begins_is_usage(free: Path) -> None:
+def test_a_span_that_ends_before_it_begins_is_usage(free):
     played = called("identify", free, "--map", EXAMPLE / "map.toml", "--from", "5", "--until", "4")
     assert (played.exit_code, played.stdout) == (2, "")
     assert "--from 5 s is not before --until 4 s" in played.stderr

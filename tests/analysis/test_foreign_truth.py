@@ -47,9 +47,7 @@ def make_logs(
         ({}, {CONFIG_DIGEST_KEY: config_digest("name = 'x'")}, None, "its host had another configuration"),
     ],
 )
-def test_logs_tell_runs_apart_by_what_was_played(
-    host: dict[str, str], emulator: dict[str, str], seed: int | None, reason: str, tmp_path: Path
-) -> None:
+def test_logs_tell_runs_apart_by_what_was_played(host, emulator, seed, reason, tmp_path):
     log, truth = make_logs(tmp_path, host, emulator, seed)
     assert foreign_truth(log, truth) == (f"{truth} is of another run: {reason}" if reason else "")
     told: list[str] = []
@@ -79,9 +77,7 @@ def with_truth_of(run: Run, rows: slice) -> Run:
     ("rows", "false_alarms", "unjudged"),
     [(slice(None), 1, ""), (slice(3000), 0, "2 detections"), (slice(3000, None), 1, "1 detection")],
 )
-def test_what_comes_before_or_after_the_truth_is_not_judged(
-    rows: slice, false_alarms: int, unjudged: str, full_cycles: int, tmp_path: Path
-) -> None:
+def test_what_comes_before_or_after_the_truth_is_not_judged(rows, false_alarms, unjudged, full_cycles, tmp_path):
     run, gathered, source = read_run(*recorded(tmp_path, with_truth_of(touched_run(), rows)), full_cycles=full_cycles)
     assert evaluate(run, gathered).false_alarms == false_alarms
     said = f"the truth doesn't cover {unjudged}, not judged" if unjudged else ""
@@ -89,7 +85,7 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(
 
 
 @pytest.mark.slow
-def test_a_report_without_the_truth_of_another_run_says_so(tmp_path: Path) -> None:
+def test_a_report_without_the_truth_of_another_run_says_so(tmp_path):
     log, _ = recorded(tmp_path, touched_run())
     (tmp_path / "truth.mcap").unlink()
     TruthLog(tmp_path / "truth.mcap", blocking=True, metadata={"scenario": "idle"}).close()
@@ -100,11 +96,11 @@ def test_a_report_without_the_truth_of_another_run_says_so(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_host_and_emulator_write_logs_of_one_run(log: Path) -> None:
+def test_host_and_emulator_write_logs_of_one_run(log):
     assert foreign_truth(log, log.with_name("truth.mcap")) == ""
 
 
-def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end() -> None:
+def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end():
     nothing = np.zeros(1, np.int64)
     truth = Truth(
         nothing, np.zeros((1, 2)), np.zeros(1), np.full(1, -1.0), np.zeros(1), np.zeros((1, 7)),

@@ -9,35 +9,35 @@ from adacd_hil.score.distribution import bar_chart, doubling_bins, log_histogram
 INF = float("inf")
 
 
-def test_percentiles_are_values_that_occurred() -> None:
+def test_percentiles_are_values_that_occurred():
     values = np.arange(1, 1001)
     assert percentiles(values) == {"p50": 501.0, "p99": 991.0, "p99.9": 1000.0, "max": 1000.0}
     assert low_percentiles(values) == {"p50": 500.0, "p1": 10.0, "p0.1": 1.0, "min": 1.0}
     assert percentiles(values[:0]) == low_percentiles(values[:0]) == {}
 
 
-def test_a_logarithmic_histogram_counts_every_value_once_an_edge_in_the_upper_bin() -> None:
+def test_a_logarithmic_histogram_counts_every_value_once_an_edge_in_the_upper_bin():
     values = np.array([-5.0, 0.0, 0.99, 1.0, 1.1, 10.0, 100.0, 999_999.0, 1e6, 3e7])
     histogram = log_histogram(values)
     assert (histogram.below, int(histogram.counts.sum()), histogram.above) == (3, 5, 2)
     assert np.flatnonzero(histogram.counts).tolist() == [0, 20, 40, 119]
 
 
-def test_a_histogram_in_plain_values_leaves_out_empty_ends() -> None:
+def test_a_histogram_in_plain_values_leaves_out_empty_ends():
     plain = plain_values(log_histogram(np.array([10.0, 12.0, 0.5])).trimmed())
     assert (plain["counts"], plain["below"], plain["above"]) == ([1, 1], 1, 0)
     assert plain["edges"] == pytest.approx([10.0, 11.220185, 12.589254])
 
 
-def test_a_value_on_a_bound_belongs_to_the_upper_bin() -> None:
+def test_a_value_on_a_bound_belongs_to_the_upper_bin():
     assert doubling_bins(np.array([0, 9, 10, 19, 20, 1000]), 10.0, 4) == [(10.0, 2), (20.0, 2), (40.0, 1), (INF, 1)]
 
 
-def test_trailing_empty_bins_are_left_out() -> None:
+def test_trailing_empty_bins_are_left_out():
     assert doubling_bins(np.array([1, 15]), 10.0, 4) == [(10.0, 1), (20.0, 1)]
 
 
-def test_a_bin_that_is_not_empty_always_has_a_bar() -> None:
+def test_a_bin_that_is_not_empty_always_has_a_bar():
     first, second, third = bar_chart(["a", "bb", "c"], [10_000, 1, 0])
     assert (first.count("#"), second.count("#"), third.count("#")) == (40, 1, 0)
     assert second.endswith("0.01 %")

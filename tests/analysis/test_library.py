@@ -44,7 +44,7 @@ def arrays() -> dict[str, Any]:
     return {"t": t, "q": q[:, None], "dq": dq[:, None], "tau_J": tau[:, None]}
 
 
-def test_a_contact_is_found_in_arrays_and_the_model_is_the_arms(arm: OfflineArm, arrays: dict[str, Any]) -> None:
+def test_a_contact_is_found_in_arrays_and_the_model_is_the_arms(arm, arrays):
     found = detect(arrays, arm)
     named = dict(zip(found.model.names, found.model.theta, strict=True))
     assert named["F_c1"] == pytest.approx(0.1, abs=0.01)
@@ -58,15 +58,13 @@ def test_a_contact_is_found_in_arrays_and_the_model_is_the_arms(arm: OfflineArm,
     assert (found.t_s[0], found.t_s[-1]) == (pytest.approx(100.0), pytest.approx(arrays["t"][-1]))
 
 
-def test_a_model_of_one_recording_watches_another_and_names_of_others_are_taken(
-    arm: OfflineArm, arrays: dict[str, Any]
-) -> None:
+def test_a_model_of_one_recording_watches_another_and_names_of_others_are_taken(arm, arrays):
     model = fit(arrays, arm, fit_s=(100.0, 105.0))
     renamed = {"time": arrays["t"], "q": arrays["q"], "qd": arrays["dq"], "tau": arrays["tau_J"]}
     assert detect(renamed, arm, model=model).contacts == detect(arrays, arm, fit_s=(100.0, 105.0)).contacts
 
 
-def test_a_recording_without_torque_is_not_explained(arm: OfflineArm, arrays: dict[str, Any]) -> None:
+def test_a_recording_without_torque_is_not_explained(arm, arrays):
     noise = 0.01 * np.random.default_rng(2).standard_normal((6000, 1))
     for tau_J, cause in ((np.zeros((6000, 1)), "is always 0 Nm"), (noise, "is noise, unrelated to the motion")):
         model = fit({**arrays, "tau_J": tau_J}, arm)
@@ -78,7 +76,7 @@ def test_a_recording_without_torque_is_not_explained(arm: OfflineArm, arrays: di
     assert whole.explained.min() > 0.99
 
 
-def test_touches_that_are_known_are_left_out_of_the_fit(arm: OfflineArm, arrays: dict[str, Any]) -> None:
+def test_touches_that_are_known_are_left_out_of_the_fit(arm, arrays):
     touched = (arrays["t"] >= 100.0 + PUSH_S[0]) & (arrays["t"] < 100.0 + PUSH_S[1])
     blind = fit(arrays, arm, fit_s=(106.0, 112.0))
     told = fit({**arrays, "touched": touched}, arm, fit_s=(106.0, 112.0))
@@ -111,7 +109,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("line", WRONG)
-def test_arrays_that_can_not_be_used_are_one_line(arm: OfflineArm, arrays: dict[str, Any], line: str) -> None:
+def test_arrays_that_can_not_be_used_are_one_line(arm, arrays, line):
     with pytest.raises(ArrayError, match=f"^{re.escape(line)}$"):
         detect(WRONG[line](arrays), arm)
 
@@ -128,14 +126,12 @@ def test_arrays_that_can_not_be_used_are_one_line(arm: OfflineArm, arrays: dict[
         ({"velocity_lag_s": -1.0}, "velocity_lag_s = -1 s is not within 0 to 0.05 s"),
     ],
 )  # fmt: skip
-def test_options_that_can_not_be_are_one_line(
-    arm: OfflineArm, arrays: dict[str, Any], options: dict[str, Any], line: str
-) -> None:
+def test_options_that_can_not_be_are_one_line(arm, arrays, options, line):
     with pytest.raises(ArrayError, match=f"^{re.escape(line)}$"):
         detect(arrays, arm, **options)
 
 
-def test_a_log_is_arrays_with_a_row_for_each_cycle(log: Path) -> None:
+def test_a_log_is_arrays_with_a_row_for_each_cycle(log):
     run, raw = load(log.parent), read_log(log)
     assert len(run) == len(raw.scheme)
     assert np.array_equal(run["tau_J"], raw.scheme["tau_J"])
@@ -152,15 +148,13 @@ def test_a_log_is_arrays_with_a_row_for_each_cycle(log: Path) -> None:
         run["q"][0] = 1.0
 
 
-def test_what_is_no_log_is_one_line(tmp_path: Path) -> None:
+def test_what_is_no_log_is_one_line(tmp_path):
     with pytest.raises(LogError, match=r"run\.mcap"):
         load(tmp_path)
 
 
 @pytest.mark.parametrize("library", ["pandas", "polars"])
-def test_a_data_frame_has_a_column_for_each_number_and_a_row_for_each_cycle(
-    log: Path, library: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_data_frame_has_a_column_for_each_number_and_a_row_for_each_cycle(log, library, monkeypatch):
     run = load(log)
     assert {"t_s", "q_1", "q_2", "state"} <= set(run.columns())
     assert set(run.columns()["state"]) <= set(SchemeState.__members__)
@@ -182,7 +176,7 @@ def python(code: str) -> str:
     return ran.stdout
 
 
-def test_importing_the_package_costs_nothing() -> None:
+def test_importing_the_package_costs_nothing():
     begin = "import sys, time; begin = time.process_time(); import adacd_hil, adacd_hil.api"
     seconds, has_numpy = python(f"{begin}; print(time.process_time() - begin, 'numpy' in sys.modules)").split()
     assert float(seconds) < 0.1
@@ -190,7 +184,7 @@ def test_importing_the_package_costs_nothing() -> None:
 
 
 @pytest.mark.parametrize("name", api.__all__)
-def test_every_name_of_the_surface_is_what_it_says(name: str) -> None:
+def test_every_name_of_the_surface_is_what_it_says(name):
     text = Path(str(api.__file__)).with_suffix(".pyi").read_text()
     module, attribute = api.PLACES[name]
     assert getattr(api, name) is getattr(import_module(module), attribute)
@@ -198,14 +192,14 @@ def test_every_name_of_the_surface_is_what_it_says(name: str) -> None:
     assert re.search(rf"from {re.escape(module)} import [^\n]*\b{re.escape(imported)}\b", text)
 
 
-def test_a_name_that_is_not_of_the_surface_is_an_attribute_error() -> None:
+def test_a_name_that_is_not_of_the_surface_is_an_attribute_error():
     assert set(api.PLACES) == set(api.__all__) == set(dir(api))
     with pytest.raises(AttributeError, match="has no attribute 'Pipeline'"):
         _ = api.Pipeline
 
 
 @pytest.mark.long
-def test_the_example_is_right_for_a_type_checker_from_outside(tmp_path: Path) -> None:
+def test_the_example_is_right_for_a_type_checker_from_outside(tmp_path):
     """The package is found by its py.typed, as an installed one is."""
     file = EXAMPLES / "api" / "compare_offline.py"
     checked = subprocess.run(
@@ -220,6 +214,6 @@ def test_the_example_is_right_for_a_type_checker_from_outside(tmp_path: Path) ->
 
 
 @pytest.mark.long
-def test_the_example_script_runs(log: Path) -> None:
+def test_the_example_script_runs(log):
     said = python(f"import sys; sys.argv = ['', {str(log.parent)!r}]; exec(open('api/compare_offline.py').read())")
     assert said.startswith("margin ")

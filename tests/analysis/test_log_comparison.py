@@ -42,7 +42,7 @@ def contact(time_s: float, **changes: Any) -> Contact:
         ({"fault": 99}, "/scheme has fault 99 in cycle 7"),
     ],
 )
-def test_a_report_of_a_state_that_there_is_not_is_refused_in_one_line(tmp_path: Path, change, line: str) -> None:
+def test_a_report_of_a_state_that_there_is_not_is_refused_in_one_line(tmp_path, change, line):
     def corrupt(run) -> None:
         run.cycles[7].output = run.cycles[7].output._replace(**change)
 
@@ -52,7 +52,7 @@ def test_a_report_of_a_state_that_there_is_not_is_refused_in_one_line(tmp_path: 
     assert not compare_logs(path, path).fields
 
 
-def test_a_report_of_a_contact_that_there_is_not_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_report_of_a_contact_that_there_is_not_is_refused_in_one_line(tmp_path):
     def corrupt(run) -> None:
         cycle = next(cycle for cycle in run.cycles if cycle.contact is not None)
         cycle.contact = cycle.contact._replace(level=77)
@@ -76,13 +76,13 @@ def paths(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return write(folder / "a"), write(folder / "b", 25, change, other)
 
 
-def test_a_log_is_the_same_as_itself(paths: tuple[Path, Path]) -> None:
+def test_a_log_is_the_same_as_itself(paths):
     found = compare_logs(paths[0], paths[0])
     assert found.is_same
     assert (found.cycles, found.fields, found.settings, found.notes) == (40, (), {}, ())
 
 
-def test_what_differs_is_named_with_its_first_cycle_and_by_how_much(paths: tuple[Path, Path]) -> None:
+def test_what_differs_is_named_with_its_first_cycle_and_by_how_much(paths):
     found = compare_logs(*paths)
     missing, q = found.fields
     assert (missing.field, missing.first_cycle, missing.cycles, missing.largest) == ("tau_J", 5, 1, np.inf)
@@ -94,7 +94,7 @@ def test_what_differs_is_named_with_its_first_cycle_and_by_how_much(paths: tuple
     assert (found.cycles, found.only) == (25, (15, 0))
 
 
-def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone() -> None:
+def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone():
     first = [contact(1.0), contact(5.0), contact(9.0)]
     second = [contact(1.0 + 0.9 * MATCH_S), contact(1.1), contact(5.0 + 1.1 * MATCH_S)]
     assert match_contacts(first, second) == [
@@ -115,17 +115,17 @@ def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone() -> No
         ({}, ""),
     ],
 )
-def test_a_lower_bound_reads_as_one_in_a_comparison(changes, words: str) -> None:
+def test_a_lower_bound_reads_as_one_in_a_comparison(changes, words):
     assert contact_in_words(contact(1.0, **changes)) == f"1.000 s, link 1{words}"
 
 
-def test_a_contact_has_one_counterpart_at_most() -> None:
+def test_a_contact_has_one_counterpart_at_most():
     first, second = [contact(1.0), contact(1.25)], [contact(1.125)]
     assert match_contacts(first, second) == [(first[0], second[0]), (first[1], None)]
     assert match_contacts(second, first) == [(second[0], first[0]), (None, first[1])]
 
 
-def test_a_long_comparison_says_how_far_it_is(paths: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_comparison_says_how_far_it_is(paths, monkeypatch):
     lines: list[str] = []
     compare_logs(paths[0], paths[0], lines.append)
     assert lines == []

@@ -65,7 +65,7 @@ HEADS = {
 
 
 @pytest.mark.parametrize("kind", HEADS)
-def test_columns_and_units_are_found_by_their_heads(tmp_path: Path, motion: Motion, kind: str) -> None:
+def test_columns_and_units_are_found_by_their_heads(tmp_path, motion, kind):
     heads, units = HEADS[kind]
     _, keys = draft(tmp_path, table(heads, motion.t, motion.q, motion.dq, motion.tau))
     (names,) = csv.reader([heads])
@@ -73,14 +73,14 @@ def test_columns_and_units_are_found_by_their_heads(tmp_path: Path, motion: Moti
     assert keys.get("units", {}) == units
 
 
-def test_joints_in_another_order_are_put_in_the_urdfs(tmp_path: Path, motion: Motion) -> None:
+def test_joints_in_another_order_are_put_in_the_urdfs(tmp_path, motion):
     heads = "t,joint2_pos,joint1_pos,joint2_effort,joint1_effort"
     _, keys = draft(tmp_path, table(heads, motion.t, motion.q[:, ::-1], motion.tau[:, ::-1]))
     assert keys["columns"]["q"] == ["joint1_pos", "joint2_pos"]
     assert keys["columns"]["tau_J"] == ["joint1_effort", "joint2_effort"]
 
 
-def test_measured_columns_go_before_desired_and_filtered_ones(tmp_path: Path, motion: Motion) -> None:
+def test_measured_columns_go_before_desired_and_filtered_ones(tmp_path, motion):
     heads = "t,q_des1,q_des2,q_filt1,q_filt2,q_meas1,q_meas2,tau_cmd1,tau_cmd2,tau_meas1,tau_meas2,qdd1,qdd2"
     text = table(heads, motion.t, motion.q, motion.q, motion.q, motion.tau, motion.tau, motion.q)
     found, keys = draft(tmp_path, text)
@@ -89,7 +89,7 @@ def test_measured_columns_go_before_desired_and_filtered_ones(tmp_path: Path, mo
     assert reasons["q"] == "one of q_des1, q_filt1, q_meas1"
 
 
-def test_what_heads_leave_open_is_guessed_from_spans_against_the_urdf(tmp_path: Path, motion: Motion) -> None:
+def test_what_heads_leave_open_is_guessed_from_spans_against_the_urdf(tmp_path, motion):
     heads = "t,q1,q2,dq1,dq2,tau1,tau2"
     columns = (5.0 * np.arange(len(motion.t)), np.degrees(motion.q), np.degrees(motion.dq), 1e3 * motion.tau)
     found, keys = draft(tmp_path, table(heads, *columns))
@@ -102,27 +102,27 @@ def test_what_heads_leave_open_is_guessed_from_spans_against_the_urdf(tmp_path: 
     assert "units" not in keys
 
 
-def test_columns_without_heads_are_found_by_their_slopes(tmp_path: Path, motion: Motion) -> None:
+def test_columns_without_heads_are_found_by_their_slopes(tmp_path, motion):
     _, keys = draft(tmp_path, table("", motion.t, motion.q, motion.dq, motion.tau, motion.tau))
     assert keys["csv"] == {"has_header": False}
     assert keys["columns"] == {"time": "1", "q": ["2", "3"], "dq": ["4", "5"], "tau_J": ["6", "7"]}
 
 
-def test_semicolons_decimal_commas_and_lines_above_the_head_are_found(tmp_path: Path, motion: Motion) -> None:
+def test_semicolons_decimal_commas_and_lines_above_the_head_are_found(tmp_path, motion):
     rows = table("", motion.t, motion.q, motion.tau, delimiter=";", form="{:.5f}".format).replace(".", ",")
     _, keys = draft(tmp_path, f"Recorder 3.1\nArm;left\nt;q1;q2;tau1;tau2\ns;deg;deg;Nm;Nm\n{rows}")
     assert keys["csv"] == {"delimiter": ";", "decimal": ",", "skip_rows": 2}
     assert keys["units"] == {"q": "deg"}
 
 
-def test_dates_are_found(tmp_path: Path, motion: Motion) -> None:
+def test_dates_are_found(tmp_path, motion):
     rows = table("", motion.q, motion.tau).splitlines()
     dated = [f"2024-05-01T10:00:{0.005 * k:09.6f}Z,{row}" for k, row in enumerate(rows)]
     _, keys = draft(tmp_path, "\n".join(["stamp,q1,q2,tau1,tau2", *dated]))
     assert keys["units"] == {"time": "iso"}
 
 
-def test_a_period_that_nobody_says_is_left_to_be_written(tmp_path: Path, motion: Motion) -> None:
+def test_a_period_that_nobody_says_is_left_to_be_written(tmp_path, motion):
     _, keys = draft(tmp_path, table("q1,q2,tau1,tau2", motion.q, motion.tau))
     assert keys["sampling"] == {"period_s": 0.0}
     played = called("identify", tmp_path / "r.csv", "--map", tmp_path / "map.toml")
@@ -130,7 +130,7 @@ def test_a_period_that_nobody_says_is_left_to_be_written(tmp_path: Path, motion:
     assert "`sampling.period_s`" in played.stderr
 
 
-def test_a_gripper_that_makes_the_arm_branch_is_locked(tmp_path: Path, motion: Motion) -> None:
+def test_a_gripper_that_makes_the_arm_branch_is_locked(tmp_path, motion):
     fingers = "".join(
         f'<link name="{side}"/><joint name="{side}_finger" type="prismatic"><parent link="link2"/>'
         f'<child link="{side}"/><axis xyz="0 1 0"/><limit lower="0" upper="0.04" velocity="1" effort="10"/></joint>'
@@ -150,7 +150,7 @@ def test_a_gripper_that_makes_the_arm_branch_is_locked(tmp_path: Path, motion: M
         ("", "no rows of numbers"),
     ],
 )
-def test_a_table_that_nothing_can_be_made_of_is_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_a_table_that_nothing_can_be_made_of_is_one_line(tmp_path, text, said):
     with pytest.raises((LogError, ConfigError)) as refusal:
         draft(tmp_path, text)
     assert said in str(refusal.value)
@@ -167,7 +167,7 @@ def bag(folder: Path, names: tuple[str, ...], motion: Motion, **more) -> dict:
     return tomllib.loads(draft_map(path, folder / "arm.urdf", folder / "map.toml").text())
 
 
-def test_a_bag_needs_its_urdf_alone_where_it_has_the_urdfs_names(tmp_path: Path, motion: Motion) -> None:
+def test_a_bag_needs_its_urdf_alone_where_it_has_the_urdfs_names(tmp_path, motion):
     assert bag(tmp_path, ("joint1", "joint2"), motion) == {"arm": {"urdf": "arm.urdf"}}
     assert bag(tmp_path, ("left_joint1", "left_joint2"), motion, is_stamped=False) == {
         "arm": {"urdf": "arm.urdf"},
@@ -180,7 +180,7 @@ def test_a_bag_needs_its_urdf_alone_where_it_has_the_urdfs_names(tmp_path: Path,
 
 
 @pytest.mark.slow
-def test_the_command_writes_a_map_that_identifies_the_arm_and_replaces_none(tmp_path: Path) -> None:
+def test_the_command_writes_a_map_that_identifies_the_arm_and_replaces_none(tmp_path):
     urdf, recording, described = (tmp_path / name for name in ("arm.urdf", "r.csv", "map.toml"))
     urdf.write_text(urdf_text(3, AXES))
     motion = record(urdf.read_text())
@@ -203,7 +203,7 @@ def test_the_command_writes_a_map_that_identifies_the_arm_and_replaces_none(tmp_
     assert "--map names a file for this one" in refused.stderr
 
 
-def test_init_takes_a_recording_and_a_urdf_and_identify_a_map(tmp_path: Path) -> None:
+def test_init_takes_a_recording_and_a_urdf_and_identify_a_map(tmp_path):
     (tmp_path / "r.csv").write_text("")
     for arguments, said in (
         (["--init", str(tmp_path / "r.csv")], "--init takes one recording and one URDF"),

@@ -103,7 +103,7 @@ PAGES = {
 
 @pytest.mark.usefixtures("spoiling")
 @pytest.mark.parametrize("name", PAGES)
-def test_whatever_text_a_template_is_given_stays_text(name: str) -> None:
+def test_whatever_text_a_template_is_given_stays_text(name):
     write, make = PAGES[name]
     html = write(make())
     parsed = Page(html)
@@ -113,12 +113,12 @@ def test_whatever_text_a_template_is_given_stays_text(name: str) -> None:
     assert html.count("alert(1)") == html.count("&lt;script&gt;alert(1)") + html.count("\\u003cscript\\u003ealert(1)")
 
 
-def test_a_template_that_asks_for_what_it_is_not_given_is_an_error() -> None:
+def test_a_template_that_asks_for_what_it_is_not_given_is_an_error():
     with pytest.raises(UndefinedError, match="'settling_s' is undefined"):
         render("definitions.html.j2", run=touched_run(), motion_start_s=None)
 
 
-def test_what_is_not_escaped_is_the_packages_own_and_says_why() -> None:
+def test_what_is_not_escaped_is_the_packages_own_and_says_why():
     unescaped = []
     for template in TEMPLATES:
         lines = template.read_text(encoding="utf-8").splitlines()
@@ -152,7 +152,7 @@ def markup_in(module: Path) -> list[str]:
     return found
 
 
-def test_no_module_writes_markup() -> None:
+def test_no_module_writes_markup():
     modules = [module for package in ("adacd_hil", "firmware_sim") for module in (ROOT / package).rglob("*.py")]
     found = {module.relative_to(ROOT): markup_in(module) for module in modules}
     assert {module: texts for module, texts in found.items() if texts} == {}

@@ -60,7 +60,7 @@ GOOD = {
 
 
 @pytest.mark.parametrize("kind", GOOD)
-def test_a_good_recording_is_explained(tmp_path: Path, kind: str) -> None:
+def test_a_good_recording_is_explained(tmp_path, kind):
     joints, axes, has_dq, options = GOOD[kind]
     found = judged(tmp_path, record(urdf_text(joints, axes), **options), axes, has_dq)
     assert found.verdict.is_explained, found.verdict
@@ -69,7 +69,7 @@ def test_a_good_recording_is_explained(tmp_path: Path, kind: str) -> None:
     assert not any("times" in remark or "drives" in remark or "stuck" in remark for remark in found.verdict.remarks)
 
 
-def test_friction_and_inertia_of_a_good_recording_are_within_their_deviations(tmp_path: Path) -> None:
+def test_friction_and_inertia_of_a_good_recording_are_within_their_deviations(tmp_path):
     text = urdf_text(7, AXES)
     motion = record(text)
     found = judged(tmp_path, motion, AXES, has_dq=True)
@@ -80,7 +80,7 @@ def test_friction_and_inertia_of_a_good_recording_are_within_their_deviations(tm
     assert np.sqrt(np.mean(apart**2)) < 1.5
 
 
-def test_joints_are_explained_though_their_sensors_have_no_noise_and_the_margin_is_small(tmp_path: Path) -> None:
+def test_joints_are_explained_though_their_sensors_have_no_noise_and_the_margin_is_small(tmp_path):
     """Whatever a model lacks is more than no noise; 99 % of the torque is explained all the same."""
     motion = record(urdf_text(3, AXES), noise_Nm=0.0)
     stribeck = 0.3 * motion.truth["F_c"] * np.sign(motion.dq) * np.exp(-np.abs(motion.dq) / 0.1)
@@ -183,9 +183,7 @@ UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
 
 
 @pytest.mark.parametrize("kind", UNEXPLAINED)
-def test_what_can_not_be_explained_is_named_with_the_next_thing_to_do(
-    tmp_path: Path, upright: Motion, kind: str
-) -> None:
+def test_what_can_not_be_explained_is_named_with_the_next_thing_to_do(tmp_path, upright, kind):
     spoil, cause, remedy = UNEXPLAINED[kind]
     verdict = judged(tmp_path, spoil(upright)).verdict
     assert not verdict.is_explained
@@ -195,7 +193,7 @@ def test_what_can_not_be_explained_is_named_with_the_next_thing_to_do(
     assert remedy in verdict.remedy
 
 
-def test_the_share_is_that_of_what_the_same_filter_leaves_of_the_torque(tmp_path: Path, upright: Motion) -> None:
+def test_the_share_is_that_of_what_the_same_filter_leaves_of_the_torque(tmp_path, upright):
     """Noise that the filter takes away is no merit of the model's: of noise alone nothing is explained, at any rate."""
     for period_s in (5e-3, 1e-3):
         motion = record(urdf_text(2, UPRIGHT), period_s=period_s)
@@ -206,7 +204,7 @@ def test_the_share_is_that_of_what_the_same_filter_leaves_of_the_torque(tmp_path
     assert np.all(judged(tmp_path, half).explained > 0.95)  # 40 rad/s hardly pass 10 rad/s twice
 
 
-def test_a_passive_joint_is_told_from_a_dead_sensor(tmp_path: Path) -> None:
+def test_a_passive_joint_is_told_from_a_dead_sensor(tmp_path):
     """The forearm swings freely below a driven one: nothing but noise is at its sensor, as its motion says, too."""
     text = urdf_text(2, UPRIGHT)
     arm, period_s = read_urdf(text), 5e-3
@@ -237,7 +235,7 @@ def test_a_passive_joint_is_told_from_a_dead_sensor(tmp_path: Path) -> None:
     assert reason.startswith("the torque of joint2 is noise, and by the model of the others it is tiny: a passive")
 
 
-def test_a_wrong_model_says_how_far_it_is_off(tmp_path: Path, upright: Motion) -> None:
+def test_a_wrong_model_says_how_far_it_is_off(tmp_path, upright):
     spring = replace(upright, tau=upright.tau + [0.0, 1.5] * np.sin(3.0 * upright.q))
     verdict = judged(tmp_path, spring).verdict
     assert any(reason.startswith("joint2: ") and "99 % are needed" in reason for reason in verdict.reasons)
@@ -246,7 +244,7 @@ def test_a_wrong_model_says_how_far_it_is_off(tmp_path: Path, upright: Motion) -
     assert "`arm.has_rotors` = true" in motors.remedy
 
 
-def test_friction_that_drives_and_a_negative_term_of_it_are_said(tmp_path: Path, upright: Motion) -> None:
+def test_friction_that_drives_and_a_negative_term_of_it_are_said(tmp_path, upright):
     compensated = replace(upright, tau=upright.tau - 2.0 * upright.truth["F_c"] * np.sign(upright.dq))
     verdict = judged(tmp_path, compensated, has_dq=True).verdict
     assert any(remark.startswith("friction drives joint1 on: F_v ") for remark in verdict.remarks)
@@ -255,14 +253,14 @@ def test_friction_that_drives_and_a_negative_term_of_it_are_said(tmp_path: Path,
     assert any(remark.startswith("F_v1 of joint1 is negative, -0.1") for remark in verdict.remarks)
 
 
-def test_an_inertia_that_no_masses_make_is_said(tmp_path: Path, level: Motion) -> None:
+def test_an_inertia_that_no_masses_make_is_said(tmp_path, level):
     ddq = np.gradient(level.dq, level.t, axis=0)
     odd = replace(level, tau=level.tau - np.array([3.0, 0.0]) * ddq)
     verdict = judged(tmp_path, odd, LEVEL, has_dq=True).verdict
     assert any("the inertia about joint1 is negative, -" in reason and "kg m²" in reason for reason in verdict.reasons)
 
 
-def test_motion_that_tells_nothing_of_a_parameter_is_too_little_excitation(tmp_path: Path) -> None:
+def test_motion_that_tells_nothing_of_a_parameter_is_too_little_excitation(tmp_path):
     text = urdf_text(2, UPRIGHT)
     motion = record(text)
     held = replace(motion, q=motion.q * [1.0, 0.0] + [0.0, 0.3], dq=motion.dq * [1.0, 0.0])
@@ -290,9 +288,7 @@ def rests(motion: Motion, first: int, last: int, joints: list[int]) -> Motion:
         ((0, 1440), [1], "joint2 does not move in the part that is fitted"),
     ],
 )
-def test_an_arm_or_a_joint_that_rests_in_the_fit_or_in_the_test_is_said_to(
-    tmp_path: Path, upright: Motion, part: tuple[int, int], joints: list[int], said: str
-) -> None:
+def test_an_arm_or_a_joint_that_rests_in_the_fit_or_in_the_test_is_said_to(tmp_path, upright, part, joints, said):
     verdict = judged(tmp_path, rests(upright, *part, joints)).verdict
     assert said in verdict.reasons
     if len(joints) == 2:
@@ -383,7 +379,7 @@ MISTAKES: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_common_mistake_is_named_with_its_key(tmp_path: Path, upright: Motion, mistake: str) -> None:
+def test_a_common_mistake_is_named_with_its_key(tmp_path, upright, mistake):
     spoil, said, remedy = MISTAKES[mistake]
     has_dq = list(MISTAKES).index(mistake) % 2 == 0
     verdict = judged(tmp_path, spoil(upright), has_dq=has_dq).verdict
@@ -402,7 +398,7 @@ def test_a_common_mistake_is_named_with_its_key(tmp_path: Path, upright: Motion,
     ],
     ids=["mNm that are none", "degrees that are none", "a torque that the map turns"],
 )
-def test_a_mistake_of_the_map_is_named_with_its_key(tmp_path: Path, upright: Motion, keys, said, remedy) -> None:
+def test_a_mistake_of_the_map_is_named_with_its_key(tmp_path, upright, keys, said, remedy):
     verdict = judged(tmp_path, upright, more=keys).verdict
     assert not verdict.is_explained
     assert said in verdict.reasons[0]
@@ -417,21 +413,21 @@ def test_a_mistake_of_the_map_is_named_with_its_key(tmp_path: Path, upright: Mot
     ],
     ids=["mNm", "degrees"],
 )
-def test_the_unit_of_one_joint_alone_is_its_scale(tmp_path: Path, upright: Motion, spoil, said, remedy) -> None:
+def test_the_unit_of_one_joint_alone_is_its_scale(tmp_path, upright, spoil, said, remedy):
     verdict = judged(tmp_path, spoil(upright)).verdict
     assert not verdict.is_explained
     assert verdict.reasons[0].startswith(said)
     assert verdict.remedy == f"if the {remedy}"
 
 
-def test_what_is_named_makes_the_recording_explained(tmp_path: Path, upright: Motion) -> None:
+def test_what_is_named_makes_the_recording_explained(tmp_path, upright):
     turned = replace(upright, q=upright.q * TURNED, dq=upright.dq * TURNED, tau=1e3 * upright.tau * TURNED)
     keys = '[units]\ntau_J = "mNm"\n[scale]\nq = [1, -1]\ntau_J = [1, -1]\n'
     assert not judged(tmp_path, turned).verdict.is_explained
     assert judged(tmp_path, turned, more=keys).verdict.is_explained
 
 
-def test_three_positions_that_count_from_the_base_are_named_with_their_torques(tmp_path: Path) -> None:
+def test_three_positions_that_count_from_the_base_are_named_with_their_torques(tmp_path):
     motion = record(urdf_text(3, AXES))
     sums = np.tril(np.ones((3, 3)))
     coupled = replace(motion, q=motion.q @ sums.T, tau=motion.tau @ np.linalg.inv(sums))
@@ -439,7 +435,7 @@ def test_three_positions_that_count_from_the_base_are_named_with_their_torques(t
     assert said in judged(tmp_path, coupled, AXES).verdict.reasons[0]
 
 
-def test_which_joint_of_an_arm_without_gravity_is_turned_nobody_can_say(tmp_path: Path, level: Motion) -> None:
+def test_which_joint_of_an_arm_without_gravity_is_turned_nobody_can_say(tmp_path, level):
     turned = replace(level, q=level.q * TURNED, tau=level.tau * TURNED)
     (reason,) = judged(tmp_path, turned, LEVEL).verdict.reasons
     assert "joint1 counts the other way round, position and torque, or joint2 counts" in reason or (
@@ -447,9 +443,7 @@ def test_which_joint_of_an_arm_without_gravity_is_turned_nobody_can_say(tmp_path
     )
 
 
-def test_an_arm_without_masses_in_its_urdf_is_judged_by_its_effort_and_by_its_reach(
-    tmp_path: Path, upright: Motion
-) -> None:
+def test_an_arm_without_masses_in_its_urdf_is_judged_by_its_effort_and_by_its_reach(tmp_path, upright):
     milli = replace(upright, tau=1e3 * upright.tau)
     (reason,) = judged(tmp_path, milli, has_masses=False).verdict.reasons
     assert "Nm, the URDF allows 60 Nm" in reason
@@ -458,7 +452,7 @@ def test_an_arm_without_masses_in_its_urdf_is_judged_by_its_effort_and_by_its_re
     assert judged(tmp_path, upright, has_masses=False).verdict.is_explained
 
 
-def test_torques_of_a_third_of_what_the_masses_need_are_a_remark(tmp_path: Path, upright: Motion) -> None:
+def test_torques_of_a_third_of_what_the_masses_need_are_a_remark(tmp_path, upright):
     """As currents taken for torques, of motors with a few Nm/A behind their gears."""
     verdict = judged(tmp_path, replace(upright, tau=0.35 * upright.tau)).verdict
     assert any(remark.startswith("the torques are 0.3") and "a gain is wrong" in remark for remark in verdict.remarks)
@@ -468,7 +462,7 @@ def test_torques_of_a_third_of_what_the_masses_need_are_a_remark(tmp_path: Path,
     assert any(remark.startswith("the torques are 0.3") for remark in late.remarks)
 
 
-def test_masses_of_a_urdf_that_are_none_make_no_verdict(tmp_path: Path, upright: Motion) -> None:
+def test_masses_of_a_urdf_that_are_none_make_no_verdict(tmp_path, upright):
     """Some have a thousandth of a kilogram to please a simulator."""
     verdict = judged(tmp_path, upright, density=1e-3).verdict
     assert verdict.is_explained
@@ -489,9 +483,7 @@ VELOCITIES: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
 
 
 @pytest.mark.parametrize("kind", VELOCITIES)
-def test_velocities_that_are_not_the_slope_of_the_positions_are_named(
-    tmp_path: Path, upright: Motion, kind: str
-) -> None:
+def test_velocities_that_are_not_the_slope_of_the_positions_are_named(tmp_path, upright, kind):
     spoil, said, remedy = VELOCITIES[kind]
     verdict = judged(tmp_path, spoil(upright), has_dq=True).verdict
     assert not verdict.is_explained
@@ -499,26 +491,26 @@ def test_velocities_that_are_not_the_slope_of_the_positions_are_named(
     assert remedy in verdict.remedy
 
 
-def test_a_position_that_stays_while_its_velocity_does_not_is_a_dead_encoder(tmp_path: Path, level: Motion) -> None:
+def test_a_position_that_stays_while_its_velocity_does_not_is_a_dead_encoder(tmp_path, level):
     verdict = judged(tmp_path, still(level, 1), LEVEL, has_dq=True).verdict
     assert "though by its velocity it turns: a dead encoder" in verdict.reasons[0]
     assert not verdict.is_explained
 
 
-def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path: Path, upright: Motion) -> None:
+def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path, upright):
     noisy = replace(upright, dq=upright.dq + 1.0 * np.random.default_rng(5).standard_normal(upright.dq.shape))
     verdict = judged(tmp_path, noisy, has_dq=True).verdict
     assert any("noise of the velocities, 1 rad/s, hides contacts" in remark for remark in verdict.remarks)
 
 
-def test_joints_at_rest_are_named_in_one_reason(tmp_path: Path) -> None:
+def test_joints_at_rest_are_named_in_one_reason(tmp_path):
     motion = record(urdf_text(3, AXES))
     verdict = judged(tmp_path, still(motion, 0, 2), AXES).verdict
     (reason,) = verdict.reasons
     assert reason.startswith("the positions of joint1 (q1) and joint3 (q3) change by less than 0.01 rad: dead encoders")
 
 
-def test_a_stuck_sensor_makes_no_share_that_is_no_number(tmp_path: Path, upright: Motion) -> None:
+def test_a_stuck_sensor_makes_no_share_that_is_no_number(tmp_path, upright):
     tau = upright.tau.copy()
     tau[len(tau) // 3 :, 0] = tau[len(tau) // 3, 0]
     verdict = judged(tmp_path, replace(upright, tau=tau)).verdict
@@ -530,7 +522,7 @@ def test_a_stuck_sensor_makes_no_share_that_is_no_number(tmp_path: Path, upright
 # The command.
 
 
-def test_the_command_says_verdict_rows_left_out_and_the_next_thing_to_do(tmp_path: Path, upright: Motion) -> None:
+def test_the_command_says_verdict_rows_left_out_and_the_next_thing_to_do(tmp_path, upright):
     recording, described = write_recording(tmp_path, urdf_text(2, UPRIGHT), replace(upright, tau=upright.tau * TURNED))
     rows = recording.read_text().splitlines(keepends=True)
     recording.write_text("".join([*rows[:901], *rows[900:]]))
@@ -546,14 +538,14 @@ def test_the_command_says_verdict_rows_left_out_and_the_next_thing_to_do(tmp_pat
     assert verdict["next"] == "in the map: `scale.tau_J` = [1, -1]"
 
 
-def test_json_of_a_recording_without_torque_is_json(tmp_path: Path, upright: Motion) -> None:
+def test_json_of_a_recording_without_torque_is_json(tmp_path, upright):
     recording, described = write_recording(tmp_path, urdf_text(2, UPRIGHT), replace(upright, tau=0.0 * upright.tau))
     played = called("identify", recording, "--map", described, "--json")
     test = json.loads(played.stdout, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))["test"]
     assert (test["margin"], test["explained"]) == (None, {"joint1": None, "joint2": None})
 
 
-def test_the_picture_of_the_test_has_the_thresholds_of_its_margin(tmp_path: Path, upright: Motion) -> None:
+def test_the_picture_of_the_test_has_the_thresholds_of_its_margin(tmp_path, upright):
     spring = replace(upright, tau=upright.tau + [0.0, 1.5] * np.sin(3.0 * upright.q))
     found = judged(tmp_path, spring)
     ratios = [
@@ -564,7 +556,7 @@ def test_the_picture_of_the_test_has_the_thresholds_of_its_margin(tmp_path: Path
     assert found.test.contacts
 
 
-def test_an_arm_has_an_inertia_about_every_joint_and_friction_that_takes_power(upright: Motion) -> None:
+def test_an_arm_has_an_inertia_about_every_joint_and_friction_that_takes_power(upright):
     arm = read_urdf(urdf_text(2, UPRIGHT))
     model = model_of(arm.chain)
     theta = np.concatenate([model.base.map @ arm.theta_full, [0.1, 0.1, 0.2, 0.2, 0.0, 0.0]])

@@ -32,7 +32,7 @@ def changed(log: Path, change, cycles_per_piece: int = 20_000, is_old: bool = Fa
     return replay_source(source, [source.settings], script_of=ScriptedOperator, shown=80, by_frames=by_frames)[0]
 
 
-def test_a_replay_comes_to_the_same_bits_through_contact_fault_and_recovery(log: Path, whole: Replay) -> None:
+def test_a_replay_comes_to_the_same_bits_through_contact_fault_and_recovery(log, whole):
     found = whole
     assert found.mismatches == ()
     assert found.is_identical
@@ -44,9 +44,7 @@ def test_a_replay_comes_to_the_same_bits_through_contact_fault_and_recovery(log:
 
 
 @pytest.mark.parametrize(("is_old", "by_frames"), [(False, False), (False, True), (True, False)])
-def test_where_the_log_is_cut_into_pieces_doesnt_matter(
-    log: Path, whole: Replay, is_old: bool, by_frames: bool
-) -> None:
+def test_where_the_log_is_cut_into_pieces_doesnt_matter(log, whole, is_old, by_frames):
     found = changed(log, lambda piece: piece, 333, is_old, by_frames)
     assert (found.mismatches, found.attempts, found.notes) == ((), 2, ())
     assert found.states == whole.states
@@ -60,7 +58,7 @@ def said_of(source: LogSource, **changes: str) -> list[str]:
     return said
 
 
-def test_a_replay_that_must_decode_the_frames_says_why(log: Path) -> None:
+def test_a_replay_that_must_decode_the_frames_says_why(log):
     assert said_of(LogSource(log), **{"detector.threshold_Nm": "0.3"}) == []
     (why,) = said_of(LogSource(log), **{"safety.tolerated_emergencies": "[4096]"})
     assert why.startswith("a setting is another by which the arm takes its frames")
@@ -68,7 +66,7 @@ def test_a_replay_that_must_decode_the_frames_says_why(log: Path) -> None:
     assert why.startswith("the log has no /arm")
 
 
-def test_without_the_states_of_the_arm_a_proof_by_frames_is_not_whole(log: Path, whole: Replay) -> None:
+def test_without_the_states_of_the_arm_a_proof_by_frames_is_not_whole(log, whole):
     found = changed(log, lambda piece: piece, is_old=True, by_frames=True)
     assert (found.is_identical, found.arms_compared, found.compared) == (True, 0, whole.compared)
     assert ["no /arm" in note for note in found.notes] == [True]
@@ -77,7 +75,7 @@ def test_without_the_states_of_the_arm_a_proof_by_frames_is_not_whole(log: Path,
 ARM_FIELDS = ["steps", "sample_age_ns", "age_q", "age_tau_J", "is_enabled", "is_complete", "fault", "is_late"]
 
 
-def test_what_the_log_says_of_the_arm_otherwise_than_its_frames_is_named(log: Path) -> None:
+def test_what_the_log_says_of_the_arm_otherwise_than_its_frames_is_named(log):
     def change(piece):
         records = writable(piece.series["/arm"])
         for place, name in enumerate(ARM_FIELDS):
@@ -94,7 +92,7 @@ def test_what_the_log_says_of_the_arm_otherwise_than_its_frames_is_named(log: Pa
     assert changed(log, change).arms_compared == 0
 
 
-def test_a_fault_of_the_arm_that_this_version_does_not_know_is_refused(log: Path) -> None:
+def test_a_fault_of_the_arm_that_this_version_does_not_know_is_refused(log):
     def change(piece):
         records = writable(piece.series["/arm"])
         records["fault"][5] = 99
@@ -104,7 +102,7 @@ def test_a_fault_of_the_arm_that_this_version_does_not_know_is_refused(log: Path
         changed(log, change)
 
 
-def test_every_flipped_bit_is_found_and_named(log: Path) -> None:
+def test_every_flipped_bit_is_found_and_named(log):
     """A bit of every field of /scheme, of one value of each, each in a cycle of its own.
 
     q, dq and tau_J are what the scheme was given: that they are another is seen by the frames.
@@ -135,7 +133,7 @@ def test_every_flipped_bit_is_found_and_named(log: Path) -> None:
     assert "/scheme.state" in by_field["state"].line()
 
 
-def test_an_nmt_frame_without_data_tells_nothing(log: Path, whole: Replay) -> None:
+def test_an_nmt_frame_without_data_tells_nothing(log, whole):
     def change(piece):
         frames = piece.frames.copy()
         first = np.flatnonzero(frames["is_tx"] & (frames["can_id"] == 0))[0]
@@ -156,7 +154,7 @@ def stretched(log: Path, stretch: TimeWindow, change=lambda piece: piece, cycles
 
 
 @pytest.mark.parametrize("cycles_per_piece", [20_000, 333])
-def test_of_a_stretch_that_alone_is_compared_and_told(log: Path, cycles_per_piece: int) -> None:
+def test_of_a_stretch_that_alone_is_compared_and_told(log, cycles_per_piece):
     whole = replay_source(LogSource(log), [LogSource(log).settings], contacts_beside(log))[0]
     contact = whole.score.contacts[0]
     stretch = TimeWindow(at_s(log, contact.onset_ns) - 0.2004, at_s(log, contact.onset_ns) + 0.3)
@@ -182,7 +180,7 @@ def test_of_a_stretch_that_alone_is_compared_and_told(log: Path, cycles_per_piec
 
 
 @pytest.mark.parametrize(("row", "count"), [(899, 0), (900, 1), (1099, 1), (1100, 0)])
-def test_only_what_differs_in_the_stretch_is_named(log: Path, row: int, count: int) -> None:
+def test_only_what_differs_in_the_stretch_is_named(log, row, count):
     scheme = read_log(log, ("/scheme",)).scheme
 
     def change(piece):
@@ -195,7 +193,7 @@ def test_only_what_differs_in_the_stretch_is_named(log: Path, row: int, count: i
     assert (found.compared, found.mismatch_count) == (200, count)
 
 
-def test_a_stretch_in_which_nothing_changes_says_what_state_it_is_in(log: Path, whole: Replay) -> None:
+def test_a_stretch_in_which_nothing_changes_says_what_state_it_is_in(log, whole):
     last = whole.states[-1]
     found = stretched(log, TimeWindow(at_s(log, last.t_ns) + 0.0014))
     assert found.states == ()
@@ -204,7 +202,7 @@ def test_a_stretch_in_which_nothing_changes_says_what_state_it_is_in(log: Path, 
 
 
 @pytest.mark.parametrize("script_of", [ScriptedOperator, None])
-def test_a_request_that_nobody_can_make_is_named(log: Path, script_of) -> None:
+def test_a_request_that_nobody_can_make_is_named(log, script_of):
     def change(piece):
         records = writable(piece.series["/scheme"])
         flip(records, 900, "request", bit=6)
@@ -216,7 +214,7 @@ def test_a_request_that_nobody_can_make_is_named(log: Path, script_of) -> None:
     assert (mismatch.name, mismatch.logged, mismatch.replayed) == ("/scheme.request", "64", "0")
 
 
-def test_a_flipped_bit_of_any_field_of_a_contact_report_is_found_and_named(log: Path) -> None:
+def test_a_flipped_bit_of_any_field_of_a_contact_report_is_found_and_named(log):
     names: list[str] = []
 
     def change(piece):
@@ -231,16 +229,14 @@ def test_a_flipped_bit_of_any_field_of_a_contact_report_is_found_and_named(log: 
     assert {(each.topic, each.field) for each in found.mismatches} == {("/contact", name) for name in names}
 
 
-def test_a_report_that_is_not_in_the_log_is_named(log: Path) -> None:
+def test_a_report_that_is_not_in_the_log_is_named(log):
     found = changed(log, lambda piece: with_records(piece, "/contact", piece.series["/contact"].records[1:]))
     (mismatch,) = found.mismatches
     assert (mismatch.name, mismatch.logged, mismatch.replayed) == ("/contact.report", "no report", "a report")
 
 
 @pytest.mark.parametrize("is_old", [False, True])
-def test_a_gap_is_said_and_what_follows_it_in_the_attempt_is_not_compared(
-    log: Path, whole: Replay, is_old: bool
-) -> None:
+def test_a_gap_is_said_and_what_follows_it_in_the_attempt_is_not_compared(log, whole, is_old):
     found = changed(log, without_cycles(700, 725), cycles_per_piece=1000, is_old=is_old)
     number = read_log(log, ("/cycle",)).cycle["cycle"].astype(int)
     assert found.mismatches == ()
@@ -251,7 +247,7 @@ def test_a_gap_is_said_and_what_follows_it_in_the_attempt_is_not_compared(
 
 
 @pytest.mark.parametrize("is_old", [False, True])
-def test_of_a_log_that_begins_in_the_middle_the_next_attempt_is_compared(log: Path, is_old: bool) -> None:
+def test_of_a_log_that_begins_in_the_middle_the_next_attempt_is_compared(log, is_old):
     found = changed(log, without_cycles(0, 500), cycles_per_piece=1000, is_old=is_old)
     assert found.attempts == 1 or found.compared < found.cycles
     assert found.mismatches == ()
@@ -259,7 +255,7 @@ def test_of_a_log_that_begins_in_the_middle_the_next_attempt_is_compared(log: Pa
     assert not found.is_whole
 
 
-def test_a_cut_log_is_compared_as_far_as_it_goes(log: Path, whole: Replay, tmp_path: Path) -> None:
+def test_a_cut_log_is_compared_as_far_as_it_goes(log, whole, tmp_path):
     content = log.read_bytes()
     cut = tmp_path / "run.mcap"
     cut.write_bytes(content[: len(content) * 2 // 3])
@@ -269,7 +265,7 @@ def test_a_cut_log_is_compared_as_far_as_it_goes(log: Path, whole: Replay, tmp_p
     assert any("not whole" in note for note in found.notes)
 
 
-def test_what_a_replay_says_of_contacts_is_what_the_report_says(log: Path, whole: Replay) -> None:
+def test_what_a_replay_says_of_contacts_is_what_the_report_says(log, whole):
     metrics = evaluate(read_run(log, log.with_name("truth.mcap")).run)
     found = whole
     assert found.score is not None
@@ -280,7 +276,7 @@ def test_what_a_replay_says_of_contacts_is_what_the_report_says(log: Path, whole
     assert found.adaptation_s == pytest.approx(list(metrics.adaptation_s.values()))
 
 
-def test_other_settings_decide_otherwise_about_the_same_motion(log: Path) -> None:
+def test_other_settings_decide_otherwise_about_the_same_motion(log):
     own = settings_of_run()
     resolved = {"realtime.sample_period": "nominal", "safety.enable_timeout_s": str(enable_timeout_s(own))}
     own = apply_settings(own, resolved)
@@ -309,13 +305,13 @@ def test_other_settings_decide_otherwise_about_the_same_motion(log: Path) -> Non
     assert contacts_beside(log) is not None
 
 
-def test_a_log_without_its_settings_is_refused(tmp_path: Path) -> None:
+def test_a_log_without_its_settings_is_refused(tmp_path):
     record_log(tmp_path / "run.mcap", make_run(3))
     with pytest.raises(LogError, match=r"no attachment config\.toml"):
         replay(tmp_path / "run.mcap")
 
 
-def test_what_comes_before_or_after_the_truth_is_not_judged(log: Path, whole: Replay) -> None:
+def test_what_comes_before_or_after_the_truth_is_not_judged(log, whole):
     """As in the report: a detection there is neither right nor a false alarm, and a replay says that there are some."""
     source, (contacts, span) = LogSource(log), contacts_beside(log)
     attempt, onset = contacts[0].attempt, contacts[0].onset
@@ -334,7 +330,7 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(log: Path, whole: Re
     assert replay_source(LogSource(log), [source.settings], (contacts, span))[0].notes == ()
 
 
-def test_a_truth_without_a_cycle_knows_nothing(log: Path, tmp_path: Path) -> None:
+def test_a_truth_without_a_cycle_knows_nothing(log, tmp_path):
     (tmp_path / "run.mcap").write_bytes(log.read_bytes())
     TruthLog(tmp_path / "truth.mcap", blocking=True).close()
     found = replay(tmp_path / "run.mcap")

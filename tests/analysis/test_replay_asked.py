@@ -1,7 +1,6 @@
 """What was asked in a run, against what its configuration's script asks."""
 
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ from adacd_hil.settings.run_settings import RequestSettings
     ],
     ids=["an interrupt", "before the script's finish", "the finish at another time", "two", "the host's own check"],
 )
-def test_one_finish_that_is_not_in_the_script_is_an_interrupt(logged, asked, unexplained) -> None:
+def test_one_finish_that_is_not_in_the_script_is_an_interrupt(logged, asked, unexplained):
     """unexplained: cycle, logged and asked."""
     cycle = np.arange(100)
     columns = [np.array([requests.get(k, 0) for k in cycle], np.uint8) for requests in (logged, asked)]
@@ -36,7 +35,7 @@ def test_one_finish_that_is_not_in_the_script_is_an_interrupt(logged, asked, une
     assert [(k, was, is_) for k, _, was, is_ in check.unexplained] == unexplained
 
 
-def test_what_the_user_asked_before_a_fault_and_asks_again_after_it_is_the_scripts(tmp_path: Path) -> None:
+def test_what_the_user_asked_before_a_fault_and_asks_again_after_it_is_the_scripts(tmp_path):
     settings = settings_of_run()
     script = (RequestSettings(at_s=0.2, request="payload"), RequestSettings(at_s=1.9, request="finish"))
     operator = dataclasses.replace(settings.operator, script=script)

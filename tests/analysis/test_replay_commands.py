@@ -27,14 +27,14 @@ def flipped(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-def test_an_identical_log_ends_with_status_0_and_says_so(log: Path) -> None:
+def test_an_identical_log_ends_with_status_0_and_says_so(log):
     done = called("replay", log.parent)
     assert done.exit_code == OK
     assert "identical, bit for bit" in done.stdout
     assert "in 2 attempts" in done.stdout
 
 
-def test_a_flipped_bit_in_the_file_ends_with_status_1_and_the_field_is_named(log: Path, flipped: Path) -> None:
+def test_a_flipped_bit_in_the_file_ends_with_status_1_and_the_field_is_named(log, flipped):
     done = called("replay", flipped, "--json")
     (result,) = json.loads(done.stdout)
     assert (done.exit_code, result["mismatch_count"]) == (FAILURE, 1)
@@ -45,7 +45,7 @@ def test_a_flipped_bit_in_the_file_ends_with_status_1_and_the_field_is_named(log
     assert "theta_hat[a1]" in called("replay", flipped).stdout
 
 
-def test_a_cut_log_ends_with_status_3(log: Path, tmp_path: Path) -> None:
+def test_a_cut_log_ends_with_status_3(log, tmp_path):
     content = log.read_bytes()
     (tmp_path / "run.mcap").write_bytes(content[: len(content) // 2])
     done = called("replay", tmp_path)
@@ -54,7 +54,7 @@ def test_a_cut_log_ends_with_status_3(log: Path, tmp_path: Path) -> None:
     assert "the log is not whole" in done.stdout
 
 
-def test_a_stretch_is_replayed_from_the_beginning_and_told_so(log: Path) -> None:
+def test_a_stretch_is_replayed_from_the_beginning_and_told_so(log):
     done = called("replay", log, "--from", "2.2", "--until", "2.7")
     assert done.exit_code == OK
     assert "500 of 500 cycles in 2 attempts compared, from 2.2 s until 2.7 s; replayed from the begin" in done.stdout
@@ -63,7 +63,7 @@ def test_a_stretch_is_replayed_from_the_beginning_and_told_so(log: Path) -> None
     assert 0 < result["compared"] < len(read_log(log, ("/scheme",)).scheme)
 
 
-def test_a_stretch_of_two_runs_is_compared(log: Path, flipped: Path) -> None:
+def test_a_stretch_of_two_runs_is_compared(log, flipped):
     at_s = (int(read_log(log, ("/scheme",)).scheme.t_ns[ROW]) - begin_of_log(log)) * 1e-9
     for start_s, end_s, code, fields in (
         (at_s - 0.3004, at_s - 0.0004, OK, []),
@@ -79,7 +79,7 @@ def test_a_stretch_of_two_runs_is_compared(log: Path, flipped: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["replay", "compare", "thresholds", "tune"])
-def test_a_stretch_that_holds_nothing_is_one_line(log: Path, command: str) -> None:
+def test_a_stretch_that_holds_nothing_is_one_line(log, command):
     logs = [log, log] if command == "compare" else [log]
     for bounds, code, line in (
         (("--from", "2000"), FAILURE, "from 2000 s"),
@@ -94,7 +94,7 @@ def test_a_stretch_that_holds_nothing_is_one_line(log: Path, command: str) -> No
         assert line in said
 
 
-def test_other_settings_stand_beside_the_original(log: Path) -> None:
+def test_other_settings_stand_beside_the_original(log):
     done = called("replay", log, "--vary", "detector.threshold_Nm=0.3,50", "--json")
     (result,) = json.loads(done.stdout)
     assert (done.exit_code, result["identical"]) == (OK, True)
@@ -114,20 +114,20 @@ def test_other_settings_stand_beside_the_original(log: Path) -> None:
         (("--set", "devices.drive_node=[5, 6]"), "`devices.drive_node` made the numbers of the log"),
     ],
 )
-def test_settings_that_cant_be_used_end_with_status_2(log: Path, arguments: tuple[str, ...], line: str) -> None:
+def test_settings_that_cant_be_used_end_with_status_2(log, arguments, line):
     done = called("replay", log, *arguments)
     assert done.exit_code == USAGE
     assert line in done.stderr
 
 
-def test_a_recording_alone_needs_a_configuration(log: Path, tmp_path: Path) -> None:
+def test_a_recording_alone_needs_a_configuration(log, tmp_path):
     write_candump(log, tmp_path / "bus.log")
     done = called("replay", tmp_path / "bus.log")
     assert done.exit_code == USAGE
     assert "--against the log of its run, or --config" in done.stderr
 
 
-def test_two_logs_that_are_the_same_compare_with_status_0_and_others_with_1(log: Path, tmp_path: Path) -> None:
+def test_two_logs_that_are_the_same_compare_with_status_0_and_others_with_1(log, tmp_path):
     assert called("compare", log, log.parent).exit_code == OK
     content = log.read_bytes()
     (tmp_path / "run.mcap").write_bytes(content[: len(content) * 3 // 4])

@@ -60,20 +60,20 @@ def events_of(path: Path) -> list[str]:
     return [name for name in names if name in CERTIFICATE_EVENTS]
 
 
-def test_the_log_says_that_a_certificate_was_withheld_and_what_anchors_the_one_that_was_not(leant_on: Path) -> None:
+def test_the_log_says_that_a_certificate_was_withheld_and_what_anchors_the_one_that_was_not(leant_on):
     assert events_of(leant_on) == ["anchor", "certificate"]
     found = replay(leant_on, script_of=ScriptedOperator)
     assert found.mismatches == ()
     assert found.is_identical
 
 
-def test_a_certificate_that_a_torque_by_place_withholds_is_withheld_again(tmp_path: Path) -> None:
+def test_a_certificate_that_a_torque_by_place_withholds_is_withheld_again(tmp_path):
     log = log_of(tmp_path, TILT)
     assert "position" in events_of(log)
     assert replay(log, script_of=ScriptedOperator).is_identical
 
 
-def test_another_word_about_a_certificate_is_a_difference(leant_on: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_word_about_a_certificate_is_a_difference(leant_on, monkeypatch):
     monkeypatch.setattr(anchor, "describe", lambda k, m: "something else")
     (mismatch,) = replay(leant_on, script_of=ScriptedOperator).mismatches
     assert (mismatch.topic, mismatch.field) == ("/events", "certificate")
@@ -81,9 +81,7 @@ def test_another_word_about_a_certificate_is_a_difference(leant_on: Path, monkey
     assert mismatch.replayed.endswith(f"; {THIS_RUN_ONLY}'")
 
 
-def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(
-    leant_on: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(leant_on, monkeypatch):
     (now,) = {part.said for part in LogSource(leant_on).parts(with_frames=False)}
     assert now == {"margin", *CERTIFICATE_EVENTS}
     config = to_toml(LogSource(leant_on).settings).split("\n")
@@ -100,7 +98,7 @@ def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(
     assert then == {"margin"}
 
 
-def test_threshold_and_smallest_push_are_rows_that_follow_the_settings(leant_on: Path) -> None:
+def test_threshold_and_smallest_push_are_rows_that_follow_the_settings(leant_on):
     own = replay(leant_on, script_of=ScriptedOperator).settings
     louder = apply_settings(own, {"certified.noise_sigmas": "12"})
     rows = {row[0]: row[1:] for row in side_by_side(replay_many(leant_on, [own, louder]))}

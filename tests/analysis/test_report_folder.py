@@ -33,7 +33,7 @@ def report(*given: object):
 
 
 @pytest.mark.long
-def test_every_run_of_a_folder_is_reported_and_one_that_cannot_be_keeps_none_back(folder: Path, tmp_path: Path) -> None:
+def test_every_run_of_a_folder_is_reported_and_one_that_cannot_be_keeps_none_back(folder, tmp_path):
     found = report(folder, "--out", tmp_path)
     assert found.exit_code == 3
     lines = found.stdout.splitlines()
@@ -51,15 +51,13 @@ def test_every_run_of_a_folder_is_reported_and_one_that_cannot_be_keeps_none_bac
     assert set(tables[2]) == {"folder", "problem"}
 
 
-def test_a_folder_without_a_run_is_one_line(tmp_path: Path) -> None:
+def test_a_folder_without_a_run_is_one_line(tmp_path):
     found = report(tmp_path)
     assert (found.exit_code, found.stderr) == (1, f"adacd-hil: {tmp_path} has no run.mcap, nor has any folder in it\n")
 
 
 @pytest.mark.long
-def test_a_folder_with_a_run_is_that_run_and_several_are_reported_in_folders_of_their_names(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_folder_with_a_run_is_that_run_and_several_are_reported_in_folders_of_their_names(folder, tmp_path):
     one = report(folder / "b" / "deep", "--out", tmp_path / "one")
     assert (one.exit_code, (tmp_path / "one" / "index.html").exists()) == (0, False)
     both = report(folder / "b" / "deep", folder / "a c#1" / "run.mcap", "--out", tmp_path / "both")
@@ -67,7 +65,7 @@ def test_a_folder_with_a_run_is_that_run_and_several_are_reported_in_folders_of_
     assert sorted(path.parent.name for path in (tmp_path / "both").rglob("report.html")) == ["a c#1", "deep"]
 
 
-def test_two_reports_in_one_folder_are_refused_before_the_first(folder: Path, tmp_path: Path) -> None:
+def test_two_reports_in_one_folder_are_refused_before_the_first(folder, tmp_path):
     run = folder / "b" / "deep"
     found = report(run, run, "--out", tmp_path)
     line = f"adacd-hil: two reports would go to {tmp_path / 'deep'}; report these logs one by one\n"
@@ -75,7 +73,7 @@ def test_two_reports_in_one_folder_are_refused_before_the_first(folder: Path, tm
     assert not list(tmp_path.iterdir())
 
 
-def test_an_index_is_written_though_no_run_can_be_reported(tmp_path: Path) -> None:
+def test_an_index_is_written_though_no_run_can_be_reported(tmp_path):
     (tmp_path / "runs" / "d").mkdir(parents=True)
     (tmp_path / "runs" / "d" / "run.mcap").write_bytes(b"nothing of a log")
     found = report(tmp_path / "runs", "--out", tmp_path / "new" / "reports")

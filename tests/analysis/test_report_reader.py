@@ -41,7 +41,7 @@ def contrast(one: str, other: str) -> float:
 
 
 @pytest.mark.parametrize("colours", [LIGHT, DARK], ids=["light", "dark"])
-def test_text_and_curves_are_told_from_their_ground(colours: dict[str, str]) -> None:
+def test_text_and_curves_are_told_from_their_ground(colours):
     text = {(ink, ground): contrast(colours[ink], colours[ground]) for ink in ("ink", "muted") for ground in GROUNDS}
     text |= {
         (ink, ground): contrast(colours[ink], colours[ground])
@@ -54,7 +54,7 @@ def test_text_and_curves_are_told_from_their_ground(colours: dict[str, str]) -> 
     assert {curve: ratio for curve, ratio in curves.items() if ratio < 3.0} == {}
 
 
-def test_every_state_has_a_name_in_words() -> None:
+def test_every_state_has_a_name_in_words():
     assert set(STATE_WORDS) == set(SchemeState)
     assert len(set(STATE_WORDS.values())) == len(SchemeState)
 
@@ -63,7 +63,7 @@ PHONE = re.search(r"@media screen and \(max-width: 640px\) \{(.*?)\n\}", CSS, re
 """What the style says for a narrow screen."""
 
 
-def test_on_a_narrow_screen_cells_wrap_and_rows_of_wide_tables_become_blocks() -> None:
+def test_on_a_narrow_screen_cells_wrap_and_rows_of_wide_tables_become_blocks():
     rules = {selector.strip(): said for selector, said in re.findall(r"([^{}]+)\{([^{}]*)\}", PHONE)}
     assert "white-space: normal; overflow-wrap: anywhere" in rules["th, td, td.l"]
     assert "grid-template-columns: repeat(auto-fill, minmax(100px, 1fr))" in rules[".folds tr"]
@@ -85,7 +85,7 @@ def heads_over_cells(html: str) -> list[tuple[list[str], list[list[str]]]]:
     return found
 
 
-def test_each_cell_of_a_table_that_folds_bears_the_head_of_its_column() -> None:
+def test_each_cell_of_a_table_that_folds_bears_the_head_of_its_column():
     run = touched_run()
     html = report_page(evaluate(run), run, SOURCE)
     tables = heads_over_cells(html)
@@ -101,14 +101,14 @@ def steps_of(run: Run, source: ReportSource = SOURCE) -> list[NextStep]:
     return [*steps, *more]
 
 
-def test_a_good_run_needs_nothing_and_says_so() -> None:
+def test_a_good_run_needs_nothing_and_says_so():
     nothing, *further = steps_of(make_run((A, 1000), (M, 1000)))
     assert nothing.text == "Nothing: all went well."
     replayed = "adacd-hil replay run.mcap"
     assert [step.command for step in further] == [replayed, f"{replayed} --set filter.a_rad_s=20"]
 
 
-def test_missed_contacts_and_false_alarms_come_first() -> None:
+def test_missed_contacts_and_false_alarms_come_first():
     commands = [step.command for step in steps_of(touched_run())]
     assert commands[:2] == ["adacd-hil thresholds run.mcap", "adacd-hil tune run.mcap"]
     assert "Nothing: all went well." not in [step.text for step in steps_of(touched_run())]
@@ -124,7 +124,7 @@ def faulted(**said: str) -> Run:
     return run
 
 
-def test_a_fault_on_a_bus_leads_to_the_doctor_of_that_arm_and_to_nothing_else_on_the_first_screen() -> None:
+def test_a_fault_on_a_bus_leads_to_the_doctor_of_that_arm_and_to_nothing_else_on_the_first_screen():
     run = faulted()
     page = report_page(evaluate(run), run, SOURCE)
     first, _, folded = page.partition("<details")
@@ -132,18 +132,18 @@ def test_a_fault_on_a_bus_leads_to_the_doctor_of_that_arm_and_to_nothing_else_on
     assert ("false alarms</dt>" in page, "adacd-hil replay run.mcap" in folded) == (False, True)
 
 
-def test_a_fault_of_an_emulated_arm_is_played_again() -> None:
+def test_a_fault_of_an_emulated_arm_is_played_again():
     run = faulted(interface="embedded", config="certified", scenario="idle")
     assert steps_of(run)[0].command == "adacd-hil demo --config certified --scenario idle"
 
 
-def test_a_run_without_a_cycle_is_not_told_to_be_replayed() -> None:
+def test_a_run_without_a_cycle_is_not_told_to_be_replayed():
     run = make_run((A, 1))
     steps, more = next_steps(evaluate(run), on_a_bus(without_cycles(run)), SOURCE)
     assert ([step.command.split()[1] for step in steps], more) == (["doctor"], [])
 
 
-def test_what_a_log_says_of_itself_is_quoted_for_the_shell() -> None:
+def test_what_a_log_says_of_itself_is_quoted_for_the_shell():
     steps = steps_of(faulted(config="$(reboot)\n;", channel="a b", interface="-x;y"), ReportSource("a'b.mcap"))
     words = ["adacd-hil", "doctor", "-i", "-x;y", "-c", "a b", "--config", "$(reboot)\\u000a;.toml"]
     assert shlex.split(steps[0].command) == words
@@ -151,13 +151,13 @@ def test_what_a_log_says_of_itself_is_quoted_for_the_shell() -> None:
     assert shlex.split(steps[-2].command)[-1] == "a'b.mcap"
 
 
-def test_the_head_names_ones_own_arm_and_where_it_is() -> None:
+def test_the_head_names_ones_own_arm_and_where_it_is():
     assert origin_words(on_a_bus(make_run())) == ["arm lab", "on socketcan can1"]
     emulated = on_a_bus(make_run(), config="paper", profile="P", interface="embedded", clock="lockstep", version="1")
     assert origin_words(emulated)[:2] == ["configuration paper, arm profile P", "emulated arm, simulated time"]
 
 
-def test_the_papers_numbers_are_those_of_its_arm_alone() -> None:
+def test_the_papers_numbers_are_those_of_its_arm_alone():
     run = touched_run()
     own = on_a_bus(run)
     own = replace(own, settings=replace(run.settings, arm=replace(run.settings.arm, link_length_m=(0.4, 0.3))))
@@ -168,7 +168,7 @@ def test_the_papers_numbers_are_those_of_its_arm_alone() -> None:
     assert "run report · arm lab · on socketcan can1</p>" in page
 
 
-def test_notices_are_written_out_below_the_timeline() -> None:
+def test_notices_are_written_out_below_the_timeline():
     run = make_run((A, 1000), (M, 1000))
     event = LoggedEvent(int(run.t_ns[500]), Event("warning", "bus", "slow <&>"))
     run = replace(run, events=(event,) * 14)
@@ -186,11 +186,11 @@ def test_notices_are_written_out_below_the_timeline() -> None:
         (0.5, None, "–"),
     ],
 )
-def test_a_small_deviation_does_not_read_as_none(value: float, sigma: float | None, text: str) -> None:
+def test_a_small_deviation_does_not_read_as_none(value, sigma, text):
     assert uncertain_text(value, sigma, 3, "Nm") == text
 
 
-def test_certificates_are_told_clause_by_clause_and_one_that_was_taken_back_is_marked() -> None:
+def test_certificates_are_told_clause_by_clause_and_one_that_was_taken_back_is_marked():
     run = make_certified_run()
     told = (("certificate", "offsets anchored; a <push>"), ("revoked", "the load changed"), ("sight", "not of it"))
     events = (LoggedEvent(int(run.t_ns[1100 + row]), Event("info", *each)) for row, each in enumerate(told))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from called import called
+from called import called, complaints
 from hand_made_run import A, M, make_certified_run, make_run, record
 
 from adacd_hil.file_access import create_file
@@ -64,7 +64,7 @@ def one(made: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(made, tmp_path / "runs" / DATED))
 
 
-def test_a_report_beside_the_log_has_the_figures(one: Path) -> None:
+def test_a_report_beside_the_log_has_the_figures(one):
     run = summarise(one)
     assert (run.status, run.verdict) == (GOOD, json.loads((one / "report.json").read_text())["verdict"])
     assert run.certificate == CertificateState(IDENTIFIED, 0.06, 1)
@@ -72,7 +72,7 @@ def test_a_report_beside_the_log_has_the_figures(one: Path) -> None:
     assert (run.found, run.expected, run.scenario) == (0, None, "paper")
 
 
-def test_a_log_in_lockstep_is_dated_by_its_folder_then_by_its_file(one: Path) -> None:
+def test_a_log_in_lockstep_is_dated_by_its_folder_then_by_its_file(one):
     run = summarise(one)
     assert (run.started_by, run.started) == ("folder", datetime(2026, 11, 25, 14, 22, 33).astimezone())
     odd = one.rename(one.parent / "odd")
@@ -95,9 +95,7 @@ def test_a_log_in_lockstep_is_dated_by_its_folder_then_by_its_file(one: Path) ->
         ("\x00", "report.json is damaged: "),
     ],
 )
-def test_a_report_that_is_not_of_the_whole_log_is_left_alone_and_that_is_told(
-    one: Path, values: dict[str, Any] | str, why: str
-) -> None:
+def test_a_report_that_is_not_of_the_whole_log_is_left_alone_and_that_is_told(one, values, why):
     path = one / "report.json"
     path.write_text(values if isinstance(values, str) else json.dumps({**json.loads(path.read_text()), **values}))
     run = summarise(one)
@@ -105,7 +103,7 @@ def test_a_report_that_is_not_of_the_whole_log_is_left_alone_and_that_is_told(
     assert run.verdict.startswith(why)
 
 
-def test_a_run_without_a_report_is_judged_when_asked(one: Path) -> None:
+def test_a_run_without_a_report_is_judged_when_asked(one):
     asked = summarise(one)
     (one / "report.json").unlink()
     quick = summarise(one)
@@ -113,7 +111,7 @@ def test_a_run_without_a_report_is_judged_when_asked(one: Path) -> None:
     assert judged(quick) == asked
 
 
-def test_a_log_is_broken_though_a_report_of_it_is_there(one: Path) -> None:
+def test_a_log_is_broken_though_a_report_of_it_is_there(one):
     log = one / "run.mcap"
     log.write_bytes(log.read_bytes()[:-100])
     run = summarise(one)
@@ -121,7 +119,7 @@ def test_a_log_is_broken_though_a_report_of_it_is_there(one: Path) -> None:
     assert run.scenario == "paper"
 
 
-def test_a_log_that_is_being_written_is_running(tmp_path: Path) -> None:
+def test_a_log_that_is_being_written_is_running(tmp_path):
     descriptor = create_file(tmp_path / "run.mcap")
     try:
         run = summarise(tmp_path)
@@ -135,7 +133,7 @@ def certified_table() -> dict[str, Any]:
     return report_json(evaluate(run), run.metadata, ReportSource("run.mcap"))
 
 
-def test_friction_and_offsets_are_those_of_the_first_certificate_without_payload(one: Path) -> None:
+def test_friction_and_offsets_are_those_of_the_first_certificate_without_payload(one):
     table = certified_table()
     payload = {key: [9.0] * len(values) for key, values in CERTIFICATE.items()}
     table["certified"]["certificates"] = [{**payload, "is_payload": True}, {**CERTIFICATE, "is_payload": False}]
@@ -158,7 +156,7 @@ def series(**columns: list[Any]) -> list[RunSummary]:
     ]  # fmt: skip
 
 
-def test_a_threshold_has_changed_by_a_share_of_it_and_the_settings_that_did_are_named() -> None:
+def test_a_threshold_has_changed_by_a_share_of_it_and_the_settings_that_did_are_named():
     one, other = (replace(load_settings("certified"), name=name) for name in ("one", "other"))
     other = replace(other, certified=replace(other.certified, noise_sigmas=9.0))
     runs = series(threshold_Nm=[(0.1, 0.2), (0.11, 0.2), (0.13, 0.2), (0.12, 0.2)], settings=[one, one, other, other])
@@ -173,7 +171,7 @@ def test_a_threshold_has_changed_by_a_share_of_it_and_the_settings_that_did_are_
     assert "the settings are those of the run before" in trend.sentence
 
 
-def test_an_offset_that_creeps_adds_up_and_one_within_its_deviations_does_not() -> None:
+def test_an_offset_that_creeps_adds_up_and_one_within_its_deviations_does_not():
     creeping = [(0.001 * day, 0.0) for day in range(10)]
     (trend,) = trends(series(offset_Nm=creeping, offset_std_Nm=[(0.001, 0.001)] * 10))
     assert [(change.run.name, change.joint) for change in trend.offsets.changes] == [("r6", 1)]
@@ -183,7 +181,7 @@ def test_an_offset_that_creeps_adds_up_and_one_within_its_deviations_does_not() 
     assert trend.further[1] == "Torque offsets: no change beyond what the certificates' uncertainty explains."
 
 
-def test_what_has_no_deviation_is_not_said_to_have_changed() -> None:
+def test_what_has_no_deviation_is_not_said_to_have_changed():
     (trend,) = trends(series(friction_Nm=[(0.1, 0.1), (0.9, 0.9)]))
     assert trend.friction.changes == ()
     assert trend.further[0].startswith(
@@ -192,7 +190,7 @@ def test_what_has_no_deviation_is_not_said_to_have_changed() -> None:
     assert trend.sentence == "Thresholds can't be compared: 0 of 2 runs have any."
 
 
-def test_an_emulated_arm_is_another_than_that_on_a_bus() -> None:
+def test_an_emulated_arm_is_another_than_that_on_a_bus():
     runs = series(margin=[1.0, 2.0])
     found = trends([runs[0], replace(runs[1], interface="embedded"), replace(runs[1], status=BROKEN)])
     assert [(trend.arm, len(trend.runs), len(trend.left_out)) for trend in found] == [
@@ -216,12 +214,16 @@ def many(one: Path) -> Path:
     return folder
 
 
-def test_a_folder_that_is_not_there_is_one_line(tmp_path: Path) -> None:
-    (line,) = called("runs", tmp_path / "none").stderr.splitlines()
-    assert f"{tmp_path / 'none'} does not exist; `adacd-hil demo` and `run` make runs" in line
+def test_a_folder_that_is_not_there_or_has_no_run_is_one_line(tmp_path):
+    for folder, why in (
+        (tmp_path / "none", "does not exist; `adacd-hil demo` and `run` make"),
+        (tmp_path, "has no run"),
+    ):
+        (line,) = complaints(called("runs", folder))
+        assert f"{folder} {why}" in line
 
 
-def test_every_run_is_listed_and_a_broken_one_with_the_reason(many: Path) -> None:
+def test_every_run_is_listed_and_a_broken_one_with_the_reason(many):
     found = called("runs", many)
     assert found.exit_code == PARTIAL
     assert "4 runs, 2 not good, 1 not judged" in found.stdout
@@ -230,7 +232,7 @@ def test_every_run_is_listed_and_a_broken_one_with_the_reason(many: Path) -> Non
     assert "\x1b" not in found.stdout
 
 
-def test_runs_are_chosen_by_verdict_date_and_arm(many: Path) -> None:
+def test_runs_are_chosen_by_verdict_date_and_arm(many):
     def names(*options: str) -> list[str]:
         return [run["run"] for run in json.loads(called("runs", many, "--json", *options).stdout)["runs"]]
 
@@ -250,13 +252,13 @@ def test_runs_are_chosen_by_verdict_date_and_arm(many: Path) -> None:
         (("--arm", "lab"), "no run of arm 'lab'"),
     ],
 )
-def test_a_choice_that_makes_no_sense_is_one_line(many: Path, options: tuple[str, ...], line: str) -> None:
+def test_a_choice_that_makes_no_sense_is_one_line(many, options, line):
     found = called("runs", many, *options)
     assert found.exit_code == USAGE
     assert line in found.stderr
 
 
-def test_tables_have_a_row_for_each_run_and_fixed_types(many: Path, tmp_path: Path) -> None:
+def test_tables_have_a_row_for_each_run_and_fixed_types(many, tmp_path):
     parquet = pytest.importorskip("pyarrow.parquet")
     called("runs", many, "--csv", tmp_path / "runs.csv", "--parquet", tmp_path / "runs.parquet")
     with (tmp_path / "runs.csv").open(newline="") as file:
@@ -268,7 +270,7 @@ def test_tables_have_a_row_for_each_run_and_fixed_types(many: Path, tmp_path: Pa
     assert str(table.schema.field("offset_1_Nm").type) == "double"  # though nothing is known of it
 
 
-def test_the_page_leads_to_the_reports_that_there_are(many: Path) -> None:
+def test_the_page_leads_to_the_reports_that_there_are(many):
     (many / DATED / "report.html").write_text("")
     called("runs", many, "--html", many / "index.html")
     page = (many / "index.html").read_text(encoding="utf-8")
@@ -278,7 +280,7 @@ def test_the_page_leads_to_the_reports_that_there_are(many: Path) -> None:
     assert "<i>" not in page
 
 
-def test_a_trend_is_drawn_and_told(one: Path, tmp_path: Path) -> None:
+def test_a_trend_is_drawn_and_told(one, tmp_path):
     shutil.copytree(one, one.parent / "2026-11-26T08-00-00")
     found = called("trend", one.parent, "--out", tmp_path / "trend.html")
     assert found.exit_code == 0, found.stderr

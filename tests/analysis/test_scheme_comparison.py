@@ -72,24 +72,22 @@ def count(logged: SchemeBatch, replayed: SchemeBatch, tolerance: float) -> int:
         (np.nan, 1.0, 1e-9, 1),
     ],
 )
-def test_a_real_value_may_be_off_by_the_tolerance_of_its_fields_scale(
-    value: float, scale: float, tolerance: float, expected: int
-) -> None:
+def test_a_real_value_may_be_off_by_the_tolerance_of_its_fields_scale(value, scale, tolerance, expected):
     assert count(off_by(0.0, scale), off_by(value, scale), tolerance) == expected
 
 
-def test_the_sign_of_zero_counts_bit_for_bit_and_neither_it_nor_not_a_number_between_machines() -> None:
+def test_the_sign_of_zero_counts_bit_for_bit_and_neither_it_nor_not_a_number_between_machines():
     zeros, minus = off_by(-1.0), off_by(-1.0)
     minus.block[1, THETA.start + 2] = -0.0
     assert [count(zeros, minus, tolerance) for tolerance in (0.0, 1e-9)] == [1, 0]
     assert count(off_by(np.nan), off_by(np.nan), 1e-9) == 0
 
 
-def test_a_decision_has_to_be_the_same_between_machines_too() -> None:
+def test_a_decision_has_to_be_the_same_between_machines_too():
     assert count(batch(), batch(state=np.array([0, 1, 0], np.uint8)), 1e-9) == 1
 
 
-def test_all_mismatches_are_counted_and_the_earliest_are_kept() -> None:
+def test_all_mismatches_are_counted_and_the_earliest_are_kept():
     comparison = SchemeComparison(SETTINGS, shown=4)
     comparison.compare(records(batch()), TICKS, batch(block=np.full((3, LAYOUT.size), 2.0)))
     assert comparison.count == 3 * LAYOUT.size
@@ -97,7 +95,7 @@ def test_all_mismatches_are_counted_and_the_earliest_are_kept() -> None:
     assert comparison.fields["/scheme.theta_hat"] == 21
 
 
-def test_the_schemes_events_are_compared_in_order() -> None:
+def test_the_schemes_events_are_compared_in_order():
     comparison = SchemeComparison(SETTINGS)
     half, third = Event("warning", "margin", "half"), Event("info", "certificate", "third")
     comparison.compare_events([LoggedEvent(5, half)], [half], 3)
@@ -113,7 +111,7 @@ def test_the_schemes_events_are_compared_in_order() -> None:
     assert [one.t_ns for one in comparison.first()[:2]] == [9, 0]
 
 
-def test_only_another_arithmetic_asks_for_a_tolerance() -> None:
+def test_only_another_arithmetic_asks_for_a_tolerance():
     here = arithmetic()
     assert different_arithmetic(here) == []
     assert different_arithmetic({}) == []

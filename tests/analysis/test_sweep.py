@@ -15,7 +15,6 @@ from sweep_work import Dying, Work
 from adacd_hil.lab.tune.sweep import Plan, SweepStore, plan_logs, plan_scenarios, replay_task, run_sweep
 from adacd_hil.lab.tune.workers import connect
 from adacd_hil.log.log_files import LogError
-from adacd_hil.replay.replayed_outcome import Replay
 
 parquet = pytest.importorskip("pyarrow.parquet")
 
@@ -49,7 +48,7 @@ def client():
 
 
 @pytest.mark.slow
-def test_a_task_that_kills_its_worker_costs_its_own_rows_alone(tmp_path: Path) -> None:
+def test_a_task_that_kills_its_worker_costs_its_own_rows_alone(tmp_path):
     work = Dying(tmp_path, always=(2,), once=(4,))
     with connect("", 2, preload=("adacd_hil.lab.tune.sweep",)) as workers:
         outcome, rows, lines = sweep(tmp_path, workers, work)
@@ -81,7 +80,7 @@ if __name__ == "__main__":
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)])
-def test_no_process_outlives_the_sweep(tmp_path: Path, number: int, status: int) -> None:
+def test_no_process_outlives_the_sweep(tmp_path, number, status):
     script = tmp_path / "slow_sweep.py"
     script.write_text(SLOW_SWEEP)
     command = [sys.executable, script]
@@ -108,7 +107,7 @@ def sweep(folder: Path, client, work, plan=None, rows_per_task=2):
     return outcome, rows, lines
 
 
-def test_every_row_is_computed_once_and_stands_in_the_order_of_the_plan(tmp_path: Path, client) -> None:
+def test_every_row_is_computed_once_and_stands_in_the_order_of_the_plan(tmp_path, client):
     work = Work(tmp_path)
     outcome, rows, lines = sweep(tmp_path, client, work)
     assert (outcome.computed, outcome.found, outcome.failed) == (10, 0, 0)
@@ -118,7 +117,7 @@ def test_every_row_is_computed_once_and_stands_in_the_order_of_the_plan(tmp_path
     assert lines[-1].startswith("10 of 10 rows")
 
 
-def test_a_sweep_that_is_begun_again_computes_what_is_missing(tmp_path: Path, client) -> None:
+def test_a_sweep_that_is_begun_again_computes_what_is_missing(tmp_path, client):
     sweep(tmp_path, client, Work(tmp_path), plan_of(range(1, 4)))
     work = Work(tmp_path)
     outcome, rows, _ = sweep(tmp_path, client, work)
@@ -126,16 +125,14 @@ def test_a_sweep_that_is_begun_again_computes_what_is_missing(tmp_path: Path, cl
     assert [work.tries(seed) for seed in range(1, 6)] == [0, 0, 0, 1, 1]
 
 
-def test_a_task_that_fails_by_accident_is_tried_again(tmp_path: Path, client) -> None:
+def test_a_task_that_fails_by_accident_is_tried_again(tmp_path, client):
     work = Work(tmp_path, {2: 2})
     outcome, rows, _ = sweep(tmp_path, client, work)
     assert (outcome.failed, work.tries(2)) == (0, 3)
     assert {row["status"] for row in rows} == {"ok"}
 
 
-def test_a_task_that_always_fails_leaves_rows_that_say_why_and_are_computed_the_next_time(
-    tmp_path: Path, client
-) -> None:
+def test_a_task_that_always_fails_leaves_rows_that_say_why_and_are_computed_the_next_time(tmp_path, client):
     outcome, rows, lines = sweep(tmp_path, client, Work(tmp_path, {3: 9}))
     assert (outcome.computed, outcome.failed) == (10, 2)
     assert {row["error"] for row in rows if row["seed"] == 3} == {"OSError: the disk was away"}
@@ -145,7 +142,7 @@ def test_a_task_that_always_fails_leaves_rows_that_say_why_and_are_computed_the_
     assert {row["status"] for row in rows} == {"ok"}
 
 
-def test_a_key_changes_with_all_that_a_result_depends_on(tmp_path: Path) -> None:
+def test_a_key_changes_with_all_that_a_result_depends_on(tmp_path):
     log = tmp_path / "run.mcap"
     log.write_bytes(b"one")
     first = list(plan_logs([log], THRESHOLDS, "", "", "1").row_keys())
@@ -162,13 +159,13 @@ def test_a_key_changes_with_all_that_a_result_depends_on(tmp_path: Path) -> None
     assert not set(first) & set(plan_logs([log], THRESHOLDS, "", "", "1").row_keys())
 
 
-def test_tasks_are_of_one_subject_and_of_so_many_rows_at_most() -> None:
+def test_tasks_are_of_one_subject_and_of_so_many_rows_at_most():
     plan = plan_of(range(1, 3), [{"filter.a_rad_s": str(value)} for value in range(10, 17)])
     tasks = list(plan.tasks(frozenset(), 3))
     assert [(task.subject.seed, len(task.rows)) for task in tasks] == [(1, 3), (1, 3), (1, 1), (2, 3), (2, 3), (2, 1)]
 
 
-def test_a_part_that_is_damaged_is_named(tmp_path: Path, client) -> None:
+def test_a_part_that_is_damaged_is_named(tmp_path, client):
     sweep(tmp_path, client, Work(tmp_path))
     part = next((tmp_path / "parts").glob("*.parquet"))
     part.write_bytes(part.read_bytes()[:-9])
@@ -187,7 +184,7 @@ def test_a_part_that_is_damaged_is_named(tmp_path: Path, client) -> None:
         (("none.mcap",), "log none.mcap does not exist"),
     ],
 )
-def test_a_wrong_plan_is_one_line_before_anything_runs(tmp_path: Path, arguments: tuple[str, ...], line: str) -> None:
+def test_a_wrong_plan_is_one_line_before_anything_runs(tmp_path, arguments, line):
     played = called("sweep", *arguments, "--out", tmp_path / "out")
     assert played.exit_code in (1, 2)
     assert line in played.stderr
@@ -195,7 +192,7 @@ def test_a_wrong_plan_is_one_line_before_anything_runs(tmp_path: Path, arguments
     assert not (tmp_path / "out").exists()
 
 
-def test_a_row_of_a_log_says_what_its_replay_came_to(log: Path, whole: Replay) -> None:
+def test_a_row_of_a_log_says_what_its_replay_came_to(log, whole):
     variants = [{}, {"detector.threshold_Nm": "9.0"}, {"detector.threshold_Nm": "-1"}]
     (task,) = plan_logs([log], variants, "", "", "1").tasks(frozenset(), 10)
     own, deaf, wrong = replay_task(task)

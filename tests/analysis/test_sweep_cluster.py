@@ -54,7 +54,7 @@ def files(authority: Authority, who: str, **changes: timedelta) -> list[object]:
 
 
 @pytest.mark.long
-def test_a_small_sweep_over_tls(tmp_path: Path, log: Path, cluster, authority: Authority) -> None:
+def test_a_small_sweep_over_tls(tmp_path, log, cluster, authority):
     played = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *files(authority, "engineer"))
     assert (played.returncode, "is open" in played.stderr) == (0, False)
     rows = parquet.read_table(tmp_path / "out/sweep.parquet").to_pylist()
@@ -62,9 +62,7 @@ def test_a_small_sweep_over_tls(tmp_path: Path, log: Path, cluster, authority: A
 
 
 @pytest.mark.long
-def test_certificates_can_stand_in_dasks_configuration(
-    tmp_path: Path, log: Path, cluster, authority: Authority, monkeypatch
-) -> None:
+def test_certificates_can_stand_in_dasks_configuration(tmp_path, log, cluster, authority, monkeypatch):
     certificate, key = authority.sign("configured")
     tls = f"{{ca-file: {authority.ca_file}, client: {{cert: {certificate}, key: {key}}}}}"
     (tmp_path / "dask.yaml").write_text(f"distributed: {{comm: {{tls: {tls}}}}}\n")
@@ -73,9 +71,7 @@ def test_certificates_can_stand_in_dasks_configuration(
 
 
 @pytest.mark.long
-def test_who_has_no_certificate_of_the_clusters_is_one_line_and_status_1(
-    tmp_path: Path, log: Path, cluster, authority: Authority
-) -> None:
+def test_who_has_no_certificate_of_the_clusters_is_one_line_and_status_1(tmp_path, log, cluster, authority):
     stranger = Authority(tmp_path / "stranger")
     mixed = files(stranger, "mixed")
     mixed[1] = authority.ca_file  # trusts the cluster, but is not trusted
@@ -100,8 +96,8 @@ def test_who_has_no_certificate_of_the_clusters_is_one_line_and_status_1(
     ],
 )
 def test_certificates_that_cant_be_used_are_one_line_and_status_2(
-    tmp_path: Path, log: Path, authority: Authority, monkeypatch, changes: dict[str, str | None], reason: str
-) -> None:
+    tmp_path, log, authority, monkeypatch, changes, reason
+):
     (tmp_path / "text.pem").write_text("no certificate\n")
     (tmp_path / "other.pem").write_bytes(authority.sign("other")[1].read_bytes())
     given = files(authority, "user")
@@ -118,7 +114,7 @@ def test_certificates_that_cant_be_used_are_one_line_and_status_2(
     assert reason in complaints[0]
 
 
-def test_an_open_scheduler_is_called_open(tmp_path: Path, log: Path, monkeypatch) -> None:
+def test_an_open_scheduler_is_called_open(tmp_path, log, monkeypatch):
     monkeypatch.setattr("adacd_hil.lab.tune.workers.TIMEOUT_S", 0.1)
     words = ["sweep", str(log), "--scheduler", "tcp://127.0.0.1:1", "--out", str(tmp_path / "out")]
     refused = called(*words)

@@ -18,11 +18,11 @@ from adacd_hil.settings.setting_keys import (
 PAPER = load_settings("paper")
 
 
-def test_a_number_stands_for_a_list_of_it() -> None:
+def test_a_number_stands_for_a_list_of_it():
     assert apply_settings(PAPER, {"detector.threshold_Nm": "0.1"}).detector.threshold_Nm == (0.1, 0.1)
 
 
-def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken() -> None:
+def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken():
     changed = apply_settings(
         PAPER,
         {
@@ -56,32 +56,32 @@ def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken() -> None:
         ("detector.threshold_Nm", "[0.1]", "`detector.threshold_Nm` has 1 values, 2 expected"),
     ],
 )
-def test_a_change_that_cant_be_made_is_named(key: str, value: str, line: str) -> None:
+def test_a_change_that_cant_be_made_is_named(key, value, line):
     with pytest.raises(ConfigError) as error:
         apply_settings(PAPER, {key: value})
     assert line in str(error.value)
 
 
-def test_several_lists_of_values_give_every_combination() -> None:
+def test_several_lists_of_values_give_every_combination():
     given = ["filter.a_rad_s=10,20", "detector.threshold_Nm=[0.1, 0.2],0.3"]
     assert parse_variations(given) == [
         {"filter.a_rad_s": a, "detector.threshold_Nm": h} for a in ("10", "20") for h in ("[0.1, 0.2]", "0.3")
     ]
 
 
-def test_commas_in_brackets_and_quotes_part_nothing() -> None:
+def test_commas_in_brackets_and_quotes_part_nothing():
     assert split_list("""[1, 2], {a = 1, b = 2}, "x, y", 'z,', 5""") == [
         "[1, 2]", "{a = 1, b = 2}", '"x, y"', "'z,'", "5",
     ]  # fmt: skip
 
 
 @pytest.mark.parametrize("given", ["filter.a_rad_s", "=5"])
-def test_a_change_without_key_or_value_is_refused(given: str) -> None:
+def test_a_change_without_key_or_value_is_refused(given):
     with pytest.raises(ConfigError, match="must be key=value"):
         parse_changes([given])
 
 
-def test_another_configuration_keeps_what_made_the_numbers_of_the_log() -> None:
+def test_another_configuration_keeps_what_made_the_numbers_of_the_log():
     tared = replace(PAPER.arm, torque_offset_Nm=(0.3, -0.2), torque_offset_std_Nm=(0.01, 0.01), sign=(-1, 1))
     own = apply_settings(replace(PAPER, arm=tared), {"bus.heartbeat_ms": "200", "realtime.sample_period": "nominal"})
     kept = keep_facts(own, load_settings("certified"))
@@ -94,7 +94,7 @@ def test_another_configuration_keeps_what_made_the_numbers_of_the_log() -> None:
     ("key", "own", "other"),
     [("holding_torque_Nm", (0.0, 0.0), (8.0, 4.0)), ("position_torque_Nm", 0.1, 0.2)],
 )
-def test_what_is_known_of_an_arm_is_another_configurations_to_say_only_where_the_log_does_not(key, own, other) -> None:
+def test_what_is_known_of_an_arm_is_another_configurations_to_say_only_where_the_log_does_not(key, own, other):
     def saying(settings: Settings, value: object) -> Settings:
         return replace(settings, arm=replace(settings.arm, **{key: value}))
 
@@ -103,7 +103,7 @@ def test_what_is_known_of_an_arm_is_another_configurations_to_say_only_where_the
     assert getattr(keep_facts(PAPER, theirs).arm, key) == other
 
 
-def test_changed_settings_are_listed_by_key_with_both_values() -> None:
+def test_changed_settings_are_listed_by_key_with_both_values():
     other = apply_settings(PAPER, {"filter.a_rad_s": "50", "devices.quick_stop_option": "6"})
     assert changed_keys(PAPER, other) == {
         "filter.a_rad_s": ("10.0", "50.0"),

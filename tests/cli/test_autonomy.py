@@ -6,7 +6,6 @@ import pty
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import can
 import pytest
@@ -26,19 +25,19 @@ from adacd_hil.wire.can_interface import InterfaceState, is_virtual
 CERTIFIED = load_settings("certified")
 
 
-def test_only_the_demo_s_own_configurations_act_by_script() -> None:
+def test_only_the_demo_s_own_configurations_act_by_script():
     acting = {name for name in builtin_names() if load_settings(name).operator != OperatorSettings()}
     assert acting == {"demo", "demo_paper"}
     assert load_settings("demo").operator == load_settings("demo_paper").operator
 
 
 @pytest.mark.parametrize(("config", "base"), [("demo", "certified"), ("demo_paper", "paper")])
-def test_but_for_its_user_a_configuration_of_the_demo_is_the_one_that_it_extends(config: str, base: str) -> None:
+def test_but_for_its_user_a_configuration_of_the_demo_is_the_one_that_it_extends(config, base):
     own, plain = load_settings(config), load_settings(base)
     assert dataclasses.replace(own, name=base, operator=plain.operator) == plain
 
 
-def test_a_configuration_without_a_script_gets_the_demo_s_user(tmp_path: Path) -> None:
+def test_a_configuration_without_a_script_gets_the_demo_s_user(tmp_path):
     mine = tmp_path / "my-arm.toml"
     mine.write_text('extends = "certified"\n[operator]\nscript = []\nacknowledge_after_s = 0.0\n')
     assert resolve(str(mine), "paper", None, None).settings.operator == load_settings(USER).operator
@@ -47,7 +46,7 @@ def test_a_configuration_without_a_script_gets_the_demo_s_user(tmp_path: Path) -
     assert resolve(str(mine), "paper", None, None).settings.operator == load_settings(str(mine)).operator
 
 
-def test_on_what_may_be_hardware_no_scenario_s_user_acknowledges() -> None:
+def test_on_what_may_be_hardware_no_scenario_s_user_acknowledges():
     result = called("run", "-i", "slcan", "-c", "/dev/null", "--scenario", "paper")
     assert result.exit_code == ExitCode.USAGE
     assert result.stderr.splitlines() == [
@@ -55,7 +54,7 @@ def test_on_what_may_be_hardware_no_scenario_s_user_acknowledges() -> None:
     ]
 
 
-def test_an_emulated_arm_says_what_its_motors_hold_unless_the_configuration_does(tmp_path: Path) -> None:
+def test_an_emulated_arm_says_what_its_motors_hold_unless_the_configuration_does(tmp_path):
     assert resolve("certified", "idle", None, None).settings.arm.holding_torque_Nm == (0.0, 0.0)
     geared = resolve("certified", "motor-side-friction", None, None)
     assert geared.settings.arm.holding_torque_Nm == geared.scenario.mechanics.motor_coulomb_Nm != (0.0, 0.0)
@@ -76,9 +75,7 @@ def test_an_emulated_arm_says_what_its_motors_hold_unless_the_configuration_does
         ("operator.acknowledge_faults", "1", "acknowledges by itself"),
     ],
 )
-def test_on_what_may_be_hardware_nothing_is_driven_blind_or_acknowledged_by_itself(
-    key: str, value: str, words: str
-) -> None:
+def test_on_what_may_be_hardware_nothing_is_driven_blind_or_acknowledged_by_itself(key, value, words):
     settings = apply_settings(CERTIFIED, {key: value})
     with pytest.raises(CommandError, match=f"`{key}` = {value} {words}") as refused:
         check_autonomy(settings, "pcan", "PCAN_USBBUS1")
@@ -94,16 +91,14 @@ def test_on_what_may_be_hardware_nothing_is_driven_blind_or_acknowledged_by_itse
         {"operator.script": '[{ at_s = 1.0, request = "finish" }]'},
     ],
 )
-def test_a_script_acknowledges_on_hardware_by_a_second_setting_and_ends_a_run_without(changes: dict[str, str]) -> None:
+def test_a_script_acknowledges_on_hardware_by_a_second_setting_and_ends_a_run_without(changes):
     check_autonomy(apply_settings(CERTIFIED, changes), "pcan", "PCAN_USBBUS1")
 
 
 @pytest.mark.parametrize(
     ("kind", "expected"), [("vcan", True), ("vxcan", True), ("slcan", False), ("can", False), ("", False)]
 )
-def test_what_kind_an_interface_is_says_whether_a_wire_is_behind_it(
-    monkeypatch: pytest.MonkeyPatch, kind: str, expected: bool
-) -> None:
+def test_what_kind_an_interface_is_says_whether_a_wire_is_behind_it(monkeypatch, kind, expected):
     monkeypatch.setattr("adacd_hil.wire.can_interface.read_link", lambda _: InterfaceState("bus", True, kind, 16, 10))
     monkeypatch.setattr("adacd_hil.cli.connection.can_interfaces", lambda: ["bus"])
     assert is_virtual("socketcan", "bus") == expected
@@ -121,7 +116,7 @@ def is_refused(clock: str, interface: str, channel: str) -> bool:
     return False
 
 
-def test_lockstep_is_refused_on_an_adapter_and_a_name_that_is_not_there_is_left_to_who_opens_it() -> None:
+def test_lockstep_is_refused_on_an_adapter_and_a_name_that_is_not_there_is_left_to_who_opens_it():
     assert not is_virtual("socketcan", "no_such_can0")
     assert not is_virtual("pcan", "PCAN_USBBUS1")
     assert is_refused("lockstep", "pcan", "PCAN_USBBUS1")
@@ -146,7 +141,7 @@ with never_stopped():
 
 
 @pytest.mark.slow
-def test_a_terminal_does_not_stop_who_runs_in_its_background() -> None:
+def test_a_terminal_does_not_stop_who_runs_in_its_background():
     leader, terminal = pty.fork()
     if not leader:
         child = os.spawnl(os.P_NOWAIT, sys.executable, sys.executable, "-c", IN_BACKGROUND)
@@ -161,7 +156,7 @@ def test_a_terminal_does_not_stop_who_runs_in_its_background() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGTSTP])
-def test_a_signal_asks_for_the_end(number: signal.Signals) -> None:
+def test_a_signal_asks_for_the_end(number):
     asked: list[int] = []
     before = signal.getsignal(number)
     further = [number] if number == signal.SIGTSTP else []  # Ctrl-Z, where an arm would be left alone
@@ -171,7 +166,7 @@ def test_a_signal_asks_for_the_end(number: signal.Signals) -> None:
     assert signal.getsignal(number) is before
 
 
-def test_a_command_that_was_started_to_outlive_its_terminal_goes_on_after_a_hang_up() -> None:
+def test_a_command_that_was_started_to_outlive_its_terminal_goes_on_after_a_hang_up():
     program = (
         "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "from adacd_hil.cli.connection import on_interrupt\n"
@@ -184,7 +179,7 @@ def test_a_command_that_was_started_to_outlive_its_terminal_goes_on_after_a_hang
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", ["run", "tare", "commtest"])
-def test_an_arm_that_has_a_host_is_left_to_it(command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_arm_that_has_a_host_is_left_to_it(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # The scheduler would be that of all tests that follow.
     monkeypatch.setattr("adacd_hil.control.session.request_realtime", lambda _: RealtimeGrant(scheduler_name()))

@@ -1,7 +1,6 @@
 """Bad input gets one clear line and a documented exit status; the log is closed and readable."""
 
 import re
-from pathlib import Path
 
 import pytest
 from called import called, complaints
@@ -15,7 +14,7 @@ pytestmark = pytest.mark.slow
 USAGE, SAFETY_STOP, BUS_MISSING = 2, 4, 5
 
 
-def test_a_bus_without_devices_says_who_is_missing_and_leaves_a_readable_log_with_the_reason(tmp_path: Path) -> None:
+def test_a_bus_without_devices_says_who_is_missing_and_leaves_a_readable_log_with_the_reason(tmp_path):
     result = called("run", "-i", "virtual", "-c", "empty", *PAPER, "--out", tmp_path)
     missing = "no boot-up from Drive1 (node 1), Drive2 (node 2), Sensor1 (node 3), Sensor2 (node 4)"
     assert result.exit_code == BUS_MISSING
@@ -26,7 +25,7 @@ def test_a_bus_without_devices_says_who_is_missing_and_leaves_a_readable_log_wit
     assert any(missing in entry.event.message for entry in log.events)
 
 
-def test_a_dbc_that_says_otherwise_than_the_device_profiles_is_refused_before_the_bus_is_opened(tmp_path: Path) -> None:
+def test_a_dbc_that_says_otherwise_than_the_device_profiles_is_refused_before_the_bus_is_opened(tmp_path):
     text = (contract_folder() / "arm.dbc").read_text()
     other = tmp_path / "other.dbc"
     other.write_text(text.replace("SG_ torque : 16|32@1- (1e-06,0)", "SG_ torque : 16|32@1- (1e-05,0)"))
@@ -37,7 +36,7 @@ def test_a_dbc_that_says_otherwise_than_the_device_profiles_is_refused_before_th
     assert not (tmp_path / "run").exists()
 
 
-def test_a_scale_that_the_sensors_own_eds_contradicts_is_refused_before_the_arm_moves(tmp_path: Path) -> None:
+def test_a_scale_that_the_sensors_own_eds_contradicts_is_refused_before_the_arm_moves(tmp_path):
     result = called("demo", "--config", other_contract(tmp_path), "--out", tmp_path / "run")
     assert result.exit_code == BUS_MISSING
     (complaint,) = complaints(result)
@@ -46,7 +45,7 @@ def test_a_scale_that_the_sensors_own_eds_contradicts_is_refused_before_the_arm_
 
 @pytest.mark.long
 @pytest.mark.vcan
-def test_devices_with_another_contract_are_refused_before_the_arm_moves(tmp_path: Path) -> None:
+def test_devices_with_another_contract_are_refused_before_the_arm_moves(tmp_path):
     config = other_contract(tmp_path)
     with emulator(tmp_path, "--scenario", "idle"):
         played = run_on_vcan(tmp_path, "--config", config, "--clock", "lockstep")
@@ -58,7 +57,7 @@ def test_devices_with_another_contract_are_refused_before_the_arm_moves(tmp_path
 
 @pytest.mark.long
 @pytest.mark.vcan
-def test_an_emulator_that_stops_mid_run_is_a_safety_stop_in_lockstep(tmp_path: Path) -> None:
+def test_an_emulator_that_stops_mid_run_is_a_safety_stop_in_lockstep(tmp_path):
     with emulator(tmp_path, "--scenario", "idle") as process:
         played = run_while_killing(tmp_path, process, "--clock", "lockstep")
     assert played.status == SAFETY_STOP

@@ -25,13 +25,13 @@ def budget(*arguments: str) -> Result:
         (("--dbc", str(CONTRACTS / "fd_1ms.dbc"), "--data-bitrate", "1000000"), DOES_NOT_FIT),
     ],
 )
-def test_the_exit_status_is_the_verdict(words: tuple[str, ...], status: int) -> None:
+def test_the_exit_status_is_the_verdict(words, status):
     ran = budget(*words, "--json")
     assert (ran.exit_code, json.loads(ran.stdout)["is_fit"]) == (status, status == FITS)
 
 
 @pytest.mark.parametrize(("dbc", "period_us", "status"), [("arm", 1000, DOES_NOT_FIT), ("arm_fd", 2000, FITS)])
-def test_two_arms_on_one_bus_have_one_sync(dbc: str, period_us: int, status: int) -> None:
+def test_two_arms_on_one_bus_have_one_sync(dbc, period_us, status):
     ran = budget("--dbc", dbc, "--arms", "2", "--period-us", str(period_us), "--json")
     found, one = json.loads(ran.stdout), json.loads(budget("--dbc", dbc, "--json").stdout)
     assert (ran.exit_code, found["arms"]) == (status, 2)
@@ -39,7 +39,7 @@ def test_two_arms_on_one_bus_have_one_sync(dbc: str, period_us: int, status: int
     assert len(found["messages"]) == 2 * len(one["messages"]) - 2  # NMT and SYNC are there once
 
 
-def test_the_configuration_says_how_many_arms_share_the_bus(tmp_path: Path) -> None:
+def test_the_configuration_says_how_many_arms_share_the_bus(tmp_path):
     config = tmp_path / "two.toml"
     config.write_text("[bus]\narms = 2\nperiod_us = 2000\n")
     said = budget("--config", str(config), "--period-us", "2000").stdout
@@ -48,7 +48,7 @@ def test_the_configuration_says_how_many_arms_share_the_bus(tmp_path: Path) -> N
     )
 
 
-def test_the_text_has_table_phases_and_verdict_within_120_columns() -> None:
+def test_the_text_has_table_phases_and_verdict_within_120_columns():
     lines = budget().stdout.splitlines()
     assert max(len(line) for line in lines) <= 120
     table = lines[2 : lines.index("", 2)]
@@ -63,7 +63,7 @@ def test_the_text_has_table_phases_and_verdict_within_120_columns() -> None:
     assert lines[-1] == "verdict       arm.dbc at 1000 µs fits: 795 µs of cyclic frames, 205 µs left for the host"
 
 
-def test_json_has_every_message_with_its_response_times() -> None:
+def test_json_has_every_message_with_its_response_times():
     found = json.loads(budget("--json").stdout)
     assert (found["wire_version"], found["layout_digest"]) == (1, "0xF80FDAE0")
     (command,) = [message for message in found["messages"] if message["name"] == "Drive1Command"]
@@ -78,7 +78,7 @@ def test_json_has_every_message_with_its_response_times() -> None:
     }  # fmt: skip
 
 
-def test_the_period_is_the_options_else_the_dbcs_else_the_configurations(tmp_path: Path) -> None:
+def test_the_period_is_the_options_else_the_dbcs_else_the_configurations(tmp_path):
     config = tmp_path / "slow.toml"
     config.write_text("[bus]\nperiod_us = 2000\n")
     without = tmp_path / "without.dbc"
@@ -102,9 +102,7 @@ STOCK = 'drive = ["stock-drive", "stock-drive"]\nsensor = ["int32-sensor", "int3
 @pytest.mark.parametrize(
     ("devices", "name", "bits"), [("", "arm", 795), ('contract = ""', "contract", 795), (STOCK, "contract", 715)]
 )
-def test_without_a_dbc_it_is_the_contract_of_the_configured_devices(
-    tmp_path: Path, devices: str, name: str, bits: int
-) -> None:
+def test_without_a_dbc_it_is_the_contract_of_the_configured_devices(tmp_path, devices, name, bits):
     config = tmp_path / "mine.toml"
     config.write_text(f"[devices]\n{devices}\n")
     found = json.loads(budget("--config", str(config), "--json").stdout)
@@ -131,7 +129,7 @@ MANY = "".join(
     ],
     ids=["200 times", "a name", "an identifier", "too many"],
 )
-def test_messages_that_are_defined_twice_or_too_many_are_one_line(text: str, line: str, tmp_path: Path) -> None:
+def test_messages_that_are_defined_twice_or_too_many_are_one_line(text, line, tmp_path):
     path = tmp_path / "x.dbc"
     path.write_text(text)
     done = budget("--dbc", str(path))

@@ -1,6 +1,5 @@
 """What `run` names before it looks for an arm."""
 
-from pathlib import Path
 from typing import NoReturn
 
 import pytest
@@ -35,9 +34,7 @@ class NoSession:
         ),
     ],
 )
-def test_a_run_names_at_once_what_nobody_has_confirmed(
-    assumed: list[str], line: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_names_at_once_what_nobody_has_confirmed(assumed, line, tmp_path, monkeypatch):
     monkeypatch.setattr(run_command, "Session", NoSession)
     config = tmp_path / "mine.toml"
     config.write_text(f'extends = "certified"\nname = "mine"\nassumed = {assumed}\n')

@@ -2,7 +2,6 @@
 
 import json
 import re
-from pathlib import Path
 
 from rig import Rig
 
@@ -21,7 +20,7 @@ def played(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, Communicat
     return described | {"fault": "NONE", "device_faults": [], "events": []}, test.report()
 
 
-def test_the_report_shows_shares_ages_times_and_the_verdict() -> None:
+def test_the_report_shows_shares_ages_times_and_the_verdict():
     described, _ = played(Rig(is_wall=True))
     lines = as_text(described).splitlines()
     assert lines[0].startswith("cycles 200, complete 200, overruns 0, period 1000 µs, SCHED_FIFO 80, bus load ")
@@ -37,7 +36,7 @@ def test_the_report_shows_shares_ages_times_and_the_verdict() -> None:
     assert json.loads(json.dumps(described)) == described
 
 
-def test_a_silent_device_and_a_missing_priority_are_warned_of() -> None:
+def test_a_silent_device_and_a_missing_priority_are_warned_of():
     rig = Rig(is_wall=True)
     rig.tamper = lambda cycle, can_id, data: None if can_id == 0x184 else data
     described, _ = played(rig, "SCHED_OTHER")
@@ -51,7 +50,7 @@ def test_a_silent_device_and_a_missing_priority_are_warned_of() -> None:
     assert lines[-1].startswith("not sufficient: 0.00 %")
 
 
-def test_the_page_has_the_curves_of_the_report_with_the_numbers_of_the_test(tmp_path: Path) -> None:
+def test_the_page_has_the_curves_of_the_report_with_the_numbers_of_the_test(tmp_path):
     described, report = played(Rig(is_wall=True))
     paths = write_pictures(tmp_path, report, described)
     assert [path.name for path in paths] == ["commtest.html"]
@@ -62,7 +61,7 @@ def test_the_page_has_the_curves_of_the_report_with_the_numbers_of_the_test(tmp_
     assert "<h1>good: 100.00\u00a0% of the periods" in page
 
 
-def test_a_test_without_a_cycle_has_no_pictures(tmp_path: Path) -> None:
+def test_a_test_without_a_cycle_has_no_pictures(tmp_path):
     rig = Rig(is_wall=True)
     report = CommunicationTest(rig.settings, rig.arm, 1_000_000).report()
     assert write_pictures(tmp_path, report, {}) == []

@@ -32,7 +32,7 @@ def own_arm(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_each_value_is_told_with_where_it_is_from(own_arm: str) -> None:
+def test_each_value_is_told_with_where_it_is_from(own_arm):
     told = shown("--config", own_arm, "--set", "filter.a_rad_s=12")
     assert told["arm.link_length_m"] == ("[0.4, 0.25]", own_arm)
     assert told["filter.a_rad_s"] == ("12", "--set")
@@ -47,12 +47,12 @@ def test_each_value_is_told_with_where_it_is_from(own_arm: str) -> None:
 
 
 @pytest.mark.parametrize("name", builtin_names())
-def test_what_comes_with_the_package_has_no_error_and_no_warning(name: str) -> None:
+def test_what_comes_with_the_package_has_no_error_and_no_warning(name):
     result = config("check", name)
     assert (result.exit_code, result.stdout) == (0, f"{name}: 0 errors, 0 warnings\n")
 
 
-def test_all_errors_are_told_at_once(tmp_path: Path) -> None:
+def test_all_errors_are_told_at_once(tmp_path):
     path = tmp_path / "bad.toml"
     path.write_text(
         "[arm]\nlink_length_m = [350, 300]\nrated_torque = [12, 6]\n[bus]\nperiod_us = 1\n"
@@ -104,9 +104,7 @@ LENGTHS = "[arm]\nlink_length_m = [0.4, 0.3]"
         ),
     ],
 )
-def test_a_likely_mistake_is_a_warning_and_a_motion_that_leaves_the_arm_s_limits_an_error(
-    tmp_path: Path, text: str, status: int, line: str
-) -> None:
+def test_a_likely_mistake_is_a_warning_and_a_motion_that_leaves_the_arm_s_limits_an_error(tmp_path, text, status, line):
     path = tmp_path / "odd.toml"
     path.write_text(text)
     result = config("check", str(path))
@@ -114,7 +112,7 @@ def test_a_likely_mistake_is_a_warning_and_a_motion_that_leaves_the_arm_s_limits
     assert line in result.stdout
 
 
-def test_devices_and_contract_are_looked_at(tmp_path: Path) -> None:
+def test_devices_and_contract_are_looked_at(tmp_path):
     path = tmp_path / "devices.toml"
     path.write_text('[devices]\ndrive = ["stok-drive", "int32-sensor"]\n')
     result = config("check", str(path))
@@ -125,7 +123,7 @@ def test_devices_and_contract_are_looked_at(tmp_path: Path) -> None:
     assert "Drive1" in config("check", str(path)).stdout
 
 
-def test_the_guesses_of_a_device_s_profile_are_those_of_the_configuration(tmp_path: Path) -> None:
+def test_the_guesses_of_a_device_s_profile_are_those_of_the_configuration(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('extends = "certified"\n[devices]\ndrive = ["geared.toml", "maxon-epos4"]\ncontract = ""\n')
     (tmp_path / "geared.toml").write_text('extends = "maxon-epos4"\n[scale]\ngear_ratio = 30\n')
@@ -139,14 +137,14 @@ def test_the_guesses_of_a_device_s_profile_are_those_of_the_configuration(tmp_pa
     assert outcome.reason == "26 is a guess"
 
 
-def test_several_files_are_checked_each() -> None:
+def test_several_files_are_checked_each():
     result = config("check", "certified", "papper")
     assert result.exit_code == USAGE
     assert result.stdout.splitlines()[0] == "certified: 0 errors, 0 warnings"
     assert "did you mean 'paper'?" in result.stdout
 
 
-def test_the_groups_a_group_and_a_key_are_explained() -> None:
+def test_the_groups_a_group_and_a_key_are_explained():
     assert "certified" in config("docs").stdout
     assert "arm.position_limit_deg" in config("docs", "arm").stdout
     assert config("docs", "certified.noise_sigmas").stdout == (
@@ -154,7 +152,7 @@ def test_the_groups_a_group_and_a_key_are_explained() -> None:
     )
 
 
-def test_the_profile_is_that_of_the_file_and_the_files_outweigh_it(tmp_path: Path) -> None:
+def test_the_profile_is_that_of_the_file_and_the_files_outweigh_it(tmp_path):
     base, top = tmp_path / "base.toml", tmp_path / "top.toml"
     base.write_text("[controller]\nKp = [1, 2]\n[profiles.S]\ncontroller.Kd = [3, 4]\n")
     top.write_text('extends = "base.toml"\n[arm]\nprofile = "S"\n')

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -41,7 +40,7 @@ def statuses(findings: dict[str, Finding], status: Status) -> list[str]:
     return [name for name, finding in findings.items() if finding.status is status]
 
 
-def test_a_sound_arm_passes_everything_but_what_it_lacks_and_is_asked_for_no_voltage_only() -> None:
+def test_a_sound_arm_passes_everything_but_what_it_lacks_and_is_asked_for_no_voltage_only():
     rig = Rig(is_wall=True)
     findings = doctor(rig)
     assert statuses(findings, Status.FAILED) == []
@@ -55,7 +54,7 @@ def test_a_sound_arm_passes_everything_but_what_it_lacks_and_is_asked_for_no_vol
     assert {device.state for device in rig.bench.devices} == {NmtState.PRE_OPERATIONAL}
 
 
-def test_another_master_stops_the_examination_before_anything_is_sent() -> None:
+def test_another_master_stops_the_examination_before_anything_is_sent():
     rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
@@ -76,7 +75,7 @@ def test_another_master_stops_the_examination_before_anything_is_sent() -> None:
         (0x601, "writes objects of drive 1 (0x601)"),
     ],
 )
-def test_each_kind_of_host_frame_shows_another_master(can_id: int, doing: str) -> None:
+def test_each_kind_of_host_frame_shows_another_master(can_id, doing):
     rig = Rig(is_wall=True)
     rig.bus.deliver(can_id, b"\x05\x00\x00\x00\x00\x00")
     assert doctor(rig)["other masters"].reason == f"somebody else {doing}"
@@ -93,7 +92,7 @@ def test_each_kind_of_host_frame_shows_another_master(can_id: int, doing: str) -
         ("follow", 0x77F, Status.FAILED),
     ],
 )
-def test_on_a_shared_bus_the_neighbours_frames_are_no_other_master(sync: str, can_id: int, status: Status) -> None:
+def test_on_a_shared_bus_the_neighbours_frames_are_no_other_master(sync, can_id, status):
     rig = Rig(apply_settings(load_settings("paper"), {"bus.arms": "2", "bus.sync": sync}), is_wall=True)
     patient = examination(rig)
     patient.connect()
@@ -101,7 +100,7 @@ def test_on_a_shared_bus_the_neighbours_frames_are_no_other_master(sync: str, ca
     assert check_other_masters(patient).status is status
 
 
-def test_a_missing_node_fails_and_nothing_is_reset() -> None:
+def test_a_missing_node_fails_and_nothing_is_reset():
     rig = Rig(is_wall=True)
     rig.silence(2)
     findings = doctor(rig)
@@ -110,7 +109,7 @@ def test_a_missing_node_fails_and_nothing_is_reset() -> None:
     assert not any(frame.can_id == 0x000 for frame in rig.sent)
 
 
-def test_another_contract_is_told_and_stops_the_set_up(tmp_path) -> None:
+def test_another_contract_is_told_and_stops_the_set_up(tmp_path):
     rig = Rig(is_wall=True)
     other = tmp_path / "other.dbc"
     other.write_bytes(CODEC.text.replace(b"0|32@1- (5.9921124526782858e-06,0)", b"0|32@1- (5e-06,0)"))
@@ -130,7 +129,7 @@ def test_another_contract_is_told_and_stops_the_set_up(tmp_path) -> None:
         (0x1600, 3, 0x60710010, "Drive1Command: mapped object 0x1600:3 = 0x60710010, 0x60400010 expected"),
     ],
 )
-def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, value: int, reason: str) -> None:
+def test_a_pdo_map_that_is_not_the_contract_is_told(index, subindex, value, reason):
     rig = Rig(is_wall=True)
     rig.bench.devices[0].serve(index, subindex, lambda: value)  # as if it had another mapping
     patient = examination(rig)
@@ -141,7 +140,7 @@ def test_a_pdo_map_that_is_not_the_contract_is_told(index: int, subindex: int, v
 
 
 @pytest.mark.parametrize("describe", [describe_arm, describe_geared_arm])
-def test_devices_of_one_s_own_pass(tmp_path: Path, describe: Callable[[Path], list[str]]) -> None:
+def test_devices_of_one_s_own_pass(tmp_path, describe):
     """Sensors of 16 bits have their torque in 0x7130, and the drives theirs in objects of the maker, or in µNm."""
     written = called("init", *describe(tmp_path))
     assert written.exit_code == 0, written.stderr
@@ -180,9 +179,7 @@ def change_torque(rig: Rig, change: Callable[[int, float], float]) -> None:
         (lambda k, tau: tau + 0.1 * (-1) ** k, "torque noise", Status.WARNING, "three of it exceed"),
     ],
 )
-def test_a_torque_that_is_not_plausible_at_rest_is_told(
-    change: Callable[[int, float], float], name: str, status: Status, text: str
-) -> None:
+def test_a_torque_that_is_not_plausible_at_rest_is_told(change, name, status, text):
     rig = Rig(is_wall=True)
     change_torque(rig, change)
     finding = doctor(rig)[name]
@@ -218,7 +215,7 @@ def losing(cycle: int, can_id: int, data: bytes) -> bytes | None:
         (losing, "rate", "80.0 % of the periods complete", ""),
     ],
 )
-def test_what_a_device_sends_wrong_fails_its_check_and_skips_what_needs_it(tamper, name, text, skipped) -> None:
+def test_what_a_device_sends_wrong_fails_its_check_and_skips_what_needs_it(tamper, name, text, skipped):
     rig = Rig(is_wall=True)
     rig.tamper = tamper
     findings = doctor(rig)
@@ -267,16 +264,14 @@ def move_by_hand(rig: Rig, speed_rad_s: tuple[float, float], torque_Nm: float) -
         ((0.05, 0.0), -0.3, Status.WARNING, "not moved by 10 deg in time"),
     ],
 )
-def test_a_joint_moved_by_hand_tells_its_order_and_signs(
-    speed_rad_s: tuple[float, float], torque_Nm: float, status: Status, text: str
-) -> None:
+def test_a_joint_moved_by_hand_tells_its_order_and_signs(speed_rad_s, torque_Nm, status, text):
     rig = Rig(is_wall=True)
     finding = doctor(rig, move_by_hand(rig, speed_rad_s, torque_Nm))["joint 1"]
     assert finding.status is status
     assert text in finding.reason
 
 
-def test_a_check_whose_prerequisite_failed_is_skipped_with_the_reason_behind_it() -> None:
+def test_a_check_whose_prerequisite_failed_is_skipped_with_the_reason_behind_it():
     checks = [
         Check("a", lambda _: failed("broken", "mend it")),
         Check("b", lambda _: ok("fine"), ("a",)),
@@ -290,7 +285,7 @@ def test_a_check_whose_prerequisite_failed_is_skipped_with_the_reason_behind_it(
     assert summarise(findings) == "1 ok, 1 warning, 1 failed, 2 skipped"
 
 
-def test_the_report_has_a_remedy_under_what_is_wrong() -> None:
+def test_the_report_has_a_remedy_under_what_is_wrong():
     findings = [Finding("a", Status.OK, "fine", ""), Finding("bb", Status.FAILED, "broken", "mend it")]
     assert as_text(findings).splitlines() == [
         "ok      a   fine",

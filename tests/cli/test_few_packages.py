@@ -30,7 +30,7 @@ def python(folder: Path, program: str, *words: str) -> "subprocess.CompletedProc
 
 
 @pytest.mark.slow
-def test_without_the_labs_packages_an_arm_is_run_and_its_log_replayed(tmp_path: Path) -> None:
+def test_without_the_labs_packages_an_arm_is_run_and_its_log_replayed(tmp_path):
     (tmp_path / "short.toml").write_text("lasts_s = 0.3\nstart_deg = [-30.0, -60.0]\n")
     played = python(tmp_path, WITHOUT + PLAY + "main(['replay', 'run', '--frames'])")
     assert (played.returncode, "identical, bit for bit" in played.stdout) == (0, True), played.stderr
@@ -40,7 +40,7 @@ def test_without_the_labs_packages_an_arm_is_run_and_its_log_replayed(tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_scan_does_not_wait_for_the_compiler(tmp_path: Path) -> None:
+def test_a_scan_does_not_wait_for_the_compiler(tmp_path):
     program = (
         "import sys\nfrom adacd_hil.cli.main import main\n"
         "try:\n    main(['scan', '-i', 'virtual', '-c', 'x', '--seconds', '0.1'])\n"

@@ -20,7 +20,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_demos_leave_each_other_as_they_are_and_the_links_lead_to_the_last(tmp_path: Path) -> None:
+def test_demos_leave_each_other_as_they_are_and_the_links_lead_to_the_last(tmp_path):
     (tmp_path / "short.toml").write_text("lasts_s = 0.3\n")
     command = [BIN / "adacd-hil", "demo", *PAPER, "--scenario", "short.toml"]
     pair = [subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=tmp_path) for _ in range(2)]
@@ -42,7 +42,7 @@ def test_demos_leave_each_other_as_they_are_and_the_links_lead_to_the_last(tmp_p
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_a_start_that_fails_leaves_yesterday_alone_and_can_be_tried_again(tmp_path: Path) -> None:
+def test_a_start_that_fails_leaves_yesterday_alone_and_can_be_tried_again(tmp_path):
     yesterday = tmp_path / "runs" / "yesterday"
     yesterday.mkdir(parents=True)
     (yesterday / "run.mcap").write_bytes(b"yesterday")
@@ -64,7 +64,7 @@ def test_a_start_that_fails_leaves_yesterday_alone_and_can_be_tried_again(tmp_pa
     assert (tmp_path / "runs" / "latest").resolve() == yesterday
 
 
-def test_runs_of_one_second_are_numbered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_of_one_second_are_numbered(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(run_folder_module, "wall_ns", lambda: 1_800_000_000_000_000_000)
     made = []
@@ -77,7 +77,7 @@ def test_runs_of_one_second_are_numbered(tmp_path: Path, monkeypatch: pytest.Mon
     assert (tmp_path / "runs" / "latest").readlink() == (tmp_path / "runs" / "run").readlink() == Path(made[2])
 
 
-def test_a_run_that_makes_nothing_leaves_no_folder_and_no_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_makes_nothing_leaves_no_folder_and_no_link(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for out in (None, Path("a/b")):
         with run_folder(out, ("run.mcap",), "run") as folder:
@@ -85,7 +85,7 @@ def test_a_run_that_makes_nothing_leaves_no_folder_and_no_link(tmp_path: Path, m
         assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_of_the_name_of_a_link_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_of_the_name_of_a_link_stays(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs" / "demo").mkdir(parents=True)
     (tmp_path / "runs" / "demo" / "run.mcap").write_text("yesterday")
@@ -98,7 +98,7 @@ def test_a_folder_of_the_name_of_a_link_stays(tmp_path: Path, monkeypatch: pytes
     assert (tmp_path / "runs" / "latest").resolve() == folder.path.resolve()
 
 
-def test_a_folder_with_a_log_is_refused_before_anything_is_made(tmp_path: Path) -> None:
+def test_a_folder_with_a_log_is_refused_before_anything_is_made(tmp_path):
     (tmp_path / "truth.mcap").write_text("yesterday")
     with (
         pytest.raises(LogExistsError, match=r"truth\.mcap is there already"),

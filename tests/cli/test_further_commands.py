@@ -35,7 +35,7 @@ def add_package(folder: Path, entry: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_package_adds_a_command(tmp_path: Path) -> None:
+def test_a_package_adds_a_command(tmp_path):
     add_package(tmp_path, "greeting:COMMANDS")
     done = called(tmp_path, "greet")
     assert (done.returncode, done.stdout, done.stderr) == (0, "hello, arm\n", "")
@@ -43,7 +43,7 @@ def test_a_package_adds_a_command(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("entry", ["no_greeting:COMMANDS", "greeting:NONE"])
-def test_commands_that_can_t_be_imported_are_named_and_cost_no_others(tmp_path: Path, entry: str) -> None:
+def test_commands_that_can_t_be_imported_are_named_and_cost_no_others(tmp_path, entry):
     add_package(tmp_path, entry)
     done = called(tmp_path, "run", "--help")
     assert done.returncode == 0

@@ -1,7 +1,5 @@
 """Paths that can't be meant are refused before any work: empty names, links that lead nowhere."""
 
-from pathlib import Path
-
 import click
 import pytest
 from called import called
@@ -34,7 +32,7 @@ def refused(*words: str) -> str:
         (("budget", "--dbc", ""), "contract '' is neither in dbc/ nor a file; known: "),
     ],
 )
-def test_an_empty_name_is_not_the_working_directory(words: tuple[str, ...], line: str, tmp_path: Path) -> None:
+def test_an_empty_name_is_not_the_working_directory(words, line, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
         assert line in refused(*words)
@@ -51,7 +49,7 @@ def test_an_empty_name_is_not_the_working_directory(words: tuple[str, ...], line
         (("run", *ON_BUS, "--history"), "arm.toml"),
     ],
 )
-def test_a_link_that_leads_nowhere_is_named(words: tuple[str, ...], name: str, tmp_path: Path) -> None:
+def test_a_link_that_leads_nowhere_is_named(words, name, tmp_path):
     link = tmp_path / "runs"
     link.symlink_to("unmounted")
     said = refused(*words, str(link / name))
@@ -59,7 +57,7 @@ def test_a_link_that_leads_nowhere_is_named(words: tuple[str, ...], name: str, t
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
 
-def test_a_history_that_a_link_leads_nowhere_for_is_no_first_run(tmp_path: Path) -> None:
+def test_a_history_that_a_link_leads_nowhere_for_is_no_first_run(tmp_path):
     link = tmp_path / "arm.toml"
     link.symlink_to("/unmounted/arm.toml")
     with pytest.raises(ConfigError, match=rf"^history {link}: link {link} leads to /unmounted/arm.toml, which is not"):
@@ -68,7 +66,7 @@ def test_a_history_that_a_link_leads_nowhere_for_is_no_first_run(tmp_path: Path)
     assert "which is not there" in said
 
 
-def test_a_link_to_itself_leads_nowhere_and_one_to_a_folder_somewhere(tmp_path: Path) -> None:
+def test_a_link_to_itself_leads_nowhere_and_one_to_a_folder_somewhere(tmp_path):
     (tmp_path / "loop").symlink_to("loop")
     (tmp_path / "here").symlink_to(".")
     assert dangling_link(tmp_path / "loop" / "x") == tmp_path / "loop"
@@ -76,7 +74,7 @@ def test_a_link_to_itself_leads_nowhere_and_one_to_a_folder_somewhere(tmp_path: 
 
 
 @pytest.mark.parametrize("group", [host_cli, emulator_cli], ids=["adacd-hil", "firmware-sim"])
-def test_every_path_is_looked_at(group: click.Group) -> None:
+def test_every_path_is_looked_at(group):
     def parameters(command: click.Command) -> list[click.Parameter]:
         below = command.commands.values() if isinstance(command, click.Group) else ()
         return [*command.params, *(each for one in below for each in parameters(one))]

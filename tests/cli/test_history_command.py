@@ -63,9 +63,7 @@ def file(lab: Lab, first_history: str) -> Path:
     return path
 
 
-def test_a_run_adds_its_certificate_and_the_next_one_is_compared_with_it(
-    lab: Lab, file: Path, first_history: str
-) -> None:
+def test_a_run_adds_its_certificate_and_the_next_one_is_compared_with_it(lab, file, first_history):
     first = read_history(file).last
     assert first.text.endswith("by this run only")
     result = lab.run("--history", str(file))
@@ -81,7 +79,7 @@ def test_a_run_adds_its_certificate_and_the_next_one_is_compared_with_it(
     assert "identical, bit for bit" in replayed.stdout + replayed.stderr
 
 
-def test_devices_with_other_serial_numbers_are_another_arms(lab: Lab, file: Path) -> None:
+def test_devices_with_other_serial_numbers_are_another_arms(lab, file):
     before = file.read_bytes()
     lab.serials[1] = 4711
     result = lab.run("--history", str(file))
@@ -103,9 +101,7 @@ def test_devices_with_other_serial_numbers_are_another_arms(lab: Lab, file: Path
         ('date_utc = "', 'date_utc = "x', "arm.toml: certificate 1: date_utc is not like 2026-01-31T12:00:00Z"),
     ],
 )
-def test_a_file_that_is_not_as_it_was_written_is_refused_in_one_line(
-    lab: Lab, file: Path, old: str, new: str, says: str
-) -> None:
+def test_a_file_that_is_not_as_it_was_written_is_refused_in_one_line(lab, file, old, new, says):
     file.write_text(file.read_text().replace(old, new, 1))
     for result in (lab.run("--history", str(file)), called("history", file)):
         assert result.exit_code == USAGE
@@ -113,7 +109,7 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_one_line(
         assert says in line
 
 
-def test_a_certificate_is_not_added_to_what_another_arm_has_made_meanwhile(lab: Lab, first_history: str) -> None:
+def test_a_certificate_is_not_added_to_what_another_arm_has_made_meanwhile(lab, first_history):
     path = lab.folder / "arm.toml"
     used = use_history(path, wall_ns())
     path.write_text(first_history)
@@ -124,14 +120,14 @@ def test_a_certificate_is_not_added_to_what_another_arm_has_made_meanwhile(lab: 
     assert path.read_text() == first_history
 
 
-def test_a_scheme_without_certificates_has_no_history(lab: Lab) -> None:
+def test_a_scheme_without_certificates_has_no_history(lab):
     lab.settings_file.write_text(SHORT_RUN)
     result = lab.run("--history", str(lab.folder / "arm.toml"))
     assert result.exit_code == USAGE
     assert complaints(result)[0].startswith("adacd-hil: --history: scheme 'paper'")
 
 
-def test_the_picture_replaces_an_earlier_one_and_nothing_else(file: Path, first_history: str) -> None:
+def test_the_picture_replaces_an_earlier_one_and_nothing_else(file, first_history):
     picture, other = file.with_name("arm.png"), file.with_name("other.toml")
     other.write_text(first_history)
     picture.touch()  # an empty file is nobody's
@@ -143,7 +139,7 @@ def test_the_picture_replaces_an_earlier_one_and_nothing_else(file: Path, first_
         assert taken.read_text() == first_history
 
 
-def test_the_chain_of_digests_notices_a_certificate_that_is_missing_or_moved(file: Path) -> None:
+def test_the_chain_of_digests_notices_a_certificate_that_is_missing_or_moved(file):
     found = read_history(file)
     second = replace(found.last, date_utc="2030-01-01T00:00:00Z")
     second = replace(second, digest=second.digest_after(found.last.digest))
@@ -153,7 +149,7 @@ def test_the_chain_of_digests_notices_a_certificate_that_is_missing_or_moved(fil
             History(HISTORY_FORMAT, found.devices, certificates)
 
 
-def test_a_certificate_that_lacks_values_is_refused_though_its_digest_is_right(file: Path) -> None:
+def test_a_certificate_that_lacks_values_is_refused_though_its_digest_is_right(file):
     last = read_history(file).last
     with pytest.raises(ValueError, match="friction_Nm has 5 values, 6 expected"):
         replace(last, friction_Nm=last.friction_Nm[1:])
@@ -168,9 +164,7 @@ def test_a_certificate_that_lacks_values_is_refused_though_its_digest_is_right(f
         ("friction_Nm", (1e9,) * 6, "`certificates[0].friction_Nm[0]` = 1000000000.0 Nm is above 1000 Nm"),
     ],
 )
-def test_values_that_no_arm_has_are_refused_though_their_digest_is_right(
-    file: Path, monkeypatch: pytest.MonkeyPatch, old: str, new: tuple[float, ...], says: str
-) -> None:
+def test_values_that_no_arm_has_are_refused_though_their_digest_is_right(file, monkeypatch, old, new, says):
     found = read_history(file)
     with monkeypatch.context() as forger:
         forger.setattr(CertificateRecord, "__post_init__", lambda self: None)
@@ -182,7 +176,7 @@ def test_values_that_no_arm_has_are_refused_though_their_digest_is_right(
     assert says in str(caught.value)
 
 
-def test_the_older_a_certificate_the_less_its_zero_is_known(file: Path) -> None:
+def test_the_older_a_certificate_the_less_its_zero_is_known(file):
     last = read_history(file).last
     settings = load_settings("certified")
     fresh, old = (
@@ -194,12 +188,12 @@ def test_the_older_a_certificate_the_less_its_zero_is_known(file: Path) -> None:
     np.testing.assert_allclose(old, np.hypot(fresh, walked))
 
 
-def test_a_certificate_of_the_future_is_refused(file: Path) -> None:
+def test_a_certificate_of_the_future_is_refused(file):
     with pytest.raises(ConfigError, match="h ahead of this clock"):
         use_history(file, 1_000_000_000)
 
 
-def test_it_is_listed_printed_and_drawn(lab: Lab, file: Path) -> None:
+def test_it_is_listed_printed_and_drawn(lab, file):
     picture = lab.folder / "history.png"
     listed = called("history", file, "--plot", picture)
     assert listed.exit_code == 0
@@ -212,7 +206,7 @@ def test_it_is_listed_printed_and_drawn(lab: Lab, file: Path) -> None:
     assert printed == json.loads(json.dumps(asdict(read_history(file))))
 
 
-def test_a_run_without_a_certificate_adds_nothing(lab: Lab) -> None:
+def test_a_run_without_a_certificate_adds_nothing(lab):
     lab.settings_file.write_text(CERTIFIED.replace("3.5", "0.5"))
     path = lab.folder / "arm.toml"
     result = lab.run("--history", str(path))
@@ -221,7 +215,7 @@ def test_a_run_without_a_certificate_adds_nothing(lab: Lab) -> None:
     assert called("history", path).exit_code == USAGE
 
 
-def test_a_history_that_cannot_be_written_is_partial_and_says_so(lab: Lab) -> None:
+def test_a_history_that_cannot_be_written_is_partial_and_says_so(lab):
     blocker = lab.folder / "blocker"
     blocker.write_text("no folder")
     result = lab.run("--history", str(blocker / "arm.toml"))
@@ -231,9 +225,7 @@ def test_a_history_that_cannot_be_written_is_partial_and_says_so(lab: Lab) -> No
 
 
 @pytest.mark.parametrize(("answer", "is_started"), [("y\n", True), ("n\n", False), ("\n", False)])
-def test_before_a_first_run_the_user_says_that_nobody_touches_the_arm(
-    monkeypatch: pytest.MonkeyPatch, answer: str, is_started: bool
-) -> None:
+def test_before_a_first_run_the_user_says_that_nobody_touches_the_arm(monkeypatch, answer, is_started):
     result = answered(monkeypatch, lambda: ask_first_run(UsedHistory(Path("arm.toml"), b"", None)), answer)
     assert (result.exit_code, "started" in result.stdout) == (0 if is_started else 1, is_started)
     assert "this is the arm's first run" in result.stderr

@@ -79,9 +79,7 @@ def urdf(folder: Path, axis: str = "0 0 1", wrist: str = "fixed") -> Path:
         (("--from", ".", "--length-m", "1", "1"), "leave out --length-m"),
     ],
 )
-def test_options_that_are_missing_or_wrong_are_named_and_nothing_is_written(
-    tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], line: str
-) -> None:
+def test_options_that_are_missing_or_wrong_are_named_and_nothing_is_written(tmp_path, out, monkeypatch, options, line):
     monkeypatch.chdir(tmp_path)
     Path("float.eds").write_text((contract_folder() / "int32_sensor.eds").read_text().replace("9130", "6130"))
     result = init(out, *options)
@@ -90,7 +88,7 @@ def test_options_that_are_missing_or_wrong_are_named_and_nothing_is_written(
     assert not out.parent.exists()
 
 
-def test_guesses_are_listed_and_doctor_asks_for_each(out: Path) -> None:
+def test_guesses_are_listed_and_doctor_asks_for_each(out):
     assert init(out, *NO_BUS, "--mass-kg", "1", "0.5", "--length-m", "0.4", "0.25").exit_code == 0
     settings = written(out)
     assert settings.scheme == "certified"
@@ -104,7 +102,7 @@ def test_guesses_are_listed_and_doctor_asks_for_each(out: Path) -> None:
     assert findings["`arm.holding_torque_Nm`"].reason.startswith("nothing is given: largest torque that brake")
 
 
-def test_what_is_known_is_no_guess(out: Path) -> None:
+def test_what_is_known_is_no_guess(out):
     known = ("--rated-torque-nm", "8", "4", "--torque-limit-nm", "7", "3", "--position-limit-deg", "50", "60")
     devices = ("--drive-node", "11", "12", "--sensor-node", "21", "22", "--drive", "stock-drive", "stock-drive")
     assert init(out, *NO_BUS, *known, *devices, "--sensor", "int32-sensor", "int32-sensor", "--flat").exit_code == 0
@@ -116,7 +114,7 @@ def test_what_is_known_is_no_guess(out: Path) -> None:
     assert set(settings.assumed) == {*(f"arm.{name}" for name in guessed), "controller.Kp", "controller.Kd"}
 
 
-def test_a_file_that_is_there_is_replaced_by_force_alone(out: Path) -> None:
+def test_a_file_that_is_there_is_replaced_by_force_alone(out):
     out.parent.mkdir()
     out.write_text("mine")
     assert init(out, *NO_BUS).exit_code == USAGE
@@ -126,7 +124,7 @@ def test_a_file_that_is_there_is_replaced_by_force_alone(out: Path) -> None:
 
 
 @pytest.mark.parametrize(("axis", "is_upright"), [("0 0 1", False), ("0 1 0", True)])
-def test_a_urdf_gives_lengths_masses_limits_and_gravity(tmp_path: Path, out: Path, axis: str, is_upright: bool) -> None:
+def test_a_urdf_gives_lengths_masses_limits_and_gravity(tmp_path, out, axis, is_upright):
     assert init(out, *NO_BUS, "--urdf", str(urdf(tmp_path, axis))).exit_code == 0
     settings = written(out)
     assert settings.arm.link_length_m == (0.35, 0.3)
@@ -155,8 +153,8 @@ def test_a_urdf_gives_lengths_masses_limits_and_gravity(tmp_path: Path, out: Pat
     ],
 )
 def test_gravity_comes_from_the_root_of_the_urdf_and_its_mounting(
-    tmp_path: Path, out: Path, axis: str, root_rpy: str, mounting: tuple[str, ...], mounting_deg: tuple[float, float]
-) -> None:
+    tmp_path, out, axis, root_rpy, mounting, mounting_deg
+):
     file = urdf(tmp_path, axis)
     text = file.read_text()
     shoulder = text[text.index('name="shoulder"') :]
@@ -181,16 +179,14 @@ def test_gravity_comes_from_the_root_of_the_urdf_and_its_mounting(
         (("--flat",), None),
     ],
 )
-def test_words_say_how_an_arm_without_a_urdf_is_mounted(
-    out: Path, options: tuple[str, ...], mounting_deg: tuple[float, float] | None
-) -> None:
+def test_words_say_how_an_arm_without_a_urdf_is_mounted(out, options, mounting_deg):
     assert init(out, *NO_BUS, "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", *options).exit_code == 0
     settings = written(out)
     assert settings.arm.mounting_deg == mounting_deg
     assert settings.estimator.gravity == (mounting_deg is not None)
 
 
-def test_rods_of_a_urdf_and_of_lengths_and_masses_are_the_same_arm() -> None:
+def test_rods_of_a_urdf_and_of_lengths_and_masses_are_the_same_arm():
     text = URDF.format(axis="0 1 0", wrist="fixed").replace("0.2 0 0", "0.175 0 0").replace("0.13 0 0", "0.15 0 0")
     for inertia, mass, length_m in (("0.04", 3.0, 0.35), ("0.015", 1.5, 0.3)):
         text = text.replace(f'"{inertia}"', f'"{mass * length_m**2 / 12.0!r}"')
@@ -208,16 +204,17 @@ def test_rods_of_a_urdf_and_of_lengths_and_masses_are_the_same_arm() -> None:
         (('lower="-1.2"', 'lower="0.1"'), 'joint "shoulder": 0 is not within its limits'),
         (("0.35 0 0", "0 0 0.35"), "the two axes are the same line"),
         (('<mass value="3"/>', '<mass value="0"/>'), 'link "upper": an inertia without a mass'),
+        (('xyz="0.13 0 0"/><mass', 'xyz="0 0 0"/><mass'), 'link "lower": mass 1.5 kg without inertia'),
     ],
 )
-def test_a_urdf_of_another_arm_or_with_a_mass_that_no_link_has_is_refused(change: tuple[str, str], line: str) -> None:
+def test_a_urdf_of_another_arm_or_with_a_mass_that_no_link_has_is_refused(change, line):
     text = URDF.format(axis="0 0 1", wrist="fixed").replace('"0.015"', '"0"')
     with pytest.raises(UrdfError) as caught:
         planar_from_urdf(text.replace(*change).encode())
     assert line in str(caught.value)
 
 
-def test_crossed_axes_are_refused_and_a_bent_zero_is_doubted() -> None:
+def test_crossed_axes_are_refused_and_a_bent_zero_is_doubted():
     text = URDF.format(axis="0 0 1", wrist="fixed")
     crossed = text.replace('<axis xyz="0 0 1"/><limit lower="-2" upper="2" effort="9"', '<axis xyz="0 1 0"/><limit')
     with pytest.raises(UrdfError, match="90 deg apart"):
@@ -230,7 +227,7 @@ def test_crossed_axes_are_refused_and_a_bent_zero_is_doubted() -> None:
     assert "180 deg off the line of link 1" in doubt
 
 
-def test_a_urdf_of_shapes_alone_says_how_the_masses_get_known(tmp_path: Path, out: Path) -> None:
+def test_a_urdf_of_shapes_alone_says_how_the_masses_get_known(tmp_path, out):
     path = urdf(tmp_path)
     path.write_text(re.sub("<inertial>.*?</inertial>", "<visual/>", path.read_text(), flags=re.DOTALL))
     result = init(out, *NO_BUS, "--urdf", str(path))
@@ -241,7 +238,7 @@ def test_a_urdf_of_shapes_alone_says_how_the_masses_get_known(tmp_path: Path, ou
     assert written(out).arm.mass_kg is None
 
 
-def test_masses_and_friction_of_a_urdf_are_for_the_emulator(tmp_path: Path, out: Path) -> None:
+def test_masses_and_friction_of_a_urdf_are_for_the_emulator(tmp_path, out):
     path = urdf(tmp_path)
     path.write_text(path.read_text().replace("</joint>", '<dynamics damping="0.05" friction="0.1"/></joint>'))
     assert init(out, *NO_BUS, "--urdf", str(path)).exit_code == 0
@@ -257,7 +254,7 @@ def test_masses_and_friction_of_a_urdf_are_for_the_emulator(tmp_path: Path, out:
     "limits",
     [("--velocity-limit-deg-s", "5", "5"), ("--velocity-limit-deg-s", "1", "1"), ("--torque-limit-nm", "0.1", "0.1")],
 )
-def test_an_arm_that_is_slow_or_weak_moves_less_and_within_bounds(out: Path, limits: tuple[str, ...]) -> None:
+def test_an_arm_that_is_slow_or_weak_moves_less_and_within_bounds(out, limits):
     masses = ("--length-m", "0.6", "0.5", "--mass-kg", "10", "6", "--flat")
     result = init(out, *NO_BUS, *masses, *limits)
     assert result.exit_code == 0, result.stderr
@@ -268,7 +265,7 @@ def test_an_arm_that_is_slow_or_weak_moves_less_and_within_bounds(out: Path, lim
     assert "learning it takes minutes" in result.stdout
 
 
-def test_an_upright_arm_may_rest_on_its_brakes_and_swings_wide(out: Path) -> None:
+def test_an_upright_arm_may_rest_on_its_brakes_and_swings_wide(out):
     arm = ("--mass-kg", "1.5", "1", "--length-m", "0.3", "0.3", "--upright")
     assert init(out, *NO_BUS, *arm, "--position-limit-deg", "90", "120").exit_code == 0
     settings, base = written(out), load_settings("certified")
@@ -283,7 +280,7 @@ def test_an_upright_arm_may_rest_on_its_brakes_and_swings_wide(out: Path) -> Non
     assert "safety.rest_torque_Nm" in written(out).assumed
 
 
-def test_the_scheme_s_numbers_and_the_motion_are_those_of_the_arm_s_masses(out: Path) -> None:
+def test_the_scheme_s_numbers_and_the_motion_are_those_of_the_arm_s_masses(out):
     base = load_settings("certified")
 
     def of(*arm: str) -> Settings:
@@ -308,14 +305,12 @@ def test_the_scheme_s_numbers_and_the_motion_are_those_of_the_arm_s_masses(out: 
     assert weak.certified.prior_std[0] == pytest.approx(2.0 * weak.arm.cad_theta[0], rel=1e-3)
 
 
-def test_three_joints_are_two_when_one_is_locked(tmp_path: Path, out: Path) -> None:
+def test_three_joints_are_two_when_one_is_locked(tmp_path, out):
     path = str(urdf(tmp_path, wrist="revolute"))
     assert init(out, *NO_BUS, "--urdf", path, "--lock", "wrist").exit_code == 0
 
 
-def test_profiles_are_drafted_from_eds_files_beside_the_configuration(
-    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_profiles_are_drafted_from_eds_files_beside_the_configuration(out, tmp_path, monkeypatch):
     eds = [str(contract_folder() / name) for name in ("stock_drive.eds", "int32_sensor.eds")]
     result = init(out, *NO_BUS, "--eds", eds[0], "--eds", eds[1])
     assert result.exit_code == 0
@@ -333,7 +328,7 @@ def test_profiles_are_drafted_from_eds_files_beside_the_configuration(
     assert drafted.layout_digest == stock.layout_digest
 
 
-def test_the_guessed_worth_of_a_count_lets_16_bits_carry_a_joint_s_torque(tmp_path: Path, out: Path) -> None:
+def test_the_guessed_worth_of_a_count_lets_16_bits_carry_a_joint_s_torque(tmp_path, out):
     assert init(out, *NO_BUS, "--eds", str(write_sensor_eds(tmp_path))).exit_code == 0
     assert "devices.sensor" in written(out).assumed
     warned = examine_configuration(str(out)).warnings
@@ -342,7 +337,7 @@ def test_the_guessed_worth_of_a_count_lets_16_bits_carry_a_joint_s_torque(tmp_pa
     assert (signal.bits, signal.scale) == (16, 2e-3)
 
 
-def test_what_the_device_says_outweighs_the_eds() -> None:
+def test_what_the_device_says_outweighs_the_eds():
     draft = draft_profile(contract_folder() / "int32_sensor.eds", DeviceRatings(torque_Nm=1e-4))
     assert draft.guesses == ()
     assert "torque_Nm = 0.0001\n" in draft.text
@@ -364,9 +359,7 @@ def on_bus(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Rig]:
 BUS = ("-i", "virtual", "-c", "lab", "--yes")
 
 
-def test_devices_are_recognised_with_their_ratings_and_no_drive_is_enabled(
-    out: Path, on_bus: Callable[..., Rig]
-) -> None:
+def test_devices_are_recognised_with_their_ratings_and_no_drive_is_enabled(out, on_bus):
     rig = on_bus()
     result = init(out, *BUS, "--json")
     assert result.exit_code == 0
@@ -385,9 +378,7 @@ def test_devices_are_recognised_with_their_ratings_and_no_drive_is_enabled(
 @pytest.mark.parametrize(
     ("contract", "drive"), [("arm_fd", "adacd-drive-fd"), ("arm_fd_500us", "adacd-drive-fd-500us")]
 )
-def test_the_frames_of_the_devices_tell_profiles_apart(
-    out: Path, on_bus: Callable[..., Rig], contract: str, drive: str
-) -> None:
+def test_the_frames_of_the_devices_tell_profiles_apart(out, on_bus, contract, drive):
     on_bus(codec=load_codec(contract_folder() / f"{contract}.dbc"))
     assert init(out, *BUS).exit_code == 0
     settings = written(out)
@@ -403,9 +394,7 @@ def test_the_frames_of_the_devices_tell_profiles_apart(
         (0, ("--drive-node", "1", "3"), USAGE, "node 3 of --drive-node is no drive that answers; there are 1 2"),
     ],
 )
-def test_a_device_that_is_missing_or_no_drive_is_named(
-    out: Path, on_bus: Callable[..., Rig], silent: int, options: tuple[str, ...], status: int, line: str
-) -> None:
+def test_a_device_that_is_missing_or_no_drive_is_named(out, on_bus, silent, options, status, line):
     rig = on_bus()
     if silent:
         rig.silence(silent)
@@ -416,7 +405,7 @@ def test_a_device_that_is_missing_or_no_drive_is_named(
     assert not out.exists()
 
 
-def test_a_log_gives_its_arm_without_its_user(tmp_path: Path, out: Path) -> None:
+def test_a_log_gives_its_arm_without_its_user(tmp_path, out):
     config = tmp_path / "arm.toml"
     config.write_text(
         'extends = "certified"\nassumed = ["arm.sign", "arm.holding_torque_Nm"]\n[arm]\nlink_length_m = [0.4, 0.25]\n'
@@ -435,7 +424,7 @@ def test_a_log_gives_its_arm_without_its_user(tmp_path: Path, out: Path) -> None
     assert (settings.operator.acknowledges, settings.operator.script) == (False, ())
 
 
-def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out, monkeypatch):
     monkeypatch.setattr("adacd_hil.lab.cli.interview.is_terminal", lambda: True)
     monkeypatch.setattr("adacd_hil.wire.can_interface.can_interfaces", list)
     answers = [
@@ -469,9 +458,7 @@ def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out: Path, mo
     assert "arm.torque_limit_Nm" not in settings.assumed
 
 
-def test_a_question_mark_and_a_mistyped_path_lose_no_answer(
-    tmp_path: Path, out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_question_mark_and_a_mistyped_path_lose_no_answer(tmp_path, out, monkeypatch):
     monkeypatch.setattr("adacd_hil.lab.cli.interview.is_terminal", lambda: True)
     monkeypatch.setattr("adacd_hil.wire.can_interface.can_interfaces", list)
     eds = EdsVariant().without("6091", "608F").write(tmp_path / "drive.eds")
@@ -502,7 +489,7 @@ def test_a_question_mark_and_a_mistyped_path_lose_no_answer(
     assert written(out).arm.link_length_m == (0.35, 0.3)
 
 
-def test_who_ends_the_questions_gets_no_file(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_ends_the_questions_gets_no_file(out, monkeypatch):
     monkeypatch.setattr("adacd_hil.lab.cli.interview.is_terminal", lambda: True)
     result = init(out, typed="none\n")
     assert result.exit_code != 0
@@ -510,7 +497,7 @@ def test_who_ends_the_questions_gets_no_file(out: Path, monkeypatch: pytest.Monk
 
 
 @pytest.mark.slow
-def test_init_ends_with_the_commands_up_to_the_first_run_of_which_tare_is_one(tmp_path: Path) -> None:
+def test_init_ends_with_the_commands_up_to_the_first_run_of_which_tare_is_one(tmp_path):
     out = tmp_path / "my lab" / "my-arm.toml"
     result = init(out, *NO_BUS, "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", "--flat")
     assert result.exit_code == 0, result.stderr

@@ -2,7 +2,6 @@
 
 import json
 
-import pytest
 from called import called
 from rig import CODEC, Rig
 
@@ -16,7 +15,7 @@ def monitor(rig: Rig, node_id: int | None = None) -> Monitor:
     return Monitor(connection, connection.load_decoder(), rig.bus, rig.clock, node_id)
 
 
-def test_the_table_shows_nodes_messages_and_load() -> None:
+def test_the_table_shows_nodes_messages_and_load():
     rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
@@ -37,7 +36,7 @@ def test_the_table_shows_nodes_messages_and_load() -> None:
     assert shown == {"Sensor1Torque", "Sensor1Status", "Sensor1Heartbeat"}
 
 
-def test_frames_that_this_computer_dropped_are_not_counted_against_the_sensor(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_that_this_computer_dropped_are_not_counted_against_the_sensor(monkeypatch):
     rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
@@ -60,7 +59,7 @@ def test_frames_that_this_computer_dropped_are_not_counted_against_the_sensor(mo
     assert (messages["Sensor1Torque"]["lost"], messages["Sensor1Torque"]["errors"]) == (0, 0)
 
 
-def test_a_full_bus_ends_in_time_and_misses_nothing() -> None:
+def test_a_full_bus_ends_in_time_and_misses_nothing():
     rig = Rig(is_wall=True)
     inner = rig.bus.receive
 
@@ -76,7 +75,7 @@ def test_a_full_bus_ends_in_time_and_misses_nothing() -> None:
     assert watched.describe()["frames"] in range(4000, 4300)
 
 
-def test_a_terminal_is_redrawn_in_place_and_not_scrolled() -> None:
+def test_a_terminal_is_redrawn_in_place_and_not_scrolled():
     written: list[str] = []
     screen = Screen(True, written.append)
     screen.draw_table("\n".join(str(number) for number in range(200)))
@@ -87,14 +86,14 @@ def test_a_terminal_is_redrawn_in_place_and_not_scrolled() -> None:
     assert screen.redraw_s == 0.2
 
 
-def test_without_a_terminal_lines_are_plain() -> None:
+def test_without_a_terminal_lines_are_plain():
     written: list[str] = []
     screen = Screen(False, written.append)
     screen.draw_table("a\nb")
     assert written == ["a\nb\n\n"]
 
 
-def test_a_silent_bus_is_said_to_be_and_json_is_one_snapshot() -> None:
+def test_a_silent_bus_is_said_to_be_and_json_is_one_snapshot():
     words = ("monitor", "-i", "virtual", "-c", "silent", "--seconds", "0.1")
     result = called(*words)
     assert (result.exit_code, result.stderr) == (0, "listening on silent\n")
@@ -103,7 +102,7 @@ def test_a_silent_bus_is_said_to_be_and_json_is_one_snapshot() -> None:
     assert (described["frames"], described["messages"], described["not_processed"]) == (0, [], None)
 
 
-def test_every_signal_of_the_contract_can_be_shown() -> None:
+def test_every_signal_of_the_contract_can_be_shown():
     rig = Rig(is_wall=True)
     watched = monitor(rig)
     for message in CODEC.messages.values():

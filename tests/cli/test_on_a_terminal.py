@@ -125,7 +125,7 @@ def is_one_word(line: str) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("columns", long_but(1, [40, 80, 60]))  # tables and `fold` are tested at every width
-def test_no_line_is_longer_than_the_terminal_and_plain_words_have_no_escape_code(folder: Path, columns: int) -> None:
+def test_no_line_is_longer_than_the_terminal_and_plain_words_have_no_escape_code(folder, columns):
     shown = play(folder, COMMANDS, columns, NO_COLOR="1")
     assert [line for line in shown.lines if len(line) > columns and not is_one_word(line)] == []
     assert sum(line.startswith("status ") for line in shown.lines) == len(COMMANDS)
@@ -134,28 +134,28 @@ def test_no_line_is_longer_than_the_terminal_and_plain_words_have_no_escape_code
 
 
 @pytest.mark.slow
-def test_a_terminal_that_is_dumb_gets_plain_text(folder: Path) -> None:
+def test_a_terminal_that_is_dumb_gets_plain_text(folder):
     shown = play(folder, [*MARKED, (HOST, "monitor", "-i", "virtual", "-c", "x", "--once")], 80, TERM="dumb")
     assert "\x1b" not in shown.text
     assert "\r" not in shown.text.replace("\r\n", "")
 
 
 @pytest.mark.slow
-def test_marks_have_a_colour_and_say_the_same_without(folder: Path, marked: Shown) -> None:
+def test_marks_have_a_colour_and_say_the_same_without(folder, marked):
     for mark in ("\x1b[32mok\x1b[0m ", "\x1b[31mFAILED\x1b[0m   nodes ", "\x1b[31madacd-hil:\x1b[0m log none.mcap"):
         assert mark in marked.text
     assert marked.lines == play(folder, MARKED, 80, NO_COLOR="1").lines
 
 
 @pytest.mark.slow
-def test_what_a_check_says_while_it_goes_on_is_gone_when_it_ends(marked: Shown) -> None:
+def test_what_a_check_says_while_it_goes_on_is_gone_when_it_ends(marked):
     assert "scheduler: " in marked.text
     assert [line for line in marked.lines if ": ok" in line or ": skipped" in line] == []
     assert marked.lines[0].startswith("ok       settings ")
 
 
 @pytest.mark.slow
-def test_help_is_whole_on_a_terminal(folder: Path) -> None:
+def test_help_is_whole_on_a_terminal(folder):
     shown = play(folder, HELPS, 60)
     assert [line for line in shown.lines if len(line) > 60 and not is_one_word(line)] == []
     assert shown.lines.count("status 0") == len(HELPS)
@@ -163,7 +163,7 @@ def test_help_is_whole_on_a_terminal(folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_an_emulator_that_compiles_counts_in_one_line_and_leaves_nothing() -> None:
+def test_an_emulator_that_compiles_counts_in_one_line_and_leaves_nothing():
     environment = {**os.environ, "TERM": "xterm", "PYTHONPATH": str(Path.cwd()), "NO_COLOR": "1"}
     shown = show_on_terminal([sys.executable, "-c", COUNT], 60, 24, environment)
     written = [piece.removeprefix("\x1b[2K") for line in shown.text.split("\r\n") for piece in line.split("\r")]
@@ -185,7 +185,7 @@ suggest("adacd-hil report runs/2026-11-25T10-00-00 --out /srv/reports/of/the/lef
 
 
 @pytest.mark.slow
-def test_a_command_that_may_be_typed_next_can_be_copied_from_a_narrow_terminal() -> None:
+def test_a_command_that_may_be_typed_next_can_be_copied_from_a_narrow_terminal():
     environment = {**os.environ, "TERM": "xterm", "PYTHONPATH": str(Path.cwd())}
     shown = show_on_terminal([sys.executable, "-c", SUGGEST], 60, 24, environment)
     assert shown.text.startswith("\x1b[1mnext:\x1b[0m ")

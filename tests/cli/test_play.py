@@ -5,13 +5,26 @@ import json
 import can
 import pytest
 from click.testing import CliRunner
-from recorded_frames_log import write_frames
 
 from adacd_hil.lab.cli import play_command as play_module
 from adacd_hil.lab.cli.play_command import play
+from adacd_hil.log.frames.mcap_frames import FrameWriter, RecordedFrame
 from adacd_hil.scheduling import RealtimeGrant
 
 CHANNEL = "test_play"
+KINDS = (
+    {"can_id": 0x000, "data": b"\x01\x00", "is_tx": True},
+    {"can_id": 0x080, "data": b"\x07", "is_tx": True},
+    {"can_id": 0x181, "data": bytes(8)},
+    {"can_id": 0x18DAF110, "data": b"\x01", "is_extended": True},
+    {"can_id": 0x201, "data": bytes(6), "is_tx": True},
+    {"can_id": 0x7A5, "data": b"\x02"},
+    {"can_id": 0x181, "data": b"", "length": 8, "is_remote": True},
+    {"can_id": 0x004, "data": bytes(8), "is_error": True},
+    {"can_id": 0x181, "data": bytes(8), "is_fd": True, "has_rate_switch": True},
+    {"can_id": 0x123, "data": b"", "is_extended": True},
+)
+"""A frame of every kind that a playback meets."""
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +46,13 @@ def heard(bus):
 
 @pytest.fixture
 def log(tmp_path):
-    return write_frames(tmp_path / "bus.mcap")
+    path = tmp_path / "bus.mcap"
+    with path.open("wb") as file:
+        writer = FrameWriter(file)
+        for number, kind in enumerate(KINDS):
+            writer.write_frame(RecordedFrame(**{"t_ns": 1_000_000 * number, "length": len(kind["data"]), **kind}))
+        writer.finish()
+    return path
 
 
 def run(log, *arguments):

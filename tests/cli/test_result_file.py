@@ -24,7 +24,7 @@ sine = [[0.0, 0.0], [0.0, 0.0]]
 """
 
 
-def test_a_place_is_tried_and_left_as_it_was(tmp_path: Path) -> None:
+def test_a_place_is_tried_and_left_as_it_was(tmp_path):
     (tmp_path / "old.toml").write_text("kept")
     for out in (tmp_path / "old.toml", tmp_path / "new" / "newer" / "x.toml"):
         with checked_place(out):
@@ -41,7 +41,7 @@ def test_a_place_is_tried_and_left_as_it_was(tmp_path: Path) -> None:
         ("/proc/none/x.toml", "No such file or directory"),
     ],
 )
-def test_a_place_that_takes_no_file_is_said_before_the_search(out: str, reason: str, tmp_path: Path) -> None:
+def test_a_place_that_takes_no_file_is_said_before_the_search(out, reason, tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(CommandError, match=rf"can't be written: {reason}"), checked_place(tmp_path / out):
         raise AssertionError("searched")
@@ -53,9 +53,7 @@ def fill(path: Path, content: str) -> None:
 
 
 @pytest.mark.parametrize("has_all", [False, True])
-def test_what_was_found_is_told_where_it_can_not_be_written(
-    has_all: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_found_is_told_where_it_can_not_be_written(has_all, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("adacd_hil.cli.output.replace_file", fill)
     out = tmp_path / "x.toml"
     with pytest.raises(CommandError) as raised:
@@ -66,7 +64,7 @@ def test_what_was_found_is_told_where_it_can_not_be_written(
 
 
 @pytest.mark.parametrize("words", [("excitation",), ("tune", "none.mcap"), ("thresholds", "none.mcap")])
-def test_each_search_tries_its_place(words: tuple[str, ...], tmp_path: Path) -> None:
+def test_each_search_tries_its_place(words, tmp_path):
     (tmp_path / "file").touch()
     done = called(*words, "--out", tmp_path / "file" / "x.toml")
     assert (done.exit_code, done.stdout) == (FAILURE, "")
@@ -76,9 +74,7 @@ def test_each_search_tries_its_place(words: tuple[str, ...], tmp_path: Path) -> 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("json_words", [(), ("--json",)], ids=["text", "json"])
-def test_an_excitation_that_has_no_room_is_not_lost(
-    json_words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_excitation_that_has_no_room_is_not_lost(json_words, tmp_path, monkeypatch):
     monkeypatch.setattr("adacd_hil.cli.output.replace_file", fill)
     monkeypatch.chdir(tmp_path)
     Path("small.toml").write_text(SMALL)

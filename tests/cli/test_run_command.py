@@ -1,7 +1,6 @@
 """What `run` asks before the arm moves, and what it says of a run that has broken off."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from bus_lab import BUS_MISSING, SHORT_RUN, Lab, answered
@@ -44,23 +43,19 @@ def with_arm(**arm):
     ],
     ids=["nothing", "free motors", "one brake", "a tare", "a rough tare", "a last certificate", "a rough one"],
 )
-def test_a_joint_has_an_anchor_by_a_tare_a_last_certificate_or_a_motor_that_holds_little(settings, joints) -> None:
+def test_a_joint_has_an_anchor_by_a_tare_a_last_certificate_or_a_motor_that_holds_little(settings, joints):
     assert unanchored_joints(settings) == joints
 
 
 @pytest.mark.parametrize(("answer", "is_started"), [("y\n", True), ("\n", False)])
-def test_on_a_terminal_the_user_says_that_an_arm_may_run_without_an_anchor(
-    monkeypatch: pytest.MonkeyPatch, answer: str, is_started: bool
-) -> None:
+def test_on_a_terminal_the_user_says_that_an_arm_may_run_without_an_anchor(monkeypatch, answer, is_started):
     result = answered(monkeypatch, lambda: ask_without_anchor([1], "-i kvaser -c 0"), answer)
     assert (result.exit_code, "started" in result.stdout) == (0 if is_started else 1, is_started)
     assert "the torque offset of joint 2 has no bound" in result.stderr
     assert "`adacd-hil tare -i kvaser -c 0` first, then `run --tare tare.toml`" in result.stderr
 
 
-def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(tmp_path, monkeypatch):
     lab = Lab(tmp_path, monkeypatch)
     lab.settings_file.write_text('scheme = "certified"\n' + SHORT_RUN)
     monkeypatch.setattr("adacd_hil.cli.commands.run_command.may_be_hardware", lambda interface, channel: True)
@@ -73,14 +68,14 @@ def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
 
 
 @pytest.mark.parametrize("interface", ["socketcan", "sockercan", "udp_multicast"])
-def test_an_interface_that_cannot_be_used_is_named_before_any_question(interface: str) -> None:
+def test_an_interface_that_cannot_be_used_is_named_before_any_question(interface):
     result = called("run", "-i", interface, "-c", "can77", "--config", "certified")
     assert result.exit_code == BUS_MISSING
     assert "torque offset" not in result.stderr
 
 
 @pytest.mark.slow
-def test_a_run_that_loses_its_devices_says_how_far_it_had_come(tmp_path: Path) -> None:
+def test_a_run_that_loses_its_devices_says_how_far_it_had_come(tmp_path):
     summary, _ = run_embedded(resolve("certified", "power-loss", None, None), "lockstep", tmp_path)
     assert summary.result is None
     told = summarise(summary)

@@ -14,7 +14,7 @@ def scanned(rig: Rig, codec: Codec = CODEC) -> dict:
     return describe(found, compare(found, expected_nodes(rig.master.slaves, codec)), codec)
 
 
-def test_the_table_shows_nodes_what_they_send_and_whether_they_fit() -> None:
+def test_the_table_shows_nodes_what_they_send_and_whether_they_fit():
     rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
@@ -31,7 +31,7 @@ def test_the_table_shows_nodes_what_they_send_and_whether_they_fit() -> None:
     assert lines[-1] == "nodes: 4 as expected"
 
 
-def test_nodes_that_only_answer_are_not_taken_for_silence() -> None:
+def test_nodes_that_only_answer_are_not_taken_for_silence():
     rig = Rig(is_wall=True)
     rig.forget()
     text = as_text(scanned(rig))
@@ -44,7 +44,7 @@ def test_nodes_that_only_answer_are_not_taken_for_silence() -> None:
     ]
 
 
-def test_an_empty_bus_is_said_to_be_and_each_node_missing() -> None:
+def test_an_empty_bus_is_said_to_be_and_each_node_missing():
     rig = Rig(is_wall=True)
     rig.tamper = lambda cycle, can_id, data: None
     rig.forget()
@@ -54,14 +54,14 @@ def test_an_empty_bus_is_said_to_be_and_each_node_missing() -> None:
     assert text.splitlines()[-1] == "nodes: 0 as expected, 4 missing"
 
 
-def test_the_result_is_json() -> None:
+def test_the_result_is_json():
     described = scanned(Rig(is_wall=True))
     assert json.loads(json.dumps(described)) == described
     assert described["contract"] == {"name": "arm.dbc", "wire_version": 1, "layout_digest": "0xF80FDAE0"}
     assert {node["layout_digest"] for node in described["nodes"]} == {"0xF80FDAE0"}
 
 
-def test_nodes_with_another_layout_are_told_apart() -> None:
+def test_nodes_with_another_layout_are_told_apart():
     """The nodes have arm.dbc; the host has it with another scale of the torque."""
     text = CODEC.text.replace(b"@1- (1e-06,0)", b"@1- (2e-06,0)")
     other = parse_codec(text, CODEC.path)
@@ -77,7 +77,7 @@ def test_nodes_with_another_layout_are_told_apart() -> None:
     assert lines[-1] == "nodes: 0 as expected, 4 different"
 
 
-def test_a_node_that_tells_no_digest_is_different() -> None:
+def test_a_node_that_tells_no_digest_is_different():
     rig = Rig(is_wall=True)
     rig.tamper = lambda cycle, can_id, data: None if can_id == 0x583 and data[1:4] == bytes.fromhex("002002") else data
     described = scanned(rig)

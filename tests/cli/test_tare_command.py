@@ -21,7 +21,7 @@ def lab(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Lab:
     return Lab(tmp_path, monkeypatch)
 
 
-def test_a_tare_is_measured_stored_and_printed(lab: Lab) -> None:
+def test_a_tare_is_measured_stored_and_printed(lab):
     result = lab.tare("--json")
     assert result.exit_code == 0, result.stderr
     printed = json.loads(result.stdout)
@@ -32,7 +32,7 @@ def test_a_tare_is_measured_stored_and_printed(lab: Lab) -> None:
     assert stored.samples == 300
 
 
-def test_a_second_tare_keeps_the_first_and_says_what_it_replaces(lab: Lab) -> None:
+def test_a_second_tare_keeps_the_first_and_says_what_it_replaces(lab):
     lab.tare()
     first = read_tare(lab.tare_file)
     lab.scenario["torque_offset_Nm"] = [0.4, -0.2]
@@ -43,7 +43,7 @@ def test_a_second_tare_keeps_the_first_and_says_what_it_replaces(lab: Lab) -> No
     assert result.stdout.splitlines()[-1] == f"{lab.tare_file}; the one before is {lab.tare_file}.1"
 
 
-def test_a_refused_tare_is_one_line_and_leaves_the_file_as_it_was(lab: Lab) -> None:
+def test_a_refused_tare_is_one_line_and_leaves_the_file_as_it_was(lab):
     lab.tare()
     before = lab.tare_file.read_bytes()
     lab.scenario["torque_offset_Nm"] = [0.3, 3.0]
@@ -55,7 +55,7 @@ def test_a_refused_tare_is_one_line_and_leaves_the_file_as_it_was(lab: Lab) -> N
     assert [path.name for path in lab.folder.iterdir() if path.name.startswith("tare")] == ["tare.toml"]
 
 
-def test_a_file_that_is_no_tare_is_not_overwritten(lab: Lab) -> None:
+def test_a_file_that_is_no_tare_is_not_overwritten(lab):
     lab.tare_file.write_text(SHORT_RUN)
     result = lab.tare()
     assert result.exit_code == USAGE
@@ -64,14 +64,14 @@ def test_a_file_that_is_no_tare_is_not_overwritten(lab: Lab) -> None:
     assert lab.tare_file.read_text() == SHORT_RUN
 
 
-def test_the_options_outweigh_the_configuration_whose_offset_a_first_tare_replaces(lab: Lab) -> None:
+def test_the_options_outweigh_the_configuration_whose_offset_a_first_tare_replaces(lab):
     lab.settings_file.write_text("[tare]\nposes = 3\nwindow_s = 5.0\n[arm]\ntorque_offset_Nm = [0.25, 0.0]\n")
     result = lab.tare("--config", str(lab.settings_file), "--poses", "1")
     assert result.exit_code == 0, result.stderr
     assert (read_tare(lab.tare_file).samples, read_tare(lab.tare_file).old_offset_Nm) == (300, (0.25, 0.0))
 
 
-def test_several_poses_tell_the_user_what_to_do(lab: Lab) -> None:
+def test_several_poses_tell_the_user_what_to_do(lab):
     lab.settings_file.write_text("[tare]\nmove_timeout_s = 1.0\n")
     result = lab.tare("--config", str(lab.settings_file), "--poses", "2")
     assert result.exit_code == FAILURE
@@ -80,7 +80,7 @@ def test_several_poses_tell_the_user_what_to_do(lab: Lab) -> None:
     assert "the arm has not been moved by more than tare.move_deg = 10 deg" in line
 
 
-def test_with_the_tare_the_run_sees_no_torque_at_rest_and_the_log_holds_raw_tared_and_the_tare_itself(lab: Lab) -> None:
+def test_with_the_tare_the_run_sees_no_torque_at_rest_and_the_log_holds_raw_tared_and_the_tare_itself(lab):
     lab.tare()
     result = lab.run("--tare", str(lab.tare_file))
     assert result.exit_code == 0, result.stderr
@@ -97,7 +97,7 @@ def test_with_the_tare_the_run_sees_no_torque_at_rest_and_the_log_holds_raw_tare
     assert any(entry.event.name == "tare" and entry.event.level == "info" for entry in log.events)
 
 
-def test_a_tare_of_other_sensors_is_refused_before_the_arm_is_started(lab: Lab) -> None:
+def test_a_tare_of_other_sensors_is_refused_before_the_arm_is_started(lab):
     lab.tare()
     lab.serials[3] = 4711
     result = lab.run("--tare", str(lab.tare_file))
@@ -109,7 +109,7 @@ def test_a_tare_of_other_sensors_is_refused_before_the_arm_is_started(lab: Lab) 
     assert len(log.scheme["tau_J"]) == 0
 
 
-def test_an_old_tare_is_used_with_a_warning_on_the_terminal_and_in_the_log(lab: Lab) -> None:
+def test_an_old_tare_is_used_with_a_warning_on_the_terminal_and_in_the_log(lab):
     lab.tare()
     date = read_tare(lab.tare_file).date_utc
     lab.tare_file.write_text(lab.tare_file.read_text().replace(date, "2020-01-01T00:00:00Z"))
@@ -120,7 +120,7 @@ def test_an_old_tare_is_used_with_a_warning_on_the_terminal_and_in_the_log(lab: 
         assert "more than tare.warn_age_h = 24 h" in text
 
 
-def test_a_tare_that_cant_be_used_is_one_line_and_wrong_usage(lab: Lab) -> None:
+def test_a_tare_that_cant_be_used_is_one_line_and_wrong_usage(lab):
     lab.tare()
     lab.settings_file.write_text("[arm]\nsign = [1, -1]\n")
     result = lab.run("--tare", str(lab.tare_file))

@@ -64,6 +64,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("run -i slcan -c tty1 --clock lockstep", USAGE, ("lockstep is for emulated arms", "it needs --clock realtime")),
     ("commtest -i udp_multicast -c 239.0.0.1", BUS_MISSING, ("echoes own frames",)),
     ("commtest -i virtual -c empty --seconds 0.1", BUS_MISSING, ("no boot-up from Drive1 (node 1)",)),
+    ("tare -i virtual -c empty --out new.toml", BUS_MISSING, ("no boot-up from Drive1 (node 1)",)),
     (f"{RUN} -b 1M", USAGE, ("'1M' is not a valid integer", "run --help")),
     ("init new.toml -i virtual -c x --yes", BUS_MISSING, ("drives that answer: none", "Check power, wiring and node")),
     ("monitor --url ws://127.0.0.1:1", FAILURE, ("nobody serves one there", "start the run with --live")),
@@ -153,16 +154,7 @@ def interface(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(("typed", "status", "words"), MISTAKES, ids=[typed for typed, _, _ in MISTAKES])
-def test_a_mistake_gets_one_line_with_the_remedy(
-    folder: Path,
-    port: int,
-    interface: None,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    typed: str,
-    status: int,
-    words: tuple[str, ...],
-) -> None:
+def test_a_mistake_gets_one_line_with_the_remedy(folder, port, interface, monkeypatch, capsys, typed, status, words):
     monkeypatch.chdir(folder)
     with pytest.raises(SystemExit) as ended:
         main(shlex.split(typed.format(port=port)))
@@ -178,7 +170,7 @@ def test_a_mistake_gets_one_line_with_the_remedy(
 
 
 @pytest.mark.slow
-def test_a_full_disk_behind_the_output_is_a_partial_result() -> None:
+def test_a_full_disk_behind_the_output_is_a_partial_result():
     """The door to the terminals is the program's, so this one runs as one."""
     script = "from adacd_hil.cli.start_host import start_host; start_host()"
     with Path("/dev/full").open("w") as full:

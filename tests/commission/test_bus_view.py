@@ -24,7 +24,7 @@ def torque_frames(count: int) -> list[bytes]:
     return [sender.protect(TORQUE.encode(0.001 * number)) for number in range(count)]
 
 
-def test_a_message_has_rate_age_and_the_values_of_its_last_frame() -> None:
+def test_a_message_has_rate_age_and_the_values_of_its_last_frame():
     seen = view()
     for number, data in enumerate(torque_frames(100)):
         seen.accept(Frame(0x183, data, 10 * MS * number))
@@ -33,7 +33,7 @@ def test_a_message_has_rate_age_and_the_values_of_its_last_frame() -> None:
     assert message.values == (("torque", pytest.approx(0.099), "Nm"),)
 
 
-def test_a_lost_frame_and_a_wrong_crc_are_told_apart_and_change_no_value() -> None:
+def test_a_lost_frame_and_a_wrong_crc_are_told_apart_and_change_no_value():
     seen = view()
     frames = torque_frames(6)
     frames[5] = frames[5][:-1] + bytes((frames[5][-1] ^ 1,))
@@ -44,7 +44,7 @@ def test_a_lost_frame_and_a_wrong_crc_are_told_apart_and_change_no_value() -> No
     assert message.values == (("torque", pytest.approx(0.004), "Nm"),)
 
 
-def test_what_this_computer_lost_is_no_fault_of_a_device() -> None:
+def test_what_this_computer_lost_is_no_fault_of_a_device():
     frames = torque_frames(60)
     blamed, excused = view(), view()
     for number in (0, 1, 58, 59):
@@ -56,21 +56,21 @@ def test_what_this_computer_lost_is_no_fault_of_a_device() -> None:
     assert [(verdict.lost, verdict.errors) for verdict in verdicts] == [(0, 2), (0, 0)]
 
 
-def test_a_frame_of_the_wrong_length_is_an_error_and_has_no_value() -> None:
+def test_a_frame_of_the_wrong_length_is_an_error_and_has_no_value():
     seen = view()
     seen.accept(Frame(0x181, b"\x01\x02", MS))
     message = by_name(seen.snapshot(2 * MS))["Drive1Feedback"]
     assert (message.errors, message.values, message.data) == (1, (), b"\x01\x02")
 
 
-def test_an_unknown_identifier_is_shown_with_its_bytes() -> None:
+def test_an_unknown_identifier_is_shown_with_its_bytes():
     seen = view()
     seen.accept(Frame(0x055, b"\xab", MS))
     (message,) = seen.snapshot(2 * MS).messages
     assert (message.name, message.is_known, message.data) == ("unknown", False, b"\xab")
 
 
-def test_nodes_are_told_by_their_heartbeats() -> None:
+def test_nodes_are_told_by_their_heartbeats():
     seen = view()
     seen.accept(Frame(0x702, b"\x7f", 100 * MS))
     seen.accept(Frame(0x709, b"\x05", 150 * MS))
@@ -78,7 +78,7 @@ def test_nodes_are_told_by_their_heartbeats() -> None:
     assert nodes == [(2, "Drive2", "pre-operational", 0.1), (9, "", "operational", 0.05)]
 
 
-def test_a_node_filter_leaves_that_nodes_identifiers() -> None:
+def test_a_node_filter_leaves_that_nodes_identifiers():
     seen = view()
     for can_id in (0x080, 0x181, 0x182, 0x201, 0x701, 0x702):
         seen.accept(Frame(can_id, b"\x05", MS))
@@ -88,7 +88,7 @@ def test_a_node_filter_leaves_that_nodes_identifiers() -> None:
     assert snapshot.frames == 6
 
 
-def test_a_rate_follows_a_talker_that_falls_silent() -> None:
+def test_a_rate_follows_a_talker_that_falls_silent():
     seen = view()
     for number in range(1000):
         seen.accept(Frame(0x080, b"\x01", number * MS))
@@ -96,7 +96,7 @@ def test_a_rate_follows_a_talker_that_falls_silent() -> None:
     assert rates == [1000.0, 500.0, 0.0, 0.0]
 
 
-def test_the_load_is_that_since_the_snapshot_before() -> None:
+def test_the_load_is_that_since_the_snapshot_before():
     seen = view()
     for number in range(100):
         seen.accept(Frame(0x7FF, bytes(8), number * MS))
@@ -105,14 +105,14 @@ def test_the_load_is_that_since_the_snapshot_before() -> None:
     assert second.load_percent == 0.0
 
 
-def test_a_frame_too_long_for_the_contracts_bus_is_counted_and_left_out_of_the_load() -> None:
+def test_a_frame_too_long_for_the_contracts_bus_is_counted_and_left_out_of_the_load():
     seen = view()
     seen.accept(Frame(0x055, bytes(12), MS))
     snapshot = seen.snapshot(2 * MS)
     assert (snapshot.strange_frames, snapshot.load_percent, snapshot.messages[0].count) == (1, 0.0, 1)
 
 
-def test_error_frames_are_counted_apart() -> None:
+def test_error_frames_are_counted_apart():
     seen = view()
     seen.accept(Frame(0x040, bytes(8), MS, is_error=True))
     snapshot = seen.snapshot(2 * MS)

@@ -38,7 +38,7 @@ def commands(rig: Rig) -> set[tuple[int, int]]:
     return {tuple(map(int, COMMAND.decode_values(frame.data))) for frame in rig.sent if frame.can_id in COMMANDS}
 
 
-def test_an_undisturbed_connection_is_good_and_complete_and_asks_the_drives_for_no_voltage() -> None:
+def test_an_undisturbed_connection_is_good_and_complete_and_asks_the_drives_for_no_voltage():
     rig = Rig(is_wall=True)
     report, fault = run(rig)
     assert commands(rig) == {(0x0000, 0)}
@@ -47,7 +47,7 @@ def test_an_undisturbed_connection_is_good_and_complete_and_asks_the_drives_for_
     assert [device.ages[0] for device in report.devices.values()] == [200] * 4
 
 
-def test_enabled_drives_get_no_torque_and_are_disabled_at_the_end() -> None:
+def test_enabled_drives_get_no_torque_and_are_disabled_at_the_end():
     rig = Rig(is_wall=True)
     report, fault = run(rig, is_enabling=True)
     assert (report.verdict, fault) == (Verdict.GOOD, FaultReason.NONE)
@@ -57,7 +57,7 @@ def test_enabled_drives_get_no_torque_and_are_disabled_at_the_end() -> None:
     assert not any(drive.is_enabled for drive in rig.bench.drives)
 
 
-def test_a_drive_that_drops_out_ends_an_enabled_test_with_quick_stop() -> None:
+def test_a_drive_that_drops_out_ends_an_enabled_test_with_quick_stop():
     rig = Rig(is_wall=True)
     loop = loop_of(rig, is_enabling=True)
     cycles = []
@@ -73,7 +73,7 @@ def test_a_drive_that_drops_out_ends_an_enabled_test_with_quick_stop() -> None:
     assert COMMAND.decode_values(last.data) == (0x0002, 0)
 
 
-def test_every_fifteenth_torque_frame_lost_is_a_warning_and_told_by_device() -> None:
+def test_every_fifteenth_torque_frame_lost_is_a_warning_and_told_by_device():
     rig = Rig(is_wall=True)
     count = [0]
 
@@ -90,7 +90,7 @@ def test_every_fifteenth_torque_frame_lost_is_a_warning_and_told_by_device() -> 
     assert (sensor.ages[:3], sensor.checks["OK_SOME_LOST"]) == ([280, 20, 0], 21)  # one more while disabling
 
 
-def test_a_device_that_never_answers_is_not_sufficient() -> None:
+def test_a_device_that_never_answers_is_not_sufficient():
     rig = Rig(is_wall=True)
     rig.tamper = lambda cycle, can_id, data: None if can_id == 0x182 else data
     report, _ = run(rig)
@@ -99,7 +99,7 @@ def test_a_device_that_never_answers_is_not_sufficient() -> None:
     assert set(report.columns["frames_missing"].tolist()) == {1}
 
 
-def test_skipped_periods_count_as_without_data() -> None:
+def test_skipped_periods_count_as_without_data():
     rig = Rig(is_wall=True)
     loop = loop_of(rig)
     begin_ns = rig.clock.now_ns()
@@ -114,7 +114,7 @@ def test_skipped_periods_count_as_without_data() -> None:
     assert report.columns["overruns"][[49, 51, -1]].tolist() == [0, 20, 20]
 
 
-def test_the_record_of_a_cycle_has_its_queues_and_what_was_lost(monkeypatch) -> None:
+def test_the_record_of_a_cycle_has_its_queues_and_what_was_lost(monkeypatch):
     rig = Rig(is_wall=True)
     monkeypatch.setattr(type(rig.bus), "queue_bytes", lambda bus: QueueBytes(700, 1400))
     monkeypatch.setattr(type(rig.bus), "frames_lost", 3, raising=False)
@@ -136,11 +136,11 @@ def test_the_record_of_a_cycle_has_its_queues_and_what_was_lost(monkeypatch) -> 
         (np.nextafter(0.90, 0.0), Verdict.NOT_SUFFICIENT),
     ],
 )
-def test_verdicts_change_at_the_bounds(share: float, verdict: Verdict) -> None:
+def test_verdicts_change_at_the_bounds(share, verdict):
     assert judge(share) is verdict
 
 
-def test_an_interrupt_ends_the_loop_and_disables() -> None:
+def test_an_interrupt_ends_the_loop_and_disables():
     rig = Rig(is_wall=True)
     loop = loop_of(rig)
     seen = []

@@ -1,7 +1,6 @@
 """Doctor's checks of the host, as rows: what the kernel says, and what is made of it."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -67,27 +66,25 @@ FD = {"data_bitrate": 5_000_000}
         ("mtu", {"mtu": 16}, FD, Status.FAILED, "no CAN FD frames"),
     ],
 )
-def test_an_interface_is_judged_by_what_the_kernel_says(
-    check: str, changes: dict[str, Any], contract: dict[str, int], status: Status, text: str
-) -> None:
+def test_an_interface_is_judged_by_what_the_kernel_says(check, changes, contract, status, text):
     outcome = RUN[check](host(dataclasses.replace(CAN0, **changes), **contract))
     assert outcome.status is status
     assert text in outcome.reason
     assert bool(outcome.remedy) is (status in (Status.WARNING, Status.FAILED))
 
 
-def test_an_interface_that_is_not_there_is_named_with_those_that_are() -> None:
+def test_an_interface_that_is_not_there_is_named_with_those_that_are():
     outcome = RUN["interface"](host(None))
     assert outcome.status is Status.FAILED
     assert outcome.reason.startswith("can0 is no CAN interface; present: ")
 
 
 @pytest.mark.parametrize("check", ["kernel", "interface", "permissions"])
-def test_python_cans_own_interfaces_have_no_kernel_to_look_at(check: str) -> None:
+def test_python_cans_own_interfaces_have_no_kernel_to_look_at(check):
     assert RUN[check](host(None, interface="virtual")).status is Status.SKIPPED
 
 
-def test_what_is_granted_is_told_and_what_is_not_with_its_remedy() -> None:
+def test_what_is_granted_is_told_and_what_is_not_with_its_remedy():
     reason = RUN["scheduler"](host()).reason
     assert reason == "scheduler SCHED_FIFO 80, cpu 3, memory locked, idle states shallow"
     grant = RealtimeGrant("SCHED_OTHER", (Refusal("SCHED_FIFO: no", "allow it"), Refusal("memory: no", "allow that")))
@@ -107,7 +104,7 @@ def test_what_is_granted_is_told_and_what_is_not_with_its_remedy() -> None:
         ("1", "2-3", Status.WARNING, "processor 1 is shared"),
     ],
 )
-def test_a_processor_of_its_own_is_judged(tmp_path: Path, cpu: str, isolated: str, status: Status, text: str) -> None:
+def test_a_processor_of_its_own_is_judged(tmp_path, cpu, isolated, status, text):
     folder = tmp_path / "sys/devices/system/cpu"
     folder.mkdir(parents=True)
     (folder / "isolated").write_text(f"{isolated}\n")
@@ -145,9 +142,7 @@ def throttled(runtime_us: int) -> dict[str, str]:
         ({}, "throttling", Status.SKIPPED, "/proc"),
     ],
 )
-def test_the_machine_is_judged_by_its_files(
-    tmp_path: Path, files: dict[str, str], check: str, status: Status, text: str
-) -> None:
+def test_the_machine_is_judged_by_its_files(tmp_path, files, check, status, text):
     for name, content in files.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -157,7 +152,7 @@ def test_the_machine_is_judged_by_its_files(
     assert text in outcome.reason
 
 
-def test_a_link_is_read_from_iproute2() -> None:
+def test_a_link_is_read_from_iproute2():
     shown = {
         "ifname": "can0",
         "flags": ["NOARP", "UP", "LOWER_UP", "ECHO"],
@@ -180,12 +175,12 @@ def test_a_link_is_read_from_iproute2() -> None:
     assert parse_ip_link(shown) == CAN0
 
 
-def test_a_vcan_has_no_bit_timing() -> None:
+def test_a_vcan_has_no_bit_timing():
     shown = {"ifname": "vcan0", "flags": ["UP"], "mtu": 72, "txqlen": 1000, "link_type": "can"}
     link = parse_ip_link(shown | {"linkinfo": {"info_kind": "vcan"}})
     assert link is not None
     assert (link.bitrate, link.restart_ms, link.state, link.is_virtual) == (None, None, None, True)
 
 
-def test_what_is_no_can_is_no_link() -> None:
+def test_what_is_no_can_is_no_link():
     assert parse_ip_link({"ifname": "lo", "flags": ["UP"], "link_type": "loopback", "mtu": 65536}) is None

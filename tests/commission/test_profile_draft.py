@@ -41,19 +41,19 @@ def guessed(drafted: ProfileDraft) -> set[str]:
     ("unit", "rad_s"),
     [(RPM, math.pi / 30.0), (MILLI_RPM, math.pi / 30_000.0), (DEGREES_PER_S, math.pi / 180.0)],
 )
-def test_the_unit_of_velocity_is_that_of_the_motor(eds: Path, unit: int, rad_s: float) -> None:
+def test_the_unit_of_velocity_is_that_of_the_motor(eds, unit, rad_s):
     drafted = draft(eds, EdsVariant().with_object("60A9", unit))
     assert drafted.settings.scale.velocity_rad_s == pytest.approx(rad_s / GEAR)
     assert "velocity_rad_s" not in guessed(drafted)
 
 
-def test_without_a_unit_of_velocity_a_count_is_guessed_to_be_an_increment_per_second(eds: Path) -> None:
+def test_without_a_unit_of_velocity_a_count_is_guessed_to_be_an_increment_per_second(eds):
     drafted = draft(eds, EdsVariant())
     assert drafted.settings.scale.velocity_rad_s == pytest.approx(math.tau / 65536 / GEAR)
     assert "velocity_rad_s" in guessed(drafted)
 
 
-def test_an_answer_is_no_guess(eds: Path) -> None:
+def test_an_answer_is_no_guess(eds):
     drafted = draft(eds, EdsVariant(), velocity_unit=RPM, gear_ratio=50.0, gear_efficiency=0.8)
     scale = drafted.settings.scale
     assert (scale.gear_ratio, scale.gear_efficiency) == (50.0, 0.8)
@@ -63,7 +63,7 @@ def test_an_answer_is_no_guess(eds: Path) -> None:
 
 
 @pytest.mark.parametrize("access", ["rw", "rww"])
-def test_increments_that_the_factory_sets_are_a_guess_until_the_device_says_them(eds: Path, access: str) -> None:
+def test_increments_that_the_factory_sets_are_a_guess_until_the_device_says_them(eds, access):
     variant = EdsVariant().with_value(2000, "608Fsub1").with_value(access, "608Fsub1", key="AccessType")
     drafted = draft(eds, variant)
     assert drafted.settings.scale.increments_per_joint_rev == 2000 * GEAR
@@ -73,27 +73,27 @@ def test_increments_that_the_factory_sets_are_a_guess_until_the_device_says_them
 
 
 @pytest.mark.parametrize("increments", [1, 2000])
-def test_fewer_increments_than_a_joint_has_are_nobody_s(eds: Path, increments: int) -> None:
+def test_fewer_increments_than_a_joint_has_are_nobody_s(eds, increments):
     drafted = draft(eds, EdsVariant().with_value(increments, "608Fsub1").with_value(1, "6091sub1"))
     assert drafted.settings.scale.increments_per_joint_rev > 1e5
     assert "increments_per_joint_rev" in guessed(drafted)
 
 
-def test_the_coarse_increments_of_a_device_that_was_read_are_kept_as_a_guess(eds: Path) -> None:
+def test_the_coarse_increments_of_a_device_that_was_read_are_kept_as_a_guess(eds):
     numbers = {(0x608F, 1): 2000, (0x608F, 2): 1, (0x6091, 1): 1, (0x6091, 2): 1}
     drafted = draft_profile(EdsVariant().write(eds), DeviceRatings(numbers=numbers), answers={"gear_ratio": 1.0})
     assert drafted.settings.scale.increments_per_joint_rev == 2000
     assert "increments_per_joint_rev" in guessed(drafted)
 
 
-def test_a_motor_too_strong_for_an_arm_counts_millionths(eds: Path) -> None:
+def test_a_motor_too_strong_for_an_arm_counts_millionths(eds):
     drafted = draft(eds, EdsVariant().with_value(512871, "6076"), gear_ratio=26.0, gear_efficiency=1.0)
     assert drafted.settings.scale.rated_torque_count_Nm == 1e-6
     assert drafted.rated_torque_Nm == pytest.approx(13.334646)
     assert "rated_torque_count_Nm" in guessed(drafted)
 
 
-def test_an_object_that_may_not_be_mapped_or_has_no_room_is_left_out(eds: Path) -> None:
+def test_an_object_that_may_not_be_mapped_or_has_no_room_is_left_out(eds):
     for variant in (
         EdsVariant().with_value(0, "603F", "6077", key="PDOMapping"),
         EdsVariant().without(*(f"1A01sub{sub}" for sub in range(3, 9))),
@@ -101,14 +101,14 @@ def test_an_object_that_may_not_be_mapped_or_has_no_room_is_left_out(eds: Path) 
         assert objects(draft(eds, variant), "Status") == ["0x6041", "0x6061"]
 
 
-def test_a_torque_by_event_comes_no_more_often_than_the_bus_bears(eds: Path) -> None:
+def test_a_torque_by_event_comes_no_more_often_than_the_bus_bears(eds):
     assert frame(draft(eds, EdsVariant()), "Status").inhibit_100us == 50
     without = draft(eds, EdsVariant().without("1801sub3"))
     assert "0x6077" not in objects(without, "Status")
     assert frame(without, "Status").inhibit_100us == 0
 
 
-def test_times_and_an_identifier_that_can_t_be_written_are_the_eds_s(eds: Path) -> None:
+def test_times_and_an_identifier_that_can_t_be_written_are_the_eds_s(eds):
     variant = EdsVariant().with_value("ro", "1801sub3", "1801sub5", key="AccessType")
     status = frame(draft(eds, variant.with_value(20, "1801sub3").with_value(50, "1801sub5")), "Status")
     assert (status.inhibit_100us, status.event_timer_ms) == (20, 50)
@@ -116,7 +116,7 @@ def test_times_and_an_identifier_that_can_t_be_written_are_the_eds_s(eds: Path) 
     assert frame(draft(eds, variant.with_value("$NODEID+0x240", "1400sub1")), "Command").cob_id == 0x240
 
 
-def test_an_event_timer_that_is_absent_is_a_remark(eds: Path) -> None:
+def test_an_event_timer_that_is_absent_is_a_remark(eds):
     drafted = draft(eds, EdsVariant().without("1801sub5"))
     assert frame(drafted, "Status").event_timer_ms == 0
     assert any("0x1801:5" in line for line in drafted.remarks)
@@ -137,19 +137,19 @@ def test_an_event_timer_that_is_absent_is_a_remark(eds: Path) -> None:
         (EdsVariant().with_value(401, "1000"), "names CiA 401, neither a drive's"),
     ],
 )
-def test_the_reason_of_a_refusal_is_the_object_that_lacks(eds: Path, variant: EdsVariant, reason: str) -> None:
+def test_the_reason_of_a_refusal_is_the_object_that_lacks(eds, variant, reason):
     with pytest.raises(ConfigError, match=reason):
         draft(eds, variant)
 
 
-def test_a_node_without_profile_number_can_be_said_to_be_a_drive_and_a_known_maker_s_is_one(eds: Path) -> None:
+def test_a_node_without_profile_number_can_be_said_to_be_a_drive_and_a_known_maker_s_is_one(eds):
     path = EdsVariant().with_value("", "1000").write(eds)
     assert kind_of(path) == ""
     assert draft_profile(path, kind="drive").settings.kind == "drive"
     assert kind_of(EdsVariant("maxon_epos4.eds").with_value("", "1000").write(eds)) == "drive"
 
 
-def test_the_identifiers_of_a_dcf_are_those_of_its_node(eds: Path) -> None:
+def test_the_identifiers_of_a_dcf_are_those_of_its_node(eds):
     variant = (
         EdsVariant().with_value("0x187", "1800sub1").with_value("0x287", "1801sub1").with_value("0x207", "1400sub1")
     )
@@ -158,7 +158,7 @@ def test_the_identifiers_of_a_dcf_are_those_of_its_node(eds: Path) -> None:
     assert [frame(drafted, message).cob_id for message in ("Feedback", "Status", "Command")] == [0x180, 0x280, 0x200]
 
 
-def test_a_maker_s_drive_is_recognised_whatever_its_model() -> None:
+def test_a_maker_s_drive_is_recognised_whatever_its_model():
     node = Node(5)
     node.vendor, node.product = 0xFB, 0x65510000
     assert fitting_profiles(node, "drive") == ("maxon-epos4",)
@@ -167,12 +167,12 @@ def test_a_maker_s_drive_is_recognised_whatever_its_model() -> None:
 
 
 @pytest.mark.parametrize(("rpm", "degrees_s"), [(50_000, None), (3000, 360.0), (6, None), (0, None)])
-def test_a_speed_limit_that_no_joint_has_is_the_factory_s(rpm: int, degrees_s: float | None) -> None:
+def test_a_speed_limit_that_no_joint_has_is_the_factory_s(rpm, degrees_s):
     ratings = DeviceRatings(numbers={(0x6080, 0): rpm})
     assert ratings.velocity_limit_deg_s(ScaleSettings(gear_ratio=50.0)) == degrees_s
 
 
 @pytest.mark.parametrize(("counts", "degrees"), [(1, None), (25_600, 90.0), (0x7FFFFFFF, None)])
-def test_a_position_limit_that_no_joint_has_is_the_factory_s(counts: int, degrees: float | None) -> None:
+def test_a_position_limit_that_no_joint_has_is_the_factory_s(counts, degrees):
     ratings = DeviceRatings(numbers={(0x607D, 1): -counts, (0x607D, 2): counts})
     assert ratings.position_limit_deg(ScaleSettings(increments_per_joint_rev=102_400.0)) == degrees

@@ -16,7 +16,7 @@ def verdicts(rig: Rig, found: Survey) -> dict[int, str]:
     return compare(found, expected_nodes(rig.master.slaves))
 
 
-def test_every_node_is_found_with_its_identity_and_nothing_but_sdo_uploads_is_sent() -> None:
+def test_every_node_is_found_with_its_identity_and_nothing_but_sdo_uploads_is_sent():
     rig = Rig(is_wall=True)
     found = look(rig)
     told = [(n.node_id, n.device_text, n.name, n.vendor, n.product, n.serial, n.error_register) for n in found.nodes]
@@ -33,7 +33,7 @@ def test_every_node_is_found_with_its_identity_and_nothing_but_sdo_uploads_is_se
 
 
 @pytest.mark.parametrize("is_started", [False, True])
-def test_no_node_changes_its_state(is_started: bool) -> None:
+def test_no_node_changes_its_state(is_started):
     rig = Rig(is_wall=True)
     if is_started:
         rig.start()
@@ -42,7 +42,7 @@ def test_no_node_changes_its_state(is_started: bool) -> None:
     assert [device.state for device in rig.bench.devices] == before
 
 
-def test_nodes_in_operation_are_seen_with_what_they_produce() -> None:
+def test_nodes_in_operation_are_seen_with_what_they_produce():
     rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
@@ -55,7 +55,7 @@ def test_nodes_in_operation_are_seen_with_what_they_produce() -> None:
     assert [(talk.can_id, round(talk.rate_Hz or 0)) for talk in found.others] == [(0x080, 1000)]
 
 
-def test_an_operational_node_without_heartbeat_is_told_by_its_pdos() -> None:
+def test_an_operational_node_without_heartbeat_is_told_by_its_pdos():
     rig = Rig(is_wall=True)
     rig.start()
     rig.add_host()
@@ -64,13 +64,13 @@ def test_an_operational_node_without_heartbeat_is_told_by_its_pdos() -> None:
     assert {node.state_text for node in look(rig, 0.5).nodes} == {"operational (sends PDOs)"}
 
 
-def test_a_missing_node_is_named() -> None:
+def test_a_missing_node_is_named():
     rig = Rig(is_wall=True)
     rig.silence(3)
     assert verdicts(rig, look(rig)) == {1: "", 2: "", 3: "missing: Sensor1 expected", 4: ""}
 
 
-def test_who_is_found_is_compared_with_who_is_expected() -> None:
+def test_who_is_found_is_compared_with_who_is_expected():
     rig = Rig(is_wall=True)
     found, expected = look(rig), expected_nodes(rig.master.slaves)
 
@@ -82,7 +82,7 @@ def test_who_is_found_is_compared_with_who_is_expected() -> None:
     assert compare(found, [node for node in expected if node.node_id != 2])[2] == "unexpected"
 
 
-def test_a_node_that_is_only_heard_is_found_and_does_not_answer() -> None:
+def test_a_node_that_is_only_heard_is_found_and_does_not_answer():
     rig = Rig(is_wall=True)
     rig.bus.deliver(0x709, b"\x05")
     rig.bus.deliver(0x089, b"\x10\x83\x11\0\0\0\0\0")
@@ -90,7 +90,7 @@ def test_a_node_that_is_only_heard_is_found_and_does_not_answer() -> None:
     assert (node.answers, node.state_text, node.emergencies) == (False, "operational", [(0x8310, 0x11)])
 
 
-def test_what_is_not_canopen_is_listed_by_identifier() -> None:
+def test_what_is_not_canopen_is_listed_by_identifier():
     rig = Rig(is_wall=True)
     rig.bus.deliver(0x055, b"\x01\x02\x03")
     rig.bus.deliver(0x055, b"\x01")
@@ -98,7 +98,7 @@ def test_what_is_not_canopen_is_listed_by_identifier() -> None:
     assert (talk.can_id, talk.length, talk.count, message_name(CODEC, talk.can_id)) == (0x055, "1-3", 2, "unknown")
 
 
-def test_an_abort_of_0x1000_still_shows_a_node() -> None:
+def test_an_abort_of_0x1000_still_shows_a_node():
     rig = Rig(is_wall=True)
     rig.bus.deliver(0x58A, bytes.fromhex("8000100000000206"))
     node = next(node for node in look(rig).nodes if node.node_id == 10)
@@ -106,13 +106,13 @@ def test_an_abort_of_0x1000_still_shows_a_node() -> None:
 
 
 @pytest.mark.parametrize("data", ["43001000", "43001000920000", ""])
-def test_an_answer_that_is_too_short_is_none(data: str) -> None:
+def test_an_answer_that_is_too_short_is_none(data):
     rig = Rig(is_wall=True)
     rig.bus.deliver(0x58A, bytes.fromhex(data))
     assert [node.node_id for node in look(rig).nodes if node.answers] == [1, 2, 3, 4]
 
 
-def test_an_empty_bus_has_nobody() -> None:
+def test_an_empty_bus_has_nobody():
     rig = Rig(is_wall=True)
     rig.tamper = lambda cycle, can_id, data: None
     rig.forget()
@@ -137,5 +137,5 @@ def test_an_empty_bus_has_nobody() -> None:
         (0x18FF1234, ""),
     ],
 )
-def test_identifiers_are_named_as_in_the_predefined_connection_set(can_id: int, name: str) -> None:
+def test_identifiers_are_named_as_in_the_predefined_connection_set(can_id, name):
     assert function_name(can_id) == name

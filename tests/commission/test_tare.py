@@ -40,14 +40,14 @@ def gravity_poses(poses_deg: list[tuple[float, float]], offset: tuple[float, flo
     return [exact_pose(pose, gravity(np.radians(np.array(pose))) + offset) for pose in poses_deg]
 
 
-def test_a_still_window_gives_its_mean_and_its_standard_error() -> None:
+def test_a_still_window_gives_its_mean_and_its_standard_error():
     pose = measure_pose(**window(), settings=tare_settings())
     np.testing.assert_allclose(pose.mean_Nm, OFFSET, atol=3 * 0.02 / 20)
     np.testing.assert_allclose(pose.standard_error_Nm, 0.02 / 20, rtol=0.6)
     np.testing.assert_allclose(pose.q, [0.1, -0.2])
 
 
-def test_noise_that_is_slower_than_the_samples_makes_the_standard_error_larger() -> None:
+def test_noise_that_is_slower_than_the_samples_makes_the_standard_error_larger():
     samples = window(4000)
     slow = np.repeat(np.random.default_rng(2).normal(0.0, 0.01, (10, 2)), 400, axis=0)
     samples["tau_J"] = samples["tau_J"] + slow
@@ -68,9 +68,7 @@ def test_noise_that_is_slower_than_the_samples_makes_the_standard_error_larger()
         ("tau_J", slice(7, 8), np.nan, "standard deviation of tau_J[{}] = nan Nm"),
     ],
 )
-def test_a_window_that_is_not_still_is_refused_with_value_and_bound(
-    joint: int, field: str, rows: slice, change: float, words: str
-) -> None:
+def test_a_window_that_is_not_still_is_refused_with_value_and_bound(joint, field, rows, change, words):
     samples = window()
     samples[field][rows, joint] += change
     with pytest.raises(TareRefusedError) as refusal:
@@ -78,7 +76,7 @@ def test_a_window_that_is_not_still_is_refused_with_value_and_bound(
     assert words.format(f"joint{joint + 1}") in str(refusal.value)
 
 
-def test_a_window_within_every_bound_is_taken() -> None:
+def test_a_window_within_every_bound_is_taken():
     for field, rows, change in (
         ("dq", slice(7, 8), 0.05),
         ("q", slice(390, 400), 0.0017),
@@ -91,12 +89,12 @@ def test_a_window_within_every_bound_is_taken() -> None:
         assert measure_pose(**samples, settings=tare_settings()).samples == 400
 
 
-def test_a_handful_of_samples_is_no_window() -> None:
+def test_a_handful_of_samples_is_no_window():
     with pytest.raises(TareRefusedError, match="19 complete samples in a pose are below 20"):
         measure_pose(**window(19), settings=tare_settings())
 
 
-def test_with_vertical_axes_the_offset_is_the_mean_and_its_error_comes_from_the_spread() -> None:
+def test_with_vertical_axes_the_offset_is_the_mean_and_its_error_comes_from_the_spread():
     torques = np.array(OFFSET) + np.array([[0.02, 0.0], [-0.02, 0.0], [0.03, 0.0], [-0.03, 0.0]])
     poses = [exact_pose(q, torque) for q, torque in zip(SPREAD_POSES, torques, strict=True)]
     solution = solve_tare(poses, tare_settings())
@@ -113,20 +111,20 @@ def test_with_vertical_axes_the_offset_is_the_mean_and_its_error_comes_from_the_
         ([(0.0, 0.1), (0.0, -0.01)], r"spread between poses of tau_J\[joint2\] = 0.11 Nm exceeds"),
     ],
 )
-def test_an_offset_or_a_spread_over_its_bound_is_refused(torques: list[tuple[float, float]], words: str) -> None:
+def test_an_offset_or_a_spread_over_its_bound_is_refused(torques, words):
     with pytest.raises(TareRefusedError, match=words):
         solve_tare([exact_pose((20.0 * n, 0.0), np.array(each)) for n, each in enumerate(torques)], tare_settings())
 
 
 @pytest.mark.slow
-def test_gravity_is_estimated_with_the_offsets() -> None:
+def test_gravity_is_estimated_with_the_offsets():
     solution = solve_tare(gravity_poses(SPREAD_POSES), tare_settings(NINE, {"cad_theta": ()}))
     np.testing.assert_allclose(solution.gravity_Nm, [A4, A5], rtol=1e-9)
     np.testing.assert_allclose(solution.offset_Nm, OFFSET, atol=1e-9)
     assert 1.0 < solution.condition < 30.0
 
 
-def test_noise_of_the_poses_spreads_into_the_offsets_as_their_error_says() -> None:
+def test_noise_of_the_poses_spreads_into_the_offsets_as_their_error_says():
     settings = tare_settings(NINE, {"cad_theta": ()})
     generator = np.random.default_rng(3)
     found, claimed = [], []
@@ -143,14 +141,14 @@ def test_noise_of_the_poses_spreads_into_the_offsets_as_their_error_says() -> No
     assert np.all(scatter > 0.6 * np.mean(claimed, axis=0))
 
 
-def test_gravity_may_come_from_the_cad_model_in_a_single_pose() -> None:
+def test_gravity_may_come_from_the_cad_model_in_a_single_pose():
     settings = tare_settings(NINE, {"cad_theta": (*CAD[:7], A4, A5)}, gravity_model="cad")
     solution = solve_tare(gravity_poses(SPREAD_POSES[:1]), settings)
     np.testing.assert_allclose(solution.offset_Nm, OFFSET, atol=1e-12)
     np.testing.assert_allclose(solution.gravity_Nm, [A4, A5])
 
 
-def test_a_cad_model_that_is_wrong_shows_in_the_residuals() -> None:
+def test_a_cad_model_that_is_wrong_shows_in_the_residuals():
     settings = tare_settings(NINE, {"cad_theta": CAD}, gravity_model="cad")
     with pytest.raises(TareRefusedError, match=r"residual of pose 1\[joint1\] = -?0.\d+ Nm exceeds tare.pose_limit_Nm"):
         solve_tare(gravity_poses([(0.0, 0.0), (80.0, 0.0), (80.0, 90.0)]), settings)
@@ -164,27 +162,25 @@ def test_a_cad_model_that_is_wrong_shows_in_the_residuals() -> None:
         ([(10.0, 20.0)] * 3, "condition number of 3 poses = "),
     ],
 )
-def test_poses_that_cant_tell_gravity_from_offsets_are_refused_with_the_motion_that_is_missing(
-    poses_deg: list[tuple[float, float]], motion: str
-) -> None:
+def test_poses_that_cant_tell_gravity_from_offsets_are_refused_with_the_motion_that_is_missing(poses_deg, motion):
     with pytest.raises(TareRefusedError, match=motion) as refusal:
         solve_tare(gravity_poses(poses_deg), tare_settings(NINE, {"cad_theta": ()}))
     assert "exceeds tare.condition_limit = 30" in str(refusal.value)
 
 
-def test_poses_of_a_hanging_arm_are_judged_by_how_far_it_is_from_the_level() -> None:
+def test_poses_of_a_hanging_arm_are_judged_by_how_far_it_is_from_the_level():
     hanging = tare_settings(NINE, {"cad_theta": (), "mounting_deg": (90.0, 0.0)})
     poses = gravity_poses([(60.0, 60.0), (60.0, -20.0), (60.5, 5.0)])
     with pytest.raises(TareRefusedError, match=r"cos\(q1 - 90 deg\) only goes from 0.87 to 0.87; move joint 1 further"):
         solve_tare(poses, hanging)
 
 
-def test_a_weight_that_a_flat_arm_has_not_is_named_with_the_mounting() -> None:
+def test_a_weight_that_a_flat_arm_has_not_is_named_with_the_mounting():
     with pytest.raises(TareRefusedError, match=r"offset\[joint1\] = .* the mounting is not flat"):
         solve_tare(gravity_poses([(10.0, 20.0)]), tare_settings())
 
 
-def test_the_offset_is_in_joint_direction_and_the_configured_one_is_not_subtracted() -> None:
+def test_the_offset_is_in_joint_direction_and_the_configured_one_is_not_subtracted():
     settings = tare_settings(arm={"sign": (1, -1), "torque_offset_Nm": (0.25, 0.25)})
     tare = TareRig(settings, torque_offset_Nm=OFFSET, noise=False).session.run()
     np.testing.assert_allclose(tare.offset_Nm, [0.3, 0.2], atol=1e-3)
@@ -193,7 +189,7 @@ def test_the_offset_is_in_joint_direction_and_the_configured_one_is_not_subtract
 
 
 @pytest.mark.slow
-def test_drives_stay_disabled_and_without_torque_on_the_wire() -> None:
+def test_drives_stay_disabled_and_without_torque_on_the_wire():
     rig = TareRig(tare_settings(poses=2))
     Hand(rig, [(-10.0, -60.0)])
     rig.session.run()
@@ -204,7 +200,7 @@ def test_drives_stay_disabled_and_without_torque_on_the_wire() -> None:
     assert not any(drive.is_enabled for drive in rig.bench.drives)
 
 
-def test_the_sensors_offsets_are_found_and_stored_with_where_they_came_from() -> None:
+def test_the_sensors_offsets_are_found_and_stored_with_where_they_came_from():
     rig = TareRig(torque_offset_Nm=OFFSET, old_offset_Nm=(0.1, 0.0))
     for sensor, temperature in zip(rig.bench.devices[2:], (2345, -150), strict=True):
         sensor.serve(0x2111, 0, lambda value=temperature: value)
@@ -228,7 +224,7 @@ def refusal_of(rig: TareRig) -> str:
 
 
 @pytest.mark.parametrize("joint", [0, 1])
-def test_a_moving_arm_is_refused(joint: int) -> None:
+def test_a_moving_arm_is_refused(joint):
     rig = TareRig()
     rig.hand = lambda cycle: np.eye(2)[joint] * 1e-4 * max(0, cycle - SETTLED_CYCLE - 100)
     assert f"the arm moves: |dq[joint{joint + 1}]| = 0.1 rad/s exceeds" in refusal_of(rig)
@@ -241,12 +237,12 @@ def test_a_moving_arm_is_refused(joint: int) -> None:
         ((0.0, -50.1), "Sensor2", "NOT_VALID, NEGATIVE_OVERLOAD (0x6150 = 5)"),
     ],
 )
-def test_a_saturated_sensor_is_refused(offset: tuple[float, float], status: str, flags: str) -> None:
+def test_a_saturated_sensor_is_refused(offset, status, flags):
     refusal = refusal_of(TareRig(torque_offset_Nm=offset))
     assert refusal == f"{status} reports {flags}"
 
 
-def test_boot_ups_from_before_the_reset_are_not_taken_for_answers() -> None:
+def test_boot_ups_from_before_the_reset_are_not_taken_for_answers():
     rig = TareRig()
     for node_id in (1, 2, 3, 4):
         rig.bus.deliver(0x700 + node_id, b"\x00")
@@ -272,7 +268,7 @@ def test_boot_ups_from_before_the_reset_are_not_taken_for_answers() -> None:
     ],
     ids=["never", "falls silent", "too many lost", "a few lost"],
 )
-def test_a_device_that_is_not_heard_is_refused_unless_few_frames_are_lost(is_lost, refusal: str) -> None:
+def test_a_device_that_is_not_heard_is_refused_unless_few_frames_are_lost(is_lost, refusal):
     rig = TareRig()
     rig.tamper = lambda cycle, can_id, data: None if is_lost(cycle, can_id) else data
     if refusal:
@@ -281,7 +277,7 @@ def test_a_device_that_is_not_heard_is_refused_unless_few_frames_are_lost(is_los
         assert rig.session.run().samples in (298, 299)
 
 
-def test_a_frame_with_a_wrong_crc_is_no_sample() -> None:
+def test_a_frame_with_a_wrong_crc_is_no_sample():
     rig = TareRig(torque_offset_Nm=OFFSET, noise=False)
 
     def corrupt(cycle: int, can_id: int, data: bytes) -> bytes:
@@ -293,7 +289,7 @@ def test_a_frame_with_a_wrong_crc_is_no_sample() -> None:
 
 
 @pytest.mark.slow
-def test_poses_are_taken_as_a_hand_moves_the_arm_and_friction_shows_as_spread() -> None:
+def test_poses_are_taken_as_a_hand_moves_the_arm_and_friction_shows_as_spread():
     rig = TareRig(tare_settings(poses=3), torque_offset_Nm=OFFSET)
     friction = {-30: 0.0, -10: 0.04, 20: -0.02}
     rig.push = lambda cycle, q: np.array([friction.get(round(np.degrees(q[0])), 0.0), 0.0])
@@ -312,7 +308,7 @@ def test_poses_are_taken_as_a_hand_moves_the_arm_and_friction_shows_as_spread() 
 
 
 @pytest.mark.slow
-def test_a_pose_that_moves_again_while_it_is_measured_is_measured_anew() -> None:
+def test_a_pose_that_moves_again_while_it_is_measured_is_measured_anew():
     rig = TareRig(tare_settings(poses=2))
     Hand(rig, [(-10.0, -60.0)])
     steady = rig.hand
@@ -330,14 +326,14 @@ def test_a_pose_that_moves_again_while_it_is_measured_is_measured_anew() -> None
 @pytest.mark.parametrize(
     ("rad_per_cycle", "missing"), [(0.0, "been moved by more than tare.move_deg = 10 deg"), (2e-4, "come to rest")]
 )
-def test_an_arm_that_is_not_brought_to_the_next_pose_is_refused_after_the_timeout(rad_per_cycle, missing) -> None:
+def test_an_arm_that_is_not_brought_to_the_next_pose_is_refused_after_the_timeout(rad_per_cycle, missing):
     rig = TareRig(tare_settings(poses=2, move_timeout_s=1.0))
     rig.hand = lambda cycle: np.array([rad_per_cycle, 0.0]) * max(0, cycle - 550)
     assert refusal_of(rig) == f"the arm has not {missing} within tare.move_timeout_s = 1 s for pose 2"
 
 
 @pytest.mark.slow
-def test_an_arm_under_gravity_is_tared_from_several_poses() -> None:
+def test_an_arm_under_gravity_is_tared_from_several_poses():
     rig = TareRig(tare_settings(NINE, {"cad_theta": ()}, poses=5), torque_offset_Nm=OFFSET)
     rig.push = lambda cycle, q: gravity(q)
     Hand(rig, [*SPREAD_POSES[1:], (70.0, 10.0)])
@@ -347,7 +343,7 @@ def test_an_arm_under_gravity_is_tared_from_several_poses() -> None:
     assert tare.gravity_model == "estimated"
 
 
-def test_a_plan_that_cant_work_is_refused_before_anything_is_sent() -> None:
+def test_a_plan_that_cant_work_is_refused_before_anything_is_sent():
     with pytest.raises(ConfigError, match=r"`tare.poses` = 2 is below 3"):
         TareRig(tare_settings(NINE, {"cad_theta": ()}, poses=2))
     with pytest.raises(ConfigError, match=r"needs `arm.cad_theta`"):
@@ -356,7 +352,7 @@ def test_a_plan_that_cant_work_is_refused_before_anything_is_sent() -> None:
         TareRig(tare_settings(NINE, {"cad_theta": CAD}, gravity_model="cad"), is_auto_zeroing=True)
 
 
-def test_an_interrupt_ends_the_tare_and_stops_the_devices() -> None:
+def test_an_interrupt_ends_the_tare_and_stops_the_devices():
     rig = TareRig()
     rig.on_line = lambda line: rig.session.interrupt() if "measuring" in line else None
     with pytest.raises(KeyboardInterrupt):
@@ -364,7 +360,7 @@ def test_an_interrupt_ends_the_tare_and_stops_the_devices() -> None:
     assert rig.sent[-1][:2] == (0x000, bytes((0x80, 0)))
 
 
-def test_auto_zero_leaves_little_and_the_host_takes_the_rest() -> None:
+def test_auto_zero_leaves_little_and_the_host_takes_the_rest():
     rig = TareRig(is_auto_zeroing=True, torque_offset_Nm=OFFSET)
     tare = rig.session.run()
     assert np.abs(tare.offset_Nm).max() < 0.015
@@ -387,7 +383,7 @@ def answer_auto_zero(rig: TareRig, joint: int, answer: str) -> None:
     rig.bus.attach(take)
 
 
-def test_a_sensor_that_takes_the_zero_and_does_not_apply_it_is_refused() -> None:
+def test_a_sensor_that_takes_the_zero_and_does_not_apply_it_is_refused():
     rig = TareRig(is_auto_zeroing=True, torque_offset_Nm=OFFSET)
     answer_auto_zero(rig, 2, "6025610100000000")
     refusal = refusal_of(rig)
@@ -395,14 +391,14 @@ def test_a_sensor_that_takes_the_zero_and_does_not_apply_it_is_refused() -> None
     assert refusal.endswith("Nm after the sensor's own zero exceeds tare.auto_zero_limit_Nm = 0.02 Nm")
 
 
-def test_a_pushed_arm_is_not_zeroed() -> None:
+def test_a_pushed_arm_is_not_zeroed():
     rig = TareRig(is_auto_zeroing=True)
     rig.push = lambda cycle, q: np.array([-3.0, 0.0])
     assert "something pushes on the arm" in refusal_of(rig)
     assert [data for can_id, data, *_ in rig.sent if can_id == 0x603 and data[1:3] == b"\x25\x61"] == []
 
 
-def test_a_sensor_without_its_own_zero_says_so() -> None:
+def test_a_sensor_without_its_own_zero_says_so():
     rig = TareRig(is_auto_zeroing=True)
     answer_auto_zero(rig, 1, "8025610100000206")
     with pytest.raises(DeviceError, match=r"Sensor1 \(node 3\): auto-zero refused: .*Object does not exist"):

@@ -1,7 +1,5 @@
 """What the certified scheme's settings refuse, what follows from them, and the block that carries its numbers."""
 
-from typing import Any
-
 import pytest
 
 from adacd_hil.records import PARAMETER_NAMES, PARAMETER_UNITS, SchemeState, certified_layout, scheme_layout
@@ -119,7 +117,7 @@ def test_the_number_of_the_certifying_state_is_appended():
     assert SchemeState.CERTIFY == max(SchemeState) == 9
 
 
-def test_gravity_brings_gains_of_its_own() -> None:
+def test_gravity_brings_gains_of_its_own():
     estimator = parse(Settings, {"estimator": {"gravity": True}}).estimator
     assert estimator.P0 == (8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5, 50.0, 50.0)
     assert len(estimator.P0) == len(estimator.parameter_names)
@@ -140,7 +138,7 @@ SEVEN_NAMES = "a1, a2, a3, F_v1, F_v2, F_c1, F_c2"
         ),
     ],
 )
-def test_a_list_of_parameters_of_another_length_is_told_their_names(table: dict[str, Any], line: str) -> None:
+def test_a_list_of_parameters_of_another_length_is_told_their_names(table, line):
     with pytest.raises(ConfigError) as caught:
         parse(Settings, table)
     assert line in str(caught.value)

@@ -1,14 +1,12 @@
 """Which file a configuration extends: a path is taken from the file that names it, wherever one stands."""
 
-from pathlib import Path
-
 import pytest
 
 from adacd_hil.settings.configuration import load_settings
 from adacd_hil.settings.schema import ConfigError
 
 
-def test_a_path_is_taken_from_the_file_that_names_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_is_taken_from_the_file_that_names_it(tmp_path, monkeypatch):
     below = tmp_path / "below"
     below.mkdir()
     (below / "mine.toml").write_text('extends = "base.toml"\n')
@@ -23,7 +21,7 @@ def test_a_path_is_taken_from_the_file_that_names_it(tmp_path: Path, monkeypatch
         load_settings("below/mine.toml")
 
 
-def test_a_file_that_extends_itself_by_another_path_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_extends_itself_by_another_path_is_refused(tmp_path):
     (tmp_path / "mine.toml").write_text('extends = "./mine.toml"\n')
     with pytest.raises(ConfigError, match=r"^configuration .*mine\.toml extends itself$"):
         load_settings(str(tmp_path / "mine.toml"))

@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import settings_page
@@ -14,11 +16,16 @@ NAMES = {key.rpartition(".")[2] for key in known_keys()}
 NAMED_IN = ("tests/**/*.py", "docs/**/*.md", "README.md", "adacd_hil/configs/*.toml", "docs/examples/**/*.toml")
 
 
-def test_the_page_is_what_the_declarations_say() -> None:
+def test_the_page_is_what_the_declarations_say():
     assert PAGE.read_text(encoding="utf-8") == settings_page.page()
 
 
-def test_a_setting_is_read_by_the_product() -> None:
+def test_the_tool_prints_the_page():
+    done = subprocess.run([sys.executable, settings_page.__file__], capture_output=True, check=True)
+    assert done.stdout.decode() == settings_page.page()
+
+
+def test_a_setting_is_read_by_the_product():
     files = (path for package in ("adacd_hil", "firmware_sim") for path in (ROOT / package).rglob("*.py"))
     nodes = (node for path in files for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
     attributes = (node for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load))
@@ -26,7 +33,7 @@ def test_a_setting_is_read_by_the_product() -> None:
     assert NAMES - read == set()
 
 
-def test_a_setting_is_named_by_a_test_a_document_or_a_configuration() -> None:
+def test_a_setting_is_named_by_a_test_a_document_or_a_configuration():
     files = {path for pattern in NAMED_IN for path in ROOT.glob(pattern)} - {PAGE, Path(__file__)}
     words = {word for path in files for word in re.findall("[A-Za-z0-9_]+", path.read_text(encoding="utf-8"))}
     assert NAMES - words == set()
