@@ -142,6 +142,7 @@ def test_frames_worked_out_by_long_division_come_out(sender: E2eSender, sent: li
 def test_the_counter_begins_at_0_and_wraps(profile: Profile) -> None:
     sent = frames(profile, profile.modulus + 2)
     assert [frame[profile.counter_byte] for frame in sent] == [*range(profile.modulus), 0, 1]
+    assert profile.receiver().counter_range == profile.modulus
 
 
 @pytest.mark.parametrize(("profile", "largest"), [(profile_2(6), 3), (profile_5(24), 5)], ids=["P02", "P05"])
