@@ -206,8 +206,10 @@ def test_a_late_frame_is_of_the_cycle_before_skipped_periods_and_leaves_the_pres
     devices.arm.synchronise(0, 0, 1)
     devices.arm.synchronise(75, 0, 75)
     feedback = CODEC.message("Drive1Feedback")
+    status = CODEC.message("Drive1Status")
     devices.arm.accept(Frame(feedback.can_id, bytes(feedback.encode(0.1, 0.01)), 0), is_late=True)
-    assert devices.arm.drives[0].sample_cycle == 0
+    devices.arm.accept(Frame(status.can_id, bytes(status.encode(0x0237, 10, 0, 0)), 0), is_late=True)
+    assert (devices.arm.drives[0].sample_cycle, devices.arm.drives[0].status_cycle) == (0, 0)
     assert devices.arm.missing_frames == 4
     assert not devices.arm.has_all_frames
     assert devices.arm.state().age_q[0] == 75
