@@ -20,7 +20,7 @@ def test_every_kind_of_fault_has_a_row() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("case", "clock"), long_but(4, covering()), ids=lambda value: getattr(value, "name", value))
 def test_the_host_makes_of_a_fault_what_its_row_says(tmp_path: Path, case: Case, clock: str) -> None:
-    assert deviations(play(case, clock, tmp_path), getattr(case, clock), case.wire) == []
+    assert deviations(play(case, clock, tmp_path), case.expected(clock), case.wire) == []
 
 
 @pytest.mark.long
