@@ -66,9 +66,6 @@ def test_the_identified_inertia_follows_the_payload(played: dict[str, Played]) -
 def test_the_experiment_ends_well_and_its_log_is_whole(played: dict[str, Played]) -> None:
     assert {profile: run.status for profile, run in played.items()} == {"P": 0, "S": 0, "M": 0}
     assert played["P"].json["log"]["dropped"] == 0
-
-
-def test_every_file_of_the_report_is_there(played: dict[str, Played]) -> None:
     names = {path.name for path in played["P"].folder.iterdir()}
     assert names >= {"run.mcap", "truth.mcap", "report.html", "report.json"}
 

@@ -250,12 +250,18 @@ def test_ctrl_c_in_what_raises_nothing_is_not_lost_and_no_traceback() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (OK, b"ended\n", b"")
 
 
-def test_columns_are_those_of_the_environment_where_there_is_no_terminal(monkeypatch):
+@pytest.mark.parametrize(
+    ("told", "columns"),
+    [("97", 97), (None, None), ("0", None), ("-5", None), ("x", None), ("", None), ("9" * 400, None)],
+    ids=lambda value: str(value)[:4],
+)
+def test_columns_are_those_of_the_environment_where_there_is_no_terminal(told, columns, monkeypatch) -> None:
     monkeypatch.setattr(sys, "stdout", io.StringIO())
     monkeypatch.delenv("COLUMNS", raising=False)
-    assert terminal_columns() is None
-    monkeypatch.setenv("COLUMNS", "97")
-    assert terminal_columns() == 97
+    if told is not None:
+        monkeypatch.setenv("COLUMNS", told)
+    assert terminal_columns() == columns
+    assert terminal_columns(io.StringIO()) is None  # errors are lines for programs
 
 
 @pytest.mark.parametrize(
@@ -293,23 +299,11 @@ def test_no_text_of_others_has_a_colour_of_its_own(monkeypatch) -> None:
     )
 
 
-@pytest.mark.parametrize("told", ["0", "-5", "x", "", "9" * 400])
-def test_columns_that_are_none_are_not_heard(told: str, monkeypatch) -> None:
-    monkeypatch.setattr(sys, "stdout", io.StringIO())
-    monkeypatch.setenv("COLUMNS", told)
-    assert terminal_columns() is None
-
-
 def test_a_terminal_that_hangs_up_while_it_is_asked_for_its_width_is_no_error(monkeypatch) -> None:
     monkeypatch.delenv("COLUMNS", raising=False)
     stream = io.StringIO()  # without a descriptor: asking raises OSError
     monkeypatch.setattr(stream, "isatty", lambda: True)
     assert terminal_columns(stream) == 80
-
-
-def test_errors_are_lines_for_programs_though_columns_are_set(monkeypatch) -> None:
-    monkeypatch.setenv("COLUMNS", "40")
-    assert terminal_columns(io.StringIO()) is None
 
 
 def test_a_screen_says_how_much_of_a_table_it_has_no_room_for(monkeypatch) -> None:

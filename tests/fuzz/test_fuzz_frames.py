@@ -52,10 +52,6 @@ def test_the_legal_traffic_holds_what_there_is_to_damage(legal: list[CanFrame]) 
     assert names >= set(CODEC.messages) - {"Drive1Emcy", "Drive2Emcy", "Sensor1Emcy", "Sensor2Emcy"}
 
 
-def test_the_same_seed_gives_the_same_frames(legal: list[CanFrame]) -> None:
-    assert list(islice(fuzz(legal, SEED), 1000)) == list(islice(fuzz(legal, SEED), 1000))
-
-
 def test_the_codec_decodes_the_right_length_and_nothing_else(legal: list[CanFrame]) -> None:
     receiver = CodecReceiver()
     for frame in islice(fuzz(legal, SEED), 12_000):

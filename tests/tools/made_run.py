@@ -51,10 +51,14 @@ def states(*changes: tuple[int, SchemeState]) -> Callable[[int], SchemeState]:
 
 @dataclass
 class Made:
-    """One run. Every callable gives a value by cycle; what is in `extra` is put before the commands of its cycle."""
+    """One run. Every callable gives a value by cycle; what is in `extra` is put before the commands of its cycle.
+
+    Commands carry a torque from 5 cycles after enabling to 10 cycles before the end; `torques` replaces single ones.
+    """
 
     cycles: int = 600
-    torque: Callable[[int], int] = lambda cycle: 10 if cycle >= ENABLED + 5 else 0
+    torque: Callable[[int], int] | None = None
+    torques: dict[int, int] = field(default_factory=dict)
     controlword: Callable[[int], int] = lambda cycle: 0x0F if cycle >= ENABLED else 0x00
     statusword: Callable[[int], int] = lambda cycle: ENABLED_WORD if cycle >= ENABLED + 3 else DISABLED_WORD
     state: Callable[[int], SchemeState] = usual_state
@@ -73,6 +77,11 @@ class Made:
     scenario: Scenario = field(default_factory=Scenario)
     settings: Settings = field(default_factory=load_settings)
     changes: dict[str, Any] = field(default_factory=dict)
+
+    def torque_of(self, cycle: int) -> int:
+        if self.torque is not None:
+            return self.torque(cycle)
+        return self.torques.get(cycle, 10 if ENABLED + 5 <= cycle < self.cycles - 10 else 0)
 
     def play(self) -> Played:
         """Write the frames, the truth and the log."""
@@ -104,7 +113,7 @@ class Made:
             passed += [Passed(t_ns + 350_000, *frame) for frame in self.extra.get(cycle, [])]
             for joint in (0, 1):
                 payload = self.controlword(cycle).to_bytes(2, "little")
-                payload += self.torque(cycle).to_bytes(2, "little", signed=True)
+                payload += self.torque_of(cycle).to_bytes(2, "little", signed=True)
                 frames = self.command(cycle, joint, signed(0x201 + joint, cycle % 16, payload))
                 passed += [Passed(t_ns + 400_000, True, 0x201 + joint, data) for data in frames]
         return self._played(passed)

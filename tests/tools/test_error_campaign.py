@@ -3,7 +3,7 @@
 import error_campaign
 import numpy as np
 import pytest
-from error_campaign import AGREES, ERRORS, SENSORS, WITHIN, Case, Played, find_steps, mechanics_of, quiet_onsets, row_of
+from error_campaign import AGREES, ERRORS, SENSORS, WITHIN, find_steps, mechanics_of, quiet_onsets
 
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.arm.hardware_settings import MechanicsSettings, SensorSettings
@@ -51,15 +51,6 @@ def test_every_error_is_one():
         assert (is_mechanical or is_measured) == (
             error not in ("clean", "cable 0.05 Nm sin q", "cable 0.1 Nm sin q")
         ), error
-
-
-def test_a_row_has_a_field_for_each_column():
-    case = Case("P", "clean", 0.0, 1)
-    times = ((9.0, 24.0, np.inf),) * 3
-    played = Played(case, 2.0, 0.5, 0, 1, (0.01, 0.01), (0.02, 0.02), (0.0, 0.0), 0.8, times, (0.01, 0.0, 0.0))
-    for row in (row_of(played), row_of(Played(case, None))):
-        assert len(row) == len(error_campaign.HEAD)
-    assert row_of(played)[-3] == "9, 24, inf (1.0%)"
 
 
 @pytest.mark.parametrize("seed", [1, 2, 205])

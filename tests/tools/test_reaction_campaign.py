@@ -44,12 +44,6 @@ def test_a_withdrawal_is_worse_by_its_peak_or_its_impulse(peak_N: float, impulse
     assert len(reaction_campaign.worse(harms(Harm(peak_N, impulse_N_s, 1, False)))) == count
 
 
-def test_the_table_names_limit_means_and_faults() -> None:
-    table = reaction_campaign.as_table(harms(Harm(80.0, 0.5, 2, True)))
-    assert "clamped      140" in table
-    assert "80 / 0.50 (2.0) 1 faults" in table
-
-
 def test_the_same_seed_puts_the_same_bodies_in_the_way() -> None:
     settings = reaction_campaign.reacting(Reaction.STOP)
     first, again, other = (reaction_campaign.meetings(settings, "face", True, 2, seed) for seed in (1, 1, 2))
