@@ -1,7 +1,7 @@
 """Every command line, TOML, path, link and Python example in README and docs/ is parsed, loaded, found or run.
 
 Each block and each piece of inline code falls under one rule here. A block under none fails: give it a language.
-Commands that need no bus are run here; the options of all others are compared with what the programs take.
+Each command of a block is run here, or played by a test that is named, or only shown, with the reason.
 `text` is for what is neither typed nor read by a program; indented blocks are equations.
 """
 
@@ -252,6 +252,53 @@ RUN = (
     r"firmware-sim (list|show|check|truths)",
 )
 """Commands that need no bus, no terminal, and a second or two at most: they are run here as they stand."""
+PLAYED = {
+    r"make (demo|install)": ("test_first_hour.py", "newcomer"),
+    r"adacd-hil (demo( --config (paper --out runs/paper|my-arm.toml))?|init|identify .*)": (
+        "test_first_hour.py",
+        "play",
+    ),
+    r"python tools/foreign_csv.py .*": ("test_first_hour.py", "play"),
+    r"adacd-hil init (by-urdf|made-up)\.toml .*": ("cli/test_init_command.py", "--urdf"),
+    r"adacd-hil demo --config my-arm.toml --truth .*": ("test_rehearsal.py", "--truth"),
+    r"(adacd-hil demo --scenario|python tools/campaigns/campaign.py) .*": ("test_scenarios.py", "expect"),
+    r"adacd-hil demo --clock realtime --live": ("log/test_live_monitor.py", "live"),
+    r"(adacd-hil monitor --url|python tools/live_client.py) .*": ("log/test_live_monitor.py", "monitor"),
+    r"adacd-hil report runs.*": ("analysis/test_report_folder.py", "report"),
+    r"adacd-hil report run.mcap --from .*": ("analysis/test_long_run.py", "--from"),
+    r"adacd-hil trend .*": ("analysis/test_runs.py", "trend"),
+    r"python tools/browse_report.py .*": ("analysis/test_run_report.py", "browse_report"),
+    r"adacd-hil (doctor|commtest|scan|tare) .*": ("vcan/test_commands_on_vcan.py", "commtest"),
+    r"adacd-hil run .*|tools/with-vcan .* sh -c .*": ("vcan/test_on_vcan.py", "run_on_vcan"),
+    r"firmware-sim run .*": ("vcan/test_on_vcan.py", "emulator"),
+    r"adacd-hil play .*": ("cli/test_play.py", "play"),
+    r"firmware-sim play .*": ("vcan/test_recorded_arm_on_vcan.py", "play"),
+    r"can_(logger|logconvert|player) .*": ("log/test_can_io.py", "can_logconvert"),
+    r"adacd-hil sweep .* --scheduler .*": ("analysis/test_sweep_cluster.py", "tls"),
+    r"adacd-hil sweep .*": ("analysis/test_sweep.py", "sweep"),
+    r"pip install docs/examples/detector": ("test_packaging.py", "docs/examples/detector"),
+    r"python tests/reference/renew.py": ("reference/test_reference_runs.py", "reference"),
+    r"python tools/notebook.py .*": ("test_certified_experiment.py", "run_notebook"),
+    r"python tools/campaigns/reached_lines.py.*": ("tools/test_reached_lines.py", "FAULTS"),
+    r".*tools/campaigns/(attack|cause|doubt|error|property|timing|touch)_campaign.py .*": (
+        "tools/test_tool_commands.py",
+        "PROGRAMS",
+    ),
+    r"python tools/campaigns/(blind_grid|damage_campaign|mutation_campaign).py .*": (
+        "tools/test_tool_commands.py",
+        "PROGRAMS",
+    ),
+}
+"""Commands that a test plays in its own way, in short or on a bus: the test's file, and what it must hold."""
+SHOWN = {
+    r"make test": "it is what runs this test",
+    r"(ip|groupadd|usermod|useradd|udevadm|systemctl|cp .* /etc/.*|echo 1)\b.*": "changes the computer, as root",
+    r"(python3 -m venv /opt/|/opt/adacd-hil/bin/pip ).*": "changes the computer, as root",
+    r"grep .* /proc/interrupts": "asks for the interrupts of a computer with an adapter",
+    r"podman .*": "needs a container engine and a network",
+    r"duckdb .*": "a program of others, which only reads what `log export` and `sweep` have written",
+}
+"""Commands that are only shown, and why."""
 
 
 @pytest.fixture(scope="module")
@@ -273,6 +320,25 @@ def typed(block: Piece) -> str:
     return "\n".join(line.removeprefix("$ ") for line in block.text.splitlines() if line.startswith("$ "))
 
 
+def fates(command: str) -> list[str]:
+    """List the rules that a command falls under: it is run here, a test plays it, it is only shown."""
+    run_here = [pattern for pattern in RUN if re.match(pattern, command)]
+    return run_here or [pattern for pattern in (*PLAYED, *SHOWN) if re.fullmatch(pattern, command)]
+
+
+def test_every_command_is_run_or_played_by_a_test_or_says_why_not(commands):
+    assert failures([(block, [line]) for line, (block, _) in commands.items() if not fates(line)]) == ""
+    unused = {*RUN, *PLAYED, *SHOWN} - {pattern for line in commands for pattern in fates(line)}
+    assert unused == set()
+    assert [rule for rule in SHOWN.items() if len(rule[1].split()) < 3] == []
+
+
+@pytest.mark.parametrize("pattern", PLAYED)
+def test_the_test_that_plays_a_command_is_there(pattern):
+    name, word = PLAYED[pattern]
+    assert word in (ROOT / "tests" / name).read_text()
+
+
 def test_what_needs_no_bus_runs(commands, folder):
     played = [entry for line, entry in commands.items() if any(re.match(pattern, line) for pattern in RUN)]
     found = []
@@ -282,8 +348,6 @@ def test_what_needs_no_bus_runs(commands, folder):
             found.append((block, [f"`{' '.join(words)}` ended with {status}: {complaint}"]))
     assert failures(found) == ""
     assert len(played) >= 25
-    used = {pattern for line in commands for pattern in RUN if re.match(pattern, line)}
-    assert used == set(RUN)
 
 
 def free_and_pushed_motion() -> dict[str, Any]:

@@ -257,11 +257,12 @@ class LogSource:
 
     is_recording = False
 
-    def __init__(self, path: Path) -> None:
-        """Open the log. Raises LogError, ConfigError, CodecError."""
+    def __init__(self, path: Path, cycles_per_piece: int = CYCLES_PER_PIECE) -> None:
+        """Open the log, to be read in pieces of so many cycles. Raises LogError, ConfigError, CodecError."""
         self.has_arms = has_arms(path)
         self._partner = ARM.name if self.has_arms else "/cycle"
         self._path = path
+        self._cycles_per_piece = cycles_per_piece
         self._stream = self._open(with_frames=False)
         self.metadata: Mapping[str, str] = self._stream.metadata
         self.settings = settings_of(path, self._stream.attachments)
@@ -271,7 +272,7 @@ class LogSource:
 
     def _open(self, with_frames: bool) -> LogStream:
         topics = (*_TOPICS, self._partner, *(FRAME_TOPICS if with_frames else ()))
-        return LogStream(self._path, topics, CYCLES_PER_PIECE, is_ahead=False)  # replay reads in a thread
+        return LogStream(self._path, topics, self._cycles_per_piece, is_ahead=False)  # replay reads in a thread
 
     def parts(self, with_frames: bool) -> Iterator[Part]:
         """Yield the parts, in order. with_frames: stretches have their frames, else none."""
