@@ -104,7 +104,7 @@ def test_texts_and_frames_decode_to_the_same_values(report, log_path):
 
 
 def test_attachments_and_metadata_are_there(report):
-    assert report["attachments"] == ["arm.dbc", "run.toml", "viewer-layout.json"]
+    assert report["attachments"] == ["arm.dbc", "run.toml"]
     assert report["metadata"] == ["run", "summary"]
     assert int(report["chunks"]) >= 3
 
