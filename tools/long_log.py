@@ -33,7 +33,7 @@ from adacd_hil.log.log_files import (
     part_path,
 )
 from adacd_hil.log.mcap.chunks import Contents
-from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
+from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD
 from adacd_hil.log.recording.log_file import McapFile, Sink
 from adacd_hil.log.types.message_types import MessageType
 from adacd_hil.log.types.record_arrays import count_frames

@@ -31,16 +31,8 @@ from adacd_hil.log.log_files import (
 )
 from adacd_hil.log.log_walk import read_head
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_contents
-from adacd_hil.log.mcap.mcap_records import (
-    MAGIC,
-    MESSAGE_HEAD,
-    Definitions,
-    FileEnd,
-    RawRecord,
-    parse,
-    read_end,
-    read_record,
-)
+from adacd_hil.log.mcap.mcap_records import Definitions, FileEnd, RawRecord, parse, read_end, read_record
+from adacd_hil.log.mcap.record_layout import MAGIC, MESSAGE_HEAD
 from adacd_hil.log.payload_sizes import payload_size
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.salvage import Losses, Salvage

@@ -32,7 +32,6 @@ from adacd_hil.log.mcap.chunks import Block, Item, read_blocks
 from adacd_hil.log.mcap.mcap_records import (
     CHANNEL_NUMBERS,
     DEFINITIONS,
-    HEAD,
     Definitions,
     RawRecord,
     attachment_crc_fits,
@@ -40,14 +39,8 @@ from adacd_hil.log.mcap.mcap_records import (
     summary_of,
     walk,
 )
-from adacd_hil.log.types.record_arrays import (
-    UNKNOWN,
-    UNWANTED,
-    PieceBuilder,
-    RawPiece,
-    Topic,
-    record_dtype,
-)
+from adacd_hil.log.mcap.record_layout import HEAD, record_dtype
+from adacd_hil.log.types.record_arrays import UNKNOWN, UNWANTED, PieceBuilder, RawPiece, Topic
 
 PayloadLayout = Callable[[Channel, Schema], "np.dtype[Any] | None"]
 _COUNTS = {"frames", "messages", "dropped"}

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import DROPPED_KEY, EPOCH_KEY, FIELDS_KEY, LOST_KEY, LogError, log_in
 from adacd_hil.log.log_walk import LogWalk
+from adacd_hil.log.mcap.record_layout import record_dtype
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,
@@ -30,13 +31,7 @@ from adacd_hil.log.types.message_types import (
     log_time_ns,
     unpack_log,
 )
-from adacd_hil.log.types.record_arrays import (
-    FRAME_DTYPE,
-    FRAME_TOPICS,
-    LONG_FRAME_DTYPE,
-    Topic,
-    record_dtype,
-)
+from adacd_hil.log.types.record_arrays import FRAME_DTYPE, FRAME_TOPICS, LONG_FRAME_DTYPE, Topic
 from adacd_hil.log.types.topics import DECODED, contact_report, run_channels, truth_channels
 from adacd_hil.records import (
     PARAMETER_NAMES,

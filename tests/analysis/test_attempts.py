@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from adacd_hil.log.mcap.record_layout import record_dtype
 from adacd_hil.log.reader import FRAME_DTYPE, LONG_FRAME_DTYPE, Piece, Series
-from adacd_hil.log.types.record_arrays import record_dtype
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import SchemeState
 from adacd_hil.replay.log_source import AttemptSplitter

@@ -5,8 +5,8 @@ import pytest
 
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import arithmetic
+from adacd_hil.log.mcap.record_layout import record_dtype
 from adacd_hil.log.reader import LoggedEvent, Series
-from adacd_hil.log.types.record_arrays import record_dtype
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import Event, scheme_layout
 from adacd_hil.replay.scheme_comparison import SchemeComparison, different_arithmetic

@@ -15,7 +15,7 @@ from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex
 from mcap.records import SummaryOffset as GroupOffset
 
 from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile, encode
-from adacd_hil.log.mcap.mcap_records import MAGIC
+from adacd_hil.log.mcap.record_layout import MAGIC
 from adacd_hil.log.types.message_types import ENCAPSULATION, Member, number_type
 
 HEAD = struct.Struct("<BQ")

@@ -12,7 +12,7 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
+from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD
 from adacd_hil.log.reader import Series
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_arm, pack_contact, pack_control, pack_cycle, pack_scheme

@@ -41,7 +41,7 @@ from adacd_hil.lab.live.scene import (
     transforms_of,
 )
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
+from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.processes import WriterSetup, start_module
 from adacd_hil.log.recording.ring import Ring

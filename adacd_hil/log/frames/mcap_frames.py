@@ -37,17 +37,8 @@ from adacd_hil.log.log_files import (
 )
 from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS, LIBRARY
 from adacd_hil.log.mcap.chunks import Block, Contents, read_blocks
-from adacd_hil.log.mcap.mcap_records import (
-    DEFINITIONS,
-    HEAD,
-    MAGIC,
-    MESSAGE_HEAD,
-    Definitions,
-    Problem,
-    RawRecord,
-    parse,
-    summary_of,
-)
+from adacd_hil.log.mcap.mcap_records import DEFINITIONS, Definitions, Problem, RawRecord, parse, summary_of
+from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, MESSAGE_HEAD, record_dtype
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     CAN_FRAME_DTYPE,
@@ -58,7 +49,7 @@ from adacd_hil.log.types.message_types import (
     pack_can_frame,
     pack_fd_frame,
 )
-from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE, SENT, fill_times, record_dtype
+from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE, SENT, fill_times
 
 CHANNEL_KEY = "can_channel"
 RATE_SWITCH_KEY = "bit_rate_switch"

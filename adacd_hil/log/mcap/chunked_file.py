@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from adacd_hil import __version__
 from adacd_hil.log.log_files import PRODUCT
-from adacd_hil.log.mcap.mcap_records import INDEX_ENTRY, MAGIC, crc32
+from adacd_hil.log.mcap.record_layout import INDEX_ENTRY, MAGIC, crc32
 
 LIBRARY = f"{PRODUCT} {__version__}; {LIBRARY_IDENTIFIER}"
 CHUNK_BYTES = 256 * 1024

@@ -25,19 +25,8 @@ from mcap.records import Chunk
 from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.mcap.mcap_records import (
-    DEFINITIONS,
-    HEAD,
-    INDEX_ENTRY,
-    MAGIC,
-    MESSAGE_HEAD,
-    IndexRun,
-    Problem,
-    RawRecord,
-    crc32,
-    parse,
-    walk,
-)
+from adacd_hil.log.mcap.mcap_records import DEFINITIONS, IndexRun, Problem, RawRecord, parse, walk
+from adacd_hil.log.mcap.record_layout import HEAD, INDEX_ENTRY, MAGIC, MESSAGE_HEAD, crc32
 
 MOST_BYTES = 32 << 20
 """Of a chunk, before compression."""

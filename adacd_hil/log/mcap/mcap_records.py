@@ -15,7 +15,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
-import numpy as np
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -35,10 +34,10 @@ from mcap.records import (
     Statistics,
     SummaryOffset,
 )
-from zlib_ng import zlib_ng
 
 from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LogError
+from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, crc32
 
 _TEXT = _TABLE = -4  # a length of 4 bytes, then so many bytes
 _DATA = -8  # a length of 8 bytes, then so many bytes
@@ -84,14 +83,6 @@ def fits(opcode: int, length: int, read: Callable[[int, int], bytes]) -> bool:
     return position == length
 
 
-crc32: Callable[..., int] = zlib_ng.crc32
-"""Six times as fast as zlib's, which saves a sixth of the time to read a log."""
-MAGIC = b"\x89MCAP0\r\n"
-HEAD = struct.Struct("<BQ")
-RECORD_HEAD_BYTES = HEAD.size
-"""Bytes of a record that its length doesn't count: opcode, length."""
-MESSAGE_HEAD = 31
-"""Bytes of a message record before its payload: opcode, length, channel, sequence, log time, publish time."""
 MOST_RECORD_BYTES = 64 << 20
 """Of a record that is read. A chunk of ours has 0.1 MB, one of others up to 16 MB; an attachment of a run 0.2 MB."""
 CHANNEL_NUMBERS = 1 << 16
@@ -99,7 +90,6 @@ DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 _WINDOW = 1 << 20
 _RUN_BYTES = 40 << 10
 """Read at once of message indexes. A chunk of ours has 33 KB of them, in 30 records."""
-INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 _INDEX_HEAD = 6
 """Bytes of a message index before its entries: its channel, how many bytes they have."""
 _READERS: dict[int, Any] = {

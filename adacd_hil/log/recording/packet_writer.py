@@ -18,7 +18,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD, RECORD_HEAD_BYTES
+from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD, RECORD_HEAD_BYTES, record_dtype
 from adacd_hil.log.recording.log_file import McapFile
 from adacd_hil.log.recording.packet import (
     EVENT,
@@ -44,7 +44,6 @@ from adacd_hil.log.types.message_types import (
     pack_joint_state,
     pack_log,
 )
-from adacd_hil.log.types.record_arrays import record_dtype
 from adacd_hil.log.types.topics import ChannelId
 from adacd_hil.records import JOINTS, Event
 from adacd_hil.wire.codec_columns import ColumnCodec, MessageTable

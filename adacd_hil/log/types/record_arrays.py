@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.mcap.mcap_records import MESSAGE_HEAD
 from adacd_hil.log.types.message_types import CAN_FRAME, FD_FRAME, LOG, MAX_DATA, is_log
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 
@@ -25,20 +24,6 @@ _MOST_SMALL = 1 << 15
 """Topics whose slots go into 16 bits."""
 UNKNOWN, UNWANTED = -1, -2
 """Slots of channels that aren't gathered."""
-
-
-def record_dtype(payload: "np.dtype[Any]") -> "np.dtype[Any]":
-    """Describe a whole message record with such a payload."""
-    assert payload.names is not None
-    assert payload.fields is not None
-    fields = [payload.fields[name] for name in payload.names]
-    layout = {
-        "names": ["record_length", "log_time", "publish_time", *payload.names],
-        "formats": ["<u8", "<u8", "<u8", *(field[0] for field in fields)],
-        "offsets": [1, 15, 23, *(MESSAGE_HEAD + int(field[1]) for field in fields)],
-        "itemsize": MESSAGE_HEAD + payload.itemsize,
-    }
-    return np.dtype(layout)  # type: ignore[call-overload,no-any-return]
 
 
 class Topic(NamedTuple):

@@ -33,18 +33,8 @@ from adacd_hil.log.log_files import (
     part_path,
     parts_of,
 )
-from adacd_hil.log.mcap.mcap_records import (
-    HEAD,
-    MAGIC,
-    FileGap,
-    RawRecord,
-    attachment_crc_fits,
-    crc32,
-    crc_of,
-    name_of,
-    parse,
-    scan,
-)
+from adacd_hil.log.mcap.mcap_records import FileGap, RawRecord, attachment_crc_fits, crc_of, name_of, parse, scan
+from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, crc32
 from adacd_hil.log.types.record_arrays import count_frames
 
 _DATA = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA}

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from adacd_hil.lab.logs.check.content_checks import ContentCheck, DefinitionCheck
 from adacd_hil.lab.logs.check.findings import Findings
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
-from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, HEAD, INDEX_ENTRY, RawRecord, name_of, parse
+from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, RawRecord, name_of, parse
+from adacd_hil.log.mcap.record_layout import HEAD, INDEX_ENTRY
 
 
 @dataclass
