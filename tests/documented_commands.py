@@ -27,7 +27,8 @@ from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.device.profile import ProfileSettings, load_profile
 from adacd_hil.given_path import WrittenPath
 from adacd_hil.lab.offline.recording_map import read_map
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.setting_keys import apply_settings, parse_changes, parse_variations
 from adacd_hil.wire.codec import CodecError, load_codec

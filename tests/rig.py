@@ -20,10 +20,12 @@ from adacd_hil.device.network import Master
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.settings.arm_settings import BusSettings, LockstepSettings
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
-from adacd_hil.wire.bus import Bus, EmbeddedBus, Frame, Tap
+from adacd_hil.wire.bus import Bus, Frame, Tap
 from adacd_hil.wire.codec import Codec, load_codec
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import Scenario, load_scenario
 

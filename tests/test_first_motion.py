@@ -16,7 +16,7 @@ from adacd_hil.control.first_motion import FirstMotion
 from adacd_hil.control.session import SessionSummary
 from adacd_hil.records import ArmState, FaultReason, SchemeState
 from adacd_hil.replay.replay import replay
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import RequestSettings
 
 pytestmark = pytest.mark.slow

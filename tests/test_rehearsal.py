@@ -16,7 +16,7 @@ from adacd_hil.device.profile import load_profile
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.cli.own_devices import rehearse as rehearse_file
 from firmware_sim.scenario.scenario import Scenario

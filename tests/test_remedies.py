@@ -10,7 +10,8 @@ import pytest
 
 from adacd_hil import remedies
 from adacd_hil.remedies import install_command, nearest_name
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse
 from adacd_hil.settings.setting_keys import apply_settings
 

@@ -21,9 +21,11 @@ from adacd_hil.device.network import Master
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.records import FaultReason, SchemeState
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
-from adacd_hil.wire.bus import BusError, EmbeddedBus, Tap
+from adacd_hil.wire.bus import BusError, Tap
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 from adacd_hil.wire.lockstep_bus import make_lockstep_bus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import load_scenario

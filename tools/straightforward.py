@@ -27,7 +27,8 @@ import numpy as np
 from cantools.autosar import end_to_end
 from mcap.writer import CompressionType, Writer
 
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.codec import contract_folder
 
 ANSWERS = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")

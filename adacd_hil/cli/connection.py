@@ -15,7 +15,8 @@ from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.printable import in_line
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.terminal import hurry
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError
 from adacd_hil.wire.can_interface import can_interfaces, is_virtual

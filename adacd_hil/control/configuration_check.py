@@ -8,7 +8,8 @@ from typing import NamedTuple
 from adacd_hil.control.motions import motion_problems
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
-from adacd_hil.settings.configuration import ConfigurationLayer, Settings, configuration_layers, resolved_table
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.setting_keys import explain_unknown, known_keys, value_of
 from adacd_hil.settings.toml_files import builtin_names

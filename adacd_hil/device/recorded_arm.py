@@ -30,9 +30,10 @@ from adacd_hil.device.network import RESET_COMMUNICATION, START
 from adacd_hil.device.profile import place_devices
 from adacd_hil.records import JOINTS, ArmBatch, ArmState
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import NMT_ID
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 
 _Passed = Iterable[tuple[bool, Frame]]
 """Frames in the order of the log, True for sent."""

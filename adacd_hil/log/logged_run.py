@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from adacd_hil.log.log_files import LogError, TimeWindow
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.records import ContactReport, CycleRecord, SchemeState, Vector
-from adacd_hil.settings.configuration import Settings, renewed
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import renewed
 from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW

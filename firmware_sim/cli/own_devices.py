@@ -15,7 +15,8 @@ from typing import NamedTuple
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import ObjectName, PlacedDevice, place_devices
 from adacd_hil.records import JOINTS
-from adacd_hil.settings.configuration import ConfigurationLayer, Settings, configuration_layers, resolved_table
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import Codec, contract_folder
 from adacd_hil.wire.contract_frames import NOT_VALID

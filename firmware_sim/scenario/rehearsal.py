@@ -21,7 +21,8 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from adacd_hil.settings.arm_settings import ArmSettings
-from adacd_hil.settings.configuration import ConfigurationLayer, Settings, resolved_table
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import ConfigurationLayer, resolved_table
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_names
 from firmware_sim.arm.arms import ARMS

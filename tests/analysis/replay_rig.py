@@ -11,7 +11,8 @@ from adacd_hil.cli.embedded_run import Cast, run_embedded
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.reader import Piece, Series
 from adacd_hil.replay.log_source import LogSource
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import RequestSettings
 from firmware_sim.scenario.scenario import load_scenario
 

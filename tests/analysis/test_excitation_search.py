@@ -12,7 +12,8 @@ from adacd_hil.control.motions import Excitation
 from adacd_hil.lab.tune.excitation_search import TOLERANCE, NoExcitationError, Search
 from adacd_hil.scheme.kernel.certified_memory import constants_of
 from adacd_hil.scheme.model.regressor import regressor
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import ExcitationSettings, TrajectorySettings
 from adacd_hil.settings.schema import ConfigError, parse
 

@@ -13,7 +13,7 @@ from adacd_hil.lab.runs.log_comparison import MATCH_S, Contact, compare_logs, ma
 from adacd_hil.log import logged_run
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import ContactReport
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.settings.toml_files import to_toml
 

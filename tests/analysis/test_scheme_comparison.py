@@ -11,7 +11,7 @@ from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import Event, scheme_layout
 from adacd_hil.replay.scheme_comparison import SchemeComparison, different_arithmetic
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 
 SETTINGS = load_settings("paper")
 LAYOUT = scheme_layout(7)

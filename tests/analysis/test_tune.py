@@ -44,7 +44,7 @@ from adacd_hil.replay.log_source import LogSource
 from adacd_hil.scheme.pipeline.pipeline import layout_of
 from adacd_hil.score.emulator_truth import contacts_beside
 from adacd_hil.score.judge import least_rate_per_h, rate_bound_per_h, share_bounds
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import apply_settings

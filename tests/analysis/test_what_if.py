@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import (
     apply_settings,

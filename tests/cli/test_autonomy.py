@@ -16,7 +16,7 @@ from adacd_hil.cli.embedded_run import USER, resolve
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.lab.cli.play_command import may_move_an_arm
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings
 from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.settings.toml_files import builtin_names

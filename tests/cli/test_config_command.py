@@ -8,7 +8,7 @@ from called import called
 from click.testing import Result
 
 from adacd_hil.lab.commission.host_checks import Status, configuration_checks
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.toml_files import builtin_names
 
 USAGE = 2

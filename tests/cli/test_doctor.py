@@ -12,7 +12,7 @@ from rig import CODEC, Rig
 from adacd_hil.lab.cli.doctor_command import as_json, as_text
 from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
 from adacd_hil.lab.commission.host_checks import Check, Finding, Status, diagnose, failed, ok, summarise, warning
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.wire.codec import Codec, load_codec
 from firmware_sim.cli.own_devices import rehearse

@@ -22,7 +22,7 @@ from adacd_hil.control.history_file import (
     use_history,
 )
 from adacd_hil.device.network import Identity
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml, to_toml
 

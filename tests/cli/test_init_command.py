@@ -22,7 +22,8 @@ from adacd_hil.lab.commission.arm_draft import planar_from_urdf, uniform_rods
 from adacd_hil.lab.commission.host_checks import Status, configuration_checks, diagnose
 from adacd_hil.lab.commission.profile_draft import DeviceRatings, draft_profile
 from adacd_hil.lab.serial_arm.urdf import UrdfError
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.codec import contract_folder, load_codec
 from firmware_sim.cli.own_devices import rehearse
 

@@ -9,7 +9,7 @@ from called import called, complaints
 from adacd_hil.cli.commands.run_command import as_text, ask_without_anchor, next_of_run, summarise
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.scheme.identify.anchor import unanchored_joints
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 
 SETTINGS = load_settings("certified")
 

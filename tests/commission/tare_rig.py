@@ -8,7 +8,8 @@ import numpy as np
 from rig import CODEC, Rig
 
 from adacd_hil.lab.commission.tare_session import TareSession
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from firmware_sim.scenario.scenario import load_scenario
 
 FEEDBACK_IDS, TORQUE_IDS = (0x181, 0x182), (0x183, 0x184)

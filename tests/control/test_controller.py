@@ -5,7 +5,7 @@ import pytest
 
 from adacd_hil.control.controller import HANDOVER_S, Controller
 from adacd_hil.scheme.model.regressor import inverse_dynamics
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 
 SETTINGS = load_settings("paper", "S")
 THETA = np.array([0.4, 0.07, 0.04, 0.03, 0.02, 0.1, 0.05])

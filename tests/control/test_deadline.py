@@ -11,7 +11,7 @@ from rig import SessionRig, transition
 from adacd_hil.device.arm_watch import DeadlineWatch
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import ArmState, FaultReason, SchemeState
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import RealtimeSettings
 
 STALL_CYCLE = 600

@@ -9,7 +9,8 @@ from adacd_hil.control.pacing import GridPacer
 from adacd_hil.device.arm_report import describe_checks
 from adacd_hil.device.arm_watch import RateLimitedEvents
 from adacd_hil.records import ArmCommand, ArmState
-from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 
 
 class ExchangeRig:

@@ -3,7 +3,8 @@
 import numpy as np
 
 from adacd_hil.control.motions import Excitation
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import parse
 
 SETTINGS = load_settings("certified", "P")

@@ -7,7 +7,8 @@ import pytest
 from adacd_hil.control.geometry_check import geometry_event
 from adacd_hil.records import Event
 from adacd_hil.scheme.identify.certificate import Certificate
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 
 LENGTHS = (0.4, 0.25)
 MASSES = (2.0, 1.0)

@@ -8,7 +8,8 @@ from desired_motion import Desired
 
 from adacd_hil.control.reference import LOST_CYCLES
 from adacd_hil.records import JOINTS, Event, Reaction, SchemeState, Vector
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 
 SCHEMES = ("paper", "certified")
 PERIOD_US = 10_000

@@ -9,8 +9,9 @@ from adacd_hil.clock import MonotonicClock, VirtualClock
 from adacd_hil.control.pacing import GridPacer, Pacer, Tick, calibrate, make_pacer, prepare_spin
 from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.settings.arm_settings import LockstepSettings
-from adacd_hil.settings.configuration import load_settings
-from adacd_hil.wire.bus import EmbeddedBus, Tap
+from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.wire.bus import Tap
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 
 PERIOD_NS = 1_000_000
 

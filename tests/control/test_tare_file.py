@@ -17,7 +17,7 @@ from adacd_hil.control.tare_file import (
 )
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 
 DATE_NS = 1_767_225_600_000_000_000  # 2026-01-01T00:00:00Z

@@ -11,9 +11,10 @@ from adacd_hil.device.arm_report import describe_checks, describe_excess, descri
 from adacd_hil.records import ArmCommand, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import parse
-from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import load_codec
 from adacd_hil.wire.e2e import E2eSender
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 
 CODEC = load_codec()
 

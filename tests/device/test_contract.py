@@ -11,7 +11,8 @@ import adacd_hil
 from adacd_hil.control.session import write_contract
 from adacd_hil.device.contract import compose, load_contract
 from adacd_hil.device.profile import place_devices
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import contract_folder, load_codec
 

@@ -8,10 +8,12 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.contract import load_contract
 from adacd_hil.records import FaultReason
-from adacd_hil.settings.configuration import Settings, load_settings
-from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.e2e import E2eSender
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 
 PERIOD_NS = 1_000_000
 USUAL_NS = {"Drive1Feedback": 200_000, "Drive2Feedback": 300_000, "Sensor1Torque": 400_000, "Sensor2Torque": 480_000}

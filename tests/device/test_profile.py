@@ -10,7 +10,7 @@ import pytest
 from adacd_hil.device.canopen_bus import read_eds
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import ProfileSettings, load_profile, profile_names
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.wire.codec import contract_folder
 

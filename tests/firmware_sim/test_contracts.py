@@ -12,7 +12,7 @@ from bench_host import ENABLING, PERIOD_NS, BenchHost, Nmt, Word, quiet_scenario
 from canopen.objectdictionary.datatypes import SIGNED_TYPES
 
 from adacd_hil.device.contract import load_contract
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import contract_folder, load_codec, parse_codec
 from firmware_sim.arm.sensing import TORQUE_LSB_NM

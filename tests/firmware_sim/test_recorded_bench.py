@@ -14,9 +14,10 @@ from adacd_hil.control.session import Session
 from adacd_hil.log.frames.mcap_frames import FrameWriter, RecordedFrame
 from adacd_hil.log.reader import topic_bytes
 from adacd_hil.settings.arm_settings import BusSettings, LockstepSettings
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
-from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 from adacd_hil.wire.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
 from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
 from firmware_sim.scenario.scenario import load_scenario

@@ -8,8 +8,9 @@ from rig import SessionRig
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.session import SessionSummary
-from adacd_hil.settings.configuration import load_settings
-from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 
 CanFrame = tuple[int, bytes]
 SHORT_RUN = '[operator]\nscript = [{ at_s = 0.3, request = "finish" }]\n'

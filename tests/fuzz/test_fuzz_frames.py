@@ -27,8 +27,9 @@ from fuzz_receivers import (
 from adacd_hil.clock import VirtualClock
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import topic_bytes
-from adacd_hil.settings.configuration import load_settings
-from adacd_hil.wire.bus import EmbeddedBus, Frame
+from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.nodes.drive_profile import DriveState
 
 pytestmark = pytest.mark.slow

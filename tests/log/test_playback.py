@@ -4,7 +4,7 @@ import pytest
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.lab.logs.playback import LEAD_NS, LOOP_PAUSE_NS, Lateness, PlayedFrame, play, repeat
-from adacd_hil.wire.bus import EmbeddedBus
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 
 BEGIN_NS = 1_000_000_000
 

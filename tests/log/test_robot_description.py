@@ -15,7 +15,7 @@ from adacd_hil.log.robot_description import robot_description
 from adacd_hil.log.viewer_layout import viewer_layout
 from adacd_hil.records import GRAVITY_M_S2
 from adacd_hil.scheme.model.regressor import inverse_dynamics
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 
 LENGTHS_M = (0.42, 0.27)
 

@@ -33,7 +33,8 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import place_devices
 from adacd_hil.log.reader import RunLog, Series, read_log
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from firmware_sim.cli.own_devices import describe_devices
 from firmware_sim.scenario.scenario import Scenario, load_scenario
 

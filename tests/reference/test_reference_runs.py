@@ -26,7 +26,7 @@ from adacd_hil.log.reader import RunLog
 from adacd_hil.records import SchemeState
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.replay.replay import replay_source
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 
 RENEW = "if this is meant: python tests/reference/renew.py"
 UNCOMPILED = {"certified-quick": 1000, "paper-quick": 750}

@@ -13,7 +13,8 @@ from adacd_hil.control.motions import Excitation
 from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 
 PERIOD_S = 1e-3
 SETTINGS = load_settings("certified", "P")

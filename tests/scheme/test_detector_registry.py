@@ -8,7 +8,8 @@ from documents import ROOT
 
 from adacd_hil.lab.detectors import detector_registry
 from adacd_hil.lab.detectors.detectors import DetectorBankSettings
-from adacd_hil.settings.configuration import Settings, load_settings, renewed
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings, renewed
 from adacd_hil.settings.schema import ConfigError, DetectorError, parse
 from adacd_hil.settings.setting_keys import apply_settings
 

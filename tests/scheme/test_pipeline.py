@@ -16,7 +16,7 @@ from adacd_hil.scheme.kernel import certified_kernel, paper_kernel
 from adacd_hil.scheme.model.regressor import is_positive_definite
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.supervisor import transitions
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 
 PAPER = load_settings("paper", "P")
 NEVER_ALARM = {"detector": {"threshold_Nm": [50.0, 50.0]}}

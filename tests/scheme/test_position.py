@@ -12,7 +12,7 @@ from adacd_hil.records import CERTIFICATE_EVENTS, POSITION_TERMS, Request, Schem
 from adacd_hil.scheme.identify import missing_torque
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model import filter_bank, regressor
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 
 TOLD = replace(FREE, arm=replace(FREE.arm, position_torque_Nm=0.15))
 CABLE_NM = 0.1

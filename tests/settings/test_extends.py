@@ -2,7 +2,7 @@
 
 import pytest
 
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 
 

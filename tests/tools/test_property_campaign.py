@@ -18,7 +18,7 @@ from made_run import DISABLED_WORD, ENABLED, ENABLED_WORD, Made, states
 from wire_record import Passed, WireRecord
 
 from adacd_hil.records import Request, SchemeState
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import parse
 from adacd_hil.wire.codec import contract_folder
 from firmware_sim.scenario.scenario import Scenario

@@ -12,7 +12,7 @@ import side_by_side
 import yardstick
 from side_by_side import Block, Window
 
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 
 
 def block(name: str, cpu_us: list[float], overruns: int = 0, compute_ns: int = 50_000) -> Block:

@@ -13,7 +13,7 @@ import witness
 import yardstick
 from mcap.writer import Writer
 
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.codec import load_codec
 from firmware_sim.scenario.scenario import load_scenario

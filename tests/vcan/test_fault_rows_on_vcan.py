@@ -13,7 +13,7 @@ from rig import SessionRig
 
 from adacd_hil.log.log_files import TRUTH_NAME
 from adacd_hil.log.reader import read_log
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.scenario.scenario import load_scenario
 

@@ -14,7 +14,7 @@ from experiment_runs import BIN, Played, Witness, candump, demo, emulator, run_o
 from mcap.reader import make_reader
 
 from adacd_hil.log.reader import read_log, topic_bytes
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.codec import contract_folder
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]

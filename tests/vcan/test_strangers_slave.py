@@ -23,7 +23,7 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, ArmState, FaultReason
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import contract_folder
 

@@ -4,7 +4,8 @@ import can
 import pytest
 
 from adacd_hil.clock import MonotonicClock, VirtualClock
-from adacd_hil.wire.bus import BusError, BusMissingError, BusOffError, EmbeddedBus, Frame, Tap
+from adacd_hil.wire.bus import BusError, BusMissingError, BusOffError, Frame, Tap
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 from adacd_hil.wire.open_bus import open_bus
 
 

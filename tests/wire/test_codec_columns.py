@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from adacd_hil.device.contract import load_contract
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.codec import MessageCodec, parse_codec
 from adacd_hil.wire.codec_columns import ColumnCodec
 

@@ -22,7 +22,8 @@ from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.reader import LoggedEvent, RunLog, read_log
 from adacd_hil.records import TRUTH_LAYOUT, SchemeState
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Bus, Frame

@@ -33,7 +33,8 @@ from witnessed_run import Played, play_witnessed
 
 from adacd_hil.cli.output import format_table
 from adacd_hil.records import SchemeState
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import parse
 from firmware_sim.scenario.scenario import Scenario

@@ -25,7 +25,7 @@ from typing import Any
 from campaign_loop import play_trials
 
 from adacd_hil.cli.output import format_table
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.scenario.scenario import builtin_scenarios, deviations, load_scenario
 

@@ -15,7 +15,8 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.supervisor.transitions import ADAPTED, CONTACT_SHIFT
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 
 ADAPTING, TESTING, ARMED = 0, 1, 2
 _LEARN = paper_kernel.LEARN

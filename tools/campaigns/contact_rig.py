@@ -29,7 +29,8 @@ from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.kernel.cycle import DECISION, decide, follow_contact, new_course
 from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, fill_sample
 from adacd_hil.scheme.supervisor import transitions
-from adacd_hil.settings.configuration import Settings, load_settings, merge
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings, merge
 from adacd_hil.settings.schema import parse
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_settings import ticks

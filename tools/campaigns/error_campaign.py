@@ -34,7 +34,8 @@ from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.scheme.supervisor import transitions
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 from adacd_hil.score.judge import begins_of
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import apply_settings, parse_changes
 from firmware_sim.arm.arms import EmulatedArm
 from firmware_sim.arm.hardware_settings import MechanicsSettings, SensorSettings

@@ -23,7 +23,8 @@ from scipy.signal import lfilter
 from adacd_hil.cli.output import format_table
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.model import filter_bank
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 
 Array = NDArray[np.float64]
 SIGMAS = 5.0

@@ -7,7 +7,7 @@ import numpy as np
 from lab_motion import PERIOD_S
 from numpy.typing import NDArray
 
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from firmware_sim.arm.arms import ARMS, EmulatedArm
 from firmware_sim.arm.hardware_settings import DriveSettings, MechanicsSettings, SensorSettings
 

@@ -14,7 +14,7 @@ from adacd_hil.lab.logs.cut import TimeWindow, cut
 from adacd_hil.log.frames.can_io import to_messages
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.scheme.model.regressor import inverse_dynamics
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.codec import contract_folder
 from firmware_sim.scenario.scenario import builtin_scenarios

@@ -13,7 +13,8 @@ from typing import Any
 from witnessed_run import User
 
 from adacd_hil.records import Request
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.codec import Codec, load_codec

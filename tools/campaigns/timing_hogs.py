@@ -32,7 +32,7 @@ from timing_hour import write_contacts
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME
 from adacd_hil.log.reader import Series, read_log
 from adacd_hil.records import SchemeState
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from firmware_sim.scenario.scenario import load_scenario
 
 COUNTED = ("command-counter", "sync-counter", "log-not-whole")

@@ -25,7 +25,7 @@ from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.records import TRUTH_LAYOUT, Request, SchemeState
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.wire.bus import EmbeddedBus
+from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import Scenario
 

@@ -56,7 +56,8 @@ def show_settings(
 def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tuple[str, ...]) -> list[dict[str, str]]:
     """Return the effective settings with value and default as TOML, and origin. Raises ConfigError, CommandError."""
     from adacd_hil.control.configuration_check import origins_of
-    from adacd_hil.settings.configuration import Settings, configuration_layers, resolved_table
+    from adacd_hil.settings.configuration import Settings
+    from adacd_hil.settings.configuration_files import configuration_layers, resolved_table
     from adacd_hil.settings.schema import parse
     from adacd_hil.settings.setting_keys import apply_settings, in_words, parse_changes, value_of
 

@@ -121,7 +121,7 @@ def _replay_one(
     from adacd_hil.control.operator import ScriptedOperator
     from adacd_hil.replay.replay import replay_source
     from adacd_hil.score.emulator_truth import contacts_beside
-    from adacd_hil.settings.configuration import load_settings
+    from adacd_hil.settings.configuration_files import load_settings
     from adacd_hil.settings.setting_keys import (
         apply_settings,
         keep_facts,
@@ -158,7 +158,7 @@ def _open(
     from adacd_hil.device.contract import load_contract
     from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone
     from adacd_hil.replay.log_source import LogSource
-    from adacd_hil.settings.configuration import load_settings
+    from adacd_hil.settings.configuration_files import load_settings
     from adacd_hil.wire.codec import load_codec
 
     path = log_in(given)

@@ -5,7 +5,7 @@ from typing import Any
 
 from adacd_hil.device.contract import find_contract, load_contract
 from adacd_hil.printable import in_line
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import fold, terminal_columns
 from adacd_hil.wire.budget import Budget, FrameBudget, LoadCase, ResponseTime, check_budget, us

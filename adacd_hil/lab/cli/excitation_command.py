@@ -8,7 +8,7 @@ from adacd_hil.cli.output import CommandError, ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.tune.excitation_search import NoExcitationError, Search
 from adacd_hil.progress_lines import Progress
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import ExcitationSettings
 from adacd_hil.settings.toml_files import builtin_names, to_toml
 

@@ -14,7 +14,8 @@ from adacd_hil.lab.commission.arm_draft import ArmDraft, Entry, write_draft
 from adacd_hil.log.log_files import log_in
 from adacd_hil.log.log_info import attachment
 from adacd_hil.log.logged_run import settings_of
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import known_keys, value_of
 

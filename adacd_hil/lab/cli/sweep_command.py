@@ -131,7 +131,7 @@ def _plan(
     from adacd_hil import __version__
     from adacd_hil.compiled import program_digest
     from adacd_hil.lab.tune.sweep import plan_logs, plan_scenarios
-    from adacd_hil.settings.configuration import load_settings
+    from adacd_hil.settings.configuration_files import load_settings
     from adacd_hil.settings.setting_keys import apply_settings, parse_variations
 
     variants = parse_variations(vary)

@@ -26,7 +26,7 @@ from adacd_hil.lab.serial_arm.urdf import BASE, SerialArm, UrdfError, read_urdf
 from adacd_hil.printable import one_line
 from adacd_hil.records import GRAVITY_M_S2, JOINTS, Vector
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.setting_keys import known_keys
 from adacd_hil.settings.toml_files import toml_value

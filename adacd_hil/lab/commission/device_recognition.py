@@ -24,7 +24,7 @@ from adacd_hil.lab.commission.profile_draft import (
 )
 from adacd_hil.lab.commission.survey import BETWEEN_READS_S, Node
 from adacd_hil.records import JOINTS
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Bus, Tap
 from adacd_hil.wire.codec import CodecError

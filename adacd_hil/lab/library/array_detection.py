@@ -31,7 +31,7 @@ from adacd_hil.log.robot_description import robot_description
 from adacd_hil.records import Vector
 from adacd_hil.remedies import nearest_name
 from adacd_hil.score.wording import number_of
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 
 FIT_SHARE: Final = 0.4

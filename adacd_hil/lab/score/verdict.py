@@ -27,7 +27,7 @@ from adacd_hil.score.metrics import (
 )
 from adacd_hil.score.wording import NONE, found_text, number_of, percent_text, score_sentence
 from adacd_hil.settings.arm_settings import ArmSettings
-from adacd_hil.settings.configuration import load_settings
+from adacd_hil.settings.configuration_files import load_settings
 
 LISTED: Final = 4
 """Adaptations that are listed one by one."""

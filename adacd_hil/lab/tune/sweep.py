@@ -34,7 +34,8 @@ from adacd_hil.remedies import install_command
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.replay.replay import replay_many
 from adacd_hil.replay.replayed_outcome import Replay
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import apply_settings, keep_facts
 from adacd_hil.wire.codec import CodecError

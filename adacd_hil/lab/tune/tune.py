@@ -53,7 +53,8 @@ from adacd_hil.replay.replay import replay_many
 from adacd_hil.replay.replayed_outcome import Replay
 from adacd_hil.score.judge import least_rate_per_h
 from adacd_hil.score.wording import delay_figures, delays_phrase, number_of, rate_phrase, share_phrase
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import apply_settings, changed_keys, keep_facts
 from adacd_hil.settings.toml_files import builtin_names

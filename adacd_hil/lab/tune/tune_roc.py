@@ -38,7 +38,8 @@ from adacd_hil.replay.log_source import LogSource
 from adacd_hil.score.emulator_truth import HostCycles, contacts_beside, placed_contacts
 from adacd_hil.score.judge import Times, TrueContact, explained_until, rate_bound_per_h, share_bounds
 from adacd_hil.score.wording import delay_figures
-from adacd_hil.settings.configuration import Settings, load_settings
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import changed_keys, keep_facts
 
 Changes = dict[str, str]

@@ -1,0 +1,137 @@
+"""Configurations from files: a built-in name or a TOML file, merged over the files that it extends."""
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from adacd_hil.file_access import exists
+from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.schema import WITHDRAWN, ConfigError, parse
+from adacd_hil.settings.toml_files import builtin_folder, builtin_names, find_toml, read_toml
+
+_LONGEST_CHAIN = 8
+"""Most configurations that may extend each other in a row."""
+
+
+def renewed(table: dict[str, Any]) -> dict[str, Any]:
+    """Return the configuration of a log with the keys of older versions replaced by today's.
+
+    A log holds every key of the version that wrote it. So a term whose key is missing was not in that version's model.
+    """
+    certified = table.get("certified")
+    if isinstance(certified, dict) and "cross_talk_std" not in certified:
+        table = table | {"certified": certified | {"cross_talk_std": 0.0}}
+    detector = table.get("detector")
+    if isinstance(detector, dict):
+        table = table | {"detector": {key: detector[key] for key in detector if f"detector.{key}" not in WITHDRAWN}}
+    safety = table.get("safety")
+    if not isinstance(safety, dict) or "commission_cycles" not in safety:
+        return table
+    bus = table.get("bus")
+    period_us = bus.get("period_us", 1000) if isinstance(bus, dict) else 1000
+    cycles = safety["commission_cycles"]
+    if not (isinstance(cycles, int) and isinstance(period_us, int)):
+        return table
+    kept = {key: value for key, value in safety.items() if key != "commission_cycles"}
+    return table | {"safety": kept | {"commission_s": cycles * period_us * 1e-6}}
+
+
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """Merge two TOML tables, section by section; `over` wins."""
+    merged = dict(base)
+    for key, value in over.items():
+        if isinstance(value, dict) and isinstance(merged.get(key), dict):
+            merged[key] = merge(merged[key], value)
+        else:
+            merged[key] = value
+    return merged
+
+
+class ConfigurationLayer(NamedTuple):
+    """Settings of one file, or of one profile in it; `origin` names it."""
+
+    origin: str
+    table: dict[str, Any]
+
+
+def load_settings(name_or_file: str = "paper", profile: str | None = None) -> Settings:
+    """Resolve a configuration: a built-in name, or a TOML file merged over the one it `extends` (default `paper`).
+
+    `profile` picks the `[profiles.X]` table. Raises ConfigError.
+    """
+    return parse(Settings, resolved_table(configuration_layers(name_or_file, profile)))
+
+
+def resolved_table(layers: Sequence[ConfigurationLayer]) -> dict[str, Any]:
+    """Merge the layers of a configuration, later over earlier."""
+    return functools.reduce(merge, (layer.table for layer in layers), {})
+
+
+def configuration_layers(name_or_file: str, profile: str | None = None) -> list[ConfigurationLayer]:
+    """Read a configuration and all that it extends, the base first. Raises ConfigError.
+
+    A profile's values come first: keys of the files override them.
+    """
+    files = _load_chain(name_or_file)
+    table = resolved_table(files)
+    profiles = _table_in(table, "profiles", "`profiles`")
+    chosen = profile or _table_in(table, "arm", "`arm`").get("profile", "P")
+    if not isinstance(chosen, str) or chosen not in profiles:
+        raise ConfigError(f"profile {chosen!r} is not in configuration {name_or_file}; known: {', '.join(profiles)}")
+    layers = []
+    for layer in files:
+        own = _table_in(_table_in(layer.table, "profiles", "`profiles`"), chosen, f"`profiles.{chosen}`")
+        if own:
+            layers.append(ConfigurationLayer(f"{layer.origin} [profiles.{chosen}]", own))
+    layers += [
+        ConfigurationLayer(origin, {key: value for key, value in said.items() if key != "profiles"})
+        for origin, said in files
+    ]
+    if profile is not None:
+        layers.append(ConfigurationLayer("--profile", {"arm": {"profile": chosen}}))
+    return layers
+
+
+def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
+    """Return a table within a table, empty if absent. Raises ConfigError if the value is not a table."""
+    value = table.get(key, {})
+    if not isinstance(value, dict):
+        raise ConfigError(f"{name} = {value!r} must be a table")
+    return value
+
+
+def _find_beside(table: dict[str, Any], folder: Path) -> None:
+    """Make the paths of device and contract files absolute if the files lie in the configuration's folder."""
+
+    def found(name: Any) -> Any:
+        is_beside = isinstance(name, str) and Path(name).suffix and exists(folder / name)
+        return str(folder / name) if is_beside else name
+
+    devices = table.get("devices")
+    if not isinstance(devices, dict):
+        return
+    for key in ("drive", "sensor", "contract"):
+        if key in devices:
+            value = devices[key]
+            devices[key] = [found(name) for name in value] if isinstance(value, list) else found(value)
+
+
+def _load_chain(name_or_file: str, seen: tuple[str, ...] = ()) -> list[ConfigurationLayer]:
+    """Read a configuration and all that it extends; relative paths start in the folder of the file that names them."""
+    if name_or_file in seen:
+        raise ConfigError(f"configuration {name_or_file} extends itself")
+    if len(seen) > _LONGEST_CHAIN:
+        raise ConfigError(f"configuration {seen[0]} extends more than {_LONGEST_CHAIN} others, one by one")
+    path = find_toml("configuration", name_or_file, builtin_folder())
+    table = read_toml(path)
+    table.setdefault("name", path.stem)
+    _find_beside(table, path.parent)
+    if "extends" not in table and name_or_file in builtin_names():
+        return [ConfigurationLayer(name_or_file, table)]
+    extended = table.pop("extends", "paper")
+    if not isinstance(extended, str):
+        raise ConfigError(f"`extends` = {extended!r} must be the name of a configuration or a file")
+    if extended not in builtin_names() and Path(extended).suffix:
+        extended = str(path.parent / extended)
+    return [*_load_chain(extended, (*seen, name_or_file)), ConfigurationLayer(name_or_file, table)]
