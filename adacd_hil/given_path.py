@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from adacd_hil.file_access import dangling_link
+from adacd_hil.file_replacement import dangling_link
 
 
 class GivenPath(click.Path):

@@ -8,19 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.file_access import (
-    InUseError,
-    Replacement,
-    check_unused,
-    create_file,
-    exists,
-    open_input,
-    place_file,
-    read_input,
-    replace_file,
-    replacing,
-    tidied,
-)
+from adacd_hil.file_access import InUseError, check_unused, create_file, exists, open_input, place_file, read_input
+from adacd_hil.file_replacement import Replacement, replace_file, replacing, tidied
 from adacd_hil.log.mcap.chunked_file import MAGIC
 
 

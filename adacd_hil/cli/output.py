@@ -20,7 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adacd_hil.clock import wall_ns
-from adacd_hil.file_access import Replacement, in_words, is_disk_full, replace_file, tidied
+from adacd_hil.file_access import in_words, is_disk_full
+from adacd_hil.file_replacement import Replacement, replace_file, tidied
 from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line, one_line

@@ -15,7 +15,8 @@ from adacd_hil.clock import date_ns
 from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
-from adacd_hil.file_access import read_input, replacing
+from adacd_hil.file_access import read_input
+from adacd_hil.file_replacement import replacing
 from adacd_hil.records import JOINTS, Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.run_settings import TareSettings

@@ -20,7 +20,7 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from adacd_hil.file_access import replace_files
+from adacd_hil.file_replacement import replace_files
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.plain_values import json_text
 from adacd_hil.records import Vector

@@ -14,7 +14,8 @@ import click
 
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.compiled import compiling
-from adacd_hil.file_access import in_words, tidied
+from adacd_hil.file_access import in_words
+from adacd_hil.file_replacement import tidied
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.log.log_files import TRUTH_NAME, LogError, LogExistsError
 from adacd_hil.log.log_info import run_metadata

@@ -12,7 +12,7 @@ from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import refuse_company
-from adacd_hil.file_access import replace_files
+from adacd_hil.file_replacement import replace_files
 from adacd_hil.lab.commission.communication_test import (
     CommunicationReport,
     CommunicationTest,

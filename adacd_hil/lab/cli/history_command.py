@@ -7,7 +7,7 @@ import click
 
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained, format_table
-from adacd_hil.file_access import is_anothers, replace_file
+from adacd_hil.file_replacement import is_anothers, replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.printable import in_line
 

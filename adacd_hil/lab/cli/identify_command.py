@@ -8,7 +8,8 @@ import click
 
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table, quoted, show
-from adacd_hil.file_access import place_file, replace_file
+from adacd_hil.file_access import place_file
+from adacd_hil.file_replacement import replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line

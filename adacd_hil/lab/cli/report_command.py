@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adacd_hil.cli.output import CommandError, ExitCode
-from adacd_hil.file_access import replace_file
+from adacd_hil.file_replacement import replace_file
 from adacd_hil.lab.report.report_files import Report, write_report
 from adacd_hil.lab.runs.run_pages import INDEX_NAME, ListedRun, runs_page
 from adacd_hil.lab.runs.run_summary import BROKEN, RunSummary, find_runs, reported

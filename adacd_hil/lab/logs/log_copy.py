@@ -11,7 +11,8 @@ import numpy as np
 from mcap.records import Attachment, Channel, Header, Schema
 from numpy.typing import NDArray
 
-from adacd_hil.file_access import Replacement, open_input
+from adacd_hil.file_access import open_input
+from adacd_hil.file_replacement import Replacement
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import (
     COPY_ENDINGS,

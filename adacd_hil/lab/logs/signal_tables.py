@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.file_access import is_anothers, replacing
+from adacd_hil.file_replacement import is_anothers, replacing
 from adacd_hil.log.frames.frame_log import open_frames
 from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series

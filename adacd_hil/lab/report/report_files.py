@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from adacd_hil.file_access import replace_files
+from adacd_hil.file_replacement import replace_files
 from adacd_hil.lab.report.next_steps import NextStep, next_steps
 from adacd_hil.lab.report.page import has_paper, went_wrong
 from adacd_hil.lab.report.report_json import JSON_NAME, report_json

@@ -13,7 +13,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from adacd_hil.file_access import replace_files, replacing
+from adacd_hil.file_replacement import replace_files, replacing
 from adacd_hil.lab.logs.signal_tables import import_pyarrow
 from adacd_hil.lab.runs.run_summary import CERTIFIED, GOOD, NO_CERTIFICATE, NOT_JUDGED, RUNNING, RunSummary
 from adacd_hil.log.log_files import failing_as

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.file_access import replace_file, replacing
+from adacd_hil.file_replacement import replace_file, replacing
 from adacd_hil.lab.tune.workers import Workers
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Progress

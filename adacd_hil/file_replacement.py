@@ -1,0 +1,134 @@
+"""Replacement of files in one step.
+
+A replacement is written beside the file and renamed: at each moment the path holds the whole old file or the whole new
+one. Nothing is written through a link, into a FIFO or a device, so that only the named path changes.
+"""
+
+import contextlib
+import errno
+import itertools
+import os
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+from adacd_hil.file_access import NEW
+
+_LOG_MAGIC = b"\x89MCAP0\r\n"
+
+
+class Replacement:
+    """A new file, `beside`, that takes the place of `path` when it is committed."""
+
+    def __init__(self, path: Path, is_log: bool = False) -> None:
+        """Create the new file. `commit` replaces a link itself, not the link's target.
+
+        is_log: a log may be replaced. Raises OSError, also if a FIFO, a device, a folder or (unless is_log) a log is
+        there.
+        """
+        _check_replaceable(path, is_log)
+        self.path = path
+        self.beside = _create_beside(path)
+
+    def commit(self, is_durable: bool = False) -> None:
+        """Rename the new file to `path`; is_durable: after its contents are on the disk. Raises OSError."""
+        try:
+            if is_durable:
+                with self.beside.open("rb") as file:
+                    os.fsync(file.fileno())
+            self.beside.replace(self.path)
+        except OSError:
+            self.discard()
+            raise
+
+    def discard(self) -> None:
+        """Remove the new file."""
+        with contextlib.suppress(OSError):
+            self.beside.unlink()
+
+
+@contextmanager
+def replacing(path: Path, is_durable: bool = False) -> Iterator[Path]:
+    """Yield the path of a new file that takes the place of `path` when the block ends without error.
+
+    See `Replacement`. Raises OSError.
+    """
+    replacement = Replacement(path)
+    try:
+        yield replacement.beside
+    except BaseException:
+        replacement.discard()
+        raise
+    replacement.commit(is_durable)
+
+
+def replace_file(path: Path, content: bytes | str) -> None:
+    """Write a whole file in one step, text as UTF-8; see `Replacement`. Raises OSError."""
+    with replacing(path) as beside:
+        beside.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Path, ...]:
+    """Write whole files, by name, into a folder, which is made if missing; return their paths. Raises OSError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, content in contents.items():
+        replace_file(folder / name, content)
+    return tuple(folder / name for name in contents)
+
+
+def is_anothers(path: Path, head: bytes) -> bool:
+    """Return whether the file exists, isn't empty, and doesn't begin with `head`: then it may not be replaced.
+
+    Raises OSError.
+    """
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(len(head)) not in (b"", head)
+
+
+def _check_replaceable(path: Path, is_log: bool) -> None:
+    """Raise OSError if the path is a folder, a FIFO, a socket, a device or (unless is_log) a log."""
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, "it is a folder; give the name of a file", str(path))
+    if not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
+        raise OSError(errno.EINVAL, "it is a FIFO, a socket or a device; give the name of a file", str(path))
+    if stat.S_ISREG(mode) and not is_log:
+        with path.open("rb") as file:
+            if file.read(len(_LOG_MAGIC)) == _LOG_MAGIC:
+                raise FileExistsError(errno.EEXIST, "it is a log, which is not replaced; give another name", str(path))
+
+
+def _create_beside(path: Path) -> Path:
+    for number in itertools.count():
+        beside = path.with_name(f".{path.name}.{os.getpid()}-{number}.part")
+        with contextlib.suppress(FileExistsError):  # left by a process of this id that was killed
+            os.close(os.open(beside, NEW, 0o666))
+            return beside
+    raise AssertionError
+
+
+def dangling_link(path: Path) -> Path | None:
+    """Return the first link on a path, or the path itself, whose target doesn't exist; None if there is none."""
+    for place in (path, *path.parents):
+        with contextlib.suppress(OSError):
+            if place.is_symlink() and not place.exists():
+                return place
+    return None
+
+
+@contextmanager
+def tidied(path: Path) -> Iterator[None]:
+    """When the block ends, remove a folder and its parents as far as they are empty and didn't exist before."""
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        yield
+    finally:
+        with contextlib.suppress(OSError):  # not empty: it stays, and so do those above
+            for folder in made:
+                folder.rmdir()
