@@ -101,7 +101,10 @@ def test_a_name_reaches_a_terminal_as_plain_text(
         log.write_event(0, "info", "run", "begun")
     ours, theirs = os.openpty()
     program, *rest = (word.replace("EVIL", EVIL) for word in words)
-    done = subprocess.run([BIN / program, *rest], stdout=theirs, stderr=theirs, check=False, cwd=tmp_path)
+    environment = {**os.environ, "NO_COLOR": "1"}  # else our own colours are escape sequences, too
+    done = subprocess.run(
+        [BIN / program, *rest], stdout=theirs, stderr=theirs, check=False, cwd=tmp_path, env=environment
+    )
     os.close(theirs)
     shown = os.read(ours, 65536).decode()
     os.close(ours)
