@@ -17,9 +17,11 @@ _MEDIAN_TO_SIGMA: Final = 1.4826 / math.sqrt(6.0)  # of the second difference of
 def white_noise(*parts: Vector) -> Vector:
     """Estimate the rms of white noise, (n,) or a number, on series that are smooth but for it.
 
-    By the median of the second difference, which motion hardly changes.
+    By the median of the second difference, which motion hardly changes. 0 where no part has three samples.
     """
     seconds = np.concatenate([np.abs(np.diff(part, 2, axis=0)) for part in parts])
+    if not len(seconds):
+        return np.zeros(seconds.shape[1:])
     return np.asarray(_MEDIAN_TO_SIGMA * np.median(seconds, axis=0))
 
 

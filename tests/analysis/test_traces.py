@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import arrays
 
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.timeline import traces_of
-from adacd_hil.lab.report.traces import noise_of, pack, panels_of, step_of
+from adacd_hil.lab.report.traces import pack, panels_of, step_of
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.logged_run import MeasuredMotion
 from adacd_hil.log.reader import LoggedEvent
@@ -64,12 +64,18 @@ def test_noise_costs_less_than_five_bits_per_sample():
 
 def test_a_step_is_half_the_noise_and_no_finer_than_asked_for():
     noise = np.random.default_rng(7).normal(0.0, 0.02, 20_000)
-    assert noise_of(noise + np.sin(np.arange(20_000) / 300.0)) == pytest.approx(0.02, rel=0.03)  # it moves, too
-    assert step_of(noise, 1e-4) == pytest.approx(0.01, rel=0.03)
+    assert step_of(noise + np.sin(np.arange(20_000) / 300.0), 1e-4) == pytest.approx(0.01, rel=0.03)  # it moves, too
     assert step_of(np.zeros(100), 1e-3) == 1e-3
-    gaps = np.zeros(1000)
-    gaps[::3] = np.nan
-    assert noise_of(gaps) == 0.0
+    gaps = np.where(np.arange(1000) % 3 == 0, np.nan, 1.0)
+    assert step_of(gaps, 1e-3) == 1e-3
+
+
+def test_a_step_is_that_of_the_noise_between_gaps():
+    noise = np.random.default_rng(7).normal(0.0, 0.02, 20_000)
+    jumps = np.arange(20_000) % 3 == 0
+    values = noise + 100.0 * np.cumsum(jumps) ** 2
+    assert step_of(values, 1e-4, ~jumps) == pytest.approx(0.01, rel=0.03)
+    assert step_of(values[::3], 1e-4, jumps[::3] & False) == 1e-4
 
 
 def moved(run):

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.lab.score.evaluation import QUEUES
+from adacd_hil.lab.signal_noise import white_noise
 from adacd_hil.log.logged_run import (
     COMPUTE,
     LATENESS,
@@ -231,10 +232,6 @@ def run_tracks(run: Run) -> list[Track]:
 STEPS_PER_SIGMA: Final = 2.0
 """A rounding error of 0.14 standard deviations: it makes the noise 1 % larger."""
 _LARGEST_CODE: Final = 2**30
-_THIRD_DIFFERENCE: Final = 20.0**0.5
-"""Standard deviation of the third difference of white noise, over its own."""
-_NORMAL: Final = 1.4826
-"""Standard deviation of normal noise over its median absolute value."""
 
 
 class Packed(NamedTuple):
@@ -247,22 +244,16 @@ class Packed(NamedTuple):
     text: str
 
 
-def noise_of(values: Vector, is_next: NDArray[np.bool_] | None = None) -> float:
-    """Estimate the standard deviation of a series' white noise by its third differences, which motion hardly has.
+def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = None) -> float:
+    """Choose a step: half the standard deviation of a series' white noise, but no finer than `finest`.
 
     is_next (n,): samples that follow the one before at once; None: all do.
     """
     is_finite = np.isfinite(values)
-    differences = np.diff(values[is_finite], 3)
+    parts = [values[is_finite]]
     if is_next is not None:
-        follows = is_next[is_finite]
-        differences = differences[follows[3:] & follows[2:-1] & follows[1:-2]]
-    return float(_NORMAL * np.median(np.abs(differences)) / _THIRD_DIFFERENCE) if differences.size else 0.0
-
-
-def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = None) -> float:
-    """Choose a step: half the noise's standard deviation, see `noise_of`, but no finer than `finest`."""
-    return max(finest, noise_of(values, is_next) / STEPS_PER_SIGMA)
+        parts = np.split(parts[0], np.flatnonzero(~is_next[is_finite]))
+    return max(finest, float(white_noise(*parts)) / STEPS_PER_SIGMA)
 
 
 def pack(values: Vector, step: float) -> Packed:
