@@ -8,7 +8,7 @@ import pytest
 from hand_made_run import A, M, make_run, react, touch, touched_run, without_cycles
 
 from adacd_hil.lab.report.page import render
-from adacd_hil.lab.report.run_page import CARDS, Push, contact_cards, draw_arm
+from adacd_hil.lab.report.run_page import CARDS, Push, contact_cards, contacts_table, draw_arm
 from adacd_hil.lab.report.timeline import notices_of, state_key, stays_of, timeline_of
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.logged_run import MeasuredMotion
@@ -162,3 +162,15 @@ def test_cards_stop_where_the_table_goes_on():
         touch(run, 1100 + 20 * index, 10, (5.0, 0.0), index=index)
     html = carded(run)
     assert (html.count("<h3>"), f"The first {CARDS} of {CARDS + 2}." in html) == (CARDS, True)
+
+
+@pytest.mark.parametrize(
+    ("link", "direction", "marked"),
+    [(1, (1, 0), []), (2, (1, 0), ["found on link"]), (1, (-1, 0), ["direction right"])],
+)
+def test_a_wrong_link_or_direction_is_marked_in_the_table_of_contacts(link, direction, marked):
+    run = make_run()
+    touch(run, 2000, 250, (6.0, 0.0))
+    table = contacts_table(evaluate(react(run, 2005, link=link, direction=direction)))
+    named = zip(table.head, table.rows[0], strict=True)
+    assert [head.content for head, cell in named if cell.kind == "bad"] == marked

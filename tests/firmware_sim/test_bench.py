@@ -115,6 +115,22 @@ def test_another_period_can_be_written_again_once_the_nodes_have_left_operationa
     assert np.abs(position).max() > 0.005
 
 
+@pytest.mark.parametrize("command", [Nmt.RESET_COMMUNICATION, Nmt.RESET_NODE])
+def test_a_reset_node_begins_the_sequences_of_its_protected_frames_anew(command):
+    host = BenchHost()
+
+    def started() -> list[bytes]:
+        host.cycle = 0
+        host.start()
+        host.sync(times=7)
+        return host.taken(0x183)
+
+    first = started()
+    host.nmt(command)
+    assert len(set(first)) > 3
+    assert started() == first
+
+
 def test_by_wall_clock_a_sync_that_waited_in_the_queue_is_no_lost_sync():
     host = BenchHost(clock_mode="wall")
     host.enable()

@@ -135,6 +135,14 @@ def test_the_direction_is_that_of_the_first_contact_of_the_joint():
     assert [report.direction for report in reports] == [(1, 0), (1, 0)]
 
 
+def test_a_later_contact_has_no_direction_of_the_one_before():
+    course = Course(settings_with())
+    course.step(1, np.array([3.0, 0.0]))
+    course.step(0, np.zeros(2), state=SchemeState.MONITOR)
+    course.step(2, np.array([0.0, -2.0]))
+    assert course.m.direction.tolist() == [0, -1]
+
+
 @pytest.mark.parametrize(("share", "integral"), [(0.4, 0.0), (0.6, 0.06)])
 def test_a_contact_begins_at_half_of_the_threshold(share, integral):
     found, peak = np.zeros(2), np.zeros(2)
