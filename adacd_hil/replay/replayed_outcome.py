@@ -23,7 +23,7 @@ from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, placed_contacts
 from adacd_hil.score.judge import Detection, Score, TrueContact, judge
-from adacd_hil.score.margins import PushGatherer
+from adacd_hil.score.smallest_push import PushGatherer
 from adacd_hil.score.wording import NONE, found_text, why_not_found
 from adacd_hil.settings.configuration import Settings
 

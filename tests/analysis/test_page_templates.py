@@ -22,8 +22,8 @@ from adacd_hil.lab.runs.run_pages import ListedRun, runs_page, trend_page
 from adacd_hil.lab.runs.run_summary import BROKEN, CERTIFIED, GOOD, CertificateState, RunSummary
 from adacd_hil.lab.runs.run_trend import trends
 from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.log.logged_run import MeasuredMotion, Run
-from adacd_hil.score.metrics import ReportSource
 
 pytestmark = pytest.mark.slow
 

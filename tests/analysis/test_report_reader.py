@@ -12,10 +12,10 @@ from adacd_hil.lab.report.next_steps import NextStep, next_steps, origin_words
 from adacd_hil.lab.report.page import has_paper
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.log.logged_run import Run
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
-from adacd_hil.score.metrics import ReportSource
 from adacd_hil.score.wording import STATE_WORDS, uncertain_text
 
 SOURCE = ReportSource("run.mcap")

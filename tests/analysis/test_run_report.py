@@ -20,11 +20,11 @@ from adacd_hil.lab.report.report_files import write_report, write_run_report
 from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.report_tables import timing_tables
 from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.verdict import headlines
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
-from adacd_hil.score.metrics import ReportSource
 from adacd_hil.settings.toml_files import to_toml
 
 pytestmark = pytest.mark.slow

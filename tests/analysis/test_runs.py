@@ -31,7 +31,7 @@ from adacd_hil.lab.runs.run_summary import (
 )
 from adacd_hil.lab.runs.run_trend import trends
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.score.metrics import ReportSource
+from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.toml_files import to_toml
 

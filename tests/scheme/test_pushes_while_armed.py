@@ -8,7 +8,7 @@ from planar_arm import THETA
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.margin import WITHIN_S
 from adacd_hil.scheme.supervisor import transitions
-from adacd_hil.score.margins import PushGatherer
+from adacd_hil.score.smallest_push import PushGatherer
 
 SECONDS = 9.0
 

@@ -1,14 +1,14 @@
 """The numbers of a run as plain values for other programs: the content of report.json.
 
-It draws no figure, so that lists of runs read it quickly; the keys are described in `adacd_hil.score.metrics`.
+It draws no figure, so that lists of runs read it quickly; the keys are described in `adacd_hil.lab.score.metrics`.
 """
 
 from collections.abc import Mapping
 from typing import Any, Final
 
+from adacd_hil.lab.score.metrics import CertifiedEvidence, Metrics, ReportSource
 from adacd_hil.log.logged_run import StretchOfRun
 from adacd_hil.plain_values import plain_values
-from adacd_hil.score.metrics import CertifiedEvidence, Metrics, ReportSource
 
 JSON_NAME: Final = "report.json"
 SCHEMA: Final = 3
@@ -19,7 +19,7 @@ _DIGITS: Final = 6
 def report_json(
     metrics: Metrics, metadata: Mapping[str, str], source: ReportSource, stretch: StretchOfRun | None = None
 ) -> dict[str, Any]:
-    """Give the content of report.json; the keys are described in `adacd_hil.score.metrics`."""
+    """Give the content of report.json; the keys are described in `adacd_hil.lab.score.metrics`."""
     fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
     plain: dict[str, Any] = plain_values(
         {
@@ -72,5 +72,5 @@ def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
 
 
 def _evidence_json(evidence: CertifiedEvidence) -> dict[str, Any]:
-    """Give the evidence of the certified scheme; the keys are described in `adacd_hil.score.margins`."""
+    """Give the evidence of the certified scheme; the keys are described in `adacd_hil.lab.score.margins`."""
     return {**vars(evidence), "smallest_margin": evidence.smallest_margin}

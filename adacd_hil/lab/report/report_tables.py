@@ -17,10 +17,7 @@ from adacd_hil.lab.report.page import (
     stretch_text,
 )
 from adacd_hil.lab.score.evaluation import OLDEST_CYCLES
-from adacd_hil.log.logged_run import QUANTITIES, Quantity, Run
-from adacd_hil.records import PARAMETER_UNITS
-from adacd_hil.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
-from adacd_hil.score.metrics import (
+from adacd_hil.lab.score.metrics import (
     CertifiedEvidence,
     ChannelMargin,
     CyclicData,
@@ -29,6 +26,9 @@ from adacd_hil.score.metrics import (
     Residual,
     TimingEvidence,
 )
+from adacd_hil.log.logged_run import QUANTITIES, Quantity, Run
+from adacd_hil.records import PARAMETER_UNITS
+from adacd_hil.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
 from adacd_hil.score.wording import (
     NONE,
     number_of,

@@ -40,11 +40,11 @@ from adacd_hil.lab.report.timeline import (
     timeline_of,
     traces_of,
 )
+from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.lab.score.verdict import LISTED, headlines
 from adacd_hil.log.logged_run import Run
 from adacd_hil.records import Location, Vector
 from adacd_hil.score.judge import row_at
-from adacd_hil.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.score.wording import (
     NONE,
     number_text,

@@ -32,6 +32,8 @@ from numpy.typing import NDArray
 from adacd_hil.lab.report.page import ADAPTATIONS, TRACED_CONTACTS
 from adacd_hil.lab.report.traces import panels_of
 from adacd_hil.lab.score.evaluation import QUEUES, RunGatherer
+from adacd_hil.lab.score.margins import SETTLING_TIME_CONSTANTS
+from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import (
     QUANTITIES,
@@ -66,8 +68,6 @@ from adacd_hil.score.emulator_truth import (
     truth_rows,
 )
 from adacd_hil.score.judge import find_detections, timed_contacts
-from adacd_hil.score.margins import SETTLING_TIME_CONSTANTS
-from adacd_hil.score.metrics import ReportSource
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 

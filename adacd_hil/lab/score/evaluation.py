@@ -13,6 +13,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.lab.score.margins import UntouchedGatherer, evaluate_certified, last_row
+from adacd_hil.lab.score.metrics import (
+    Count,
+    CycleStatistics,
+    Metrics,
+    ReportedContact,
+    TimingEvidence,
+)
 from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_causes, find_faults
 from adacd_hil.lab.score.verdict import compare_with_paper, list_findings
 from adacd_hil.log.logged_run import (
@@ -40,14 +48,6 @@ from adacd_hil.score.judge import (
     find_detections,
     judge_run,
     row_at,
-)
-from adacd_hil.score.margins import UntouchedGatherer, evaluate_certified, last_row
-from adacd_hil.score.metrics import (
-    Count,
-    CycleStatistics,
-    Metrics,
-    ReportedContact,
-    TimingEvidence,
 )
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.scheme_settings import KIND_S

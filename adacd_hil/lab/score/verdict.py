@@ -12,9 +12,7 @@ from typing import Final, TypeGuard
 
 import numpy as np
 
-from adacd_hil.log.logged_run import Run, Section
-from adacd_hil.score.judge import Score
-from adacd_hil.score.metrics import (
+from adacd_hil.lab.score.metrics import (
     Beside,
     CertifiedEvidence,
     CyclicData,
@@ -25,6 +23,8 @@ from adacd_hil.score.metrics import (
     ReportedContact,
     Residual,
 )
+from adacd_hil.log.logged_run import Run, Section
+from adacd_hil.score.judge import Score
 from adacd_hil.score.wording import NONE, found_text, number_of, percent_text, score_sentence
 from adacd_hil.settings.arm_settings import ArmSettings
 from adacd_hil.settings.configuration_files import load_settings

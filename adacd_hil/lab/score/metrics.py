@@ -18,8 +18,8 @@ to F_c: those cycles don't count.
 which detections are false alarms; detection is armed in MONITOR.
 
 **Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
-those of the fastest channel of its bank. Its other results: `adacd_hil.score.margins`; the paper's
-scheme that ran beside it on the same stream: `adacd_hil.score.margins`.
+those of the fastest channel of its bank. Its other results: `adacd_hil.lab.score.margins`; the paper's
+scheme that ran beside it on the same stream: `adacd_hil.lab.score.margins`.
 """
 
 import json
@@ -32,6 +32,7 @@ from adacd_hil.log.logged_run import Section
 from adacd_hil.log.types.topics import CERTIFIED_MODEL
 from adacd_hil.score.distribution import LogHistogram
 from adacd_hil.score.judge import rate_bound_per_h
+from adacd_hil.score.smallest_push import SmallestPush
 
 if TYPE_CHECKING:
     from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
@@ -119,19 +120,6 @@ class CyclicData:
     aged: float | None
     devices: dict[str, DeviceShares]
     excesses: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class SmallestPush:
-    """Of each joint the percentiles p50, p99, p99.9 and max, Nm, over so many hours of MONITOR without a touch.
-
-    tail_rate_per_h: false alarms to be expected if all channels' residuals have the tail of a Gaussian.
-    """
-
-    push_Nm: tuple[dict[str, float], ...]
-    threshold_Nm: tuple[dict[str, float], ...]
-    hours: float
-    tail_rate_per_h: float
 
 
 @dataclass(frozen=True)

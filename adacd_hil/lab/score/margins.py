@@ -3,14 +3,9 @@
 Cycles come piece by piece, in order, each with an outline: a run that has all that happened so far, and a second or
 more beyond the piece. A run in memory is one piece, and its own outline. A cycle is *free* unless it lies in
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
-5 Nm. Without the truth, [detection - 10/a, detection + 10/a] stands for the contact. Cycles that the
-truth does not cover are not free. After the request to finish the
-arm parks and stands, where friction may hold any torque up to F_c: those cycles are not free.
-
-The smallest push that is found in time (`scheme.detect.margin`) is an estimate, since threshold and residual change
-meanwhile:
-of 300 pushes 2 % larger than at their moment 247 were found in 100 ms, the others as the threshold rose. Of 300 as
-large as at the worst moment all were, after 59 ms at most.
+5 Nm. Without the truth, [detection - 10/a, detection + 10/a] stands for the contact. Cycles that the truth does not
+cover are not free. After the request to finish the arm parks and stands, where friction may hold any torque up to F_c:
+those cycles are not free.
 
 *Margin* of a channel of the certified scheme: the smallest threshold / |residual| of any free cycle; below 1 it would
 have been a false alarm. Per section, adaptations included, since detection is on there too.
@@ -25,23 +20,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from adacd_hil.compiled import compiled
-from adacd_hil.log.logged_run import CertifiedStream, Mask, Run, Section, rows_of, split_sections
-from adacd_hil.records import JOINTS, SchemeState, Vector
-from adacd_hil.scheme.detect import margin as detect_margin
-from adacd_hil.scheme.model.filter_bank import channels_of
-from adacd_hil.score.distribution import Distribution
-from adacd_hil.score.judge import StreamJudge, TrueContact, find_detections, placed_in, timed_contacts
-from adacd_hil.score.metrics import (
+from adacd_hil.lab.score.metrics import (
     Beside,
     CertifiedEvidence,
     ChannelMargin,
     ParameterEstimate,
     Residual,
-    SmallestPush,
     Untouched,
     certificates_in,
 )
+from adacd_hil.log.logged_run import CertifiedStream, Mask, Run, Section, rows_of, split_sections
+from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.scheme.model.filter_bank import channels_of
+from adacd_hil.score.distribution import Distribution
+from adacd_hil.score.judge import StreamJudge, TrueContact, find_detections, placed_in, timed_contacts
+from adacd_hil.score.smallest_push import PushGatherer
 from adacd_hil.settings.configuration import Settings
 
 SETTLING_TIME_CONSTANTS = 10.0
@@ -351,47 +344,3 @@ def _pair(values: Vector | None) -> tuple[float, float] | None:
 
 def _larger_pair(largest: tuple[float, float] | None, values: Vector) -> tuple[float, float] | None:
     return _pair(larger(None if largest is None else np.array(largest), values))
-
-
-class PushGatherer:
-    """Gathers the cycles of MONITOR that are free of contact."""
-
-    def __init__(self, settings: Settings) -> None:
-        self._shown = detect_margin.constants_of(settings).shown
-        self._period_s = settings.bus.period_s
-        self._excursions_Hz = detect_margin.constants_of(settings).excursions_Hz
-        self._share = np.zeros((self._shown.size, JOINTS))  # largest of residual over threshold
-        self._push, self._threshold = ([Distribution() for _ in range(JOINTS)] for _ in range(2))
-
-    def add_residuals(self, tau_ext: Vector, threshold: Vector) -> None:
-        """Take in residuals and thresholds (k, channels, 2), k > 0."""
-        push = np.zeros((len(tau_ext), JOINTS))
-        _fill(tau_ext, threshold, self._shown, push)
-        in_force = threshold.min(axis=1)
-        self._share = np.maximum(self._share, (np.abs(tau_ext) / threshold).max(axis=0))
-        for joint in range(JOINTS):
-            self._push[joint].add_values(push[:, joint])
-            self._threshold[joint].add_values(in_force[:, joint])
-
-    def smallest_push(self) -> SmallestPush | None:
-        """Sum up; return None before the first cycle."""
-        if not self._push[0].count:
-            return None
-        seen_s = self._push[0].count * self._period_s
-        return SmallestPush(
-            push_Nm=tuple(each.percentiles() for each in self._push),
-            threshold_Nm=tuple(each.percentiles() for each in self._threshold),
-            hours=seen_s / 3600.0,
-            tail_rate_per_h=sum(
-                detect_margin.rate_per_h(float(nu), seen_s, float(share))
-                for nu, shares in zip(self._excursions_Hz, self._share, strict=True)
-                for share in shares
-            ),
-        )
-
-
-@compiled
-def _fill(tau_ext: Vector, threshold: Vector, shown: Vector, push: Vector) -> None:
-    for k in range(push.shape[0]):
-        for i in range(push.shape[1]):
-            push[k, i] = detect_margin.smallest_push(tau_ext[k], threshold[k], shown, i)
