@@ -22,7 +22,7 @@ from documents import PAGES, ROOT, Document, Piece, read_document
 from adacd_hil.api import load
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.lab.detectors.detectors import DetectorBankSettings, unregister
-from adacd_hil.log.frames.can_io import McapReader
+from adacd_hil.lab.logs.python_can_files import McapReader
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from firmware_sim.cli.emulator_main import main as emulator_main
 

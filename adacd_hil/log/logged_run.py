@@ -1,27 +1,21 @@
-"""A run as plain arrays: the host's records, the emulator's truth, the streams of the certified scheme.
+"""What replays and reports of a run share: its settings, its attempts, the emulator's truth, mismatches.
 
-Torques in Nm, joint arrays (2,), histories time-first (n, 2). Times in s count from *motion start*: the first cycle in
-ADAPT.
+Torques in Nm, joint arrays (2,), histories time-first (n, 2).
 
 **Attempts.** The emulator counts cycles by the counter of SYNC, anew after each reset: in every attempt of a run it
 begins with the first cycle's number less all whole rounds of the counter. The host counts on.
-
-**Sections** are lettered. *adaptation* lasts from ADAPT until MONITOR, the test of the frozen model (CERTIFY) included;
-*detection* from there to the announcement of a payload change; *payload* is PAYLOAD, *fault* is FAULT. REACT and
-STOPPED belong to the section that they interrupt. The paper's experiment gives A to E.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.log_files import LogError, TimeWindow
-from adacd_hil.log.reader import LoggedEvent, Series
-from adacd_hil.records import ContactReport, CycleRecord, SchemeState, Vector
+from adacd_hil.log.log_files import LogError
+from adacd_hil.records import SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import renewed
 from adacd_hil.settings.schema import parse
@@ -31,100 +25,6 @@ from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 Cycles = NDArray[np.int64]
 
 
-class Quantity(NamedTuple):
-    """A time of each cycle: its column in /cycle, ns. `is_reserve`: it must be large, not small."""
-
-    name: str
-    column: str
-    title: str
-    meaning: str
-    is_reserve: bool = False
-
-
-LATENESS: Final = Quantity("lateness", "lateness_ns", "Lateness", "wake-up after the grid point")
-
-COMPUTE: Final = Quantity("compute", "compute_ns", "Compute", "last cyclic frame received to last command handed over")
-
-SYNC_TO_COMMAND: Final = Quantity(
-    "sync_to_command", "command_ns", "SYNC → command", "SYNC sent to last command handed over"
-)
-
-SLACK: Final = Quantity(
-    "slack", "slack_ns", "Slack", "last command to the next grid point; negative: overrun", is_reserve=True
-)
-
-QUANTITIES: Final = (
-    LATENESS,
-    Quantity("sync_to_feedback", "feedback_ns", "SYNC → feedback", "SYNC sent to last cyclic frame decoded"),
-    COMPUTE,
-    SYNC_TO_COMMAND,
-    SLACK,
-)
-
-
-@dataclass(frozen=True)
-class CycleColumns:
-    """The columns of /cycle over n cycles, int64 (n,); a column that the log does not have is not in `columns`."""
-
-    t_ns: Cycles
-    columns: Mapping[str, Cycles]
-
-    def __len__(self) -> int:
-        return self.t_ns.size
-
-    def __getitem__(self, name: str) -> Cycles:
-        return self.columns[name]
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.columns
-
-    def rows(self, rows: Cycles) -> "CycleColumns":
-        """Return some of the cycles."""
-        return CycleColumns(self.t_ns[rows], {name: column[rows] for name, column in self.columns.items()})
-
-    @staticmethod
-    def joined(parts: "Sequence[CycleColumns]") -> "CycleColumns":
-        """Put parts with the same columns one after the other."""
-        names = parts[0].columns
-        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in names}
-        return CycleColumns(np.concatenate([part.t_ns for part in parts]), columns)
-
-    def times_us(self, quantity: Quantity) -> Vector | None:
-        """Return a time of the cycles that have it, µs; None where the log does not have it."""
-        if quantity.column not in self:
-            return None
-        values_ns = self[quantity.column]
-        if quantity.column == "feedback_ns":
-            values_ns = values_ns[self["frames_missing"] == 0]  # else it is when the host gave up
-        return np.asarray(values_ns / 1000.0, dtype=np.float64)
-
-    def steps(self, name: str, before: int = 0) -> Cycles:
-        """Return the increments of a running count (n,); a count that began anew begins at 0.
-
-        before: the count in the cycle before the first.
-        """
-        count = self[name]
-        added = np.diff(count, prepend=before)
-        return np.where(added < 0, count, added)
-
-
-def columns_of_series(series: Series) -> CycleColumns:
-    """Take the columns out of a log's /cycle; one of an older version lacks some."""
-    names = [name for name in CycleRecord._fields if name in series.fields]
-    return CycleColumns(series.t_ns, {name: series[name].astype(np.int64) for name in names})
-
-
-def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> CycleColumns:
-    """Make the columns of records at times t_ns."""
-    table = np.array(records, dtype=np.int64).reshape(len(records), len(CycleRecord._fields))
-    columns = {name: table[:, place].copy() for place, name in enumerate(CycleRecord._fields)}
-    return CycleColumns(np.array(t_ns, dtype=np.int64), columns)
-
-
-EMBEDDED: Final = "embedded"
-"""The interface that a log names where the arm is emulated in the host's own process."""
-
-_BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
 _NEVER: Final = 1 << 62
 
 PROGRESS_CYCLES: Final = 1_000_000
@@ -148,28 +48,6 @@ class Milestones:
 
 EmulatorSpan = tuple[tuple[int, int], tuple[int, int]]
 """Attempt and cycle, as the emulator counts, of the first and the last one that it recorded."""
-
-
-class AttemptBegins:
-    """Finds the cycles in which attempts begin, in columns that come piece by piece."""
-
-    def __init__(self) -> None:
-        self._begins: list[int] = []
-        self._was_beginning: bool | None = None  # None before the first cycle
-
-    def add_cycles(self, cycle: NDArray[Any], state: NDArray[np.uint8]) -> None:
-        """Take in the next cycles (k,), k > 0."""
-        is_beginning = np.isin(state, _BEGINNING)
-        if self._was_beginning is None and not is_beginning[0]:
-            self._begins.append(0)
-        before = np.concatenate(([bool(self._was_beginning)], is_beginning[:-1]))
-        self._begins += cycle[is_beginning & ~before].astype(np.int64).tolist()
-        self._was_beginning = bool(is_beginning[-1])
-
-    @property
-    def begins(self) -> Cycles:
-        """First cycle of each attempt so far; of one that began before the log, 0."""
-        return np.array(self._begins or [0], np.int64)
 
 
 class Span(NamedTuple):
@@ -235,221 +113,9 @@ class Truth:
         return max(int(np.searchsorted(cycles, cycle, side="right")) - 1, 0) if cycles.size else None
 
 
-@dataclass(frozen=True)
-class CertifiedStream:
-    """Fields of the certified scheme's block beyond the paper's, over n cycles.
-
-    tau_ext, threshold: of the bank (n, channels, 2): each filter smoothed, then all but the slowest bare. theta_further
-    (n, k): offsets, lags and friction terms; theta_std (n, p + k); promotions (n,).
-    """
-
-    tau_ext: Vector
-    threshold: Vector
-    theta_further: Vector
-    theta_std: Vector
-    promotions: Vector
-
-
-@dataclass(frozen=True)
-class PaperStream:
-    """The paper's scheme beside, over n cycles: is_armed (n,), its residual and threshold (n, 2)."""
-
-    is_armed: Mask
-    tau_ext_hat: Vector
-    threshold: Vector
-
-
-@dataclass(frozen=True)
-class MeasuredMotion:
-    """Measured values over n cycles: q rad, dq rad/s, tau_J Nm, each (n, 2)."""
-
-    q: Vector
-    dq: Vector
-    tau_J: Vector
-
-
-@dataclass(frozen=True)
-class CheckCounts:
-    """Running counts of the checks of cyclic frames, as logged (k,): counts (k, devices, statuses)."""
-
-    devices: tuple[str, ...]
-    cycle: Cycles
-    counts: Cycles
-
-
-class StretchOfRun(NamedTuple):
-    """A stretch of a log: as requested, as found, widened so that it cuts nothing, and the contacts before it.
-
-    motion_start_s: s since the beginning of the log.
-    """
-
-    asked: TimeWindow
-    found: TimeWindow
-    contacts_before: int
-    motion_start_s: float
-
-
-@dataclass(frozen=True)
-class Run:
-    """A run as plain arrays over n of its cycles: over all, or of a long one over those that the report keeps.
-
-    `truth` is None on a real arm.
-    """
-
-    cycle: Cycles
-    t_ns: Cycles
-    state: NDArray[np.uint8]
-    fault: NDArray[np.uint8]
-    tau_ext_hat: Vector
-    tau_ext_hat_cad: Vector
-    theta_hat: Vector
-    threshold: Vector
-    reports: tuple[ContactReport, ...]
-    timing: CycleColumns
-    truth: Truth | None
-    settings: Settings
-    metadata: Mapping[str, str]
-    frames: int | None
-    dropped: int | None
-    finish_cycle: int | None = None  # cycle of the request to finish; None: never
-    contact_joints: NDArray[np.uint8] | None = None  # bit i: joint i is over its threshold
-    certified: CertifiedStream | None = None  # None of the paper's scheme
-    beside: PaperStream | None = None
-    motion: MeasuredMotion | None = None
-    events: tuple[LoggedEvent, ...] = ()
-    motion_start_ns: int | None = None  # None: the first cycle in ADAPT, else the first cycle
-    all_cycles: int | None = None  # of a long run: how many there are, of which the n are kept
-    bucket: int = 1  # of a long run: of so many cycles those with extremes are kept
-    log_start_ns: int | None = None  # the beginning of its log
-    stretch: StretchOfRun | None = None  # None: the whole log
-    checks: CheckCounts | None = None  # None: not in the log
-    broken_off: str = ""  # the reason for an unintended end of the log
-
-    @property
-    def first_contact(self) -> int:
-        """Number of the first contact in this stretch, by its place among all contacts of the log, from 1."""
-        return 1 if self.stretch is None else 1 + self.stretch.contacts_before
-
-    @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """Names of the columns of `theta_hat`."""
-        return self.settings.estimator.parameter_names
-
-    @property
-    def has_cad(self) -> bool:
-        """Whether the configuration gives a CAD model."""
-        return len(self.settings.arm.cad_theta) > 0
-
-    @property
-    def a_rad_s(self) -> float:
-        """Cut-off of the filter of `tau_ext_hat`: the bank's slowest, or the paper's."""
-        is_certified = self.certified is not None
-        return self.settings.certified.cutoffs_rad_s[0] if is_certified else self.settings.filter.a_rad_s
-
-    @property
-    def zero_ns(self) -> int:
-        """Motion start, ns."""
-        if self.motion_start_ns is not None:
-            return self.motion_start_ns
-        if self.t_ns.size == 0:
-            return 0
-        adapting = self.state == SchemeState.ADAPT
-        return int(self.t_ns[int(np.argmax(adapting)) if adapting.any() else 0])
-
-    def time_s(self) -> Vector:
-        """Return the time of every cycle since motion start, s (n,)."""
-        # Subtracted as integers: float64 resolves only 256 ns of an absolute time.
-        return np.asarray((self.t_ns - self.zero_ns) * 1e-9, dtype=np.float64)
-
-    def time_of_s(self, cycle: NDArray[Any]) -> Vector:
-        """Return the time of any cycle numbers since motion start, s; between logged cycles by interpolation."""
-        if self.cycle.size == 0:
-            return np.zeros(len(cycle))
-        return np.asarray(np.interp(cycle, self.cycle, self.time_s()), dtype=np.float64)
-
-    def truth_time_s(self) -> Vector:
-        """Return the time of the cycles of the truth since motion start, s (k,)."""
-        if self.truth is None:
-            return np.zeros(0)
-        time_s = self.truth.time_s
-        return self.time_of_s(self.truth.cycle) if time_s is None else time_s
-
-
-@dataclass(frozen=True)
-class Section:
-    """One part of a run; `is_complete` is False if the run ended, or failed, in it."""
-
-    label: str
-    kind: str  # "adaptation", "detection", "payload", "fault"
-    start_s: float
-    end_s: float
-    is_complete: bool
-
-    @property
-    def duration_s(self) -> float:
-        """Length in s."""
-        return self.end_s - self.start_s
-
-
-_KINDS: Final = {
-    SchemeState.ADAPT: "adaptation",
-    SchemeState.CERTIFY: "adaptation",
-    SchemeState.MONITOR: "detection",
-    SchemeState.PAYLOAD: "payload",
-    SchemeState.FAULT: "fault",
-}
-
-
-def section_label(index: int) -> str:
-    """Name a section by its place: A to Z, then AA, AB and so on."""
-    letter = chr(ord("A") + index % 26)
-    return letter if index < 26 else section_label(index // 26 - 1) + letter
-
-
-def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return for each cycle (n,) the state, where it is REACT or STOPPED the one that was interrupted."""
-    rows = np.arange(state.size)
-    own = np.maximum.accumulate(np.where(is_interrupted(state), -1, rows))
-    return np.where(own < 0, np.uint8(SchemeState.MONITOR), state[np.maximum(own, 0)])
-
-
 def is_interrupted(state: NDArray[np.uint8]) -> Mask:
     """Mark the cycles (n,) of REACT and STOPPED."""
     return np.isin(state, (SchemeState.REACT, SchemeState.STOPPED))
-
-
-def split_sections(run: Run) -> tuple[Section, ...]:
-    """Split a run into lettered sections; cycles before the first ADAPT belong to no section."""
-    if run.state.size == 0:
-        return ()
-    kinds = np.array([_KINDS.get(SchemeState(value), "") for value in range(len(SchemeState))])[origins(run.state)]
-    starts = np.concatenate(([0], np.flatnonzero(kinds[1:] != kinds[:-1]) + 1))
-    time_s = run.time_s()
-    sections: list[Section] = []
-    for start, end in zip(starts, [*starts[1:], None], strict=True):
-        kind = str(kinds[start])
-        if not kind:
-            continue
-        end_s = float(time_s[-1] if end is None else time_s[end])
-        following = "" if end is None else str(kinds[end])
-        is_complete = following == "detection" if kind == "adaptation" else following not in ("", "fault")
-        sections.append(Section(section_label(len(sections)), kind, float(time_s[start]), end_s, is_complete))
-    return tuple(sections)
-
-
-def section_at(sections: Iterable[Section], time_s: float) -> str | None:
-    """Name the section that a time belongs to, None before the first."""
-    return next((section.label for section in sections if section.start_s <= time_s <= section.end_s), None)
-
-
-def rows_of(time_s: Vector, section: Section, end_s: float) -> slice:
-    """Return the rows of a section among cycles at such times (n,), which ascend.
-
-    end_s: when the run ends. Its last cycle belongs to the last section; the first one of the next section to that.
-    """
-    is_last = bool(section.end_s >= end_s)
-    first = int(np.searchsorted(time_s, section.start_s))
-    return slice(first, int(np.searchsorted(time_s, section.end_s, side="right" if is_last else "left")))
 
 
 def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
@@ -460,11 +126,6 @@ def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
         return parse(Settings, renewed(parse_toml(attachments["config.toml"])))
     except ValueError as error:  # errors of the text, the TOML and a setting are ValueErrors
         raise LogError(f"log {path}, attachment config.toml: {error}") from None
-
-
-def is_realtime(run: Run) -> bool:
-    """Return whether the host's own clock drove the cycles."""
-    return run.metadata.get("clock") == "realtime"
 
 
 def enters_react(previous: NDArray[np.uint8], state: NDArray[np.uint8]) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""Percentiles and histograms of values that come piece by piece, in bounded memory; percentiles and bars as text.
+"""Percentiles of values that come piece by piece, in bounded memory.
 
 Up to `EXACT` values all of them are kept, and percentiles are values that occurred. Further ones are counted in bins
 that are 2^-12 of a value wide, and a percentile is the end of its bin that is nearer to 0: less than the value that
@@ -6,8 +6,7 @@ occurred by 0.024 % at most, and a whole number up to 4096 as it is. The smalles
 Values nearer to 0 than 2^-30 count as 0, sizes from 2^63 on as infinite; NaN is left out.
 """
 
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,41 +14,8 @@ from numpy.typing import NDArray
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
 PERCENTILE_NAMES = ("p50", "p99", "p99.9", "max")
 LOW_PERCENTILE_NAMES = ("p50", "p1", "p0.1", "min")
-BINS_PER_DECADE = 20
-DECADES = 6
-"""Of a histogram with logarithmic bins, from 1 on: of times in µs up to 1 s."""
-_BAR = 40
 
 Values = NDArray[np.int64] | NDArray[np.float64]
-
-
-class LogHistogram(NamedTuple):
-    """Counts (n,) of values in bins of equal width on a logarithmic axis, between `edges` (n + 1,).
-
-    below: values less than the first edge, negative ones too. above: values from the last edge on.
-    """
-
-    edges: NDArray[np.float64]
-    counts: NDArray[np.int64]
-    below: int
-    above: int
-
-    def joined(self, other: "LogHistogram") -> "LogHistogram":
-        """Add the counts of another one with the same bins."""
-        return LogHistogram(self.edges, self.counts + other.counts, self.below + other.below, self.above + other.above)
-
-    def trimmed(self) -> "LogHistogram":
-        """Return the histogram without the empty bins at both ends."""
-        filled = np.flatnonzero(self.counts)
-        first, end = (int(filled[0]), int(filled[-1]) + 1) if filled.size else (0, 0)
-        return self._replace(edges=self.edges[first : end + 1], counts=self.counts[first:end])
-
-
-def log_histogram(values: Values) -> LogHistogram:
-    """Count values in logarithmic bins from 1 on; a value on an edge belongs to the upper bin."""
-    edges = np.logspace(0.0, DECADES, BINS_PER_DECADE * DECADES + 1)
-    places = np.bincount(np.searchsorted(edges, values, side="right"), minlength=edges.size + 1)
-    return LogHistogram(edges, places[1:-1], int(places[0]), int(places[-1]))
 
 
 def percentiles(values: Values) -> dict[str, float]:
@@ -64,29 +30,6 @@ def low_percentiles(values: Values) -> dict[str, float]:
     """Return p50, p1, p0.1 and min of values that occurred, for values that must not be small."""
     mirrored = percentiles(-values)
     return {name: -value for name, value in zip(LOW_PERCENTILE_NAMES, mirrored.values(), strict=False)}
-
-
-def doubling_bins(values: Values, first: float, count: int) -> list[tuple[float, int]]:
-    """Count values below first, 2 first, 4 first, …; the last bin has no upper bound (inf). Trailing empty bins go."""
-    bounds = [first * 2.0**power for power in range(count - 1)] + [float("inf")]
-    places = np.searchsorted(bounds, values, side="right")
-    counts = np.bincount(places, minlength=count)
-    bins = [(bound, int(amount)) for bound, amount in zip(bounds, counts, strict=True)]
-    while len(bins) > 1 and bins[-1][1] == 0:
-        bins.pop()
-    return bins
-
-
-def bar_chart(labels: Sequence[str], counts: Sequence[int]) -> list[str]:
-    """Draw one line per bin: label, bar, count, share. A bin that isn't empty has a bar."""
-    total, largest = sum(counts), max(counts, default=0)
-    width = max((len(label) for label in labels), default=0)
-    lines = []
-    for label, count in zip(labels, counts, strict=True):
-        bar = "#" * max(round(_BAR * count / largest), 1) if count else ""
-        share = f"{100.0 * count / total:.2f} %" if total else ""
-        lines.append(f"{label.rjust(width)}  {bar.ljust(_BAR)}  {count:>8}  {share:>8}")
-    return lines
 
 
 EXACT: Final = 500_000

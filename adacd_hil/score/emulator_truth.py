@@ -10,7 +10,6 @@ The reader refuses a log of another run, as far as both logs name their scenario
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -25,8 +24,6 @@ from adacd_hil.log.logged_run import (
     EmulatorSpan,
     Progress,
     Truth,
-    host_cycles,
-    host_span,
     is_interrupted,
 )
 from adacd_hil.log.reader import LogStream, Series
@@ -204,38 +201,6 @@ class _TruthRows:
 
 def _place(row: NDArray[Any]) -> tuple[int, int]:
     return int(row["attempt"][0]), int(row["cycle"][0])
-
-
-def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
-    """Return the truth on the host's cycles; None where the emulator never cycled.
-
-    begins: first cycle of each attempt of the run so far; last: of the run; time_s: of the rows (m,). Rows of later
-    attempts, and those after the host's last cycle, are left out: the arm goes on when the host has died.
-    """
-    rows = table.rows
-    assert rows.attempt is not None
-    assert rows.model_cycle is not None
-    assert rows.model_attempt is not None
-    if not rows.model_cycle.size:
-        return None
-    cycle = host_cycles(rows.cycle, rows.attempt, begins)
-    of_host = (cycle <= last) & (rows.attempt < len(begins))
-    known = rows.model_attempt < len(begins)
-    return replace(
-        truth_rows(replace(rows, cycle=cycle, time_s=time_s), of_host),
-        payload_kg=rows.payload_kg[known],
-        theta=rows.theta[known],
-        model_cycle=host_cycles(rows.model_cycle, rows.model_attempt, begins)[known],
-        model_attempt=rows.model_attempt[known],
-        span=None if table.span is None else host_span(table.span, begins),
-    )
-
-
-def truth_rows(truth: Truth, rows: NDArray[np.bool_]) -> Truth:
-    """Return some rows of a truth, with all of its payloads and parameters."""
-    names = ("cycle", "tau_ext", "contact_link", "contact_index", "force_N", "time_s", "attempt")
-    columns = {name: getattr(truth, name) for name in names}
-    return replace(truth, **{name: column[rows] for name, column in columns.items() if column is not None})
 
 
 _PLAYED = ("scenario", "seed")

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.logged_run import CertifiedStream, CycleColumns, PaperStream, Run, Truth, columns_of_records
+from adacd_hil.lab.score.run_arrays import CertifiedStream, CycleColumns, PaperStream, Run, columns_of_records
+from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth
 from adacd_hil.records import (

@@ -12,10 +12,10 @@ from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
-from adacd_hil.log.logged_run import split_sections
+from adacd_hil.lab.score.run_arrays import split_sections
+from adacd_hil.lab.score.run_judge import FilterChannel, two_pole_delay_s
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction
-from adacd_hil.score.judge import FilterChannel, two_pole_delay_s
 
 
 def test_an_adaptation_lasts_until_its_model_is_certified():

@@ -7,12 +7,12 @@ import pytest
 from hand_made_run import EPOCH_NS, A, M, make_certified_run, make_run, with_columns, without_cycles
 
 from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.report_wording import percent_text
+from adacd_hil.lab.score.run_arrays import CheckCounts, CycleColumns
 from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_faults
 from adacd_hil.lab.score.verdict import data_text
-from adacd_hil.log.logged_run import CheckCounts, CycleColumns
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
-from adacd_hil.score.wording import percent_text
 
 ZERO = EPOCH_NS + 100_000_000
 """When the first cycle of a hand-made run is, ns."""

@@ -10,10 +10,10 @@ from hand_made_run import record, record_truth, touched_run
 from adacd_hil.lab.report.report_files import write_report
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.run_arrays import Run, host_truth
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
-from adacd_hil.log.logged_run import Run, Truth
+from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.score import emulator_truth
 from adacd_hil.score.emulator_truth import TruthTable, config_digest, contacts_beside, foreign_truth
 from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.bench.bench_time import TruthLog
@@ -108,7 +108,7 @@ def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end():
     )  # fmt: skip
     rows = TruthTable(truth, {}, "", True, ((0, 3), (1, 50)))
     begun = ([0], [0, 480])
-    one, both = (emulator_truth.host_truth(rows, np.array(begins), 1000, np.zeros(1)) for begins in begun)
+    one, both = (host_truth(rows, np.array(begins), 1000, np.zeros(1)) for begins in begun)
     assert one is not None
     assert both is not None
     assert (one.covers(2), one.covers(3), one.covers(900)) == (False, True, True)

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from adacd_hil.lab.score.histogram import bar_chart, doubling_bins, log_histogram
 from adacd_hil.plain_values import plain_values
-from adacd_hil.score.distribution import bar_chart, doubling_bins, log_histogram, low_percentiles, percentiles
+from adacd_hil.score.distribution import low_percentiles, percentiles
 
 INF = float("inf")
 

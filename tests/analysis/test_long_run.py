@@ -16,10 +16,11 @@ from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_reading import TruthClock, read_run
 from adacd_hil.lab.report.timeline import timeline_of
 from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.run_arrays import AttemptBegins, host_truth
 from adacd_hil.lab.score.verdict import identified_text
 from adacd_hil.log import reader
 from adacd_hil.log.log_files import LogError, TimeWindow
-from adacd_hil.log.logged_run import AttemptBegins, Truth
+from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.reader import Series, start_of_log
 from adacd_hil.records import CycleRecord, FaultReason, SchemeState
 from adacd_hil.score import emulator_truth
@@ -157,9 +158,7 @@ def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s()
         payload_kg=np.zeros(1),
         theta=np.zeros((1, 7)),
     )
-    truth = emulator_truth.host_truth(
-        TruthTable(rows, {}, "", True), np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5)
-    )
+    truth = host_truth(TruthTable(rows, {}, "", True), np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
     assert truth.cycle.tolist() == [98, 99, 100]
     columns = (truth.tau_ext, truth.contact_link, truth.contact_index, truth.force_N, truth.time_s)
     assert [len(column) for column in columns] == [3] * 5

@@ -23,7 +23,7 @@ from adacd_hil.lab.runs.run_summary import BROKEN, CERTIFIED, GOOD, CertificateS
 from adacd_hil.lab.runs.run_trend import trends
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
-from adacd_hil.log.logged_run import MeasuredMotion, Run
+from adacd_hil.lab.score.run_arrays import MeasuredMotion, Run
 
 pytestmark = pytest.mark.slow
 

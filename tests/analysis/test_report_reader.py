@@ -13,10 +13,10 @@ from adacd_hil.lab.report.page import has_paper
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
-from adacd_hil.log.logged_run import Run
+from adacd_hil.lab.score.report_wording import STATE_WORDS, uncertain_text
+from adacd_hil.lab.score.run_arrays import Run
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
-from adacd_hil.score.wording import STATE_WORDS, uncertain_text
 
 SOURCE = ReportSource("run.mcap")
 CSS = resources.files("adacd_hil.lab.report").joinpath("assets", "report.css").read_text(encoding="utf-8")

@@ -23,9 +23,11 @@ from hand_made_run import (
 )
 
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.log.logged_run import Span, section_label, split_sections
+from adacd_hil.lab.score.run_arrays import section_label, split_sections
+from adacd_hil.lab.score.run_judge import detection_delay_s
+from adacd_hil.log.logged_run import Span
 from adacd_hil.records import FaultReason, SchemeState
-from adacd_hil.score.judge import detection_delay_s, filtered
+from adacd_hil.score.judge import filtered
 
 SETTLING_ROWS = 1000
 """10/a at a = 10 rad/s and 1 kHz."""

@@ -10,9 +10,9 @@ from hand_made_run import A, C, M, make_certified_run, make_run, react, touch
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.report_tables import counted_sentence, push_table
 from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.report_wording import rate_sentence
 from adacd_hil.log.logged_run import Span
 from adacd_hil.scheme.detect.sensitivity import AGREES
-from adacd_hil.score.wording import rate_sentence
 
 SLOWEST = 0.612758  # what 10 and then 200 rad/s show of a step after 0.1 s: 1 - (200 e^-1 - 10 e^-20) / 190
 

@@ -11,7 +11,7 @@ from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.run_page import CARDS, Push, contact_cards, contacts_table, draw_arm
 from adacd_hil.lab.report.timeline import notices_of, state_key, stays_of, timeline_of
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.log.logged_run import MeasuredMotion
+from adacd_hil.lab.score.run_arrays import MeasuredMotion
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, Location, SchemeState
 

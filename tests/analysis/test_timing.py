@@ -8,7 +8,7 @@ from hand_made_run import A, M, R, S, like_an_old_log, make_run, with_columns
 
 from adacd_hil.lab.report.traces import timing_track
 from adacd_hil.lab.score.evaluation import OLDEST_CYCLES, collect_evidence, evaluate, find_reactions
-from adacd_hil.log.logged_run import COMPUTE, CycleColumns, columns_of_records, columns_of_series
+from adacd_hil.lab.score.run_arrays import COMPUTE, CycleColumns, columns_of_records, columns_of_series
 from adacd_hil.log.reader import Series
 from adacd_hil.records import CycleRecord
 

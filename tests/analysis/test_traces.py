@@ -17,7 +17,7 @@ from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.timeline import traces_of
 from adacd_hil.lab.report.traces import pack, panels_of, step_of
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.log.logged_run import MeasuredMotion
+from adacd_hil.lab.score.run_arrays import MeasuredMotion
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event
 

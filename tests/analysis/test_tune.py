@@ -14,6 +14,7 @@ import pytest
 from called import called
 
 from adacd_hil.cli.embedded_run import Cast, run_embedded
+from adacd_hil.lab.score.rates import least_rate_per_h, rate_bound_per_h, share_bounds
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.lab.tune import tune_roc
 from adacd_hil.lab.tune.tune import base_of, best_of, problems_of, suggested_toml, write_tuning
@@ -43,7 +44,6 @@ from adacd_hil.records import SchemeState
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.scheme.pipeline.pipeline import layout_of
 from adacd_hil.score.emulator_truth import contacts_beside
-from adacd_hil.score.judge import least_rate_per_h, rate_bound_per_h, share_bounds
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import ConfigError

@@ -7,7 +7,7 @@ from rig import Rig
 
 from adacd_hil.lab.cli.commtest_command import as_text, describe, write_pictures
 from adacd_hil.lab.commission.communication_test import CommunicationReport, CommunicationTest, ZeroTorqueLoop
-from adacd_hil.score.wording import number_text
+from adacd_hil.lab.score.report_wording import number_text
 
 
 def played(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:

@@ -8,7 +8,8 @@ from click.testing import CliRunner
 
 from adacd_hil.lab.cli import play_command as play_module
 from adacd_hil.lab.cli.play_command import play
-from adacd_hil.log.frames.mcap_frames import FrameWriter, RecordedFrame
+from adacd_hil.lab.logs.frame_writer import FrameWriter
+from adacd_hil.log.frames.mcap_frames import RecordedFrame
 from adacd_hil.scheduling import RealtimeGrant
 
 CHANNEL = "test_play"

@@ -11,7 +11,8 @@ from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
-from adacd_hil.log.frames.mcap_frames import FrameWriter, RecordedFrame
+from adacd_hil.lab.logs.frame_writer import FrameWriter
+from adacd_hil.log.frames.mcap_frames import RecordedFrame
 from adacd_hil.log.reader import topic_bytes
 from adacd_hil.settings.arm_settings import BusSettings, LockstepSettings
 from adacd_hil.settings.configuration_files import load_settings

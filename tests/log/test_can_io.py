@@ -18,7 +18,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 
-from adacd_hil.log.frames.can_io import McapReader, McapWriter, TimedMessage
+from adacd_hil.lab.logs.python_can_files import McapReader, McapWriter, TimedMessage
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.message_types import CAN_FRAME, ENCAPSULATION, FD_FRAME

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from recorded_run import make_run, record
 
 from adacd_hil.lab.cli.log_command import export
+from adacd_hil.lab.logs.python_can_files import McapReader
 from adacd_hil.lab.logs.signal_tables import choose_topics, export_tables
-from adacd_hil.log.frames.can_io import McapReader
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.chunked_file import MAGIC
 from adacd_hil.log.reader import read_log

@@ -5,7 +5,7 @@ from recorded_run import CODEC, make_run, record
 from test_can_io import write
 
 from adacd_hil.lab.logs.frame_choice import FrameChoice, sides
-from adacd_hil.log.frames.can_io import TimedMessage
+from adacd_hil.lab.logs.python_can_files import TimedMessage
 from adacd_hil.log.frames.frame_log import open_frames, read_frames
 
 

@@ -6,8 +6,8 @@ import pytest
 from made_log import BLF_FRAME, blf_frame, blf_object, make_log, write_blf
 
 from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.python_can_files import to_messages
 from adacd_hil.lab.logs.signal_tables import Tables, export_tables
-from adacd_hil.log.frames.can_io import to_messages
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError, find_parts
 from adacd_hil.log.log_info import read_info

@@ -13,8 +13,9 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.cut import TimeWindow, cut
+from adacd_hil.lab.logs.frame_writer import FrameWriter
 from adacd_hil.lab.logs.recover import recover
-from adacd_hil.log.frames.mcap_frames import FrameWriter, RecordedFrame
+from adacd_hil.log.frames.mcap_frames import RecordedFrame
 from adacd_hil.log.reader import read_log
 
 CYCLES = 120

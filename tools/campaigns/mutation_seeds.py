@@ -11,7 +11,7 @@ from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.control.history_file import HISTORY_FORMAT, CertificateRecord, History, devices_digest
 from adacd_hil.lab.logs.cut import TimeWindow, cut
-from adacd_hil.log.frames.can_io import to_messages
+from adacd_hil.lab.logs.python_can_files import to_messages
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.configuration_files import load_settings

@@ -21,9 +21,10 @@ from adacd_hil.lab.commission.communication_test import (
     ZeroTorqueLoop,
 )
 from adacd_hil.lab.score.evaluation import collect_evidence
+from adacd_hil.lab.score.histogram import bar_chart, doubling_bins
 from adacd_hil.lab.score.metrics import TimingEvidence
+from adacd_hil.lab.score.run_arrays import QUANTITIES
 from adacd_hil.log.log_files import LAYOUT_NAME, failing_as
-from adacd_hil.log.logged_run import QUANTITIES
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.log.types.topics import ChannelId, pack_cycle
@@ -31,7 +32,6 @@ from adacd_hil.log.viewer_layout import viewer_layout
 from adacd_hil.plain_values import plain_values
 from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime
-from adacd_hil.score.distribution import bar_chart, doubling_bins
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import BusError, Tap

@@ -134,7 +134,7 @@ def _as_text(found: "Tuning") -> str:
 
 def _cells(checked: "Found") -> tuple[str, ...]:
     """Format the result of thresholds in one half, a cell for each figure."""
-    from adacd_hil.score.wording import delay_figures
+    from adacd_hil.lab.score.report_wording import delay_figures
 
     low, high = checked.share_bounds
     return (
@@ -147,7 +147,7 @@ def _cells(checked: "Found") -> tuple[str, ...]:
 
 
 def _row(candidate: "Candidate") -> tuple[str, ...]:
-    from adacd_hil.score.wording import delay_figures
+    from adacd_hil.lab.score.report_wording import delay_figures
 
     outcome = candidate.outcome
     median_ms, _, _ = delay_figures(outcome.delays_ms)

@@ -24,12 +24,12 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.drive import DISABLE_CYCLES, Drive
 from adacd_hil.device.network import Master
 from adacd_hil.device.torque_sensor import TorqueSensor
+from adacd_hil.lab.commission.load_meter import LoadMeter
 from adacd_hil.lab.score.evaluation import OLDEST_CYCLES
-from adacd_hil.log.logged_run import CycleColumns, columns_of_records
+from adacd_hil.lab.score.run_arrays import CycleColumns, columns_of_records
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, CycleRecord, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Frame, Tap
-from adacd_hil.wire.frame_time import LoadMeter
 
 
 class ZeroTorqueCycle(NamedTuple):

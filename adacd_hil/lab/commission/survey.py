@@ -372,7 +372,7 @@ class BusView:
         """Begin at `t_ns`; the bit rates in bit/s are for the load."""
         self.frames = 0
         self._codec = codec
-        from adacd_hil.wire.frame_time import LoadMeter  # imports the compiler, which takes a second: `scan` has no use
+        from adacd_hil.lab.commission.load_meter import LoadMeter
 
         self._load = LoadMeter(bitrate, data_bitrate, t_ns)
         self._entries: dict[int, _Entry] = {}

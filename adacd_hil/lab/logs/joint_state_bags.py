@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from adacd_hil.file_access import open_input
+from adacd_hil.lab.logs.joint_states import TYPE, JointStateMessage, decode_joint_state
 from adacd_hil.log.log_files import LOG_NAME, LogError
-from adacd_hil.log.types.joint_states import TYPE, JointStateMessage, decode_joint_state
 from adacd_hil.settings.schema import ConfigError
 
 JOINT_STATES: Final = "/joint_states"

@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.file_replacement import is_anothers, replacing
+from adacd_hil.lab.logs.joint_states import joint_state_columns
 from adacd_hil.log.frames.frame_log import open_frames
 from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
-from adacd_hil.log.types.joint_states import joint_state_columns
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 from adacd_hil.log.types.topics import DECODED, EVENTS
 from adacd_hil.remedies import install_command, nearest_name

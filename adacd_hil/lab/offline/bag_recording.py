@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from adacd_hil.lab.logs.joint_state_bags import JOINT_STATES, joint_state_topics, opened_bag
+from adacd_hil.lab.logs.joint_states import TYPE, JointStateMessage
 from adacd_hil.lab.offline.recorded_columns import RecordedColumns, RecordedRows
 from adacd_hil.lab.offline.recording_map import RecordingMap
 from adacd_hil.log.log_files import LogError, TimeWindow
-from adacd_hil.log.types.joint_states import TYPE, JointStateMessage
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.schema import ConfigError
 

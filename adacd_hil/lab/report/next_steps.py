@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 from adacd_hil.lab.report.page import STEPS, went_wrong
 from adacd_hil.lab.score.metrics import Metrics, ReportSource
+from adacd_hil.lab.score.run_arrays import EMBEDDED, Run
 from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked
-from adacd_hil.log.logged_run import EMBEDDED, Run
 from adacd_hil.printable import in_line
 from adacd_hil.settings.toml_files import builtin_names
 

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from adacd_hil.lab.score.metrics import Beside, Metrics, ReportedContact
-from adacd_hil.log.logged_run import StretchOfRun
-from adacd_hil.score.wording import NONE, number_text
+from adacd_hil.lab.score.report_wording import number_text
+from adacd_hil.lab.score.run_arrays import StretchOfRun
+from adacd_hil.score.wording import NONE
 from adacd_hil.terminal import keep_units
 
 if TYPE_CHECKING:

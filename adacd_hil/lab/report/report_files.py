@@ -21,12 +21,14 @@ from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.report.timeline import stays_of
 from adacd_hil.lab.score.evaluation import RunGatherer, evaluate
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
+from adacd_hil.lab.score.report_wording import number_text
+from adacd_hil.lab.score.run_arrays import Run, StretchOfRun, section_at
 from adacd_hil.lab.score.verdict import headlines
 from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
-from adacd_hil.log.logged_run import Progress, Run, StretchOfRun, section_at
+from adacd_hil.log.logged_run import Progress
 from adacd_hil.printable import in_line
 from adacd_hil.records import PARAMETER_UNITS
-from adacd_hil.score.wording import NONE, number_of, number_text, why_not_found
+from adacd_hil.score.wording import NONE, number_of, why_not_found
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import terminal_columns
 

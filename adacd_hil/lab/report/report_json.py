@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from adacd_hil.lab.score.metrics import CertifiedEvidence, Metrics, ReportSource
-from adacd_hil.log.logged_run import StretchOfRun
+from adacd_hil.lab.score.run_arrays import StretchOfRun
 from adacd_hil.plain_values import plain_values
 
 JSON_NAME: Final = "report.json"

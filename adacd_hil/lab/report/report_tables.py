@@ -26,18 +26,11 @@ from adacd_hil.lab.score.metrics import (
     Residual,
     TimingEvidence,
 )
-from adacd_hil.log.logged_run import QUANTITIES, Quantity, Run
+from adacd_hil.lab.score.report_wording import number_text, pair_text, percent_text, rate_sentence, signed_text
+from adacd_hil.lab.score.run_arrays import QUANTITIES, Quantity, Run
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
-from adacd_hil.score.wording import (
-    NONE,
-    number_of,
-    number_text,
-    pair_text,
-    percent_text,
-    rate_sentence,
-    signed_text,
-)
+from adacd_hil.score.wording import NONE, number_of
 
 
 def paper_table(metrics: Metrics) -> Table:

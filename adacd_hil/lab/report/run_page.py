@@ -41,21 +41,20 @@ from adacd_hil.lab.report.timeline import (
     traces_of,
 )
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
-from adacd_hil.lab.score.verdict import LISTED, headlines
-from adacd_hil.log.logged_run import Run
-from adacd_hil.records import Location, Vector
-from adacd_hil.score.judge import row_at
-from adacd_hil.score.wording import (
-    NONE,
+from adacd_hil.lab.score.report_wording import (
     number_text,
     pair_text,
     scaled,
     signs_text,
     state_words,
     uncertain_text,
-    why_not_found,
     yes_text,
 )
+from adacd_hil.lab.score.run_arrays import Run
+from adacd_hil.lab.score.run_judge import row_at
+from adacd_hil.lab.score.verdict import LISTED, headlines
+from adacd_hil.records import Location, Vector
+from adacd_hil.score.wording import NONE, why_not_found
 
 _Point = tuple[float, float]
 

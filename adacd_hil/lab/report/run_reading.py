@@ -34,40 +34,29 @@ from adacd_hil.lab.report.traces import panels_of
 from adacd_hil.lab.score.evaluation import QUEUES, RunGatherer
 from adacd_hil.lab.score.margins import SETTLING_TIME_CONSTANTS
 from adacd_hil.lab.score.metrics import ReportSource
-from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, WHOLE, LogError, TimeWindow
-from adacd_hil.log.logged_run import (
+from adacd_hil.lab.score.run_arrays import (
     QUANTITIES,
     AttemptBegins,
     CertifiedStream,
     CheckCounts,
     CycleColumns,
-    Cycles,
-    Mask,
     MeasuredMotion,
-    Milestones,
     PaperStream,
-    Progress,
     Run,
     StretchOfRun,
     columns_of_series,
-    host_cycles,
+    host_truth,
     is_realtime,
-    settings_of,
     split_sections,
+    truth_rows,
 )
+from adacd_hil.lab.score.run_judge import find_detections, timed_contacts
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, WHOLE, LogError, TimeWindow
+from adacd_hil.log.logged_run import Cycles, Mask, Milestones, Progress, host_cycles, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series, check_states, contacts_of, start_of_log
 from adacd_hil.printable import one_line
 from adacd_hil.records import JOINTS, ContactReport, Request, SchemeState
-from adacd_hil.score.emulator_truth import (
-    Rows,
-    TruthTable,
-    extreme_rows,
-    foreign_truth,
-    host_truth,
-    read_truth,
-    truth_rows,
-)
-from adacd_hil.score.judge import find_detections, timed_contacts
+from adacd_hil.score.emulator_truth import Rows, TruthTable, extreme_rows, foreign_truth, read_truth
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 

@@ -14,9 +14,9 @@ import numpy as np
 from adacd_hil.lab.report.page import MARKS
 from adacd_hil.lab.report.traces import Traces, pack_tracks, run_tracks
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact
-from adacd_hil.log.logged_run import Run
+from adacd_hil.lab.score.report_wording import STATE_WORDS, number_text
+from adacd_hil.lab.score.run_arrays import Run
 from adacd_hil.records import SchemeState
-from adacd_hil.score.wording import STATE_WORDS, number_text
 
 STATE_COLOURS: Final = {
     SchemeState.ADAPT: "adaptation",

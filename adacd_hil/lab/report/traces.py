@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.lab.score.evaluation import QUEUES
-from adacd_hil.lab.signal_noise import white_noise
-from adacd_hil.log.logged_run import (
+from adacd_hil.lab.score.run_arrays import (
     COMPUTE,
     LATENESS,
     SLACK,
@@ -29,6 +28,7 @@ from adacd_hil.log.logged_run import (
     Run,
     is_realtime,
 )
+from adacd_hil.lab.signal_noise import white_noise
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, PARAMETER_UNITS, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of
 

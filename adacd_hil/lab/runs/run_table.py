@@ -16,8 +16,9 @@ from typing import Any, Final, NamedTuple
 from adacd_hil.file_replacement import replace_files, replacing
 from adacd_hil.lab.logs.signal_tables import import_pyarrow
 from adacd_hil.lab.runs.run_summary import CERTIFIED, GOOD, NO_CERTIFICATE, NOT_JUDGED, RUNNING, RunSummary
+from adacd_hil.lab.score.report_wording import number_text, pair_text
 from adacd_hil.log.log_files import failing_as
-from adacd_hil.score.wording import NONE, found_text, number_text, pair_text
+from adacd_hil.score.wording import NONE, found_text
 
 
 class Column(NamedTuple):

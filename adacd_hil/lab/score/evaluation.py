@@ -13,6 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.lab.score.histogram import LogHistogram, log_histogram
 from adacd_hil.lab.score.margins import UntouchedGatherer, evaluate_certified, last_row
 from adacd_hil.lab.score.metrics import (
     Count,
@@ -21,14 +22,11 @@ from adacd_hil.lab.score.metrics import (
     ReportedContact,
     TimingEvidence,
 )
-from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_causes, find_faults
-from adacd_hil.lab.score.verdict import compare_with_paper, list_findings
-from adacd_hil.log.logged_run import (
+from adacd_hil.lab.score.run_arrays import (
     COMPUTE,
     LATENESS,
     QUANTITIES,
     CycleColumns,
-    Cycles,
     Quantity,
     Run,
     Section,
@@ -37,18 +35,13 @@ from adacd_hil.log.logged_run import (
     section_at,
     split_sections,
 )
+from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_causes, find_faults
+from adacd_hil.lab.score.run_judge import channels_at, contacts_of, find_detections, judge_run, row_at
+from adacd_hil.lab.score.verdict import compare_with_paper, list_findings
+from adacd_hil.log.logged_run import Cycles
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
-from adacd_hil.score.distribution import Distribution, LogHistogram, log_histogram
-from adacd_hil.score.judge import (
-    Detection,
-    Score,
-    TrueContact,
-    channels_at,
-    contacts_of,
-    find_detections,
-    judge_run,
-    row_at,
-)
+from adacd_hil.score.distribution import Distribution
+from adacd_hil.score.judge import Detection, Score, TrueContact
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.scheme_settings import KIND_S
 

@@ -29,11 +29,13 @@ from adacd_hil.lab.score.metrics import (
     Untouched,
     certificates_in,
 )
-from adacd_hil.log.logged_run import CertifiedStream, Mask, Run, Section, rows_of, split_sections
+from adacd_hil.lab.score.run_arrays import CertifiedStream, Run, Section, rows_of, split_sections
+from adacd_hil.lab.score.run_judge import find_detections, placed_in, timed_contacts
+from adacd_hil.log.logged_run import Mask
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of
 from adacd_hil.score.distribution import Distribution
-from adacd_hil.score.judge import StreamJudge, TrueContact, find_detections, placed_in, timed_contacts
+from adacd_hil.score.judge import StreamJudge, TrueContact
 from adacd_hil.score.smallest_push import PushGatherer
 from adacd_hil.settings.configuration import Settings
 

@@ -28,10 +28,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from adacd_hil.log.logged_run import Section
+from adacd_hil.lab.score.histogram import LogHistogram
+from adacd_hil.lab.score.rates import rate_bound_per_h
+from adacd_hil.lab.score.run_arrays import Section
 from adacd_hil.log.types.topics import CERTIFIED_MODEL
-from adacd_hil.score.distribution import LogHistogram
-from adacd_hil.score.judge import rate_bound_per_h
 from adacd_hil.score.smallest_push import SmallestPush
 
 if TYPE_CHECKING:

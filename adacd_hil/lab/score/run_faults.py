@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.lab.score.metrics import CyclicData, DeviceShares, Fault
-from adacd_hil.log.logged_run import CheckCounts, CycleColumns, Cycles, Mask, Run
+from adacd_hil.lab.score.report_wording import percent_text
+from adacd_hil.lab.score.run_arrays import CheckCounts, CycleColumns, Run
+from adacd_hil.log.logged_run import Cycles, Mask
 from adacd_hil.printable import one_line
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.scheme.supervisor.supervisor import POWERED
-from adacd_hil.score.wording import percent_text
 from adacd_hil.settings.arm_settings import DATA_WINDOW_S, SHORTEST_DATA_WINDOW, DataSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.e2e import E2eStatus

@@ -23,9 +23,10 @@ from adacd_hil.lab.score.metrics import (
     ReportedContact,
     Residual,
 )
-from adacd_hil.log.logged_run import Run, Section
+from adacd_hil.lab.score.report_wording import percent_text, score_sentence
+from adacd_hil.lab.score.run_arrays import Run, Section
 from adacd_hil.score.judge import Score
-from adacd_hil.score.wording import NONE, found_text, number_of, percent_text, score_sentence
+from adacd_hil.score.wording import NONE, found_text, number_of
 from adacd_hil.settings.arm_settings import ArmSettings
 from adacd_hil.settings.configuration_files import load_settings
 

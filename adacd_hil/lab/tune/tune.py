@@ -26,6 +26,8 @@ from matplotlib.figure import Figure
 from adacd_hil import __version__
 from adacd_hil.clock import wall_ns
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
+from adacd_hil.lab.score.rates import least_rate_per_h
+from adacd_hil.lab.score.report_wording import delay_figures, delays_phrase, rate_phrase, share_phrase
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.lab.tune.tune_candidates import (
     candidates,
@@ -51,8 +53,7 @@ from adacd_hil.log.log_files import WHOLE, TimeWindow
 from adacd_hil.log.logged_run import Progress
 from adacd_hil.replay.replay import replay_many
 from adacd_hil.replay.replayed_outcome import Replay
-from adacd_hil.score.judge import least_rate_per_h
-from adacd_hil.score.wording import delay_figures, delays_phrase, number_of, rate_phrase, share_phrase
+from adacd_hil.score.wording import number_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError

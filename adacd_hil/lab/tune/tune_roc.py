@@ -20,6 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
+from adacd_hil.lab.score.rates import rate_bound_per_h, share_bounds
+from adacd_hil.lab.score.report_wording import delay_figures
+from adacd_hil.lab.score.run_arrays import AttemptBegins
 from adacd_hil.lab.thresholds.false_alarms import (
     BLOCK_S,
     TailCalibration,
@@ -31,13 +34,12 @@ from adacd_hil.lab.thresholds.false_alarms import (
 )
 from adacd_hil.lab.thresholds.free_motion import APART_S, LoggedMotion, read_motion, schemes
 from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
-from adacd_hil.log.logged_run import AttemptBegins, Progress, host_span
+from adacd_hil.log.logged_run import Progress, host_span
 from adacd_hil.log.reader import Series
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.score.emulator_truth import HostCycles, contacts_beside, placed_contacts
-from adacd_hil.score.judge import Times, TrueContact, explained_until, rate_bound_per_h, share_bounds
-from adacd_hil.score.wording import delay_figures
+from adacd_hil.score.judge import Times, TrueContact, explained_until
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import changed_keys, keep_facts

@@ -1,104 +1,33 @@
-"""The plugin of python-can for `.mcap`: `can_logger`, `can_player` and `can_logconvert` read and write our logs.
+"""Messages of python-can as frames of ours, and its readers of other formats.
 
-python-can finds the two classes by the entry points `can.io.message_reader` and `can.io.message_writer`. The reader's
-messages carry their time in whole nanoseconds, which the writer uses; other messages have python-can's float: float64
-seconds, which stand 238 ns apart at today's dates. BLF and MF4 count from the start of the recording, so we read their
-nanoseconds without the start, and add the start as an integer.
-
-A channel of digits is a number to python-can and a name here: "0" is its 0, "" its None.
+Our own readers of `.mcap` (`adacd_hil.lab.logs.python_can_files`) give messages their time in whole nanoseconds; other
+messages have python-can's float: float64 seconds, which stand 238 ns apart at today's dates. BLF and MF4 count from the
+start of the recording, so we read their nanoseconds without the start, and add the start as an integer.
 """
 
 import io
 import logging
-import os
 import re
 from collections.abc import Generator, Iterable, Iterator
 from decimal import Decimal
 from pathlib import Path
-from typing import IO, Any, cast
+from typing import Any, cast
 
 import can
 import numpy as np
 from can.io import blf
 from can.io.asc import ASC_MESSAGE_REGEX
-from can.io.generic import BinaryIOMessageReader, BinaryIOMessageWriter, TextIOMessageReader
+from can.io.generic import TextIOMessageReader
 from can.io.player import MESSAGE_READERS
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
-from adacd_hil.log.frames.mcap_frames import FrameWriter, McapFrames, RecordedFrame
+from adacd_hil.log.frames.mcap_frames import RecordedFrame
 from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.mcap.chunks import MOST_BYTES
 from adacd_hil.log.types.message_types import MAX_DATA
 from adacd_hil.log.types.record_arrays import MOST_CHANNELS, MOST_NS, PIECE_FRAMES, RECORDED_FRAME_DTYPE
-from adacd_hil.printable import in_line
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
-
-
-class McapReader(BinaryIOMessageReader):
-    """The messages of an MCAP file, in its order; of a log of ours all parts.
-
-    `problem` names afterwards the missing data, "" for a whole file. It is also logged as a warning.
-    """
-
-    def __init__(self, file: Any, **_: Any) -> None:
-        """Open a path or take an open binary file. Raises LogError when it can't be read or isn't MCAP."""
-        super().__init__(file, mode="rb")
-        try:
-            is_path = isinstance(file, str | os.PathLike)
-            self._frames = McapFrames(Path(file) if is_path else cast("IO[bytes]", self.file))
-        except Exception:
-            self.file.close()
-            raise
-
-    @property
-    def problem(self) -> str:
-        """The missing or unreadable parts, one line; "" for a whole file."""
-        return self._frames.problem
-
-    def __iter__(self) -> Generator[can.Message, None, None]:
-        for frames in self._frames:
-            yield from to_messages(frames, self._frames.channels, self._frames.epoch_ns)
-        if self.problem:  # for the terminal of python-can's tools, which know no `problem`
-            logging.getLogger(__name__).warning("%s", in_line(self.problem))
-        self.stop()
-
-
-class McapWriter(BinaryIOMessageWriter):
-    """Writes messages to an MCAP file with the topics and types of our logs."""
-
-    def __init__(self, file: Any, append: bool = False, **_: Any) -> None:
-        """Create a file, or take an open binary one. Raises ValueError for `append`, FileExistsError for a log."""
-        if append:
-            raise ValueError("nothing can be appended to an MCAP file; log to another one")
-        if isinstance(file, str | os.PathLike) and Path(file).is_file() and Path(file).stat().st_size:
-            raise FileExistsError(f"{os.fspath(file)} is there already; log to another file")
-        super().__init__(file, mode="wb")
-        self._writer = FrameWriter(cast("IO[bytes]", self.file))
-        self._is_stopped = False
-
-    def on_message_received(self, msg: can.Message) -> None:
-        """Write a message. Raises ValueError for a message that no CAN frame can have."""
-        self._writer.write_frame(to_frame(msg))
-
-    def stop(self) -> None:
-        """End the file; twice is once."""
-        if not self._is_stopped:
-            self._is_stopped = True
-            self._writer.finish()
-            super().stop()
-
-
-_MOST_DIGITS = 9
-"""Of a channel that is a number."""
-
-
-class TimedMessage(can.Message):
-    """A message with its time in whole nanoseconds, besides python-can's `timestamp`."""
-
-    def __init__(self, t_ns: int, **fields: Any) -> None:
-        super().__init__(timestamp=t_ns / 1_000_000_000, **fields)
-        self.t_ns = t_ns
 
 
 def time_ns(message: can.Message) -> int:
@@ -145,29 +74,6 @@ def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
         has_rate_switch=message.is_fd and message.bitrate_switch,
         has_error_state=message.is_fd and message.error_state_indicator,
     )
-
-
-def to_messages(frames: NDArray[Any], channels: list[str], epoch_ns: int = 0) -> Iterator[TimedMessage]:
-    """Make a message of each row; `epoch_ns` is added to its time."""
-    names = [int(name) if name.isdecimal() and len(name) < _MOST_DIGITS else name or None for name in channels]
-    for row in frames:
-        (t_ns, _, can_id, is_tx, is_error, length, _, channel, is_extended, is_remote, is_fd, has_switch, has_error) = (
-            row.item()
-        )
-        yield TimedMessage(
-            t_ns + epoch_ns,
-            arbitration_id=can_id,
-            is_extended_id=is_extended,
-            is_remote_frame=is_remote,
-            is_error_frame=is_error,
-            channel=names[channel],
-            dlc=length,
-            data=b"" if is_remote else row["data"][:length].tobytes(),
-            is_fd=is_fd,
-            is_rx=not is_tx,
-            bitrate_switch=has_switch,
-            error_state_indicator=has_error,
-        )
 
 
 class _BlfReader(can.BLFReader):

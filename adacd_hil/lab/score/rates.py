@@ -1,0 +1,30 @@
+"""Exact 95 % bounds of shares and rates.
+
+Sources: Clopper and Pearson, "The use of confidence or fiducial limits illustrated in the case of the binomial",
+Biometrika 26 (1934); Garwood, "Fiducial limits for the Poisson distribution", Biometrika 28 (1936).
+"""
+
+import math
+from typing import Final
+
+from scipy.special import betaincinv, gammaincinv
+
+CONFIDENCE: Final = 0.95
+
+
+def share_bounds(found: int, count: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share, seen in `found` of `count` cases; (0, 1) for no case."""
+    rest = 0.5 * (1.0 - CONFIDENCE)
+    low = float(betaincinv(found, count - found + 1, rest)) if found > 0 else 0.0
+    high = float(betaincinv(found + 1, count - found, 1.0 - rest)) if found < count else 1.0
+    return low, high
+
+
+def rate_bound_per_h(alarms: int, hours: float) -> float:
+    """Return the upper 95 % bound of a rate, one-sided: 3 / T after T hours without an alarm; infinite without time."""
+    return float(gammaincinv(alarms + 1, CONFIDENCE)) / hours if hours > 0.0 else math.inf
+
+
+def least_rate_per_h(alarms: int, hours: float) -> float:
+    """Return the lower 95 % bound of a rate, one-sided; 0 after no alarm."""
+    return float(gammaincinv(alarms, 1.0 - CONFIDENCE)) / hours if alarms > 0 and hours > 0.0 else 0.0

@@ -1,0 +1,144 @@
+"""One wording of each number, state and rate, for reports; those that a replay needs, too, are in `score.wording`."""
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from adacd_hil.records import SchemeState
+from adacd_hil.score.judge import Score
+from adacd_hil.score.wording import NONE, found_text, number_of
+
+_MORE_DIGITS: Final = 3
+
+
+_TELLING_PER_H: Final = 3.0
+"""The bound after an hour without a false alarm."""
+
+
+STATE_WORDS: Final = {
+    SchemeState.INIT: "starting",
+    SchemeState.COMMISSION: "checking at rest",
+    SchemeState.ENABLE: "enabling",
+    SchemeState.ADAPT: "learning",
+    SchemeState.CERTIFY: "testing",
+    SchemeState.MONITOR: "watching",
+    SchemeState.REACT: "reacting",
+    SchemeState.STOPPED: "stopped",
+    SchemeState.PAYLOAD: "payload change",
+    SchemeState.FAULT: "fault",
+}
+"""States as a report names them."""
+
+
+def state_words(name: str | None) -> str:
+    """Write a state that a log names."""
+    return NONE if name is None else STATE_WORDS[SchemeState[name]]
+
+
+def number_text(value: float | None, digits: int, unit: str = "") -> str:
+    """Write a number with a fixed count of decimals and a true minus sign; a dash for None."""
+    if value is None or not math.isfinite(value):
+        return NONE
+    text = f"{value:z.{digits}f}".replace("-", "−")
+    return f"{text} {unit}" if unit else text
+
+
+def pair_text(values: Sequence[float] | None, digits: int) -> str:
+    """Write the values of both joints; a dash for None."""
+    return NONE if values is None else " / ".join(number_text(value, digits) for value in values)
+
+
+def yes_text(value: bool | None) -> str:
+    """Write yes or no; a dash for None."""
+    return NONE if value is None else "yes" if value else "no"
+
+
+def signs_text(direction: tuple[int, int] | None) -> str:
+    """Write the signs of both joints; a dash for None."""
+    return NONE if direction is None else " / ".join({1: "+", -1: "−", 0: "0"}[sign] for sign in direction)
+
+
+def signed_text(value: float) -> str:
+    """Write a number with its sign and one decimal."""
+    return f"{value:+.1f}".replace("-", "−")
+
+
+def scaled(value: float | None, factor: float) -> float | None:
+    """Multiply a value, if there is one."""
+    return None if value is None else factor * value
+
+
+def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: str) -> str:
+    """Write a value with its standard deviation, with as many more decimals as a small one needs not to read as none.
+
+    A dash where either is not known.
+    """
+    if value is None or sigma is None:
+        return NONE
+    if 0.0 < sigma < 0.5 * 10.0**-digits:
+        digits = min(-math.floor(math.log10(sigma)), digits + _MORE_DIGITS)
+    return f"{number_text(value, digits)} ± {number_text(sigma, digits)} {unit}"
+
+
+def score_sentence(score: Score) -> str:
+    """Count the contacts found and missed, the longest delay, and the false alarms."""
+    armed = [contact for contact in score.contacts if contact.is_armed]
+    delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
+    within = f" within {max(delays_ms):.0f} ms" if delays_ms else ""
+    if not armed:
+        found = "no contact while the arm was watched"
+    elif score.missed:
+        found = f"{len(delays_ms)} of {number_of(len(armed), 'contact')} detected{within}, {score.missed} missed"
+    else:
+        found = f"{'the one contact' if len(armed) == 1 else f'all {len(armed)} contacts'} detected{within}"
+    false = number_of(len(score.false_alarms), "false alarm") if score.false_alarms else "none false"
+    if not armed and not score.false_alarms:
+        false = "no false alarm"
+    disarmed = [contact for contact in score.contacts if not contact.is_armed]
+    outside = f", {len(disarmed)} more while it was not watched" if disarmed else ""
+    early = sum(contact.detected_ns is not None for contact in disarmed)
+    outside += f" ({early} of them detected)" if early else ""
+    return f"{found}{outside}, {false}"
+
+
+def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
+    """Write how many false alarms there were, and an upper bound of their rate, if the time is long enough."""
+    count = number_of(false_alarms, "false alarm") if false_alarms else "No false alarms"
+    if bound_per_h > _TELLING_PER_H:
+        return f"{count} in that time, which is too short to tell a rate by counting"
+    return f"{count} in that time: by counting alone, at most {bound_per_h:.3g} per hour at 95 %"
+
+
+def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | None, float | None]:
+    """Return median, 90th percentile and largest."""
+    if not delays_ms:
+        return None, None, None
+    median, p90, largest = np.quantile(delays_ms, (0.5, 0.9, 1.0)).tolist()
+    return median, p90, largest
+
+
+def delays_phrase(delays_ms: Sequence[float]) -> str:
+    """Write the distribution of delays; "" without delays."""
+    if not delays_ms:
+        return ""
+    return ", after {:.1f} ms (median), {:.1f} (p90), {:.1f} (largest)".format(*delay_figures(delays_ms))
+
+
+def share_phrase(delays_ms: Sequence[float], contacts: int, bounds: tuple[float, float]) -> str:
+    """Write how many contacts were found, the bounds of their share, and their delays."""
+    found = found_text(len(delays_ms), contacts)
+    return f"{found} contacts found ({100 * bounds[0]:.0f} to {100 * bounds[1]:.0f} %){delays_phrase(delays_ms)}"
+
+
+def rate_phrase(alarms: int, hours: float, bound_per_h: float) -> str:
+    """Write how many false alarms came in how many hours."""
+    return f"{alarms} false alarms in {hours:.4f} h, 95 % bound {bound_per_h:.3g} per hour"
+
+
+def percent_text(share: float) -> str:
+    """Write a share with two digits that count."""
+    if 0.0 < share < 5e-5:
+        return "less than 0.01 %"
+    return f"{100.0 * share:.2g} %" if share < 0.995 else f"{100.0 * share:.0f} %"

@@ -1,0 +1,148 @@
+"""The alarms and the true contacts of a whole run, and the response of an ideal detector with its filters.
+
+Shapes and units as in `adacd_hil.lab.score.run_arrays`.
+"""
+
+import math
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from adacd_hil.lab.score.run_arrays import Run
+from adacd_hil.log.logged_run import Cycles, Mask, enters_react
+from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.scheme.model.filter_bank import channels_of, step_response
+from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge, true_contacts
+
+
+def find_detections(run: Run) -> tuple[Detection, ...]:
+    """Find the alarms of a run and the reports that belong to them by their cycle."""
+    rows = np.flatnonzero(enters_react(run.state[:-1], run.state[1:])) + 1
+    alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
+    finals = {report.cycle: report for report in run.reports if report.is_final}
+    detections = []
+    for row in rows.tolist():
+        cycle = int(run.cycle[row])
+        final = finals.get(cycle)
+        first = alarms.get(cycle, final)
+        if first is None and run.contact_joints is not None and not run.contact_joints[row]:
+            continue
+        is_armed = bool(run.state[row - 1] == SchemeState.MONITOR)
+        is_known = run.truth is None or run.truth.covers(cycle)
+        detections.append(Detection(int(run.t_ns[row]), is_armed, is_known, row, first, final or first))
+    return tuple(detections)
+
+
+def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
+    """Find the true contacts of a run, with the times of their rows."""
+    truth = run.truth
+    if truth is None or run.cycle.size == 0:
+        return ()
+    if truth.time_s is None:
+        truth = replace(truth, time_s=run.time_of_s(truth.cycle))
+    return true_contacts(truth, run.first_contact)
+
+
+def contacts_of(run: Run) -> tuple[TrueContact, ...]:
+    """Find the true contacts of a run, on its clock, with the thresholds and the filter of its own scheme."""
+    armed = run.state == SchemeState.MONITOR
+    return tuple(placed_in(run, contact, run.a_rad_s, None, armed) for contact in timed_contacts(run))
+
+
+def placed_in(run: Run, contact: TrueContact, a_rad_s: float, threshold: Vector | None, armed: Mask) -> TrueContact:
+    """Return a contact on the clock of a run. threshold: None: that in force; armed (n,): where detection is armed."""
+    assert contact.time_s is not None
+    ends_ns = [run.zero_ns + round(float(at_s) * 1e9) for at_s in contact.time_s[[0, -1]]]
+    row = row_at(run, float(contact.time_s[0]))
+    threshold = threshold_in(run, row) if threshold is None else threshold
+    return contact.placed((ends_ns[0], ends_ns[1]), run.settings, a_rad_s, threshold, bool(row > 0 and armed[row - 1]))
+
+
+def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
+    """Return the closed-form delay of a torque step, t = -ln(1 - h / |tau|) / a; None if it never crosses."""
+    if not abs(tau_ext_Nm) > threshold_Nm:
+        return None
+    return -math.log1p(-threshold_Nm / abs(tau_ext_Nm)) / a_rad_s
+
+
+def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float) -> float | None:
+    """Return the delay of a torque step behind two first-order low-passes; None if it never crosses.
+
+    The response rises steadily, so that bisection finds the crossing.
+    """
+    if not abs(tau_ext_Nm) > threshold_Nm:
+        return None
+    wanted = threshold_Nm / abs(tau_ext_Nm)
+    low_s, high_s = 0.0, 40.0 / min(a_rad_s, b_rad_s)
+    for _ in range(60):
+        middle_s = 0.5 * (low_s + high_s)
+        is_below = step_response(middle_s, a_rad_s, b_rad_s) < wanted
+        low_s, high_s = (middle_s, high_s) if is_below else (low_s, middle_s)
+    return high_s
+
+
+@dataclass(frozen=True)
+class FilterChannel:
+    """A filter with its threshold, Nm (2,): first order, and with `smoothing_rad_s` a second one behind it."""
+
+    cutoff_rad_s: float
+    smoothing_rad_s: float | None
+    threshold: Vector
+
+    def step_delay_s(self, tau_ext: Vector) -> float | None:
+        """Return how long steps of each joint's torque (2,) take over the threshold, the faster joint; None: never."""
+        delays_s = []
+        for joint in range(JOINTS):
+            tau, h = float(tau_ext[joint]), float(self.threshold[joint])
+            if self.smoothing_rad_s is None:
+                delays_s.append(detection_delay_s(tau, h, self.cutoff_rad_s))
+            else:
+                delays_s.append(two_pole_delay_s(tau, h, self.cutoff_rad_s, self.smoothing_rad_s))
+        return min((delay_s for delay_s in delays_s if delay_s is not None), default=None)
+
+    def respond(self, tau_ext: Vector, cycle: Cycles, period_s: float) -> Vector:
+        """Filter a true torque (n, 2), at rest at the first sample; see `filtered`."""
+        response = filtered(tau_ext, cycle, period_s, self.cutoff_rad_s)
+        if self.smoothing_rad_s is None:
+            return response
+        return filtered(response, cycle, period_s, self.smoothing_rad_s)
+
+
+def threshold_in(run: Run, row: int) -> Vector:
+    """Return the threshold of `tau_ext_hat` in force in a cycle, Nm (2,); the configured one where detection is off."""
+    configured = np.array(run.settings.detector.threshold_Nm)
+    return np.where(np.isfinite(run.threshold[row]), run.threshold[row], configured)
+
+
+def row_at(run: Run, time_s: float) -> int:
+    """Return the first cycle's row that is not before a time; the last one after the end."""
+    t_ns, zero_ns = run.t_ns, run.zero_ns
+    row = bisect_left(range(len(t_ns)), time_s, key=lambda row: float((t_ns[row] - zero_ns) * 1e-9))
+    return min(row, len(t_ns) - 1)
+
+
+def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
+    """Return the filters that detect at a time, with their thresholds: the paper's one, or the bank."""
+    if run.certified is None:
+        return (FilterChannel(run.a_rad_s, None, threshold_in(run, row_at(run, time_s))),)
+    thresholds = run.certified.threshold[row_at(run, time_s)]
+    return tuple(
+        FilterChannel(cutoff, smoothing, threshold)
+        for (cutoff, smoothing), threshold in zip(channels_of(run.settings), thresholds, strict=True)
+    )
+
+
+def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[Detection]) -> Score:
+    """Judge the alarms of a run's own scheme."""
+    return judge(contacts, [detection for detection in detections if not is_of_weight(run, detection.row)])
+
+
+def is_of_weight(run: Run, row: int) -> bool:
+    """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet."""
+    truth, armed = run.truth, np.flatnonzero(run.state[:row] == SchemeState.MONITOR)
+    if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:
+        return False
+    known, now = (truth.model_row(int(run.cycle[place])) for place in (armed[-1] if len(armed) else row, row))
+    return known is not None and now is not None and bool(truth.payload_kg[known] != truth.payload_kg[now])
