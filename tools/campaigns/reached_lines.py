@@ -5,9 +5,10 @@
     python tools/campaigns/reached_lines.py paper-quick lose-feedback     these runs alone
 
 Plays each run of `tests/reference` and five scenarios of the emulator without compilation, the log's writer included,
-then replays each log and the stored one. A line counts once it was executed; importing a module reaches the lines that
-define its functions, so the share of lines within functions is told apart. Neither the emulator nor what a run and its
-replay do without (`LEFT_OUT`) counts.
+then replays each log and the stored one. Then come three of a user's ways: a tare and two runs with a history, by the
+commands; a replay of frames that another program recorded; a replay with other settings. A line counts once it was
+executed; importing a module reaches the lines that define its functions, so the share of lines within functions is told
+apart. Neither the emulator nor what a run and its replay do without (`LEFT_OUT`) counts.
 
 Coverage.py is in no lock. Where it can't be imported, pip fetches it into a folder that is removed.
 Exit status: 0 measured, 1 a run or a replay failed, 2 wrong usage.
@@ -35,7 +36,10 @@ from adacd_hil.log.log_files import LOG_NAME
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "reference")]
 
+import can  # noqa: E402
+import pytest  # noqa: E402
 import reference_runs  # noqa: E402 (it is the tests')
+from cli.bus_lab import Lab  # noqa: E402
 
 COVERAGE = "coverage==7.17.5"
 FAULTS = ("corrupt-torque", "drive-fault-and-recovery", "lose-feedback", "power-loss-and-return", "stuck-torque")
@@ -65,7 +69,7 @@ class Played(NamedTuple):
 
 def main() -> int:
     """Play, measure, print."""
-    known = [*reference_runs.names(), *FAULTS]
+    known = [*reference_runs.names(), *FAULTS, *WAYS]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help="reference runs or scenarios; default: all")
     parser.add_argument("--functions", action="store_true", help="name the functions that no run enters")
@@ -99,20 +103,51 @@ def play(name: str, folder: Path) -> Path:
     return folder / LOG_NAME
 
 
-def replay(log: Path) -> None:
+def replay(log: Path, *options: str) -> None:
     """Replay a log by the command; it ends this process unless the decisions are the same."""
     from adacd_hil.cli.main import main as host
 
-    sys.argv = ["adacd-hil", "replay", str(log)]
+    sys.argv = ["adacd-hil", "replay", str(log), *options]
     host()
 
 
+def run_with_files(folder: Path) -> None:
+    """Tare, then run twice with the tare and the history of the arm, by the commands."""
+    with pytest.MonkeyPatch.context() as patches:
+        lab = Lab(folder, patches)
+        lab.settings_file.write_text('extends = "certified"\n[operator]\nscript = [{at_s = 3.0, request = "finish"}]\n')
+        files = ("--tare", str(lab.tare_file), "--history", str(folder / "arm.toml"))
+        for result in (lab.tare(), lab.run(*files), lab.run(*files)):
+            if result.exit_code != 0:
+                sys.exit(result.stderr or result.exit_code)
+
+
+def replay_recording(folder: Path) -> None:
+    """Replay frames that another program recorded, against the log of their run."""
+    recording = folder / "bus.log"
+    with can.LogReader(STORED_LOG) as reader, can.Logger(recording) as converted:
+        for message in reader:
+            converted(message)
+    replay(recording, "--against", str(STORED_LOG))
+
+
+def replay_otherwise(folder: Path) -> None:
+    """Replay a log with settings that its run did not have."""
+    del folder
+    replay(STORED_LOG, "--set", "certified.noise_sigmas=7", "--vary", "detector.isolation_window_s=0.05,0.1")
+
+
+WAYS = {"tare-and-history": run_with_files, "recorded-frames": replay_recording, "what-if": replay_otherwise}
+"""What users do besides, by name."""
+
+
 def _play_apart(name: str, environment: dict[str, str]) -> Played:
-    """Play and replay a run, or replay a log, in a process that is measured."""
+    """Play and replay a run, replay a log, or go one of the ways, in a process that is measured."""
     with tempfile.TemporaryDirectory() as scratch:
-        is_log = name.endswith(".mcap")
-        log = repr(name) if is_log else f"reached_lines.play({name!r}, Path({scratch!r}))"
-        program = f"import reached_lines; from pathlib import Path; reached_lines.replay(Path({log}))"
+        folder = f"Path({scratch!r})"
+        log = f"Path({name!r})" if name.endswith(".mcap") else f"reached_lines.play({name!r}, {folder})"
+        call = f"WAYS[{name!r}]({folder})" if name in WAYS else f"replay({log})"
+        program = f"import reached_lines; from pathlib import Path; reached_lines.{call}"
         done = subprocess.run(
             [sys.executable, "-c", program], env=environment, cwd=ROOT, capture_output=True, text=True, check=False
         )
@@ -121,7 +156,8 @@ def _play_apart(name: str, environment: dict[str, str]) -> Played:
 
 
 def _line(played: Played) -> str:
-    return f"{played.name} {played.error or 'played, and replayed the same'}"
+    done = "done" if played.name in WAYS else "played, and replayed the same"
+    return f"{played.name} {played.error or done}"
 
 
 def _environment(folder: Path) -> dict[str, str]:
