@@ -5,10 +5,11 @@
     python tools/campaigns/reached_lines.py paper-quick lose-feedback     these runs alone
 
 Plays each run of `tests/reference` and five scenarios of the emulator without compilation, the log's writer included,
-then replays each log and the stored one. Then come three of a user's ways: a tare and two runs with a history, by the
-commands; a replay of frames that another program recorded; a replay with other settings. A line counts once it was
-executed; importing a module reaches the lines that define its functions, so the share of lines within functions is told
-apart. Neither the emulator nor what a run and its replay do without (`LEFT_OUT`) counts.
+then replays each log and the stored one. Then come five of a user's ways: a tare and two runs with a history, by the
+commands; a run on vcan; a look at configurations; a replay of frames that another program recorded; a replay with other
+settings. A line counts once it was executed; importing a module reaches the lines that define its functions, so the
+share of lines within functions is told apart. Neither the emulator nor what a run and its replay do without
+(`LEFT_OUT`) counts.
 
 Coverage.py is in no lock. Where it can't be imported, pip fetches it into a folder that is removed.
 Exit status: 0 measured, 1 a run or a replay failed, 2 wrong usage.
@@ -39,9 +40,11 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "reference")]
 import can  # noqa: E402
 import pytest  # noqa: E402
 import reference_runs  # noqa: E402 (it is the tests')
-from cli.bus_lab import Lab  # noqa: E402
+from called import called  # noqa: E402
+from cli.bus_lab import SHORT_RUN, Lab  # noqa: E402
 
 COVERAGE = "coverage==7.17.5"
+BIN = Path(sys.executable).parent
 FAULTS = ("corrupt-torque", "drive-fault-and-recovery", "lose-feedback", "power-loss-and-return", "stuck-torque")
 STORED_LOG = ROOT / "tests" / "reference" / "logs" / "recovery.mcap"
 LEFT_OUT = ("adacd_hil/lab/", "adacd_hil/api.py", "adacd_hil/cli/completion.py")
@@ -117,9 +120,33 @@ def run_with_files(folder: Path) -> None:
         lab = Lab(folder, patches)
         lab.settings_file.write_text('extends = "certified"\n[operator]\nscript = [{at_s = 3.0, request = "finish"}]\n')
         files = ("--tare", str(lab.tare_file), "--history", str(folder / "arm.toml"))
-        for result in (lab.tare(), lab.run(*files), lab.run(*files)):
+        second = ("--out", str(folder / "second"))
+        for result in (lab.tare(), lab.run(*files), lab.run(*files, *second)):
             if result.exit_code != 0:
                 sys.exit(result.stderr or result.exit_code)
+
+
+def run_on_vcan(folder: Path) -> None:
+    """Run on real SocketCAN, the emulator in a process of its own."""
+    (folder / "short.toml").write_text(SHORT_RUN)
+    on_bus = "run -i socketcan -c vcan0"
+    host = f"{BIN}/adacd-hil {on_bus} --clock lockstep --config {folder}/short.toml --out {folder}/run"
+    both = f"{BIN}/firmware-sim {on_bus} --once --scenario idle & {host}; code=$?; wait; exit $code"
+    subprocess.run([ROOT / "tools" / "with-vcan", "--", "sh", "-c", both], check=True)
+
+
+def look_at_configurations(folder: Path) -> None:
+    """Show, check and explain configurations, a wrong one too."""
+    (folder / "wrong.toml").write_text('extends = "certified"\n[bus]\nperiod_us = 250\n')
+    for words, status in (
+        (("show", "certified", "--changed"), 0),
+        (("check", "certified", "paper"), 0),
+        (("check", str(folder / "wrong.toml")), 2),
+        (("docs", "certified.noise_sigmas"), 0),
+    ):
+        result = called("config", *words)
+        if result.exit_code != status:
+            sys.exit(f"config {' '.join(words)}: exit status {result.exit_code}, not {status}: {result.stderr}")
 
 
 def replay_recording(folder: Path) -> None:
@@ -137,7 +164,13 @@ def replay_otherwise(folder: Path) -> None:
     replay(STORED_LOG, "--set", "certified.noise_sigmas=7", "--vary", "detector.isolation_window_s=0.05,0.1")
 
 
-WAYS = {"tare-and-history": run_with_files, "recorded-frames": replay_recording, "what-if": replay_otherwise}
+WAYS = {
+    "tare-and-history": run_with_files,
+    "vcan": run_on_vcan,
+    "configurations": look_at_configurations,
+    "recorded-frames": replay_recording,
+    "what-if": replay_otherwise,
+}
 """What users do besides, by name."""
 
 
