@@ -55,7 +55,7 @@ EPILOG = (
 
 
 def tell(line: str) -> None:
-    """Print a line that is neither question nor result."""
+    """Print a line on standard error; for lines that are neither question nor result."""
     print(in_line(line), file=sys.stderr, flush=True)
 
 
@@ -68,7 +68,7 @@ class CommandError(Exception):
 
 
 def exit_code(summary: "SessionSummary") -> ExitCode:
-    """Return the exit status of a run, for the gravest of its outcomes."""
+    """Return the exit status of a run, for the gravest of its outcomes: fault, incomplete log, interrupt, none."""
     from adacd_hil.records import FaultReason
 
     if summary.result is None:
@@ -81,7 +81,7 @@ def exit_code(summary: "SessionSummary") -> ExitCode:
 
 
 def _expected() -> tuple[tuple[type[BaseException], ExitCode], ...]:
-    """Return the errors that a command ends with in one line, each with its exit status; the first match counts.
+    """Return the exceptions that a command reports in one line, each with its exit status; the first match counts.
 
     Imported only after an error: numpy and cantools take longer to import than help takes to print.
     """
@@ -145,7 +145,11 @@ def complain(error: BaseException) -> ExitCode:
 def format_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = (), is_cut: bool = False, names: int = 1
 ) -> str:
-    """Align rows under a head for standard output, as `fit_table` does. An empty head is left out."""
+    """Return rows aligned under a head, as text that fits the terminal on standard output. An empty head is left out.
+
+    right: columns, from 0, that are aligned to the right. is_cut: cut cells, so that each row is one line. names: how
+    many columns, from the left, identify a row: they are repeated where a wide table is split.
+    """
     lines = [tuple(head), *map(tuple, rows)] if any(head) else [*map(tuple, rows)]
     return "\n".join(fit_table(lines, right, terminal_columns(), is_cut, names))
 
@@ -165,7 +169,7 @@ def answer(as_json: bool, described: Any, text: str, *next_commands: str) -> Non
 
 
 def suggest(*next_commands: str) -> None:
-    """Suggest next commands on standard error, with this program's name as its user typed it."""
+    """Print commands to run next on standard error, with this program's name as its user typed it."""
     called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
     for place, command in enumerate(next_commands):
         typed = f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
@@ -187,12 +191,12 @@ _GOES_ON = " \\"
 
 
 def counted(count: int, noun: str) -> str:
-    """Return count and noun, in the plural unless the count is one."""
+    """Return a count and its noun, such as "2 cycles"; the noun is singular for one."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def quoted(path: Path) -> str:
-    """Quote a path for a shell."""
+    """Return a path quoted for a shell."""
     return shlex.quote(str(path))
 
 
