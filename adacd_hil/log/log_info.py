@@ -88,10 +88,10 @@ class LogInfo:
 
 
 def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
-    """Look at the log whose first part is `path`, with all its parts.
+    """Return an overview of the log whose first part is `path`, over all its parts.
 
-    is_brief: without events and contacts, and of a damaged file no more than the metadata of the run: some 2 ms.
-    Raises LogError when a file can't be read, or has neither MCAP's magic nor anything of a log.
+    is_brief: without events and contacts, and of a damaged file no more than the metadata of the run: some 2 ms. Raises
+    LogError when a file can't be read, or has neither MCAP's magic nor anything of a log.
     """
     parts = parts_of(path)
     info = LogInfo(path, files=len(parts))
@@ -218,7 +218,7 @@ class _InfoView:
             info.ending = item.metadata.get(ENDING_KEY, "")
 
     def _read(self, contents: Contents, definitions: Definitions) -> None:
-        """Read the events and contacts of a chunk."""
+        """Add the events and contacts of a chunk to the info."""
         for channel in definitions.channels.values():
             if channel.topic not in _READ:
                 continue
@@ -253,7 +253,7 @@ class _InfoView:
                 self._contact_cycles[cycle] = max(level, self._contact_cycles.get(cycle, 0))
 
     def sum_up(self) -> None:
-        """Complete the view."""
+        """Fill in the totals of the info after the last file: times, counts, contacts, topics."""
         info = self._info
         if self._end_ns:
             info.start_ns, info.end_ns = self._start_ns, self._end_ns
@@ -281,14 +281,14 @@ def _payloads(contents: Contents, channel: int) -> Iterator[bytes]:
 
 
 def attachment(path: Path, name: str) -> bytes | None:
-    """Return an attachment of an MCAP file by its name; None when the head of the file does not have it."""
+    """Return an attachment of an MCAP file by its name; None if the head of the file lacks it or can't be read."""
     with contextlib.suppress(LogError):  # the reader of the log reports damage
         return read_head(path).attachments.get(name)
     return None
 
 
 def run_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of the run in an MCAP file; empty when the head of the file does not have it."""
+    """Return the metadata of the run in an MCAP file; empty if the head of the file lacks them or can't be read."""
     with contextlib.suppress(LogError):
         return read_head(path).metadata.get(RUN_METADATA, {})
     return {}

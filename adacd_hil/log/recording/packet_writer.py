@@ -85,7 +85,10 @@ class PacketWriter:
         epoch_ns: int,
         watch: Watch | None = None,
     ) -> None:
-        """Write to `file`; `watch`, if given, gets every batch of records, too."""
+        """Write to `file`; `watch`, if given, gets every batch of records, too.
+
+        messages: of the DBC, whose frames are decoded. epoch_ns: added to the packets' times.
+        """
         self.frames = 0
         self.dropped = 0  # packets that didn't reach the writer
         self._lost = 0  # packets that reached it and were lost; the next packet's event reports them
@@ -106,7 +109,7 @@ class PacketWriter:
         self._least_scheme = max((place.stop for place in self._joint_slices.values()), default=_BODY) - _BODY
 
     def begin_file(self, file: McapFile) -> None:
-        """Continue with another file of the same topics."""
+        """Write later packets to another file with the same topics."""
         self._file = file
 
     def lose(self, count: int) -> None:
@@ -139,7 +142,7 @@ class PacketWriter:
         return np.asarray(self._has_stamp(packets.heads["t_ns"]) & (wrong == 0))
 
     def _has_stamp(self, t_ns: Numbers) -> NDArray[np.bool_]:
-        """Tell which times, in ns of the run's clock, fit into a stamp."""
+        """Return for each time, in ns of the run's clock, whether it fits into a stamp."""
         time_ns = t_ns + self._epoch_ns
         return np.asarray((time_ns >= 0) & (time_ns < END_OF_TIME_NS))
 
@@ -294,7 +297,7 @@ class PacketWriter:
             self._watch(records, channels, log_ns, ends)
 
     def _move_up(self, log_ns: Numbers, channels: NDArray[np.uint16]) -> None:
-        """Raise log times that would run backwards in their topic, which readers don't expect."""
+        """Raise, in place, log times that would run backwards in their topic, which readers don't expect."""
         order = np.argsort(channels, kind="stable")
         for places in np.split(order, np.flatnonzero(np.diff(channels[order])) + 1):
             if not len(places):
@@ -307,7 +310,7 @@ class PacketWriter:
 
 
 def _rows(payload: bytes, count: int) -> Rows:
-    """Make `count` records of a payload (count, size), without channel and times."""
+    """Return `count` equal records of a payload (count, size), without channel and times."""
     length = MESSAGE_HEAD + len(payload) - RECORD_HEAD_BYTES
     record = _HEAD.pack(Opcode.MESSAGE, length, 0, 0, 0, 0) + payload
     return np.repeat(np.frombuffer(record, np.uint8)[np.newaxis], count, axis=0)

@@ -36,7 +36,7 @@ class LiveFeed(Protocol):
         log_ns: NDArray[np.int64],
         ends: NDArray[np.int64],
     ) -> None:
-        """Show consecutive message records (b,); channels, log_ns, ends (n,): one entry per record."""
+        """Send consecutive message records (b,) to viewers; channels, log_ns, ends (n,): one entry per record."""
 
     def end_view(self) -> None:
         """End the view without waiting for viewers."""
