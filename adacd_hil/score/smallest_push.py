@@ -39,7 +39,7 @@ class PushGatherer:
         self._push, self._threshold = ([Distribution() for _ in range(JOINTS)] for _ in range(2))
 
     def add_residuals(self, tau_ext: Vector, threshold: Vector) -> None:
-        """Take in residuals and thresholds (k, channels, 2), k > 0."""
+        """Gather residuals and thresholds (k, channels, 2), k > 0, of the next cycles in MONITOR without contact."""
         push = np.zeros((len(tau_ext), JOINTS))
         _fill(tau_ext, threshold, self._shown, push)
         in_force = threshold.min(axis=1)
@@ -49,7 +49,7 @@ class PushGatherer:
             self._threshold[joint].add_values(in_force[:, joint])
 
     def smallest_push(self) -> SmallestPush | None:
-        """Sum up; return None before the first cycle."""
+        """Return the percentiles over all cycles gathered so far; None before the first."""
         if not self._push[0].count:
             return None
         seen_s = self._push[0].count * self._period_s
