@@ -60,7 +60,7 @@ def complete_interface(_ctx: Context, _param: Parameter, incomplete: str) -> lis
 
 
 def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete the CAN interfaces of this machine, if the interface is SocketCAN or not given yet."""
+    """Return this machine's CAN interfaces that begin with `incomplete`; [] if another bus than SocketCAN is given."""
     if ctx.params.get("interface") not in (None, "socketcan"):
         return []
     from adacd_hil.wire.can_interface import can_interfaces
@@ -69,7 +69,7 @@ def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[C
 
 
 def complete_run(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return the 30 newest folders below `runs` that have a log and begin with `incomplete`; the shell adds files."""
+    """Return those of the 30 newest folders in `runs` with a log that begin with `incomplete`; the shell adds files."""
     from adacd_hil.cli.output import RUNS
     from adacd_hil.log.log_files import LOG_NAME
 
