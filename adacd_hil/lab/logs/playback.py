@@ -49,7 +49,7 @@ class Lateness:
         self._counts[lateness_ns // _BUCKET_NS] += 1
 
     def quantile_us(self, share: float) -> int:
-        """Return the smallest whole number of µs such that this share of the frames was not later."""
+        """Return the lateness that a share (0…1) of the frames did not exceed, µs, rounded up; 0 without frames."""
         needed = share * self.frames
         for bucket, count in sorted(self._counts.items()):
             needed -= count
@@ -67,10 +67,10 @@ def play(
     longest_pause_ns: int | None = None,
     is_stopped: Callable[[], bool] = lambda: False,
 ) -> Lateness:
-    """Send frames at their times until they end or `is_stopped`; return the lateness.
+    """Send frames at their times until they end or `is_stopped`; return how late they were sent.
 
-    longest_pause_ns: longer pauses of the recording are shortened to this. Frames out of order are sent with the frames
-    before them. Raises BusError.
+    speed: 2 plays twice as fast. longest_pause_ns: longer pauses of the recording are shortened to this. Frames out of
+    order are sent with the frames before them. Raises BusError.
     """
     lateness = Lateness()
     for due_ns, group in _grouped(_scheduled(frames, clock, speed, longest_pause_ns)):
