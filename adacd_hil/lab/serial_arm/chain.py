@@ -305,11 +305,11 @@ class BaseParameters:
 
 
 def find_base(chain: Chain) -> BaseParameters:
-    """Find a smallest parameter set from the regressor at random states: QR with pivoting.
+    """Return a smallest set of parameters that determines the torque, from the regressor at random states.
 
-    A combination that shows in no W shows neither in Y_p nor in Y_h: its M, and with it C, is zero, and its g. The
-    states are the same at every call. Source: Gautier, Numerical calculation of the base inertial parameters of
-    robots, 1991.
+    By QR with pivoting. A combination that shows in no W shows neither in Y_p nor in Y_h: its M, and with it C, is
+    zero, and its g. The states are the same at every call. Source: Gautier, Numerical calculation of the base inertial
+    parameters of robots, 1991.
     """
     n = chain.axis.shape[0]
     random = np.random.default_rng(0)

@@ -329,7 +329,7 @@ def _named(robot: Element, tag: str) -> dict[str, Element]:
 
 
 def _only(element: Element, tag: str, where: str) -> Element | None:
-    """Return the one child of a kind, or None."""
+    """Return the one child element of a kind, or None. Raises UrdfError for more than one."""
     found = element.findall(tag)
     if len(found) > 1:
         raise UrdfError(f"{where}: more than one <{tag}>")
@@ -372,5 +372,5 @@ def _parse(word: str, where: str) -> float:
 
 
 def _list(names: list[str]) -> str:
-    """Join names for a message."""
+    """Return names in quotes, joined by commas."""
     return ", ".join(f'"{name}"' for name in names)
