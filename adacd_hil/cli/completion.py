@@ -17,7 +17,7 @@ _MOST_RUNS = 30
 
 
 def _complete_toml(package: str, folder: str) -> Callable[[Context, Parameter, str], list[CompletionItem]]:
-    """Return a completion of the TOML files in a package's folder by name, and of others by path."""
+    """Return a completion function: TOML files in a package's folder by name, and others by path."""
 
     def complete(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
         from importlib import resources

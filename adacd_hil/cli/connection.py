@@ -169,7 +169,7 @@ class Connection:
         return self.load()[1]
 
     def open(self, clock: Clock, codec: Codec, settings: Settings) -> Bus:
-        """Open the bus for a run and return it; in real time it receives only the host's identifiers.
+        """Open the bus for a run and return it; in real time it receives only the identifiers of `received_ids`.
 
         A VirtualClock means lockstep: the bus then models the time. Raises BusMissingError, CodecError.
         """

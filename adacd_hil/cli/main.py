@@ -93,7 +93,7 @@ COMMAND_ENTRY_POINTS: Final = "adacd_hil.commands"
 
 
 def further_commands() -> Iterator[click.Command]:
-    """Yield the commands of other packages; warn of entries that can't be imported and continue with the others."""
+    """Yield the commands that other packages add by entry points; warn of one that can't be imported, and go on."""
     for entry in entry_points(group=COMMAND_ENTRY_POINTS):
         try:
             yield from entry.load()

@@ -105,7 +105,7 @@ def _expected() -> tuple[tuple[type[BaseException], ExitCode], ...]:
 
 
 def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Wrap a command: an error ends it with one line on standard error and its exit status."""
+    """Return a command wrapped: it ends the process with its exit status, and prints an error in one line."""
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -122,13 +122,13 @@ _REMEDY = "; give another place, or let its owner change the rights"
 
 
 def _is_forbidden(error: BaseException) -> bool:
-    """Tell whether the system denied this user access to a file."""
+    """Return whether the system denied this user access to a file."""
     causes = (error, error.__cause__)
     return any(isinstance(one, OSError) and one.errno in (errno.EACCES, errno.EPERM, errno.EROFS) for one in causes)
 
 
 def complain(error: BaseException) -> ExitCode:
-    """Print an error in one line and return its exit status; raise the error again if it is a bug."""
+    """Print an error in one line and return its exit status; raise an error again that no command should end with."""
     if isinstance(error, KeyboardInterrupt):
         print("adacd-hil: interrupted", file=sys.stderr)
         return ExitCode.INTERRUPTED
@@ -178,7 +178,7 @@ def suggest(*next_commands: str) -> None:
 
 
 def _as_typed(line: str) -> str:
-    """Fold a command to the terminal's width so that a shell still accepts it: with backslashes, outside of quotes."""
+    """Return a command folded to the terminal's width, with backslashes outside of quotes: a shell still accepts it."""
     columns = terminal_columns(sys.stderr)
     command, mark, comment = line.partition("   # ")
     if columns is None or len(line) <= columns:
@@ -221,7 +221,7 @@ def checked_place(out: Path | None) -> Iterator[None]:
 
 
 def print_and_write(text: str, out: Path | None, content: str, has_all: bool) -> None:
-    """Print a result's text and write `content` to its file.
+    """Print a result's text, and write `content` to the file `out`; None: to no file.
 
     If the file can't be written, `content` is printed, too, unless the printed result contains it (`has_all`). Raises
     CommandError.

@@ -56,9 +56,9 @@ def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
 
 
 def drop_old_frames(bus: Bus, interface: str) -> None:
-    """Drop all queued frames of a SocketCAN interface if an earlier process left frames to send. Raises BusError.
+    """Recover a SocketCAN bus if frames of an earlier process wait to be sent, so that they are dropped.
 
-    Do nothing on a shared bus: a neighbour's frames leave by themselves.
+    Raises BusError. On a shared bus that carries frames, they leave by themselves.
     """
     if interface == "socketcan" and CanInterface(bus.channel).waiting_frames():
         bus.recover()
@@ -248,7 +248,7 @@ _FOR_MACHINES = ("data", "certificates", "broke_off")
 
 
 def as_text(result: dict[str, Any]) -> str:
-    """Format the result of `summarise` for people, a line each."""
+    """Return the result of `summarise` as lines of text for people."""
     data = result.get("data")
     lines = [_verdict(result), *(f"{key}: {value}" for key, value in result.items() if key not in _FOR_MACHINES)]
     if data is not None:
