@@ -151,7 +151,7 @@ _CENTURY_S = 3.2e9
 
 
 class TimeWindow(NamedTuple):
-    """[start_s, end_s), s since the beginning of the log; infinite where it is not bounded."""
+    """A stretch of a log, [start_s, end_s), s since its beginning; infinite where it is not bounded."""
 
     start_s: float = float("-inf")
     end_s: float = float("inf")

@@ -83,7 +83,7 @@ class LogInfo:
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last."""
+        """Time from the first message to the last, s."""
         return (self.end_ns - self.start_ns) * 1e-9
 
 
@@ -110,7 +110,7 @@ def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
 
 
 class _InfoView:
-    """The records of a log that have been read."""
+    """Gathers the records of a log in a `LogInfo`."""
 
     def __init__(self, info: LogInfo, is_brief: bool) -> None:
         self._info = info
@@ -145,7 +145,7 @@ class _InfoView:
             self._info.problems.append(f"{path.name} is cut or damaged: `adacd-hil log check` says how")
 
     def _take_each(self, path: Path) -> Losses:
-        """Read every record of a file and add it to the info; return what was lost to damage."""
+        """Read every record of a file and add it to the info; return the losses by damage."""
         salvage = Salvage(path)
         for item in salvage:
             if isinstance(item, Attachment):

@@ -158,7 +158,7 @@ class LogWalk:
         return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []
 
     def pieces(self, cycles: int, epoch_ns: int, is_ahead: bool = True) -> Iterator[RawPiece]:
-        """Yield the messages of all parts in pieces of so many cycles; `topics`, `summary`, `problem` grow meanwhile.
+        """Yield the messages of all parts in pieces of `cycles` cycles; topics, summary and problem grow meanwhile.
 
         epoch_ns: offset of the times in the file from those of frames. is_ahead: a thread opens chunks in advance.
         """

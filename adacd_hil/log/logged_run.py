@@ -1,4 +1,4 @@
-"""What replays and reports of a run share: its settings, its attempts, the emulator's truth, mismatches.
+"""Common parts of replays and reports of a run: its settings, its attempts, the emulator's truth, mismatches.
 
 Torques in Nm, joint arrays (2,), histories time-first (n, 2).
 
@@ -155,7 +155,7 @@ class Mismatch(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Topic, field and place."""
+        """Topic, field and place of the value, such as /scheme.q[joint 1]."""
         return f"{self.topic}.{self.field}" + (f"[{self.place}]" if self.place else "")
 
     def line(self, zero_ns: int = 0) -> str:

@@ -153,7 +153,7 @@ class RunLog:
 
     @property
     def cycle(self) -> Series:
-        """How the cycles went, records.CycleRecord."""
+        """Times and counts of each cycle, records.CycleRecord."""
         return self.topics["/cycle"]
 
     @property

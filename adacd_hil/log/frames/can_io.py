@@ -97,7 +97,7 @@ _BLF_FRAMES = (blf.CAN_MESSAGE, blf.CAN_MESSAGE2, blf.CAN_ERROR_EXT, blf.CAN_FD_
 
 
 class _AscReader(can.ASCReader):
-    """python-can's, without its silent errors.
+    """python-can's ASC reader, without its silent errors.
 
     python-can's loses a first frame that follows a head without `internal events logged`, as BUSMASTER writes it, takes
     stamps that count from the line before for stamps from the beginning, requests to send (TxRq) for frames, and passes
@@ -141,7 +141,7 @@ _ERROR_FLAG = 0x20000000
 
 
 class _CandumpReader(can.CanutilsLogReader):
-    """python-can's, but it skips lines without a frame, and error frames keep their class.
+    """python-can's candump reader; it skips lines without a frame, and error frames keep their class.
 
     Of an error frame python-can makes data of a 29-bit identifier, or drops all but the time.
     """
@@ -198,7 +198,7 @@ _HARMLESS = ("Unknown object header version", "DLC vs Data Length mismatch")
 """Beginnings of warnings: on objects other than frames, or that `_BlfReader` counts; on frames that are read."""
 _READERS: dict[str, Any] = {".blf": _BlfReader, ".asc": _AscReader, ".log": _CandumpReader}
 _FLAGS = slice(RecordedFrame._fields.index("is_extended"), None)
-"""Those that a row of RECORDED_FRAME_DTYPE ends with, too."""
+"""Flags at the end of a RecordedFrame, and of a row of RECORDED_FRAME_DTYPE."""
 _STATUS_ID = 0xFFFFFFFF
 """Of the lines of a TRC that tell the state of the bus."""
 _FORMS = {

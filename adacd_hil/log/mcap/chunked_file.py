@@ -58,7 +58,7 @@ class Target(Protocol):
         """Write a part of the file; return its length. packets: number of log packets that are whole with it."""
 
     def tell(self) -> int:
-        """Return how many bytes of the file have been taken."""
+        """Return how many bytes of the file have been written."""
 
 
 class ChunkedFile:
@@ -133,7 +133,7 @@ class ChunkedFile:
         ends: NDArray[np.int64],
         packet_ends: NDArray[np.int64],
     ) -> None:
-        """Add message records that follow each other in `records`.
+        """Add message records that follow each other in `records`, and write the chunks that are full.
 
         channels: the file's numbers (n,); log_times_ns (n,); ends: where each record ends in `records` (n,);
         packet_ends: how many of the records come before the end of each packet, in order.
@@ -158,12 +158,12 @@ class ChunkedFile:
             first = stop
 
     def flush(self) -> None:
-        """End the chunk in progress, if it holds a message."""
+        """Write the chunk in progress, if it holds a message."""
         if self._entries:
             self._end_chunk()
 
     def flush_definitions(self) -> None:
-        """End the chunk in progress; put definitions that no message follows behind it, as records of their own."""
+        """Write the chunk in progress, then the definitions that no message follows, as records of their own."""
         self.flush()
         self._put(bytes(self._chunk))
         self._chunk = bytearray()

@@ -31,7 +31,7 @@ from adacd_hil.log.mcap.record_layout import HEAD, INDEX_ENTRY, MAGIC, MESSAGE_H
 MOST_BYTES = 32 << 20
 """Of a chunk, before compression."""
 MOST_RATIO = 200
-"""How many times its size in the file all that has been opened of it may have."""
+"""Largest ratio of all decompressed bytes of a file to their size in the file."""
 FREE_BYTES = 64 << 20
 """Bytes that may be decompressed from a file of any size."""
 _PIECE_BYTES = 1 << 20
@@ -154,22 +154,22 @@ class Contents:
 
     @cached_property
     def ends(self) -> NDArray[np.int64]:
-        """Ends of the messages in `data`."""
+        """Ends of the messages in `data` (n,)."""
         return np.asarray(self.starts + self.heads["length"] + HEAD.size)
 
     @cached_property
     def channels(self) -> NDArray[np.uint16]:
-        """Channel ids of the messages."""
+        """Channel ids of the messages (n,)."""
         return self.heads["channel"].copy()
 
     @cached_property
     def log_times(self) -> NDArray[np.uint64]:
-        """Log times of the messages, ns (k,)."""
+        """Log times of the messages, ns (n,)."""
         return self.heads["log_time"].copy()
 
     @cached_property
     def publish_times(self) -> NDArray[np.uint64]:
-        """Publish times of the messages, ns (k,)."""
+        """Publish times of the messages, ns (n,)."""
         return self.heads["publish_time"].copy()
 
     @property

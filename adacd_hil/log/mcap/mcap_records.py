@@ -144,7 +144,7 @@ class FileGap(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """Something that is missing of a file, in words. `is_damage`: these follow "the file is"."""
+    """A defect of a file, in words. `is_damage`: the words follow "the file is"."""
 
     text: str
     is_damage: bool = False

@@ -28,7 +28,7 @@ WAITING_BYTES = 32 * 1024 * 1024
 
 
 class Sink:
-    """The stream that `McapFile` needs, over a file descriptor that it closes."""
+    """Writes the bytes of `McapFile` to a file descriptor, on a thread of its own, and closes the descriptor."""
 
     def __init__(
         self,

@@ -147,7 +147,7 @@ class PacketWriter:
         return np.asarray((time_ns >= 0) & (time_ns < END_OF_TIME_NS))
 
     def _write(self, packets: Columns) -> None:
-        """Give every record its slot, make the records in groups of one size, and place them."""
+        """Write packets: make their records in groups of one size, and place them in the packets' order."""
         heads, frames, messages = packets.heads, packets.frames, packets.messages
         dropped = heads["dropped"].astype(np.int64)
         missing = np.diff(dropped, prepend=self.dropped)
@@ -192,7 +192,7 @@ class PacketWriter:
         return np.where(fits & (frames["flags"] & IS_ERROR == 0), found, -1)
 
     def _frame_groups(self, packets: Columns, slots: Numbers, publish_ns: Numbers) -> Iterator[_Group]:
-        """Make the records of the frames: those of up to 8 bytes together, longer ones by length."""
+        """Yield the records of the frames: those of up to 8 bytes in one group, longer ones in a group per length."""
         frames = packets.frames
         is_long = frames["length"] > CLASSIC_BYTES
         places = np.flatnonzero(~is_long)
@@ -220,7 +220,10 @@ class PacketWriter:
         slots: Numbers,
         publish_ns: Numbers,
     ) -> _Group:
-        """Fill the fields that all frames have; `records` views `rows`; `ids`: channels of sent and received ones."""
+        """Fill the fields that all frames have, and return the records as a group.
+
+        records: a view of `rows`. ids: channels of sent and of received frames.
+        """
         records["can_id"] = frames["can_id"]
         records["is_extended"] = frames["can_id"] > MAX_STANDARD_ID
         records["is_error"] = frames["flags"] & IS_ERROR != 0
@@ -231,7 +234,7 @@ class PacketWriter:
     def _decoded_groups(
         self, packets: Columns, decoders: Numbers, slots: Numbers, publish_ns: Numbers
     ) -> Iterator[_Group]:
-        """Make the records of decoded frames, message by message."""
+        """Yield the records of decoded frames, a group per message of the DBC."""
         for number in np.unique(decoders[decoders >= 0]).tolist():
             decoder = self._decoders[number]
             places = np.flatnonzero(decoders == number)
@@ -243,7 +246,7 @@ class PacketWriter:
             yield _Group(rows, slots[places], self._decoded_ids[number], t_ns, publish_ns[places])
 
     def _body_groups(self, packets: Columns, slots: Numbers, time_ns: Numbers) -> Iterator[_Group]:
-        """Make the records of our own topics, which come as bodies, and the joint states contained in /scheme."""
+        """Yield the records of our own topics, a group per topic, and the joint states that /scheme contains."""
         messages = packets.messages
         kinds = messages.view(np.uint32)
         for kind in np.unique(kinds):

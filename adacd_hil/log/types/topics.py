@@ -128,7 +128,7 @@ class OwnTopic:
 
     @cached_property
     def body(self) -> struct.Struct:
-        """The struct that packs the head as it follows the stamp, up to a block if one follows."""
+        """The struct that packs a message's head as it follows the stamp, up to a block if one follows."""
         return body_struct(self.head, has_block=self.block is not None)
 
     @cached_property
@@ -136,7 +136,10 @@ class OwnTopic:
         return any(member.size > 1 for member in self.head)
 
     def pack(self, *values: Any, block: Vector | None = None) -> bytes:
-        """Return the body of a message; values: in the order of the head. Raises struct.error or ValueError."""
+        """Return a message as bytes, without the stamp that the writer adds. Raises struct.error or ValueError.
+
+        values: fields of the head, in its order. block: the float64 values that follow it.
+        """
         if self._has_arrays:
             pairs = zip(self.head, values, strict=True)
             values = tuple(number for member, value in pairs for number in (value if member.size > 1 else (value,)))
@@ -329,14 +332,14 @@ def _check_names(channels: tuple[LogChannel, ...]) -> None:
 
 
 def pack_scheme(output: SchemeOutput, request: Request) -> bytes:
-    """Return the body of a /scheme message."""
+    """Return a /scheme message as bytes, without the stamp that the writer adds."""
     o = output
     head = (o.cycle, o.state, o.previous_state, o.fault, request, o.contact_joints, o.is_model_valid)
     return SCHEME.pack(*head, block=o.block)
 
 
 def pack_arm(arm: ArmState, first_cycle: int) -> bytes:
-    """Return the body of an /arm message; first_cycle: number of the attempt's first cycle."""
+    """Return an /arm message as bytes, without the stamp; first_cycle: number of the attempt's first cycle."""
     cycle, t_ns, periods, _, _, _, age_q, age_tau_J, is_enabled, is_complete, fault, is_late, steps, sampled_ns = arm
     age_ns = 0 if sampled_ns is None else t_ns - sampled_ns
     ages = (*age_q, *age_tau_J)
@@ -344,7 +347,7 @@ def pack_arm(arm: ArmState, first_cycle: int) -> bytes:
 
 
 def pack_contact(report: ContactReport) -> bytes:
-    """Return the body of a /contact message."""
+    """Return a /contact message as bytes, without the stamp."""
     return CONTACT.pack(*(getattr(report, member.name) for member in CONTACT.head))
 
 
@@ -358,10 +361,7 @@ def contact_report(record: Any) -> ContactReport:
 
 
 def unpack_contact(body: bytes) -> ContactReport:
-    """Return the report in the body of a /contact message.
-
-    Raises ValueError if it is cut, or for a value without a name.
-    """
+    """Return the report in the bytes of `pack_contact`. Raises ValueError if cut, or for a value without a name."""
     head = bytes(_CONTACT_DTYPE.itemsize - CONTACT.body.size)
     return contact_report(np.frombuffer(head + body, _CONTACT_DTYPE)[0])
 
@@ -370,7 +370,7 @@ _CONTACT_DTYPE = CONTACT.channel().type.dtype
 
 
 def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick_stop: bool) -> bytes:
-    """Return the body of a /control message; `block` is laid out by CONTROL_LAYOUT.
+    """Return a /control message as bytes, without the stamp; `block` is laid out by CONTROL_LAYOUT.
 
     gate_flags: a bit for each limit that acted. enable, quick_stop: requests to the drives.
     """
@@ -378,15 +378,15 @@ def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick
 
 
 def pack_cycle(record: CycleRecord) -> bytes:
-    """Return the body of a /cycle message."""
+    """Return a /cycle message as bytes, without the stamp."""
     return CYCLE.pack(*record)
 
 
 def pack_frame_checks(checks: FrameChecks) -> bytes:
-    """Return the body of a /frame_checks message."""
+    """Return a /frame_checks message as bytes, without the stamp."""
     return FRAME_CHECKS.pack(checks.cycle, *checks.counts, checks.implausible)
 
 
 def pack_truth(cycle: int, block: Vector) -> bytes:
-    """Return the body of a /truth message; `block` is laid out by TRUTH_LAYOUT."""
+    """Return a /truth message as bytes, without the stamp; `block` is laid out by TRUTH_LAYOUT."""
     return TRUTH.pack(cycle, block=block)
