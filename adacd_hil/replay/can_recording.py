@@ -161,7 +161,7 @@ class RecordingAgainstLog(LogSource):
         return super()._open(with_frames=False)
 
     def _piece(self, piece: Piece) -> Piece:
-        """Put the recording's frames in place of the log's, and leave out the cycles that it lacks."""
+        """Return a piece of the log with the recording's frames, without the cycles that the recording lacks."""
         cycles = piece.series[self._partner]
         number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
         recording = self._recording

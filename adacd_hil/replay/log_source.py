@@ -48,7 +48,7 @@ class CycleStretch(NamedTuple):
 
 
 class AttemptSplitter:
-    """Splits the pieces of a log, in order.
+    """Splits the pieces of a log, in order, into stretches of its attempts.
 
     /arm says with which cycle an attempt began, and how many periods were skipped. Without it, an attempt begins with
     the host's reset of communication, and skipped periods follow from /cycle's overruns and the counters of SYNC.
@@ -204,7 +204,10 @@ class AttemptSplitter:
         begins: dict[int, int],
         is_begin: NDArray[np.bool_],
     ) -> tuple[Places, Places]:
-        """Return each cycle's periods by its overruns; for the first one of an attempt by SYNC's counters, too."""
+        """Return each cycle's periods by its overruns, and the number of cycles before it that the log lacks.
+
+        The periods of an attempt's first cycle depend on the counters of SYNC, too.
+        """
         overruns = cycles["overruns"].astype(np.int64)
         skipped = np.diff(overruns, prepend=self._overruns)
         steps = np.diff(number, prepend=self._last_cycle)
@@ -267,7 +270,7 @@ class LogSource:
     is_recording = False
 
     def __init__(self, path: Path, cycles_per_piece: int = CYCLES_PER_PIECE) -> None:
-        """Open the log, to be read in pieces of so many cycles. Raises LogError, ConfigError, CodecError."""
+        """Open the log, to be read in pieces of `cycles_per_piece` cycles. Raises LogError, ConfigError, CodecError."""
         self.has_arms = has_arms(path)
         self._partner = ARM.name if self.has_arms else "/cycle"
         self._path = path
@@ -296,7 +299,7 @@ class LogSource:
 
     @property
     def start_ns(self) -> int:
-        """When the log's first message was, ns of the run's clock. Raises LogError."""
+        """Time of the log's first message, ns of the run's clock. Raises LogError."""
         return begin_of_log(self._path)
 
     def _piece(self, piece: Piece) -> Piece:

@@ -171,7 +171,7 @@ class _Player:
             self._asking.begin_attempt()
 
     def _run(self, stretch: CycleStretch, arms: ArmBatch) -> SchemeBatch:
-        """Run the scheme on a stretch; if its requests are unknown, the script makes them cycle by cycle."""
+        """Run the scheme on a stretch and return its decisions; the script makes requests that are unknown."""
         if stretch.requests is not None:
             return self._pipeline.run(arms, _known(stretch.requests))
         outputs = []

@@ -50,7 +50,10 @@ def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:
 
 
 class SchemeComparison:
-    """Compares stretch after stretch. `count`: all mismatches; `fields`: how many in which field."""
+    """Compares a replay with its log, stretch by stretch.
+
+    `count`: of all mismatches; `fields`: of those in each field.
+    """
 
     def __init__(self, settings: Settings, tolerance: float = 0.0, shown: int = SHOWN) -> None:
         self.mismatches: list[Mismatch] = []
@@ -138,7 +141,7 @@ class SchemeComparison:
             self._keep(Mismatch(topic, name, names[column], int(ticks.cycle[row]), int(ticks.t_ns[row]), *values))
 
     def add_mismatch(self, mismatch: Mismatch) -> None:
-        """Count a mismatch that was found elsewhere."""
+        """Count and keep a mismatch that was found elsewhere."""
         self.count += 1
         self.fields[f"{mismatch.topic}.{mismatch.field}"] += 1
         self._keep(mismatch)
