@@ -60,7 +60,7 @@ _HELD: Final = 30_000
 
 
 class TruthTable(NamedTuple):
-    """What an emulator's log has of the truth: kept rows on the emulator's own cycles; its metadata.
+    """The truth in an emulator's log: kept rows on the emulator's own cycles, and its metadata.
 
     problem: missing parts; is_complete: it is whole and no record was dropped on the way to it. span: None if the
     emulator never cycled.
@@ -114,7 +114,7 @@ class _TruthRows:
         self._waiting = np.zeros(0, _ROW)
 
     def add_records(self, truth: Series) -> None:
-        """Add the next cycles of the truth: models and contacts."""
+        """Keep, of the next cycles of the truth, those of contacts and those in which payload or parameters change."""
         if not len(truth):
             return
         rows = self._rows(truth)

@@ -91,12 +91,12 @@ class TrueContact:
 
     @property
     def end(self) -> int:
-        """The first cycle without it; its last one where the truth ends with it."""
+        """First cycle without the contact; its last one where the truth ends with it."""
         return int(self.cycle[-1])
 
     @property
     def delay_ms(self) -> float | None:
-        """Time from onset to detection."""
+        """Time from onset to detection, ms; None if no alarm found the contact."""
         return None if self.detected_ns is None else (self.detected_ns - self.onset_ns) * 1e-6
 
     @property
@@ -142,7 +142,7 @@ class Score:
 
     @property
     def armed(self) -> int:
-        """How many contacts began while detection was armed."""
+        """Number of contacts that began while detection was armed."""
         return sum(contact.is_armed for contact in self.contacts)
 
     @property
@@ -227,9 +227,10 @@ class StreamJudge:
     def add_samples(
         self, contacts: Sequence[TrueContact], t_ns: Times, is_over: NDArray[np.bool_], is_judged: NDArray[np.bool_]
     ) -> None:
-        """Judge the next samples (n,). is_judged: where an alarm that no contact explains counts as false.
+        """Judge the next samples (n,); is_over: where the statistic is above its threshold.
 
-        contacts: in order, those at least that begin before the last sample and aren't forgotten before the first.
+        is_judged: where an alarm that no contact explains counts as false. contacts: in order, those at least that
+        begin before the last sample and aren't forgotten before the first.
         """
         rows = np.flatnonzero(is_over)
         about = owners(t_ns[rows], *_bounds(contacts))
@@ -253,7 +254,7 @@ def _bounds(contacts: Sequence[TrueContact]) -> tuple[Times, Times]:
 
 
 def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
-    """Return the first time about each contact, by its place."""
+    """Return the earliest of the times about each contact, by the contact's index; about: that index, -1: none."""
     first = dict(zip(reversed(about), reversed(times_ns), strict=True))
     first.pop(-1, None)
     return first

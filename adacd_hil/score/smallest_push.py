@@ -17,9 +17,10 @@ from adacd_hil.settings.configuration import Settings
 
 @dataclass(frozen=True)
 class SmallestPush:
-    """Of each joint the percentiles p50, p99, p99.9 and max, Nm, over so many hours of MONITOR without a touch.
+    """Percentiles p50, p99, p99.9 and max of each joint's smallest push found and of its threshold, Nm.
 
-    tail_rate_per_h: false alarms to be expected if all channels' residuals have the tail of a Gaussian.
+    hours: time in MONITOR without a touch. tail_rate_per_h: false alarms to be expected if all channels' residuals have
+    the tail of a Gaussian.
     """
 
     push_Nm: tuple[dict[str, float], ...]
@@ -29,7 +30,7 @@ class SmallestPush:
 
 
 class PushGatherer:
-    """Gathers the cycles of MONITOR that are free of contact."""
+    """Gathers residuals and thresholds in MONITOR without contact, and the smallest push that would be found."""
 
     def __init__(self, settings: Settings) -> None:
         self._shown = detect_margin.constants_of(settings).shown
