@@ -57,7 +57,7 @@ class LogCopy:
 
     @property
     def messages(self) -> int:
-        """How many messages have been copied."""
+        """Number of messages copied so far."""
         return self._file.messages
 
     def add_attachment(self, attachment: Attachment) -> None:
@@ -203,7 +203,7 @@ class _CopyTarget:
 
 
 def _is_copy(path: Path) -> bool:
-    """Tell whether a file is a log that was made of others, so that it can be made again."""
+    """Return whether a file is a log that was made of others, so that it may be overwritten."""
     try:
         with open_input(path) as file:
             return read_end(file) is not None and read_info(path).ending in COPY_ENDINGS

@@ -42,7 +42,7 @@ class Lateness:
         self._counts: Counter[int] = Counter()
 
     def add_lateness(self, lateness_ns: int) -> None:
-        """Count a frame that was sent so much later than due, ns."""
+        """Count a frame that was sent `lateness_ns` after it was due."""
         self.frames += 1
         self.late_frames += lateness_ns > LATE_NS
         self.worst_ns = max(self.worst_ns, lateness_ns)
@@ -86,7 +86,7 @@ def play(
 
 
 def repeat(frames: Callable[[], Iterable[PlayedFrame]], times: int) -> Iterator[PlayedFrame]:
-    """Yield a recording several times in a row, on one time axis; 0 times: forever."""
+    """Yield the frames of a recording several times in a row, with times that go on; times 0: forever."""
     shift_ns, end_ns, done = 0, None, 0
     while not times or done < times:
         is_first = True
@@ -118,7 +118,7 @@ def _scheduled(
 
 
 def _grouped(scheduled: Iterable[tuple[int, PlayedFrame]]) -> Iterator[tuple[int, list[PlayedFrame]]]:
-    """Group frames that are due at the same time, a few at most."""
+    """Yield the frames that are due at the same time together, up to 64 of them."""
     group: list[PlayedFrame] = []
     group_ns = 0
     for due_ns, frame in scheduled:

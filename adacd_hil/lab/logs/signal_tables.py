@@ -34,7 +34,7 @@ _LONGEST_STEM = 60
 """Letters of the name of a file, so that it has room in 255 bytes."""
 
 _HEADS = {"csv": b"t_ns,", "parquet": b"PAR1"}
-"""How the tables begin that are made here."""
+"""First bytes of the tables that this module writes."""
 
 Columns = Mapping[str, Any]
 """Columns of a table by name, of equal length: arrays or lists."""
@@ -96,7 +96,7 @@ class Tables:
         Raises LogError if that fails, or if pyarrow is missing.
         """
         self.rows: dict[Path, int] = {}
-        """How many rows each file has."""
+        """Number of rows of each file."""
         self._folder = folder
         self._kind = kind
         self._metadata = dict(metadata)

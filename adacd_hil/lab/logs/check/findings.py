@@ -108,4 +108,4 @@ RULES: dict[str, Severity] = {
     "dropped": _WARNING,  # no packet was dropped on the way to the log
     "lost": _WARNING,  # nothing was lost before the log was recovered
 }
-"""How bad it is where a log is not as a rule demands."""
+"""Severity of a finding, by the rule that a log breaks."""

@@ -51,7 +51,7 @@ _DATA_SECTION = "data section"
 
 
 class _FileCheck:
-    """The check of one file by itself; then what the file states about itself."""
+    """The check of one file by itself; afterwards, its metadata and counts."""
 
     def __init__(self, name: str, file: IO[bytes]) -> None:
         """Check a whole file; the results are in `findings`."""
@@ -94,11 +94,11 @@ class _FileCheck:
 
     @property
     def is_ended(self) -> bool:
-        """Whether it has a DataEnd."""
+        """Whether the file has a DataEnd."""
         return self._counts[Opcode.DATA_END] > 0
 
     def _gap(self, gap: FileGap) -> None:
-        """Report bytes that don't form a record; the CRC includes them."""
+        """Add a finding on bytes that form no record; the CRC includes them."""
         self.findings.add_finding("record", f"{gap.size} bytes are no record", gap.offset)
         position = self._file.tell()
         self._crc = crc_of(self._file, gap.offset, gap.offset + gap.size, self._crc)
@@ -123,7 +123,7 @@ class _FileCheck:
             self.findings.add_finding("record", str(error), record.offset)
 
     def _count(self, record: RawRecord) -> None:
-        """Count records that a file may have only once."""
+        """Count a record that a file may have only once; add a finding for a second one."""
         opcode = Opcode(record.opcode)
         self._counts[opcode] += 1
         if self._counts[opcode] > 1:
@@ -209,7 +209,7 @@ class _FileCheck:
         self._judge_missing_crcs()
 
     def _judge_missing_crcs(self) -> None:
-        """Report the parts that no CRC covers. The CRC of the data section covers all that is in it."""
+        """Add a finding on the parts that no CRC covers. The CRC of the data section covers all that is in it."""
         missing, chunks = self.findings.without_crc, len(self._chunks.facts)
         if not missing[_DATA_SECTION]:
             missing = Counter(summary=missing["summary"])
