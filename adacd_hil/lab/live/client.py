@@ -42,7 +42,7 @@ class LiveMessage(NamedTuple):
 
 
 class LiveClient:
-    """A connection whose subscriptions are in force."""
+    """A connection to a live view, subscribed to topics."""
 
     def __init__(self, connection: ClientConnection, topics: Collection[str] | None) -> None:
         """Subscribe to `topics`, None: to all, and wait until the server sends messages. Raises LogError."""
@@ -109,7 +109,10 @@ class LiveClient:
             self._connection.send(json.dumps({"op": "subscribe", "subscriptions": group}))
 
     def decode(self, message: LiveMessage) -> Any:
-        """Return a message of numbers as a numpy record, its fields named as in the schema. Raises LogError."""
+        """Return a message of numbers as a numpy record, its fields named as in the schema.
+
+        Raises LogError if the message doesn't fit its schema, or if the schema has no fixed size.
+        """
         if message.topic not in self._dtypes:
             self._dtypes[message.topic] = payload_dtype(self.topics[message.topic].text)
         try:

@@ -67,7 +67,11 @@ class Batch(NamedTuple):
 
 
 class ServerSetup(NamedTuple):
-    """live: where; setup: of the log; ids: the file's number of each channel; start_ns: before the first record."""
+    """Setup of the view's process.
+
+    live: its address and admitted viewers. setup: of the log. ids: the file's number of each channel. start_ns: log
+    time before the first record.
+    """
 
     live: LiveView
     setup: WriterSetup
@@ -155,7 +159,7 @@ class LiveFeed:
 
     @property
     def waiting_bytes(self) -> int:
-        """Bytes that the other side has not taken yet."""
+        """Bytes that the view's process has not taken yet."""
         return self._ring.waiting
 
     def show(
@@ -241,7 +245,10 @@ class LiveTopics:
     """The topics that are served. `latest_ns`: log time of the latest record; before the first, of the beginning."""
 
     def __init__(self, setup: LiveView, channels: Iterable[LogChannel], ids: dict[int, int], start_ns: int) -> None:
-        """`ids`: the file's number of each channel, by ours. `start_ns`: log time before the first record."""
+        """Prepare the topics of a log, and three that are drawn from them.
+
+        ids: the file's number of each channel, by ours. start_ns: log time before the first record.
+        """
         channels = tuple(channels)
         self.latest_ns = start_ns
         self._shape = setup.shape

@@ -105,11 +105,11 @@ class Viewer:
 
     @property
     def is_served(self) -> bool:
-        """Whether no message waits."""
+        """Whether no message waits for the viewer."""
         return not self._waiting
 
     async def send_all(self) -> None:
-        """Send waiting messages forever."""
+        """Send queued messages to the viewer until the task is cancelled."""
         while True:
             await self._has_some.wait()
             self._has_some.clear()
