@@ -177,9 +177,9 @@ def likelihood_windows(
 
 
 def autocovariance(z: Vector, length: int) -> Vector:
-    """Estimate the covariance (length,) of a zero-mean series (n,) with itself; biased, so that it is positive.
+    """Return an estimate of the covariance (length,) of a zero-mean series (n,) with itself, at lags from 0.
 
-    Raises ValueError if the series is shorter than ten times that.
+    Biased, so that it is positive. Raises ValueError if the series is shorter than ten times `length`.
     """
     if z.shape[0] < 10 * length:
         raise ValueError(f"{z.shape[0]} samples are too few for a covariance of {length}")
@@ -230,7 +230,7 @@ def constants_of(settings: DetectorBankSettings, weights: Vector, period_s: floa
 
 
 def new_memory(constants: Structured) -> Structured:
-    """Return the memory before the first sample: all zeros."""
+    """Return the detectors' memory before the first sample: all zeros."""
     c: DetectorConstants = constants[0]
     joints = c.weights.shape[0]
     return zeros_of(
@@ -311,7 +311,7 @@ class DetectorBank:
     """All detectors on one stream, from its beginning."""
 
     def __init__(self, settings: DetectorBankSettings, weights: Vector, period_s: float) -> None:
-        """Begin a stream. weights (n, N, L): the joints' likelihood weights."""
+        """Begin all detectors on one stream. weights (n, N, L): the joints' likelihood weights."""
         self._constants = constants_of(settings, weights, period_s)
         self._memory = new_memory(self._constants)
         self._channels = len(settings.channels)
@@ -320,7 +320,8 @@ class DetectorBank:
     def take_stream(self, z: Vector, held_Nm: Vector, block_samples: int = 1) -> Vector:
         """Process N samples (N, n); return the largest statistic of each block, (ceil(N / block_samples), channels, n).
 
-        One sample per block keeps everything; a stream goes on at a block's end.
+        held_Nm (N, n): the friction that may hold a standing joint. One sample per block keeps everything. The next
+        call begins a new block.
         """
         count, joints = z.shape
         own = np.empty((-(-count // block_samples), self._channels - len(self._registered), joints))
