@@ -276,7 +276,7 @@ def parameter_deviation(
 
 
 def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredTorque:
-    """Return torque and residual of a record as the fit sees them. Raises as `identify`."""
+    """Return torque and residual of a record behind the filter of the fit. Raises as `identify`."""
     trace = _trace(model, record, estimate, settings, estimate.theta)
     return FilteredTorque(trace.tau_f, -trace.tau_ext_hat, trace.unit)
 

@@ -115,7 +115,7 @@ def read_urdf(
 
 
 def _held(joints: dict[str, Element], locked: Collection[str]) -> set[str]:
-    """Return the locked joints with those that mimic them."""
+    """Return the names of the locked joints, and of those that mimic them."""
     held = set(locked)
     leaders = {name: mimic.get("joint") for name, joint in joints.items() if (mimic := joint.find("mimic")) is not None}
     while following := {name for name, leader in leaders.items() if leader in held} - held:
@@ -196,7 +196,10 @@ def _merge(
     children: dict[str, list[_Joint]],
     places: dict[str, tuple[int, FramePose]],
 ) -> list[_Joint]:
-    """Place `link` and all that is fixed to it; return the joints that move on it."""
+    """Add `link` and all links fixed to it to `places`; return the joints that move on them.
+
+    index: of the joint that carries them, or BASE.
+    """
     outward = []
     places[link] = (index, FramePose(np.eye(3), np.zeros(3)))
     waiting = [link]
