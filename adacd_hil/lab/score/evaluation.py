@@ -338,7 +338,10 @@ class TimingGatherer:
         self._reactions: Distribution | None = None
 
     def add_columns(self, columns: CycleColumns, reactions: NDArray[np.bool_] | None = None) -> None:
-        """Gather the next cycles. reactions: those in which the state becomes REACT (n,); None without states."""
+        """Gather times, queues, data ages and counts of the next cycles.
+
+        reactions: those in which the state becomes REACT (n,); None without states.
+        """
         self._cycles += len(columns)
         for quantity in QUANTITIES:
             self._add_times(quantity, columns)

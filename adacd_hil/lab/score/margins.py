@@ -97,7 +97,7 @@ class BesideGatherer:
                 self._largest[section.label] = larger(self._largest.get(section.label), values)
 
     def _contacts(self, run: Run, sections: Sequence[Section], since_s: float = -np.inf) -> list[TrueContact]:
-        """Place the true contacts that end since a time on the clock of a run, as the paper's scheme has them."""
+        """Return the true contacts that end at `since_s` or later, on a run's clock, for the paper's scheme."""
         assert run.beside is not None
         time_s = run.time_s()
         armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
@@ -178,7 +178,10 @@ def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouch
 
 
 def last_row(run: Run, section: Section) -> int:
-    """Return the row with an adaptation's result: the next section's first cycle, which still learns."""
+    """Return the row with an adaptation's result: the next section's first cycle, which still learns.
+
+    If the run ended or failed in the adaptation, its own last cycle.
+    """
     time_s = run.time_s()
     end = int(rows_of(time_s, section, float(time_s[-1])).stop)
     return end - 1 + int(section.is_complete)

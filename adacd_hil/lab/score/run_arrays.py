@@ -332,7 +332,7 @@ def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def split_sections(run: Run) -> tuple[Section, ...]:
-    """Split a run into lettered sections; cycles before the first ADAPT belong to no section."""
+    """Return the lettered sections of a run; cycles before the first ADAPT belong to no section."""
     if run.state.size == 0:
         return ()
     kinds = np.array([_KINDS.get(SchemeState(value), "") for value in range(len(SchemeState))])[origins(run.state)]
@@ -356,7 +356,7 @@ def section_at(sections: Iterable[Section], time_s: float) -> str | None:
 
 
 def rows_of(time_s: Vector, section: Section, end_s: float) -> slice:
-    """Return the rows of a section among cycles at such times (n,), which ascend.
+    """Return the rows of a section among cycles at the ascending times `time_s` (n,).
 
     end_s: when the run ends. Its last cycle belongs to the last section; the first one of the next section to that.
     """
@@ -373,8 +373,8 @@ def is_realtime(run: Run) -> bool:
 def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
     """Return the truth on the host's cycles; None where the emulator never cycled.
 
-    begins: first cycle of each attempt of the run so far; last: of the run; time_s: of the rows (m,). Rows of later
-    attempts, and those after the host's last cycle, are left out: the arm goes on when the host has died.
+    begins: first cycle of each attempt of the run so far; last: the host's last cycle; time_s: of the rows (m,). Rows
+    of later attempts, and those after the host's last cycle, are left out: the arm goes on when the host has died.
     """
     rows = table.rows
     assert rows.attempt is not None

@@ -28,7 +28,7 @@ _RUN = "run"
 """Name of the events that end an attempt without a fault: no boot-up, a bus that failed."""
 _SUPERVISOR = "supervisor"
 _NEAR_NS = 2_000_000
-"""How far the event of a fault may lie from its cycle's time."""
+"""Largest time between a fault's event and its cycle."""
 _MOST_LETTERS = 300
 
 

@@ -98,7 +98,7 @@ class FilterChannel:
     threshold: Vector
 
     def step_delay_s(self, tau_ext: Vector) -> float | None:
-        """Return how long steps of each joint's torque (2,) take over the threshold, the faster joint; None: never."""
+        """Return how long a step of tau_ext (2,) takes to cross the threshold, at the faster joint; None: never."""
         delays_s = []
         for joint in range(JOINTS):
             tau, h = float(tau_ext[joint]), float(self.threshold[joint])

@@ -145,7 +145,7 @@ def _summary(times_s: list[float | None], failed: str) -> str:
 
 
 def begun_anew(sections: tuple[Section, ...]) -> frozenset[str]:
-    """Return the labels of adaptations that follow no payload change: after a fault, or after a broken attempt."""
+    """Return the labels of further adaptations that follow no payload change, but a fault or a broken attempt."""
     pairs = itertools.pairwise(sections)
     return frozenset(now.label for before, now in pairs if now.kind == "adaptation" and before.kind != "payload")
 
