@@ -68,7 +68,7 @@ class CommandError(Exception):
 
 
 def exit_code(summary: "SessionSummary") -> ExitCode:
-    """Return the exit status of a run, for the gravest of its outcomes: fault, incomplete log, interrupt, none."""
+    """Return the exit status of a run: not started, broken off, faulted, log incomplete, interrupted, or fine."""
     from adacd_hil.records import FaultReason
 
     if summary.result is None:

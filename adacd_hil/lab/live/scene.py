@@ -226,7 +226,7 @@ def draw_contact(shape: Shape, report: ContactReport) -> Entity:
 
 
 def _force(shape: Shape, report: ContactReport) -> tuple[float, bool]:
-    """Return the force across the link, N, and whether it is measured; if not, it is the smallest with this torque."""
+    """Return the force across the link, N, and whether it is known; if not, it is the smallest with this torque."""
     if report.location is Location.NOT_SOUGHT:
         torque = report.tau_ext_peak[report.link - 1]
         return torque / shape.link_length_m[report.link - 1], False
