@@ -77,7 +77,7 @@ def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
 
 
 class _BlfReader(can.BLFReader):
-    """python-can's, but for an object of no size, at which it stays for ever, and frames that it passes over."""
+    """python-can's BLF reader; fails at an object of no size, where the original hangs; it warns of skipped frames."""
 
     def _parse_container(self, data: bytes) -> Iterator[can.Message]:
         if len(data) > MOST_BYTES:
