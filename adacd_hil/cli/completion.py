@@ -17,7 +17,7 @@ _MOST_RUNS = 30
 
 
 def _complete_toml(package: str, folder: str) -> Callable[[Context, Parameter, str], list[CompletionItem]]:
-    """Return a completion of the TOML files in a package's folder by name, and of others by path."""
+    """Return a completion function: TOML files in a package's folder by name, and others by path."""
 
     def complete(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
         from importlib import resources
@@ -36,7 +36,7 @@ complete_truth = _complete_toml("firmware_sim", "truths")
 
 
 def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete sections and keys; for an option KEY=VALUE keys with `=`, and the choices of a key."""
+    """Return the groups and keys that begin with `incomplete`; for an option KEY=VALUE, `KEY=` or the key's choices."""
     from adacd_hil.settings.setting_keys import known_keys, sections
 
     known = {key: row for key, row in known_keys().items() if not row.is_in_row}
@@ -53,14 +53,14 @@ def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[C
 
 
 def complete_interface(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete python-can's interfaces, SocketCAN first."""
+    """Return the names of python-can's interfaces that begin with `incomplete`, SocketCAN first."""
     from adacd_hil.wire.python_can import interface_names
 
     return _starting(("socketcan", *(name for name in interface_names() if name != "socketcan")), incomplete)
 
 
 def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete the CAN interfaces of this machine, if the interface is SocketCAN or not given yet."""
+    """Return this machine's CAN interfaces that begin with `incomplete`; [] if another bus than SocketCAN is given."""
     if ctx.params.get("interface") not in (None, "socketcan"):
         return []
     from adacd_hil.wire.can_interface import can_interfaces
@@ -69,7 +69,7 @@ def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[C
 
 
 def complete_run(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Complete files and the folders below `runs` that have a log, the newest first."""
+    """Return those of the 30 newest folders in `runs` with a log that begin with `incomplete`; the shell adds files."""
     from adacd_hil.cli.output import RUNS
     from adacd_hil.log.log_files import LOG_NAME
 
@@ -86,7 +86,7 @@ def _starting(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
 
 
 def _toml_files(incomplete: str) -> list[CompletionItem]:
-    """Complete TOML files and folders by their paths."""
+    """Return the TOML files and folders whose paths begin with `incomplete`."""
     folder, slash, _ = incomplete.rpartition("/")
     found = []
     try:
@@ -118,7 +118,7 @@ class BashWithEquals(BashComplete):
     """The part of the word before `=` that bash keeps."""
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """Return the words before the cursor, and the word under it."""
+        """Return the words before the cursor, and the word under it; join KEY, `=` and VALUE, which bash has split."""
         args, incomplete = super().get_completion_args()
         words: list[str] = []
         for word in [*args, incomplete]:
@@ -132,7 +132,7 @@ class BashWithEquals(BashComplete):
         return words[:-1], words[-1]
 
     def format_completion(self, item: CompletionItem) -> str:
-        """Return the replacement for the part of the word that bash sees."""
+        """Return a completion as bash needs it: without the `KEY=` that bash keeps."""
         return super().format_completion(CompletionItem(item.value.removeprefix(self._kept), item.type))
 
 
@@ -150,11 +150,11 @@ class ZshWithEquals(ZshComplete):
 
 
 def is_completing() -> bool:
-    """Tell whether a shell started this process, for the completion script or for an answer."""
+    """Return whether a shell started this process to complete a command line."""
     return _ASKED in os.environ
 
 
 def prepare_completion() -> None:
-    """Register the classes above with click."""
+    """Register BashWithEquals and ZshWithEquals with click."""
     add_completion_class(BashWithEquals)
     add_completion_class(ZshWithEquals)

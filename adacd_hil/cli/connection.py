@@ -29,7 +29,7 @@ MOST_BLIND_CYCLES = 5
 
 
 def make_clock(name: str) -> Clock:
-    """Make the clock of a run: `lockstep` or `realtime`."""
+    """Return the clock of a run: modelled time for `lockstep`, else the system's monotonic clock."""
     return VirtualClock() if name == "lockstep" else MonotonicClock()
 
 
@@ -46,7 +46,7 @@ def check_clock(name: str, interface: str, channel: str) -> None:
 
 
 def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
-    """Raise CommandError for a scripted user on a channel that may be hardware, where a person has to acknowledge."""
+    """Raise CommandError for a scripted user on a channel that may be hardware, where a person must acknowledge."""
     if may_be_hardware(interface, channel):
         raise CommandError(
             f"--scenario {in_line(scenario)} plays the user of an emulated arm; {interface} {channel} may be hardware: "
@@ -56,7 +56,7 @@ def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
 
 
 def may_be_hardware(interface: str, channel: str) -> bool:
-    """Tell whether an arm may be on an existing channel: on all but vcan, vxcan and python-can's own virtual bus."""
+    """Return whether an arm may be on a channel: it exists, and isn't vcan, vxcan or python-can's own virtual bus."""
     from adacd_hil.wire.python_can import is_usable
 
     is_there = channel in can_interfaces() if interface == "socketcan" else is_usable(interface)
@@ -91,7 +91,10 @@ def check_autonomy(settings: Settings, interface: str, channel: str) -> None:
 
 
 def check_shared(name: str, settings: Settings) -> None:
-    """Raise CommandError for lockstep on a bus with other hosts: in lockstep one host sets the time."""
+    """Raise CommandError for lockstep on a bus with other hosts: in lockstep one host sets the time.
+
+    name: of the clock, `lockstep` or `realtime`.
+    """
     if name == "lockstep" and settings.bus.is_shared:
         raise CommandError(
             f"`bus.arms` = {settings.bus.arms} hosts need --clock realtime; in lockstep one host sets the time",
@@ -100,7 +103,7 @@ def check_shared(name: str, settings: Settings) -> None:
 
 
 def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> Bus:
-    """Wrap a bus in the modelled time of lockstep. Raises CodecError."""
+    """Return the bus wrapped for lockstep: only modelled time passes on it. Raises CodecError."""
     # Imported here: it belongs to lockstep and isn't needed in real time.
     from adacd_hil.wire.lockstep_bus import make_lockstep_bus
 
@@ -108,7 +111,10 @@ def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) 
 
 
 def received_ids(codec: Codec, settings: Settings) -> list[int]:
-    """Return the identifiers that the host receives: of the contract, and of frames that only the host may send."""
+    """Return the CAN identifiers that the host reads: the contract's, and those that only the host may send.
+
+    A frame of the second kind shows another host.
+    """
     return sorted({message.can_id for message in codec.messages.values()} | host_frames(settings, codec).keys())
 
 
@@ -137,22 +143,22 @@ class Connection:
         return " ".join(f"{option} {shlex.quote(str(value))}" for option, value in given if value is not None)
 
     def settings(self) -> Settings:
-        """Read the configuration, with the contract of --dbc if given. Raises ConfigError."""
+        """Read the configuration; --dbc, if given, becomes its contract. Raises ConfigError."""
         return self.with_contract(load_settings(self.config, self.profile))
 
     def with_contract(self, settings: Settings) -> Settings:
-        """Return the settings with the contract of --dbc, if given."""
+        """Return the settings with --dbc as their contract; without --dbc, return them unchanged."""
         if self.dbc is None:
             return settings
         return dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, contract=str(self.dbc)))
 
     def load(self) -> tuple[Settings, Codec]:
-        """Read configuration and contract. Raises ConfigError, CodecError."""
+        """Return the settings, and the codec of their contract. Raises ConfigError, CodecError."""
         settings = self.settings()
         return settings, load_contract(settings)
 
     def load_decoder(self) -> Codec | DbcDecoder:
-        """Return the decoder of a listener: any DBC that --dbc names, else the contract of the configuration.
+        """Return the frame decoder for a command that only listens: of any DBC that --dbc names, else of the contract.
 
         Raises ConfigError, CodecError.
         """
@@ -163,9 +169,9 @@ class Connection:
         return self.load()[1]
 
     def open(self, clock: Clock, codec: Codec, settings: Settings) -> Bus:
-        """Open the bus for a run. Real time: with a filter on the host's identifiers; lockstep: with modelled time.
+        """Open the bus for a run and return it; in real time it receives only the identifiers of `received_ids`.
 
-        Raises BusMissingError, CodecError.
+        A VirtualClock means lockstep: the bus then models the time. Raises BusMissingError, CodecError.
         """
         can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings)
         bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)
@@ -173,9 +179,9 @@ class Connection:
 
     @contextmanager
     def bus(self, clock: Clock, is_fd: bool) -> Iterator[Bus]:
-        """Open the bus without a filter while the block lasts. Raises BusMissingError.
+        """Open the bus without a filter, and close it after the block. Raises BusMissingError.
 
-        A BusError in the block becomes BusMissingError: no drive has been enabled.
+        A BusError in the block becomes a CommandError with the exit status BUS_MISSING: no drive has been enabled.
         """
         bus = open_bus(self.interface, self.channel, clock, None, self.bitrate, is_fd)
         try:
@@ -195,7 +201,7 @@ def raise_interrupt() -> NoReturn:
 
 @contextmanager
 def never_stopped() -> Iterator[None]:
-    """Ignore SIGTTIN and SIGTTOU, by which a terminal stops background processes that read or write it.
+    """Ignore SIGTTIN and SIGTTOU in the block: a terminal stops background processes with them that read or write it.
 
     A stopped process would send no commands to a moving arm. Reading such a terminal raises OSError instead.
     """
@@ -209,9 +215,9 @@ def never_stopped() -> Iterator[None]:
 
 @contextmanager
 def on_interrupt(interrupt: Callable[[], None], *further: signal.Signals) -> Iterator[None]:
-    """Call a function on SIGINT, SIGTERM and SIGHUP, in place of their default; only in the main thread.
+    """Call a function on SIGINT, SIGTERM and SIGHUP while the block runs; then restore the handlers.
 
-    SIGHUP stays ignored if it was. further: signals that call it, too.
+    Outside the main thread, change nothing. SIGHUP stays ignored if it was. further: signals that call it, too.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -46,7 +46,7 @@ class ConsoleOperator:
         self._thread.start()
 
     def join(self, timeout_s: float) -> None:
-        """Wait until the stream has ended, at most `timeout_s`."""
+        """Wait until the terminal's stream has ended, at most `timeout_s`."""
         self._thread.join(timeout_s)
 
     def _listen(self) -> None:
@@ -61,7 +61,10 @@ class ConsoleOperator:
                     self._tell(_unknown(word))
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return the user's first request, else the script's; for a faulted arm, leave it to `answer_fault`."""
+        """Return the next request that the user typed, else the script's; print which word a new state waits for.
+
+        In FAULT, typed requests stay for `answer_fault`. elapsed_s: since the drives were enabled, None before.
+        """
         if state is not self._state:
             self._state = state
             if state in _AWAITED and not self._asked:
@@ -71,7 +74,10 @@ class ConsoleOperator:
         return self._script.request(elapsed_s, state)
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Return the answer if the user has typed `ack` or `finish`; without a user the script's answer."""
+        """Return RECOVER if the user typed `ack`, END for `finish`, else WAIT; drop other typed requests.
+
+        After the terminal's end, return the script's answer. elapsed_s: since the fault.
+        """
         while self._asked:
             request = self._asked.popleft()
             if request is Request.ACKNOWLEDGE:
@@ -82,7 +88,7 @@ class ConsoleOperator:
 
 
 def _unknown(word: str) -> str:
-    """Return the line for a word that is none of `CONSOLE_WORDS`, with the nearest known word."""
+    """Return an error line for a word that is not in `CONSOLE_WORDS`, with the nearest known word."""
     nearest = nearest_name(word, CONSOLE_WORDS)
     meant = f"; did you mean `{nearest}`?" if nearest else ""
     return f"unknown word {word[:_MOST_LETTERS]!r}{meant} (known: {', '.join(CONSOLE_WORDS)})"

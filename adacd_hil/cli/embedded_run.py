@@ -50,12 +50,12 @@ class Cast(NamedTuple):
 
 
 def resolve(config: str, scenario_name: str, profile: str | None, seed: int | None, truth: str | None = None) -> Cast:
-    """Read configuration, scenario and truth. Raises ConfigError, CodecError.
+    """Return host settings and emulated arm of a run, by configuration and scenario. Raises ConfigError, CodecError.
 
     If the configuration describes an arm of one's own, the emulator plays that arm, unless a profile is given.
-    Otherwise the profile is the given one, else the scenario's, else the configuration's. A configuration without a
-    script gets the demo's user, since somebody has to acknowledge. A built-in arm gets its motors' holding torque from
-    its data sheet; an arm of one's own keeps the value of its file.
+    Otherwise the profile is the given one, else the scenario's, else the configuration's. truth: name or file of the
+    emulated arm's true values. A configuration without a script gets the demo's user, since somebody must acknowledge.
+    A built-in arm gets its motors' holding torque from its data sheet; an arm of one's own keeps the value of its file.
     """
     contract: EmulatedContract | None = None
     assumed: list[str] = []
@@ -89,7 +89,7 @@ def run_embedded(
     live: LiveView | None = None,
     on_started: Callable[[], None] = lambda: None,
 ) -> tuple[SessionSummary, Path]:
-    """Run host and arm in this process, logs in `out`; return the summary and the path of the truth.
+    """Run host and emulated arm in this process, with both logs in `out`; return the summary and the path of the truth.
 
     Raises ConfigError, CodecError, LogError, OSError.
     """

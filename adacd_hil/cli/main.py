@@ -93,7 +93,7 @@ COMMAND_ENTRY_POINTS: Final = "adacd_hil.commands"
 
 
 def further_commands() -> Iterator[click.Command]:
-    """Yield the commands of other packages; warn of entries that can't be imported and continue with the others."""
+    """Yield the commands that other packages add by entry points; warn of one that can't be imported, and go on."""
     for entry in entry_points(group=COMMAND_ENTRY_POINTS):
         try:
             yield from entry.load()
@@ -109,7 +109,7 @@ for command in (config, replay, *further_commands()):
 
 
 def _misused(error: click.ClickException) -> str:
-    """Describe a wrong command line in one line, with the command that shows its help."""
+    """Return one line that describes a wrong command line and names the command that shows its help."""
     text = " ".join(error.format_message().split())
     context = error.ctx if isinstance(error, click.UsageError) else None
     return text if context is None else f"{text} see `{context.command_path} --help`"
@@ -142,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _missing(error: ImportError) -> Exception:
-    """Return an error that names a missing package of others and the command that installs it, else the error itself.
+    """Return an error that names a missing third-party package and the command to install it; else the error itself.
 
     `run`, `replay` and `config` need fewer packages than the commands of the lab.
     """

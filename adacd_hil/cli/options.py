@@ -46,7 +46,10 @@ set_option = click.option(
 
 
 def run_folder_option(name: str) -> Callable[..., Any]:
-    """Give a command the option for the folder of its run; the default is a new one by date, linked as `runs/NAME`."""
+    """Return a decorator that adds `--out`, the folder of a run, to a command; name: of the command.
+
+    Without `--out` a run gets a new folder by date, with links to it from `runs/latest` and `runs/NAME`.
+    """
     return click.option(
         "--out",
         type=WrittenPath(file_okay=False),
@@ -61,7 +64,7 @@ clock_option = functools.partial(
 
 
 def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
-    """Give a command --from and --until; it receives them as a `TimeWindow`."""
+    """Add --from and --until to a command, which receives both as `stretch`, a `TimeWindow`."""
 
     @functools.wraps(command)
     def bounded(*args: Any, from_s: float | None, until_s: float | None, **kwargs: Any) -> ExitCode:
@@ -108,12 +111,15 @@ def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
 
 
 def on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Give a command the options of a bus; it receives a `Connection` before its own options."""
+    """Add the options of a bus to a command, which receives a `Connection` as its first argument."""
     return _connected(command, is_required=True)
 
 
 def on_bus_or_url(help_text: str) -> Callable[[Callable[..., ExitCode]], Callable[..., None]]:
-    """Give a command the options of a bus, or --url; it receives a `Connection` or the URL first."""
+    """Return a decorator that adds the options of a bus and --url; a command receives a `Connection` or the URL first.
+
+    help_text: of --url.
+    """
     url_option = click.option("--url", help=help_text)
     return lambda command: url_option(_connected(command, is_required=False))
 
@@ -177,14 +183,14 @@ _OPTIONS = (  # last first: click lists them the other way round
 
 
 def require_extra(asked_for: str, *modules: str) -> None:
-    """Raise CommandError if a module of the extra `live` is missing."""
+    """Raise CommandError if a module of the extra `live` is not installed; asked_for: the option that needs it."""
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
         raise CommandError(f"{asked_for} needs the extra `live`: {install_command('live')}", ExitCode.USAGE)
 
 
 def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
-    """Give a command the options of the live view; it receives `live`, a LiveView or None."""
+    """Add the options of the live view to a command, which receives `live`: a LiveView, or None without --live."""
 
     @functools.wraps(command)
     def run(

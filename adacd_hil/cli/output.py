@@ -55,7 +55,7 @@ EPILOG = (
 
 
 def tell(line: str) -> None:
-    """Print a line that is neither question nor result."""
+    """Print a line on standard error; for lines that are neither question nor result."""
     print(in_line(line), file=sys.stderr, flush=True)
 
 
@@ -68,7 +68,7 @@ class CommandError(Exception):
 
 
 def exit_code(summary: "SessionSummary") -> ExitCode:
-    """Return the exit status of a run, for the gravest of its outcomes."""
+    """Return the exit status of a run: not started, broken off, faulted, log incomplete, interrupted, or fine."""
     from adacd_hil.records import FaultReason
 
     if summary.result is None:
@@ -81,7 +81,7 @@ def exit_code(summary: "SessionSummary") -> ExitCode:
 
 
 def _expected() -> tuple[tuple[type[BaseException], ExitCode], ...]:
-    """Return the errors that a command ends with in one line, each with its exit status; the first match counts.
+    """Return the exceptions that a command reports in one line, each with its exit status; the first match counts.
 
     Imported only after an error: numpy and cantools take longer to import than help takes to print.
     """
@@ -105,7 +105,7 @@ def _expected() -> tuple[tuple[type[BaseException], ExitCode], ...]:
 
 
 def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Wrap a command: an error ends it with one line on standard error and its exit status."""
+    """Return a command wrapped: it ends the process with its exit status, and prints an error in one line."""
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -122,13 +122,13 @@ _REMEDY = "; give another place, or let its owner change the rights"
 
 
 def _is_forbidden(error: BaseException) -> bool:
-    """Tell whether the system denied this user access to a file."""
+    """Return whether the system denied this user access to a file."""
     causes = (error, error.__cause__)
     return any(isinstance(one, OSError) and one.errno in (errno.EACCES, errno.EPERM, errno.EROFS) for one in causes)
 
 
 def complain(error: BaseException) -> ExitCode:
-    """Print an error in one line and return its exit status; raise the error again if it is a bug."""
+    """Print an error in one line and return its exit status; raise an error again that no command should end with."""
     if isinstance(error, KeyboardInterrupt):
         print("adacd-hil: interrupted", file=sys.stderr)
         return ExitCode.INTERRUPTED
@@ -145,7 +145,11 @@ def complain(error: BaseException) -> ExitCode:
 def format_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = (), is_cut: bool = False, names: int = 1
 ) -> str:
-    """Align rows under a head for standard output, as `fit_table` does. An empty head is left out."""
+    """Return rows aligned under a head, as text that fits the terminal on standard output. An empty head is left out.
+
+    right: columns, from 0, that are aligned to the right. is_cut: cut cells, so that each row is one line. names: how
+    many columns, from the left, identify a row: they are repeated where a wide table is split.
+    """
     lines = [tuple(head), *map(tuple, rows)] if any(head) else [*map(tuple, rows)]
     return "\n".join(fit_table(lines, right, terminal_columns(), is_cut, names))
 
@@ -165,7 +169,7 @@ def answer(as_json: bool, described: Any, text: str, *next_commands: str) -> Non
 
 
 def suggest(*next_commands: str) -> None:
-    """Suggest next commands on standard error, with this program's name as its user typed it."""
+    """Print commands to run next on standard error, with this program's name as its user typed it."""
     called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
     for place, command in enumerate(next_commands):
         typed = f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
@@ -174,7 +178,7 @@ def suggest(*next_commands: str) -> None:
 
 
 def _as_typed(line: str) -> str:
-    """Fold a command to the terminal's width so that a shell still accepts it: with backslashes, outside of quotes."""
+    """Return a command folded to the terminal's width, with backslashes outside of quotes: a shell still accepts it."""
     columns = terminal_columns(sys.stderr)
     command, mark, comment = line.partition("   # ")
     if columns is None or len(line) <= columns:
@@ -187,12 +191,12 @@ _GOES_ON = " \\"
 
 
 def counted(count: int, noun: str) -> str:
-    """Return count and noun, in the plural unless the count is one."""
+    """Return a count and its noun, such as "2 cycles"; the noun is singular for one."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def quoted(path: Path) -> str:
-    """Quote a path for a shell."""
+    """Return a path quoted for a shell."""
     return shlex.quote(str(path))
 
 
@@ -217,7 +221,7 @@ def checked_place(out: Path | None) -> Iterator[None]:
 
 
 def print_and_write(text: str, out: Path | None, content: str, has_all: bool) -> None:
-    """Print a result's text and write `content` to its file.
+    """Print a result's text, and write `content` to the file `out`; None: to no file.
 
     If the file can't be written, `content` is printed, too, unless the printed result contains it (`has_all`). Raises
     CommandError.

@@ -10,7 +10,7 @@ INTERRUPTED = 130
 
 
 def start_host() -> NoReturn:
-    """Import, run the command line and exit with a documented status."""
+    """Import the program, run its command line and exit with a documented status."""
 
     def load() -> Callable[[], NoReturn]:
         from adacd_hil.cli.main import main

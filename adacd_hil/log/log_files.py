@@ -22,7 +22,7 @@ class LogExistsError(LogError):
 
 @contextmanager
 def failing_as(what: str) -> Iterator[None]:
-    """Raise LogError for an OSError in the block: the failed operation, and the reason."""
+    """Turn an OSError in the block into a LogError with one line: `what`, the failed operation, and the reason."""
     try:
         yield
     except OSError as error:
@@ -60,7 +60,10 @@ _DIGITS, _MOST_DIGITS = 3, 5
 
 
 def log_in(given: str | Path) -> Path:
-    """Name the log that is meant: a folder stands for the run's log in it. Raises LogError for one without."""
+    """Return the path of a log: the given path, or for a folder run.mcap in it.
+
+    Raises LogError for a folder without it.
+    """
     path = Path(given)
     if not path.is_dir():
         return path
@@ -70,18 +73,18 @@ def log_in(given: str | Path) -> Path:
 
 
 def part_path(path: Path, number: int) -> Path:
-    """Name a part of the log `path`; part 0 is `path` itself."""
+    """Return the path of part `number` of the log `path`, such as run_001.mcap; part 0 is `path` itself."""
     return path.with_name(f"{path.stem}_{number:0{_DIGITS}d}{path.suffix}") if number else path
 
 
 def is_part_name(path: Path) -> bool:
-    """Return whether a file of this name would be taken for a part of a log that lies beside it."""
+    """Return whether the name is that of a further part, such as run_001.mcap, of a log in the same folder."""
     match = re.fullmatch(rf"(.+)_\d{{{_DIGITS},{_MOST_DIGITS}}}", path.stem)
     return match is not None and path.with_name(f"{match[1]}{path.suffix}").exists()
 
 
 def find_parts(path: Path) -> dict[int, Path]:
-    """Find the parts of the log `path` that exist, by their numbers, in order. Raises OSError."""
+    """Return the paths of the existing parts of the log `path`, by number and in order. Raises OSError."""
     pattern = re.compile(rf"{re.escape(path.stem)}_(\d{{{_DIGITS},{_MOST_DIGITS}}}){re.escape(path.suffix)}")
     matches = (pattern.fullmatch(entry.name) for entry in path.parent.iterdir())
     numbers = {int(match[1]) for match in matches if match}
@@ -107,7 +110,7 @@ DROPPED_KEY = "dropped"
 
 
 def parts_of(path: Path) -> dict[int, Path]:
-    """Find the parts of the log `path` by their numbers; `path` alone without any: opening it gives the error."""
+    """Return the existing parts of the log `path` by number; without any, {0: path}, which fails when it is opened."""
     try:
         return find_parts(path) or {0: path}
     except OSError:
@@ -115,7 +118,10 @@ def parts_of(path: Path) -> dict[int, Path]:
 
 
 def missing_parts(path: Path, parts: Collection[int], ending: str = "") -> list[Path]:
-    """Name the parts of the log `path` that are missing; parts: the numbers found, ending: of the last one."""
+    """Return the paths of missing parts of the log `path`: in between, and behind a last one that says "continued".
+
+    parts: the numbers found. ending: of the last one, from its summary.
+    """
     last = max(parts)
     missing = [number for number in range(last) if number not in parts]
     if ending == CONTINUED:
@@ -124,13 +130,13 @@ def missing_parts(path: Path, parts: Collection[int], ending: str = "") -> list[
 
 
 def summary_count(texts: Mapping[str, str], key: str) -> int:
-    """Read a count; any other text counts as 0."""
+    """Return the count under a key in a log's summary; 0 if it is missing or not a number."""
     text = texts.get(key, "0")
     return int(text) if text.isdecimal() else 0
 
 
 def arithmetic() -> dict[str, str]:
-    """Describe processor and libraries for a log's metadata: equal descriptions compute equal bits."""
+    """Return machine, Python and libraries by name, for a log's metadata: equal descriptions compute equal bits."""
     from importlib.metadata import version  # costs 20 ms, and most importers don't need it
 
     return {
@@ -145,7 +151,7 @@ _CENTURY_S = 3.2e9
 
 
 class TimeWindow(NamedTuple):
-    """[start_s, end_s), s since the beginning of the log; infinite where it is not bounded."""
+    """A stretch of a log, [start_s, end_s), s since its beginning; infinite where it is not bounded."""
 
     start_s: float = float("-inf")
     end_s: float = float("inf")
@@ -162,7 +168,7 @@ class TimeWindow(NamedTuple):
         return " ".join(f"{word} {bound_s:g} s" for word, bound_s in words if math.isfinite(bound_s))
 
     def bounds_ns(self, start_ns: int) -> tuple[int, int]:
-        """Return begin and end of the window, ns, on a clock on which the log begins at `start_ns`."""
+        """Return begin and end of the window, ns; start_ns: the log's first message on the same clock."""
         first_ns, end_ns = (start_ns + round(min(max(bound_s, -_CENTURY_S), _CENTURY_S) * 1e9) for bound_s in self)
         return first_ns, end_ns
 

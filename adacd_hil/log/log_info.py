@@ -83,15 +83,15 @@ class LogInfo:
 
     @property
     def duration_s(self) -> float:
-        """From the first message to the last."""
+        """Time from the first message to the last, s."""
         return (self.end_ns - self.start_ns) * 1e-9
 
 
 def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
-    """Look at the log whose first part is `path`, with all its parts.
+    """Return an overview of the log whose first part is `path`, over all its parts.
 
-    is_brief: without events and contacts, and of a damaged file no more than the metadata of the run: some 2 ms.
-    Raises LogError when a file can't be read, or has neither MCAP's magic nor anything of a log.
+    is_brief: without events and contacts, and of a damaged file no more than the metadata of the run: some 2 ms. Raises
+    LogError when a file can't be read, or has neither MCAP's magic nor anything of a log.
     """
     parts = parts_of(path)
     info = LogInfo(path, files=len(parts))
@@ -110,7 +110,7 @@ def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
 
 
 class _InfoView:
-    """The records of a log that have been read."""
+    """Gathers the records of a log in a `LogInfo`."""
 
     def __init__(self, info: LogInfo, is_brief: bool) -> None:
         self._info = info
@@ -145,7 +145,7 @@ class _InfoView:
             self._info.problems.append(f"{path.name} is cut or damaged: `adacd-hil log check` says how")
 
     def _take_each(self, path: Path) -> Losses:
-        """Read every record of a file and add it to the info; return what was lost to damage."""
+        """Read every record of a file and add it to the info; return the losses by damage."""
         salvage = Salvage(path)
         for item in salvage:
             if isinstance(item, Attachment):
@@ -218,7 +218,7 @@ class _InfoView:
             info.ending = item.metadata.get(ENDING_KEY, "")
 
     def _read(self, contents: Contents, definitions: Definitions) -> None:
-        """Read the events and contacts of a chunk."""
+        """Add the events and contacts of a chunk to the info."""
         for channel in definitions.channels.values():
             if channel.topic not in _READ:
                 continue
@@ -253,7 +253,7 @@ class _InfoView:
                 self._contact_cycles[cycle] = max(level, self._contact_cycles.get(cycle, 0))
 
     def sum_up(self) -> None:
-        """Complete the view."""
+        """Fill in the totals of the info after the last file: times, counts, contacts, topics."""
         info = self._info
         if self._end_ns:
             info.start_ns, info.end_ns = self._start_ns, self._end_ns
@@ -281,14 +281,14 @@ def _payloads(contents: Contents, channel: int) -> Iterator[bytes]:
 
 
 def attachment(path: Path, name: str) -> bytes | None:
-    """Return an attachment of an MCAP file by its name; None when the head of the file does not have it."""
+    """Return an attachment of an MCAP file by its name; None if the head of the file lacks it or can't be read."""
     with contextlib.suppress(LogError):  # the reader of the log reports damage
         return read_head(path).attachments.get(name)
     return None
 
 
 def run_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of the run in an MCAP file; empty when the head of the file does not have it."""
+    """Return the metadata of the run in an MCAP file; empty if the head of the file lacks them or can't be read."""
     with contextlib.suppress(LogError):
         return read_head(path).metadata.get(RUN_METADATA, {})
     return {}

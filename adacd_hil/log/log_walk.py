@@ -55,7 +55,7 @@ class Extras:
         self.metadata: dict[str, dict[str, str]] = {}
 
     def add_record(self, record: RawRecord) -> None:
-        """Add an attachment or metadata. Raises LogError for a damaged one."""
+        """Keep the attachment or metadata in a record; ignore other records. Raises LogError for a damaged one."""
         if record.opcode == Opcode.ATTACHMENT:
             attachment: Attachment = parse(record.opcode, record.body)
             if not attachment_crc_fits(record):
@@ -67,7 +67,10 @@ class Extras:
 
 
 def read_head(path: Path) -> Extras:
-    """Read attachments and metadata up to those of the run. Raises LogError for an unreadable file, or no MCAP."""
+    """Return the attachments and metadata at the beginning of a file, up to the metadata of the run.
+
+    Damaged ones are left out. Raises LogError if the file can't be read or isn't MCAP.
+    """
     extras = Extras()
     with failing_as(f"log {path} can't be read"), open_input(path) as file:
         for record in walk(file, str(path), _NOT_OF_HEAD):
@@ -80,7 +83,10 @@ def read_head(path: Path) -> Extras:
 
 
 def _read_items(path: Path, is_ahead: bool = True) -> Iterator[Item]:
-    """Read a file from front to end; is_ahead: as for `read_blocks`. Raises LogError as `read_head` does."""
+    """Yield the contents of a file from front to end; is_ahead: as for `read_blocks`.
+
+    Raises LogError as `read_head`.
+    """
     with failing_as(f"log {path} can't be read"), open_input(path) as file:
         yield from read_blocks(file, str(path), is_ahead=is_ahead)
 
@@ -89,9 +95,9 @@ class LogWalk:
     """The content of a log. `problem` names missing parts in one line, "" for a whole log."""
 
     def __init__(self, path: Path, topics: Collection[str] | None = None) -> None:
-        """Find the parts of the log whose first is `path`; of the messages only those of `topics` are read if given.
+        """Find the parts of the log whose first part is `path`.
 
-        Raises LogError when no part of it can be read.
+        topics: names of the topics whose messages are read; None: all. Raises LogError when no part can be read.
         """
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, str] = {}
@@ -112,7 +118,7 @@ class LogWalk:
         return "; ".join(self._problems)
 
     def layout(self, channel: Channel, schema: Schema) -> "np.dtype[Any] | None":  # noqa: ARG002 (a subclass's)
-        """Describe the payloads of a channel; None: they are gathered as bytes."""
+        """Return the numpy type of a channel's payloads; None: they vary in size, as here. Subclasses override it."""
         return None
 
     def _find_parts(self) -> None:
@@ -147,14 +153,14 @@ class LogWalk:
         self.attachments = {**head.attachments, **self.attachments}
 
     def _missing(self, start: int, stop: int) -> list[str]:
-        """Return a line that names the missing parts from start to stop - 1; none if there are none."""
+        """Return a line that names the missing parts from start to stop - 1, in a list; [] if there are none."""
         names = [part_path(self.path, number).name for number in sorted({start, stop - 1})] if start < stop else []
         return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []
 
     def pieces(self, cycles: int, epoch_ns: int, is_ahead: bool = True) -> Iterator[RawPiece]:
-        """Read the messages of all parts, so many cycles at a time; topics, summary and problems grow meanwhile.
+        """Yield the messages of all parts in pieces of `cycles` cycles; topics, summary and problem grow meanwhile.
 
-        epoch_ns: offset of the times in the file from those of frames; is_ahead: a thread opens chunks in advance.
+        epoch_ns: offset of the times in the file from those of frames. is_ahead: a thread opens chunks in advance.
         """
         builder = PieceBuilder(cycles, epoch_ns)
         self._problems, self.summary, self.parts = [], {}, 0
@@ -210,7 +216,7 @@ class _PartWalk:
         self.problem = self.problem or problem
 
     def pieces(self, is_ahead: bool) -> Iterator[RawPiece]:
-        """Read the file; yield whenever enough is gathered."""
+        """Read the file; yield a piece whenever enough cycles are gathered; keep attachments, metadata and problems."""
         for item in _read_items(self._path, is_ahead):
             if isinstance(item, Block):
                 yield from self._take_block(item)
@@ -252,7 +258,7 @@ class _PartWalk:
         yield from self._builder.add_messages(block.contents, messages, slots)
 
     def _define(self, record: RawRecord | None) -> None:
-        """Add a schema or a channel to those known. Raises LogError for an invalid record and for None."""
+        """Keep a schema, or a channel with its slot. Raises LogError for an invalid record and for None."""
         if record is None:
             raise LogError("no record")
         definition = self._definitions.add_record(record)
@@ -260,7 +266,7 @@ class _PartWalk:
             self._slots[definition.id] = self._slot_of(definition)
 
     def _slot_of(self, channel: Channel) -> int:
-        """Find the slot of a channel."""
+        """Return the slot that gathers a channel's messages, a new one for a new topic; UNWANTED: they are skipped."""
         if self._wanted is not None and channel.topic not in self._wanted:
             return UNWANTED
         schema = self._definitions.schemas.get(channel.schema_id, Schema(0, b"", "", ""))
@@ -275,7 +281,10 @@ class _PartWalk:
         return slot
 
     def _search(self, channel: int) -> None:
-        """Look for the definition of a channel in the summary: the one that came before its messages is damaged."""
+        """Look for the definition of a channel in the file's summary, since the one before its messages is damaged.
+
+        If there is none, note the problem and skip the channel's messages.
+        """
         if not self._has_searched:
             self._has_searched = True
             with contextlib.suppress(OSError, LogError), open_input(self._path) as file:

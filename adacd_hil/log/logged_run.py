@@ -1,4 +1,4 @@
-"""What replays and reports of a run share: its settings, its attempts, the emulator's truth, mismatches.
+"""Common parts of replays and reports of a run: its settings, its attempts, the emulator's truth, mismatches.
 
 Torques in Nm, joint arrays (2,), histories time-first (n, 2).
 
@@ -40,7 +40,7 @@ class Milestones:
         self._tell, self._step, self._told = tell, step or PROGRESS_CYCLES, 0
 
     def reach(self, count: int) -> None:
-        """Call `tell` if the count has grown by a step since the last call."""
+        """Call `tell` with the count if it has grown by a step since the last call of `tell`."""
         if count - self._told >= self._step:
             self._told = count
             self._tell(count)
@@ -57,24 +57,33 @@ class Span(NamedTuple):
     last: int
 
     def covers(self, cycle: Cycles) -> NDArray[np.bool_]:
-        """Mark those of some cycles (n,) that the emulator recorded."""
+        """Return for each cycle (n,) of the host whether the emulator recorded it."""
         return np.asarray((cycle >= self.first) & (cycle <= self.last))
 
 
 def host_cycles(cycle: Cycles, attempt: Cycles, begins: Cycles) -> Cycles:
-    """Turn the emulator's cycles (m,) of attempts (m,) into the host's; begins: first cycle of each attempt."""
+    """Return the host's numbers (m,) of the emulator's cycles (m,).
+
+    attempt: of each cycle (m,), from 0. begins: the host's number of the first cycle of each attempt (k,).
+    """
     return np.asarray(cycle + whole_rounds(begins)[np.minimum(attempt, len(begins) - 1)])
 
 
 def host_span(span: EmulatorSpan, begins: Cycles) -> Span:
-    """Turn the emulator's first and last cycle into the host's; no last one if the emulator goes on after the log."""
+    """Return the emulator's first and last cycle in the host's numbers; begins: as for `host_cycles`.
+
+    The last cycle is unbounded if the emulator's last attempt is not in the log.
+    """
     attempts, cycles = (np.array(column) for column in zip(*span, strict=True))
     first, last = host_cycles(cycles, attempts, begins).tolist()
     return Span(first, last if attempts[1] < len(begins) else _NEVER)
 
 
 def whole_rounds(begins: Cycles) -> Cycles:
-    """Return, per attempt that begins with such a cycle (k,), the offset of the host's cycles from the emulator's."""
+    """Return per attempt the host's cycle numbers minus the emulator's (k,).
+
+    begins: the host's number of the first cycle of each attempt (k,).
+    """
     return np.asarray(begins - begins % SYNC_OVERFLOW)
 
 
@@ -104,22 +113,22 @@ class Truth:
     """Cycles that the emulator recorded, whichever are kept; None: all."""
 
     def covers(self, cycle: int) -> bool:
-        """Whether the emulator recorded a cycle."""
+        """Return whether the emulator recorded a cycle of the host."""
         return self.span is None or bool(self.span.covers(np.array(cycle)))
 
     def model_row(self, cycle: int) -> int | None:
-        """Return the row of payload and parameters in a cycle; None without any."""
+        """Return the index, in `payload_kg` and `theta`, of the values that hold in a cycle; None if there are none."""
         cycles = self.cycle if self.model_cycle is None else self.model_cycle
         return max(int(np.searchsorted(cycles, cycle, side="right")) - 1, 0) if cycles.size else None
 
 
 def is_interrupted(state: NDArray[np.uint8]) -> Mask:
-    """Mark the cycles (n,) of REACT and STOPPED."""
+    """Return for each cycle (n,) whether its state is REACT or STOPPED."""
     return np.isin(state, (SchemeState.REACT, SchemeState.STOPPED))
 
 
 def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
-    """Read the settings that a run had. Raises LogError."""
+    """Return the settings of a run from the attachment config.toml of its log `path`. Raises LogError."""
     if "config.toml" not in attachments:
         raise LogError(f"log {path} has no attachment config.toml: its settings are not known")
     try:
@@ -129,7 +138,7 @@ def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
 
 
 def enters_react(previous: NDArray[np.uint8], state: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Mark the cycles (n,) that begin to react, from the states before them and their own."""
+    """Return for each cycle (n,) whether a reaction begins: REACT, after a state that is neither REACT nor STOPPED."""
     return np.asarray((state == SchemeState.REACT) & ~is_interrupted(previous))
 
 
@@ -146,11 +155,11 @@ class Mismatch(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Topic, field and place."""
+        """Topic, field and place of the value, such as /scheme.q[joint 1]."""
         return f"{self.topic}.{self.field}" + (f"[{self.place}]" if self.place else "")
 
     def line(self, zero_ns: int = 0) -> str:
-        """Say all of it in one line, with the time since `zero_ns`."""
+        """Return the mismatch as one line, with the time in s since `zero_ns`."""
         time_s = (self.t_ns - zero_ns) * 1e-9
         return f"cycle {self.cycle}, {time_s:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"
 

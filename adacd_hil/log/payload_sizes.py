@@ -32,6 +32,6 @@ def payload_size(channel: Channel, schema: Schema | None) -> int | None:
 
 
 def is_own(channel: Channel, schema: Schema, own: MessageType) -> bool:
-    """Return whether a channel's schema is exactly the given one of ours."""
+    """Return whether a channel's schema is exactly that of `own`, a message type that we write."""
     is_named = channel.message_encoding == "cdr" and schema.encoding == "ros2msg" and schema.name == own.name
     return is_named and schema.data == own.text.encode()

@@ -96,11 +96,11 @@ class Series:
         return np.asarray(stamp_ns - self._epoch_ns, np.int64)
 
     def part(self, rows: slice | NDArray[np.bool_]) -> "Series":
-        """Return some of the messages."""
+        """Return the messages of some rows: of a slice, or where a mask is True."""
         return Series(self.records[rows], self._epoch_ns)
 
     def between(self, first_ns: int, end_ns: int) -> "Series":
-        """Return the messages from a time to one before another."""
+        """Return the messages with times from `first_ns` on and before `end_ns`."""
         t_ns = self.t_ns
         return self.part((t_ns >= first_ns) & (t_ns < end_ns))
 
@@ -153,7 +153,7 @@ class RunLog:
 
     @property
     def cycle(self) -> Series:
-        """How the cycles went, records.CycleRecord."""
+        """Times and counts of each cycle, records.CycleRecord."""
         return self.topics["/cycle"]
 
     @property
@@ -167,7 +167,7 @@ def _is_complete(problem: str, summary: Mapping[str, str]) -> bool:
 
 
 def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
-    """Read the log whose first part is `path`, with all its parts, of the messages only those of `topics` when given.
+    """Read the log whose first part is `path`, with all its parts. topics: those whose messages are read; None: all.
 
     A folder stands for the run's log in it, `run.mcap`. Raises LogError when the file doesn't exist or isn't MCAP.
     """
@@ -204,7 +204,7 @@ def topic_bytes(path: str | Path, topic: str) -> bytes:
 
 
 def _own_layout(message_type: MessageType) -> "np.dtype[Any] | None":
-    """Describe payloads as we write them; None where their size varies."""
+    """Return the numpy type of payloads as we write them; None where their size varies."""
     if message_type.name in _KNOWN:
         return _KNOWN[message_type.name]
     try:
@@ -221,7 +221,7 @@ def _number(metadata: Mapping[str, str], key: str, default: int) -> int:
 
 
 def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
-    """Describe our own topics but those of bus frames, in a log with such metadata. Raises LogError."""
+    """Return our own topics but those of bus frames, by name, for a log with such metadata. Raises LogError."""
     parameter_count = _number(metadata, "parameter_count", len(PARAMETER_NAMES))
     topics = {}
     for channel in (*run_channels(parameter_count), *truth_channels()):
@@ -234,9 +234,9 @@ def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
 def _series_of(
     rows: Mapping[str, NDArray[np.uint8]], topics: Mapping[str, Topic], own: Mapping[str, Topic], epoch_ns: int
 ) -> dict[str, Series]:
-    """Make a series of each topic of fixed size: of our own ones, present or not, and of the others present.
+    """Return a series for each topic of fixed size: each of our own, even if it is empty, and the others present.
 
-    rows: the records of topics (n, size).
+    rows: the records of topics (n, size). topics: those of the log; own: ours.
     """
     series = {}
     for name, topic in {**topics, **own}.items():
@@ -282,7 +282,7 @@ Time = TypeVar("Time", int, float)
 
 
 def each_once(reports: Iterable[tuple[Time, ContactReport]]) -> list[tuple[Time, ContactReport]]:
-    """Return each contact once: the time of its first report, and its last one.
+    """Return each contact once, as the time of its first report and the content of its last report.
 
     All reports of a contact name the cycle in which it began.
     """
@@ -321,7 +321,7 @@ class LogStream(LogWalk):
         cycles_per_piece: int = 5_000,
         is_ahead: bool = True,
     ) -> None:
-        """Begin to read the log whose first part is `path`, of the messages only those of `topics` when given.
+        """Open the log whose first part is `path`. topics: those whose messages are read; None: all.
 
         A folder stands for the run's log in it. is_ahead: a thread opens chunks ahead, for a caller without a thread of
         its own for the reading. Raises LogError when no part of it can be read.
@@ -332,7 +332,7 @@ class LogStream(LogWalk):
         self._is_ahead = is_ahead
 
     def layout(self, channel: Channel, schema: Schema) -> "np.dtype[Any] | None":
-        """Describe the payloads of a channel; None where their size varies."""
+        """Return the numpy type of a channel's payloads; None where their size varies."""
         if schema.name == JOINT_STATE.name and not self.metadata:
             return None  # others have any number of joints
         try:
@@ -351,7 +351,7 @@ class LogStream(LogWalk):
         return _is_complete(self.problem, self.summary)
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
-        """Unpack the events of a piece."""
+        """Return the events of a piece; [] for a log without events."""
         topic = self.topics.get("/events")
         if topic is None or topic.type_name != LOG.name:
             return []
@@ -359,7 +359,7 @@ class LogStream(LogWalk):
         return [LoggedEvent(log_time_ns(payload) - self.epoch_ns, unpack_log(payload)) for payload in payloads]
 
     def joint_states(self, piece: Piece) -> dict[str, list[bytes]]:
-        """Return the payloads of joint states of others, by topic."""
+        """Return the payloads of joint states that another program recorded, by topic."""
         found = self.topics
         return {name: each for name, each in piece.payloads.items() if found[name].type_name == JOINT_STATE.name}
 
@@ -391,7 +391,7 @@ def start_of_log(path: Path) -> int | None:
 
 
 def begin_of_log(path: Path) -> int:
-    """Return the time of the first message as `start_of_log`. Raises LogError also when there is none."""
+    """Return the time of a log's first message, ns, as `start_of_log` does. Raises LogError also without a message."""
     start_ns = start_of_log(path)
     if start_ns is None:
         raise LogError(f"log {path} has no message")

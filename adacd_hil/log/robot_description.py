@@ -46,9 +46,9 @@ class LinkBody(NamedTuple):
 def find_bodies(
     theta: Sequence[float], length1_m: float, gravity_m_s2: float = GRAVITY_M_S2
 ) -> tuple[LinkBody, LinkBody]:
-    """Find two links with these parameters (p,), 7 or 9 of them. Raises ValueError if there are none.
+    """Return two rigid links with the parameters `theta` (p,), p = 7 or 9. Raises ValueError if no links have them.
 
-    gravity_m_s2: in the plane of motion.
+    theta: in the order of `records.PARAMETER_NAMES`. gravity_m_s2: in the plane of motion.
     """
     alpha, beta, gamma = theta[_A1] - theta[_A3], theta[_A2], theta[_A3]
     if not (gamma > 0.0 and alpha * gamma > beta * beta):
@@ -82,7 +82,7 @@ _COLORS = {"link": "0.35 0.45 0.6 1", "joint": "0.25 0.27 0.3 1"}
 
 
 def robot_description(settings: Settings) -> str:
-    """Write the URDF of the configured arm: lengths, limits, shapes, and the CAD model's masses and friction."""
+    """Return the URDF of the configured arm: lengths, limits, shapes, and the CAD model's masses and friction."""
     arm, tilt_rad = settings.arm, settings.tilt_rad
     robot = Element("robot", name="adacd")
     bodies: tuple[LinkBody, ...] = ()
@@ -165,5 +165,5 @@ def _add_shape(link: Element, color: str, shape: str, x_m: float = 0.0, **sizes:
 
 
 def _text(value: float | np.floating) -> str:
-    """Format a number so that it reads back to the same value."""
+    """Return a number as text that reads back to the same value."""
     return repr(float(value))

@@ -62,7 +62,7 @@ class Losses:
         return bool(self.describe())
 
     def describe(self) -> str:
-        """Describe the losses in words; "" without a loss. Gaps in time alone, without lost data, are no loss."""
+        """Return the losses in words; "" without a loss. Gaps in time alone, without lost data, are no loss."""
         messages = "an unknown number of messages" if self.messages is None else f"{self.messages} messages"
         head = [
             ("the end", self.is_cut),
@@ -82,12 +82,12 @@ class Losses:
         return ", ".join(word for word, is_said in (*head, holes, *tail) if is_said)
 
     def add_note(self, text: str) -> None:
-        """Keep the text of a damage, of the first _NOTES."""
+        """Add a text about a damage to `notes`; ignore it when there are already 20."""
         if len(self.notes) < _NOTES:
             self.notes.append(text)
 
     def add_losses(self, other: "Losses") -> None:
-        """Add the losses of another file."""
+        """Add the losses of another file to these."""
         self.chunks += other.chunks
         self.bytes += other.bytes
         is_known = self.messages is not None and other.messages is not None
@@ -106,7 +106,7 @@ class Salvage:
     """One file: iterate for its trusted records, then ask for `losses`. `definitions` fill up on the way."""
 
     def __init__(self, path: Path) -> None:
-        """Look at both ends of a file. Raises LogError when it can't be read."""
+        """Read the summary of a file, and find which CRCs it has. Raises LogError when it can't be read."""
         self.losses = Losses()
         self.definitions = Definitions()
         self.is_vouched = False
@@ -128,7 +128,7 @@ class Salvage:
             self._look_at_end(file)
 
     def _look_at_end(self, file: IO[bytes]) -> None:
-        """Take the summary where its CRC fits, and compare the CRC of the data section."""
+        """Keep definitions and statistics of a sound summary, and compare the CRC of the data section."""
         end = read_end(file)
         has_data_crc = end is not None and end.data_crc != 0
         chunks = (item for item in scan(file) if isinstance(item, RawRecord) and item.opcode == Opcode.CHUNK)
@@ -221,14 +221,14 @@ class Salvage:
         yield contents
 
     def _compare_index(self, body: bytes) -> None:
-        """Notice an index that doesn't fit its chunk: it is made anew, but it explains a CRC."""
+        """Compare a message index with its chunk: a difference explains why the CRC of the data section fails."""
         if self._chunk is not None:
             contents, entries = self._chunk
             is_own = contents.channels == int.from_bytes(body[:2], "little")
             self._is_explained |= body[6:] != entries[is_own].tobytes()
 
     def _doubt(self, file: IO[bytes]) -> None:
-        """Note a doubt when the CRC of the data section fails and no damage that was found explains it."""
+        """Note that metadata may be wrong if the CRC of the data section fails without a damage that explains it."""
         stored = int.from_bytes(self._data_end.body, "little")
         if stored and stored != crc_of(file, 0, self._data_end.offset):
             self.losses.is_doubtful = True
@@ -243,7 +243,7 @@ class Salvage:
         self._is_explained = True
 
     def _sum_up(self) -> None:
-        """Count the losses, by the statistics where they can be trusted."""
+        """Fill in `losses` at the end of the file, from its statistics where these can be trusted."""
         losses, statistics = self.losses, self._statistics
         losses.is_cut = not self._has_data_end and not self._has_footer and statistics is None
         if losses.is_cut:

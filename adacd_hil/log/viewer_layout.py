@@ -37,7 +37,7 @@ def _both_joints(field: str) -> tuple[str, str]:
 
 
 def _scene(robot: bytes) -> dict[str, Any]:
-    """Describe the 3-D panel. The URDF is part of the layout: a log can't serve files, and a server isn't needed."""
+    """Return the 3-D panel. The URDF is part of the layout: a log can't serve files, and a server isn't needed."""
     arm = {
         "instanceId": "arm",
         "layerId": "foxglove.Urdf",
@@ -113,7 +113,7 @@ def viewer_layout(robot: bytes = b"") -> bytes:
 
 
 def _stack(first: str, *others: str) -> Any:
-    """Stack panels of equal height."""
+    """Return panels of equal height, one below the other."""
     if not others:
         return first
     share = 100.0 / (1 + len(others))

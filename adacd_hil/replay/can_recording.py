@@ -55,7 +55,11 @@ class CanRecording(NamedTuple):
     problem: str
 
     def in_time(self, number: Places, t_ns: Places, part: slice) -> NDArray[Any]:
-        """Return some of the frames with the times of the given cycles; those of other cycles lie in between."""
+        """Return copies of some frames with t_ns and cycle_t_ns on the clock of given cycles.
+
+        number, t_ns (n,): these cycles and their times. part: which frames. A frame of a cycle that isn't given gets a
+        time between its neighbours.
+        """
         frames = self.frames[part].copy()
         frames["t_ns"] = _time_of(self.since[part], number, t_ns) + self.offset_ns[part]
         frames["cycle_t_ns"] = _time_of(self.owner[part], number, t_ns)
@@ -70,7 +74,10 @@ def _time_of(wanted: Places, number: Places, t_ns: Places) -> Places:
 
 
 def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording:
-    """Read a recording and put it in order. Raises LogError."""
+    """Read a recording, and put its frames in the order in which the host would have read them.
+
+    Of several CAN channels, only the one with the most SYNCs counts. Raises LogError, also without a SYNC.
+    """
     found = read_frames(path)
     sync_id = codec.message("Sync").can_id
     frames = as_logged(_of_busiest_channel(found.frames, sync_id))
@@ -107,7 +114,10 @@ def _of_busiest_channel(frames: NDArray[Any], sync_id: int) -> NDArray[Any]:
 
 
 def _unwrap(counter: Places, t_ns: Places, period_ns: int) -> Places:
-    """Count the cycles by the counter 1…240 of their SYNC; times give its number of turns where they determine it."""
+    """Return cycle numbers (n,) from the counters 1…240 of the cycles' SYNCs.
+
+    Their times give the number of turns in a gap; period_ns 0: they don't, as in lockstep.
+    """
     steps = np.diff(counter) % SYNC_OVERFLOW
     if period_ns:
         periods = np.rint(np.diff(t_ns) / period_ns)
@@ -117,7 +127,10 @@ def _unwrap(counter: Places, t_ns: Places, period_ns: int) -> Places:
 
 
 def _complete(frames: NDArray[Any], sync: Places, can_ids: list[int]) -> Places:
-    """Return the place of the frame with which each cycle has all its cyclic ones (n,); beyond all where it hasn't."""
+    """Return for each cycle (n,) the index of the frame that completes its cyclic ones; `_NOWHERE` if one is missing.
+
+    sync: indices of the SYNCs. can_ids: of the cyclic frames.
+    """
     ends = np.append(sync[1:], len(frames))
     latest = np.zeros(len(sync), np.int64)
     for can_id in can_ids:
@@ -133,7 +146,10 @@ class RecordingAgainstLog(LogSource):
     is_recording = True
 
     def __init__(self, path: Path, against: Path) -> None:
-        """Open both. Raises LogError, ConfigError, CodecError."""
+        """Open a recording and the log of its run, and number the recording's cycles as the run's.
+
+        Raises LogError, ConfigError, CodecError.
+        """
         super().__init__(against)
         self._recording = load_recording(path, self.settings, self.codec)
         self._recorded = path
@@ -145,7 +161,7 @@ class RecordingAgainstLog(LogSource):
         return super()._open(with_frames=False)
 
     def _piece(self, piece: Piece) -> Piece:
-        """Put the recording's frames in place of the log's, and leave out the cycles that it lacks."""
+        """Return a piece of the log with the recording's frames, without the cycles that the recording lacks."""
         cycles = piece.series[self._partner]
         number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
         recording = self._recording
@@ -164,7 +180,7 @@ class RecordingAgainstLog(LogSource):
         return piece._replace(series=series, frames=frames)
 
     def _align(self, cycle: int) -> None:
-        """Let the recording's numbers be the run's, given the cycle that it begins with."""
+        """Renumber the recording's cycles as the run's; cycle: the run's number of the recording's first cycle."""
         recording = self._recording
         shift = cycle - int(recording.number[0])
         self._recording = recording._replace(
@@ -172,7 +188,7 @@ class RecordingAgainstLog(LogSource):
         )
 
     def notes(self) -> list[str]:
-        """List the missing parts, a line each."""
+        """Return the parts that can't be replayed or compared, a line each."""
         notes = super().notes()
         if self._missing:
             notes.insert(0, f"{self._missing} cycles of the run are not in {self._recorded.name}")
@@ -182,7 +198,7 @@ class RecordingAgainstLog(LogSource):
 
 
 def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
-    """Return the cycle of the run with which a recording begins: the devices' answers are equal, bit for bit.
+    """Return the run's number of a recording's first cycle: there the devices' answers are equal, bit for bit.
 
     The counter gives the cycle but for multiples of 240. If no cycle fits, return the one nearest to the run's first.
     """
@@ -199,7 +215,7 @@ def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
 
 
 def _answers(frames: NDArray[Any], codec: Codec) -> dict[int, bytes]:
-    """Return the data of the first cyclic frame of each device."""
+    """Return the data of the first cyclic frame of each device, by identifier."""
     answers: dict[int, bytes] = {}
     for can_id in (codec.message(name).can_id for name in _CYCLIC):
         mine = frames[(frames["can_id"] == can_id) & ~frames["is_error"]]
@@ -227,7 +243,7 @@ class RecordingAlone:
 
     @property
     def start_ns(self) -> int:
-        """When the first SYNC was, ns of the clock of the cycles."""
+        """Time of the first SYNC, ns of the clock of the cycles."""
         return int(self._t_ns()[0])
 
     def _t_ns(self) -> Places:
@@ -236,7 +252,7 @@ class RecordingAlone:
         return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
 
     def parts(self, with_frames: bool) -> Iterator[Part]:  # noqa: ARG002 (there are only frames)
-        """Yield the whole recording as one part; it has frames only."""
+        """Yield the whole recording as one part; with_frames has no effect, since it has only frames."""
         yield Part(list(self._stretches()), {}, (), frozenset())
 
     def _stretches(self) -> Iterator[CycleStretch]:
@@ -268,7 +284,7 @@ class RecordingAlone:
                 )
 
     def notes(self) -> list[str]:
-        """List the missing parts, a line each."""
+        """Return the parts that can't be replayed, a line each."""
         notes = [self._recording.problem] if self._recording.problem else []
         if self._is_headless:
             notes.append(f"{self._path.name} begins in the middle of a run: the scheme begins with INIT there")
@@ -276,7 +292,10 @@ class RecordingAlone:
 
 
 def _disabling(frames: NDArray[Any], t_ns: Places, codec: Codec) -> int:
-    """Count the last cycles of an attempt in which both drives are commanded off; at most as many as a host sends."""
+    """Return how many cycles at the end of an attempt command both drives off; at most as many as a host sends.
+
+    t_ns: of the attempt's cycles (n,).
+    """
     commands = [codec.message(name) for name in ("Drive1Command", "Drive2Command")]
     for count, cycle_ns in enumerate(t_ns[: -DISABLE_CYCLES - 1 : -1].tolist()):
         for message in commands:

@@ -48,7 +48,7 @@ class CycleStretch(NamedTuple):
 
 
 class AttemptSplitter:
-    """Splits the pieces of a log, in order.
+    """Splits the pieces of a log, in order, into stretches of its attempts.
 
     /arm says with which cycle an attempt began, and how many periods were skipped. Without it, an attempt begins with
     the host's reset of communication, and skipped periods follow from /cycle's overruns and the counters of SYNC.
@@ -72,7 +72,10 @@ class AttemptSplitter:
         self._tail = np.zeros(0, np.uint8)  # counters of the SYNCs after that cycle
 
     def split(self, piece: Piece) -> Iterator[CycleStretch]:
-        """Yield the stretches of the next piece."""
+        """Yield the stretches of the log's next piece: cycles of one attempt, without a gap.
+
+        Cycles of an attempt that began before the log are left out and counted.
+        """
         scheme, other = self._pair(piece)
         frames = piece.frames
         if self._frames is not None:
@@ -102,7 +105,10 @@ class AttemptSplitter:
     def _begins(
         self, t_ns: Places, scheme: NDArray[Any], other: NDArray[Any], frames: NDArray[Any]
     ) -> list[tuple[int, int]]:
-        """List the rows with which attempts begin, and the frame with which each does."""
+        """Return for each attempt that begins in a piece the row of its first cycle, and the index of its first frame.
+
+        A row behind the last one means that its first cycle comes with the next piece.
+        """
         begins: dict[int, int] = {}
         resets = find_resets(frames)
         rows = np.searchsorted(t_ns, frames["cycle_t_ns"][resets])
@@ -198,7 +204,10 @@ class AttemptSplitter:
         begins: dict[int, int],
         is_begin: NDArray[np.bool_],
     ) -> tuple[Places, Places]:
-        """Return each cycle's periods by its overruns; for the first one of an attempt by SYNC's counters, too."""
+        """Return each cycle's periods by its overruns, and the number of cycles before it that the log lacks.
+
+        The periods of an attempt's first cycle depend on the counters of SYNC, too.
+        """
         overruns = cycles["overruns"].astype(np.int64)
         skipped = np.diff(overruns, prepend=self._overruns)
         steps = np.diff(number, prepend=self._last_cycle)
@@ -223,14 +232,17 @@ def _sync_counters(frames: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _skipped(counters: NDArray[np.uint8], last: int) -> int:
-    """Count the periods that were skipped between a cycle and the last of the SYNCs that came after it."""
+    """Return the number of periods skipped between a cycle and the last of the SYNCs after it.
+
+    last: number of that cycle. counters: those of the SYNCs.
+    """
     if counters.size == 0:
         return 0
     return (int(counters[-1]) - 1 - last) % SYNC_OVERFLOW - counters.size
 
 
 def find_resets(frames: NDArray[Any]) -> Places:
-    """Find the host's resets of communication among frames."""
+    """Return the indices of the frames by which the host resets the devices' communication (NMT)."""
     is_nmt = frames["is_tx"] & (frames["can_id"] == NMT_ID) & ~frames["is_error"]
     places = np.flatnonzero(is_nmt)
     return np.asarray(places[frames["data"][places, 0] == RESET_COMMUNICATION])
@@ -258,7 +270,7 @@ class LogSource:
     is_recording = False
 
     def __init__(self, path: Path, cycles_per_piece: int = CYCLES_PER_PIECE) -> None:
-        """Open the log, to be read in pieces of so many cycles. Raises LogError, ConfigError, CodecError."""
+        """Open the log, to be read in pieces of `cycles_per_piece` cycles. Raises LogError, ConfigError, CodecError."""
         self.has_arms = has_arms(path)
         self._partner = ARM.name if self.has_arms else "/cycle"
         self._path = path
@@ -275,7 +287,10 @@ class LogSource:
         return LogStream(self._path, topics, self._cycles_per_piece, is_ahead=False)  # replay reads in a thread
 
     def parts(self, with_frames: bool) -> Iterator[Part]:
-        """Yield the parts, in order. with_frames: stretches have their frames, else none."""
+        """Yield the content of the log in parts, in order.
+
+        with_frames: read the frames, too; else stretches have none.
+        """
         self._stream = self._open(with_frames)
         for read in self._stream:
             piece = self._piece(read)
@@ -284,7 +299,7 @@ class LogSource:
 
     @property
     def start_ns(self) -> int:
-        """When the log's first message was, ns of the run's clock. Raises LogError."""
+        """Time of the log's first message, ns of the run's clock. Raises LogError."""
         return begin_of_log(self._path)
 
     def _piece(self, piece: Piece) -> Piece:
@@ -292,7 +307,7 @@ class LogSource:
         return piece
 
     def notes(self) -> list[str]:
-        """List the missing parts, a line each."""
+        """Return the parts of the log that can't be replayed or compared, a line each; complete after the last part."""
         splitter = self._splitter
         notes = [f"the log is not whole: {self._stream.problem}"] if self._stream.problem else []
         dropped = self._stream.summary.get("dropped", "0")
@@ -315,20 +330,20 @@ class LogSource:
 
 
 def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:
-    """Generate the codec of the DBC that a run had. Raises LogError, CodecError."""
+    """Return the codec of a run's DBC, from the attachment arm.dbc of its log `path`. Raises LogError, CodecError."""
     if "arm.dbc" not in attachments:
         raise LogError(f"log {path} has no arm.dbc attached: its frames can't be decoded")
     return parse_codec(attachments["arm.dbc"], path.with_name("arm.dbc"))
 
 
 def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
-    """Return whether the run that the settings are of knew anchors: since then they say how a zero drifts."""
+    """Return whether the version that made the log knew anchors, by a setting that came with them."""
     tare = parse_toml(attachments["config.toml"]).get("tare")
     return isinstance(tare, dict) and "drift_Nm_sqrt_s" in tare
 
 
 def contact_records(series: Series) -> dict[int, dict[str, Any]]:
-    """Return the logged reports by the time at which they were made, ns."""
+    """Return the fields of each logged contact report, by the time at which it was made, ns."""
     names = [name for name in ContactReport._fields if name in series.fields]
     rows = zip(series.t_ns.tolist(), series.records, strict=True)
     return {t_ns: {name: record[name].tolist() for name in names} for t_ns, record in rows}

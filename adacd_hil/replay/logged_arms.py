@@ -25,7 +25,10 @@ def has_arms(path: Path) -> bool:
 
 
 def logged_arms(scheme: NDArray[Any], arm: NDArray[Any], ticks: Ticks) -> ArmBatch:
-    """Join the records of n cycles, given their beginnings. Raises LogError for an unknown fault."""
+    """Return the arm's states of n cycles, from their records of /scheme and /arm (n,).
+
+    Raises LogError for an unknown fault. ticks: number, time and periods of each cycle.
+    """
     odd = np.flatnonzero(~np.isin(arm["fault"], [int(fault) for fault in FaultReason]))
     if odd.size:
         fault, cycle = arm["fault"][odd[0]], arm["cycle"][odd[0]]

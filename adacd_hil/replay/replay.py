@@ -59,10 +59,11 @@ def replay(
     tolerance: float | None = None,
     script_of: ScriptOf | None = None,
 ) -> Replay:
-    """Replay a log with its own settings, or with others. Raises LogError, ConfigError, CodecError.
+    """Replay a log with its own settings, or with others, and return the outcome.
 
-    tolerance: of the comparison; None: exact, or `TOLERANCE` where the log's numbers were computed otherwise.
-    script_of: plays the user of a configuration; with it, the requests of a run without typed requests are compared.
+    Raises LogError, ConfigError, CodecError. tolerance: of the comparison; None: exact, or `TOLERANCE` where the log's
+    numbers were computed on another kind of machine. script_of: plays the user of a configuration; with it, the
+    requests of a run without typed requests are compared.
     """
     source = LogSource(path)
     return replay_source(
@@ -80,7 +81,7 @@ def replay_many(
 ) -> list[Replay]:
     """Replay a log, or a stretch of it, once for each of the settings; the log is read and decoded once.
 
-    Raises LogError, ConfigError, CodecError.
+    watch: called with the decisions of each variant. Raises LogError, ConfigError, CodecError.
     """
     return replay_source(
         LogSource(path), variants, contacts_beside(path, progress), progress, watch=watch, stretch=stretch
@@ -116,7 +117,10 @@ class _Player:
         self._cycles: dict[int, int] = {}
 
     def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool = True) -> SchemeBatch:
-        """Take in a stretch of a part; return the scheme's decisions. is_told: they are compared and counted."""
+        """Run the scheme on a stretch of a part; gather and return its decisions.
+
+        is_told: compare and count them, too.
+        """
         ticks = stretch.ticks
         if stretch.is_begin:
             self._begin()
@@ -142,7 +146,7 @@ class _Player:
         part: Part,
         events: Sequence[Event],
     ) -> None:
-        """Compare a stretch with the log, if the log has its decisions."""
+        """Compare a stretch with the log; do nothing if the log lacks its decisions, or cycles before it."""
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
         ticks = stretch.ticks
@@ -167,7 +171,7 @@ class _Player:
             self._asking.begin_attempt()
 
     def _run(self, stretch: CycleStretch, arms: ArmBatch) -> SchemeBatch:
-        """Run the scheme on a stretch; if its requests are unknown, the script makes them cycle by cycle."""
+        """Run the scheme on a stretch and return its decisions; the script makes requests that are unknown."""
         if stretch.requests is not None:
             return self._pipeline.run(arms, _known(stretch.requests))
         outputs = []
@@ -181,7 +185,11 @@ class _Player:
         return _columns(outputs)
 
     def compare_contacts(self, logged: Mapping[int, Mapping[str, Any]], exact: Sequence[tuple[int, int]]) -> None:
-        """Compare the reports of a part; exact: from when to when, ns, it can be compared."""
+        """Compare a part's contact reports with the logged ones, then forget them.
+
+        logged: fields of the logged reports by time, ns. exact: first and last time, ns, of each stretch that can be
+        compared.
+        """
         if self.comparison is not None:
             judged = {t_ns: record for t_ns, record in logged.items() if any(a <= t_ns <= b for a, b in exact)}
             self.comparison.compare_contacts(judged, self._reports, self._cycles)
@@ -189,7 +197,7 @@ class _Player:
 
 
 def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
-    """Put the decisions of single cycles into columns."""
+    """Return the decisions of single cycles as columns."""
     states = (("state", np.uint8), ("previous_state", np.uint8), ("fault", np.uint8), ("reaction", np.uint8))
     wholes = (("cycle", np.int64), ("contact_joints", np.int64), ("is_model_valid", np.bool_), *states)
     columns: dict[str, Any] = {
@@ -248,7 +256,7 @@ def replay_source(
 
 
 def _decoded(source: ReplaySource, reader: "_ArmReader", end_ns: int) -> Generator[_DecodedPart]:
-    """Read a source part by part, up to the stretch in which the reported part ends."""
+    """Yield the parts of a source with the arm's states, up to the stretch in which the reported part ends."""
     for part in source.parts(reader.needs_frames):
         stretches: list[CycleStretch] = []
         arms: list[list[ArmBatch]] = []
@@ -282,7 +290,7 @@ def _replay_part(
     bounds_ns: tuple[int, int],
     watch: Watch | None,
 ) -> int:
-    """Replay a part; return its cycles."""
+    """Replay a part with each player; return its number of cycles."""
     exact: list[tuple[int, int]] = []
     cycles, (part, arms_of_part) = 0, decoded
     for stretch, all_arms in zip(part.stretches, arms_of_part, strict=True):
@@ -300,7 +308,7 @@ def _replay_part(
 
 
 def _known(requests: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return requests (n,); a value that isn't a Request becomes NONE."""
+    """Return requests (n,), in which a value that isn't a Request has become NONE."""
     return np.where(requests <= max(Request), requests, np.uint8(Request.NONE))
 
 
@@ -349,7 +357,7 @@ class _ArmReader:
         self._arms: dict[Any, RecordedArm] = {}
 
     def read(self, stretch: CycleStretch) -> list[ArmBatch]:
-        """Return the states of a stretch, for each of the variants."""
+        """Return the arm's states in a stretch, for each of the variants."""
         if stretch.is_begin:
             self._arms = {key: RecordedArm(settings, self._codec) for key, settings in self._settings.items()}
         batches = {key: arm.read(stretch.ticks, stretch.frames) for key, arm in self._arms.items()}
@@ -359,7 +367,7 @@ class _ArmReader:
 
 
 def why_frames(source: ReplaySource, variants: Sequence[Settings]) -> str:
-    """Return why frames must be decoded, which takes longer, one line; empty if the log's states serve."""
+    """Return the reason why frames must be decoded, which takes longer, in one line; "" if the log's states serve."""
     if source.is_recording:
         return ""
     if not source.has_arms:
@@ -380,7 +388,7 @@ def _decoding_key(settings: Settings) -> Any:
 def _result(
     player: _Player, source: ReplaySource, source_notes: Sequence[str], tolerance: float, first_ns: int
 ) -> Replay:
-    """Return a player's results from a time on."""
+    """Return a player's outcome; first_ns: contacts and changes of state before it are left out."""
     gatherer, comparison, notes = player.gatherer, player.comparison, list(source_notes)
     gatherer.end_attempt()
     score = gatherer.score()

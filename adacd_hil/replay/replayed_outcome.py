@@ -73,7 +73,7 @@ class OutcomeGatherer:
         self._was_over = False
 
     def add_stretch(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Gather states, contacts and detections of the next decided cycles."""
+        """Gather states, contacts and alarms of the next cycles, from the scheme's decisions in them."""
         count = len(batch.cycle)
         if count == 0:
             return
@@ -114,7 +114,7 @@ class OutcomeGatherer:
         self._kept.append(HostCycles(ticks.cycle[rows], ticks.t_ns[rows], batch.previous_state[rows], threshold))
 
     def _watch(self, batch: SchemeBatch, is_quiet: NDArray[np.bool_]) -> None:
-        """Add residuals and thresholds of the cycles in MONITOR in which no joint is over its threshold."""
+        """Gather residuals and thresholds of the cycles in MONITOR in which no joint is over its threshold."""
         monitors = (batch.state == SchemeState.MONITOR) & (batch.previous_state == SchemeState.MONITOR)
         block = batch.block[monitors & is_quiet]
         if not len(block):
@@ -125,7 +125,7 @@ class OutcomeGatherer:
             kept.add_values(block[:, self._threshold][:, joint])
 
     def sensitivity_Nm(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return the medians, in MONITOR, of each joint's threshold and smallest push found: see `Replay`."""
+        """Return, per joint, the medians in MONITOR of the threshold and of the smallest push found: see `Replay`."""
         pushes = None if self._push is None else self._push.smallest_push()
         if pushes is None:
             return tuple(kept.percentiles().get("p50", math.nan) for kept in self._thresholds), ()
@@ -145,13 +145,16 @@ class OutcomeGatherer:
             self._give_up()
 
     def _give_up(self) -> None:
-        """End an adaptation that never reached MONITOR."""
+        """Record an adaptation in progress as one that never reached MONITOR."""
         if self._began is not None:
             self.adaptations.append(Adaptation(self._began[1], None, self.theta_hat))
             self._began = None
 
     def begin_attempt(self, attempt: int, cycle: int) -> None:
-        """Begin an attempt, by its number in the run and its first cycle."""
+        """End the attempt in progress and begin another.
+
+        attempt: its number in the run, from 0. cycle: its first cycle.
+        """
         self.end_attempt()
         self._begins += [cycle] * (attempt + 1 - len(self._begins))  # also of those that a recording lacks
         if self._truth is not None:
@@ -160,7 +163,10 @@ class OutcomeGatherer:
         self._was_over = False
 
     def end_attempt(self) -> None:
-        """End an attempt, also with the log."""
+        """Record an unfinished adaptation, and place the true contacts of the attempt on the host's clock.
+
+        Call it at the end of the log, too.
+        """
         self._give_up()
         if self._kept:
             host = HostCycles(*map(np.concatenate, zip(*self._kept, strict=True)))
@@ -173,7 +179,7 @@ class OutcomeGatherer:
         return [alarm.t_ns for _, alarm in self._alarms]
 
     def score(self) -> Score | None:
-        """Judge the alarms; None without the truth."""
+        """Return which true contacts were detected and which alarms were false; None if the truth is not known."""
         if self._truth is None:
             return None
         span = host_span(self._truth[1], np.array(self._begins or [0]))
@@ -236,7 +242,7 @@ class Replay:
         return tuple(adaptation.took_s for adaptation in self.adaptations)
 
     def time_s(self, t_ns: int) -> float:
-        """Return a time since motion start."""
+        """Return a time in s since motion start, from ns of the run's clock."""
         return (t_ns - self.zero_ns) * 1e-9
 
 
@@ -338,7 +344,7 @@ def _end(found: Replay) -> str:
 
 
 def as_json(found: Replay) -> dict[str, Any]:
-    """Return a replay in plain values; times in s since motion start."""
+    """Return a replay's outcome in plain values for JSON; times in s since motion start."""
     return {
         "cycles": found.cycles,
         "attempts": found.attempts,

@@ -37,7 +37,7 @@ _HEAD: Final = ("cycle", "state", "previous_state", "fault", "contact_joints", "
 
 
 def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:
-    """List the parts of the computing environment that differ from a log's; empty if numbers must be equal bit for bit.
+    """Return the parts of the computing environment that differ from a log's, as texts; [] if all bits must be equal.
 
     A part that the log doesn't name counts as equal. Of the machine, only the architecture counts.
     """
@@ -50,7 +50,10 @@ def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:
 
 
 class SchemeComparison:
-    """Compares stretch after stretch. `count`: all mismatches; `fields`: how many in which field."""
+    """Compares a replay with its log, stretch by stretch.
+
+    `count`: of all mismatches; `fields`: of those in each field.
+    """
 
     def __init__(self, settings: Settings, tolerance: float = 0.0, shown: int = SHOWN) -> None:
         self.mismatches: list[Mismatch] = []
@@ -66,7 +69,7 @@ class SchemeComparison:
         self._scales: dict[str, Vector] = {}
 
     def compare(self, scheme: Series, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Compare the decisions of n cycles with the records of /scheme (n,)."""
+        """Compare the decisions of n cycles with the records of /scheme (n,); count and keep the mismatches."""
         records = scheme.records
         self.cycles += len(records)
         self._compare_whole("stamp_ns", scheme.t_ns, ticks.t_ns, ticks)
@@ -108,7 +111,7 @@ class SchemeComparison:
         return np.asarray(is_near | (logged == replayed) | (np.isnan(logged) & np.isnan(replayed)))
 
     def compare_arms(self, logged: ArmBatch, decoded: ArmBatch, ticks: Ticks) -> None:
-        """Compare the states of n cycles, as the log has them, with those made of its frames."""
+        """Compare the logged states of n cycles with those decoded from frames; count and keep the mismatches."""
         self.arms += len(ticks.cycle)
         for name in ArmBatch._fields:
             theirs: NDArray[Any] = getattr(logged, name)
@@ -138,26 +141,29 @@ class SchemeComparison:
             self._keep(Mismatch(topic, name, names[column], int(ticks.cycle[row]), int(ticks.t_ns[row]), *values))
 
     def add_mismatch(self, mismatch: Mismatch) -> None:
-        """Count a mismatch that was found elsewhere."""
+        """Count and keep a mismatch that was found elsewhere."""
         self.count += 1
         self.fields[f"{mismatch.topic}.{mismatch.field}"] += 1
         self._keep(mismatch)
 
     def _keep(self, mismatch: Mismatch) -> None:
-        """Keep a mismatch; drop all but the earliest when there are many."""
+        """Keep a mismatch; when there are many, drop all but the earliest."""
         self.mismatches.append(mismatch)
         if len(self.mismatches) > 2 * self._shown:
             self.first()
 
     def first(self) -> tuple[Mismatch, ...]:
-        """Return the earliest mismatches."""
+        """Return the earliest mismatches, by cycle; drop the others."""
         self.mismatches = sorted(self.mismatches, key=lambda mismatch: mismatch.cycle)[: self._shown]
         return tuple(self.mismatches)
 
     def compare_contacts(
         self, logged: Mapping[int, Mapping[str, Any]], replayed: Mapping[int, ContactReport], cycles: Mapping[int, int]
     ) -> None:
-        """Compare contact reports by the time at which they were made, ns; cycles: of these times."""
+        """Compare contact reports, each by the time at which it was made, ns; count and keep the mismatches.
+
+        cycles: number of the cycle at each of these times.
+        """
         for t_ns in sorted({*logged, *replayed}):
             where = (cycles.get(t_ns, -1), t_ns)
             theirs, ours = logged.get(t_ns), replayed.get(t_ns)
@@ -176,7 +182,10 @@ class SchemeComparison:
         return is_real and abs(logged - replayed) <= self._tolerance * max(1.0, abs(logged))
 
     def compare_events(self, logged: Sequence[LoggedEvent], replayed: Sequence[Event], cycle: int) -> None:
-        """Compare the scheme's own events of the stretch that begins with a cycle, in order."""
+        """Compare, in order, the scheme's own events of a stretch; count and keep the mismatches.
+
+        cycle: the stretch's first.
+        """
         for theirs, ours in itertools.zip_longest(logged, replayed):
             if theirs is not None and theirs.event == ours:
                 continue
@@ -195,7 +204,7 @@ def _same_bits(first: Vector, second: Vector) -> bool:
 
 
 def _text(value: float) -> str:
-    """Write a value so that it reads back to the same bits."""
+    """Return a value as text that reads back to the same bits."""
     return repr(value)
 
 
@@ -210,7 +219,7 @@ def _contact_values(logged: Mapping[str, Any], replayed: ContactReport) -> Itera
 
 
 def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...]]:
-    """Name the values of every field of the block."""
+    """Return the names of the values of each field of the block, by field."""
     parameters, further = settings.estimator.parameter_names, settings.further_names
     named = {
         "theta_hat": parameters,
@@ -263,19 +272,25 @@ class Asking:
         self._kept = KeptRequest()
 
     def begin_attempt(self) -> None:
-        """Begin another attempt."""
+        """Begin another attempt: the drives are not enabled yet; a request that is still open is kept."""
         self._enabled = None
         self._was_stopped = False
         self._kept = KeptRequest(self._kept.request)
 
     def ask(self, cycle: int, state: SchemeState) -> Request:
-        """Return the request in a cycle; state: that of the cycle before."""
+        """Return the user's request in a cycle: one left open by the attempt before, else the script's.
+
+        state: that of the cycle before.
+        """
         elapsed_s = None if self._enabled is None else (cycle - self._enabled) * self._period_s
         carried = Request.NONE if elapsed_s is None else self._kept.take_carried()
         return carried or self._script.request(elapsed_s, state)
 
     def note_request(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:
-        """Note a request, the state before the cycle and the state after it."""
+        """Keep a request that the scheme hasn't served, and note in which cycle the drives were enabled.
+
+        previous, state: states before and after the cycle.
+        """
         self._kept.ask(request, previous)
         self._kept.serve((state,))
         if state is SchemeState.ADAPT and self._enabled is None:
@@ -303,7 +318,7 @@ class Asking:
         return asked
 
     def _rows(self, ticks: Ticks, batch: SchemeBatch, first: int) -> list[int]:
-        """List the rows from `first` on in which the script could make a request, or its wait begins anew."""
+        """Return the rows from `first` on in which the script could make a request, or its wait begins anew."""
         assert self._enabled is not None
         is_due = np.zeros(len(ticks.cycle), np.bool_)
         is_due[first : first + 1] = True  # a request left by the attempt before, in the first cycle of an enabled arm
@@ -329,7 +344,11 @@ class RequestCheck:
         self.unexplained: list[tuple[int, int, int, int]] = []  # cycle, time, logged, of the script
 
     def compare(self, ticks: Ticks, logged: NDArray[np.uint8], asked: NDArray[np.uint8]) -> None:
-        """Compare a stretch."""
+        """Compare logged requests of a stretch (n,) with the script's; keep the differences.
+
+        A first request to finish goes to `interrupts`, any other difference to `unexplained`; those of the host's own
+        checks are no difference.
+        """
         for row in np.flatnonzero(logged != asked).tolist():
             cycle, t_ns = int(ticks.cycle[row]), int(ticks.t_ns[row])
             if logged[row] in _OWN_CHECKS:

@@ -51,7 +51,7 @@ _SIDE: Final = int(_code(np.array([_HIGH]))[0]) - _FIRST + 1
 
 
 class Distribution:
-    """The values so far."""
+    """Percentiles of the values added so far, in bounded memory."""
 
     def __init__(self, exact: int = EXACT) -> None:
         self.count = 0

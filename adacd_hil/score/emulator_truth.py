@@ -37,9 +37,9 @@ Rows = NDArray[np.int64]
 
 
 def extreme_rows(series: Iterable[Vector], starts: Rows) -> Rows:
-    """Choose of every bucket the rows in which a series (n,) is smallest and largest, the first of equal ones.
+    """Return the rows in which a series (n,) is smallest or largest in its bucket, the first of equal ones, ascending.
 
-    starts: where the buckets begin, from 0, ascending. Rows ascend. NaN is chosen nowhere.
+    starts: where the buckets begin, from 0, ascending. NaN is chosen nowhere.
     """
     chosen: list[Rows] = [np.empty(0, np.int64)]
     for values in series:
@@ -60,7 +60,7 @@ _HELD: Final = 30_000
 
 
 class TruthTable(NamedTuple):
-    """What an emulator's log has of the truth: kept rows on the emulator's own cycles; its metadata.
+    """The truth in an emulator's log: kept rows on the emulator's own cycles, and its metadata.
 
     problem: missing parts; is_complete: it is whole and no record was dropped on the way to it. span: None if the
     emulator never cycled.
@@ -83,7 +83,10 @@ _MODEL: Final = ("payload", "theta")
 
 
 def read_truth(path: Path) -> TruthTable:
-    """Read the contacts from the emulator's log, with the cycle after each. Raises LogError."""
+    """Read the emulator's log: the cycles of contacts and the one after each, payload and parameters.
+
+    Raises LogError.
+    """
     stream = LogStream(path, ("/truth",))
     rows = _TruthRows()
     for piece in stream:
@@ -111,7 +114,7 @@ class _TruthRows:
         self._waiting = np.zeros(0, _ROW)
 
     def add_records(self, truth: Series) -> None:
-        """Add the next cycles of the truth: models and contacts."""
+        """Keep, of the next cycles of the truth, those of contacts and those in which payload or parameters change."""
         if not len(truth):
             return
         rows = self._rows(truth)
@@ -148,7 +151,7 @@ class _TruthRows:
         self._model = tuple(column[-1:].copy() for column in columns)
 
     def _add_spell(self, rows: NDArray[Any]) -> None:
-        """Keep rows with or without a contact; the row after a contact unless that is the next contact's own."""
+        """Keep consecutive rows of one contact. Of rows without a contact, keep the first one after a contact."""
         key = int(rows["attempt"][0]), float(rows["contact_index"][0])
         if self._key not in (None, key):
             self._thin()
@@ -170,14 +173,14 @@ class _TruthRows:
         self._kept_rows += len(rows)
 
     def _thin(self) -> None:
-        """Choose among the waiting rows but the last ones."""
+        """Keep the extreme rows of those that wait, and drop the others; the last ones still wait."""
         middle, self._waiting = self._waiting[:-_ENDING], self._waiting[-_ENDING:].copy()
         if len(middle):
             series = (middle["tau_ext"][:, 0], middle["tau_ext"][:, 1], middle["contact_force"])
             self._keep(middle[extreme_rows(series, np.arange(0, len(middle), _BUCKET))])
 
     def table(self, stream: LogStream) -> TruthTable:
-        """Return the kept rows, at the end of the log."""
+        """Return the kept rows as a truth, at the end of the log."""
         self._thin()
         rows = np.concatenate([np.zeros(0, _ROW), *self._kept, self._waiting])
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, len(PARAMETER_NAMES)))
@@ -242,7 +245,7 @@ def _digest(config: bytes) -> str | None:
 
 
 def _played(truth: Path) -> dict[str, str]:
-    """Return scenario and seed of a truth; old ones have them in an attachment alone."""
+    """Return scenario and seed of a truth by name; old ones have them in an attachment alone."""
     said = run_metadata(truth)
     try:
         table = parse_toml(attachment(truth, "scenario.toml") or b"")
@@ -262,9 +265,9 @@ class HostCycles(NamedTuple):
 
 
 def placed_contacts(contacts: Sequence[TrueContact], host: HostCycles, settings: Settings) -> list[TrueContact]:
-    """Return those contacts, with the host's cycles, that begin before these end, on the host's clock.
+    """Return the contacts that begin within the host's cycles, with their times on the host's clock.
 
-    host: has the cycles that each onset and each end lies between.
+    contacts: their cycles are counted by the host. host: has the cycles that each onset and each end lies between.
     """
     contacts = [contact for contact in contacts if len(host.cycle) and contact.onset <= host.cycle[-1]]
     if not contacts:
@@ -296,9 +299,9 @@ KnownContacts = tuple[tuple[TrueContact, ...], EmulatorSpan]
 
 
 def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownContacts | None:
-    """Read the true contacts from the emulator's log in the same folder, and of which cycles they are known.
+    """Return the true contacts of a log's run from truth.mcap beside it, and the cycles of which they are known.
 
-    None where there is none. The truth of another run is left out, and `progress` gets a line with the reason. Raises
+    None without that file. The truth of another run is left out, and `progress` gets a line with the reason. Raises
     LogError.
     """
     truth = path.with_name(TRUTH_NAME)

@@ -48,9 +48,9 @@ class Detection:
 
 
 def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> NDArray[np.bool_]:
-    """Mark, of samples over a threshold at ascending times (n,), those that begin an alarm: after more than a pause.
+    """Return which samples over a threshold, at ascending times (n,), begin an alarm: those after more than a pause.
 
-    last: the sample before them, whose alarm they may continue; None: without one.
+    last: time of the sample before them, whose alarm they may continue; None: there is none. All times in one unit.
     """
     begins = np.diff(at, prepend=at[:1] if last is None else [last]) > pause
     if last is None:
@@ -91,17 +91,17 @@ class TrueContact:
 
     @property
     def end(self) -> int:
-        """The first cycle without it; its last one where the truth ends with it."""
+        """First cycle without the contact; its last one where the truth ends with it."""
         return int(self.cycle[-1])
 
     @property
     def delay_ms(self) -> float | None:
-        """Time from onset to detection."""
+        """Time from onset to detection, ms; None if no alarm found the contact."""
         return None if self.detected_ns is None else (self.detected_ns - self.onset_ns) * 1e-6
 
     @property
     def is_missed(self) -> bool:
-        """Whether detection was armed and did not find it."""
+        """Whether detection was armed at the contact's onset and did not find it."""
         return self.is_armed and self.detected_ns is None
 
     def counted_from(self, first_cycle: int) -> "TrueContact":
@@ -117,7 +117,10 @@ class TrueContact:
         is_armed: bool,
         is_reacting: bool = False,
     ) -> "TrueContact":
-        """Return it on the clock of a run; times_ns: of onset and end; a_rad_s, threshold (2,): the filter's."""
+        """Return the contact on the clock of a run, with the times in which it explains alarms.
+
+        times_ns: of onset and end. a_rad_s, threshold (2,): cut-off of the filter and threshold of each joint.
+        """
         after_s = forgotten_after_s(self.tau_ext, self.cycle, settings.bus.period_s, a_rad_s, threshold)
         onset_ns, end_ns = times_ns
         return replace(
@@ -139,17 +142,17 @@ class Score:
 
     @property
     def armed(self) -> int:
-        """How many contacts began while detection was armed."""
+        """Number of contacts that began while detection was armed."""
         return sum(contact.is_armed for contact in self.contacts)
 
     @property
     def missed(self) -> int:
-        """How many of those were not found."""
+        """Number of contacts that armed detection did not find."""
         return sum(contact.is_missed for contact in self.contacts)
 
     @property
     def armed_false_alarms(self) -> int:
-        """How many false alarms armed detection raised: those that the time it was armed for can be set against."""
+        """Number of false alarms that armed detection raised, to be compared with the time for which it was armed."""
         return sum(alarm.is_armed for alarm in self.false_alarms)
 
     @property
@@ -158,7 +161,7 @@ class Score:
         return tuple(contact.delay_ms for contact in self.contacts if contact.delay_ms is not None)
 
     def since(self, first_ns: int) -> "Score":
-        """Leave out contacts and alarms that began before a time."""
+        """Return the score without contacts and alarms that began before `first_ns`."""
         return Score(
             tuple(contact for contact in self.contacts if contact.onset_ns >= first_ns),
             tuple(alarm for alarm in self.false_alarms if alarm.t_ns >= first_ns),
@@ -167,14 +170,20 @@ class Score:
 
 
 def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
-    """Give the last instant at which each of k contacts, in order, explains an alarm; integers in any one unit (k,)."""
+    """Return for each contact (k,) the last instant at which it explains an alarm.
+
+    onsets, forgotten (k,): when each begins and is forgotten, in order; integers in any one unit.
+    """
     until: Times = np.maximum.accumulate(np.asarray(forgotten, np.int64))
     until[:-1] = np.minimum(until[:-1], np.asarray(onsets, np.int64)[1:] - 1)
     return until
 
 
 def owners(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times:
-    """Return the place of the contact that each of n alarms is about (n,), -1: false; until: of `explained_until`."""
+    """Return for each alarm (n,) the index of the contact that it is about; -1: of none, so that it is false.
+
+    at (n,): times of the alarms. onsets (k,): of the contacts. until (k,): of `explained_until`.
+    """
     places = np.searchsorted(onsets, at, side="right") - 1
     if not len(onsets):
         return np.asarray(places)
@@ -182,7 +191,7 @@ def owners(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times
 
 
 def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossings_ns: Sequence[int] = ()) -> Score:
-    """Judge alarms by true contacts, both in order.
+    """Return which alarm found each true contact, and which alarms are false; contacts and alarms are in order.
 
     crossings_ns: when some threshold is first exceeded, of a scheme replayed on a motion that is not its own: while it
     still reacts, it can raise no alarm, and a crossing finds the contacts that begin meanwhile.
@@ -218,9 +227,10 @@ class StreamJudge:
     def add_samples(
         self, contacts: Sequence[TrueContact], t_ns: Times, is_over: NDArray[np.bool_], is_judged: NDArray[np.bool_]
     ) -> None:
-        """Judge the next samples (n,). is_judged: where an alarm that no contact explains counts as false.
+        """Judge the next samples (n,); is_over: where the statistic is above its threshold.
 
-        contacts: in order, those at least that begin before the last sample and aren't forgotten before the first.
+        is_judged: where an alarm that no contact explains counts as false. contacts: in order, those at least that
+        begin before the last sample and aren't forgotten before the first.
         """
         rows = np.flatnonzero(is_over)
         about = owners(t_ns[rows], *_bounds(contacts))
@@ -233,7 +243,7 @@ class StreamJudge:
             self._last_ns = int(false_ns[-1])
 
     def score(self, contacts: Sequence[TrueContact]) -> Score:
-        """Judge all samples so far; contacts: all of them."""
+        """Return the score of all samples so far; contacts: all true contacts."""
         judged = (replace(contact, detected_ns=self._found.get(contact.number)) for contact in contacts)
         return Score(tuple(judged), tuple(self._false))
 
@@ -244,7 +254,7 @@ def _bounds(contacts: Sequence[TrueContact]) -> tuple[Times, Times]:
 
 
 def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
-    """Return the first time about each contact, by its place."""
+    """Return the earliest of the times about each contact, by the contact's index; about: that index, -1: none."""
     first = dict(zip(reversed(about), reversed(times_ns), strict=True))
     first.pop(-1, None)
     return first
@@ -255,7 +265,7 @@ def _judged(contacts: Sequence[TrueContact], found: dict[int, int]) -> tuple[Tru
 
 
 def contact_bounds(index: NDArray[Any], attempt: Times | None) -> list[tuple[int, int]]:
-    """Return from which row to before which each contact of a truth lasts; index, attempt (m,): of its rows.
+    """Return the first row of each contact of a truth, and the row after its last; index, attempt (m,): of the rows.
 
     Another index is another contact, though the touch goes on. A contact that goes on as an attempt begins is another
     one, too: the scheme begins anew.
@@ -268,9 +278,9 @@ def contact_bounds(index: NDArray[Any], attempt: Times | None) -> list[tuple[int
 
 
 def filtered(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float) -> Vector:
-    """Filter a true torque (n, 2) as an ideal detector would see it: first order, at rest at the first sample.
+    """Return a true torque (n, 2) filtered as by an ideal detector: first order, at rest at the first sample.
 
-    Each sample is held until the next one; cycle (n,): when they were taken, in periods.
+    Each sample is held until the next one; cycle (n,): when they were taken, in periods. a_rad_s: cut-off.
     """
     response = np.zeros_like(tau_ext)
     decays = np.exp(-a_rad_s * period_s * np.diff(cycle).astype(np.float64)).tolist()
@@ -283,7 +293,7 @@ def filtered(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float) -> 
 
 
 def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float, threshold: Vector) -> float:
-    """Return how long after its end an alarm may still stem from a contact, s.
+    """Return how long after a contact's end an alarm may still stem from it, s.
 
     One time constant after its true torque (k, 2), filtered with `a_rad_s`, is back within the threshold (2,).
     """
@@ -293,7 +303,7 @@ def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: f
 
 
 def true_contacts(truth: Truth | None, first_number: int = 1) -> tuple[TrueContact, ...]:
-    """Find the true contacts in a truth; return () without one."""
+    """Return the true contacts in a truth, numbered from `first_number`; () without a truth."""
     if truth is None:
         return ()
     found = []

@@ -17,9 +17,10 @@ from adacd_hil.settings.configuration import Settings
 
 @dataclass(frozen=True)
 class SmallestPush:
-    """Of each joint the percentiles p50, p99, p99.9 and max, Nm, over so many hours of MONITOR without a touch.
+    """Percentiles p50, p99, p99.9 and max of each joint's smallest push found and of its threshold, Nm.
 
-    tail_rate_per_h: false alarms to be expected if all channels' residuals have the tail of a Gaussian.
+    hours: time in MONITOR without a touch. tail_rate_per_h: false alarms to be expected if all channels' residuals have
+    the tail of a Gaussian.
     """
 
     push_Nm: tuple[dict[str, float], ...]
@@ -29,7 +30,7 @@ class SmallestPush:
 
 
 class PushGatherer:
-    """Gathers the cycles of MONITOR that are free of contact."""
+    """Gathers residuals and thresholds in MONITOR without contact, and the smallest push that would be found."""
 
     def __init__(self, settings: Settings) -> None:
         self._shown = detect_margin.constants_of(settings).shown
@@ -39,7 +40,7 @@ class PushGatherer:
         self._push, self._threshold = ([Distribution() for _ in range(JOINTS)] for _ in range(2))
 
     def add_residuals(self, tau_ext: Vector, threshold: Vector) -> None:
-        """Take in residuals and thresholds (k, channels, 2), k > 0."""
+        """Gather residuals and thresholds (k, channels, 2), k > 0, of the next cycles in MONITOR without contact."""
         push = np.zeros((len(tau_ext), JOINTS))
         _fill(tau_ext, threshold, self._shown, push)
         in_force = threshold.min(axis=1)
@@ -49,7 +50,7 @@ class PushGatherer:
             self._threshold[joint].add_values(in_force[:, joint])
 
     def smallest_push(self) -> SmallestPush | None:
-        """Sum up; return None before the first cycle."""
+        """Return the percentiles over all cycles gathered so far; None before the first."""
         if not self._push[0].count:
             return None
         seen_s = self._push[0].count * self._period_s

@@ -6,20 +6,20 @@ NONE: Final = "–"
 
 
 def why_not_found(is_armed: bool) -> str:
-    """Return why a contact was not found."""
+    """Return in words why a contact was not found: missed, or detection was not armed."""
     return "missed" if is_armed else "not armed"
 
 
 def found_text(found: int, contacts: int) -> str:
-    """Write how many contacts were found."""
+    """Return as text how many contacts were found, such as "3 of 4"."""
     return f"{found} of {contacts}"
 
 
 def number_of(count: int, noun: str) -> str:
-    """Write a count with its noun."""
+    """Return a count with its noun as text, such as "2 cycles"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def unjudged_sentence(count: int) -> str:
-    """Write in one line how many alarms the truth does not cover; "" without one."""
+    """Return one line that says how many alarms the truth does not cover; "" without any."""
     return f"the truth doesn't cover {number_of(count, 'detection')}, not judged" if count else ""

@@ -54,7 +54,11 @@ def show_settings(
 
 
 def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tuple[str, ...]) -> list[dict[str, str]]:
-    """Return the effective settings with value and default as TOML, and origin. Raises ConfigError, CommandError."""
+    """Return a row per setting: key, effective value and default as TOML, and origin.
+
+    given: changes as KEY=VALUE, which override the configuration. keys: keys or groups of the settings to return; ():
+    all. Raises ConfigError, CommandError.
+    """
     from adacd_hil.control.configuration_check import origins_of
     from adacd_hil.settings.configuration import Settings
     from adacd_hil.settings.configuration_files import configuration_layers, resolved_table
@@ -131,7 +135,7 @@ def _list_groups(as_json: bool) -> None:
 
 
 def _chosen(keys: tuple[str, ...]) -> "list[KnownKey]":
-    """Return the settings of these groups and keys; without any, all. Raises CommandError."""
+    """Return the settings that are named by their key or their group; without names, all. Raises CommandError."""
     from adacd_hil.remedies import nearest_name
     from adacd_hil.settings.setting_keys import explain_unknown, known_keys, sections
 

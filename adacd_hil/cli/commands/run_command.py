@@ -45,7 +45,10 @@ from adacd_hil.wire.can_interface import CanInterface
 
 
 def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
-    """Resolve a configuration as `demo` does, with a scenario's user. Raises ConfigError, CodecError, CommandError."""
+    """Return the settings of a connection with a scenario's user, as `demo` does; the arm is emulated.
+
+    Raises CommandError if the channel may be hardware, ConfigError, CodecError.
+    """
     from adacd_hil.cli.embedded_run import resolve
 
     check_rehearsal(scenario, connection.interface, connection.channel)
@@ -53,9 +56,9 @@ def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
 
 
 def drop_old_frames(bus: Bus, interface: str) -> None:
-    """Empty the transmit queue of frames that an earlier process left. Raises BusError.
+    """Recover a SocketCAN bus if frames of an earlier process wait to be sent, so that they are dropped.
 
-    On a shared bus a neighbour's frames leave by themselves.
+    Raises BusError. On a shared bus that carries frames, they leave by themselves.
     """
     if interface == "socketcan" and CanInterface(bus.channel).waiting_frames():
         bus.recover()
@@ -71,10 +74,11 @@ def run_on_bus(
     scenario: str | None = None,
     without_anchor: bool = False,
 ) -> tuple[dict[str, Any], ExitCode]:
-    """Run the scheme on a bus; with the offsets of a tare and the arm's history if given.
+    """Run the scheme on a bus until its end; return the result, see `summarise`, and the exit status.
 
-    `out` None: a new folder by date. scenario: the emulated arm's scenario, whose user makes the requests.
-    without_anchor: the user accepts that no anchor bounds the torque offsets.
+    out: folder of the log; None: a new one by date. tare_path, history_path: files with the offsets of a tare, and with
+    the arm's certificates; this run's are added. scenario: name of an emulated arm's scenario, whose user makes the
+    requests. without_anchor: the user accepts that no anchor bounds the torque offsets.
 
     Raises ConfigError, CodecError, BusMissingError, LogError, CommandError, OSError.
     """
@@ -143,7 +147,10 @@ def run_on_bus(
 
 
 def ask_first_run(history: UsedHistory) -> None:
-    """Have the user confirm on the terminal that an arm without history is free. Raises CommandError."""
+    """Ask on the terminal whether an arm without history is free. Raises CommandError if it is not.
+
+    Do nothing if the arm has a history, or without a terminal.
+    """
     if not history.is_first_run or sys.stdin is None or not sys.stdin.isatty():
         return
     print(
@@ -156,10 +163,10 @@ def ask_first_run(history: UsedHistory) -> None:
 
 
 def ask_without_anchor(joints: list[int], arguments: str) -> None:
-    """Have the user confirm on the terminal that an arm may learn its torque offsets without an anchor.
+    """Ask on the terminal whether the arm may learn its torque offsets without an anchor.
 
-    arguments: options of the command that name bus and arm. Raises CommandError if the user declines or there is no
-    terminal.
+    joints: those without an anchor, from 0; for none, do nothing. arguments: options of the command that name bus and
+    arm. Raises CommandError if the user declines or there is no terminal.
     """
     if not joints:
         return
@@ -183,7 +190,7 @@ def ask_without_anchor(joints: list[int], arguments: str) -> None:
 
 
 def summarise(summary: SessionSummary) -> dict[str, Any]:
-    """Return the result of a session, for people and machines."""
+    """Return the result of a session by name, for JSON and `as_text`; print its error, if any, on standard error."""
     described: dict[str, Any] = {"log": str(summary.log.path), "scheduler": summary.grant.scheduler}
     if summary.error:
         described["error"] = summary.error
@@ -223,7 +230,7 @@ def next_of_run(result: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _verdict(result: dict[str, Any]) -> str:
-    """Return one sentence on how a run ended."""
+    """Return a sentence that says how a run ended."""
     if "broke_off" in result:
         certified = len(result["certificates"])
         known = f" and {certified} certificate{'s' * (certified > 1)}" if certified else ""
@@ -241,7 +248,7 @@ _FOR_MACHINES = ("data", "certificates", "broke_off")
 
 
 def as_text(result: dict[str, Any]) -> str:
-    """Format the result of `summarise` for people, a line each."""
+    """Return the result of `summarise` as lines of text for people."""
     data = result.get("data")
     lines = [_verdict(result), *(f"{key}: {value}" for key, value in result.items() if key not in _FOR_MACHINES)]
     if data is not None:

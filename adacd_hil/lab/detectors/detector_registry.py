@@ -27,10 +27,11 @@ class StreamDetector(Protocol):
     """One detector on one stream, from its beginning."""
 
     def take(self, z: Vector, held_Nm: Vector) -> Vector:
-        """Process N more samples of z and of the friction that may hold (N, n); return the statistic of each (N, n).
+        """Process N more samples; return the statistic of each sample and joint (N, n).
 
-        An alarm is a statistic above its threshold. It may depend on its sample and those before, but not on how the
-        stream is cut into pieces.
+        z (N, n): the stream. held_Nm (N, n): the friction that may hold a standing joint. An alarm is a statistic above
+        its threshold. A statistic may depend on its sample and those before, but not on how the stream is cut into
+        pieces.
         """
 
 
@@ -81,9 +82,10 @@ def forget_loaded() -> None:
 
 
 def add(name: str, make: Maker, reserved: Collection[str], origin: str = "") -> None:
-    """Register a detector. origin: of an entry point, its package.
+    """Check a detector's contract and register it. make: begins one on a stream.
 
-    Raises ValueError for a name that is taken, and for a detector that doesn't keep the contract.
+    origin: of an entry point, its package. reserved: names of the built-in ones. Raises ValueError for a name that is
+    taken, and for a detector that doesn't keep the contract.
     """
     if name in _REGISTERED or name in reserved:
         known = _REGISTERED.get(name)
@@ -94,12 +96,12 @@ def add(name: str, make: Maker, reserved: Collection[str], origin: str = "") -> 
 
 
 def remove(name: str) -> None:
-    """Remove a detector. Raises KeyError if it was not registered."""
+    """Remove a registered detector. Raises KeyError if it was not registered."""
     del _REGISTERED[name]
 
 
 def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> None:
-    """Play noise to a detector. Raises ValueError, with the reason, if it breaks the contract."""
+    """Run a detector on noise, whole and cut in two. Raises ValueError, with the reason, if it breaks the contract."""
     z = np.random.default_rng(0).standard_normal((_CHECK_SAMPLES, JOINTS))
     held_Nm = np.where(z > 1.0, 0.1, 0.0)
     first, parts = make(period_s), make(period_s)

@@ -58,7 +58,7 @@ LIKELIHOOD: Final = "likelihood"
 
 
 def register(name: str, make: Maker) -> None:
-    """Add a detector, live too if it keeps the contract for that. make: begins one on a stream of a period, s.
+    """Register a detector under a name. make: begins one on a stream of a period, s.
 
     Raises ValueError for a name that is taken, and for a detector that breaks the contract of `detector_registry`.
     """
@@ -128,13 +128,13 @@ class DetectorBankSettings:
 
     @property
     def detectors(self) -> dict[str, tuple[int, ...]]:
-        """Return the detectors and the channels of each; a joint is over if one of its channels is."""
+        """Indices of each detector's channels, by its name; a joint is over if one of its channels is over."""
         first = len(self.own_channels)
         return self.own_detectors | {name: (first + place,) for place, name in enumerate(self.registered)}
 
     @property
     def own_detectors(self) -> dict[str, tuple[int, ...]]:
-        """Return the built-in detectors and the channels of each."""
+        """Indices of each built-in detector's channels, by its name."""
         count, gains, ages = len(self.cutoff_rad_s), len(self.observer_rad_s), len(self.onset_samples)
         detectors = {
             "paper": (0,),
@@ -151,12 +151,13 @@ class DetectorBankSettings:
 def likelihood_windows(
     autocovariance: Vector, onset_samples: tuple[int, ...], lag_s: float, period_s: float, floor_Nm: float = 2e-3
 ) -> Vector:
-    """Design one joint's likelihood weights (N, L), the newest sample's first, from the covariance (L,) of its z.
+    """Return one joint's likelihood weights (N, L), the newest sample's first, from the covariance (L,) of its z.
 
-    With the covariance R of the last L samples and the step's shape s, w = R^-1 s / sqrt(s' R^-1 s): noise of this
-    covariance comes out with a standard deviation of 1, and no other window gives the step more. The shape is the
-    response of a critically damped loop of that lag to a step. floor_Nm: slow errors of the model, added as a constant
-    of unknown size; without them a window would trust averages longer than any model deserves.
+    N: number of `onset_samples`, the ages of the steps. With the covariance R of the last L samples and the step's
+    shape s, w = R^-1 s / sqrt(s' R^-1 s): noise of this covariance comes out with a standard deviation of 1, and no
+    other window gives the step more. The shape is the response of a critically damped loop of that lag to a step.
+    floor_Nm: slow errors of the model, added as a constant of unknown size; without them a window would trust averages
+    longer than any model deserves.
 
     Raises ValueError unless L is at least the largest age and the covariance is positive.
     """
@@ -176,9 +177,9 @@ def likelihood_windows(
 
 
 def autocovariance(z: Vector, length: int) -> Vector:
-    """Estimate the covariance (length,) of a zero-mean series (n,) with itself; biased, so that it is positive.
+    """Return an estimate of the covariance (length,) of a zero-mean series (n,) with itself, at lags from 0.
 
-    Raises ValueError if the series is shorter than ten times that.
+    Biased, so that it is positive. Raises ValueError if the series is shorter than ten times `length`.
     """
     if z.shape[0] < 10 * length:
         raise ValueError(f"{z.shape[0]} samples are too few for a covariance of {length}")
@@ -229,7 +230,7 @@ def constants_of(settings: DetectorBankSettings, weights: Vector, period_s: floa
 
 
 def new_memory(constants: Structured) -> Structured:
-    """Return the memory before the first sample: all zeros."""
+    """Return the detectors' memory before the first sample: all zeros."""
     c: DetectorConstants = constants[0]
     joints = c.weights.shape[0]
     return zeros_of(
@@ -239,7 +240,7 @@ def new_memory(constants: Structured) -> Structured:
 
 @compiled
 def step(constants: Structured, memory: Structured, z: Vector, held_Nm: Vector, statistics: Vector) -> None:
-    """Process z (n,) and fill the statistics (channels, n).
+    """Process one sample z (n,): update `memory` and fill `statistics` (channels, n), both in place.
 
     held_Nm (n,): the friction that may hold each joint, F_c if it stands still, else 0.
     """
@@ -292,7 +293,7 @@ def step(constants: Structured, memory: Structured, z: Vector, held_Nm: Vector, 
 def record(
     constants: Structured, memory: Structured, z: Vector, held_Nm: Vector, block_samples: int, peaks: Vector
 ) -> None:
-    """Run `step` over N samples and keep the largest statistic of each block.
+    """Run `step` over N samples, and write the largest statistic of each block of samples to `peaks`.
 
     z, held_Nm (N, n); peaks (ceil(N / block_samples), channels, n). One sample per block keeps everything.
     """
@@ -310,7 +311,7 @@ class DetectorBank:
     """All detectors on one stream, from its beginning."""
 
     def __init__(self, settings: DetectorBankSettings, weights: Vector, period_s: float) -> None:
-        """Begin a stream. weights (n, N, L): the joints' likelihood weights."""
+        """Begin all detectors on one stream. weights (n, N, L): the joints' likelihood weights."""
         self._constants = constants_of(settings, weights, period_s)
         self._memory = new_memory(self._constants)
         self._channels = len(settings.channels)
@@ -319,7 +320,8 @@ class DetectorBank:
     def take_stream(self, z: Vector, held_Nm: Vector, block_samples: int = 1) -> Vector:
         """Process N samples (N, n); return the largest statistic of each block, (ceil(N / block_samples), channels, n).
 
-        One sample per block keeps everything; a stream goes on at a block's end.
+        held_Nm (N, n): the friction that may hold a standing joint. One sample per block keeps everything. The next
+        call begins a new block.
         """
         count, joints = z.shape
         own = np.empty((-(-count // block_samples), self._channels - len(self._registered), joints))
@@ -344,11 +346,12 @@ def stream(
     z: Vector,
     held_Nm: Vector,
 ) -> None:
-    """Fill the stream and the friction that may hold (N, 2) of a recording; theta (N, p), interval_s (N,).
+    """Fill `z` and `held_Nm` (N, 2), the stream and the friction that may hold, of a recording.
 
-    The first sample has z = 0, and so has one whose interval is not positive, because the motion before it is unknown.
-    Both ends of an interval are judged by the theta of its end, so that a change of theta is not a torque. q1 counts
-    from the level, for the direction of gravity; the rest is independent of its zero.
+    q, dq, tau_J (N, 2), theta (N, p), interval_s (N,). The first sample has z = 0, and so has one whose interval is not
+    positive, because the motion before it is unknown. Both ends of an interval are judged by the theta of its end, so
+    that a change of theta is not a torque. q1 counts from the level, for the direction of gravity; the rest is
+    independent of its zero. first_coulomb: column of joint 1's Coulomb friction in theta.
     """
     count, joints = q.shape
     Y_p = np.zeros((2, joints, theta.shape[1]))
@@ -393,7 +396,7 @@ def make_stream(
 
 
 def likelihood_weights(z: Vector, settings: DetectorBankSettings, lag_s: float, period_s: float) -> Vector:
-    """Design the likelihood weights (n, N, L) of all joints from a contact-free stream z (n_samples, n)."""
+    """Return the likelihood weights (n, N, L) of all joints, from a contact-free stream z (n_samples, n)."""
     length = max(settings.onset_samples) + 16
     return np.array(
         [

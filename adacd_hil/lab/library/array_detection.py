@@ -64,7 +64,7 @@ class OfflineArm:
         locked: tuple[str, ...] = (),
         has_rotors: bool = False,
     ) -> Self:
-        """Read a URDF file, or its text; inertias in it are not needed.
+        """Return the arm that a URDF describes, a file or its text; inertias in it are not needed.
 
         gravity_m_s2: in the axes of the root link. locked: joints that do not move, as of a gripper. has_rotors: the
         torques are those of geared motors, which turn their rotors too. Raises UrdfError, a ValueError; OSError.
@@ -74,7 +74,7 @@ class OfflineArm:
 
     @classmethod
     def from_config(cls, config: str | Path, profile: str | None = None) -> Self:
-        """Make the two-joint arm of a configuration, a name or a TOML file. Raises ConfigError, a ValueError."""
+        """Return the two-joint arm of a configuration, a name or a TOML file. Raises ConfigError, a ValueError."""
         return cls(read_urdf(robot_description(load_settings(str(config), profile))))
 
     def __repr__(self) -> str:
@@ -153,9 +153,9 @@ def fit(
     velocity_lag_s: float = 0.0,
     **scheme: Any,
 ) -> FittedModel:
-    """Fit a model to the free motion in arrays and test it on the last 40 % of that; see `detect`.
+    """Fit a model to the free motion in arrays, and test it on the last 40 % of that motion.
 
-    Look at the model's `verdict` first: it tells whether the model explains the torque.
+    For the arguments see `detect`. Look at the model's `verdict` first: it tells whether the model explains the torque.
     """
     return _fitted(_taken(arrays, arm, velocity_lag_s), arm, fit_s, scheme)
 
@@ -252,7 +252,7 @@ def _named(arrays: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
 
 
 def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: float) -> ForeignRecording:
-    """Check arrays and make a recording of them. Raises ArrayError."""
+    """Check arrays, and return them as a recording. Raises ArrayError."""
     named = _named(arrays)
     t_s = _numbers("t", named["t"])
     if t_s.ndim != 1 or t_s.size < SHORTEST_SAMPLES:
@@ -290,7 +290,7 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
 
 
 def _numbers(name: str, given: ArrayLike) -> Vector:
-    """Convert to finite float64 values. Raises ArrayError."""
+    """Return an array as finite float64 values; name: of the array, for the error. Raises ArrayError."""
     try:
         values = np.asarray(given)
         if values.dtype.kind not in "fiu":
@@ -322,7 +322,10 @@ def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tup
 
 
 def _described(arm: OfflineArm, has_dq: bool, scheme: Mapping[str, Any]) -> RecordingMap:
-    """Return a map for arrays, as for a file. Raises ArrayError for an invalid setting of the scheme."""
+    """Return a recording map for arrays, as a file would have.
+
+    Raises ArrayError for an invalid setting of the scheme.
+    """
     names = tuple(f"{place}" for place in range(1, arm.joints + 1))
     plain = {key: list(value) if isinstance(value, tuple | np.ndarray) else value for key, value in scheme.items()}
     try:

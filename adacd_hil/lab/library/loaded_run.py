@@ -120,7 +120,7 @@ class LoadedRun:
         return settings_of(self.path, self.attachments)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return a column for each number of a cycle: `q_1`, `q_2`; `state` by name."""
+        """Return a column (n,) for each number of a cycle, such as `q_1` and `q_2`; `state` has the states' names."""
         found: dict[str, NDArray[Any]] = {}
         for name, values in self.arrays.items():
             if values.ndim == 1:
@@ -131,18 +131,21 @@ class LoadedRun:
         return found
 
     def to_pandas(self) -> "pandas.DataFrame":
-        """Make a data frame of `columns`, the index `t_s`. Raises ImportError with the command that installs pandas."""
+        """Return `columns` as a data frame with the index `t_s`.
+
+        Raises ImportError, which names the command for pandas.
+        """
         frame: pandas.DataFrame = _extra("pandas").DataFrame(self.columns())
         return frame.set_index("t_s")
 
     def to_polars(self) -> "polars.DataFrame":
-        """Make a data frame of `columns`. Raises ImportError with the command that installs polars."""
+        """Return `columns` as a data frame. Raises ImportError, which names the command that installs polars."""
         frame: polars.DataFrame = _extra("polars").DataFrame(self.columns())
         return frame
 
 
 def _extra(name: str) -> Any:
-    """Import a library that an extra installs."""
+    """Import and return a library that an extra installs. Raises ImportError with the command."""
     try:
         return import_module(name)
     except ImportError:
@@ -150,7 +153,7 @@ def _extra(name: str) -> Any:
 
 
 def load(run: str | Path) -> LoadedRun:
-    """Read the log of a run: a folder with run.mcap, or the log's first part; all its parts as one.
+    """Return the run in a log, all its parts as one; run: a folder with run.mcap, or the log's first part.
 
     A cut or damaged log is read as far as it is intact, see `problem`. Raises LogError, in one line, if it can't be
     read or has no cycle.
@@ -177,7 +180,10 @@ def load(run: str | Path) -> LoadedRun:
 
 
 def _arrays(log: RunLog) -> dict[str, NDArray[Any]]:
-    """Return the fields of all topics of a cycle, for the cycles that all topics have."""
+    """Return the fields of /scheme, /control and /cycle, for the cycles that all three have.
+
+    Raises LogError without any.
+    """
     if not len(log.scheme):
         raise LogError(f"log {log.path} has no cycle" + (f": {log.problem}" if log.problem else ""))
     series = [log.topics[topic] for topic in _TOPICS if len(log.topics[topic])]

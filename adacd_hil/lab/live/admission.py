@@ -81,9 +81,10 @@ class Admission:
     def refuse(
         self, origins: Sequence[str], hosts: Sequence[str], subprotocols: Sequence[str] | None
     ) -> ViewerRefusal | None:
-        """Judge a request by all values of its headers Origin, Host and Sec-WebSocket-Protocol; None: welcome.
+        """Return why a request is refused; None: it is admitted.
 
-        subprotocols: None of a browser that asks for a page.
+        origins, hosts, subprotocols: all values of its headers Origin, Host and Sec-WebSocket-Protocol; subprotocols is
+        None for a browser that asks for a page.
         """
         if len(hosts) != 1 or not self._is_own_host(hosts[0]):
             return _HOST

@@ -42,10 +42,10 @@ class LiveMessage(NamedTuple):
 
 
 class LiveClient:
-    """A connection whose subscriptions are in force."""
+    """A connection to a live view, subscribed to topics."""
 
     def __init__(self, connection: ClientConnection, topics: Collection[str] | None) -> None:
-        """Subscribe to `topics`, None: to all, and wait until messages are on their way. Raises LogError."""
+        """Subscribe to `topics`, None: to all, and wait until the server sends messages. Raises LogError."""
         self.topics: dict[str, LiveTopic] = {}
         """By name."""
         self.is_open = True
@@ -58,7 +58,7 @@ class LiveClient:
         self._wait()
 
     def _wait(self) -> None:
-        """Receive messages until the subscriptions are in force."""
+        """Receive messages until the subscriptions are in force. Raises LogError after OPEN_TIMEOUT_S."""
         clock = MonotonicClock()
         end_ns = clock.now_ns() + round(OPEN_TIMEOUT_S * 1e9)
         while not self._waiting or self._waiting[-1].topic != DESCRIPTION_TOPIC:
@@ -91,7 +91,7 @@ class LiveClient:
         return None
 
     def _obey(self, word: dict[str, Any]) -> None:
-        """Subscribe to the advertised channels, last to the description: its message shows that all are in force."""
+        """Subscribe to the channels that the server advertises, last to the arm's description, which ends `_wait`."""
         if word["op"] != "advertise":
             return
         last: dict[str, int] | None = None
@@ -109,7 +109,10 @@ class LiveClient:
             self._connection.send(json.dumps({"op": "subscribe", "subscriptions": group}))
 
     def decode(self, message: LiveMessage) -> Any:
-        """Return a message of numbers as a numpy record, its fields named as in the schema. Raises LogError."""
+        """Return a message of numbers as a numpy record, its fields named as in the schema.
+
+        Raises LogError if the message doesn't fit its schema, or if the schema has no fixed size.
+        """
         if message.topic not in self._dtypes:
             self._dtypes[message.topic] = payload_dtype(self.topics[message.topic].text)
         try:

@@ -67,7 +67,11 @@ class Batch(NamedTuple):
 
 
 class ServerSetup(NamedTuple):
-    """live: where; setup: of the log; ids: the file's number of each channel; start_ns: before the first record."""
+    """Setup of the view's process.
+
+    live: its address and admitted viewers. setup: of the log. ids: the file's number of each channel. start_ns: log
+    time before the first record.
+    """
 
     live: LiveView
     setup: WriterSetup
@@ -76,13 +80,13 @@ class ServerSetup(NamedTuple):
 
 
 def pack_batch(batch: Batch) -> bytes:
-    """Write a batch: the number of its records, their times, ends and channels, then their bytes."""
+    """Return a batch as bytes: the number of its records, their times, ends and channels, then the records."""
     columns = (batch.log_ns, batch.ends, batch.channels, batch.records)
     return _HEAD.pack(len(batch.ends)) + b"".join(column.tobytes() for column in columns)
 
 
 def unpack_batch(data: bytes) -> Batch:
-    """Unpack a packed batch; the result is a view of `data`."""
+    """Return the batch in bytes of `pack_batch`; its arrays are views of `data`."""
     (count,) = _HEAD.unpack_from(data)
     place = _HEAD.size
     log_ns = np.frombuffer(data, np.int64, count, place)
@@ -101,9 +105,9 @@ class LiveFeed:
     """Records for the live view. `url`: where it is; `process`: serves it; `hidden`: batches without room."""
 
     def __init__(self, live: LiveView, setup: WriterSetup, ids: dict[int, int], start_ns: int) -> None:
-        """Start the process, and wait until it listens where `live` says. Raises LogError.
+        """Start the view's process, and wait until it listens on the address of `live`. Raises LogError.
 
-        ids: the file's number of each channel, by ours. start_ns: log time before the first record.
+        setup: of the log. ids: the file's number of each channel, by ours. start_ns: log time before the first record.
         """
         self.hidden = 0
         self._is_watched = False
@@ -155,7 +159,7 @@ class LiveFeed:
 
     @property
     def waiting_bytes(self) -> int:
-        """Bytes that the other side has not taken yet."""
+        """Bytes that the view's process has not taken yet."""
         return self._ring.waiting
 
     def show(
@@ -165,7 +169,10 @@ class LiveFeed:
         log_ns: NDArray[np.int64],
         ends: NDArray[np.int64],
     ) -> None:
-        """Hand over message records that follow each other, of which the other side shows some; see Batch."""
+        """Hand message records that follow each other to the view's process, see Batch; without a viewer, do nothing.
+
+        If the ring is full, drop them and count the batch in `hidden`.
+        """
         if not len(ends) or not self.is_watched:
             return
         if not self._ring.put_packet(pack_batch(Batch(records, channels, log_ns, ends))):
@@ -194,7 +201,7 @@ EVERY_RECORD = 0
 
 
 def rate_of(topic: str) -> int:
-    """Return the rate of a topic, Hz; EVERY_RECORD: it is shown whole."""
+    """Return the rate at which a topic is shown, Hz; EVERY_RECORD: all its records are shown."""
     return DECODED_RATE_HZ if topic.startswith(DECODED) else RATES_HZ.get(topic, EVERY_RECORD)
 
 
@@ -207,7 +214,10 @@ class Decimator:
         self._first_ns = -1  # the first cycle of the slot
 
     def choose(self, cycles_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Choose the next records to show (n,), by the times of their cycles, which never run backwards."""
+        """Return which of the next records are shown (n,): those of the first cycle in each slot of 1 / rate.
+
+        cycles_ns (n,): times of the records' cycles, which never run backwards.
+        """
         if not self._slot_ns or not len(cycles_ns):
             return np.ones(len(cycles_ns), np.bool_)
         slots = cycles_ns // self._slot_ns
@@ -235,7 +245,10 @@ class LiveTopics:
     """The topics that are served. `latest_ns`: log time of the latest record; before the first, of the beginning."""
 
     def __init__(self, setup: LiveView, channels: Iterable[LogChannel], ids: dict[int, int], start_ns: int) -> None:
-        """`ids`: the file's number of each channel, by ours. `start_ns`: log time before the first record."""
+        """Prepare the topics of a log, and three that are drawn from them.
+
+        ids: the file's number of each channel, by ours. start_ns: log time before the first record.
+        """
         channels = tuple(channels)
         self.latest_ns = start_ns
         self._shape = setup.shape
@@ -257,11 +270,14 @@ class LiveTopics:
         self._description = pack_string(setup.robot_description)
 
     def description(self) -> Shown:
-        """Return the arm's description, for a viewer that has just subscribed to it."""
+        """Return the message with the arm's URDF, for a viewer that has just subscribed to it."""
         return Shown(self.robot, self.latest_ns, self._description)
 
     def choose(self, batch: Batch, wanted: Collection[int]) -> Iterator[Shown]:
-        """Yield the records of a batch to show, in its order, on the channels that viewers have subscribed to."""
+        """Yield the messages of a batch that are shown, in its order, and those that are drawn from them.
+
+        wanted: channels to which viewers have subscribed; others yield nothing.
+        """
         if not len(batch.ends):
             return
         self.latest_ns = max(self.latest_ns, int(batch.log_ns.max()))

@@ -30,21 +30,24 @@ class LiveView:
     shape: Shape = Shape((0.0, 0.0))
 
     def server(self, settings: "Settings") -> "LiveView":
-        """Return the view of an arm."""
+        """Return this live view with the arm of the settings: its URDF and its shape."""
         from adacd_hil.log.robot_description import robot_description
 
         shape = Shape(settings.arm.link_length_m, settings.tilt_rad, settings.level_rad)
         return dataclasses.replace(self, robot_description=robot_description(settings), shape=shape)
 
     def __call__(self, setup: "WriterSetup", ids: dict[int, int], start_ns: int) -> "LiveFeed":
-        """Start the process that serves it. Raises LogError."""
+        """Start the process that serves the live view, and return its feed. Raises LogError.
+
+        setup: of the log. ids: the file's number of each channel. start_ns: log time before the first record.
+        """
         from adacd_hil.lab.live.feed import LiveFeed
 
         return LiveFeed(self, setup, ids, start_ns)
 
 
 def live_address(host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int) -> LiveView:
-    """Return the live view at a place, for any arm. Raises ValueError for an invalid origin."""
+    """Return a live view on an address, for any arm. Raises ValueError for an invalid origin."""
     from adacd_hil.lab.live.admission import normal_origin
 
     return LiveView(host, port, tuple(map(normal_origin, origins)), names, most_viewers)

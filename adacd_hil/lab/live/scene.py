@@ -79,35 +79,35 @@ class _Payload:
         self._data = bytearray()
 
     def put(self, code: str, *values: float) -> None:
-        """Add numbers of one kind, each aligned to its size."""
+        """Append numbers of one kind, each aligned to its size; code: their format in `struct`."""
         size = struct.calcsize(code)
         self._data += bytes(-len(self._data) % size)
         self._data += struct.pack(f"<{len(values)}{code}", *values)
 
     def time(self, t_ns: int) -> None:
-        """Add a time or a duration."""
+        """Append a time or a duration, ns."""
         self.put("I", *divmod(t_ns, 1_000_000_000))
 
     def text(self, text: str) -> None:
-        """Add a string."""
+        """Append a string."""
         encoded = text.encode() + b"\0"
         self.put("I", len(encoded))
         self._data += encoded
 
     def bytes(self) -> bytes:
-        """Return the payload."""
+        """Return the whole payload."""
         return ENCAPSULATION + bytes(self._data)
 
 
 def pack_string(text: str) -> bytes:
-    """Pack a String."""
+    """Return a text as a payload of std_msgs/String."""
     payload = _Payload()
     payload.text(text)
     return payload.bytes()
 
 
 def pack_transforms(time_ns: int, transforms: tuple[Transform, ...]) -> bytes:
-    """Pack a TFMessage; `time_ns` is that of the log."""
+    """Return a payload of tf2_msgs/TFMessage; time_ns: log time of all poses."""
     payload = _Payload()
     payload.put("I", len(transforms))
     for transform in transforms:
@@ -119,7 +119,7 @@ def pack_transforms(time_ns: int, transforms: tuple[Transform, ...]) -> bytes:
 
 
 def pack_scene(time_ns: int, entities: tuple[Entity, ...]) -> bytes:
-    """Pack a SceneUpdate that adds or replaces `entities`; `time_ns` is that of the log."""
+    """Return a payload of foxglove_msgs/SceneUpdate that adds or replaces `entities`; time_ns: log time."""
     payload = _Payload()
     payload.put("I", 0, len(entities))  # no deletions
     for entity in entities:
@@ -172,12 +172,12 @@ class Shape(NamedTuple):
 
 
 def about_z(angle_rad: float) -> Quaternion:
-    """Return the rotation by an angle about z."""
+    """Return the quaternion of a rotation by an angle about z."""
     return (0.0, 0.0, math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad))
 
 
 def transforms_of(shape: Shape, q: Vector) -> tuple[Transform, ...]:
-    """Place all frames of the robot description for the joint positions q (2,)."""
+    """Return the poses of all frames of the robot description for the joint positions q (2,)."""
     half_rad = 0.5 * shape.tilt_rad
     origin = (0.0, 0.0, 0.0)
     elbow, end = ((length_m, 0.0, 0.0) for length_m in shape.link_length_m)
@@ -190,12 +190,12 @@ def transforms_of(shape: Shape, q: Vector) -> tuple[Transform, ...]:
 
 
 def share_of_threshold(tau_ext_hat: float, threshold: float) -> float:
-    """Return |residual| / threshold; NaN while detection is off."""
+    """Return |residual| / threshold of a joint; NaN while detection is off."""
     return abs(tau_ext_hat) / threshold if 0.0 < threshold < math.inf else math.nan
 
 
 def draw_joints(state: SchemeState, tau_ext_hat: Vector, threshold: Vector) -> tuple[Entity, ...]:
-    """Draw both joints and the state; tau_ext_hat, threshold (2,), Nm."""
+    """Return the shapes that show both joints and the state; tau_ext_hat, threshold (2,), Nm."""
     entities = []
     for index, link in enumerate(LINK_NAMES):
         share = share_of_threshold(float(tau_ext_hat[index]), float(threshold[index]))
@@ -207,7 +207,7 @@ def draw_joints(state: SchemeState, tau_ext_hat: Vector, threshold: Vector) -> t
 
 
 def draw_contact(shape: Shape, report: ContactReport) -> Entity:
-    """Draw the force of a report: on link 2 where its place is known, else at the end of the link that was touched."""
+    """Return an arrow with the force of a report: where link 2 was touched if that is known, else at the link's end."""
     on_link_2 = report.link == 2
     length_m = shape.link_length_m[report.link - 1]
     place_m = min(max(report.lever_m, 0.0), length_m) if on_link_2 and report.location is Location.KNOWN else length_m
@@ -226,7 +226,7 @@ def draw_contact(shape: Shape, report: ContactReport) -> Entity:
 
 
 def _force(shape: Shape, report: ContactReport) -> tuple[float, bool]:
-    """Return the force across the link, N, and whether it is that rather than the smallest with this torque."""
+    """Return the force across the link, N, and whether it is known; if not, it is the smallest with this torque."""
     if report.location is Location.NOT_SOUGHT:
         torque = report.tau_ext_peak[report.link - 1]
         return torque / shape.link_length_m[report.link - 1], False

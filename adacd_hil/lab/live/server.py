@@ -85,7 +85,7 @@ class Viewer:
         self._is_warned = False
 
     def put(self, data: Data) -> None:
-        """Let something wait, in place of the oldest where too much does."""
+        """Queue data for the viewer; if too much waits, drop the oldest."""
         self._waiting.append(data)
         self._waiting_bytes += len(data)
         while len(self._waiting) > BACKLOG or self._waiting_bytes > BACKLOG_BYTES:
@@ -93,23 +93,23 @@ class Viewer:
         self._has_some.set()
 
     def put_message(self, shown: Shown) -> None:
-        """Let a message wait, once for each subscription to it."""
+        """Queue a message for the viewer, once for each of its subscriptions to the topic."""
         for number in self.by_channel.get(shown.channel, ()):
             self.put(_message(number, shown))
 
     def warn_once(self, text: str) -> None:
-        """Send the viewer one warning about a request that isn't supported."""
+        """Queue a warning about a request that isn't supported, for the first such request only."""
         if not self._is_warned:
             self._is_warned = True
             self.put(_status(_WARNING, text))
 
     @property
     def is_served(self) -> bool:
-        """Whether no message waits."""
+        """Whether no message waits for the viewer."""
         return not self._waiting
 
     async def send_all(self) -> None:
-        """Send waiting messages forever."""
+        """Send queued messages to the viewer until the task is cancelled."""
         while True:
             await self._has_some.wait()
             self._has_some.clear()
@@ -140,7 +140,10 @@ class LiveServer:
         self._notices: int | None = None
 
     async def run(self, listening: socket.socket, notices: int | None = None) -> None:
-        """Serve until the writer ends or dies. `notices`: descriptor of the run's terminal."""
+        """Serve until the writer ends or dies.
+
+        listening: the open socket; notices: descriptor of the run's terminal.
+        """
         self._notices = notices
         loop = asyncio.get_running_loop()
         server = await serve(
@@ -167,7 +170,7 @@ class LiveServer:
     # -- the writer -----------------------------------------------------------------------------------------------
 
     def _hear(self) -> None:
-        """Receive all waiting words of the writer; after any of them, look into the ring."""
+        """Receive all waiting messages of the writer, which may end the server, then show packets of the ring."""
         word: bytes | None = None
         with contextlib.suppress(BlockingIOError):
             while True:
@@ -181,7 +184,7 @@ class LiveServer:
         self._show_some()
 
     def _show_some(self) -> None:
-        """Show a part of the packets in the ring; the rest after the viewers had their turn."""
+        """Send a part of the ring's packets to the viewers; the rest follows after other tasks."""
         data = self._ring.take_packets(_AT_ONCE_BYTES)
         for start, size in zip(*(numbers.tolist() for numbers in split(data)), strict=True):
             self._show(data[start : start + size])
@@ -203,7 +206,7 @@ class LiveServer:
                 viewer.put(_TIME.pack(_TIME_DATA, log_ns))
 
     def _tell_writer(self) -> None:
-        """Notify the writer when the first viewer subscribes, or the last subscription ends."""
+        """Tell the writer when the first viewer subscribes, or the last subscription ends."""
         is_watched = any(viewer.subscriptions for viewer in self._viewers)
         if is_watched != self._is_watched:
             self._is_watched = is_watched
@@ -213,13 +216,13 @@ class LiveServer:
     # -- viewers --------------------------------------------------------------------------------------------------
 
     def _counted(self, *given: Any, **named: Any) -> ServerConnection:
-        """Make a connection that is counted from its first byte to its last."""
+        """Return a connection that is counted from its first byte to its last."""
         return _CountedConnection(
             self._connections, self._admitted, self._setup.most_viewers + OPENING, *given, **named
         )
 
     def _judge(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answer a request that is refused, with the reason, and a browser with a page; None: it may go on."""
+        """Return the answer to a refused request, or a page for a browser; None: the connection is admitted."""
         headers = request.headers
         origins, hosts, protocols = (headers.get_all(name) for name in ("Origin", "Host", "Sec-WebSocket-Protocol"))
         is_page = not headers.get_all("Upgrade")
@@ -241,7 +244,7 @@ class LiveServer:
                 os.write(self._notices, f"{refusal.notice}\n".encode())
 
     async def _attend(self, connection: ServerConnection) -> None:
-        """Serve one viewer as long as it is there."""
+        """Serve one viewer until it disconnects."""
         viewer = Viewer(connection)
         viewer.put(json.dumps(self._describe()))
         viewer.put(json.dumps({"op": "advertise", "channels": self._topics.advertised}))
@@ -272,7 +275,7 @@ class LiveServer:
         }
 
     def _obey(self, viewer: Viewer, data: Data) -> bool:
-        """Carry out a viewer's request; False if it asks for too much."""
+        """Carry out a viewer's request; return False if it asks for too many subscriptions."""
         try:
             word = json.loads(data) if isinstance(data, str) else {}
             op = word.get("op") if isinstance(word, dict) else None
@@ -355,7 +358,7 @@ def _status(level: int, text: str) -> str:
 
 
 def _page(connection: ServerConnection, host: str) -> Response:
-    """Answer a browser with a page that names viewers for this address; `host`: requested and admitted."""
+    """Return the answer to a browser: a page that names viewers for this address; host: requested and admitted."""
     page = Template(_PAGE.read_text(encoding="utf-8")).substitute(url=f"ws://{html.escape(host)}")
     response = connection.respond(HTTPStatus.OK, page)
     del response.headers["Content-Type"]  # headers may be there twice
@@ -379,19 +382,19 @@ def _no_logger() -> logging.Logger:
 
 
 def listen(setup: LiveView) -> socket.socket:
-    """Open the listening socket: the first address that the host stands for. Raises OSError."""
+    """Open and return the listening socket, on the first address of the host's name. Raises OSError."""
     family, _, _, _, address = socket.getaddrinfo(setup.host, setup.port, type=socket.SOCK_STREAM)[0]
     return socket.create_server(address[:2], family=family, backlog=128)
 
 
 def url_of(setup: LiveView, listening: socket.socket) -> str:
-    """Return the URL for viewers."""
+    """Return the URL for viewers; listening: the open socket, whose port it names."""
     host = f"[{setup.host}]" if ":" in setup.host else setup.host
     return f"ws://{host}:{listening.getsockname()[1]}"
 
 
 def make_server(told: ServerSetup, ring: RingReader, writer: socket.socket) -> LiveServer:
-    """Make the server of a log."""
+    """Return the server of a log's live view. told: its setup; writer: socket to the writer."""
     topics = LiveTopics(told.live, told.setup.channels, told.ids, told.start_ns)
     return LiveServer(told.live, topics, ring, writer)
 

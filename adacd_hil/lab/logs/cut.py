@@ -18,12 +18,15 @@ from adacd_hil.log.reader import begin_of_log, each_once, read_log
 
 
 def default_out(path: Path) -> Path:
-    """Name the result of cutting `path`."""
+    """Return the path of the result of cutting `path`, such as run.cut.mcap."""
     return path.with_name(f"{path.stem}.{CUT}{path.suffix}")
 
 
 def find_contact(path: Path, contact: int, around_s: float) -> TimeWindow:
-    """Return the stretch around the contact of this number, from 1, of a log. Raises LogError."""
+    """Return the stretch of a log from `around_s` before a contact's detection to as long after it. Raises LogError.
+
+    contact: its number, from 1.
+    """
     log = read_log(path, ("/contact",))
     begun = each_once(log.contacts)
     if not 1 <= contact <= len(begun):
@@ -39,9 +42,10 @@ def cut(
     topics: Collection[str] = (),
     progress: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Cut a stretch out of the log whose first part is `path`, of all topics or of `topics`; return its messages.
+    """Copy a stretch of the log whose first part is `path` to the new log `out`; return its number of messages.
 
-    Raises LogError when the log is damaged, when the stretch has no message, or when `out` is the log itself.
+    topics: those that are copied; (): all. Raises LogError when the log is damaged, when the stretch has no message, or
+    when `out` is the log itself.
     """
     log = SalvagedLog(path, progress)
     known = set()

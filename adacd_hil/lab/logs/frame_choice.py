@@ -61,7 +61,7 @@ class FrameChoice:
 
 
 def sides(codec: Codec | DbcDecoder) -> tuple[frozenset[int], frozenset[int]]:
-    """List the identifiers that a contract's host and its devices send."""
+    """Return the identifiers that a contract's host sends, and those that its devices send."""
     return (
         _ids(message.can_id for message in codec.messages.values() if HOST in message.senders),
         _ids(message.can_id for message in codec.messages.values() if HOST not in message.senders),

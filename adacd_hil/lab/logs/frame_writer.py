@@ -91,7 +91,7 @@ class FrameWriter:
         return channel_id
 
     def finish(self) -> None:
-        """End the file."""
+        """Write the summary, with which the file ends; the stream stays open."""
         counts = {"frames": str(self._frames), "messages": str(self._messages), "dropped": "0"}
         self._writer.add_metadata(SUMMARY_METADATA, {**counts, ENDING_KEY: "closed"})
         self._writer.finish()  # type: ignore[no-untyped-call]
@@ -99,6 +99,6 @@ class FrameWriter:
 
 
 def _topic_name(channel: str) -> str:
-    """Spell a channel's name as ROS 2 demands of a part of a topic."""
+    """Return a channel's name as ROS 2 demands of a part of a topic."""
     spelled = re.sub(r"[^A-Za-z0-9]+", "_", channel).strip("_")
     return spelled if spelled[:1].isalpha() else f"can{spelled}"

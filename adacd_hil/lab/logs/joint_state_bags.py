@@ -21,7 +21,7 @@ Bag = tuple[Mapping[str, str], Callable[[str], Iterator[tuple[int, JointStateMes
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether a path is a bag: a folder, an MCAP file, one of ROS 1, or the database of ROS 2."""
+    """Return whether a path is a folder, an MCAP file, a bag of ROS 1, or a database of ROS 2."""
     if path.is_dir():
         return True
     try:
@@ -33,7 +33,7 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def opened_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag. Raises LogError for any error of its reader."""
+    """Open a bag while the block lasts. Raises LogError for any error of its reader."""
     try:
         if not path.is_dir():
             with open_input(path) as file:
@@ -97,5 +97,5 @@ def _opened_rosbag(path: Path, is_ros1: bool) -> Iterator[Bag]:
 
 
 def joint_state_topics(topics: Mapping[str, str]) -> list[str]:
-    """List the topics of joint states."""
+    """Return the topics of joint states; topics: type by name."""
     return [topic for topic, kind in topics.items() if kind.replace("/msg/", "/") == TYPE.replace("/msg/", "/")]

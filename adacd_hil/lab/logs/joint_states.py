@@ -51,7 +51,7 @@ def is_joint_state(payload: bytes) -> bool:
 
 
 def joint_state_columns(payloads: Iterable[bytes]) -> Iterator[tuple[tuple[str, ...], dict[str, Any]]]:
-    """Make tables of messages of ROS 2, one for each choice of joints: (their names, columns).
+    """Yield a table of messages of ROS 2 for each set of joints: the joints' names, and the columns.
 
     Columns: `t_ns` of the stamp, and `position_NAME`, `velocity_NAME`, `effort_NAME`; nan if a message has none, or not
     one of each joint. Invalid payloads are left out.

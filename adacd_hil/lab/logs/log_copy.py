@@ -40,7 +40,7 @@ class LogCopy:
     """The log in the making: a hidden file beside until `finish`, which replaces another copy, but no recording."""
 
     def __init__(self, path: Path, log: SalvagedLog, topics: Collection[str] | None = None) -> None:
-        """Begin a log at `path` that is copied from another, all of it or only `topics`.
+        """Begin a log at `path` that is copied from `log`; topics: those that are copied, None: all.
 
         Raises LogError, also where `path` is the log itself.
         """
@@ -57,7 +57,7 @@ class LogCopy:
 
     @property
     def messages(self) -> int:
-        """How many messages have been copied."""
+        """Number of messages copied so far."""
         return self._file.messages
 
     def add_attachment(self, attachment: Attachment) -> None:
@@ -65,7 +65,7 @@ class LogCopy:
         self._file.add_attachment(attachment)
 
     def add_messages(self, contents: Contents, is_chosen: NDArray[np.bool_] | None = None) -> None:
-        """Copy messages of a chunk, those of channels that aren't copied left out."""
+        """Copy messages of a chunk, those where `is_chosen` (n,) is True; None: all. Other channels are left out."""
         self._follow()
         numbers = self._numbers[contents.channels]
         is_taken = numbers >= 0 if is_chosen is None else (numbers >= 0) & is_chosen
@@ -81,7 +81,7 @@ class LogCopy:
         self._file.add_messages(records, channels, log_times, ends, np.empty(0, np.int64))
 
     def _follow(self) -> None:
-        """Copy the metadata and define the channels that have become known."""
+        """Copy the metadata, and define the channels, that the other log has read since the last call."""
         for name in [name for name in self._log.metadata if name not in self._metadata]:
             self._metadata.add(name)
             table = self._log.metadata[name]
@@ -111,7 +111,10 @@ class LogCopy:
         self._topics[number] = channel.topic
 
     def finish(self, ending: str, more: Mapping[str, str]) -> None:
-        """End the log with a summary, `more` in it, and give it its name. Raises LogError."""
+        """End the log with a summary and give the file its name. Raises LogError.
+
+        ending: why it ends. more: further entries of the summary.
+        """
         self._follow()
         self._file.flush()
         summary = {
@@ -135,7 +138,7 @@ class LogCopy:
 
 
 def _common_profile(sources: Iterable[Path]) -> str:
-    """Return the profile that all logs fit, "" if they differ. Earlier logs of ours fit ROS 2 without naming it."""
+    """Return ROS_PROFILE if all logs fit it, else "". Earlier logs of ours fit it without naming it."""
     headers = [read_header(path) for path in sources]
     return ROS_PROFILE if headers and all(header is not None and _is_ros(header) for header in headers) else ""
 
@@ -147,7 +150,7 @@ def _is_ros(header: Header) -> bool:
 def _gather(
     data: NDArray[np.uint8], starts: NDArray[np.int64], ends: NDArray[np.int64]
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Copy stretches of `data` one after the other; return them and where each ends."""
+    """Copy stretches of `data` one after the other; return the copy, and where each stretch ends in it."""
     lengths = ends - starts
     new_ends = np.cumsum(lengths)
     if len(starts) and (starts[1:] == ends[:-1]).all():
@@ -200,7 +203,7 @@ class _CopyTarget:
 
 
 def _is_copy(path: Path) -> bool:
-    """Tell whether a file is a log that was made of others, so that it can be made again."""
+    """Return whether a file is a log that was made of others, so that it may be overwritten."""
     try:
         with open_input(path) as file:
             return read_end(file) is not None and read_info(path).ending in COPY_ENDINGS

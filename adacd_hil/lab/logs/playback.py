@@ -42,14 +42,14 @@ class Lateness:
         self._counts: Counter[int] = Counter()
 
     def add_lateness(self, lateness_ns: int) -> None:
-        """Count a frame that was sent so much later than due, ns."""
+        """Count a frame that was sent `lateness_ns` after it was due."""
         self.frames += 1
         self.late_frames += lateness_ns > LATE_NS
         self.worst_ns = max(self.worst_ns, lateness_ns)
         self._counts[lateness_ns // _BUCKET_NS] += 1
 
     def quantile_us(self, share: float) -> int:
-        """Return the smallest whole number of µs such that this share of the frames was not later."""
+        """Return the lateness that a share (0…1) of the frames did not exceed, µs, rounded up; 0 without frames."""
         needed = share * self.frames
         for bucket, count in sorted(self._counts.items()):
             needed -= count
@@ -67,10 +67,10 @@ def play(
     longest_pause_ns: int | None = None,
     is_stopped: Callable[[], bool] = lambda: False,
 ) -> Lateness:
-    """Send frames at their times until they end or `is_stopped`; return the lateness.
+    """Send frames at their times until they end or `is_stopped`; return how late they were sent.
 
-    longest_pause_ns: longer pauses of the recording are shortened to this. Frames out of order are sent with the frames
-    before them. Raises BusError.
+    speed: 2 plays twice as fast. longest_pause_ns: longer pauses of the recording are shortened to this. Frames out of
+    order are sent with the frames before them. Raises BusError.
     """
     lateness = Lateness()
     for due_ns, group in _grouped(_scheduled(frames, clock, speed, longest_pause_ns)):
@@ -86,7 +86,7 @@ def play(
 
 
 def repeat(frames: Callable[[], Iterable[PlayedFrame]], times: int) -> Iterator[PlayedFrame]:
-    """Yield a recording several times in a row, on one time axis; 0 times: forever."""
+    """Yield the frames of a recording several times in a row, with times that go on; times 0: forever."""
     shift_ns, end_ns, done = 0, None, 0
     while not times or done < times:
         is_first = True
@@ -118,7 +118,7 @@ def _scheduled(
 
 
 def _grouped(scheduled: Iterable[tuple[int, PlayedFrame]]) -> Iterator[tuple[int, list[PlayedFrame]]]:
-    """Group frames that are due at the same time, a few at most."""
+    """Yield the frames that are due at the same time together, up to 64 of them."""
     group: list[PlayedFrame] = []
     group_ns = 0
     for due_ns, frame in scheduled:

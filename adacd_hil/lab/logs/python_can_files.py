@@ -69,7 +69,7 @@ class McapWriter(BinaryIOMessageWriter):
         self._writer.write_frame(to_frame(msg))
 
     def stop(self) -> None:
-        """End the file; twice is once."""
+        """End and close the file; ignore a second call."""
         if not self._is_stopped:
             self._is_stopped = True
             self._writer.finish()
@@ -89,7 +89,10 @@ class TimedMessage(can.Message):
 
 
 def to_messages(frames: NDArray[Any], channels: list[str], epoch_ns: int = 0) -> Iterator[TimedMessage]:
-    """Make a message of each row; `epoch_ns` is added to its time."""
+    """Yield a message for each frame, a row of RECORDED_FRAME_DTYPE; `epoch_ns` is added to its time.
+
+    channels: name of each channel, by its number in a row.
+    """
     names = [int(name) if name.isdecimal() and len(name) < _MOST_DIGITS else name or None for name in channels]
     for row in frames:
         (t_ns, _, can_id, is_tx, is_error, length, _, channel, is_extended, is_remote, is_fd, has_switch, has_error) = (

@@ -29,7 +29,7 @@ class LogRecovery(NamedTuple):
 
 
 def default_out(path: Path) -> Path:
-    """Name the result of recovering `path`."""
+    """Return the path of the result of recovering `path`, such as run.recovered.mcap."""
     return path.with_name(f"{path.stem}.{RECOVERED}{path.suffix}")
 
 

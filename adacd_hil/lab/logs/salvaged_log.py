@@ -70,7 +70,7 @@ class SalvagedLog:
         self.losses.missing_parts = [*(part.name for part in missing), *foreign]
 
     def _is_foreign(self, item: Metadata, is_vouched: bool) -> bool:
-        """Tell whether a part is of another run: one damaged entry doesn't make it so."""
+        """Return whether metadata show that a part is of another run; one entry that differs may be damaged."""
         if item.name != RUN_METADATA:
             return False
         mine, theirs = (

@@ -34,7 +34,7 @@ _LONGEST_STEM = 60
 """Letters of the name of a file, so that it has room in 255 bytes."""
 
 _HEADS = {"csv": b"t_ns,", "parquet": b"PAR1"}
-"""How the tables begin that are made here."""
+"""First bytes of the tables that this module writes."""
 
 Columns = Mapping[str, Any]
 """Columns of a table by name, of equal length: arrays or lists."""
@@ -43,7 +43,7 @@ AddRows = Callable[[Columns], None]
 
 
 def series_columns(series: Series, epoch_ns: int) -> dict[str, Any]:
-    """Make the columns of a topic."""
+    """Return the columns of a topic's table; epoch_ns: offset of the file's times from t_ns."""
     columns: dict[str, Any] = {
         "t_ns": series.t_ns,
         "cycle_t_ns": series.records["publish_time"].astype(np.int64) - epoch_ns,
@@ -58,13 +58,13 @@ def series_columns(series: Series, epoch_ns: int) -> dict[str, Any]:
 
 
 def event_columns(events: Iterable[LoggedEvent]) -> dict[str, Any]:
-    """Make the columns of /events."""
+    """Return the columns of the table of /events."""
     rows = [(t_ns, *event) for t_ns, event in events]
     return {name: [row[place] for row in rows] for place, name in enumerate(("t_ns", "level", "name", "message"))}
 
 
 def frame_columns(frames: NDArray[Any], decoder: DbcDecoder) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Decode frames of RECORDED_FRAME_DTYPE by a DBC: (message, columns) of each one that occurs.
+    """Decode frames of RECORDED_FRAME_DTYPE by a DBC; yield name and columns of each message that occurs.
 
     A signal that a frame lacks, because it is short or multiplexed, is NaN.
     """
@@ -91,9 +91,12 @@ class Tables:
     """Files of tables in one folder, each begun when its first rows come; they appear when all are whole."""
 
     def __init__(self, folder: Path, kind: str, metadata: Mapping[str, str]) -> None:
-        """Make the folder. `metadata` goes into Parquet files. Raises LogError if that fails, or pyarrow is missing."""
+        """Make the folder for tables of a kind, "csv" or "parquet"; `metadata` goes into Parquet files.
+
+        Raises LogError if that fails, or if pyarrow is missing.
+        """
         self.rows: dict[Path, int] = {}
-        """How many rows each file has."""
+        """Number of rows of each file."""
         self._folder = folder
         self._kind = kind
         self._metadata = dict(metadata)
@@ -106,7 +109,7 @@ class Tables:
             folder.mkdir(parents=True, exist_ok=True)
 
     def add_rows(self, topic: str, columns: Columns) -> None:
-        """Add rows to the table of a topic; without rows, make an empty table. Raises LogError."""
+        """Add rows to a topic's table, which the first call makes, even without rows. Raises LogError."""
         path = self._paths.get(topic) or self._path(topic)
         with failing_as(f"{path} can't be written"):
             if topic not in self._tables:
@@ -123,7 +126,7 @@ class Tables:
         self.rows[path] += len(columns["t_ns"])
 
     def _path(self, topic: str) -> Path:
-        """Name a file for one topic only, even if the names of other topics give the same file name."""
+        """Return a file for one topic only, even if the names of other topics give the same file name."""
         stem = re.sub(r"[^\w.-]", "_", topic.strip("/"))[:_LONGEST_STEM] or "_"
         stems = itertools.chain((stem,), (f"{stem}_{number}" for number in itertools.count(2)))
         paths = (self._folder / f"{stem}.{self._kind}" for stem in stems)
@@ -213,7 +216,7 @@ def export_tables(
 def choose_topics(
     topics: Collection[str], wanted: Collection[str], raw: Collection[str] = (), owner: str = "the log"
 ) -> list[str]:
-    """Choose topics by names or patterns. Raises LogError for one that fits no topic, with the nearest.
+    """Return the topics that fit names or patterns; wanted empty: all. Raises LogError for one that fits no topic.
 
     raw: topics of frames, of which no table is made. owner: the source of the topics, for the error.
     """
@@ -284,7 +287,7 @@ def _export_frames(
 
 
 def _topics(path: Path) -> list[str]:
-    """List the topics that an MCAP file defines before its first messages. Raises LogError for any other file."""
+    """Return the topics that an MCAP file defines before its first messages. Raises LogError for any other file."""
     stream = LogStream(path, is_ahead=False)
     next(iter(stream), None)
     return list(stream.topics)

@@ -56,7 +56,7 @@ class RunGatherer:
         self._state = int(SchemeState.INIT)  # of the last cycle so far
 
     def add_times(self, timing: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
-        """Take the times of the next cycles, and the states of the same cycles (k,)."""
+        """Gather the times of the next cycles, and the states of the same cycles (k,)."""
         self.timing.add_columns(timing, find_reactions(timing, cycle, state, self._state))
         self.data.add_columns(timing, cycle, state)
         if state.size:
@@ -64,7 +64,7 @@ class RunGatherer:
 
 
 def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
-    """Compute all metrics of a run.
+    """Return all metrics of a run.
 
     gathered: the sums over all cycles; None: the run has all of its cycles.
     """
@@ -115,7 +115,7 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
 
 
 def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, tuple[float | None, float]]]:
-    """Give true and identified parameters at the end of each adaptation."""
+    """Return each parameter's true and identified value at the end of each adaptation, by the adaptation's label."""
     found = {}
     for section in sections:
         if section.kind != "adaptation":
@@ -130,7 +130,7 @@ def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, 
 
 
 def true_parameters(run: Run, cycle: int) -> dict[str, float]:
-    """Give the true parameters in a cycle by name; empty without the truth."""
+    """Return the true parameters in a cycle by name; empty without the truth."""
     row = None if run.truth is None else run.truth.model_row(cycle)
     if run.truth is None or row is None:
         return {}
@@ -138,7 +138,7 @@ def true_parameters(run: Run, cycle: int) -> dict[str, float]:
 
 
 def _payloads(run: Run, sections: tuple[Section, ...]) -> dict[str, float | None]:
-    """Give the true payload at the end of each adaptation, kg."""
+    """Return the true payload at the end of each adaptation, kg, by label; None without the truth."""
     payloads: dict[str, float | None] = {}
     time_s = run.time_s()
     for section in sections:
@@ -154,7 +154,7 @@ def _payload_at(run: Run, cycle: int) -> float | None:
 
 
 def _cycle_statistics(run: Run, count: int) -> CycleStatistics:
-    """Give the statistics of all cycles, `count` of them, those before motion start included."""
+    """Return the statistics of all cycles, those before motion start included; count: of these cycles."""
     return CycleStatistics(
         count=count,
         duration_s=float((run.t_ns[-1] - run.t_ns[0]) * 1e-9) if run.t_ns.size else 0.0,
@@ -166,7 +166,7 @@ def _cycle_statistics(run: Run, count: int) -> CycleStatistics:
 def list_contacts(
     run: Run, sections: tuple[Section, ...], detections: tuple[Detection, ...], score: Score
 ) -> tuple[ReportedContact, ...]:
-    """List the true contacts with the detection that found each; without the truth the detections."""
+    """Return the true contacts with the detection that found each; without the truth, the detections."""
     if run.truth is None:
         return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, run.first_contact))
     raised = {detection.t_ns: detection for detection in detections}
@@ -177,7 +177,7 @@ def list_contacts(
 
 
 def _reported(run: Run, detection: Detection | None) -> dict[str, Any]:
-    """Give the fields of a contact that the reports of its detection have."""
+    """Return those fields of a contact, by name, that the reports of its detection have; {} without a detection."""
     if detection is None:
         return {}
     said: dict[str, Any] = {"detected_s": (detection.t_ns - run.zero_ns) * 1e-9}
@@ -195,7 +195,7 @@ def _reported(run: Run, detection: Detection | None) -> dict[str, Any]:
 
 
 def _told(report: ContactReport) -> dict[str, Any]:
-    """Give the fields that only the certified scheme has."""
+    """Return those fields of a contact that only the certified scheme reports."""
     return {
         "level": report.level.name,
         "kind": report.kind.name,
@@ -217,7 +217,7 @@ def _finite(value: float) -> float | None:
 
 
 def _state_at(run: Run, time_s: float) -> SchemeState:
-    """Give the state in the cycle before a time."""
+    """Return the state in the cycle before a time."""
     return SchemeState(run.state[max(row_at(run, time_s) - 1, 0)])
 
 
@@ -273,7 +273,7 @@ def _contact(
 
 
 def _touches(run: Run, from_s: float, until_s: float) -> tuple[Vector, Cycles]:
-    """Give the true torque (k, 2) and the touched link (k,) of all contacts between two times.
+    """Return the true torque (k, 2) and the touched link (k,) of all cycles with a contact between two times.
 
     A second person who joins is in the report of the contact before.
     """
@@ -285,12 +285,16 @@ def _touches(run: Run, from_s: float, until_s: float) -> tuple[Vector, Cycles]:
 
 
 def _window_s(run: Run) -> float:
-    """Give how long after the detection a report is made final."""
+    """Return the time from a detection to the final report of its contact, s."""
     return run.settings.detector.isolation_window_s if run.certified is None else KIND_S
 
 
 def _is_direction_right(direction: tuple[int, int] | None, impulse: Vector) -> bool | None:
-    """Tell whether every joint with a direction was pushed that way, and one at least has a direction."""
+    """Return whether every joint with a direction was pushed that way, and at least one has a direction.
+
+    direction: reported sign of each joint, 0: none; None: not reported, and so is the result. impulse (2,): its sign is
+    the true direction.
+    """
     if direction is None:
         return None
     told = [joint for joint in range(JOINTS) if direction[joint]]
@@ -334,7 +338,10 @@ class TimingGatherer:
         self._reactions: Distribution | None = None
 
     def add_columns(self, columns: CycleColumns, reactions: NDArray[np.bool_] | None = None) -> None:
-        """Add the next cycles. reactions: those in which the state becomes REACT (n,); None without states."""
+        """Gather times, queues, data ages and counts of the next cycles.
+
+        reactions: those in which the state becomes REACT (n,); None without states.
+        """
         self._cycles += len(columns)
         for quantity in QUANTITIES:
             self._add_times(quantity, columns)
@@ -391,7 +398,7 @@ class TimingGatherer:
 
 
 def collect_evidence(columns: CycleColumns, period_us: float, is_modelled: bool) -> TimingEvidence:
-    """Sum up the columns of a log that has no states."""
+    """Return the statistics of the times in the columns of a log that has no states."""
     gatherer = TimingGatherer(period_us, is_modelled)
     gatherer.add_columns(columns)
     return gatherer.evidence()
@@ -400,7 +407,7 @@ def collect_evidence(columns: CycleColumns, period_us: float, is_modelled: bool)
 def find_reactions(
     columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8], before: int = SchemeState.INIT
 ) -> NDArray[np.bool_] | None:
-    """Mark the cycles of `columns` in which the state becomes REACT; cycle, state: those of /scheme (k,).
+    """Return for each cycle of `columns` whether the state becomes REACT; cycle, state: those of /scheme (k,).
 
     before: the state in the cycle before the first. Returns None for a log that does not number its cycles.
     """

@@ -30,7 +30,7 @@ class LogHistogram(NamedTuple):
     above: int
 
     def joined(self, other: "LogHistogram") -> "LogHistogram":
-        """Add the counts of another one with the same bins."""
+        """Return the sum of this histogram and another one with the same bins."""
         return LogHistogram(self.edges, self.counts + other.counts, self.below + other.below, self.above + other.above)
 
     def trimmed(self) -> "LogHistogram":
@@ -41,14 +41,17 @@ class LogHistogram(NamedTuple):
 
 
 def log_histogram(values: Values) -> LogHistogram:
-    """Count values in logarithmic bins from 1 on; a value on an edge belongs to the upper bin."""
+    """Return a histogram of values in logarithmic bins from 1 on; a value on an edge belongs to the upper bin."""
     edges = np.logspace(0.0, DECADES, BINS_PER_DECADE * DECADES + 1)
     places = np.bincount(np.searchsorted(edges, values, side="right"), minlength=edges.size + 1)
     return LogHistogram(edges, places[1:-1], int(places[0]), int(places[-1]))
 
 
 def doubling_bins(values: Values, first: float, count: int) -> list[tuple[float, int]]:
-    """Count values below first, 2 first, 4 first, …; the last bin has no upper bound (inf). Trailing empty bins go."""
+    """Return upper bound and number of values of each bin: below first, 2 first, 4 first, …; the last bound is inf.
+
+    count: largest number of bins. Empty bins at the end are left out.
+    """
     bounds = [first * 2.0**power for power in range(count - 1)] + [float("inf")]
     places = np.searchsorted(bounds, values, side="right")
     counts = np.bincount(places, minlength=count)
@@ -59,7 +62,7 @@ def doubling_bins(values: Values, first: float, count: int) -> list[tuple[float,
 
 
 def bar_chart(labels: Sequence[str], counts: Sequence[int]) -> list[str]:
-    """Draw one line per bin: label, bar, count, share. A bin that isn't empty has a bar."""
+    """Return one line of text per bin: label, bar, count, share. A bin that isn't empty has a bar."""
     total, largest = sum(counts), max(counts, default=0)
     width = max((len(label) for label in labels), default=0)
     lines = []

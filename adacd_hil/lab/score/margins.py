@@ -44,9 +44,9 @@ SETTLING_TIME_CONSTANTS = 10.0
 
 
 def larger(largest: Vector | None, values: Vector) -> Vector | None:
-    """Return the larger of the sizes of `values` (k, …) and the largest of each so far (…).
+    """Return, element by element, the larger of `largest` (…) and all sizes |values| (k, …).
 
-    None before the first value. NaN stays.
+    largest: of the values so far; None before the first. NaN stays.
     """
     if values.shape[0] == 0:
         return largest
@@ -64,7 +64,10 @@ class BesideGatherer:
         self._largest: dict[str, Vector | None] = {}
 
     def add_stream(self, piece: Run, outline: Run, sections: Sequence[Section], free: Mask) -> None:
-        """Take in the next cycles (n,); free: those free of contact (n,)."""
+        """Gather the paper's scheme's results in the next cycles (n,) of a run.
+
+        piece: these cycles. outline: the run, with all that has happened so far. free (n,): cycles free of contact.
+        """
         stream, time_s, end_s = piece.beside, piece.time_s(), float(outline.time_s()[-1])
         assert stream is not None
         armed = stream.is_armed & ~_parked(time_s, sections, end_s)
@@ -94,7 +97,7 @@ class BesideGatherer:
                 self._largest[section.label] = larger(self._largest.get(section.label), values)
 
     def _contacts(self, run: Run, sections: Sequence[Section], since_s: float = -np.inf) -> list[TrueContact]:
-        """Place the true contacts that end since a time on the clock of a run, as the paper's scheme has them."""
+        """Return the true contacts that end at `since_s` or later, on a run's clock, for the paper's scheme."""
         assert run.beside is not None
         time_s = run.time_s()
         armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
@@ -106,7 +109,7 @@ class BesideGatherer:
         ]
 
     def beside(self, run: Run, sections: Sequence[Section]) -> Beside:
-        """Sum up all cycles; run: the outline of all of them."""
+        """Return the results of all cycles; run: the outline of all of them."""
         score = self._judge.score(self._contacts(run, sections))
         has_truth = run.truth is not None
         false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
@@ -139,7 +142,10 @@ def _left_s(adaptation: Section, sections: Sequence[Section]) -> float:
 
 
 def _parked(time_s: Vector, sections: Sequence[Section], end_s: float) -> Mask:
-    """Mark the cycles at such times (n,) in which the payload is changed. end_s: when the run ends."""
+    """Return for each cycle at the times `time_s` (n,) whether the payload is being changed.
+
+    end_s: when the run ends.
+    """
     parked = np.zeros(time_s.size, dtype=np.bool_)
     for section in sections:
         if section.kind == "payload":
@@ -148,7 +154,10 @@ def _parked(time_s: Vector, sections: Sequence[Section], end_s: float) -> Mask:
 
 
 def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouched) -> CertifiedEvidence | None:
-    """Judge a run of the certified scheme; None of the paper's. untouched: of all its cycles."""
+    """Return tests, estimates, margins and certificates of a run; None for the paper's scheme.
+
+    untouched: the sums over all its cycles free of contact.
+    """
     stream = run.certified
     if stream is None:
         return None
@@ -169,7 +178,10 @@ def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouch
 
 
 def last_row(run: Run, section: Section) -> int:
-    """Return the row with an adaptation's result: the next section's first cycle, which still learns."""
+    """Return the row with an adaptation's result: the next section's first cycle, which still learns.
+
+    If the run ended or failed in the adaptation, its own last cycle.
+    """
     time_s = run.time_s()
     end = int(rows_of(time_s, section, float(time_s[-1])).stop)
     return end - 1 + int(section.is_complete)
@@ -205,7 +217,7 @@ class MarginGatherer:
         self._thresholds = [[Distribution() for _ in range(JOINTS)] for _ in self._channels]
 
     def add_residuals(self, tau_ext: Vector, threshold: Vector) -> None:
-        """Take in cycles free of contact: residuals and thresholds (k, channels, 2), k > 0."""
+        """Gather residuals and thresholds (k, channels, 2), k > 0, of cycles free of contact."""
         self._residual = larger(self._residual, tau_ext)
         self._share = larger(self._share, np.abs(tau_ext) / threshold)
         for place, distributions in enumerate(self._thresholds):
@@ -213,7 +225,7 @@ class MarginGatherer:
                 distribution.add_values(threshold[:, place, joint])
 
     def margins(self) -> tuple[ChannelMargin, ...]:
-        """Sum up each channel; return () before the first cycle."""
+        """Return the margins of each channel over all cycles so far; () before the first cycle."""
         if self._residual is None or self._share is None:
             return ()
         found = []
@@ -251,7 +263,10 @@ class UntouchedGatherer:
         self._beside: BesideGatherer | None = None
 
     def add_untouched(self, piece: Run, outline: Run) -> None:
-        """Add the cycles without a touch to the residuals, margins and pushes of their sections."""
+        """Gather the cycles free of contact in a piece of a run: residuals, margins and pushes of their sections.
+
+        outline: the run, with all that has happened so far.
+        """
         if piece.cycle.size == 0:
             return
         time_s, end_s = piece.time_s(), float(outline.time_s()[-1])
@@ -275,7 +290,7 @@ class UntouchedGatherer:
             self._beside.add_stream(piece, outline, sections, free)
 
     def _free(self, piece: Run, outline: Run) -> Mask:
-        """Mark the cycles (n,) of a piece that are free of contact."""
+        """Return for each cycle (n,) of a piece whether it is free of contact."""
         settling_ns = round(SETTLING_TIME_CONSTANTS / outline.a_rad_s * 1e9)
         t_ns, truth, finish = piece.t_ns, outline.truth, outline.finish_cycle
         free = np.ones(t_ns.size, dtype=np.bool_) if finish is None else piece.cycle < finish
@@ -320,7 +335,7 @@ class UntouchedGatherer:
             self._push.add_residuals(piece.certified.tau_ext[rows][armed], threshold[armed])
 
     def _close(self, label: str) -> None:
-        """Sum up a section that is complete: its values need not be kept."""
+        """Replace a section's margins by their sums, when the section is complete: its values need not be kept."""
         if label in self._margins:
             self._done[label] = self._margins.pop(label).margins()
 
@@ -330,7 +345,7 @@ class UntouchedGatherer:
         self._promoted = float(promotions[-1])
 
     def untouched(self, run: Run) -> Untouched:
-        """Sum up all cycles; run: the outline of all of them."""
+        """Return the sums over all cycles free of contact; run: the outline of all cycles."""
         for label in list(self._margins):
             self._close(label)
         sections = split_sections(run)

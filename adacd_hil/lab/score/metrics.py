@@ -189,7 +189,10 @@ class CertifiedEvidence:
 
 
 def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
-    """Return the certificates that events, by name and message, have as numbers; unreadable ones are left out."""
+    """Yield the certificates in events of the name CERTIFIED_MODEL; leave out unreadable ones.
+
+    told: names and messages.
+    """
     from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
 
     for name, message in told:

@@ -33,12 +33,12 @@ STATE_WORDS: Final = {
 
 
 def state_words(name: str | None) -> str:
-    """Write a state that a log names."""
+    """Return the words for a state that a log names; a dash for None."""
     return NONE if name is None else STATE_WORDS[SchemeState[name]]
 
 
 def number_text(value: float | None, digits: int, unit: str = "") -> str:
-    """Write a number with a fixed count of decimals and a true minus sign; a dash for None."""
+    """Return a number as text, with a fixed count of decimals and a true minus sign; a dash for None."""
     if value is None or not math.isfinite(value):
         return NONE
     text = f"{value:z.{digits}f}".replace("-", "−")
@@ -46,34 +46,34 @@ def number_text(value: float | None, digits: int, unit: str = "") -> str:
 
 
 def pair_text(values: Sequence[float] | None, digits: int) -> str:
-    """Write the values of both joints; a dash for None."""
+    """Return the values of both joints as text; a dash for None."""
     return NONE if values is None else " / ".join(number_text(value, digits) for value in values)
 
 
 def yes_text(value: bool | None) -> str:
-    """Write yes or no; a dash for None."""
+    """Return "yes" or "no"; a dash for None."""
     return NONE if value is None else "yes" if value else "no"
 
 
 def signs_text(direction: tuple[int, int] | None) -> str:
-    """Write the signs of both joints; a dash for None."""
+    """Return the signs of both joints as text; a dash for None."""
     return NONE if direction is None else " / ".join({1: "+", -1: "−", 0: "0"}[sign] for sign in direction)
 
 
 def signed_text(value: float) -> str:
-    """Write a number with its sign and one decimal."""
+    """Return a number as text, with its sign and one decimal."""
     return f"{value:+.1f}".replace("-", "−")
 
 
 def scaled(value: float | None, factor: float) -> float | None:
-    """Multiply a value, if there is one."""
+    """Return factor * value; None for None."""
     return None if value is None else factor * value
 
 
 def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: str) -> str:
-    """Write a value with its standard deviation, with as many more decimals as a small one needs not to read as none.
+    """Return a value with its standard deviation as text; a dash where either is not known.
 
-    A dash where either is not known.
+    A standard deviation that would read as 0 gets up to three more decimals.
     """
     if value is None or sigma is None:
         return NONE
@@ -83,7 +83,7 @@ def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: 
 
 
 def score_sentence(score: Score) -> str:
-    """Count the contacts found and missed, the longest delay, and the false alarms."""
+    """Return a clause with the contacts found and missed, the longest delay, and the false alarms."""
     armed = [contact for contact in score.contacts if contact.is_armed]
     delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
     within = f" within {max(delays_ms):.0f} ms" if delays_ms else ""
@@ -104,7 +104,7 @@ def score_sentence(score: Score) -> str:
 
 
 def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
-    """Write how many false alarms there were, and an upper bound of their rate, if the time is long enough."""
+    """Return a clause with the number of false alarms, and an upper bound of their rate if the time is long enough."""
     count = number_of(false_alarms, "false alarm") if false_alarms else "No false alarms"
     if bound_per_h > _TELLING_PER_H:
         return f"{count} in that time, which is too short to tell a rate by counting"
@@ -112,7 +112,7 @@ def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
 
 
 def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """Return median, 90th percentile and largest."""
+    """Return median, 90th percentile and largest of delays; None for each without delays."""
     if not delays_ms:
         return None, None, None
     median, p90, largest = np.quantile(delays_ms, (0.5, 0.9, 1.0)).tolist()
@@ -120,25 +120,25 @@ def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | Non
 
 
 def delays_phrase(delays_ms: Sequence[float]) -> str:
-    """Write the distribution of delays; "" without delays."""
+    """Return the distribution of delays as text; "" without delays."""
     if not delays_ms:
         return ""
     return ", after {:.1f} ms (median), {:.1f} (p90), {:.1f} (largest)".format(*delay_figures(delays_ms))
 
 
 def share_phrase(delays_ms: Sequence[float], contacts: int, bounds: tuple[float, float]) -> str:
-    """Write how many contacts were found, the bounds of their share, and their delays."""
+    """Return as text how many contacts were found, the bounds of their share, and their delays."""
     found = found_text(len(delays_ms), contacts)
     return f"{found} contacts found ({100 * bounds[0]:.0f} to {100 * bounds[1]:.0f} %){delays_phrase(delays_ms)}"
 
 
 def rate_phrase(alarms: int, hours: float, bound_per_h: float) -> str:
-    """Write how many false alarms came in how many hours."""
+    """Return as text how many false alarms came in how many hours, and the upper bound of their rate."""
     return f"{alarms} false alarms in {hours:.4f} h, 95 % bound {bound_per_h:.3g} per hour"
 
 
 def percent_text(share: float) -> str:
-    """Write a share with two digits that count."""
+    """Return a share (0…1) in percent, with two digits that count."""
     if 0.0 < share < 5e-5:
         return "less than 0.01 %"
     return f"{100.0 * share:.2g} %" if share < 0.995 else f"{100.0 * share:.0f} %"

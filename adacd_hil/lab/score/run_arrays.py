@@ -82,18 +82,18 @@ class CycleColumns:
         return name in self.columns
 
     def rows(self, rows: Cycles) -> "CycleColumns":
-        """Return some of the cycles."""
+        """Return some of the cycles; rows: their indices."""
         return CycleColumns(self.t_ns[rows], {name: column[rows] for name, column in self.columns.items()})
 
     @staticmethod
     def joined(parts: "Sequence[CycleColumns]") -> "CycleColumns":
-        """Put parts with the same columns one after the other."""
+        """Return parts with the same columns, one after the other, as one."""
         names = parts[0].columns
         columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in names}
         return CycleColumns(np.concatenate([part.t_ns for part in parts]), columns)
 
     def times_us(self, quantity: Quantity) -> Vector | None:
-        """Return a time of the cycles that have it, µs; None where the log does not have it."""
+        """Return a time of the cycles that have it, µs; None if the log lacks it."""
         if quantity.column not in self:
             return None
         values_ns = self[quantity.column]
@@ -102,7 +102,7 @@ class CycleColumns:
         return np.asarray(values_ns / 1000.0, dtype=np.float64)
 
     def steps(self, name: str, before: int = 0) -> Cycles:
-        """Return the increments of a running count (n,); a count that began anew begins at 0.
+        """Return the increments (n,) of a count that runs on from cycle to cycle; a count that began anew begins at 0.
 
         before: the count in the cycle before the first.
         """
@@ -112,13 +112,13 @@ class CycleColumns:
 
 
 def columns_of_series(series: Series) -> CycleColumns:
-    """Take the columns out of a log's /cycle; one of an older version lacks some."""
+    """Return the columns of a log's /cycle; one of an older version lacks some."""
     names = [name for name in CycleRecord._fields if name in series.fields]
     return CycleColumns(series.t_ns, {name: series[name].astype(np.int64) for name in names})
 
 
 def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> CycleColumns:
-    """Make the columns of records at times t_ns."""
+    """Return the columns of records, one per cycle, at times t_ns."""
     table = np.array(records, dtype=np.int64).reshape(len(records), len(CycleRecord._fields))
     columns = {name: table[:, place].copy() for place, name in enumerate(CycleRecord._fields)}
     return CycleColumns(np.array(t_ns, dtype=np.int64), columns)
@@ -139,7 +139,7 @@ class AttemptBegins:
         self._was_beginning: bool | None = None  # None before the first cycle
 
     def add_cycles(self, cycle: NDArray[Any], state: NDArray[np.uint8]) -> None:
-        """Take in the next cycles (k,), k > 0."""
+        """Look for beginnings in the next cycles (k,), k > 0; keep them in `begins`."""
         is_beginning = np.isin(state, _BEGINNING)
         if self._was_beginning is None and not is_beginning[0]:
             self._begins.append(0)
@@ -319,20 +319,20 @@ _KINDS: Final = {
 
 
 def section_label(index: int) -> str:
-    """Name a section by its place: A to Z, then AA, AB and so on."""
+    """Return the label of a section by its place, from 0: A to Z, then AA, AB and so on."""
     letter = chr(ord("A") + index % 26)
     return letter if index < 26 else section_label(index // 26 - 1) + letter
 
 
 def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return for each cycle (n,) the state, where it is REACT or STOPPED the one that was interrupted."""
+    """Return the state of each cycle (n,); for REACT and STOPPED, the state that was interrupted."""
     rows = np.arange(state.size)
     own = np.maximum.accumulate(np.where(is_interrupted(state), -1, rows))
     return np.where(own < 0, np.uint8(SchemeState.MONITOR), state[np.maximum(own, 0)])
 
 
 def split_sections(run: Run) -> tuple[Section, ...]:
-    """Split a run into lettered sections; cycles before the first ADAPT belong to no section."""
+    """Return the lettered sections of a run; cycles before the first ADAPT belong to no section."""
     if run.state.size == 0:
         return ()
     kinds = np.array([_KINDS.get(SchemeState(value), "") for value in range(len(SchemeState))])[origins(run.state)]
@@ -351,12 +351,12 @@ def split_sections(run: Run) -> tuple[Section, ...]:
 
 
 def section_at(sections: Iterable[Section], time_s: float) -> str | None:
-    """Name the section that a time belongs to, None before the first."""
+    """Return the label of the section that a time belongs to; None if there is none."""
     return next((section.label for section in sections if section.start_s <= time_s <= section.end_s), None)
 
 
 def rows_of(time_s: Vector, section: Section, end_s: float) -> slice:
-    """Return the rows of a section among cycles at such times (n,), which ascend.
+    """Return the rows of a section among cycles at the ascending times `time_s` (n,).
 
     end_s: when the run ends. Its last cycle belongs to the last section; the first one of the next section to that.
     """
@@ -373,8 +373,8 @@ def is_realtime(run: Run) -> bool:
 def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
     """Return the truth on the host's cycles; None where the emulator never cycled.
 
-    begins: first cycle of each attempt of the run so far; last: of the run; time_s: of the rows (m,). Rows of later
-    attempts, and those after the host's last cycle, are left out: the arm goes on when the host has died.
+    begins: first cycle of each attempt of the run so far; last: the host's last cycle; time_s: of the rows (m,). Rows
+    of later attempts, and those after the host's last cycle, are left out: the arm goes on when the host has died.
     """
     rows = table.rows
     assert rows.attempt is not None
@@ -396,7 +396,7 @@ def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> 
 
 
 def truth_rows(truth: Truth, rows: NDArray[np.bool_]) -> Truth:
-    """Return some rows of a truth, with all of its payloads and parameters."""
+    """Return a truth with some of its rows, and with all of its payloads and parameters. rows (m,): a mask."""
     names = ("cycle", "tau_ext", "contact_link", "contact_index", "force_N", "time_s", "attempt")
     columns = {name: getattr(truth, name) for name in names}
     return replace(truth, **{name: column[rows] for name, column in columns.items() if column is not None})

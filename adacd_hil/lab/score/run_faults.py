@@ -28,12 +28,12 @@ _RUN = "run"
 """Name of the events that end an attempt without a fault: no boot-up, a bus that failed."""
 _SUPERVISOR = "supervisor"
 _NEAR_NS = 2_000_000
-"""How far the event of a fault may lie from its cycle's time."""
+"""Largest time between a fault's event and its cycle."""
 _MOST_LETTERS = 300
 
 
 def find_faults(run: Run) -> tuple[Fault, ...]:
-    """List the faults of a run; it has the cycles in which the state changes."""
+    """Return the faults of a run, in order; the run has the cycles in which the state changes."""
     is_fault = run.state == SchemeState.FAULT
     before = np.concatenate(([False], is_fault[:-1]))
     time_s = run.time_s()
@@ -47,7 +47,7 @@ def find_faults(run: Run) -> tuple[Fault, ...]:
 
 
 def _cause(run: Run, t_ns: int) -> str:
-    """Find the supervisor's words for a fault, without state and reason."""
+    """Return the supervisor's words for the fault at a time, without state and reason; "" without an event of it."""
     for logged in run.events:
         event = logged.event
         if event.name == _SUPERVISOR and event.level == "error" and abs(logged.t_ns - t_ns) <= _NEAR_NS:
@@ -56,7 +56,7 @@ def _cause(run: Run, t_ns: int) -> str:
 
 
 def find_causes(run: Run) -> tuple[str, ...]:
-    """List the causes that ended attempts, or the log, without a fault, each once."""
+    """Return the logged causes that ended attempts, or the log, without a fault, each once."""
     said = [
         logged.event.message for logged in run.events if logged.event.name == _RUN and logged.event.level == "error"
     ]
@@ -85,7 +85,7 @@ class CyclicDataGatherer:
         self._present = (0, 0, -1)  # of the window under way: cycles, incomplete ones, the last cycle's number
 
     def add_columns(self, columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
-        """Add the next cycles. cycle, state: those of /scheme (k,)."""
+        """Count incomplete and aged data in the next cycles. cycle, state: those of /scheme (k,)."""
         is_powered = np.isin(state, _POWERED)
         self._cycles += int(np.count_nonzero(is_powered))
         if "cycle" not in columns:
@@ -102,7 +102,7 @@ class CyclicDataGatherer:
             self._add_windows(powered["cycle"], powered["frames_missing"] > 0)
 
     def _add_windows(self, cycle: Cycles, is_incomplete: Mask) -> None:
-        """Judge the windows of consecutive cycles that are whole."""
+        """Count incomplete cycles in windows of one second, and keep the worst window; a gap in `cycle` ends one."""
         edges = np.flatnonzero(np.diff(cycle, prepend=self._present[2]) != 1)
         counted = np.concatenate(([0], np.cumsum(is_incomplete)))
         bounds = np.unique(np.concatenate(([0], edges, [len(cycle)]))).tolist()
@@ -168,7 +168,7 @@ def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShar
 
 
 def _excesses(worst: float | None, devices: dict[str, DeviceShares], limits: DataSettings) -> list[str]:
-    """List the shares that were over their limit in some second."""
+    """Return a line for each share that was over its limit in some second."""
     judged = [("incomplete cycles", worst, limits.incomplete_share)]
     for name, shares in devices.items():
         judged.append((f"no new data of {name}", shares.worst_no_new_data, limits.no_new_data_share))

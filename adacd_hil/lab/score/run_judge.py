@@ -18,7 +18,7 @@ from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge
 
 
 def find_detections(run: Run) -> tuple[Detection, ...]:
-    """Find the alarms of a run and the reports that belong to them by their cycle."""
+    """Return the alarms of a run, each with the reports that belong to it by their cycle."""
     rows = np.flatnonzero(enters_react(run.state[:-1], run.state[1:])) + 1
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
@@ -36,7 +36,7 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
 
 
 def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
-    """Find the true contacts of a run, with the times of their rows."""
+    """Return the true contacts of a run, with the times of their rows; () without the truth."""
     truth = run.truth
     if truth is None or run.cycle.size == 0:
         return ()
@@ -46,13 +46,16 @@ def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
 
 
 def contacts_of(run: Run) -> tuple[TrueContact, ...]:
-    """Find the true contacts of a run, on its clock, with the thresholds and the filter of its own scheme."""
+    """Return the true contacts of a run, on its clock, with the thresholds and the filter of its own scheme."""
     armed = run.state == SchemeState.MONITOR
     return tuple(placed_in(run, contact, run.a_rad_s, None, armed) for contact in timed_contacts(run))
 
 
 def placed_in(run: Run, contact: TrueContact, a_rad_s: float, threshold: Vector | None, armed: Mask) -> TrueContact:
-    """Return a contact on the clock of a run. threshold: None: that in force; armed (n,): where detection is armed."""
+    """Return a contact on the clock of a run, with the times in which it explains alarms.
+
+    a_rad_s, threshold (2,): filter and thresholds that do; None: those in force. armed (n,): where detection is armed.
+    """
     assert contact.time_s is not None
     ends_ns = [run.zero_ns + round(float(at_s) * 1e9) for at_s in contact.time_s[[0, -1]]]
     row = row_at(run, float(contact.time_s[0]))
@@ -61,14 +64,17 @@ def placed_in(run: Run, contact: TrueContact, a_rad_s: float, threshold: Vector 
 
 
 def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
-    """Return the closed-form delay of a torque step, t = -ln(1 - h / |tau|) / a; None if it never crosses."""
+    """Return the delay after which a torque step crosses a threshold behind a first-order low-pass; None: never.
+
+    Closed form: t = -ln(1 - h / |tau|) / a.
+    """
     if not abs(tau_ext_Nm) > threshold_Nm:
         return None
     return -math.log1p(-threshold_Nm / abs(tau_ext_Nm)) / a_rad_s
 
 
 def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float) -> float | None:
-    """Return the delay of a torque step behind two first-order low-passes; None if it never crosses.
+    """Return the delay after which a torque step crosses a threshold behind two first-order low-passes; None: never.
 
     The response rises steadily, so that bisection finds the crossing.
     """
@@ -92,7 +98,7 @@ class FilterChannel:
     threshold: Vector
 
     def step_delay_s(self, tau_ext: Vector) -> float | None:
-        """Return how long steps of each joint's torque (2,) take over the threshold, the faster joint; None: never."""
+        """Return how long a step of tau_ext (2,) takes to cross the threshold, at the faster joint; None: never."""
         delays_s = []
         for joint in range(JOINTS):
             tau, h = float(tau_ext[joint]), float(self.threshold[joint])
@@ -103,7 +109,7 @@ class FilterChannel:
         return min((delay_s for delay_s in delays_s if delay_s is not None), default=None)
 
     def respond(self, tau_ext: Vector, cycle: Cycles, period_s: float) -> Vector:
-        """Filter a true torque (n, 2), at rest at the first sample; see `filtered`."""
+        """Return the channel's output for a true torque (n, 2), at rest at the first sample; see `filtered`."""
         response = filtered(tau_ext, cycle, period_s, self.cutoff_rad_s)
         if self.smoothing_rad_s is None:
             return response
@@ -117,7 +123,7 @@ def threshold_in(run: Run, row: int) -> Vector:
 
 
 def row_at(run: Run, time_s: float) -> int:
-    """Return the first cycle's row that is not before a time; the last one after the end."""
+    """Return the row of the first cycle at a time or after it; the last row if there is none."""
     t_ns, zero_ns = run.t_ns, run.zero_ns
     row = bisect_left(range(len(t_ns)), time_s, key=lambda row: float((t_ns[row] - zero_ns) * 1e-9))
     return min(row, len(t_ns) - 1)
@@ -135,7 +141,10 @@ def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
 
 
 def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[Detection]) -> Score:
-    """Judge the alarms of a run's own scheme."""
+    """Return which contacts a run's own scheme detected, and its false alarms.
+
+    Alarms about the weight of a changed payload are left out, see `is_of_weight`.
+    """
     return judge(contacts, [detection for detection in detections if not is_of_weight(run, detection.row)])
 
 

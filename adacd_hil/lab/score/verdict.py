@@ -48,7 +48,7 @@ def list_findings(
     causes: tuple[str, ...],
     data: CyclicData,
 ) -> tuple[Finding, ...]:
-    """List the findings of a run. causes: of attempts that ended without a fault."""
+    """Return the findings of a run, failures first. causes: of attempts that ended without a fault."""
     if run.cycle.size == 0:
         cause = "; ".join(causes) or "the log does not say why"
         return (Finding(f"no cycle was run: {cause}", True),)
@@ -84,7 +84,7 @@ _HEADLINE_LETTERS: Final = 110
 
 
 def headlines(metrics: Metrics) -> list[str]:
-    """Give the findings as lines for a first screen, the bad ones first; a long one is cut, the log has all of it.
+    """Return the findings as lines for a first screen, the bad ones first; a long one is cut, the log has all of it.
 
     The paper's scheme beside, and cyclic data without a loss, are left to the tables.
     """
@@ -96,12 +96,12 @@ def headlines(metrics: Metrics) -> list[str]:
 
 
 def is_margin_below_1(evidence: CertifiedEvidence | None) -> bool:
-    """Tell whether some residual was over its threshold in a free cycle."""
+    """Return whether some residual was over its threshold in a cycle free of contact."""
     return evidence is not None and evidence.smallest_margin is not None and evidence.smallest_margin < 1.0
 
 
 def is_revoked(evidence: CertifiedEvidence | None) -> TypeGuard[CertifiedEvidence]:
-    """Tell whether some certificate was taken back."""
+    """Return whether some certificate was taken back."""
     return evidence is not None and bool(evidence.revoked)
 
 
@@ -138,14 +138,14 @@ def _beside_text(times_s: list[float | None]) -> str:
 
 
 def _summary(times_s: list[float | None], failed: str) -> str:
-    """Sum up many adaptations, of which some took their time: the shortest, the longest, and how many failed."""
+    """Return a phrase on many adaptations: the shortest and the longest time, and how many of them failed."""
     took_s = [time_s for time_s in times_s if time_s is not None]
     text = f"{min(took_s):.2f} to {max(took_s):.2f} s, {len(took_s)} times"
     return text if len(took_s) == len(times_s) else f"{text}, and {failed} {len(times_s) - len(took_s)} times"
 
 
 def begun_anew(sections: tuple[Section, ...]) -> frozenset[str]:
-    """Name the adaptations with which the arm began again after a fault, or after a broken attempt."""
+    """Return the labels of further adaptations that follow no payload change, but a fault or a broken attempt."""
     pairs = itertools.pairwise(sections)
     return frozenset(now.label for before, now in pairs if now.kind == "adaptation" and before.kind != "payload")
 
@@ -188,7 +188,7 @@ _ELSEWHERE = {
 
 
 def is_papers_experiment(run: Run) -> bool:
-    """Tell whether the emulator played the paper's experiment, with its arm; False on a real arm."""
+    """Return whether the emulator played the paper's experiment, with its arm; False on a real arm."""
     played = (run.metadata.get("scenario"), run.metadata.get("emulator_scenario"))
     arm, papers = run.settings.arm, _papers_arm(run.settings.arm.profile)
     return _EXPERIMENT in played and (arm.link_length_m, arm.cad_theta) == (papers.link_length_m, papers.cad_theta)
@@ -209,7 +209,10 @@ def compare_with_paper(
     payload_kg: dict[str, float | None],
     evidence: CertifiedEvidence | None,
 ) -> tuple[PaperRow, ...]:
-    """Set measured figures beside the paper's, where it is the same experiment."""
+    """Return a row per figure: measured, the paper's, and of the paper's scheme on the same stream.
+
+    For a run that is not the paper's experiment, the paper's figures are left out.
+    """
     settings = run.settings
     times_s = list(adaptation_s.values())
     detections = [section.label for section in sections if section.kind == "detection"]
@@ -281,7 +284,7 @@ def compare_with_paper(
 
 
 def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, ...]:
-    """Leave out the paper's numbers, and rows that are then empty, unless the run was the paper's experiment."""
+    """Return the rows, without the paper's numbers if the run was not the paper's experiment; drop rows then empty."""
     if is_papers_experiment(run):
         return tuple(rows)
     return tuple(
@@ -300,7 +303,7 @@ def _tests_text(times_s: list[float | None]) -> str:
 
 
 def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str, str, str]) -> tuple[str, ...]:
-    """Give the column of the paper's scheme on the same stream; same: payload and the CAD model's residuals."""
+    """Return the column of the paper's scheme on the same stream; same: payload and the CAD model's residuals."""
     if beside is None:
         return (NONE,) * 11
     times_s = list(beside.adaptation_s.values())
@@ -323,13 +326,13 @@ def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str
 
 
 def _threshold_text(evidence: CertifiedEvidence, detections: list[str]) -> str:
-    """Say where the thresholds of the slowest channel lie: the smallest and the largest median of a section."""
+    """Return the range of the slowest channel's thresholds as text: smallest and largest median of a section."""
     found = [h for label in detections for row in evidence.margins.get(label, ())[:1] for h in row.threshold_Nm]
     return f"{min(found):.3f} to {max(found):.3f} Nm" if found else NONE
 
 
 def _push_text(evidence: CertifiedEvidence) -> str:
-    """Give the smallest push that is found: median, and at the worst moment."""
+    """Return the smallest push that is found as text: its median, and at the worst moment."""
     if evidence.smallest_push is None:
         return NONE
     median, worst = (

@@ -89,16 +89,16 @@ def new_scratch(chain: Chain) -> Scratch:
 
 
 def all_columns(chain: Chain) -> Indices:
-    """Return the `place` of a regressor in theta_full: every parameter in its own column."""
+    """Return a `place` (10 n,) for regressors with all of theta_full: every parameter has its own column."""
     return np.arange(PER_LINK * chain.axis.shape[0], dtype=np.int64)
 
 
 @compiled
 def fill(chain: Chain, place: Indices, q: Vector, dq: Vector, scratch: Scratch, Y_p: Vector, Y_h: Vector) -> None:
-    """Fill the columns of the inertial parameters in Y_p and Y_h (n, p), friction left out.
+    """Fill Y_p and Y_h (n, p) of tau = d/dt (Y_p theta) + Y_h theta, in the columns of the inertial parameters.
 
-    place (10 n,): the column of each parameter of theta_full, or NOT_USED. Entries that are always zero are left as
-    they are.
+    Friction is left out. place (10 n,): the column of each parameter of theta_full, or NOT_USED. Entries that are
+    always zero are left as they are.
     """
     v, a, u, w, row = scratch.v, scratch.a, scratch.u, scratch.w, scratch.row
     _place_links(chain, q, scratch.E, scratch.r)
@@ -153,7 +153,10 @@ def fill_regressor(
 
 @compiled
 def add_form(u: Vector, x: Vector, scale: float, row: Vector) -> None:
-    """Add `scale` times the coefficients of the link's parameters in u' I x to row (10,)."""
+    """Add `scale` times the coefficients of a link's parameters in u' I x to row (10,), in place.
+
+    I: the link's spatial inertia. u, x (6,): motions, the angular part first.
+    """
     row[0] += scale * (u[3] * x[3] + u[4] * x[4] + u[5] * x[5])
     # first moment: u_v x x_w + x_v x u_w
     row[1] += scale * (u[4] * x[2] - u[5] * x[1] + x[4] * u[2] - x[5] * u[1])
@@ -179,7 +182,7 @@ def _put(row: Vector, place: Indices, k: int, target: Vector) -> None:
 
 @compiled
 def _place_links(chain: Chain, q: Vector, E: Vector, r: Vector) -> None:
-    """Fill E (n, 3, 3) and r (n, 3); Rodrigues' formula turns the joint's frame."""
+    """Fill E (n, 3, 3) and r (n, 3), the pose of each link in the link before, at the joint positions q (n,)."""
     for i in range(q.shape[0]):
         x, y, z = chain.axis[i, 0], chain.axis[i, 1], chain.axis[i, 2]
         angle = 0.0 if chain.is_prismatic[i] != 0.0 else q[i]
@@ -280,7 +283,7 @@ def mass_matrix(chain: Chain, q: Vector, theta_full: Vector) -> Vector:
 
 
 def regressor(chain: Chain, q: Vector, dq: Vector, ddq: Vector) -> Vector:
-    """Return W (n, 10 n) in theta_full, friction left out."""
+    """Return W (n, 10 n) of tau = W theta_full, friction left out."""
     place = all_columns(chain)
     W = np.zeros((q.shape[0], place.size))
     fill_regressor(chain, place, q, dq, ddq, new_scratch(chain), W)
@@ -305,11 +308,11 @@ class BaseParameters:
 
 
 def find_base(chain: Chain) -> BaseParameters:
-    """Find a smallest parameter set from the regressor at random states: QR with pivoting.
+    """Return a smallest set of parameters that determines the torque, from the regressor at random states.
 
-    A combination that shows in no W shows neither in Y_p nor in Y_h: its M, and with it C, is zero, and its g. The
-    states are the same at every call. Source: Gautier, Numerical calculation of the base inertial parameters of
-    robots, 1991.
+    By QR with pivoting. A combination that shows in no W shows neither in Y_p nor in Y_h: its M, and with it C, is
+    zero, and its g. The states are the same at every call. Source: Gautier, Numerical calculation of the base inertial
+    parameters of robots, 1991.
     """
     n = chain.axis.shape[0]
     random = np.random.default_rng(0)

@@ -122,14 +122,14 @@ class ArmModel:
         return (*self.base.names, *per_joint)
 
     def place_of(self, kind: str) -> slice:
-        """Return the parameters of one kind: "base", "F_v", "F_c", "offset" or, if the model has them, "rotor"."""
+        """Return where in theta one kind of parameters is: "base", "F_v", "F_c", "offset" or, with rotors, "rotor"."""
         first, n = self.base.columns.size, self.joints
         starts = {"F_v": first, "F_c": first + n, "offset": first + 2 * n, "rotor": first + 3 * n}
         return slice(0, first) if kind == "base" else slice(starts[kind], starts[kind] + n)
 
 
 def model_of(arm: Chain, has_rotors: bool = False) -> ArmModel:
-    """Find the columns of an arm; takes about 0.1 s for seven joints.
+    """Return the model of an arm: the parameters that its torque shows; takes about 0.1 s for seven joints.
 
     has_rotors: torques are those of geared motors, which turn their rotors too; a link-side sensor doesn't see them.
     """
@@ -171,7 +171,7 @@ def prior(
 def with_payload(
     model: ArmModel, estimate: ModelEstimate, mass_kg: float, at_m: tuple[float, float, float]
 ) -> ModelEstimate:
-    """Return the estimate after an unknown mass was fitted at a known place: one unknown, a rank-one increase of P.
+    """Return the estimate after an unknown mass was mounted at a known place: one unknown, a rank-one increase of P.
 
     mass_kg: standard deviation of the mass, from zero. at_m: in the frame of the last link.
     """
@@ -221,7 +221,10 @@ class OfflineDetection:
 
 
 def identify(model: ArmModel, record: Record, before: ModelEstimate, settings: OfflineSettings) -> ModelEstimate:
-    """Correct an estimate by a record of free motion. Raises ValueError if record and model differ in joints."""
+    """Return an estimate, corrected by a record of free motion. Raises ValueError if record and model differ in joints.
+
+    before: the estimate to correct; it stays as it is.
+    """
     theta_M = before.theta
     for has_velocity_noise in (False, True) if settings.velocity_noise_rad_s else (True,):
         theta, P = before.theta.copy(), before.P.copy()
@@ -273,13 +276,13 @@ def parameter_deviation(
 
 
 def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredTorque:
-    """Return torque and residual of a record as the fit sees them. Raises as `identify`."""
+    """Return torque and residual of a record behind the filter of the fit. Raises as `identify`."""
     trace = _trace(model, record, estimate, settings, estimate.theta)
     return FilteredTorque(trace.tau_f, -trace.tau_ext_hat, trace.unit)
 
 
 def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tuple[Vector, Vector]:
-    """Return the samples of a fit: regressor (m, n, p) and torque (m, n), filtered. Raises as `identify`."""
+    """Return the samples that a fit uses: regressor (m, n, p) and torque (m, n), filtered. Raises as `identify`."""
     count = len(record.q) // settings.fit_every
     shape = (count, model.joints, len(model.parameter_names))
     rows = np.zeros(shape), np.zeros(shape[:2])
@@ -304,7 +307,10 @@ def filtered_noise_Nm(settings: OfflineSettings) -> Vector:
 
 
 def certify(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> OfflineCertificate:
-    """Test a frozen estimate on a record of free motion that `identify` has not seen. Raises as `identify`."""
+    """Test a frozen estimate on a record of free motion that `identify` has not seen; return residuals and margins.
+
+    Raises ValueError if record and model differ in joints.
+    """
     trace = _trace(model, record, estimate, settings)
     residual = np.abs(trace.tau_ext_hat)
     mean_square = np.mean(residual**2, axis=0)
@@ -323,7 +329,10 @@ def detect(
     settings: OfflineSettings,
     lack_Nm: Vector | None = None,
 ) -> OfflineDetection:
-    """Find the contacts in a record. lack_Nm (n,): of `certify`, zero if not given. Raises as `identify`."""
+    """Return external torque, thresholds and contacts of a record. Raises as `identify`.
+
+    lack_Nm (n,): the model's lack, of `certify`; zero if not given.
+    """
     trace = _trace(model, record, estimate, settings)
     threshold = _threshold(trace, settings, np.zeros(model.joints) if lack_Nm is None else lack_Nm)
     window = round(settings.isolation_s / settings.period_s)
@@ -331,10 +340,10 @@ def detect(
 
 
 def find_contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[tuple[int, int, tuple[int, ...]], ...]:
-    """Split the samples over the threshold into contacts, as in `OfflineDetection`.
+    """Return the contacts in samples of external torque and threshold (k, n), as in `OfflineDetection`.
 
-    A contact ends when every joint has stayed within `ONSET_FRACTION` of its threshold for a whole window, so a push
-    that sways around the threshold is one.
+    window: samples from a detection until the link is isolated. A contact ends when every joint has stayed within
+    `ONSET_FRACTION` of its threshold for a whole window, so a push that sways around the threshold is one.
     """
     over = ~(np.abs(tau_ext_hat) <= threshold)
     touched = np.flatnonzero(np.any(~(np.abs(tau_ext_hat) <= external_torque.ONSET_FRACTION * threshold), axis=1))
@@ -447,11 +456,10 @@ def _trace(
 ) -> _Trace:
     """Run a record through the smoothed filter of the fit, or without theta_M through the one of detection.
 
-    If it learns, theta and P, contiguous then, are corrected in place.
-
-    theta_M (p,): of the mass matrix that carries the velocity's noise. scores (B, p): gets the sums of
-    `parameter_deviation`, `length` samples a part; at: samples that were before this record.
-    rows: gets the samples of the fit.
+    Returns external torque, deviation and friction of each sample. is_learning: correct theta and P of `estimate`,
+    which must be contiguous, in place. theta_M (p,): of the mass matrix that carries the velocity's noise. scores (B,
+    p): gets the sums of `parameter_deviation`, `length` samples a part; at: samples that were before this record. rows:
+    gets the samples of the fit.
     """
     n = model.joints
     if record.q.shape[1] != n or len(settings.noise_Nm) != n:
@@ -581,7 +589,7 @@ def _smooth(smoothing: float, m: _Memory) -> None:
 
 @compiled
 def _weigh(noise_Nm: Vector, R: float, passed_rad_s2: float, m: _Memory) -> None:
-    """Scale a sample of the fit to a variance of 1."""
+    """Write torque and regressor of a sample, scaled to a variance of 1, to `tau_scaled` and `W_scaled`."""
     for i in range(m.W.shape[0]):
         weight = 1.0 / np.sqrt(R * noise_Nm[i] ** 2 + passed_rad_s2**2 * m.through[i])
         m.tau_scaled[i] = weight * m.tau[i]

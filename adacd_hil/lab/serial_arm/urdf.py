@@ -115,7 +115,7 @@ def read_urdf(
 
 
 def _held(joints: dict[str, Element], locked: Collection[str]) -> set[str]:
-    """Return the locked joints with those that mimic them."""
+    """Return the names of the locked joints, and of those that mimic them."""
     held = set(locked)
     leaders = {name: mimic.get("joint") for name, joint in joints.items() if (mimic := joint.find("mimic")) is not None}
     while following := {name for name, leader in leaders.items() if leader in held} - held:
@@ -196,7 +196,10 @@ def _merge(
     children: dict[str, list[_Joint]],
     places: dict[str, tuple[int, FramePose]],
 ) -> list[_Joint]:
-    """Place `link` and all that is fixed to it; return the joints that move on it."""
+    """Add `link` and all links fixed to it to `places`; return the joints that move on them.
+
+    index: of the joint that carries them, or BASE.
+    """
     outward = []
     places[link] = (index, FramePose(np.eye(3), np.zeros(3)))
     waiting = [link]
@@ -329,7 +332,7 @@ def _named(robot: Element, tag: str) -> dict[str, Element]:
 
 
 def _only(element: Element, tag: str, where: str) -> Element | None:
-    """Return the one child of a kind, or None."""
+    """Return the one child element of a kind, or None. Raises UrdfError for more than one."""
     found = element.findall(tag)
     if len(found) > 1:
         raise UrdfError(f"{where}: more than one <{tag}>")
@@ -372,5 +375,5 @@ def _parse(word: str, where: str) -> float:
 
 
 def _list(names: list[str]) -> str:
-    """Join names for a message."""
+    """Return names in quotes, joined by commas."""
     return ", ".join(f'"{name}"' for name in names)

@@ -31,7 +31,7 @@ from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 
 def time_ns(message: can.Message) -> int:
-    """Return the time of a message: in whole nanoseconds if it has them and `timestamp` is unchanged."""
+    """Return the time of a message, ns: its exact `t_ns` if it has one that equals `timestamp`, else `timestamp`."""
     seconds = message.timestamp or 0.0
     t_ns = getattr(message, "t_ns", None)
     if t_ns is not None and t_ns / 1_000_000_000 == seconds:
@@ -40,12 +40,12 @@ def time_ns(message: can.Message) -> int:
 
 
 def channel_name(channel: object) -> str:
-    """Name a channel of python-can."""
+    """Return the name of a python-can channel as text; "" for None."""
     return "" if channel is None else str(channel)
 
 
 def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
-    """Take a frame out of a message; `start_ns` is added to its time.
+    """Convert a python-can message to a frame; `start_ns` is added to its time.
 
     Raises ValueError for data, an identifier or a time that no frame has.
     """
@@ -77,7 +77,7 @@ def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
 
 
 class _BlfReader(can.BLFReader):
-    """python-can's, but for an object of no size, at which it stays for ever, and frames that it passes over."""
+    """python-can's BLF reader; fails at an object of no size, where the original hangs; it warns of skipped frames."""
 
     def _parse_container(self, data: bytes) -> Iterator[can.Message]:
         if len(data) > MOST_BYTES:
@@ -97,7 +97,7 @@ _BLF_FRAMES = (blf.CAN_MESSAGE, blf.CAN_MESSAGE2, blf.CAN_ERROR_EXT, blf.CAN_FD_
 
 
 class _AscReader(can.ASCReader):
-    """python-can's, without its silent errors.
+    """python-can's ASC reader, without its silent errors.
 
     python-can's loses a first frame that follows a head without `internal events logged`, as BUSMASTER writes it, takes
     stamps that count from the line before for stamps from the beginning, requests to send (TxRq) for frames, and passes
@@ -117,7 +117,11 @@ _ASC_FRAME = re.compile(r"-?\d+[.,]\d+\s+(CANFD\s+)?\d+\s+\S+\s+(Rx|Tx|TxRq)\s",
 
 
 def _asc_lines(lines: Iterable[str], is_relative: bool) -> Iterator[str]:
-    """Yield the lines of an ASC, with stamps from the beginning; say which frames python-can will pass over."""
+    """Yield the lines of an ASC with times since its beginning, without requests to send (TxRq).
+
+    is_relative: the times of the file count from the line before. Log a warning for each frame that python-can will
+    skip.
+    """
     time_s = Decimal(0)
     for number, text in enumerate(lines, 1):
         line = text.strip()
@@ -137,7 +141,7 @@ _ERROR_FLAG = 0x20000000
 
 
 class _CandumpReader(can.CanutilsLogReader):
-    """python-can's, but it skips lines without a frame, and error frames keep their class.
+    """python-can's candump reader; it skips lines without a frame, and error frames keep their class.
 
     Of an error frame python-can makes data of a 29-bit identifier, or drops all but the time.
     """
@@ -183,7 +187,7 @@ class _PassedOver(logging.Handler):
             self.pass_over(words)
 
     def pass_over(self, words: str) -> None:
-        """Count a record that was not read; keep the text of the first."""
+        """Count a record that was not read; keep the reason of the first one."""
         self.count += 1
         self.first = self.first or " ".join(words.split())[:_LONGEST]
 
@@ -194,7 +198,7 @@ _HARMLESS = ("Unknown object header version", "DLC vs Data Length mismatch")
 """Beginnings of warnings: on objects other than frames, or that `_BlfReader` counts; on frames that are read."""
 _READERS: dict[str, Any] = {".blf": _BlfReader, ".asc": _AscReader, ".log": _CandumpReader}
 _FLAGS = slice(RecordedFrame._fields.index("is_extended"), None)
-"""Those that a row of RECORDED_FRAME_DTYPE ends with, too."""
+"""Flags at the end of a RecordedFrame, and of a row of RECORDED_FRAME_DTYPE."""
 _STATUS_ID = 0xFFFFFFFF
 """Of the lines of a TRC that tell the state of the bus."""
 _FORMS = {
@@ -209,7 +213,7 @@ class PythonCanFrames:
     """The frames of a file that python-can reads: iterate once; `channels` and `problem` grow meanwhile."""
 
     def __init__(self, path: Path) -> None:
-        """Look at the file. Raises LogError when it can't be read."""
+        """Check that the file can be opened. Raises LogError when it can't be read."""
         self.channels: list[str] = []
         self.epoch_ns = 0
         self.problem = ""
@@ -218,7 +222,10 @@ class PythonCanFrames:
             open_input(path).close()
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Yield the frames, (n,) of RECORDED_FRAME_DTYPE; drop other records, and set `problem`."""
+        """Yield the frames in arrays (n,) of RECORDED_FRAME_DTYPE; drop other records, and set `problem` at the end.
+
+        Raises LogError when the file has records, but no frame.
+        """
         passed_over = _PassedOver()
         rows: list[tuple[Any, ...]] = []
         count = 0
@@ -247,7 +254,7 @@ class PythonCanFrames:
             yield np.array(rows, RECORDED_FRAME_DTYPE)
 
     def _messages(self, passed_over: _PassedOver) -> Iterator[tuple[can.Message, int]]:
-        """Yield the messages that python-can reads up to an error, each with the start to add, ns."""
+        """Yield the messages up to the first error of python-can, each with a start time to add, ns."""
         suffix = self._path.suffix.lower()
         kind = _READERS.get(suffix) or MESSAGE_READERS[suffix]
         count = 0
@@ -282,7 +289,7 @@ class PythonCanFrames:
 
 
 def _take_start(reader: Any) -> int:
-    """Take the start out of a reader that would add it to each time as a float; return it in ns."""
+    """Set a reader's start time to 0, since it would add it to each time as a float; return the start time, ns."""
     for name in ("start_timestamp", "_start_timestamp"):
         if isinstance(start_s := getattr(reader, name, None), float):
             setattr(reader, name, 0.0)

@@ -28,9 +28,10 @@ SUFFIXES = (".mcap", ".log", ".blf", ".asc", ".mf4", ".trc", ".csv")
 
 
 def open_frames(path: Path) -> "McapFrames | PythonCanFrames":
-    """Open a recording; its suffix gives its format. Iterate once; all else is complete afterwards.
+    """Open a recording of CAN frames; its suffix gives its format. Iterate once, for arrays of frames.
 
-    Raises LogError when it can't be read, also from the iteration.
+    `channels`, `epoch_ns` and `problem` are complete after the iteration. Raises LogError when it can't be read, also
+    from the iteration.
     """
     suffix = path.suffix.lower()
     if suffix == ".mcap":
@@ -50,7 +51,7 @@ def open_frames(path: Path) -> "McapFrames | PythonCanFrames":
 
 
 def read_frames(path: Path) -> FrameLog:
-    """Read all frames of a recording. Raises LogError when it can't be read."""
+    """Return all frames of a recording, with the names of its channels. Raises LogError when it can't be read."""
     source = open_frames(path)
     pieces = [np.zeros(0, RECORDED_FRAME_DTYPE), *source]
     return FrameLog(tuple(source.channels), np.concatenate(pieces), source.epoch_ns, source.problem)

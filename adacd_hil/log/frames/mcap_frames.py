@@ -66,7 +66,10 @@ class McapFrames:
     """The frames of a log with all its parts: iterate once; `channels`, `epoch_ns` and `problem` grow meanwhile."""
 
     def __init__(self, source: Path | IO[bytes]) -> None:
-        """Look at the file, or take an open one, of one part. Raises LogError when it can't be read or isn't MCAP."""
+        """Open a log with all its parts, or an open file as the only part.
+
+        Raises LogError when it can't be read or doesn't begin as MCAP.
+        """
         self.channels: list[str] = []
         self.epoch_ns = 0
         self.problem = ""
@@ -99,7 +102,7 @@ class McapFrames:
         self.problem = self.problem or problem
 
     def _read(self, file: IO[bytes], name: str) -> Iterator[NDArray[Any]]:
-        """Yield the frames of one file of the log in blocks; note damage."""
+        """Yield the frames of one file of the log in blocks; keep the first damage in `problem`."""
         self._definitions, self._sources = Definitions(), {}
         summary = summary_of(file)  # for the case that the chunk that defines channels is damaged
         for item in read_blocks(file, name, block_bytes=1):
@@ -120,7 +123,10 @@ class McapFrames:
                 yield frames
 
     def _take(self, item: Block | RawRecord) -> NDArray[Any]:
-        """Take in a chunk or a record outside chunks; return the frames in it. Raises LogError, ValueError."""
+        """Return the frames in a chunk, or none of a record outside chunks; keep definitions and metadata of the run.
+
+        Raises LogError, ValueError.
+        """
         if isinstance(item, Block):
             if item.problem or item.contents.breaks:
                 raise LogError("a chunk is damaged")
@@ -136,7 +142,7 @@ class McapFrames:
         return _NO_FRAMES
 
     def _define(self, record: RawRecord) -> None:
-        """Add a schema or a channel to those known; ignore other records. Raises LogError for an invalid one."""
+        """Keep the schema or channel in a record; ignore other records. Raises LogError for an invalid one."""
         if record.opcode in DEFINITIONS:
             definition = self._definitions.add_record(record)
             if isinstance(definition, Channel):
@@ -159,7 +165,7 @@ class McapFrames:
         )
 
     def _frames(self, contents: Contents) -> NDArray[Any]:
-        """Read the frames of a chunk in the order of the file. Raises ValueError for an invalid frame."""
+        """Return the frames of a chunk in the order of the file. Raises ValueError for an invalid frame."""
         places, found = [], []
         for number in np.unique(contents.channels).tolist():
             source = self._sources.get(number)
@@ -188,9 +194,9 @@ def _check_magic(file: IO[bytes], name: str) -> None:
 
 
 def _unpack(source: _Source, rows: NDArray[np.uint8], name_bytes: int, epoch_ns: int) -> NDArray[Any]:
-    """Unpack the message records `rows` (n, size), whose frame_id has `name_bytes` bytes.
+    """Return the frames (n,) in the message records `rows` (n, size), whose frame_id has `name_bytes` bytes.
 
-    Raises ValueError where they are shorter than their type.
+    epoch_ns: subtracted from their times. Raises ValueError where they are shorter than their type.
     """
     body_start = _HEAD_BYTES + name_bytes
     body_start += -(body_start - MESSAGE_HEAD - len(ENCAPSULATION)) % 4

@@ -55,10 +55,10 @@ class Target(Protocol):
     """The target that a file is written to."""
 
     def write(self, data: bytes, packets: int = 0) -> int:
-        """Take `data`, which completes so many packets."""
+        """Write a part of the file; return its length. packets: number of log packets that are whole with it."""
 
     def tell(self) -> int:
-        """Return how many bytes of the file have been taken."""
+        """Return how many bytes of the file have been written."""
 
 
 class ChunkedFile:
@@ -87,12 +87,12 @@ class ChunkedFile:
         self._put(encode(Header(profile=profile, library=library)))
 
     def _put(self, data: bytes, packets: int = 0) -> None:
-        """Write a part of the data section, which completes so many packets."""
+        """Write a part of the data section. packets: number of log packets that are whole with it."""
         self._crc = crc32(data, self._crc)
         self._target.write(data, packets)
 
     def add_attachment(self, attachment: Attachment) -> None:
-        """Add an attachment."""
+        """Write an attachment."""
         offset = self._target.tell()
         record = encode(attachment)
         self._put(record)
@@ -109,7 +109,7 @@ class ChunkedFile:
         )
 
     def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
-        """Add a metadata record."""
+        """Write a metadata record."""
         offset = self._target.tell()
         record = encode(Metadata(name=name, metadata=metadata))
         self._put(record)
@@ -121,7 +121,7 @@ class ChunkedFile:
         self._chunk += encode(schema)
 
     def define_channel(self, channel: Channel) -> None:
-        """Define a channel, in the chunk in progress; its schema before it."""
+        """Define a channel, in the chunk in progress. Its schema must be defined before it."""
         self._channels.append(channel)
         self._chunk += encode(channel)
 
@@ -133,7 +133,7 @@ class ChunkedFile:
         ends: NDArray[np.int64],
         packet_ends: NDArray[np.int64],
     ) -> None:
-        """Add message records that follow each other in `records`.
+        """Add message records that follow each other in `records`, and write the chunks that are full.
 
         channels: the file's numbers (n,); log_times_ns (n,); ends: where each record ends in `records` (n,);
         packet_ends: how many of the records come before the end of each packet, in order.
@@ -158,12 +158,12 @@ class ChunkedFile:
             first = stop
 
     def flush(self) -> None:
-        """End the chunk in progress, if it holds a message."""
+        """Write the chunk in progress, if it holds a message."""
         if self._entries:
             self._end_chunk()
 
     def flush_definitions(self) -> None:
-        """End the chunk in progress; put definitions that no message follows behind it, as records of their own."""
+        """Write the chunk in progress, then the definitions that no message follows, as records of their own."""
         self.flush()
         self._put(bytes(self._chunk))
         self._chunk = bytearray()
@@ -207,9 +207,9 @@ class ChunkedFile:
         self._packets = 0
 
     def _index(self, channels: NDArray[np.uint16], entries: NDArray[np.void]) -> tuple[bytes, dict[int, int]]:
-        """Encode the message index of each channel, in the order of their first messages; count the messages.
+        """Return the message indexes of a chunk, one per channel in the order of first messages; count the messages.
 
-        Returns the records, and where among them that of each channel begins.
+        Returns the encoded records, and where among them that of each channel begins.
         """
         order = np.argsort(channels, kind="stable")
         groups = np.split(order, np.flatnonzero(np.diff(channels[order])) + 1)
@@ -225,7 +225,7 @@ class ChunkedFile:
         return bytes(index), offsets
 
     def complete(self) -> None:
-        """End the file."""
+        """Write the chunk in progress, the summary and the footer, with which the file ends."""
         self.flush()
         self._put(encode(DataEnd(self._crc)))
         start = self._target.tell()
@@ -272,7 +272,7 @@ def _encode_all(records: Iterable[McapRecord]) -> bytes:
 
 
 def encode(record: McapRecord) -> bytes:
-    """Encode a record, with its opcode and length."""
+    """Return an MCAP record as bytes, with its opcode and length."""
     builder = RecordBuilder()
     record.write(builder)
     encoded: bytes = builder.end()  # type: ignore[no-untyped-call]

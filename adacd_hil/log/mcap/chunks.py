@@ -31,7 +31,7 @@ from adacd_hil.log.mcap.record_layout import HEAD, INDEX_ENTRY, MAGIC, MESSAGE_H
 MOST_BYTES = 32 << 20
 """Of a chunk, before compression."""
 MOST_RATIO = 200
-"""How many times its size in the file all that has been opened of it may have."""
+"""Largest ratio of all decompressed bytes of a file to their size in the file."""
 FREE_BYTES = 64 << 20
 """Bytes that may be decompressed from a file of any size."""
 _PIECE_BYTES = 1 << 20
@@ -49,7 +49,10 @@ class Opening:
         self._packed = self._opened = 0
 
     def allow(self, packed: int, size: int) -> None:
-        """Count a chunk of `packed` bytes in the file and `size` opened. Raises ChunkError when that's too much."""
+        """Add a chunk to the file's counts: its `packed` bytes in the file, and its `size` in bytes when decompressed.
+
+        Raises ChunkError if the chunk is too large, or if the file grows to too many times its size.
+        """
         if size > MOST_BYTES:
             raise ChunkError(f"opens to {size} bytes, more than {MOST_BYTES}")
         self._packed += packed
@@ -58,7 +61,10 @@ class Opening:
             raise ChunkError(f"opens to more than {MOST_RATIO} times the file before it")
 
     def open_chunk(self, chunk: Chunk) -> bytes:
-        """Return the decompressed contents of a chunk. Raises ChunkError for too many, or another size or CRC."""
+        """Return the decompressed records of a chunk.
+
+        Raises ChunkError for too many bytes, another size or another CRC.
+        """
         data = decompress(chunk.compression, chunk.data)
         self.allow(len(chunk.data), len(data))
         return _checked(chunk, data, is_size_certain=bool(chunk.uncompressed_crc))
@@ -73,7 +79,7 @@ def _checked(chunk: Chunk, data: bytes, is_size_certain: bool) -> bytes:
 
 
 def decompress(compression: str, data: bytes, most_bytes: int = MOST_BYTES) -> bytes:
-    """Decompress the records of a chunk. Raises ChunkError when that fails, and for more than `most_bytes`."""
+    """Return the decompressed records of a chunk. Raises ChunkError when that fails, and for more than `most_bytes`."""
     if compression not in _KINDS:
         raise ChunkError(f"unknown compression {compression[:20]!r}")
     try:
@@ -148,22 +154,22 @@ class Contents:
 
     @cached_property
     def ends(self) -> NDArray[np.int64]:
-        """Ends of the messages in `data`."""
+        """Ends of the messages in `data` (n,)."""
         return np.asarray(self.starts + self.heads["length"] + HEAD.size)
 
     @cached_property
     def channels(self) -> NDArray[np.uint16]:
-        """Channel ids of the messages."""
+        """Channel ids of the messages (n,)."""
         return self.heads["channel"].copy()
 
     @cached_property
     def log_times(self) -> NDArray[np.uint64]:
-        """Log times of the messages, ns (k,)."""
+        """Log times of the messages, ns (n,)."""
         return self.heads["log_time"].copy()
 
     @cached_property
     def publish_times(self) -> NDArray[np.uint64]:
-        """Publish times of the messages, ns (k,)."""
+        """Publish times of the messages, ns (n,)."""
         return self.heads["publish_time"].copy()
 
     @property
@@ -175,31 +181,31 @@ class Contents:
         return entries
 
     def payload(self, message: int) -> bytes:
-        """Copy the payload of a message."""
+        """Return a copy of the payload of a message; message: its index, from 0."""
         return bytes(self.data[self.starts[message] + MESSAGE_HEAD : self.ends[message]])
 
     def rows(self, starts: NDArray[np.int64], size: int) -> NDArray[np.uint8]:
-        """Copy the `size` bytes from each of `starts` on, (n, size)."""
+        """Return copies of the `size` bytes from each offset of `starts` on, (n, size)."""
         return _windows(self.data, size)[starts].view(np.uint8).reshape(len(starts), size)
 
 
 def read_contents(data: bytes) -> Contents:
-    """Find the records of an opened chunk."""
+    """Find the records in the bytes of a decompressed chunk, and return them."""
     return _walk_through(data, (len(data),))
 
 
 def read_chunks(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents:
-    """Find the records of opened chunks that follow each other in `data`; PADDING bytes of no meaning follow the last.
+    """Find the records of decompressed chunks that follow each other in `data`, and return them.
 
-    ends: of the chunks; indexes: the entries of all message indexes of each chunk; without them, and where they are
-    wrong, each record takes a step.
+    ends: offset at which each chunk ends; PADDING bytes of no meaning follow the last. indexes: the entries of all
+    message indexes of each chunk; without them, and where they are wrong, the records are found one by one.
     """
     indexed = _indexed(data, ends, indexes)
     return _walk_through(data, ends) if indexed is None else indexed
 
 
 def _indexed(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents | None:
-    """Take where messages begin from the indexes; None where these leave out anything that chunks hold."""
+    """Return the contents, with the beginnings of messages from the indexes; None if these leave out any record."""
     if not indexes or not all(index and len(index) % INDEX_ENTRY.itemsize == 0 for index in indexes):
         return None
     pairs = zip(indexes, (0, *ends[:-1]), strict=True)
@@ -218,7 +224,7 @@ def _indexed(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Cont
 
 
 def _walk_through(data: bytes, ends: Sequence[int]) -> Contents:
-    """Find the records of chunks step by step."""
+    """Find the records of chunks one by one, and return them."""
     definitions: list[RawRecord] = []
     strangers: list[int] = []
     breaks: list[int] = []
@@ -245,13 +251,13 @@ def _walk_through(data: bytes, ends: Sequence[int]) -> Contents:
 
 
 def message_contents(record: RawRecord) -> Contents:
-    """Take a message outside of chunks as a chunk of its own."""
+    """Return a message outside of chunks as the contents of a chunk of its own."""
     data = HEAD.pack(record.opcode, len(record.body)) + record.body
     return Contents(data, np.zeros(1, np.int64))
 
 
 def _windows(data: bytes, size: int) -> NDArray[Any]:
-    """View the `size` bytes that begin at each byte as one item."""
+    """View the `size` bytes that begin at each byte as one item; the items overlap."""
     windows: NDArray[Any] = np.ndarray((max(0, len(data) - size + 1),), f"V{size}", data, strides=(1,))
     return windows
 
@@ -284,10 +290,10 @@ class _Packed(NamedTuple):
 
 
 def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES, is_ahead: bool = True) -> Iterator[Item]:
-    """Read a file from front to end: blocks, attachments and metadata, and problems.
+    """Yield the contents of an MCAP file from front to end: blocks of chunks, attachments, metadata, and problems.
 
-    block_bytes: of the chunks that make a block; 1: each chunk is one. is_ahead: a thread decompresses chunks in
-    advance. Raises LogError if it isn't MCAP.
+    block_bytes: most bytes of the chunks that make a block; 1: each chunk is a block. is_ahead: a thread decompresses
+    chunks in advance. Raises LogError if the file isn't MCAP.
     """
     if not is_ahead:
         for item in _pack(file, name, block_bytes):
@@ -312,7 +318,7 @@ def _finished(item: Future[Block] | RawRecord | Problem) -> Item:
 
 
 def _pack(file: IO[bytes], name: str, block_bytes: int) -> Iterator[list[_Packed] | RawRecord | Problem]:
-    """Read a file, chunks as they are."""
+    """Yield lists of chunks that are still compressed, and the other records of a file that are passed on."""
     packed: list[_Packed] = []
     size, crc = 0, crc32(MAGIC)
     opening = Opening()
@@ -340,7 +346,10 @@ def _pack(file: IO[bytes], name: str, block_bytes: int) -> Iterator[list[_Packed
 
 
 def _look_at(record: RawRecord | Problem, opening: Opening, crc: int) -> _Packed | RawRecord | Problem | None:
-    """Take a record as it is passed on; None for one that isn't. crc: of all before it."""
+    """Return a record in the form in which it is passed on; None: it is skipped.
+
+    crc: of all bytes before it, to compare with that of a DataEnd.
+    """
     if isinstance(record, Problem) or record.opcode in _OTHERS:
         return record
     if record.opcode == Opcode.CHUNK or record.opcode in _OUTSIDE:
@@ -351,7 +360,7 @@ def _look_at(record: RawRecord | Problem, opening: Opening, crc: int) -> _Packed
 
 
 def _packed(record: RawRecord, opening: Opening) -> _Packed | Problem:
-    """Look at a chunk, or take a record outside chunks."""
+    """Return a chunk, still compressed, or a message or definition outside chunks; a Problem for a bad chunk."""
     position = record.offset + HEAD.size
     if record.opcode != Opcode.CHUNK:
         whole = HEAD.pack(record.opcode, len(record.body)) + record.body

@@ -63,12 +63,16 @@ LEAST_MESSAGE = 22
 
 
 def has_shape(opcode: int) -> bool:
-    """Return whether records of this kind repeat their length."""
+    """Return whether records of this kind contain lengths that must add up to the length of the record."""
     return opcode in _SHAPES
 
 
 def fits(opcode: int, length: int, read: Callable[[int, int], bytes]) -> bool:
-    """Return whether a record of this kind can be `length` bytes long; `read` gives bytes of it, by place and count."""
+    """Return whether the lengths in a record add up to `length`, the size of its body.
+
+    read: returns bytes of the body, by offset and count. A message fits from LEAST_MESSAGE bytes on; an unknown kind
+    never fits.
+    """
     if opcode not in _SHAPES:
         return opcode == Opcode.MESSAGE and length >= LEAST_MESSAGE
     position = 0
@@ -140,21 +144,21 @@ class FileGap(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """Something that is missing of a file, in words. `is_damage`: these follow "the file is"."""
+    """A defect of a file, in words. `is_damage`: the words follow "the file is"."""
 
     text: str
     is_damage: bool = False
 
 
 def name_of(opcode: int) -> str:
-    """Name a kind of record as the specification does."""
+    """Return the name of a kind of record as in the specification, such as ChunkIndex."""
     if opcode not in set(Opcode):
         return f"record 0x{opcode:02x}"
     return "".join(word.capitalize() for word in Opcode(opcode).name.split("_"))
 
 
 def parse(opcode: int, body: bytes) -> Any:
-    """Read a record with mcap's class for it. Raises LogError when it makes no sense."""
+    """Parse a record's body to mcap's class for its kind. Raises LogError when it makes no sense."""
     try:
         return _READERS[opcode](ReadDataStream(io.BytesIO(body)))
     except (McapError, struct.error, ValueError, OverflowError, MemoryError) as error:
@@ -162,9 +166,11 @@ def parse(opcode: int, body: bytes) -> Any:
 
 
 def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[RawRecord | IndexRun | Problem]:
-    """List the records of a file up to its end, or to bytes that can't be one; the many message indexes in runs.
+    """Yield the records of a file up to its end, or to bytes that can't be a record.
 
-    passed: kinds whose bodies aren't read. Raises LogError, which begins with `name`, when it isn't MCAP.
+    Message indexes that follow each other come as one IndexRun. A cut file or an overlong record ends with a Problem.
+    passed: kinds of records that come without their body. Raises LogError, which begins with `name`, if the file isn't
+    MCAP.
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
@@ -204,7 +210,7 @@ def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[R
 
 
 def _index_run(data: bytes) -> IndexRun:
-    """Take the message indexes at the beginning of `data`, of which the first is whole."""
+    """Return the message indexes at the beginning of `data`, of which the first is whole."""
     position, size, entries = 0, len(data), []
     unpack, index, head = HEAD.unpack_from, int(Opcode.MESSAGE_INDEX), HEAD.size
     while position + head <= size:
@@ -219,9 +225,9 @@ def _index_run(data: bytes) -> IndexRun:
 
 
 def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap]:
-    """List the records of a file, and the gaps between them: after damage, search for the next record.
+    """Yield the records of a file, and the gaps between them: after damage, search for the next record.
 
-    It ends with a Footer that the magic follows.
+    It ends with a Footer that the magic follows, or with the file.
     """
     size = os.fstat(file.fileno()).st_size
     position = len(MAGIC) if _read(file, 0, len(MAGIC)) == MAGIC else 0
@@ -262,7 +268,7 @@ def _is_shaped(file: IO[bytes], position: int, size: int) -> bool:
 
 
 def _find_next(file: IO[bytes], position: int, size: int) -> int:
-    """Find the next record that repeats its length; the end of the file if there is none."""
+    """Return the offset of the next record, from `position` on, that repeats its length; `size` if there is none."""
     while position < size:
         window = _read(file, position, _WINDOW + HEAD.size)
         for match in _BEGINNING.finditer(window):
@@ -273,7 +279,7 @@ def _find_next(file: IO[bytes], position: int, size: int) -> int:
 
 
 def read_header(path: Path) -> Header | None:
-    """Read the header of a file; None without one that can be trusted."""
+    """Return the header of an MCAP file; None if it can't be read or trusted."""
     try:
         with open_input(path) as file:
             first = next(scan(file), None)
@@ -286,7 +292,7 @@ def read_header(path: Path) -> Header | None:
 
 
 def chunk_crc(record: RawRecord) -> int:
-    """Return the CRC that a chunk carries of its uncompressed records; 0 without one."""
+    """Return the CRC, stored in a chunk, of its decompressed records; 0 without one."""
     return int.from_bytes(record.body[24:28], "little")
 
 
@@ -309,7 +315,7 @@ class FileEnd(NamedTuple):
 
 
 def read_end(file: IO[bytes]) -> FileEnd | None:
-    """Read the end of a file; None without one."""
+    """Return the end of a file: its data section's end and CRC, and its summary; None if the file has no such end."""
     found = _find(file)
     if found is None:
         return None
@@ -333,7 +339,7 @@ def _has_shape(record: RawRecord) -> bool:
 
 
 def summary_of(file: IO[bytes]) -> list[RawRecord]:
-    """Read the summary of a file, whether or not it has a CRC that fits; empty without a summary."""
+    """Return the records of a file's summary, whether or not its CRC fits; empty without a summary."""
     found = _find(file)
     if found is None or found[0] - found[1] > MOST_RECORD_BYTES:
         return []
@@ -342,7 +348,7 @@ def summary_of(file: IO[bytes]) -> list[RawRecord]:
 
 
 def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
-    """Find where the footer is, and where the summary begins; None for a file without an end."""
+    """Return where the footer is, where the summary begins, and the footer; None for a file without an end."""
     size = file.seek(0, os.SEEK_END)
     place = size - len(MAGIC) - _FOOTER
     tail = _read(file, max(0, place), _FOOTER + len(MAGIC))
@@ -377,7 +383,7 @@ def read_record(file: IO[bytes], offset: int) -> RawRecord:
 
 
 def crc_of(file: IO[bytes], start: int, end: int, crc: int = 0) -> int:
-    """Compute the CRC of bytes of a file; `crc`: that of the bytes before them."""
+    """Return the CRC of the bytes of a file from start to end - 1; crc: that of the bytes before them."""
     file.seek(start)
     while start < end and (block := file.read(min(_WINDOW, end - start))):
         crc = crc32(block, crc)
@@ -398,7 +404,10 @@ class Definitions:
         self.channels: dict[int, Channel] = {}
 
     def add_record(self, record: RawRecord) -> Schema | Channel:
-        """Add a definition. Raises LogError for one that makes no sense or contradicts an earlier one."""
+        """Add the schema or channel in a record and return it.
+
+        Raises LogError for one that makes no sense or contradicts an earlier one.
+        """
         definition: Schema | Channel = parse(record.opcode, record.body)
         known: dict[int, Any] = self.schemas if isinstance(definition, Schema) else self.channels
         if known.setdefault(definition.id, definition) != definition:
@@ -406,7 +415,7 @@ class Definitions:
         return definition
 
     def add_records(self, records: Iterable[RawRecord]) -> None:
-        """Add the definitions among some records. Raises LogError as `add_record` does."""
+        """Add the schemas and channels among some records. Raises LogError as `add_record` does."""
         for record in records:
             if record.opcode in DEFINITIONS:
                 self.add_record(record)

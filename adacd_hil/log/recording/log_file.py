@@ -28,7 +28,7 @@ WAITING_BYTES = 32 * 1024 * 1024
 
 
 class Sink:
-    """The stream that `McapFile` needs, over a file descriptor that it closes."""
+    """Writes the bytes of `McapFile` to a file descriptor, on a thread of its own, and closes the descriptor."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class Sink:
             self._changed.wait_for(lambda: self._is_idle and not self._tasks)
 
     def close_file(self) -> None:
-        """Write the waiting data, then close the file."""
+        """Write the waiting data, close the file and end the thread."""
         with self._changed:
             self._tasks.append(None)
             self._changed.notify_all()
@@ -234,7 +234,7 @@ class McapFile(ChunkedFile):
             self.ids[channel.id] = number
 
     def finish(self, summary: dict[str, str]) -> None:
-        """Write the summary as metadata, then end the file."""
+        """Write the chunk in progress and `summary` as metadata, then end the file."""
         self.flush()
         self.add_metadata(SUMMARY_METADATA, summary)
         self.complete()

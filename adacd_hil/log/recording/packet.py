@@ -59,7 +59,10 @@ def _table(frame_count: int, message_count: int) -> struct.Struct:
 def pack_cycle(
     t_ns: int, dropped: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]]
 ) -> bytes:
-    """Return the packet of a cycle: its messages (channel, body) and its frames, True for sent ones."""
+    """Return the packet of a cycle: its messages (channel, body), and its frames, each with True if it was sent.
+
+    dropped: number of packets lost so far.
+    """
     values: list[int | bytes] = [CYCLE, len(messages), len(frames), dropped, t_ns]
     rests = []
     for is_tx, (can_id, data, frame_t_ns, is_error) in frames:
@@ -76,7 +79,7 @@ def pack_cycle(
 
 
 def pack_event(t_ns: int, dropped: int, event: Event) -> bytes:
-    """Return the packet of an event; longer texts are cut at 4 KiB."""
+    """Return the packet of an event; longer texts are cut at 4 KiB. dropped: number of packets lost so far."""
     texts = [text.encode("utf-8", "replace")[:_MAX_TEXT] for text in event]
     return _EVENT.pack(EVENT, dropped, t_ns, *map(len, texts)) + b"".join(texts)
 
@@ -97,19 +100,22 @@ class Columns(NamedTuple):
 
 
 def is_whole(data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Tell which packets have a whole head of a known kind (n,); `data` has ROOM bytes after the last packet."""
+    """Return for each packet (n,) whether it has a whole head of a known kind.
+
+    data: bytes of all packets, with ROOM bytes after the last. starts, sizes: of each packet in `data`.
+    """
     kinds = data[starts]
     return np.asarray((sizes >= HEAD.size) & ((kinds == CYCLE) | (kinds == EVENT)))
 
 
 def times_ns(data: NDArray[np.uint8], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return t_ns of the packets whose heads are whole (n,)."""
+    """Return t_ns of packets (n,), whose heads must be whole; starts: where each begins in `data`."""
     heads: NDArray[Any] = gather(data, starts, HEAD.size).view(HEAD_DTYPE)
     return np.asarray(heads["t_ns"])
 
 
 def unpack(data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> Columns:
-    """Unpack the packets of cycles and events that begin at `starts`; packets with inconsistent sizes are left out.
+    """Return the contents of the packets that begin at `starts` as columns; leave out packets with inconsistent sizes.
 
     `data` has ROOM bytes after the last packet.
     """
@@ -167,7 +173,10 @@ def unpack_event(columns: Columns, index: int) -> Event:
 
 
 def long_data(columns: Columns, frames: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """Return the data of FD frames by their numbers (k, 64); bytes beyond a frame's length are arbitrary."""
+    """Return the data of some frames (k, 64); frames: their rows in `columns.frames` (k,).
+
+    Bytes beyond a frame's length are arbitrary.
+    """
     data = np.empty((len(frames), MAX_DATA), np.uint8)
     data[:, :CLASSIC_BYTES] = columns.frames["data"][frames]
     rest_bytes = MAX_DATA - CLASSIC_BYTES
@@ -177,17 +186,20 @@ def long_data(columns: Columns, frames: NDArray[np.int64]) -> NDArray[np.uint8]:
 
 
 def windows(data: NDArray[np.uint8], size: int) -> NDArray[np.void]:
-    """View `data` as its windows of `size` bytes, one per offset: numpy copies such a row whole."""
+    """View `data` as overlapping items of `size` bytes, one from each offset on: numpy copies such an item whole."""
     return np.ndarray((len(data) - size + 1,), f"V{size}", data, strides=(1,))
 
 
 def gather(data: NDArray[np.uint8], starts: NDArray[np.int64], size: int) -> NDArray[np.void]:
-    """Copy the rows of `size` bytes that begin at `starts`."""
+    """Return copies of the `size` bytes from each offset of `starts` on, one item each (n,)."""
     return windows(data, size)[starts]
 
 
 def sums_within(values: NDArray[Any], counts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sum consecutive groups of `counts` values; return each value's sum before it in its group, and the totals."""
+    """Sum values within groups: return for each value the sum of those before it in its group, and each group's total.
+
+    The groups follow each other in `values`; counts: number of values in each.
+    """
     running: NDArray[np.int64] = np.zeros(len(values) + 1, np.int64)
     np.cumsum(values, out=running[1:])
     ends = np.cumsum(counts)

@@ -85,7 +85,10 @@ class PacketWriter:
         epoch_ns: int,
         watch: Watch | None = None,
     ) -> None:
-        """Write to `file`; `watch`, if given, gets every batch of records, too."""
+        """Write to `file`; `watch`, if given, gets every batch of records, too.
+
+        messages: of the DBC, whose frames are decoded. epoch_ns: added to the packets' times.
+        """
         self.frames = 0
         self.dropped = 0  # packets that didn't reach the writer
         self._lost = 0  # packets that reached it and were lost; the next packet's event reports them
@@ -106,7 +109,7 @@ class PacketWriter:
         self._least_scheme = max((place.stop for place in self._joint_slices.values()), default=_BODY) - _BODY
 
     def begin_file(self, file: McapFile) -> None:
-        """Continue with another file of the same topics."""
+        """Write later packets to another file with the same topics."""
         self._file = file
 
     def lose(self, count: int) -> None:
@@ -139,12 +142,12 @@ class PacketWriter:
         return np.asarray(self._has_stamp(packets.heads["t_ns"]) & (wrong == 0))
 
     def _has_stamp(self, t_ns: Numbers) -> NDArray[np.bool_]:
-        """Tell which times, in ns of the run's clock, fit into a stamp."""
+        """Return for each time, in ns of the run's clock, whether it fits into a stamp."""
         time_ns = t_ns + self._epoch_ns
         return np.asarray((time_ns >= 0) & (time_ns < END_OF_TIME_NS))
 
     def _write(self, packets: Columns) -> None:
-        """Give every record its slot, make the records in groups of one size, and place them."""
+        """Write packets: make their records in groups of one size, and place them in the packets' order."""
         heads, frames, messages = packets.heads, packets.frames, packets.messages
         dropped = heads["dropped"].astype(np.int64)
         missing = np.diff(dropped, prepend=self.dropped)
@@ -189,7 +192,7 @@ class PacketWriter:
         return np.where(fits & (frames["flags"] & IS_ERROR == 0), found, -1)
 
     def _frame_groups(self, packets: Columns, slots: Numbers, publish_ns: Numbers) -> Iterator[_Group]:
-        """Make the records of the frames: those of up to 8 bytes together, longer ones by length."""
+        """Yield the records of the frames: those of up to 8 bytes in one group, longer ones in a group per length."""
         frames = packets.frames
         is_long = frames["length"] > CLASSIC_BYTES
         places = np.flatnonzero(~is_long)
@@ -217,7 +220,10 @@ class PacketWriter:
         slots: Numbers,
         publish_ns: Numbers,
     ) -> _Group:
-        """Fill the fields that all frames have; `records` views `rows`; `ids`: channels of sent and received ones."""
+        """Fill the fields that all frames have, and return the records as a group.
+
+        records: a view of `rows`. ids: channels of sent and of received frames.
+        """
         records["can_id"] = frames["can_id"]
         records["is_extended"] = frames["can_id"] > MAX_STANDARD_ID
         records["is_error"] = frames["flags"] & IS_ERROR != 0
@@ -228,7 +234,7 @@ class PacketWriter:
     def _decoded_groups(
         self, packets: Columns, decoders: Numbers, slots: Numbers, publish_ns: Numbers
     ) -> Iterator[_Group]:
-        """Make the records of decoded frames, message by message."""
+        """Yield the records of decoded frames, a group per message of the DBC."""
         for number in np.unique(decoders[decoders >= 0]).tolist():
             decoder = self._decoders[number]
             places = np.flatnonzero(decoders == number)
@@ -240,7 +246,7 @@ class PacketWriter:
             yield _Group(rows, slots[places], self._decoded_ids[number], t_ns, publish_ns[places])
 
     def _body_groups(self, packets: Columns, slots: Numbers, time_ns: Numbers) -> Iterator[_Group]:
-        """Make the records of our own topics, which come as bodies, and the joint states contained in /scheme."""
+        """Yield the records of our own topics, a group per topic, and the joint states that /scheme contains."""
         messages = packets.messages
         kinds = messages.view(np.uint32)
         for kind in np.unique(kinds):
@@ -294,7 +300,7 @@ class PacketWriter:
             self._watch(records, channels, log_ns, ends)
 
     def _move_up(self, log_ns: Numbers, channels: NDArray[np.uint16]) -> None:
-        """Raise log times that would run backwards in their topic, which readers don't expect."""
+        """Raise, in place, log times that would run backwards in their topic, which readers don't expect."""
         order = np.argsort(channels, kind="stable")
         for places in np.split(order, np.flatnonzero(np.diff(channels[order])) + 1):
             if not len(places):
@@ -307,7 +313,7 @@ class PacketWriter:
 
 
 def _rows(payload: bytes, count: int) -> Rows:
-    """Make `count` records of a payload (count, size), without channel and times."""
+    """Return `count` equal records of a payload (count, size), without channel and times."""
     length = MESSAGE_HEAD + len(payload) - RECORD_HEAD_BYTES
     record = _HEAD.pack(Opcode.MESSAGE, length, 0, 0, 0, 0) + payload
     return np.repeat(np.frombuffer(record, np.uint8)[np.newaxis], count, axis=0)

@@ -36,7 +36,7 @@ class LiveFeed(Protocol):
         log_ns: NDArray[np.int64],
         ends: NDArray[np.int64],
     ) -> None:
-        """Show consecutive message records (b,); channels, log_ns, ends (n,): one entry per record."""
+        """Send consecutive message records (b,) to viewers; channels, log_ns, ends (n,): one entry per record."""
 
     def end_view(self) -> None:
         """End the view without waiting for viewers."""
@@ -72,10 +72,11 @@ class WriterSetup:
 def start_module(
     module: str, descriptors: Sequence[int], setup: object, stderr: int | None = None
 ) -> "subprocess.Popen[bytes]":
-    """Run a module of ours with descriptors as arguments and `setup` pickled on its standard input. Raises OSError.
+    """Start a process that runs a module of ours, and return it. Raises OSError.
 
-    It runs in a session of its own, so that Ctrl-C reaches only the control process, and finds modules only in this
-    package's folder. stderr: as in subprocess; None: this process's.
+    Its arguments are the descriptors; it reads `setup`, pickled, from its standard input. It runs in a session of its
+    own, so that Ctrl-C reaches only the control process, and imports this package from its own folder, not from the
+    current one. stderr: as in subprocess; None: this process's.
     """
     process = subprocess.Popen(
         [sys.executable, "-P", "-m", module, *map(str, descriptors)],

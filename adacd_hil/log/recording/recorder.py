@@ -150,11 +150,14 @@ class Recorder:
     def cycle(
         self, t_ns: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]] = ()
     ) -> None:
-        """Log a cycle: messages as (ChannelId, body), and its frames, oldest first, True for sent."""
+        """Hand a cycle to the writer: messages as (ChannelId, body), and its frames, oldest first, True for sent.
+
+        If the ring is full, wait in lockstep; in real time drop the cycle and count it in `dropped`.
+        """
         self._put(packet.pack_cycle(t_ns, self.dropped, messages, frames))
 
     def event(self, t_ns: int, event: Event) -> None:
-        """Log an event."""
+        """Hand an event to the writer; a full ring is treated as by `cycle`."""
         self._put(packet.pack_event(t_ns, self.dropped, event))
 
     def flush(self) -> None:
@@ -173,7 +176,7 @@ class Recorder:
                 self.flush()
 
     def _put_patiently(self, data: bytes) -> bool:
-        """Add a packet once the writer has made room; False if it is dead, or the packet larger than the ring."""
+        """Add a packet as soon as there is room; return False if the writer is dead or the ring is too small."""
         is_put = False
         with contextlib.suppress(OSError):  # the writer is dead
             while not is_put and room_of(len(data)) <= self._ring.capacity:
@@ -213,7 +216,7 @@ class Recorder:
         return LogSummary(self.path, 0, 0, self.dropped, False, error, max(1, len(find_parts(self.path))), peak)
 
     def _end_writer(self) -> str:
-        """End a writer that doesn't answer; return the error."""
+        """Wait for the end of a writer that doesn't answer, or kill it; return the error in words."""
         try:
             return f"the writer died (exit status {self._process.wait(DEATH_TIMEOUT_S)})"
         except subprocess.TimeoutExpired:
@@ -221,7 +224,7 @@ class Recorder:
             return f"the writer did not end within {END_TIMEOUT_S:g} s"
 
     def _hear(self, timeout_s: float) -> dict[str, str] | None:
-        """Receive the writer's message; None if it died or stays silent."""
+        """Return the next message of the writer; None if it died or stays silent."""
         self._socket.settimeout(timeout_s)
         try:
             received = self._socket.recv(processes.MOST_BYTES)
@@ -238,7 +241,7 @@ class Recorder:
 
 
 def _create(path: Path, is_truth: bool) -> int:
-    """Create the first part. Raises LogExistsError, LogError."""
+    """Create the first part of a log; return its file descriptor. Raises LogExistsError, LogError."""
     if is_truth:
         check_free(path)
     else:

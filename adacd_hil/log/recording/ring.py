@@ -76,7 +76,7 @@ class Ring(_SharedRing):
         self._room_until = self.capacity  # limit of HEAD by the last TAIL that was read
 
     def put_packet(self, packet: bytes) -> bool:
-        """Add a packet; return False if the room is too small for it."""
+        """Add a packet and return True; return False, without waiting, if there is no room for it."""
         size = len(packet)
         head = self._head
         end = head + room_of(size)
@@ -98,7 +98,7 @@ class Ring(_SharedRing):
         return True
 
     def count_dropped(self, dropped: int) -> None:
-        """Set the number of packets that were not put."""
+        """Store for the reader the number of packets that were not put so far."""
         self._counts[_DROPPED] = dropped
 
     @property
@@ -107,7 +107,7 @@ class Ring(_SharedRing):
         return self._counts[_WRITTEN]
 
     def close(self) -> None:
-        """Release the memory; later puts return False."""
+        """Release the shared memory; later calls of `put_packet` return False."""
         self._counts.release()
         self._memory.close()
         os.close(self.descriptor)
@@ -124,11 +124,11 @@ class RingReader(_SharedRing):
         return self._counts[_DROPPED]
 
     def count_written(self, packets: int) -> None:
-        """Add to the number of packets on the disk."""
+        """Add `packets` to the shared count of packets on the disk."""
         self._counts[_WRITTEN] += packets
 
     def take_packets(self, most: int) -> bytes:
-        """Take whole packets of up to `most` bytes in all, or a longer one alone; b"" if the ring is empty."""
+        """Remove and return whole packets, at most `most` bytes, or a longer one alone; b"" if the ring is empty."""
         tail = self._counts[_TAIL]
         waiting = self._counts[_HEAD] - tail
         self._counts[_PEAK] = max(self._counts[_PEAK], waiting)
@@ -143,7 +143,7 @@ class RingReader(_SharedRing):
 
 
 def split(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return where the packets of taken data begin, and their sizes (n,)."""
+    """Return where each packet begins in data that `RingReader.take_packets` returned, and its size (n,)."""
     starts, sizes = [], []
     place = 0
     while place < len(data):

@@ -13,13 +13,16 @@ _FAILED_NAME = "failed-start-{}.mcap"
 
 
 def check_free(path: Path) -> None:
-    """Raise LogExistsError if `path` can't be the first part of a new log, LogError if it can't be examined."""
+    """Raise LogExistsError if a log `path` exists, unless its start failed; LogError if that can't be examined."""
     if is_taken(path) and not _is_failed_start(path):
         raise _refusal(path)
 
 
 def make_room(path: Path) -> None:
-    """Move aside the log of a start that failed. Raises LogExistsError for any other log, LogError."""
+    """Rename the log of a start that failed, so that `path` is free.
+
+    Raises LogExistsError for any other log, LogError.
+    """
     check_free(path)
     if not is_taken(path):
         return

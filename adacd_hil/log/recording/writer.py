@@ -77,7 +77,7 @@ class WriterProcess:
         return live(self._setup, self._file.ids, start_ns)
 
     def run(self) -> None:
-        """Write until the end, then answer with the summary."""
+        """Write packets until the control process ends the log or dies, then send it the summary."""
         while True:
             word = self._hear()
             if word == processes.ROOM:
@@ -250,7 +250,7 @@ class WriterProcess:
         self._lost += self._packets.write_packets(block, starts, sizes)
 
     def _note_lost(self) -> None:
-        """Count the packets that the sink has dropped."""
+        """Count the packets that the sink has dropped since the last call as lost."""
         self._lose(self._sink.take_lost())
 
     def _lose(self, count: int) -> None:
@@ -277,7 +277,7 @@ def _schedule_plainly() -> None:
 
 
 def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> None:
-    """Write a log: report readiness, take packets until the end, send the summary."""
+    """Run the writer process: report readiness, write packets until the end of the log, send the summary."""
     _schedule_plainly()
     connection = socket.socket(fileno=socket_descriptor)
     error = url = ""

@@ -70,7 +70,7 @@ class Member(NamedTuple):
 
     @property
     def constants(self) -> tuple[tuple[str, int], ...]:
-        """Name the values that it can take."""
+        """Names and values of the schema's constants for the values that the field can take."""
         return tuple((f"{self.prefix or self.name.upper()}_{value.name}", int(value)) for value in self.values or ())
 
     def value_of(self, number: Any) -> Any:
@@ -83,14 +83,14 @@ class Member(NamedTuple):
 
 
 def ros_field_name(name: str) -> str:
-    """Spell `name` as ROS 2 demands: lower case, words separated by single underscores."""
+    """Return `name` as ROS 2 demands of fields: lower case, words separated by single underscores."""
     words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
     spelled = re.sub(r"[^a-z0-9]+", "_", words).strip("_")
     return spelled if spelled[:1].isalpha() else f"n{spelled}"
 
 
 def ros_message_name(name: str) -> str:
-    """Spell `name` as ROS 2 demands: words run together, each with a capital."""
+    """Return `name` as ROS 2 demands of types: words run together, each with a capital."""
     return "".join(word[:1].upper() + word[1:] for word in re.split(r"[^A-Za-z0-9]+", name))
 
 
@@ -104,18 +104,18 @@ class MessageType:
 
     @cached_property
     def dtype(self) -> "np.dtype[Any]":
-        """Describe one payload to numpy; raises LogError where its size isn't fixed."""
+        """The numpy type of one payload; raises LogError where its size isn't fixed."""
         return payload_dtype(self.text, self.fields)
 
 
 def foreign_type(name: str) -> MessageType:
-    """Read the type of others that `messages` has under the last part of its name, with everything it depends on."""
+    """Return a type of another package: its `.msg` file lies in `messages` under the last part of its name."""
     file = resources.files("adacd_hil.log.types").joinpath("messages", f"{name.rpartition('/')[2]}.msg")
     return MessageType(name, file.read_text(encoding="utf-8"))
 
 
 def number_type(name: str, members: Iterable[Member]) -> MessageType:
-    """Make the type of a message of numbers, preceded by the stamp. Raises LogError when two fields share a name."""
+    """Return a message type of a stamp and numbers. Raises LogError when two fields share a name."""
     lines = ["# Written by adacd-hil.", "builtin_interfaces/Time stamp"]
     names = []
     for member in members:
@@ -133,7 +133,7 @@ def number_type(name: str, members: Iterable[Member]) -> MessageType:
 
 
 def body_struct(members: Iterable[Member], has_block: bool = False) -> struct.Struct:
-    """Return the packer of the members behind the stamp; with `has_block` it ends where a float64 block may begin."""
+    """Return the struct that packs the members behind the stamp; has_block: padded up to a float64 block."""
     pattern = "<"
     position = _STAMP_END
     for member in members:
@@ -147,7 +147,7 @@ def body_struct(members: Iterable[Member], has_block: bool = False) -> struct.St
 
 
 def payload_dtype(text: str, fields: tuple[str, ...] = ()) -> "np.dtype[Any]":
-    """Read the layout of a payload from its `.msg` text; `fields` are our names of the fields, if they differ.
+    """Return the numpy type of a payload, from its `.msg` text; fields: our names of its fields, if they differ.
 
     The stamp becomes `sec` and `nanosec`. Raises LogError for anything but a stamp and numbers of fixed count.
     """
@@ -176,7 +176,7 @@ def payload_dtype(text: str, fields: tuple[str, ...] = ()) -> "np.dtype[Any]":
 
 
 def _field_lines(text: str) -> Iterator[tuple[str, int, str]]:
-    """List (type, count, name) of the fields after the stamp."""
+    """Yield (type, count, name) of the fields after the stamp."""
     own_lines = text.split(SEPARATOR, maxsplit=1)[0].splitlines()
     lines = [line.strip() for line in own_lines if line.strip() and not line.strip().startswith("#")]
     if not lines or lines[0] != "builtin_interfaces/Time stamp":
@@ -234,9 +234,10 @@ def pack_can_frame(
     is_remote: bool = False,
     is_extended: bool | None = None,
 ) -> bytes:
-    """Pack a frame; `stamp` is a packed builtin_interfaces/Time, `data` up to 8 bytes of which `dlc` count.
+    """Return a frame as a payload of can_msgs/Frame.
 
-    Without `is_extended` identifiers beyond 0x7FF are 29-bit ones.
+    stamp: a packed builtin_interfaces/Time. data: up to 8 bytes, of which `dlc` count. Without `is_extended`,
+    identifiers above 0x7FF are 29-bit ones.
     """
     is_extended = can_id > MAX_STANDARD_ID if is_extended is None else is_extended
     body = _CAN_FRAME_BODY.pack(can_id, is_remote, is_extended, is_error, dlc, data)
@@ -244,7 +245,11 @@ def pack_can_frame(
 
 
 def pack_fd_frame(stamp: bytes, can_id: int, data: bytes, is_error: bool, is_extended: bool | None = None) -> bytes:
-    """Pack an FD frame; `stamp` is a packed builtin_interfaces/Time, `data` up to 64 bytes."""
+    """Return an FD frame as a payload of ros2_socketcan_msgs/FdFrame.
+
+    stamp: a packed builtin_interfaces/Time. data: up to 64 bytes. Without `is_extended`, identifiers above 0x7FF are
+    29-bit ones.
+    """
     length = len(data)
     is_extended = can_id > MAX_STANDARD_ID if is_extended is None else is_extended
     return ENCAPSULATION + stamp + _FRAME_ID + _FD_FRAME_BODY.pack(can_id, is_extended, is_error, length, length) + data
@@ -277,12 +282,12 @@ JOINT_STATE_DTYPE = np.dtype(
 
 
 def pack_joint_state(stamp: bytes, q: bytes, dq: bytes, tau_J: bytes) -> bytes:
-    """Pack a joint state; `q`, `dq`, `tau_J` are the bytes of float64 (2,)."""
+    """Return a payload of sensor_msgs/JointState; `q`, `dq`, `tau_J` are the bytes of float64 (2,)."""
     return b"".join((ENCAPSULATION, stamp, _JOINT_STATE_HEAD, q, _COUNT, dq, _COUNT, tau_J))
 
 
 def pack_log(stamp: bytes, event: Event) -> bytes:
-    """Pack an event; an unknown level counts as an error."""
+    """Return an event as a payload of foxglove_msgs/Log; an unknown level counts as an error."""
     payload = ENCAPSULATION + stamp + bytes((_LEVELS.get(event.level, _LEVELS["error"]),))
     for text in (event.message, event.name, ""):
         encoded = text.encode("utf-8", "replace") + b"\0"
@@ -306,7 +311,7 @@ def log_time_ns(payload: bytes) -> int:
 
 
 def unpack_log(payload: bytes) -> Event:
-    """Unpack an event. Raises struct.error or IndexError when the payload is cut."""
+    """Return the event in a payload of foxglove_msgs/Log. Raises struct.error or IndexError when it is cut."""
     level = _LEVEL_NAMES.get(payload[12], "error")
     position = 13
     texts = []

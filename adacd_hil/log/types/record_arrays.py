@@ -71,7 +71,7 @@ FRAME_TOPICS = {
 
 
 def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
-    """Count the frames in a file by its channels' topics and their counts of messages."""
+    """Return the number of bus frames in a file; topics, counts: topic and number of messages by channel id."""
     return sum(count for channel, count in counts.items() if topics.get(channel) in FRAME_TOPICS)
 
 
@@ -81,7 +81,7 @@ def is_of_frames(topic: Topic) -> bool:
 
 
 def frames_of(records: NDArray[Any], topic: Topic, epoch_ns: int) -> NDArray[Any]:
-    """Make frames of the records of a topic of frames; epoch_ns: subtracted from the file's times."""
+    """Convert the records of a topic of bus frames to frames (n,); epoch_ns: subtracted from the file's times."""
     frames = np.empty(len(records), LONG_FRAME_DTYPE if topic.has_tail else FRAME_DTYPE)
     fill_times(frames, records, epoch_ns)
     frames["is_tx"] = SENT in topic.name
@@ -91,13 +91,16 @@ def frames_of(records: NDArray[Any], topic: Topic, epoch_ns: int) -> NDArray[Any
 
 
 def fill_times(frames: NDArray[Any], records: NDArray[Any], epoch_ns: int) -> None:
-    """Take the times of frames from the records of a topic; epoch_ns: subtracted from the file's times."""
+    """Set t_ns and cycle_t_ns of frames (n,), in place, to the stamps and publish times of records (n,).
+
+    epoch_ns: subtracted from the file's times.
+    """
     frames["t_ns"] = records["sec"].astype(np.int64) * 1_000_000_000 + records["nanosec"] - epoch_ns
     frames["cycle_t_ns"] = records["publish_time"].astype(np.int64) - epoch_ns
 
 
 def joined_frames(pieces: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Join frames in order, as long ones where some are."""
+    """Return frames joined in the given order, of LONG_FRAME_DTYPE if a piece is."""
     is_long = any(piece.dtype == LONG_FRAME_DTYPE for piece in pieces)
     dtype = LONG_FRAME_DTYPE if is_long else FRAME_DTYPE
     whole = [_lengthened(piece) if is_long else piece for piece in pieces]
@@ -106,12 +109,12 @@ def joined_frames(pieces: Sequence[NDArray[Any]]) -> NDArray[Any]:
 
 
 def reordered_frames(frames: NDArray[Any], order: NDArray[np.int64]) -> NDArray[Any]:
-    """Put frames into another order."""
+    """Return frames in another order; order: their indices (n,)."""
     return frames.view(_item(frames.dtype))[order].view(frames.dtype)
 
 
 def _item(dtype: "np.dtype[Any]") -> str:
-    """Name the type of a frame's bytes, which numpy copies as a whole and not field by field."""
+    """Return the numpy type of a frame's bytes, which numpy copies as a whole and not field by field."""
     return f"V{dtype.itemsize}"
 
 
@@ -155,19 +158,25 @@ class FrameLog(NamedTuple):
 
 
 def is_plain(frames: NDArray[Any]) -> NDArray[np.bool_]:
-    """Mark (n,) the frames that a `Bus` receives: all but remote ones and 29-bit ones with identifiers up to 0x7FF."""
+    """Return for each frame (n,) whether a `Bus` receives it.
+
+    It receives all but remote frames and 29-bit ones with identifiers up to 0x7FF; error frames with any identifier.
+    """
     is_as_wide = (frames["can_id"] > MAX_STANDARD_ID) == frames["is_extended"]
     return np.asarray(~frames["is_remote"] & (is_as_wide | frames["is_error"]))
 
 
 def is_sendable(frames: NDArray[Any]) -> NDArray[np.bool_]:
-    """Mark the frames that a bus end of ours can send as they are (n,): of FD frames those of more than 8 bytes."""
+    """Return for each frame (n,) whether a bus end of ours can send it as it is.
+
+    Error frames, FD frames of up to 8 bytes and frames that are not plain, see `is_plain`, can't be sent.
+    """
     is_short_fd = frames["is_fd"] & (frames["length"] <= CLASSIC_BYTES)
     return np.asarray(is_plain(frames) & ~frames["is_error"] & ~is_short_fd)
 
 
 def as_logged(frames: NDArray[Any]) -> NDArray[Any]:
-    """Return the frames that a bus end of ours would have received or sent, (k,) of LONG_FRAME_DTYPE."""
+    """Return the frames that a bus end of ours could receive, (k,) of LONG_FRAME_DTYPE; drop the others."""
     chosen = frames[is_plain(frames)]
     logged = np.zeros(len(chosen), LONG_FRAME_DTYPE)
     for name in LONG_FRAME_DTYPE.names or ():
@@ -190,7 +199,7 @@ class PieceBuilder:
     """Gathers messages; a topic's place in `topics` is its slot."""
 
     def __init__(self, cycles: int, epoch_ns: int) -> None:
-        """Gather at most so many cycles at a time."""
+        """Gather pieces of at most `cycles` cycles; epoch_ns: subtracted from the file's times of frames."""
         self.topics: list[Topic] = []
         self.wrong = 0
         """Messages that weren't as long as their schema says."""
@@ -208,14 +217,17 @@ class PieceBuilder:
         return not (self._frames or any(self._rows) or any(self._payloads))
 
     def add_topic(self, topic: Topic) -> int:
-        """Gather one more topic; return its slot."""
+        """Add a topic whose messages are gathered; return its slot."""
         self.topics.append(topic)
         self._rows.append([])
         self._payloads.append([])
         return len(self.topics) - 1
 
     def add_messages(self, contents: "Contents", messages: slice, slots: NDArray[np.int32]) -> Iterator[RawPiece]:
-        """Gather some messages of chunks, and give the pieces that are whole with them. slots (n,): of each message."""
+        """Gather consecutive messages of chunks; yield each piece that is full.
+
+        messages: which of `contents`. slots (n,): index in `topics` for each message; UNWANTED: it is skipped.
+        """
         publish_ns = contents.publish_times[messages].view(np.int64)
         if not len(publish_ns):
             return
@@ -247,7 +259,7 @@ class PieceBuilder:
         return piece
 
     def _gather(self, contents: "Contents", first: int, slots: NDArray[np.int32]) -> None:
-        """Gather consecutive messages, of which the first has the number `first`."""
+        """Sort consecutive messages into their topics; first: the index of the first one in `contents`."""
         small = slots.astype(np.int16) if len(self.topics) < _MOST_SMALL else slots
         order = np.argsort(small, kind="stable")  # of 16 bits a radix sort
         messages = order + first
@@ -284,7 +296,7 @@ class PieceBuilder:
 def _rows_of(
     contents: "Contents", starts: Numbers, sizes: Numbers, topic: Topic
 ) -> tuple[NDArray[np.bool_] | None, NDArray[np.uint8]]:
-    """Copy the records of a topic, of messages of the right length, and mark these messages; None: all are right."""
+    """Return the records of a topic's messages of the right length, and which messages these are; None: all."""
     assert topic.dtype is not None
     most = topic.dtype.itemsize
     is_right = sizes == most

@@ -116,7 +116,7 @@ class OwnTopic:
     rate_Hz: int = 0
 
     def channel(self, parameter_count: int = 0, further_count: int = 0, channel_count: int = 0) -> LogChannel:
-        """Describe the topic to a file. Raises LogError when two fields share a name.
+        """Return the topic as a channel of a file, with its message type. Raises LogError when two fields share a name.
 
         The counts size the block of /scheme: see `records.certified_layout`.
         """
@@ -128,7 +128,7 @@ class OwnTopic:
 
     @cached_property
     def body(self) -> struct.Struct:
-        """Lay out the head as it follows the stamp; where a block follows, up to it."""
+        """The struct that packs a message's head as it follows the stamp, up to a block if one follows."""
         return body_struct(self.head, has_block=self.block is not None)
 
     @cached_property
@@ -136,7 +136,10 @@ class OwnTopic:
         return any(member.size > 1 for member in self.head)
 
     def pack(self, *values: Any, block: Vector | None = None) -> bytes:
-        """Pack the body of a message; `values`: in the order of the head. Raises struct.error or ValueError."""
+        """Return a message as bytes, without the stamp that the writer adds. Raises struct.error or ValueError.
+
+        values: fields of the head, in its order. block: the float64 values that follow it.
+        """
         if self._has_arrays:
             pairs = zip(self.head, values, strict=True)
             values = tuple(number for member, value in pairs for number in (value if member.size > 1 else (value,)))
@@ -296,9 +299,10 @@ RUN_TOPICS = (
 def run_channels(
     parameter_count: int, messages: tuple[MessageTable, ...] = (), further_count: int = 0, channel_count: int = 0
 ) -> tuple[LogChannel, ...]:
-    """List the topics of a run for `parameter_count` dynamic parameters and the DBC's messages.
+    """Return the topics of a run as channels of a file, for `parameter_count` parameters and the DBC's messages.
 
-    further_count, channel_count: of the certified scheme, see `records.certified_layout`; 0 for the paper's.
+    further_count, channel_count: of the certified scheme, see `records.certified_layout`; 0 for the paper's. Raises
+    LogError when two types share a name.
     """
     own = tuple(topic.channel(parameter_count, further_count, channel_count) for topic in RUN_TOPICS)
     decoded = tuple(
@@ -309,7 +313,7 @@ def run_channels(
 
 
 def truth_channels() -> tuple[LogChannel, ...]:
-    """List the topics of the emulator's own log."""
+    """Return the topics of the emulator's own log as channels of a file."""
     return TRUTH.channel(), EVENTS.channel()
 
 
@@ -328,14 +332,14 @@ def _check_names(channels: tuple[LogChannel, ...]) -> None:
 
 
 def pack_scheme(output: SchemeOutput, request: Request) -> bytes:
-    """Pack the body of /scheme."""
+    """Return a /scheme message as bytes, without the stamp that the writer adds."""
     o = output
     head = (o.cycle, o.state, o.previous_state, o.fault, request, o.contact_joints, o.is_model_valid)
     return SCHEME.pack(*head, block=o.block)
 
 
 def pack_arm(arm: ArmState, first_cycle: int) -> bytes:
-    """Pack the body of /arm; `first_cycle`: of the attempt."""
+    """Return an /arm message as bytes, without the stamp; first_cycle: number of the attempt's first cycle."""
     cycle, t_ns, periods, _, _, _, age_q, age_tau_J, is_enabled, is_complete, fault, is_late, steps, sampled_ns = arm
     age_ns = 0 if sampled_ns is None else t_ns - sampled_ns
     ages = (*age_q, *age_tau_J)
@@ -343,12 +347,12 @@ def pack_arm(arm: ArmState, first_cycle: int) -> bytes:
 
 
 def pack_contact(report: ContactReport) -> bytes:
-    """Pack the body of /contact."""
+    """Return a /contact message as bytes, without the stamp."""
     return CONTACT.pack(*(getattr(report, member.name) for member in CONTACT.head))
 
 
 def contact_report(record: Any) -> ContactReport:
-    """Read a report of a record of /contact, of which an older log has fewer fields.
+    """Convert a record of /contact to a report; records of older logs have fewer fields.
 
     Raises ValueError or OverflowError for a value that has no name.
     """
@@ -357,7 +361,7 @@ def contact_report(record: Any) -> ContactReport:
 
 
 def unpack_contact(body: bytes) -> ContactReport:
-    """Unpack the body of /contact. Raises ValueError when it is cut, or for a value that has no name."""
+    """Return the report in the bytes of `pack_contact`. Raises ValueError if cut, or for a value without a name."""
     head = bytes(_CONTACT_DTYPE.itemsize - CONTACT.body.size)
     return contact_report(np.frombuffer(head + body, _CONTACT_DTYPE)[0])
 
@@ -366,20 +370,23 @@ _CONTACT_DTYPE = CONTACT.channel().type.dtype
 
 
 def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick_stop: bool) -> bytes:
-    """Pack the body of /control; `block` is laid out by CONTROL_LAYOUT."""
+    """Return a /control message as bytes, without the stamp; `block` is laid out by CONTROL_LAYOUT.
+
+    gate_flags: a bit for each limit that acted. enable, quick_stop: requests to the drives.
+    """
     return CONTROL.pack(cycle, gate_flags, enable, quick_stop, block=block)
 
 
 def pack_cycle(record: CycleRecord) -> bytes:
-    """Pack the body of /cycle."""
+    """Return a /cycle message as bytes, without the stamp."""
     return CYCLE.pack(*record)
 
 
 def pack_frame_checks(checks: FrameChecks) -> bytes:
-    """Pack the body of /frame_checks."""
+    """Return a /frame_checks message as bytes, without the stamp."""
     return FRAME_CHECKS.pack(checks.cycle, *checks.counts, checks.implausible)
 
 
 def pack_truth(cycle: int, block: Vector) -> bytes:
-    """Pack the body of /truth; `block` is laid out by TRUTH_LAYOUT."""
+    """Return a /truth message as bytes, without the stamp; `block` is laid out by TRUTH_LAYOUT."""
     return TRUTH.pack(cycle, block=block)

@@ -44,7 +44,10 @@ class DefinitionCheck:
         self._duplicates: set[str] = set()
 
     def schema(self, schema: Schema, offset: int, is_summary: bool) -> None:
-        """Check a schema and compare it with earlier ones of its number."""
+        """Check a schema against the rules and against earlier ones of its number; add findings.
+
+        offset: place in the file. is_summary: it stands in the summary.
+        """
         name = f"schema {schema.id}"
         if schema.id == 0:
             self._findings.add_finding("schema-id", f"schema {schema.name!r} has the number 0", offset)
@@ -63,7 +66,10 @@ class DefinitionCheck:
             self.schemas.setdefault(schema.id, schema)
 
     def channel(self, channel: Channel, offset: int, is_summary: bool) -> None:
-        """Check a channel and compare it with earlier ones of its number."""
+        """Check a channel against the rules and against earlier ones of its number; add findings.
+
+        offset: place in the file. is_summary: it stands in the summary.
+        """
         name = f"channel {channel.id}"
         known = self.channels.get(channel.id)
         if known is not None:
@@ -104,7 +110,7 @@ class DefinitionCheck:
             self._findings.add_finding("duplicate", f"{name} is defined more than once in the data section", offset)
 
     def finish(self, counts: NDArray[Any]) -> None:
-        """Judge the channels and schemas that only the summary defines. counts: messages of each channel."""
+        """Add findings on channels and schemas that only the summary defines. counts: messages by channel number."""
         used = {"channel": set(np.flatnonzero(counts).tolist())}
         used["schema"] = {self.all_channels[number].schema_id for number in used["channel"] & set(self.all_channels)}
         unused = []
@@ -133,14 +139,14 @@ class ContentCheck:
         self._joint_states: set[int] = set()
 
     def schema(self, schema: Schema, offset: int) -> None:
-        """Read the text of a schema."""
+        """Check the text of a schema, once for each number; add a finding if it can't be read."""
         if schema.encoding == "ros2msg" and schema.id not in self._read:
             self._read.add(schema.id)
             if problem := text_problem(schema.data):
                 self._findings.add_finding("schema-text", f"schema {schema.id} ({schema.name}): {problem}", offset)
 
     def messages(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
-        """Check order and payloads of the messages of a chunk."""
+        """Check order and payloads of the messages of a chunk; add findings. offset: of the chunk in the file."""
         for number in np.unique(contents.channels).tolist():
             if number not in self._described and number in definitions.channels:
                 channel = definitions.channels[number]
@@ -222,7 +228,7 @@ _CONSTANT = re.compile(r"=\s*\S.*")
 
 
 def text_problem(data: bytes) -> str:
-    """Name the defect in the text of a schema; "" when it can be read."""
+    """Return the defect in the text of a schema, in words; "" when it can be read."""
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError:
@@ -258,6 +264,6 @@ def _line_problem(line: str, known: set[str]) -> str:
 
 
 def _short(name: str) -> str:
-    """Spell package/msg/Type as package/Type."""
+    """Return package/Type for package/msg/Type."""
     parts = name.split("/")
     return f"{parts[0]}/{parts[-1]}" if len(parts) > 1 else name

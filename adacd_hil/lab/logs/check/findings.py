@@ -43,13 +43,13 @@ class Findings:
     """Parts of the file that have no CRC, by kind."""
 
     def add_finding(self, rule: str, text: str, offset: int = -1) -> None:
-        """Add a finding of a rule of `RULES`."""
+        """Count a finding of a rule of `RULES`, and keep it if it is one of the rule's first ten."""
         self.counts[rule] += 1
         if self.counts[rule] <= _TOLD:
             self.found.append(LogFinding(self.file, RULES[rule], rule, text, offset))
 
     def count(self, severity: Severity) -> int:
-        """Count all findings of a severity."""
+        """Return the number of all findings of a severity, those that were only counted too."""
         return sum(count for rule, count in self.counts.items() if RULES[rule] is severity)
 
 
@@ -108,4 +108,4 @@ RULES: dict[str, Severity] = {
     "dropped": _WARNING,  # no packet was dropped on the way to the log
     "lost": _WARNING,  # nothing was lost before the log was recovered
 }
-"""How bad it is where a log is not as a rule demands."""
+"""Severity of a finding, by the rule that a log breaks."""

@@ -51,10 +51,10 @@ _DATA_SECTION = "data section"
 
 
 class _FileCheck:
-    """The check of one file by itself; then what the file states about itself."""
+    """The check of one file by itself; afterwards, its metadata and counts."""
 
     def __init__(self, name: str, file: IO[bytes]) -> None:
-        """Check a file."""
+        """Check a whole file; the results are in `findings`."""
         self.metadata: dict[str, dict[str, str]] = {}
         self.messages = self.frames = 0
         self._file = file
@@ -94,11 +94,11 @@ class _FileCheck:
 
     @property
     def is_ended(self) -> bool:
-        """Whether it has a DataEnd."""
+        """Whether the file has a DataEnd."""
         return self._counts[Opcode.DATA_END] > 0
 
     def _gap(self, gap: FileGap) -> None:
-        """Report bytes that don't form a record; the CRC includes them."""
+        """Add a finding on bytes that form no record; the CRC includes them."""
         self.findings.add_finding("record", f"{gap.size} bytes are no record", gap.offset)
         position = self._file.tell()
         self._crc = crc_of(self._file, gap.offset, gap.offset + gap.size, self._crc)
@@ -123,7 +123,7 @@ class _FileCheck:
             self.findings.add_finding("record", str(error), record.offset)
 
     def _count(self, record: RawRecord) -> None:
-        """Count records that a file may have only once."""
+        """Count a record that a file may have only once; add a finding for a second one."""
         opcode = Opcode(record.opcode)
         self._counts[opcode] += 1
         if self._counts[opcode] > 1:
@@ -194,7 +194,7 @@ class _FileCheck:
             )
 
     def _finish(self, end: int) -> None:
-        """Judge the file as a whole; it was read up to `end`."""
+        """Add the findings on the file as a whole; end: offset up to which it was read."""
         for opcode, rule in ((Opcode.HEADER, "header"), (Opcode.DATA_END, "data-end"), (Opcode.FOOTER, "footer")):
             if not self._counts[opcode]:
                 self.findings.add_finding(rule, f"there is no {name_of(opcode)}")
@@ -209,7 +209,7 @@ class _FileCheck:
         self._judge_missing_crcs()
 
     def _judge_missing_crcs(self) -> None:
-        """Report the parts that no CRC covers. The CRC of the data section covers all that is in it."""
+        """Add a finding on the parts that no CRC covers. The CRC of the data section covers all that is in it."""
         missing, chunks = self.findings.without_crc, len(self._chunks.facts)
         if not missing[_DATA_SECTION]:
             missing = Counter(summary=missing["summary"])
@@ -238,7 +238,7 @@ class LogCheck(NamedTuple):
 
 
 def find_logs(paths: Iterable[Path]) -> list[Path]:
-    """List logs: files as given, and each .mcap file in a given folder, except the later parts of a log.
+    """Return the paths of logs: files as given, and each .mcap file in a given folder except the later parts of a log.
 
     Raises LogError for a folder without a log.
     """
@@ -256,7 +256,10 @@ def find_logs(paths: Iterable[Path]) -> list[Path]:
 
 
 def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> LogCheck:
-    """Check the log whose first part is `path`, with all its parts. Raises LogError when a file can't be read."""
+    """Check the log whose first part is `path`, with all its parts; return the findings.
+
+    Raises LogError when a file can't be read.
+    """
     parts = parts_of(path)
     checked: dict[int, _FileCheck] = {}
     for number, part in parts.items():
@@ -280,7 +283,7 @@ def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> L
 
 
 def _check_parts(path: Path, checked: dict[int, _FileCheck], findings: Findings) -> None:
-    """Judge the parts of a log together."""
+    """Compare the parts of a log with each other; add findings."""
     last = max(checked)
     for missing in missing_parts(path, checked):
         findings.add_finding("missing-part", f"{missing.name} is missing")
@@ -310,7 +313,7 @@ def _summary(facts: _FileCheck) -> dict[str, str]:
 
 
 def _check_words(facts: _FileCheck) -> None:
-    """Compare the metadata of one of our own logs with its contents, and judge how the log ended."""
+    """Compare a log's metadata with its contents, and check how it ended; skip a file that is no log of ours."""
     findings, summary = facts.findings, _summary(facts)
     if RUN_METADATA not in facts.metadata:
         return

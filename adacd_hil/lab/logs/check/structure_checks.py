@@ -59,7 +59,7 @@ _INDEXED = (
 
 
 def pack_offsets(offsets: Mapping[int, int]) -> bytes:
-    """Pack the places of message indexes, by channel."""
+    """Return the offsets of message indexes as bytes, in the order of their channels."""
     return b"".join(struct.pack("<HQ", channel, offsets[channel]) for channel in sorted(offsets))
 
 
@@ -84,7 +84,7 @@ class ChunkCheck:
         self._offsets: dict[int, int] = {}
 
     def chunk(self, record: RawRecord) -> None:
-        """Check a chunk, its messages and definitions; store the facts that its index must have."""
+        """Check a chunk, its messages and definitions; add findings, and keep the facts that its index must have."""
         chunk: Chunk = parse(record.opcode, record.body)
         facts = ChunkFacts(
             HEAD.size + len(record.body),
@@ -128,7 +128,7 @@ class ChunkCheck:
             self._findings.add_finding("chunk-times", text, offset)
 
     def _expect(self, contents: Contents, facts: ChunkFacts) -> None:
-        """Store the message indexes that the chunk must have."""
+        """Keep the message indexes that the chunk must have."""
         order = np.argsort(contents.channels, kind="stable")
         channels, firsts = np.unique(contents.channels[order], return_index=True)
         groups = np.split(contents.entries[order], firsts[1:])
@@ -136,7 +136,7 @@ class ChunkCheck:
         facts.channels = channels.tobytes()
 
     def message_index(self, record: RawRecord) -> None:
-        """Compare a message index with the chunk before it, which has one for each channel."""
+        """Compare a message index with the chunk before it; add findings."""
         channel = int.from_bytes(record.body[:2], "little")
         latest = self._latest
         if latest is None:
@@ -156,7 +156,7 @@ class ChunkCheck:
             self._findings.add_finding("message-index", text, record.offset)
 
     def end_indexes(self) -> None:
-        """Take notice that the indexes of the latest chunk are over."""
+        """Add a finding if the latest chunk lacks a message index; called at the first record after its indexes."""
         if self._latest is not None and self._expected:
             channels = [channel for channel, entries in self._expected.items() if len(entries)]
             offset = next(reversed(self.facts))
@@ -168,12 +168,12 @@ class ChunkCheck:
         self._latest = None
 
     def message(self, record: RawRecord) -> None:
-        """Check a message outside of chunks."""
+        """Check a message outside of chunks; add findings."""
         self.has_outside = True
         self._messages(message_contents(record), record.offset)
 
     def _messages(self, contents: Contents, offset: int) -> None:
-        """Check messages, after the definitions that stand between them."""
+        """Check and count messages, after the definitions that stand between them; add findings."""
         channels, firsts = np.unique(contents.channels, return_index=True)
         first_at = dict(zip(channels.tolist(), contents.starts[firsts].tolist(), strict=True))
         known = set(self._definitions.channels)
@@ -200,7 +200,7 @@ class ChunkCheck:
             self.content.messages(contents, self._definitions, offset)
 
     def compare(self, index: ChunkIndex, offset: int) -> None:
-        """Compare a chunk index with its chunk."""
+        """Compare a chunk index with its chunk; add findings. offset: of the index in the file."""
         facts = self.facts.get(index.chunk_start_offset)
         if facts is None:
             text = f"a chunk index points to byte {index.chunk_start_offset}, where no chunk begins"
@@ -239,7 +239,7 @@ class SummaryCheck:
         self._offset_start = 0
 
     def attachment(self, record: RawRecord, attachment: Attachment) -> None:
-        """Count an attachment; store the index that it must have."""
+        """Count an attachment; keep the index that the summary must have for it."""
         self._attachment_count += 1
         self._attachments[record.offset] = AttachmentIndex(
             offset=record.offset,
@@ -252,12 +252,12 @@ class SummaryCheck:
         )
 
     def metadata(self, record: RawRecord, name: str) -> None:
-        """Count a metadata record; store the index that it must have."""
+        """Count a metadata record; keep the index that the summary must have for it."""
         self._metadata_count += 1
         self._metadata[record.offset] = MetadataIndex(record.offset, HEAD.size + len(record.body), name)
 
     def record(self, record: RawRecord) -> None:
-        """Store the place of a record of the summary (not a definition); check an index or the statistics."""
+        """Keep the place of a record of the summary, no definition; check an index or the statistics, add findings."""
         self._start = self._start or record.offset
         if record.opcode == Opcode.SUMMARY_OFFSET:
             self._offset_start = self._offset_start or record.offset
@@ -299,7 +299,7 @@ class SummaryCheck:
             self._findings.add_finding("summary-channels", text, offset)
 
     def footer(self, record: RawRecord, crc: int) -> None:
-        """Check the footer. crc: of the summary up to the footer's own CRC."""
+        """Check the footer; add findings. crc: of the summary up to the footer's own CRC."""
         footer: Footer = parse(record.opcode, record.body)
         if footer.summary_start != self._start:
             text = f"the Footer says that the summary begins at byte {footer.summary_start}, it is {self._start}"
@@ -313,7 +313,7 @@ class SummaryCheck:
             self._findings.add_finding("summary-crc", "the summary fails its CRC", record.offset)
 
     def finish(self) -> None:
-        """Judge the summary as a whole."""
+        """Add the findings on the summary as a whole."""
         self._check_groups()
         self._check_indexes()
         if self.statistics is not None:
