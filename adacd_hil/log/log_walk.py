@@ -82,6 +82,20 @@ def read_head(path: Path) -> Extras:
     return extras
 
 
+def attachment(path: Path, name: str) -> bytes | None:
+    """Return an attachment of an MCAP file by its name; None if the head of the file lacks it or can't be read."""
+    with contextlib.suppress(LogError):  # the reader of the log reports damage
+        return read_head(path).attachments.get(name)
+    return None
+
+
+def run_metadata(path: Path) -> dict[str, str]:
+    """Return the metadata of the run in an MCAP file; empty if the head of the file lacks them or can't be read."""
+    with contextlib.suppress(LogError):
+        return read_head(path).metadata.get(RUN_METADATA, {})
+    return {}
+
+
 def _read_items(path: Path, is_ahead: bool = True) -> Iterator[Item]:
     """Yield the contents of a file from front to end; is_ahead: as for `read_blocks`.
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
-from adacd_hil.log.log_info import attachment, run_metadata
+from adacd_hil.log.log_walk import attachment, run_metadata
 from adacd_hil.log.logged_run import (
     Cycles,
     EmulatorSpan,

@@ -18,7 +18,7 @@ from adacd_hil.file_access import in_words
 from adacd_hil.file_replacement import tidied
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.log.log_files import TRUTH_NAME, LogError, LogExistsError
-from adacd_hil.log.log_info import run_metadata
+from adacd_hil.log.log_walk import run_metadata
 from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.printable import in_line, one_line
 from adacd_hil.progress_lines import Progress

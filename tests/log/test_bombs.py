@@ -14,11 +14,12 @@ from recorded_run import make_run, start
 
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.cut import TimeWindow, cut
+from adacd_hil.lab.logs.log_info import read_info
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.lab.logs.signal_tables import export_tables
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.log_info import attachment, read_info
+from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.mcap.chunks import FREE_BYTES, MOST_BYTES, MOST_RATIO, ChunkError, Opening, decompress
 from adacd_hil.log.mcap.mcap_records import MOST_RECORD_BYTES
 from adacd_hil.log.reader import read_log

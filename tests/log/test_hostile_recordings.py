@@ -6,11 +6,11 @@ import pytest
 from made_log import BLF_FRAME, blf_frame, blf_object, make_log, write_blf
 
 from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.log_info import read_info
 from adacd_hil.lab.logs.python_can_files import to_messages
 from adacd_hil.lab.logs.signal_tables import Tables, export_tables
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError, find_parts
-from adacd_hil.log.log_info import read_info
 from adacd_hil.log.mcap.chunks import MOST_BYTES
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.message_types import TIME_TEXT, payload_dtype

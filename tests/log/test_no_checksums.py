@@ -16,9 +16,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from adacd_hil.lab.cli.log_command import check, info_as_text, recovery_as_text
 from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.log_info import read_info
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.frames.frame_log import read_frames
-from adacd_hil.log.log_info import read_info
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.message_types import CAN_FRAME, pack_can_frame
 

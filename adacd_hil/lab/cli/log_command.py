@@ -13,9 +13,9 @@ from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.lab.logs.check.log_check import LogCheck
+    from adacd_hil.lab.logs.log_info import LogInfo
     from adacd_hil.lab.logs.recover import LogRecovery
     from adacd_hil.log.log_files import TimeWindow
-    from adacd_hil.log.log_info import LogInfo
 
 _TOLD_FAULTS = 5
 _log_argument = click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
@@ -37,7 +37,7 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     A folder stands for the logs in it.
     """
     from adacd_hil.lab.logs.check.log_check import find_logs
-    from adacd_hil.log.log_info import read_info
+    from adacd_hil.lab.logs.log_info import read_info
 
     found = [read_info(path) for path in find_logs(logs)]
     described = [{**vars(entry), "duration_s": entry.duration_s} for entry in found]
@@ -290,7 +290,7 @@ def export(
 
 def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
     """Return the DBC of a recording: the given one, else the one attached to the log, else the arm's."""
-    from adacd_hil.log.log_info import attachment
+    from adacd_hil.log.log_walk import attachment
     from adacd_hil.wire.codec import read_dbc
 
     text = attachment(log, "arm.dbc") if dbc is None and log.suffix.lower() == ".mcap" else None

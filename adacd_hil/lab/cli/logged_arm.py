@@ -12,7 +12,7 @@ from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
 from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.lab.commission.arm_draft import ArmDraft, Entry, write_draft
 from adacd_hil.log.log_files import log_in
-from adacd_hil.log.log_info import attachment
+from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings

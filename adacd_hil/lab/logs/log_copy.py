@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
 from adacd_hil.file_replacement import Replacement
+from adacd_hil.lab.logs.log_info import read_info
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import (
     COPY_ENDINGS,
@@ -26,7 +27,6 @@ from adacd_hil.log.log_files import (
     failing_as,
     is_part_name,
 )
-from adacd_hil.log.log_info import read_info
 from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end, read_header

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from mcap.records import Attachment, Metadata
 
+from adacd_hil.lab.logs.salvage import Losses, Salvage
 from adacd_hil.log.log_files import (
     DROPPED_KEY,
     ENDING_KEY,
@@ -18,7 +19,6 @@ from adacd_hil.log.log_files import (
 )
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import Definitions
-from adacd_hil.log.salvage import Losses, Salvage
 
 
 class SalvagedLog:

@@ -17,7 +17,7 @@ from scipy.ndimage import maximum_filter1d
 
 from adacd_hil.lab.detectors import detectors
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
-from adacd_hil.log.log_info import attachment
+from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
 from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector

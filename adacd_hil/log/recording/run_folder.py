@@ -5,9 +5,21 @@ The log of a start that failed before the first cycle is moved aside, so that th
 
 import itertools
 from pathlib import Path
+from typing import IO, Any
 
-from adacd_hil.file_access import InUseError, check_unused
-from adacd_hil.log.log_files import LogError, LogExistsError, failing_as, find_parts
+from mcap.opcode import Opcode
+
+from adacd_hil.file_access import InUseError, check_unused, open_input
+from adacd_hil.log.log_files import (
+    ENDING_KEY,
+    RUN_METADATA,
+    SUMMARY_METADATA,
+    LogError,
+    LogExistsError,
+    failing_as,
+    find_parts,
+)
+from adacd_hil.log.types.topics import CYCLE
 
 _FAILED_NAME = "failed-start-{}.mcap"
 
@@ -69,11 +81,27 @@ def _is_failed_start(path: Path) -> bool:
         raise LogExistsError(f"{error}; choose another folder with --out") from None
     if path.is_symlink() or not path.is_file() or list(find_parts(path)) != [0]:
         return False
-    from adacd_hil.log.log_info import read_info  # only needed for an existing log
-
     try:
-        info = read_info(path)
-    except LogError:
+        with open_input(path) as file:
+            return _has_no_cycle(file)
+    except (LogError, OSError):
         return False
-    has_no_cycle = info.ending == "closed" and not info.cycles
-    return bool(info.metadata) and not info.problems and (has_no_cycle or not info.messages)
+
+
+def _has_no_cycle(file: IO[bytes]) -> bool:
+    """Return whether a run's log has ended properly without a cycle, or has no message at all. Raises LogError."""
+    from adacd_hil.log.mcap.mcap_records import parse, read_end, read_record  # only needed for an existing log
+
+    end = read_end(file)
+    kinds: dict[int, list[Any]] = {Opcode.STATISTICS: [], Opcode.CHANNEL: [], Opcode.METADATA_INDEX: []}
+    for record in () if end is None else end.summary:
+        if record.opcode in kinds:
+            kinds[record.opcode].append(parse(record.opcode, record.body))
+    if not kinds[Opcode.STATISTICS]:
+        return False
+    found = (read_record(file, index.offset).body for index in kinds[Opcode.METADATA_INDEX])
+    metadata = {each.name: each.metadata for each in (parse(Opcode.METADATA, body) for body in found)}
+    counts = kinds[Opcode.STATISTICS][0].channel_message_counts
+    cycles = sum(counts.get(channel.id, 0) for channel in kinds[Opcode.CHANNEL] if channel.topic == CYCLE.name)
+    is_closed = metadata.get(SUMMARY_METADATA, {}).get(ENDING_KEY) == "closed"
+    return bool(metadata.get(RUN_METADATA)) and ((is_closed and not cycles) or not sum(counts.values()))

@@ -3,7 +3,6 @@
 A file whose summary can't be trusted is read whole, as far as it is readable.
 """
 
-import contextlib
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Statistics
 
 from adacd_hil.file_access import open_input
+from adacd_hil.lab.logs.salvage import Losses, Salvage
 from adacd_hil.log.log_files import (
     DROPPED_KEY,
     ENDING_KEY,
@@ -29,13 +29,12 @@ from adacd_hil.log.log_files import (
     parts_of,
     summary_count,
 )
-from adacd_hil.log.log_walk import read_head
+from adacd_hil.log.log_walk import run_metadata
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_contents
 from adacd_hil.log.mcap.mcap_records import Definitions, FileEnd, RawRecord, parse, read_end, read_record
 from adacd_hil.log.mcap.record_layout import MAGIC, MESSAGE_HEAD
 from adacd_hil.log.payload_sizes import payload_size
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.log.salvage import Losses, Salvage
 from adacd_hil.log.types.message_types import LOG, log_time_ns, payload_dtype, unpack_log
 from adacd_hil.log.types.record_arrays import count_frames
 from adacd_hil.log.types.topics import CONTACT, EVENTS
@@ -278,17 +277,3 @@ def _fields(channel: Channel) -> tuple[str, ...]:
 def _payloads(contents: Contents, channel: int) -> Iterator[bytes]:
     for place in np.flatnonzero(contents.channels == channel).tolist():
         yield contents.payload(place)
-
-
-def attachment(path: Path, name: str) -> bytes | None:
-    """Return an attachment of an MCAP file by its name; None if the head of the file lacks it or can't be read."""
-    with contextlib.suppress(LogError):  # the reader of the log reports damage
-        return read_head(path).attachments.get(name)
-    return None
-
-
-def run_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of the run in an MCAP file; empty if the head of the file lacks them or can't be read."""
-    with contextlib.suppress(LogError):
-        return read_head(path).metadata.get(RUN_METADATA, {})
-    return {}
