@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from adacd_hil.file_access import open_input
 from adacd_hil.file_replacement import Replacement
 from adacd_hil.lab.logs.log_info import read_info
+from adacd_hil.lab.logs.record_scan import read_header
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import (
     COPY_ENDINGS,
@@ -29,7 +30,7 @@ from adacd_hil.log.log_files import (
 )
 from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
 from adacd_hil.log.mcap.chunks import Contents
-from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end, read_header
+from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end
 from adacd_hil.log.types.record_arrays import count_frames
 
 _CHANNEL = 9

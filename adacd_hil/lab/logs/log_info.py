@@ -15,6 +15,7 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Statistics
 
 from adacd_hil.file_access import open_input
+from adacd_hil.lab.logs.payload_sizes import payload_size
 from adacd_hil.lab.logs.salvage import Losses, Salvage
 from adacd_hil.log.log_files import (
     DROPPED_KEY,
@@ -33,7 +34,6 @@ from adacd_hil.log.log_walk import run_metadata
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_contents
 from adacd_hil.log.mcap.mcap_records import Definitions, FileEnd, RawRecord, parse, read_end, read_record
 from adacd_hil.log.mcap.record_layout import MAGIC, MESSAGE_HEAD
-from adacd_hil.log.payload_sizes import payload_size
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.types.message_types import LOG, log_time_ns, payload_dtype, unpack_log
 from adacd_hil.log.types.record_arrays import count_frames

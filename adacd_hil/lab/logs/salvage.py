@@ -21,19 +21,17 @@ from mcap.records import Attachment, Chunk, Metadata, Statistics
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
+from adacd_hil.lab.logs.record_scan import FileGap, chunk_crc, scan
 from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, message_contents, read_contents
 from adacd_hil.log.mcap.mcap_records import (
     DEFINITIONS,
     Definitions,
-    FileGap,
     RawRecord,
     attachment_crc_fits,
-    chunk_crc,
     crc_of,
     parse,
     read_end,
-    scan,
 )
 
 _NOTES = 20

@@ -1,4 +1,4 @@
-"""The records of an MCAP file: in order, after damage, at the end of the file, and parsed by mcap's classes.
+"""The records of an MCAP file: in order, at the end of the file, and parsed by mcap's classes.
 
 A record repeats its length: its strings, maps and arrays must fill exactly the lengths that they state. In random bytes
 that happens once in 2^72 and more, so that it shows where records resume after damage. A message record has no such
@@ -9,10 +9,8 @@ Constant memory: one record at a time; one of more than MOST_RECORD_BYTES is non
 
 import io
 import os
-import re
 import struct
 from collections.abc import Callable, Collection, Iterable, Iterator
-from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 from mcap.data_stream import ReadDataStream
@@ -35,7 +33,6 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, crc32
 
@@ -91,7 +88,8 @@ MOST_RECORD_BYTES = 64 << 20
 """Of a record that is read. A chunk of ours has 0.1 MB, one of others up to 16 MB; an attachment of a run 0.2 MB."""
 CHANNEL_NUMBERS = 1 << 16
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
-_WINDOW = 1 << 20
+_PIECE_BYTES = 1 << 20
+"""Read at once for a CRC."""
 _RUN_BYTES = 40 << 10
 """Read at once of message indexes. A chunk of ours has 33 KB of them, in 30 records."""
 _INDEX_HEAD = 6
@@ -112,8 +110,6 @@ _READERS: dict[int, Any] = {
     Opcode.SUMMARY_OFFSET: SummaryOffset.read,
     Opcode.DATA_END: DataEnd.read,
 }
-_BEGINNING = re.compile(rb"(?=[\x01-\x04\x06-\x0f].{5}\0\0\0)", re.DOTALL)
-"""Possible beginning of a record of less than a TiB."""
 
 
 class RawRecord(NamedTuple):
@@ -134,13 +130,6 @@ class IndexRun(NamedTuple):
 
     data: bytes  # their records
     entries: list[bytes]  # of each
-
-
-class FileGap(NamedTuple):
-    """Bytes that belong to no record."""
-
-    offset: int
-    size: int
 
 
 class Problem(NamedTuple):
@@ -224,78 +213,6 @@ def _index_run(data: bytes) -> IndexRun:
     return IndexRun(data[:position], entries)
 
 
-def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap]:
-    """Yield the records of a file, and the gaps between them: after damage, search for the next record.
-
-    It ends with a Footer that the magic follows, or with the file.
-    """
-    size = os.fstat(file.fileno()).st_size
-    position = len(MAGIC) if _read(file, 0, len(MAGIC)) == MAGIC else 0
-    while position < size:
-        head = _head(file, position, size)
-        if head is None:
-            found = _find_next(file, position + 1, size)
-            yield FileGap(position, found - position)
-            position = found
-            continue
-        record = RawRecord(position, head[0], _read(file, position + HEAD.size, head[1]))
-        yield record
-        position = record.end
-        if record.opcode == Opcode.FOOTER and _read(file, position, len(MAGIC)) == MAGIC:
-            return
-
-
-def _head(file: IO[bytes], position: int, size: int) -> tuple[int, int] | None:
-    """Return opcode and length of the record at `position` of a file of `size` bytes, if one is there."""
-    head = _read(file, position, HEAD.size)
-    if len(head) < HEAD.size:
-        return None
-    opcode, length = HEAD.unpack(head)
-    start = position + HEAD.size
-    if not opcode or length > min(size - start, MOST_RECORD_BYTES):
-        return None
-    if opcode in set(Opcode):
-        is_there = fits(opcode, length, lambda place, count: _read(file, start + place, count))
-    else:  # a kind that is not known, if a known one follows
-        is_there = _is_shaped(file, start + length, size)
-    return (opcode, length) if is_there else None
-
-
-def _is_shaped(file: IO[bytes], position: int, size: int) -> bool:
-    """Return whether a record that repeats its length is at `position`."""
-    opcode = _read(file, position, 1)
-    return bool(opcode) and has_shape(opcode[0]) and _head(file, position, size) is not None
-
-
-def _find_next(file: IO[bytes], position: int, size: int) -> int:
-    """Return the offset of the next record, from `position` on, that repeats its length; `size` if there is none."""
-    while position < size:
-        window = _read(file, position, _WINDOW + HEAD.size)
-        for match in _BEGINNING.finditer(window):
-            if _is_shaped(file, position + match.start(), size):
-                return position + match.start()
-        position += _WINDOW
-    return size
-
-
-def read_header(path: Path) -> Header | None:
-    """Return the header of an MCAP file; None if it can't be read or trusted."""
-    try:
-        with open_input(path) as file:
-            first = next(scan(file), None)
-        if not isinstance(first, RawRecord) or first.opcode != Opcode.HEADER:
-            return None
-        header: Header = parse(first.opcode, first.body)
-    except (OSError, LogError):
-        return None
-    return header
-
-
-def chunk_crc(record: RawRecord) -> int:
-    """Return the CRC, stored in a chunk, of its decompressed records; 0 without one."""
-    return int.from_bytes(record.body[24:28], "little")
-
-
 def attachment_crc_fits(record: RawRecord, can_lack: bool = True) -> bool:
     """Return whether an attachment fits its CRC; can_lack: a CRC of 0, which means absent, fits."""
     stored = int.from_bytes(record.body[-4:], "little")
@@ -320,7 +237,7 @@ def read_end(file: IO[bytes]) -> FileEnd | None:
     if found is None:
         return None
     place, end, footer = found
-    data_end = _read(file, end - _DATA_END, _DATA_END)
+    data_end = read_bytes(file, end - _DATA_END, _DATA_END)
     if data_end[0] != Opcode.DATA_END:
         return None
     data_crc = int.from_bytes(data_end[HEAD.size :], "little")
@@ -344,14 +261,14 @@ def summary_of(file: IO[bytes]) -> list[RawRecord]:
     if found is None or found[0] - found[1] > MOST_RECORD_BYTES:
         return []
     place, end, _ = found
-    return _split(_read(file, end, place - end), end)
+    return _split(read_bytes(file, end, place - end), end)
 
 
 def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
     """Return where the footer is, where the summary begins, and the footer; None for a file without an end."""
     size = file.seek(0, os.SEEK_END)
     place = size - len(MAGIC) - _FOOTER
-    tail = _read(file, max(0, place), _FOOTER + len(MAGIC))
+    tail = read_bytes(file, max(0, place), _FOOTER + len(MAGIC))
     if place < len(MAGIC) + _DATA_END or not tail.endswith(MAGIC) or tail[0] != Opcode.FOOTER:
         return None
     footer: Footer = parse(Opcode.FOOTER, tail[HEAD.size : _FOOTER])
@@ -372,7 +289,7 @@ def _split(data: bytes, offset: int) -> list[RawRecord]:
 
 def read_record(file: IO[bytes], offset: int) -> RawRecord:
     """Read the record that begins at `offset`. Raises LogError when there is none."""
-    head = _read(file, offset, HEAD.size)
+    head = read_bytes(file, offset, HEAD.size)
     if len(head) < HEAD.size:
         raise LogError(f"no record at byte {offset}")
     opcode, length = HEAD.unpack(head)
@@ -385,13 +302,14 @@ def read_record(file: IO[bytes], offset: int) -> RawRecord:
 def crc_of(file: IO[bytes], start: int, end: int, crc: int = 0) -> int:
     """Return the CRC of the bytes of a file from start to end - 1; crc: that of the bytes before them."""
     file.seek(start)
-    while start < end and (block := file.read(min(_WINDOW, end - start))):
+    while start < end and (block := file.read(min(_PIECE_BYTES, end - start))):
         crc = crc32(block, crc)
         start += len(block)
     return crc
 
 
-def _read(file: IO[bytes], place: int, count: int) -> bytes:
+def read_bytes(file: IO[bytes], place: int, count: int) -> bytes:
+    """Return up to `count` bytes of a file from an offset on."""
     file.seek(place)
     return file.read(count)
 

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from adacd_hil.lab.logs.check.findings import Findings
 from adacd_hil.lab.logs.joint_states import is_joint_state
+from adacd_hil.lab.logs.payload_sizes import is_own, payload_size
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS
 from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD
-from adacd_hil.log.payload_sizes import is_own, payload_size
 from adacd_hil.log.types.message_types import (
     ENCAPSULATION,
     FD_FRAME,

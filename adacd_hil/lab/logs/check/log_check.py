@@ -17,6 +17,7 @@ from adacd_hil.file_access import open_input
 from adacd_hil.lab.logs.check.content_checks import DefinitionCheck
 from adacd_hil.lab.logs.check.findings import Findings, LogFinding, Severity
 from adacd_hil.lab.logs.check.structure_checks import ChunkCheck, SummaryCheck
+from adacd_hil.lab.logs.record_scan import FileGap, scan
 from adacd_hil.log.log_files import (
     CONTINUED,
     DROPPED_KEY,
@@ -33,7 +34,7 @@ from adacd_hil.log.log_files import (
     part_path,
     parts_of,
 )
-from adacd_hil.log.mcap.mcap_records import FileGap, RawRecord, attachment_crc_fits, crc_of, name_of, parse, scan
+from adacd_hil.log.mcap.mcap_records import RawRecord, attachment_crc_fits, crc_of, name_of, parse
 from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, crc32
 from adacd_hil.log.types.record_arrays import count_frames
 
