@@ -48,7 +48,10 @@ _BINS = 12
 def run_commtest(
     connection: Connection, seconds: float, is_enabling: bool, out: Path | None
 ) -> tuple[dict[str, Any], ExitCode]:
-    """Boot the arm, run cycles at zero torque, judge. Exit status FAILURE if the connection is not sufficient.
+    """Boot the arm, run cycles at zero torque, and judge the connection; return the result and the exit status.
+
+    The exit status is FAILURE if the connection is not sufficient. is_enabling: enable the drives. out: folder for log
+    and pictures, None: neither.
 
     Raises ConfigError, CodecError, BusMissingError, LogExistsError, LogError, CommandError.
     """
@@ -186,7 +189,7 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
 
 
 def describe(report: CommunicationReport, settings: Settings, scheduler: str) -> dict[str, Any]:
-    """Return the report as a dictionary for JSON; times in µs."""
+    """Return the report as a dictionary for JSON; times in µs. scheduler: granted to this process."""
     evidence = _evidence(report, settings.bus.period_us)
     return {
         "verdict": report.verdict.value,
@@ -216,7 +219,7 @@ def _evidence(report: CommunicationReport, period_us: float) -> TimingEvidence:
 
 
 def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
-    """Return reasons why the figures are less significant."""
+    """Return the warnings of a test, a line each: no real-time priority, silent devices, skipped periods."""
     warnings = []
     if not scheduler.startswith(("SCHED_FIFO", "SCHED_DEADLINE")):
         warnings.append(f"without real-time priority ({scheduler}) the times are those of a busy desktop")
@@ -229,7 +232,7 @@ def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
 
 
 def as_text(described: dict[str, Any]) -> str:
-    """Format the result for people."""
+    """Return the result, as of `describe`, as text for people."""
     lines = [
         f"cycles {described['cycles']}, complete {described['complete']}, overruns {described['overruns']}, "
         f"period {described['period_us']} µs, {described['scheduler']}, bus load {described['load_percent']:.1f} %"

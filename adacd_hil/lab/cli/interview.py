@@ -74,7 +74,7 @@ class Interview:
                 tell(str(error))
 
     def confirm(self, answer: bool | None, question: str) -> bool:
-        """Return the option's answer if given, else ask; return False without a terminal."""
+        """Return the option's answer, unless None; else ask yes or no on a terminal; elsewhere return False."""
         if answer is not None:
             return answer
         return self.is_asking and click.confirm(in_line(question), default=False, err=True)
