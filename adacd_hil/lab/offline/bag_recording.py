@@ -42,7 +42,7 @@ def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
 
 
 def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
-    """Return the topic to read: the wanted one, else the only one of JointState. Raises ConfigError."""
+    """Return the topic to read: `wanted`, else /joint_states, else the only one of JointState. Raises ConfigError."""
     found = joint_state_topics(topics)
     if wanted:
         if wanted in found:

@@ -181,7 +181,7 @@ def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
 
 
 def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
-    """Draft the keys of a bag; it needs no key if it has the URDF's names on one topic."""
+    """Draft the keys of a bag that differ from the defaults: topic, stamp, names of joints, units. Raises LogError."""
     keys = []
     with opened_bag(recording) as (topics, read_messages):
         found = joint_state_topics(topics)
