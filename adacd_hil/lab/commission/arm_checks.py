@@ -112,7 +112,7 @@ class ArmExamination:
 
 
 def check_bus(patient: ArmExamination) -> Finding:
-    """Open the bus; it stays open for the further checks."""
+    """Check that the bus opens; leave it open for the further checks."""
     patient.connect()
     return ok(f"{patient.tap.channel} is open")
 
@@ -261,7 +261,7 @@ def check_rate(patient: ArmExamination) -> Finding:
 
 
 def check_load(patient: ArmExamination) -> Finding:
-    """Check that the bus has room for frames that are not cyclic."""
+    """Check that the bus load is at most `HIGH_LOAD_PERCENT`, which leaves room for frames that are not cyclic."""
     load = patient.communication().load_percent
     text = f"{load:.1f} % at {patient.bitrate} bit/s"
     if load > HIGH_LOAD_PERCENT:

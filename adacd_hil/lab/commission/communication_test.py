@@ -161,7 +161,7 @@ class CommunicationReport:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on this share."""
+        """Verdict on `share`."""
         return judge(self.share)
 
 

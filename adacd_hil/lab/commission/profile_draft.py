@@ -385,11 +385,11 @@ class _ProfileWriter(ABC):
         return []
 
     def options(self, can_write: bool) -> list[str]:  # noqa: ARG002 (of a drive)
-        """Return the profile's lines on the reactions of a stop."""
+        """Return the profile's lines on the reactions of a stop. can_write: the drive's option codes can be written."""
         return []
 
     def further(self) -> list[str]:
-        """Return the maker's further lines, besides scale and PDOs."""
+        """Return the profile's further lines that hold for all devices of the maker, such as [patience]."""
         return []
 
     @abstractmethod

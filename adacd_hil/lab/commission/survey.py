@@ -137,9 +137,10 @@ def survey(
     progress: Callable[[str], None] = lambda _: None,
     contract_ids: Container[int] = (),
 ) -> Survey:
-    """Ask all 127 node ids for 0x1000, listen for `duration_s`, and read the identity of whoever is there.
+    """Ask all 127 node ids for 0x1000, listen for `duration_s`, and read the identity of each node that answers.
 
-    `contract_ids`: nodes whose 0x2000 is the contract's. Raises BusError.
+    contract_ids: ids of the nodes of which 0x2000, wire version and layout digest, is read, too. progress: called with
+    a line before each step. Raises BusError.
     """
     tap = Tap(bus, clock)
     traffic = Traffic()
@@ -185,7 +186,10 @@ def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
 
 
 def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
-    """Read a node's identity objects into its record; an object that the node doesn't give stays None."""
+    """Read a node's identity objects into its record; an object that the node lacks stays None.
+
+    If the node falls silent or refuses, its `answers` becomes False.
+    """
     remote = canopen.add_node(node.node_id, None, pause_s=BETWEEN_READS_S)
     try:
         name = read_object(remote, 0x1008)

@@ -194,7 +194,7 @@ class TareSession:
         return state.is_complete
 
     def _measure(self) -> Pose:
-        """Measure one window at rest. Raises TareRefusedError."""
+        """Run cycles for `tare.window_s`; return the pose. Raises TareRefusedError for motion or unfit data."""
         settings = self.settings
         cycles = self._cycles(settings.tare.window_s)
         states: list[ArmState] = []
