@@ -277,7 +277,7 @@ class Drafting:
         return chosen[0], chosen[1]
 
     def _ask_channel(self) -> str | None:
-        """Return the channel of the arm's bus; None for an arm without hardware. Raises CommandError."""
+        """Ask for the channel of the arm's bus; return it, None for an arm without hardware. Raises CommandError."""
         options = self.options
         if options.is_busless and (options.channel or options.interface):
             raise CommandError("--no-bus and --interface or --channel exclude each other", ExitCode.USAGE)

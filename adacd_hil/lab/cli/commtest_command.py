@@ -159,9 +159,10 @@ def _open_log(
 
 
 def write_pictures(out: Path, report: CommunicationReport, described: dict[str, Any]) -> list[Path]:
-    """Write commtest.html, with the tables and curves of the times as in the report of a run.
+    """Write commtest.html into a folder, with tables and curves of the cycle's times as in the report of a run.
 
-    Returns the files that were written, [] without a cycle. Raises LogError when they can't be written.
+    described: the result of `run_commtest`. Return the files that were written, [] without a cycle. Raises LogError if
+    they can't be written.
     """
     # Here and not above: they take a second to import, and memory that the test itself has no use for.
     from adacd_hil.lab.report.page import render_page
@@ -254,7 +255,7 @@ def as_text(described: dict[str, Any]) -> str:
 
 
 def _timing_lines(described: dict[str, Any]) -> list[str]:
-    """Format percentiles and bars of each time, then queues and losses."""
+    """Return lines of text with percentiles and bars of each time, then of queues and losses."""
     timing, lines = described["timing"], []
     for quantity in QUANTITIES:
         found = _percentile_text(timing["times_us"][quantity.name])

@@ -37,9 +37,10 @@ Reported = Report | Index
 def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -> tuple[list[Reported], ExitCode]:
     """Write a report of each log, or of a stretch of it, beside it or in `out`; return reports and exit status.
 
-    Reports of several logs are in subfolders of `out`.
-    A folder stands for the run log in it, or without one for the runs in its folders; one of these that can't be read
-    doesn't stop the others. Raises LogError, ConfigError, CommandError.
+    Reports of several logs are in subfolders of `out`. A folder stands for the run log in it, or without one for the
+    runs in its folders; one of these that can't be read doesn't stop the others.
+
+    Raises LogError, ConfigError, CommandError.
     """
     places: dict[Path, tuple[Path, tuple[Path, ...]]] = {}  # by folder of the report
     for given in logs:
