@@ -190,7 +190,7 @@ def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str])
     """Return the drives' positions at q = 0, deg, and the largest |q| (2,), deg, of an arm that is stretched at q2 = 0.
 
     sign: 1, or -1 if joint 2 of the URDF turns against joint 1. bent_deg: the model's q2 at the URDF's zero. Adds a
-    doubt if the limits of joint 2 exclude the stretched arm.
+    line to `doubts` if the limits of joint 2 exclude the stretched arm.
     """
     limits = _position_limits(arm)
     if abs(bent_deg) <= _BENT_DEG:
@@ -215,7 +215,7 @@ def _limit_about(arm: SerialArm, sign: int, bent_deg: float) -> float:
 
 
 def _mass_doubts(arm: SerialArm) -> list[str]:
-    """Return a doubt for each link without an inertial. Raises UrdfError for an inertia that no body has."""
+    """Return a line on each link without an inertial. Raises UrdfError for an inertia that no body has."""
     doubts = []
     links = arm.theta_full.reshape(JOINTS, PER_LINK)
     for name, link, axis in zip(arm.link_names, links, arm.chain.axis, strict=True):
@@ -276,7 +276,10 @@ def _position_limits(arm: SerialArm) -> Vector:
 
 
 def _plausible(key: str, values: Vector, doubts: list[str]) -> Pair | None:
-    """Return a pair of limits; None if one is infinite, or if `arm.KEY` doesn't accept them: then add a doubt."""
+    """Return the values as a pair of limits; None if one is infinite or `arm.KEY` doesn't accept them.
+
+    In the second case, add a line to `doubts`.
+    """
     if not np.all(np.isfinite(values)):
         return None
     pair = float(values[0]), float(values[1])
