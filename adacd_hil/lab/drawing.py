@@ -62,7 +62,10 @@ def _style() -> dict[Any, Any]:
 
 
 def style(more: dict[Any, Any] | None = None) -> AbstractContextManager[None]:
-    """Apply the figures' style for a while, whatever the user's own matplotlib configuration says."""
+    """Return a context manager that applies the figures' style, whatever the user's matplotlib configuration says.
+
+    more: rcParams that override the style's.
+    """
     return mpl.rc_context({**_style(), **(more or {}), "backend": mpl.rcParams["backend"]})
 
 
@@ -76,7 +79,7 @@ class Drawing:
     figure: Figure
 
     def png(self) -> bytes:
-        """Render on white, 150 dots per inch."""
+        """Return the figure as PNG, on white, 150 dots per inch."""
         out = io.BytesIO()
         with style():
             canvas: Any = FigureCanvasAgg(self.figure)
@@ -86,7 +89,7 @@ class Drawing:
 
 
 def paper_svg(drawing: Drawing) -> str:
-    """Render a drawing as a file of its own, on white, without date."""
+    """Return a drawing as the text of an SVG file, on white, without a date."""
     out = io.StringIO()
     with style({"svg.hashsalt": drawing.name}):
         canvas: Any = FigureCanvasSVG(drawing.figure)
@@ -95,7 +98,11 @@ def paper_svg(drawing: Drawing) -> str:
 
 
 def write_figures(out_dir: Path, name: str, described: dict[str, Any], drawings: Iterable[Drawing]) -> tuple[Path, ...]:
-    """Write NAME.json, and each drawing as PNG and SVG, into a folder. Raises LogError when they can't be written."""
+    """Write NAME.json and each drawing, by its name, as PNG and SVG, into a folder; return the files' paths.
+
+    Make the folder if missing, and replace files of these names. described: content of NAME.json. Raises LogError if a
+    file can't be written.
+    """
     contents: dict[str, bytes | str] = {f"{name}.json": json_text(described) + "\n"}
     for drawing in drawings:
         contents |= {f"{drawing.name}.png": drawing.png(), f"{drawing.name}.svg": paper_svg(drawing)}
@@ -104,9 +111,10 @@ def write_figures(out_dir: Path, name: str, described: dict[str, Any], drawings:
 
 
 def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.intp]:
-    """Choose the rows that keep the smallest and the largest value of each of `bins` equal parts, and both ends.
+    """Return indices of y (k,): the smallest and the largest value of each of `bins` equal parts, and both ends.
 
-    Rows ascend. A series of at most two rows per part is kept whole. NaN is chosen only where a part has no number.
+    Indices ascend. Of a series with at most two rows per part, all are returned. The index of a NaN is returned only
+    for a part without a number.
     """
     count = y.shape[0]
     width = -(-count // bins)
@@ -123,13 +131,13 @@ def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.intp]:
 
 
 def plot(axes: Axes, x: Vector, y: Vector, bins: int = _ENVELOPE_BINS, **look: Any) -> None:
-    """Draw a curve by the rows of its envelope."""
+    """Draw y over x, both (k,), on the axes, reduced to the rows of y's `envelope`. look: as of `Axes.plot`."""
     rows = envelope(y, bins)
     axes.plot(x[rows], y[rows], **look)
 
 
 def note(axes: Axes, text: str, colour: str = COLOURS["muted"]) -> None:
-    """Write above the right end of a panel."""
+    """Write a text above the upper right corner of a panel."""
     axes.annotate(
         text,
         (1.0, 1.0),
@@ -156,7 +164,7 @@ class HistoryPanel(NamedTuple):
 
 
 def history_figure(dates: Sequence[str], panels: Sequence[HistoryPanel]) -> Drawing:
-    """Draw panels over n dates, ISO 8601, with two deviations."""
+    """Draw panels below each other, their values over n dates (ISO 8601) with bars of two deviations."""
     at = np.array([date.removesuffix("Z") for date in dates], dtype="datetime64[s]")
     with style():
         figure = Figure(figsize=(7.2, 2.0 * len(panels)), layout="constrained")

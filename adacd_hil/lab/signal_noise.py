@@ -15,9 +15,9 @@ _MEDIAN_TO_SIGMA: Final = 1.4826 / math.sqrt(6.0)  # of the second difference of
 
 
 def white_noise(*parts: Vector) -> Vector:
-    """Estimate the rms of white noise, (n,) or a number, on series that are smooth but for it.
+    """Estimate the rms of the white noise on otherwise smooth series: (n,) for parts (k, n), a number for parts (k,).
 
-    By the median of the second difference, which motion hardly changes. 0 where no part has three samples.
+    By the median of the second differences of all parts, which motion hardly changes. 0 if no part has three samples.
     """
     seconds = np.concatenate([np.abs(np.diff(part, 2, axis=0)) for part in parts])
     if not len(seconds):
@@ -34,7 +34,7 @@ def resolution(values: Vector) -> float:
 
 
 def low_pass(values: Vector, poles_rad_s: Sequence[float], period_s: float) -> Vector:
-    """Filter series by cascaded low-passes that start at rest."""
+    """Filter series (k,) or (k, n) by a first-order low-pass per pole, one after the other, each 0 at the start."""
     from scipy.signal import lfilter  # takes half a second to load
 
     for pole in poles_rad_s:

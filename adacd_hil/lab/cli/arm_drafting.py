@@ -99,19 +99,25 @@ class DraftFiles:
     contents: dict[Path, bytes] = field(default_factory=dict)
 
     def require_free(self, path: Path) -> None:
-        """Raise CommandError if a file of that name exists and may not be replaced."""
+        """Raise CommandError if the path exists, unless `--force` is given."""
         if is_there(path) and not self.is_forced:
             raise CommandError(f"{path} exists; give another name, or --force to replace it", ExitCode.USAGE)
 
     def add_file(self, path: Path, content: str | bytes) -> None:
-        """Add a file. Raises CommandError if a file of that name exists and may not be replaced."""
+        """Add a file to those that `write_files` writes.
+
+        Raises CommandError if it exists with other content, unless `--force` is given.
+        """
         data = content.encode() if isinstance(content, str) else content
         if not (path.is_file() and path.read_bytes() == data):
             self.require_free(path)
         self.contents[path] = data
 
     def examine(self, text: str) -> ConfigurationFindings:
-        """Check a configuration's text together with the other files, as `config check`. Raises CommandError."""
+        """Check a configuration's text together with the other files, as `config check`; return the findings.
+
+        Raises CommandError if it has errors.
+        """
         with tempfile.TemporaryDirectory() as folder:
             for path, data in (self.contents | {self.out: text.encode()}).items():
                 (Path(folder) / path.name).write_bytes(data)
@@ -122,7 +128,7 @@ class DraftFiles:
         return found
 
     def write_files(self, text: str) -> None:
-        """Write the configuration and the other files. Raises CommandError."""
+        """Write the configuration, `text`, to `out`, and the added files; make the folder. Raises CommandError."""
         self.contents[self.out] = text.encode()
         try:
             self.out.parent.mkdir(parents=True, exist_ok=True)
@@ -147,7 +153,10 @@ class Drafting:
         """Drafted and completed profiles, by kind and joint."""
 
     def draft(self) -> tuple[str, dict[str, Any]]:
-        """Scan, ask, derive; return the text of the configuration and a summary."""
+        """Scan the bus, ask the user, derive the other values; return the text of the configuration and a summary.
+
+        Writes no file; adds device profiles to `writing`.
+        """
         facts = self._gather()
         title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]}"
         title += f" from {self.bus['interface']} {self.bus['channel']}." if self.bus else " without hardware."
@@ -168,7 +177,7 @@ class Drafting:
         return text, summary
 
     def _gather(self) -> ArmFacts:
-        """Find devices, profiles, geometry and limits, asking the user for unknown ones."""
+        """Return devices, profiles, geometry and limits of the arm; ask the user for unknown ones."""
         options = self.options
         drives, sensors = self._find_devices()
         drive, sensor = self._profiles(drives, sensors)
@@ -223,7 +232,7 @@ class Drafting:
         return load_profile(there, DRIVE).settings
 
     def _profile_guesses(self, facts: ArmFacts) -> list[str]:
-        """Name the guesses in the profiles, each once."""
+        """Return the guessed keys of the device profiles as "PROFILE: KEY", each once."""
         keys: dict[str, None] = {}
         for kind, names in ((DRIVE, facts.drive.value), (SENSOR, facts.sensor.value)):
             for joint, name in enumerate(names):
@@ -268,7 +277,7 @@ class Drafting:
         return chosen[0], chosen[1]
 
     def _ask_channel(self) -> str | None:
-        """Return the channel of the arm's bus; None for an arm without hardware. Raises CommandError."""
+        """Ask for the channel of the arm's bus; return it, None for an arm without hardware. Raises CommandError."""
         options = self.options
         if options.is_busless and (options.channel or options.interface):
             raise CommandError("--no-bus and --interface or --channel exclude each other", ExitCode.USAGE)
@@ -300,7 +309,10 @@ class Drafting:
     def _two(
         self, devices: Sequence[RecognisedDevice], kind: str, given: tuple[int, int] | None, channel: str
     ) -> list[RecognisedDevice]:
-        """Choose the two drives, or the two sensors."""
+        """Return the drives, or the sensors, of joint 1 and 2, asking for their node ids; warn if they are not given.
+
+        kind: "drive" or "sensor". given: node ids of the option. Raises CommandError if fewer than two answer.
+        """
         known = {device.node.node_id: device for device in devices if device.kind == kind}
         option, nodes = f"--{kind}-node", " ".join(map(str, known)) or "none"
         if len(known) < 2:
@@ -327,7 +339,10 @@ class Drafting:
         return answer
 
     def _profiles(self, drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]) -> tuple[Fact, Fact]:
-        """Return the device profiles of the drives and of the sensors, drafted from an EDS if needed."""
+        """Return the names of the profiles of the drives and of the sensors, drafted from an EDS if needed.
+
+        Raises CommandError if a device has neither a profile nor an EDS.
+        """
         options = self.options
         drafted = self._draft_profiles([*drives, *sensors])
         found = choose_family(drives, sensors) if drives else (("",) * 2, ("",) * 2)
@@ -364,7 +379,7 @@ class Drafting:
         return facts[0], facts[1]
 
     def _ask_eds(self, kind: str, joint: int, device: RecognisedDevice) -> str:
-        """Ask for the EDS of a device without a profile; return the name of the drafted profile."""
+        """Ask for the EDS of a device without a profile; draft that profile, and return its name. joint: 0 or 1."""
 
         def read(text: str) -> str:
             eds = Path(text)
@@ -376,7 +391,10 @@ class Drafting:
         return self.interview.ask("--eds FILE", None, question, read)[0]
 
     def beside(self, name: str, kind: str) -> str:
-        """Return a profile's path relative to the configuration's folder, from which it will be read."""
+        """Return a profile as the configuration names it: a built-in name, or a path relative to its folder.
+
+        If profile or EDS are in that folder, they are added unchanged to the files to be written.
+        """
         profile = load_profile(name, kind)
         if name in profile_names():
             return name
@@ -386,7 +404,10 @@ class Drafting:
         return os.path.relpath(name, self.writing.out.parent)
 
     def _draft_profiles(self, devices: Sequence[RecognisedDevice]) -> dict[tuple[str, int], str]:
-        """Draft a profile of each EDS, beside the configuration; return the names by kind and joint."""
+        """Draft profiles of each EDS, beside the configuration; return their names by kind and joint (0, 1).
+
+        devices: found on the bus, [] without a bus. Raises CommandError for an EDS that fits none of them.
+        """
         names: dict[tuple[str, int], str] = {}
         for eds, kind in self._eds_files():
             identity = identity_of(eds)
@@ -409,7 +430,7 @@ class Drafting:
         return names
 
     def _eds_files(self) -> list[tuple[Path, str]]:
-        """Return the EDS files with the kind of each; ask if 0x1000 names neither."""
+        """Return the EDS files with the kind of each, drive or sensor; ask if 0x1000 names neither."""
         options = self.options
         found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
         for eds in options.eds:
@@ -425,7 +446,10 @@ class Drafting:
         return found
 
     def _write_drafts(self, eds: Path, kind: str, ratings: dict[int, DeviceRatings]) -> dict[tuple[str, int], str]:
-        """Draft the profile of an EDS for some joints, asking for missing values; return the names of the files."""
+        """Draft profiles of an EDS, asking for missing values; add them and the EDS to the files to be written.
+
+        ratings: by joint (0, 1) to draft for. Return the profiles' file names by kind and joint.
+        """
         drafts = self._draft(eds, kind, ratings)
         folder, stem = self.writing.out.parent, f"{self.writing.out.stem}-{eds.stem}"
         self.writing.add_file(folder / eds.name, eds.read_bytes())
@@ -440,7 +464,7 @@ class Drafting:
         return names
 
     def _note(self, kind: str, joint: int, name: str, draft: ProfileDraft) -> None:
-        """Store a draft, and warn of its guesses."""
+        """Store a draft by kind and joint; add its guesses and remarks to the warnings. name: of its file."""
         self._drafts[kind, joint] = draft
         for line in (*draft.guesses, *draft.remarks):
             if (warning := f"{name}: {line}") not in self.warnings:
@@ -450,7 +474,10 @@ class Drafting:
     def _draft(
         self, eds: Path, kind: str, ratings: dict[int, DeviceRatings], among: Collection[str] | None = None
     ) -> dict[int, ProfileDraft]:
-        """Draft the profile of an EDS for some joints, and ask for each guess, or only those with keys in `among`."""
+        """Draft the profile of an EDS, asking for each guess, or only for those with keys in `among`.
+
+        ratings: by joint (0, 1) to draft for. Return the drafts by joint.
+        """
         answers: dict[int, dict[str, float]] = {joint: {} for joint in ratings}
 
         def drafted() -> dict[int, ProfileDraft]:
@@ -481,7 +508,10 @@ class Drafting:
         return drafts
 
     def _complete(self, kind: str, names: tuple[str, ...], devices: Sequence[RecognisedDevice]) -> tuple[str, ...]:
-        """Extend shipped profiles by gear and encoder of this arm, if known; return the names of the files."""
+        """Return the profiles' names, those of shipped ones replaced by extensions with known gear and encoder.
+
+        The extensions are added to the files to be written.
+        """
         completed, texts = list(names), dict[str, str]()
         for joint, name in enumerate(names):
             if name not in profile_names():
@@ -508,7 +538,7 @@ class Drafting:
     # -- the arm
 
     def _ask_geometry(self) -> tuple[PlanarArm, str, str, str]:
-        """Return the geometry, and the sources of lengths, masses, and gravity's direction."""
+        """Ask for the geometry; return it, and the sources of lengths, masses, gravity's direction ("": a guess)."""
         options, interview = self.options, self.interview
         urdf, arm = options.urdf, None
         if urdf is not None:
@@ -560,7 +590,7 @@ class Drafting:
         return arm, length_source, "given masses, as uniform rods", gravity_source
 
     def _ask_mounting(self) -> tuple[Pair, str]:
-        """Return the tilt of the plane of motion and the q1 at which link 1 hangs down, deg, and their source."""
+        """Ask for tilt of the plane of motion, and q1 at which link 1 hangs down, deg; return both and their source."""
         options, interview = self.options, self.interview
         given = options.mounting
         if options.is_upright is not None and given is None:
@@ -588,7 +618,10 @@ class Drafting:
         return (tilt_deg, hangs_deg), source if at_zero_source else ""
 
     def _mount(self, urdf: Path, arm: PlanarArm) -> tuple[PlanarArm, str]:
-        """Turn a URDF's root as it is mounted; return the arm, and a description of the mounting."""
+        """Ask how a URDF's root is mounted, and read the URDF again with its root so turned.
+
+        Return the arm, and a description of the mounting; the arm unchanged if neither option nor user answers.
+        """
         interview, given = self.interview, self.options.mounting
         if given is None and not interview.is_asking:
             return arm, "its root's z axis up"
@@ -603,7 +636,7 @@ class Drafting:
     def _rated(
         self, ratings: Sequence[DeviceRatings], profiles: Sequence[ProfileSettings], geometry: PlanarArm
     ) -> Fact:
-        """Return the rated torque at the joints: from the drives, from their EDS, or from the user."""
+        """Return the rated torque at the joints with its source: the drives, their EDS, or the user's answer."""
         scales = [profile.scale for profile in profiles]
         by_drives = [rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False)]
         drafts = [self._drafts.get((DRIVE, joint)) for joint in range(2)]
@@ -627,7 +660,7 @@ class Drafting:
         return self._limit("rated_torque_Nm", "--rated-torque-nm", proposal)
 
     def _limit(self, key: str, option: str, proposal: Fact) -> Fact:
-        """Ask for a pair of `arm.KEY`, within its bounds."""
+        """Ask for the two values of `arm.KEY`, within its bounds; return them with their source."""
         given = getattr(self.options, option[2:].replace("-", "_"))
         meaning = known_keys()[f"arm.{key}"].meaning
         value, source = self.interview.ask(
@@ -641,7 +674,7 @@ class Drafting:
 
 
 def _numbers(value: Any, kind: type, option: str) -> tuple[Any, Any]:
-    """Parse two numbers, given or typed. Raises ConfigError."""
+    """Return two numbers, typed as text or given as an option. option: name in errors. Raises ConfigError."""
     words = value.replace(",", " ").split() if isinstance(value, str) else list(value)
     try:
         first, second = (kind(word) for word in words)
@@ -651,7 +684,7 @@ def _numbers(value: Any, kind: type, option: str) -> tuple[Any, Any]:
 
 
 def _checked(key: str, value: tuple[Any, Any]) -> Any:
-    """Check a pair against the bounds of its setting. Raises ConfigError."""
+    """Return a pair if it is within the bounds of `arm.KEY`. Raises ConfigError otherwise."""
     return getattr(parse(ArmSettings, {key: list(value)}, "arm."), key)
 
 
@@ -677,7 +710,7 @@ def _hanging(text: str) -> float:
 
 
 def _word_or_deg(option: str, text: str, words: dict[str, float], low: float, high: float) -> float:
-    """Parse a word, or an angle within bounds, deg. Raises ConfigError."""
+    """Return the angle, deg, that a text gives: by a word of `words`, or as a number. Raises ConfigError."""
     if text.casefold() in words:
         return words[text.casefold()]
     try:
@@ -700,7 +733,7 @@ def _masses(value: Any) -> Pair | None:
 
 
 def _read_urdf(path: Path, locked: Sequence[str], pitch_deg: float = 0.0) -> PlanarArm:
-    """Read a URDF whose root is turned by so much about its y axis. Raises ConfigError."""
+    """Read a URDF. locked, pitch_deg: as of `planar_from_urdf`. Raises ConfigError."""
     try:
         return planar_from_urdf(read_input(path), locked, pitch_deg)
     except FileNotFoundError:
@@ -712,7 +745,7 @@ def _read_urdf(path: Path, locked: Sequence[str], pitch_deg: float = 0.0) -> Pla
 
 
 def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Fact:
-    """Propose the smallest of the drives' limit, the URDF's effort and the rated torque."""
+    """Return as proposed torque limits the smallest of 0x6072, the URDF's effort and the rated torque, per joint."""
     shares = [min(rating.torque_share or 1.0, 1.0) for rating in ratings] or [1.0, 1.0]
     efforts = geometry.effort_Nm or rated.value
     limit = tuple(min(rated.value[joint] * shares[joint], efforts[joint]) for joint in range(2))
@@ -721,7 +754,7 @@ def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: P
 
 
 def _limit_proposal(by_urdf: Pair | None, by_drives: list[float | None], source: str, default: Pair) -> Fact:
-    """Propose the URDF's limits, else those read from both drives, from this source, else a guess."""
+    """Return as proposed limits the URDF's, else those of both drives, from `source`, else `default`, a guess."""
     if by_urdf is not None:
         return Fact(by_urdf, "the URDF's")
     if by_drives and None not in by_drives:
@@ -755,7 +788,7 @@ class ScaleQuestion:
 
     @property
     def answer(self) -> str:
-        """Key of the answer in `draft_profile`."""
+        """Key of the answer in `answers` of `draft_profile`."""
         return "velocity_unit" if self.key == "scale.velocity_rad_s" else self.key.partition(".")[2]
 
     def given(self, options: InitOptions) -> Any:
@@ -769,7 +802,7 @@ class ScaleQuestion:
         return (value, value)
 
     def read(self, value: Any) -> tuple[float, float]:
-        """Parse an answer, for joint 1 and 2. Raises ConfigError."""
+        """Return an answer's values for joint 1 and 2; of a unit's name its worth, twice. Raises ConfigError."""
         if not self.units:
             first, second = _numbers(value, float, self.option.split()[0])
         elif value in self.units:
@@ -848,7 +881,7 @@ def _drive_or_sensor(text: str) -> str:
 
 
 def _extension(name: str, shipped: ScaleSettings, scale: ScaleSettings, left: Sequence[str]) -> str:
-    """Return a profile that extends a shipped one by gear and encoder of the arm."""
+    """Return the text of a profile that extends a shipped one by an arm's scale. left: keys that are still guesses."""
     rows = [
         f"{key} = {value!r}" for key, value in vars(scale).items() if not math.isclose(value, getattr(shipped, key))
     ]

@@ -48,7 +48,10 @@ _BINS = 12
 def run_commtest(
     connection: Connection, seconds: float, is_enabling: bool, out: Path | None
 ) -> tuple[dict[str, Any], ExitCode]:
-    """Boot the arm, run cycles at zero torque, judge. Exit status FAILURE if the connection is not sufficient.
+    """Boot the arm, run cycles at zero torque, and judge the connection; return the result and the exit status.
+
+    The exit status is FAILURE if the connection is not sufficient. is_enabling: enable the drives. out: folder for log
+    and pictures, None: neither.
 
     Raises ConfigError, CodecError, BusMissingError, LogExistsError, LogError, CommandError.
     """
@@ -156,9 +159,10 @@ def _open_log(
 
 
 def write_pictures(out: Path, report: CommunicationReport, described: dict[str, Any]) -> list[Path]:
-    """Write commtest.html, with the tables and curves of the times as in the report of a run.
+    """Write commtest.html into a folder, with tables and curves of the cycle's times as in the report of a run.
 
-    Returns the files that were written, [] without a cycle. Raises LogError when they can't be written.
+    described: the result of `run_commtest`. Return the files that were written, [] without a cycle. Raises LogError if
+    they can't be written.
     """
     # Here and not above: they take a second to import, and memory that the test itself has no use for.
     from adacd_hil.lab.report.page import render_page
@@ -186,7 +190,7 @@ def write_pictures(out: Path, report: CommunicationReport, described: dict[str, 
 
 
 def describe(report: CommunicationReport, settings: Settings, scheduler: str) -> dict[str, Any]:
-    """Return the report as a dictionary for JSON; times in µs."""
+    """Return the report as a dictionary for JSON; times in µs. scheduler: granted to this process."""
     evidence = _evidence(report, settings.bus.period_us)
     return {
         "verdict": report.verdict.value,
@@ -216,7 +220,7 @@ def _evidence(report: CommunicationReport, period_us: float) -> TimingEvidence:
 
 
 def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
-    """Return reasons why the figures are less significant."""
+    """Return the warnings of a test, a line each: no real-time priority, silent devices, skipped periods."""
     warnings = []
     if not scheduler.startswith(("SCHED_FIFO", "SCHED_DEADLINE")):
         warnings.append(f"without real-time priority ({scheduler}) the times are those of a busy desktop")
@@ -229,7 +233,7 @@ def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
 
 
 def as_text(described: dict[str, Any]) -> str:
-    """Format the result for people."""
+    """Return the result, as of `describe`, as text for people."""
     lines = [
         f"cycles {described['cycles']}, complete {described['complete']}, overruns {described['overruns']}, "
         f"period {described['period_us']} µs, {described['scheduler']}, bus load {described['load_percent']:.1f} %"
@@ -251,7 +255,7 @@ def as_text(described: dict[str, Any]) -> str:
 
 
 def _timing_lines(described: dict[str, Any]) -> list[str]:
-    """Format percentiles and bars of each time, then queues and losses."""
+    """Return lines of text with percentiles and bars of each time, then of queues and losses."""
     timing, lines = described["timing"], []
     for quantity in QUANTITIES:
         found = _percentile_text(timing["times_us"][quantity.name])

@@ -76,7 +76,7 @@ def _as_text(found: "LogComparison") -> str:
 
 
 def contact_in_words(contact: "Contact | None") -> str:
-    """Write a contact in a cell of the table."""
+    """Return the text of a contact in a cell of the table: time, link and force; "–" for None."""
     if contact is None:
         return "–"
     from adacd_hil.records import Location

@@ -27,7 +27,9 @@ def play(
     live: LiveView | None = None,
     truth: str | None = None,
 ) -> tuple["Report", ExitCode]:
-    """Play a scenario and report it; `out` None: in a new folder by date.
+    """Play a scenario with an emulated arm, and write log and report; return report and exit status.
+
+    out: folder; None: a new one by date. truth: how the real arm differs from the configuration. live: shows the run.
 
     Raises ConfigError, CodecError, LogError, CommandError, OSError.
     """
@@ -72,7 +74,7 @@ def next_of_report(html_path: Path) -> tuple[str, ...]:
 
 
 def _ending(summary: SessionSummary) -> str:
-    """Describe the end of a run that has no report."""
+    """Return a text on how a run ended whose report could not be written."""
     result = summary.result
     if summary.error or result is None:
         return summary.error or "no cycle was run"
@@ -82,7 +84,7 @@ def _ending(summary: SessionSummary) -> str:
 
 
 def outcome_of(summary: SessionSummary, truth_path: Path) -> ScenarioOutcome:
-    """Read the logs of a finished run, to compare it with its scenario's `expect`. Raises LogError."""
+    """Return the outcome of a finished run by its logs, as a scenario's `expect` describes it. Raises LogError."""
     from adacd_hil.lab.report.run_reading import read_run
     from adacd_hil.lab.score.evaluation import evaluate
 

@@ -27,7 +27,9 @@ _MARKS = {Status.OK: "ok", Status.WARNING: "WARNING", Status.FAILED: "FAILED", S
 
 
 def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], ExitCode]:
-    """Run all checks; the drives stay disabled, the nodes end pre-operational. Exit status FAILURE if one failed.
+    """Run all checks of configuration, host and arm; return their findings and the exit status, FAILURE if one failed.
+
+    The drives stay disabled, the nodes end pre-operational. is_moving: ask the user to move joints by hand.
 
     Raises ConfigError, CodecError.
     """
@@ -79,7 +81,7 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
 
 
 def as_json(findings: list[Finding]) -> dict[str, Any]:
-    """Return the findings as a list for JSON."""
+    """Return the findings and their summary as a dictionary for JSON."""
     checks = [finding._asdict() | {"status": finding.status.value} for finding in findings]
     return {"checks": checks, "summary": summarise(findings)}
 

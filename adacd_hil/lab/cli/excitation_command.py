@@ -24,9 +24,11 @@ _LABELS = (
 
 
 def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> dict[str, Any]:
-    """Search an excitation; `out`: the file for the result. Raises ConfigError, CommandError.
+    """Search an excitation for a configuration; return it by the keys of JSON.
 
-    Returns it by the keys of JSON: figures of the present one, None without one, and of the one found; their limits.
+    `present`, None without one, and `found`: figures of the configuration's excitation and of the one found; `limits`:
+    their bounds. seconds: duration of the search, about. out: file that the caller will write, refused if it is the
+    configuration. Raises ConfigError, CommandError.
     """
     if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
         raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
@@ -48,13 +50,13 @@ def search(config: str, profile: str | None, seconds: float, seed: int, out: Pat
 
 
 def as_toml(config: str, excitation: ExcitationSettings) -> str:
-    """Return an excitation as a configuration that extends the one it was found for."""
+    """Return an excitation as the TOML text of a configuration that extends `config`."""
     base = config if config in builtin_names() else str(Path(config).resolve())
     return f"extends = {json.dumps(base)}\n\n[excitation]\n{to_toml(excitation)}"
 
 
 def as_text(outcome: dict[str, Any]) -> str:
-    """Format the figures as a table, joint 1 / joint 2."""
+    """Return the result of `search` as a table, its figures per joint as joint 1 / joint 2."""
     rows = [
         (
             label,

@@ -116,7 +116,7 @@ def init(
 
 
 def as_text(summary: dict[str, Any]) -> str:
-    """Describe the written files and the guesses in them."""
+    """Return a text on the written files, the warnings, and the guesses."""
     lines = [f"written: {', '.join(summary['written'])}"]
     lines += [f"warning: {line}" for line in summary["warnings"]]
     if summary["assumed"]:

@@ -34,11 +34,12 @@ class Interview:
         proposal: tuple[Any, str] = (None, ""),
         explanation: str = "",
     ) -> tuple[Answer, str]:
-        """Return an answer and its source: "given", the proposal's, or "" for an unchanged guess.
+        """Return the option's answer, else ask the user on a terminal, else take the proposal if that is allowed.
 
-        read: makes an answer from an option's value, typed text, or a proposal; raises ConfigError for an invalid one,
-        and the question is repeated. explanation: printed on `?`. proposal: value and
-        source, "" for a guess; value None: none. Raises CommandError without an answer.
+        The source is returned, too: "given" for option and user, else the proposal's, "" for a guess. given: the
+        option's value, None without one. read: makes an answer of that value, of typed text, or of the proposal's; if
+        it raises ConfigError for typed text, the question is repeated. proposal: value, None without one, and source.
+        explanation: printed on `?`. Raises ConfigError for a wrong option, CommandError without an answer.
         """
         if given is not None:
             return read(given), "given"
@@ -74,7 +75,7 @@ class Interview:
                 tell(str(error))
 
     def confirm(self, answer: bool | None, question: str) -> bool:
-        """Return the option's answer if given, else ask; return False without a terminal."""
+        """Return the option's answer, unless None; else ask yes or no on a terminal; elsewhere return False."""
         if answer is not None:
             return answer
         return self.is_asking and click.confirm(in_line(question), default=False, err=True)

@@ -51,7 +51,10 @@ class LiveMonitor:
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
 
     def accept_message(self, message: LiveMessage) -> None:
-        """Update the display with a message; ignore other topics."""
+        """Store a message for `describe`: the last ones of events and contacts, the latest of /scheme and /cycle.
+
+        Other topics are ignored.
+        """
         if message.topic not in TOPICS:
             return
         self.messages += 1
@@ -130,9 +133,10 @@ def _finite(value: float) -> float | None:
 
 
 def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
-    """Watch a live view for `seconds` (None: until interrupted or it ends) and print; `is_live`: also meanwhile.
+    """Watch the live view of a run, and print its values at the end; return exit status OK.
 
-    Raises LogError.
+    seconds: None: until the user interrupts or the view ends. is_live: print them repeatedly meanwhile, too. Raises
+    LogError.
     """
     clock = MonotonicClock()
     screen = Screen(moves_cursor(sys.stdout) and is_live and not as_json, write_screen)
@@ -167,7 +171,7 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
 
 @contextlib.contextmanager
 def _understood() -> Iterator[None]:
-    """Turn errors of decoding a message that isn't ours into a LogError."""
+    """Raise LogError in place of the block's decoding errors: the server doesn't serve a log of adacd-hil."""
     try:
         yield
     except (ValueError, LookupError, OverflowError, struct.error):
@@ -175,7 +179,7 @@ def _understood() -> Iterator[None]:
 
 
 def as_text(described: dict[str, Any], is_cut: bool = False) -> str:
-    """Format the view for people; is_cut: a line for each event, cut to the terminal."""
+    """Return the values of `describe` as text for people; is_cut: a line for each event, cut to the terminal."""
     if "state" not in described:
         return f"{described['messages']} messages, none of /scheme"
     fault = "" if described["fault"] == FaultReason.NONE.name else f" by {described['fault']}"

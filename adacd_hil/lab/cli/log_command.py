@@ -173,7 +173,7 @@ def _bytes(count: int | None) -> str:
 
 
 def check_as_text(check: "LogCheck") -> str:
-    """Format the findings for people, and their number."""
+    """Return the findings on a log, a line each, and then their number."""
     lines = []
     for finding in check.findings:
         where = f"{finding.file}, byte {finding.offset}" if finding.offset >= 0 else finding.file
@@ -208,7 +208,7 @@ def _recovery(recovery: "LogRecovery") -> dict[str, Any]:
 
 
 def recovery_as_text(recovery: "LogRecovery") -> str:
-    """Format saved and lost data for people."""
+    """Return a text on the data that were saved from a damaged log, and on those lost."""
     saved = f"{recovery.messages} messages, {recovery.attachments} attachments"
     lost = recovery.losses.describe()
     lines = [f"{recovery.out}: {saved}", *(f"  {note}" for note in recovery.losses.notes)]
@@ -232,7 +232,7 @@ class TableFormat(click.Choice[str]):
     """A format of tables; those of frames, which have left, name their successor."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the format if it is one of the choices; fail with the successor of a format that has left."""
+        """Return the format if it is one of the choices; else fail, and name the tool for a format of frames."""
         if str(value).lower() in _FRAMES:
             self.fail(_CONVERTED, param, ctx)
         return super().convert(value, param, ctx)
@@ -289,7 +289,7 @@ def export(
 
 
 def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
-    """Return the DBC of a recording: the given one, else the one attached to the log, else the arm's."""
+    """Return text and path of a recording's DBC: the given one, else the one in the log, else the package's."""
     from adacd_hil.log.log_walk import attachment
     from adacd_hil.wire.codec import read_dbc
 

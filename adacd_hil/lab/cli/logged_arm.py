@@ -37,7 +37,10 @@ _NOT_TAKEN = {
 def draft_from_log(
     log: Path, options: InitOptions, interview: Interview, files: DraftFiles
 ) -> tuple[str, dict[str, Any]]:
-    """Return the text of a configuration for the arm of a log, and a summary. Raises LogError, CommandError."""
+    """Return the text of a configuration for the arm of a log, and a summary; write no file.
+
+    Adds profiles to `files`, and checks the configuration with them. Raises LogError, CommandError.
+    """
     given = [name for name in options.__dataclass_fields__ if getattr(options, name) not in (None, (), False)]
     if further := [name for name in given if name not in ("drive", "sensor")]:
         option = f"--{further[0].removeprefix('is_').replace('_', '-')}"
@@ -63,7 +66,10 @@ def draft_from_log(
 
 
 def _differences(settings: Settings, base: str, path: Path, warnings: list[str]) -> list[Entry]:
-    """Return the settings of a run that differ from its base configuration."""
+    """Return the settings of a run that differ from the configuration `base`, and guessed ones; add to the warnings.
+
+    Settings of the run and not of the arm, `_NOT_TAKEN`, are left out.
+    """
     based = load_settings(base, settings.arm.profile)
     entries = []
     if settings.arm.profile != load_settings(base).arm.profile:
@@ -87,7 +93,10 @@ def _is_unset(settings: Settings, key: str) -> bool:
 
 
 def _placed(entry: Entry, devices: Drafting, options: InitOptions) -> Entry:
-    """Make paths of devices and contract relative to the new configuration's folder. Raises CommandError."""
+    """Return an entry of devices with paths relative to the new configuration's folder; any other unchanged.
+
+    A contract that isn't there is left out. Raises CommandError if a device profile isn't there.
+    """
     kind = entry.key.removeprefix("devices.")
     if entry.key in ("devices.drive", "devices.sensor"):
         names = getattr(options, kind) or entry.value

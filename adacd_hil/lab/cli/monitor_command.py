@@ -39,7 +39,7 @@ class Screen:
         self._write = write
 
     def draw_table(self, text: str) -> None:
-        """Show a table, cut to the terminal; `end` shows the whole one."""
+        """Print a table; on a terminal in place of the previous one, and cut to its size."""
         text = plain(text)
         if not self.is_redrawn:
             self._write(text + "\n\n")
@@ -51,7 +51,7 @@ class Screen:
         self._write(_HOME + "".join(f"{_CLEAR_LINE}{line[:columns]}\n" for line in lines) + _CLEAR_BELOW)
 
     def end(self, text: str) -> None:
-        """Show the last table."""
+        """Print the last table, uncut; on a terminal in place of the previous one."""
         self._write((_HOME + _CLEAR_BELOW if self.is_redrawn else "") + plain(text) + "\n")
 
 
@@ -71,11 +71,11 @@ class Monitor:
         self.is_stopped = False
 
     def stop(self) -> None:
-        """End the present `listen` soon. Safe in a signal handler."""
+        """Make the present `listen` end soon. Safe in a signal handler."""
         self.is_stopped = True
 
     def listen(self, duration_s: float) -> None:
-        """Read frames from the bus for a duration. Raises BusError."""
+        """Read frames from the bus into the view for a duration, or until `stop`. Raises BusError."""
         end_ns = self._clock.now_ns() + round(duration_s * 1e9)
         while (frame := receive_until(self._bus, self._clock, end_ns)) is not None:
             self._accept(frame)
@@ -93,7 +93,7 @@ class Monitor:
         self._view.accept(frame)
 
     def describe(self) -> dict[str, Any]:
-        """Return the traffic so far as a dictionary for JSON."""
+        """Return the traffic so far as a dictionary for JSON; its load is since the previous call."""
         now_ns = self._clock.now_ns()
         if self._link_name is not None and now_ns - self._state_ns >= _LINK_S * 1e9:
             link = read_link(self._link_name)
@@ -111,8 +111,9 @@ class Monitor:
 
 
 def watch(connection: Connection, node_id: int | None, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
-    """Listen for `seconds` (None: until interrupted) and print; `is_live`: also meanwhile. Interrupted is OK.
+    """Listen on a bus, and print a table of its traffic at the end; return exit status OK, also if interrupted.
 
+    seconds: None: until interrupted. is_live: print the table repeatedly meanwhile, too. node_id: show this node only.
     Raises ConfigError, CodecError, BusMissingError, CommandError.
     """
     clock = MonotonicClock()
@@ -167,7 +168,7 @@ def _describe_message(message: MessageView) -> dict[str, Any]:
 
 
 def as_text(described: dict[str, Any], is_cut: bool = False) -> str:
-    """Format the table for people; is_cut: a line for each message, cut to the terminal."""
+    """Return the traffic as tables for people; is_cut: a line for each message, cut to the terminal."""
     parts = [_head(described)]
     if described["nodes"]:
         rows = [

@@ -143,7 +143,7 @@ class Playback:
     problem: str = ""
 
     def frames(self) -> "Iterator[PlayedFrame]":
-        """Give the frames, read ahead by a thread. Raises LogError."""
+        """Yield the chosen frames, read ahead by a thread; count those left out. Raises LogError."""
         from adacd_hil.lab.logs.playback import PlayedFrame
 
         for piece in _ahead(self._pieces()):
@@ -174,7 +174,10 @@ class Playback:
 def _run(
     playback: Playback, bus: Bus, clock: MonotonicClock, speed: float, times: int, longest_pause_s: float | None
 ) -> tuple[dict[str, Any], ExitCode]:
-    """Play onto a bus until the recording ends or the user interrupts. Raises LogError, CommandError."""
+    """Play a recording onto a bus, `times` times (0: until interrupted), and close the bus.
+
+    Return counts and lateness of the frames for JSON, and the exit status. Raises LogError, CommandError.
+    """
     from adacd_hil.cli.connection import on_interrupt
     from adacd_hil.lab.logs.playback import play as play_frames
     from adacd_hil.lab.logs.playback import repeat
@@ -236,7 +239,7 @@ def _as_text(described: dict[str, Any]) -> str:
 
 
 def may_move_an_arm(interface: str, channel: str) -> bool:
-    """Tell whether real drives may receive the frames."""
+    """Tell whether real drives may receive frames on this channel: it isn't certainly virtual."""
     return not is_virtual(interface, channel)
 
 

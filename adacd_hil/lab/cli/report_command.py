@@ -35,10 +35,12 @@ Reported = Report | Index
 
 
 def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -> tuple[list[Reported], ExitCode]:
-    """Report each log, or a stretch of it, beside it or in `out`; several logs in subfolders of `out`.
+    """Write a report of each log, or of a stretch of it, beside it or in `out`; return reports and exit status.
 
-    A folder stands for the run log in it, or without one for the runs in its folders; one of these that can't be read
-    doesn't stop the others. Raises LogError, ConfigError, CommandError.
+    Reports of several logs are in subfolders of `out`. A folder stands for the run log in it, or without one for the
+    runs in its folders; one of these that can't be read doesn't stop the others.
+
+    Raises LogError, ConfigError, CommandError.
     """
     places: dict[Path, tuple[Path, tuple[Path, ...]]] = {}  # by folder of the report
     for given in logs:
@@ -66,12 +68,12 @@ def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -
 
 
 def _runs_in(given: Path) -> tuple[Path, ...]:
-    """Return the folders with a run below a folder, unless the folder itself has a run."""
+    """Return the folders with a run below a folder; () for a file, or if the folder itself has a run."""
     return () if not given.is_dir() or (given / LOG_NAME).exists() else tuple(find_runs(given))
 
 
 def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWindow, progress: Progress) -> Index:
-    """Report the runs of a folder, and write their index page."""
+    """Write a report of each run of a folder, and an index page in `out`; a run that can't be read is listed, too."""
     entries: list[tuple[ListedRun, Report | None]] = []
     for number, run in enumerate(runs, start=1):
         name = run.relative_to(given).as_posix()

@@ -31,7 +31,7 @@ _DATE_FORMS = "2026-11-25, 2026-11-25T14:22 or 2026-11-25T14:22:33"
 
 
 def _local_date(text: str, of_a_day: timedelta = timedelta()) -> datetime:
-    """Read a date, or date and time, of this machine's time zone; of_a_day: added to a date without a time."""
+    """Return the time that a text gives in this machine's time zone; of_a_day: added to a date without a time."""
     try:
         found = datetime.fromisoformat(text)
         if len(text) <= len("2026-11-25"):
@@ -60,7 +60,7 @@ _FILTER_OPTIONS = (  # last first: click lists them the other way round
 
 
 def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
-    """Give a command the options that choose runs; it receives them as a `RunFilter`."""
+    """Return a command with the options that choose runs added; it receives them as `asked`, a `RunFilter`."""
 
     @functools.wraps(command)
     def chosen(
@@ -172,7 +172,10 @@ def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "R
 
 
 def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progress) -> list["RunSummary"]:
-    """Return the chosen runs of a folder, in order. Raises LogError, CommandError."""
+    """Return the runs of a folder that meet the conditions `asked`, oldest first.
+
+    is_judging: judge runs without a report by their logs. Raises LogError, CommandError.
+    """
     from adacd_hil.lab.runs import run_table
     from adacd_hil.lab.runs.run_summary import NOT_JUDGED, find_runs, judged, summarise
 

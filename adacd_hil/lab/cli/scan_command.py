@@ -13,7 +13,9 @@ from adacd_hil.wire.codec import Codec
 
 
 def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], ExitCode]:
-    """Scan a bus. Exit status OK if all expected nodes are there and right, else BUS_MISSING.
+    """Find the nodes on a bus, and compare them with the configuration; return the result and the exit status.
+
+    The exit status is OK if all expected nodes are there and right, else BUS_MISSING. listen_s: time to listen.
 
     Raises ConfigError, CodecError, BusMissingError, CommandError.
     """
@@ -29,7 +31,7 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
 
 
 def describe(found: Survey, verdicts: dict[int, str], codec: Codec) -> dict[str, Any]:
-    """Return a survey as a dictionary for JSON."""
+    """Return a survey as a dictionary for JSON. verdicts: of `compare`, by node id."""
     nodes = {node.node_id: node for node in found.nodes}
     return {
         "duration_s": round(found.duration_s, 3),
@@ -82,7 +84,7 @@ def _describe_talk(talk: Talk, codec: Codec) -> dict[str, Any]:
 
 
 def as_text(described: dict[str, Any]) -> str:
-    """Format the result for people."""
+    """Return the result of `describe` as tables for people."""
     nodes = described["nodes"]
     parts = []
     if nodes:
@@ -134,7 +136,7 @@ def _talk_row(owner: str, talk: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _contract(described: dict[str, Any]) -> str:
-    """Describe the expected contract, and the nodes that report the same or another one."""
+    """Return a line on the expected contract, and the nodes that report the same or another layout digest."""
     contract = described["contract"]
     reporting = [node for node in described["nodes"] if node.get("layout_digest") is not None]
     same = [node["node"] for node in reporting if node["layout_digest"] == contract["layout_digest"]]

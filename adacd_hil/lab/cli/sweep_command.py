@@ -149,7 +149,7 @@ def _plan(
 
 
 def _files(logs: Sequence[Path]) -> list[Path]:
-    """Find the logs; a folder stands for those below it."""
+    """Return the logs; a folder stands for every run.mcap below it. Raises CommandError if there is none."""
     found: list[Path] = []
     for given in logs:
         below = sorted(given.rglob(LOG_NAME)) if given.is_dir() else [given]
@@ -160,7 +160,7 @@ def _files(logs: Sequence[Path]) -> list[Path]:
 
 
 def _seeds(text: str) -> range:
-    """Parse `N` or `A:B`."""
+    """Return the seeds A to B of the text `A:B`, or N alone of `N`. Raises CommandError."""
     first, colon, last = text.partition(":")
     try:
         low, high = int(first), int(last if colon else first)
@@ -172,7 +172,10 @@ def _seeds(text: str) -> range:
 
 
 def simulate_task(task: "Task") -> "list[Values]":
-    """Play the scenario of a task with the settings of each row: in a temporary folder, replayed, then deleted."""
+    """Play the scenario of a task once for each row, with the row's settings; return the rows' results.
+
+    The log of each run is replayed, and then deleted. The row of a failed run has the error.
+    """
     return [_simulate(task, row) for row in task.rows]
 
 

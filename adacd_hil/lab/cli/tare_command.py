@@ -20,7 +20,7 @@ from adacd_hil.settings.configuration import Settings
 
 
 def as_text(tare: Tare, path: Path, backup: Path | None) -> str:
-    """Format a tare in a file for people. backup: the file that it replaced, None without one."""
+    """Return a tare as text for people. path: its file. backup: copy of the file before, None without one."""
     lines = [
         f"joint{joint}: offset {offset:+.4f} ± {error:.4f} Nm (was {old:+.4f}), spread of poses {spread:.4f} Nm, "
         f"sensor {sensor.serial}"
@@ -51,7 +51,9 @@ def tare_on_bus(
     seconds: float | None,
     is_auto_zeroing: bool,
 ) -> tuple[Tare, Path | None]:
-    """Tare the sensors of an arm on a bus; return the tare, and the file that its file `out` replaced, if any.
+    """Tare the sensors of an arm on a bus, and write file `out`; return the tare, and the copy of the older file.
+
+    poses, seconds: number of poses, and time per pose; None: those of the configuration.
 
     Raises ConfigError, CodecError, BusError, CommandError, OSError.
     """
@@ -79,7 +81,7 @@ def tare_on_bus(
 
 
 def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:
-    """Return the settings with the command's options."""
+    """Return the settings with number of poses and time per pose replaced, unless None."""
     tare = settings.tare
     tare = dataclasses.replace(tare, poses=poses or tare.poses, window_s=seconds or tare.window_s)
     return dataclasses.replace(settings, tare=tare)

@@ -13,7 +13,10 @@ from adacd_hil.progress_lines import Progress
 def find(
     logs: tuple[Path, ...], rate_per_h: float, is_compared: bool, stretch: TimeWindow = WHOLE
 ) -> tuple[Thresholds, Comparison | None]:
-    """Find the thresholds, and compare the detectors if requested. Raises LogError."""
+    """Find the thresholds of all detectors for a rate of false alarms, from contact-free motion in logs.
+
+    Return them, and a comparison of the detectors if is_compared, else None. Raises LogError.
+    """
     paths = [log_in(given) for given in logs]
     with Progress() as progress:
         thresholds, statistics = thresholds_of_logs(paths, rate_per_h, stretch, progress)
@@ -21,7 +24,7 @@ def find(
 
 
 def as_json(thresholds: Thresholds, comparison: Comparison | None) -> str:
-    """Return thresholds and comparison as JSON."""
+    """Return thresholds and, unless None, comparison as the text of a JSON object."""
     content = vars(thresholds)
     return json_text(content if comparison is None else content | {"comparison": comparison.by_key()})
 

@@ -133,7 +133,7 @@ def _as_text(found: "Tuning") -> str:
 
 
 def _cells(checked: "Found") -> tuple[str, ...]:
-    """Format the result of thresholds in one half, a cell for each figure."""
+    """Return the cells of a detector's row: contacts found, their share, delays, alarms, bound of the alarm rate."""
     from adacd_hil.lab.score.report_wording import delay_figures
 
     low, high = checked.share_bounds

@@ -69,7 +69,7 @@ class ArmExamination:
     traffic: Traffic = field(default_factory=Traffic)
 
     def connect(self) -> None:
-        """Open the bus; make arm and master on it. Raises BusMissingError."""
+        """Open the bus; make arm and master on it. `leave` closes it. Raises BusMissingError."""
         self._bus = self.open_bus()
         self.tap = Tap(self._bus, self.clock)
         self.arm = Arm(self.settings, self.codec, self.tap)
@@ -81,12 +81,12 @@ class ArmExamination:
         return ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
 
     def reset(self) -> None:
-        """Reset the nodes' communication; `leave` then has to stop them. Raises DeviceError, BusError."""
+        """Reset the nodes' communication, and let `leave` stop the nodes. Raises DeviceError, BusError."""
         self._has_reset = True
         self.master.reset()
 
     def leave(self) -> str:
-        """Put the nodes back to pre-operational and close the bus; return the error's text, "" without one."""
+        """Put the nodes back to pre-operational, if `reset` was called; close the bus; return an error's text or ""."""
         trouble = ""
         if self._has_reset:
             try:
@@ -106,19 +106,19 @@ class ArmExamination:
         return test.report()
 
     def joint_values(self, name: str) -> NDArray[np.float64]:
-        """Return q, dq or tau_J of the cycles with complete data, (n, 2)."""
+        """Return the values of the cycles with complete data (n, 2). name: "q", "dq" or "tau_J"."""
         values = [getattr(cycle.state, name) for cycle in self.cycles if cycle.state.is_complete]
         return np.array(values, dtype=np.float64).reshape(len(values), JOINTS)
 
 
 def check_bus(patient: ArmExamination) -> Finding:
-    """Check that the bus opens."""
+    """Check that the bus opens; leave it open for the further checks."""
     patient.connect()
     return ok(f"{patient.tap.channel} is open")
 
 
 def check_other_masters(patient: ArmExamination) -> Finding:
-    """Check that no other master is on the bus."""
+    """Listen for `LISTEN_S`, and check that no other master sends on the bus."""
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
     patient.tap.take_passed()
@@ -146,13 +146,13 @@ def check_nodes(patient: ArmExamination) -> Finding:
 
 
 def check_boot(patient: ArmExamination) -> Finding:
-    """Check that each node boots after a reset of communication."""
+    """Reset the communication of the nodes, and check that each boots."""
     patient.reset()
     return ok("all nodes booted after a reset of communication")
 
 
 def check_contract(patient: ArmExamination) -> Finding:
-    """Check that host and devices use the same contract."""
+    """Check that the devices' wire version and layout digest, 0x2000, are those of the host's DBC."""
     codec = patient.codec
     lacking = []
     for name, node in patient.master.nodes.items():
@@ -173,7 +173,7 @@ def check_contract(patient: ArmExamination) -> Finding:
 
 
 def check_set_up(patient: ArmExamination) -> Finding:
-    """Identify and set up the nodes as at the start of a run; return SYNC period and heartbeat. Raises DeviceError."""
+    """Identify and configure the nodes as at the start of a run; name SYNC period and heartbeat. Raises DeviceError."""
     patient.master.identify()
     patient.master.configure()
     return ok(f"SYNC period {patient.settings.bus.period_us} µs, heartbeat {patient.settings.bus.heartbeat_ms} ms")
@@ -192,7 +192,7 @@ def check_pdo_map(patient: ArmExamination) -> Finding:
 
 
 def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
-    """Say how the rated torque of a motor becomes that of its joint, `rated_Nm`. Raises DeviceError."""
+    """Describe how a motor's rated torque, 0x6076, becomes that of its joint, `rated_Nm`. Raises DeviceError."""
     if not slave.has(0x6076):
         return f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint"
     scale = slave.device.settings.scale
@@ -205,7 +205,7 @@ def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
 
 
 def check_torque_scale(patient: ArmExamination) -> Finding:
-    """Report the drives' rated torques at the joints; the set-up has compared them already."""
+    """Describe the drives' rated torques at the joints, which the set-up has compared; warn if one has no 0x6076."""
     slaves = patient.master.slaves[:JOINTS]
     pairs = zip(slaves, patient.settings.arm.rated_torque_Nm, strict=True)
     text = "; ".join(describe_torque_scale(slave, rated_Nm) for slave, rated_Nm in pairs)
@@ -215,7 +215,7 @@ def check_torque_scale(patient: ArmExamination) -> Finding:
 
 
 def check_protection(patient: ArmExamination) -> Finding:
-    """List the cyclic frames that carry no end-to-end header."""
+    """Check that every cyclic frame has an end-to-end header; name those without one."""
     names = [
         message.name
         for message in patient.codec.messages.values()
@@ -230,7 +230,7 @@ def check_protection(patient: ArmExamination) -> Finding:
 
 
 def check_cycle(patient: ArmExamination) -> Finding:
-    """Run cycles at the period with disabled drives."""
+    """Start the nodes, run cycles with disabled drives, and store the cycles for the further checks."""
     patient.tap.take_passed()
     patient.master.start()
     patient.loop.run(patient.cycle_s, patient.cycles.append)
@@ -242,7 +242,7 @@ def check_cycle(patient: ArmExamination) -> Finding:
 
 
 def check_rate(patient: ArmExamination) -> Finding:
-    """Check that SYNC and feedback keep the period."""
+    """Check that enough of the stored cycles have complete fresh data; name the rates of SYNC and feedback."""
     report = patient.communication()
     elapsed_s = report.periods * patient.settings.bus.period_s
     rates = ", ".join(
@@ -261,7 +261,7 @@ def check_rate(patient: ArmExamination) -> Finding:
 
 
 def check_load(patient: ArmExamination) -> Finding:
-    """Check that the bus has room for frames that are not cyclic."""
+    """Check that the bus load is at most `HIGH_LOAD_PERCENT`, which leaves room for frames that are not cyclic."""
     load = patient.communication().load_percent
     text = f"{load:.1f} % at {patient.bitrate} bit/s"
     if load > HIGH_LOAD_PERCENT:
@@ -417,11 +417,11 @@ class HandMotion:
 
     @property
     def is_done(self) -> bool:
-        """Whether any joint has moved far enough."""
+        """Whether any joint has moved by `WANTED_DEG`."""
         return bool(np.abs(self._way).max() >= math.radians(self.WANTED_DEG))
 
     def observe_cycle(self, cycle: ZeroTorqueCycle) -> None:
-        """Add a cycle to the check; ignore an incomplete one."""
+        """Add a cycle to the travel and the work of the joints; ignore an incomplete cycle."""
         state = cycle.state
         if not state.is_complete:
             return
@@ -433,7 +433,7 @@ class HandMotion:
         self._way = state.q - self._start
 
     def judge(self) -> Finding:
-        """Return the outcome for the motion so far."""
+        """Judge the motion so far: whether the right joint moved, and position and torque have the right signs."""
         joint, number = self._joint, self._joint + 1
         ways_deg = np.degrees(self._way)
         moved = int(np.argmax(np.abs(self._way)))

@@ -74,14 +74,18 @@ class PlanarArm(NamedTuple):
 
 
 def uniform_rods(link_length_m: Pair, mass_kg: Pair, mounting_deg: Pair) -> PlanarArm:
-    """Describe an arm of two uniform rods: centre of mass in the middle, inertia m l² / 12 about it."""
+    """Return the description of two uniform rods: centre of mass in the middle, inertia m l² / 12 about it."""
     (l1, l2), (m1, m2) = link_length_m, mass_kg
     theta = _theta((m1 * l1**2 / 3.0, m2 * l2**2 / 3.0), (m1 * l1 / 2.0, m2 * l2 / 2.0), m2, l1, mounting_deg)
     return PlanarArm(link_length_m, theta, mounting_deg, mass_kg=mass_kg)
 
 
 def _theta(inertia: Pair, moment_kg_m: Pair, outer_kg: float, l1: float, mounting_deg: Pair) -> tuple[float, ...]:
-    """Return the parameters of two links. inertia: of each about its joint; moment: along the line of the link."""
+    """Return the parameters a1 to a3, friction 0 and, unless the axes are vertical, a4 and a5 of two links.
+
+    inertia: of each about its joint, kg m². moment_kg_m: mass times centre of mass, along the line of the link.
+    outer_kg: mass of link 2.
+    """
     first, second = inertia
     theta = [first + outer_kg * l1**2 + second, l1 * moment_kg_m[1], second, 0.0, 0.0, 0.0, 0.0]
     if mounting_deg[0] > SLIGHT_TILT_DEG:
@@ -93,7 +97,8 @@ def _theta(inertia: Pair, moment_kg_m: Pair, outer_kg: float, l1: float, mountin
 def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float = 0.0) -> PlanarArm:
     """Read an arm of two revolute joints with parallel axes. Raises UrdfError for any other.
 
-    pitch_deg: rotation of the URDF's root about its y axis; 0: its z axis points up, 90: its x axis down.
+    locked: names of joints that count as fixed at 0. pitch_deg: rotation of the URDF's root about its y axis; 0: its z
+    axis points up, 90: its x axis down.
     """
     pitch_rad = math.radians(pitch_deg)
     gravity = GRAVITY_M_S2 * math.sin(pitch_rad), 0.0, -GRAVITY_M_S2 * math.cos(pitch_rad)
@@ -184,7 +189,8 @@ def _gravity_doubts(moment: Vector, along: Vector, axis: Vector, lever_kg_m: flo
 def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str]) -> tuple[Pair, Vector]:
     """Return the drives' positions at q = 0, deg, and the largest |q| (2,), deg, of an arm that is stretched at q2 = 0.
 
-    bent_deg: the model's q2 at the description's zero.
+    sign: 1, or -1 if joint 2 of the URDF turns against joint 1. bent_deg: the model's q2 at the URDF's zero. Adds a
+    line to `doubts` if the limits of joint 2 exclude the stretched arm.
     """
     limits = _position_limits(arm)
     if abs(bent_deg) <= _BENT_DEG:
@@ -200,13 +206,16 @@ def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str])
 
 
 def _limit_about(arm: SerialArm, sign: int, bent_deg: float) -> float:
-    """Return the largest |q2| to both sides of the stretched arm within joint 2's limits, deg; 0 or less: no room."""
+    """Return the largest |q2| that joint 2's limits allow on both sides of the stretched arm, deg; 0 or less: none.
+
+    sign: URDF direction to model direction of joint 2. bent_deg: the model's q2 at the URDF's zero.
+    """
     first, second = (math.degrees(sign * float(end[1])) + bent_deg for end in (arm.position_low, arm.position_high))
     return round(min(-min(first, second), max(first, second)), 2)
 
 
 def _mass_doubts(arm: SerialArm) -> list[str]:
-    """Name a link without mass. Raises UrdfError for an inertia that no body has."""
+    """Return a line on each link without an inertial. Raises UrdfError for an inertia that no body has."""
     doubts = []
     links = arm.theta_full.reshape(JOINTS, PER_LINK)
     for name, link, axis in zip(arm.link_names, links, arm.chain.axis, strict=True):
@@ -226,7 +235,10 @@ def _mass_doubts(arm: SerialArm) -> list[str]:
 
 
 def _body(arm: SerialArm, mass_kg: Pair, moment_kg_m: Pair, inertia: Pair) -> dict[str, Pair]:
-    """Return masses, their centres and the inertia about them, and friction if the URDF has any."""
+    """Return the links' masses, centres of mass and inertias about them, and friction if any, by `PlanarArm`'s fields.
+
+    inertia: of each link about its joint.
+    """
     center = [moment / mass for moment, mass in zip(moment_kg_m, mass_kg, strict=True)]
     own = [max(whole - mass * c * c, 0.0) for whole, mass, c in zip(inertia, mass_kg, center, strict=True)]
     named: dict[str, Sequence[float] | Vector] = {"mass_kg": mass_kg, "center_m": center, "inertia_kg_m2": own}
@@ -252,7 +264,10 @@ def _about(link: Vector, axis: Vector) -> float:
 
 
 def _position_limits(arm: SerialArm) -> Vector:
-    """Return the largest |q| that is within the limits on both sides, deg; infinite for a joint without limits."""
+    """Return each joint's largest |q| (2,) within its limits on both sides, deg; inf without limits.
+
+    Raises UrdfError if 0 is not within the limits.
+    """
     largest = np.minimum(-arm.position_low, arm.position_high)
     if np.any(largest <= 0.0):
         joint = int(np.argmax(largest <= 0.0))
@@ -261,7 +276,10 @@ def _position_limits(arm: SerialArm) -> Vector:
 
 
 def _plausible(key: str, values: Vector, doubts: list[str]) -> Pair | None:
-    """Return limits; None if the URDF lacks them, or, with a doubt, if `arm.KEY` doesn't accept them."""
+    """Return the values as a pair of limits; None if one is infinite or `arm.KEY` doesn't accept them.
+
+    In the second case, add a line to `doubts`.
+    """
     if not np.all(np.isfinite(values)):
         return None
     pair = float(values[0]), float(values[1])
@@ -419,6 +437,10 @@ def _devices(facts: ArmFacts) -> Iterator[Entry]:
 
 
 def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
+    """Draft trajectory, excitation, reaction, gains and the scheme's numbers; add to the warnings.
+
+    Raises ConfigError for a joint without torque.
+    """
     limit, speed = facts.position_limit_deg.value, facts.velocity_limit_deg_s.value
     hangs_rad = math.radians(facts.geometry.mounting_deg[1])
     is_level = facts.geometry.has_gravity and abs(math.sin(hangs_rad)) > _LEVEL
@@ -513,7 +535,10 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
 
 
 def _torque_scale(facts: ArmFacts) -> float:
-    """Return the ratio of torques to P's, of the joint closer to P; 1 if one is alike or smaller."""
+    """Return the ratio of the rated torque to that of arm P, of the joint closer to P.
+
+    1 unless both joints' ratios are above `_ALIKE`, or both below 1 / `_ALIKE`.
+    """
     ratios = [facts.rated_torque_Nm.value[i] / _MODEL_TORQUE_NM[i] for i in range(JOINTS)]
     if min(ratios) > _ALIKE:
         return float(min(ratios))
@@ -521,14 +546,14 @@ def _torque_scale(facts: ArmFacts) -> float:
 
 
 def _scaled(by_kind: Sequence[float], scale: float) -> list[float]:
-    """Scale numbers by kind of parameter, except lags, which are not torques."""
+    """Return numbers, one per kind of parameter, times `scale`; those of lags, which are not torques, unchanged."""
     return [value if kind == _LAG else scale * value for kind, value in enumerate(by_kind)]
 
 
 def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) -> float:
     """Return the factor, at least 1, by which the motion must be slower than P's to fit speed, acceleration, torque.
 
-    Raises ConfigError for a joint without torque.
+    Adds a warning if gravity leaves too little torque. Raises ConfigError for a joint without torque.
     """
     limit_Nm, speed = facts.torque_limit_Nm.value, facts.velocity_limit_deg_s.value
     inertia, gravity, slower = _inertia(facts), _gravity(facts, amplitude), 1.0
@@ -582,7 +607,7 @@ _POSES = {
 
 
 def draw_arm(mounting_deg: Pair) -> str:
-    """Draw an arm at q = 0 in one line, joint 1 on the left, with the direction of gravity in the plane of motion."""
+    """Return a line of text that draws an arm at q = 0, joint 1 on the left, with an arrow along gravity."""
     tilt_deg, hangs_deg = mounting_deg
     arm = "at q = 0: [1]====[2]===>, +q counter-clockwise"
     if tilt_deg <= SLIGHT_TILT_DEG:
@@ -609,7 +634,10 @@ extends = "{base}"
 
 
 def write_draft(draft: ArmDraft, title: str, name: str, base: str = "certified") -> str:
-    """Write a draft as a commented TOML file."""
+    """Return a draft as the text of a commented TOML file.
+
+    title: its first comment. name: of the file, for the commands in its comments. base: configuration that it extends.
+    """
     lines = [_HEAD.format(title=one_line(title), name=one_line(name), base=base).rstrip()]
     if draft.assumed:
         lines += [

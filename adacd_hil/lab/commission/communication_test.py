@@ -57,7 +57,7 @@ class ZeroTorqueLoop:
         self._max_age_cycles = settings.bus.max_age_cycles
 
     def interrupt(self) -> None:
-        """End after the present cycle. Safe in a signal handler."""
+        """Make `run` end after the present cycle. Safe in a signal handler."""
         self.is_interrupted = True
 
     def run(
@@ -66,7 +66,10 @@ class ZeroTorqueLoop:
         observe: Callable[[ZeroTorqueCycle], None],
         is_over: Callable[[], bool] = lambda: False,
     ) -> FaultReason:
-        """Run cycles for a duration, then disable the drives; return the fault that ended them. Raises BusError."""
+        """Run cycles for a duration, then disable the drives; return the fault that ended them, NONE without one.
+
+        observe: called with each cycle. is_over: ends them earlier if it returns True. Raises BusError.
+        """
         last_ns = self._clock.now_ns() + round(duration_s * 1e9) - self._period_ns
         fault = FaultReason.NONE
         while self._clock.now_ns() < last_ns and not (self.is_interrupted or is_over() or fault):
@@ -77,7 +80,7 @@ class ZeroTorqueLoop:
         return fault
 
     def _fault(self, state: ArmState) -> FaultReason:
-        """Return the fault that ends a test with enabled drives; with disabled drives NONE."""
+        """Return the fault of a cycle, old data included; NONE if `is_enabling` is not set."""
         if not self._is_enabling:
             return FaultReason.NONE
         if state.is_enabled and max(*state.age_q, *state.age_tau_J) > self._max_age_cycles:
@@ -85,12 +88,15 @@ class ZeroTorqueLoop:
         return state.fault
 
     def disable(self, quick_stop: bool = False) -> None:
-        """Disable the drives. Raises BusError."""
+        """Run `DISABLE_CYCLES` cycles that disable the drives; quick_stop: by a quick stop. Raises BusError."""
         for _ in range(DISABLE_CYCLES):
             self.step(quick_stop=quick_stop)
 
     def step(self, is_enabling: bool = False, quick_stop: bool = False) -> ZeroTorqueCycle:
-        """Do one cycle. Raises BusError, such as SilenceError in lockstep."""
+        """Run one cycle at zero torque, and return it.
+
+        is_enabling, quick_stop: part of the command to the drives. Raises BusError, such as SilenceError in lockstep.
+        """
         tick, arm = self._exchange.turn()
         self._exchange.leave()
         record = self._exchange.end(tick, arm, ArmCommand(np.zeros(JOINTS), is_enabling, quick_stop))
@@ -155,7 +161,7 @@ class CommunicationReport:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on this share."""
+        """Verdict on `share`."""
         return judge(self.share)
 
 
@@ -175,7 +181,7 @@ class CommunicationTest:
     _complete: int = 0
 
     def observe_cycle(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
-        """Add a cycle to the test; return its record for the log."""
+        """Add a cycle to the test; return its record for the log, with the overruns so far and `log_queue_bytes`."""
         state = cycle.state
         ages = (*state.age_q, *state.age_tau_J)
         if self._ages:  # periods skipped before the first cycle don't count
@@ -189,7 +195,7 @@ class CommunicationTest:
         return record
 
     def report(self) -> CommunicationReport:
-        """Return counts of cycles and overruns, ages of each device's values, and bus load of the observed cycles."""
+        """Return the results of the cycles so far: counts, ages of each device's values, bus load."""
         cycles = len(self._ages)
         ages = np.array(self._ages, dtype=np.int64).reshape(cycles, 2 * JOINTS)
         periods = cycles + self._overruns

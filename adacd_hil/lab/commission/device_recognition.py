@@ -48,7 +48,7 @@ class RecognisedDevice(NamedTuple):
 
 
 def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int, str]) -> list[RecognisedDevice]:
-    """Pick drives and sensors out of a survey's nodes, and read their ratings. Raises BusError.
+    """Return the drives and sensors among a survey's nodes, with the ratings read from them. Raises BusError.
 
     `kinds`: drive or sensor by node id, for nodes whose 0x1000 names neither.
     """
@@ -66,7 +66,7 @@ def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int,
 
 
 def fitting_profiles(node: Node, kind: str) -> tuple[str, ...]:
-    """Return the built-in profiles whose EDS has this node's vendor, and its product if the EDS gives one."""
+    """Return names of the built-in profiles whose EDS has this node's vendor, and product if given; shortest first."""
     names = []
     for name, profile in shipped_profiles(kind):
         identity = identity_of(profile.eds)
@@ -111,9 +111,9 @@ def _read_ratings(remote: Any, kind: str) -> DeviceRatings:
 def choose_family(
     drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Choose the profiles of two drives and two sensors: those whose layout digest the devices report (0x2000).
+    """Return the profiles of two drives and of two sensors: those whose layout digest the devices report (0x2000).
 
-    If no device reports a digest, the first profile that fits each; "" if no profile fits.
+    If the devices report no digest, several, or that of no profiles: the first profile that fits each; "" if none fits.
     """
     digests = {device.node.layout_digest for device in (*drives, *sensors)} - {None}
     combinations = itertools.product(drives[0].profiles or ("",), sensors[0].profiles or ("",))

@@ -111,7 +111,7 @@ def _run(check: Check[Examination], examination: Examination) -> Finding:
 
 
 def summarise(findings: Sequence[Finding]) -> str:
-    """Count the outcomes in one line."""
+    """Return a line with the number of findings of each status."""
     counts = {status: sum(finding.status is status for finding in findings) for status in Status}
     return ", ".join(f"{count} {status.value}" for status, count in counts.items())
 
@@ -222,7 +222,7 @@ def check_interface(host: Host) -> Finding:
 
 
 def _with_hardware(check: Callable[[Host, InterfaceState], Finding]) -> Callable[[Host], Finding]:
-    """Skip a check that is meaningless on a virtual bus."""
+    """Return the check as one of a `Host`; without a SocketCAN interface, or on a virtual one, it is skipped."""
 
     def run(host: Host) -> Finding:
         if host.link is None:
@@ -260,7 +260,7 @@ def check_sample_point(_host: Host, link: InterfaceState) -> Finding:
 
 
 def check_restart(_host: Host, link: InterfaceState) -> Finding:
-    """Check the automatic restart after bus-off."""
+    """Check that the interface restarts by itself after bus-off."""
     if link.restart_ms is None:
         return skipped("the kernel does not report it here; install iproute2")
     if link.restart_ms == 0:
@@ -272,7 +272,7 @@ def check_restart(_host: Host, link: InterfaceState) -> Finding:
 
 
 def check_controller(_host: Host, link: InterfaceState) -> Finding:
-    """Check that the controller takes part in the bus."""
+    """Check that the CAN controller is error-active, neither error-passive nor bus-off."""
     if link.state is None:
         return skipped("the kernel does not report it here; install iproute2")
     counters = f"{link.state}, error counters rx {link.rx_errors or 0}, tx {link.tx_errors or 0}"
@@ -327,7 +327,7 @@ def check_permissions(host: Host) -> Finding:
 
 
 def check_scheduler(host: Host) -> Finding:
-    """Check that scheduler, processor, locked memory and shallow idle states are granted."""
+    """Request scheduler, processor, locked memory and shallow idle states, and check that they are granted."""
     grant = host.request_realtime()
     if grant.missing:
         reasons, remedies = zip(*grant.missing, strict=True)
@@ -336,7 +336,7 @@ def check_scheduler(host: Host) -> Finding:
 
 
 def check_throttling(host: Host) -> Finding:
-    """Check that the kernel doesn't throttle a real-time process."""
+    """Check that the kernel lets real-time processes work for at least `_RT_SHARE` of the time."""
     folder = host.root / "proc/sys/kernel"
     try:
         runtime_us = int(_read(folder / "sched_rt_runtime_us"))
@@ -353,7 +353,7 @@ def check_throttling(host: Host) -> Finding:
 
 
 def check_preemption(host: Host) -> Finding:
-    """Check that the kernel wakes a real-time process in time."""
+    """Check that the kernel is PREEMPT_RT, so that it wakes real-time processes without delay."""
     version = _read(host.root / "proc/version")
     if _read(host.root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
         return ok("PREEMPT_RT")
@@ -362,7 +362,7 @@ def check_preemption(host: Host) -> Finding:
 
 
 def check_processor(host: Host) -> Finding:
-    """Check that the processors' clock is steady."""
+    """Check that the processors' clock is steady: governor `performance`."""
     folder = host.root / "sys/devices/system/cpu"
     governors = sorted({_read(path) for path in folder.glob("cpu[0-9]*/cpufreq/scaling_governor")})
     if not governors:
@@ -374,7 +374,7 @@ def check_processor(host: Host) -> Finding:
 
 
 def check_isolation(host: Host) -> Finding:
-    """Check that the processor of the cycle is isolated."""
+    """Check that the processor of the control cycle, `realtime.cpu`, is isolated."""
     isolated = isolated_cpus(host.root / "sys/devices/system/cpu")
     names = ", ".join(map(str, isolated)) or "none"
     isolate = "isolcpus={0} nohz_full={0} rcu_nocbs={0} on the kernel's command line, and no interrupts there"

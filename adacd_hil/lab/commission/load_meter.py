@@ -49,7 +49,10 @@ class LoadMeter:
         self._frames = self._nominal = self._data = 0
 
     def count_frame(self, frame: Frame) -> None:
-        """Count a frame. Raises ValueError for an impossible length, or CAN FD without a data bit rate."""
+        """Add a frame's bits to the load; ignore an error frame.
+
+        Raises ValueError for an impossible length, or CAN FD without a data bit rate.
+        """
         if frame.is_error:
             return
         bits = exact_frame(frame.can_id, frame.data)
@@ -64,7 +67,7 @@ class LoadMeter:
         self._data += bits.data
 
     def take_load(self, t_ns: int) -> Load:
-        """Return the load since the last call, and start again from zero."""
+        """Return the load from the last call, or the beginning, until `t_ns`; start again from zero."""
         interval_ns = 0 if self._start_ns is None else t_ns - self._start_ns
         bits = FrameBits(self._nominal, self._data)
         load = Load(interval_ns, self._frames, bits, self._bitrate, self._data_bitrate)

@@ -72,7 +72,7 @@ class DeviceRatings(NamedTuple):
         return permille * 1e-3 if permille else None
 
     def rated_torque_Nm(self, scale: ScaleSettings) -> float | None:
-        """Return the motor's rated torque, 0x6076, at the joint, Nm; None if unknown."""
+        """Return the motor's rated torque at the joint, Nm, from 0x6076 as read; None if missing or 0."""
         counts = self.numbers.get((0x6076, 0))
         return counts * scale.joint_torque_Nm if counts else None
 
@@ -85,7 +85,10 @@ class DeviceRatings(NamedTuple):
         return degrees if _LEAST_LIMIT_DEG <= degrees <= _MOST_LIMIT_DEG else None
 
     def velocity_limit_deg_s(self, scale: ScaleSettings) -> float | None:
-        """Return 0x6080, rpm of the motor, at the joint; None if missing or implausible, as a factory's 50000."""
+        """Return the joint's largest speed from 0x6080, rpm of the motor, and the gear, deg/s.
+
+        None if missing or implausible, as a factory's 50000 rpm.
+        """
         rpm = self.numbers.get((0x6080, 0))
         gear = self.numbers.get((0x6091, 1), 0) / (self.numbers.get((0x6091, 2)) or 1) or scale.gear_ratio
         degrees_s = (rpm or 0) * _DEG_S_PER_RPM / gear
@@ -112,7 +115,7 @@ class ProfileDraft(NamedTuple):
 
 
 def identity_of(eds: Path) -> tuple[int | None, int | None]:
-    """Return vendor and product of an EDS: 0x1018:1 and :2, else those of its head. Raises ConfigError."""
+    """Return vendor and product of an EDS: 0x1018:1 and :2, else its head's, None if not given. Raises ConfigError."""
     objects = read_eds(eds, 1)
     head = objects.device_information
     found = []
@@ -129,9 +132,9 @@ def is_of(identity: tuple[int | None, int | None], node: tuple[int | None, int |
 
 
 def kind_of(eds: Path) -> str:
-    """Return "drive" or "sensor" by 0x1000 of an EDS; "" for another profile, or without one.
+    """Return "drive" or "sensor" by 0x1000 of an EDS; "" for another profile.
 
-    Raises ConfigError.
+    If 0x1000 names no profile: the kind of a shipped profile of the same maker, "" without one. Raises ConfigError.
     """
     number = _profile_number(eds)
     if not number:
@@ -140,7 +143,7 @@ def kind_of(eds: Path) -> str:
 
 
 def describe_kind(eds: Path) -> str:
-    """Describe 0x1000 of an EDS that is neither a drive's nor a sensor's. Raises ConfigError."""
+    """Return a line on 0x1000 of an EDS that is neither a drive's nor a sensor's. Raises ConfigError."""
     number = _profile_number(eds)
     profile = f"names CiA {number}" if number else "names no profile"
     return f"0x1000 of {eds.name} {profile}, neither a drive's (CiA 402) nor a sensor's (CiA 404)"
@@ -178,7 +181,7 @@ def draft_profile(
 
 
 def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
-    """Return the shipped profile of the EDS's maker; None if no profile is shipped.
+    """Return the settings of the shipped profile of the EDS's maker that has guesses, `assumed`; None without one.
 
     Its values that are not `assumed` hold for all devices of this maker.
     """
@@ -279,20 +282,22 @@ class _ProfileWriter(ABC):
         return 0 if variable is None or variable.default is None else variable.default
 
     def number(self, index: int, sub: int) -> int | None:
-        """Return the device's value, else the EDS's default."""
+        """Return the value read from the device, else the EDS's default; None without either."""
         if (index, sub) in self.ratings.numbers:
             return self.ratings.numbers[index, sub]
         variable = self.find((index, sub))
         return None if variable is None else variable.default
 
     def is_factory(self, index: int, sub: int) -> bool:
-        """Tell whether the known value of an object is a factory setting."""
+        """Tell whether a factory setting is all that is known of an object: it is writable, and was not read."""
         return (index, sub) not in self.ratings.numbers and self.can_write(index, sub)
 
     def refuse(self, reason: str) -> ConfigError:
+        """Return the error to raise for an EDS of which no profile can be made."""
         return ConfigError(f"EDS {self.eds}: {reason}")
 
     def require(self, index: int, sub: int, what: str) -> None:
+        """Raise ConfigError if the EDS lacks an object, or it can't be mapped. what: its name in the error."""
         name = f"{ObjectName(index, sub)} ({what})"
         variable = self.find((index, sub))
         if variable is None:
@@ -306,7 +311,7 @@ class _ProfileWriter(ABC):
         return not any(record.room for is_received in (False, True) for record in self.records(is_received))
 
     def records(self, is_received: bool) -> list[_Record]:
-        """Return the PDOs that can be switched on."""
+        """Return the device's PDOs that can be switched on: RPDOs if is_received, else TPDOs."""
         base = _RECEIVED if is_received else _SENT
         found = []
         for number in range(1, _MOST_RECORDS + 1):
@@ -328,7 +333,7 @@ class _ProfileWriter(ABC):
         return found
 
     def _cob_id(self, index: int, number: int, is_received: bool) -> int | None:
-        """Return a PDO's identifier in the EDS without the node id; None if unusable."""
+        """Return a PDO's identifier without the node id, by the EDS or else predefined; None if unusable."""
         by_eds = self.default(index, 1)
         if by_eds & NOT_VALID and not self.can_write(index, 1):
             return None
@@ -343,6 +348,7 @@ class _ProfileWriter(ABC):
         return predefined if self.can_write(index, 1) and predefined <= 0x57F else None
 
     def text(self) -> str:
+        """Return the profile as the text of a TOML file; store guesses and remarks. Raises ConfigError."""
         self.check()
         features = [name for name, place in _FEATURES.items() if self.can_write(*place) and self.allows(name)]
         frames = self.frames()
@@ -379,11 +385,11 @@ class _ProfileWriter(ABC):
         return []
 
     def options(self, can_write: bool) -> list[str]:  # noqa: ARG002 (of a drive)
-        """Return the profile's lines on the reactions of a stop."""
+        """Return the profile's lines on the reactions of a stop. can_write: the drive's option codes can be written."""
         return []
 
     def further(self) -> list[str]:
-        """Return the maker's further lines, besides scale and PDOs."""
+        """Return the profile's further lines that hold for all devices of the maker, such as [patience]."""
         return []
 
     @abstractmethod
@@ -402,12 +408,15 @@ class _ProfileWriter(ABC):
         return value or None
 
     def guess(self, key: str, value: float, text: str) -> str:
-        """Record a guess; return the comment above its line."""
+        """Store a guess of `scale.KEY`; return the comment for the line above it."""
         self.guessed[f"scale.{key}"] = value, text
         return f"# A guess: {text}"
 
     def pdo(self, message: str, record: _Record, places: Sequence[_Place], transmission: int = 1) -> list[str]:
-        """Return the lines of one PDO; a fixed mapping keeps the EDS's default objects."""
+        """Return the profile's lines on one PDO.
+
+        places: objects to map; a fixed mapping keeps the EDS's default objects. transmission: type, unless read-only.
+        """
         rows = [
             f'    {{ object = "{ObjectName(*place)}", {self.signal(place)} }},'
             for place in (places if record.room else record.entries)
@@ -436,7 +445,7 @@ class _ProfileWriter(ABC):
         return f'signal = "{name or f"object_{index:04X}_{sub}"}"{unit}'
 
     def fill(self, places: Sequence[_Place], room: int) -> list[_Place]:
-        """Return the objects, in order, that can be mapped and fit into one PDO of so much room."""
+        """Return the objects, in order, that can be mapped and fit into one PDO. room: most objects of the PDO."""
         kept: list[_Place] = []
         bits = 0
         for place in places:
@@ -598,6 +607,7 @@ class _DriveWriter(_ProfileWriter):
         return counts * count_Nm, lines
 
     def _command(self) -> _Record:
+        """Return the RPDO that can take controlword and target torque. Raises ConfigError without one."""
         wanted = ((0x6040, 0), (0x6071, 0))
         for record in self.records(is_received=True):
             known = {_SIGNAL_OBJECTS[name] for name in HOST_SIGNALS}

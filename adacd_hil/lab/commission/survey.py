@@ -55,7 +55,7 @@ _TPDOS = (0x180, 0x280, 0x380, 0x480)
 
 
 def function_name(can_id: int) -> str:
-    """Name the service of an identifier in CiA 301's predefined connection set; "" for an identifier outside it."""
+    """Return the service of an identifier in CiA 301's predefined connection set, such as "TPDO1"; "" outside it."""
     if can_id > MAX_STANDARD_ID:
         return ""
     function, node_id = can_id & 0x780, can_id & 0x7F
@@ -137,9 +137,10 @@ def survey(
     progress: Callable[[str], None] = lambda _: None,
     contract_ids: Container[int] = (),
 ) -> Survey:
-    """Ask all 127 node ids for 0x1000, listen for `duration_s`, and read the identity of whoever is there.
+    """Ask all 127 node ids for 0x1000, listen for `duration_s`, and read the identity of each node that answers.
 
-    `contract_ids`: nodes whose 0x2000 is the contract's. Raises BusError.
+    contract_ids: ids of the nodes of which 0x2000, wire version and layout digest, is read, too. progress: called with
+    a line before each step. Raises BusError.
     """
     tap = Tap(bus, clock)
     traffic = Traffic()
@@ -161,7 +162,7 @@ def survey(
 
 
 def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
-    """Return the nodes that sent frames, ascending by node id."""
+    """Return the nodes that answered SDO, or sent a heartbeat or an EMCY, by node id, ascending."""
     found: dict[int, Node] = {}
     for is_sent, frame in tap.take_passed():
         function, node_id = frame.can_id & 0x780, frame.can_id & 0x7F
@@ -185,7 +186,10 @@ def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
 
 
 def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
-    """Read a node's identity objects into its record; an object that the node doesn't give stays None."""
+    """Read a node's identity objects into its record; an object that the node lacks stays None.
+
+    If the node falls silent or refuses, its `answers` becomes False.
+    """
     remote = canopen.add_node(node.node_id, None, pause_s=BETWEEN_READS_S)
     try:
         name = read_object(remote, 0x1008)
@@ -203,7 +207,7 @@ def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
 
 
 def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
-    """Assign each identifier to the node that produces it by the predefined connection set; return the rest."""
+    """Add each identifier to `produces` of its node by the predefined connection set; return those of no node."""
     others = []
     for talk in traffic.sorted():
         node = nodes.get(talk.can_id & 0x7F) if talk.can_id <= MAX_STANDARD_ID else None
@@ -216,7 +220,7 @@ def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
 
 
 def expected_nodes(slaves: Iterable[Slave], codec: Codec | None = None) -> list[Expected]:
-    """List the nodes that the master of an arm expects: vendor and product of the EDS, None where any will do.
+    """Return the nodes that an arm's master expects, with vendor and product of the EDS, None where any will do.
 
     With a codec, entries also have its wire version and layout digest, for nodes that give them.
     """
@@ -234,7 +238,7 @@ def expected_nodes(slaves: Iterable[Slave], codec: Codec | None = None) -> list[
 
 
 def compare(found: Survey, expected: list[Expected]) -> dict[int, str]:
-    """Describe how each node, found or expected, differs from the configuration: "" when it fits."""
+    """Return, by node id, how each node, found or expected, differs from the configuration: "" if it fits."""
     wanted = {node.node_id: node for node in expected}
     present = {node.node_id: node for node in found.nodes}
     verdicts = {}
@@ -272,7 +276,7 @@ def _difference(node: Node, wanted: Expected) -> str:
 
 
 def message_name(codec: Codec | DbcDecoder, can_id: int) -> str:
-    """Name an identifier: the contract's message, else CiA 301's use of it in parentheses, else "unknown"."""
+    """Return an identifier's name: the contract's message, else CiA 301's service in parentheses, else "unknown"."""
     message = codec.by_id.get(can_id)
     if message is not None:
         return message.name
@@ -381,7 +385,7 @@ class BusView:
         self._strange_frames = 0
 
     def accept(self, frame: Frame) -> None:
-        """Take in one frame."""
+        """Add a frame to the counts, the bus load, and the statistics and checks of its identifier."""
         self.frames += 1
         if frame.is_error:
             self._error_frames += 1
@@ -396,13 +400,19 @@ class BusView:
         entry.accept(frame)
 
     def skip_loss(self) -> None:
-        """Note that this computer has lost frames: counters that jump now are no device's fault."""
+        """Let the counters in protected frames jump once without being counted as lost frames.
+
+        For frames that this computer has lost.
+        """
         for entry in self._entries.values():
             if entry.receiver is not None:
                 entry.receiver.restart_sequence()
 
     def snapshot(self, t_ns: int, node_id: int | None = None) -> Snapshot:
-        """Sum up at `t_ns`; with `node_id`, only that node's part of it."""
+        """Return counts, nodes and messages as of `t_ns`, and the bus load since the snapshot before.
+
+        node_id: return only nodes and messages of this node; counts and load are still of the whole bus.
+        """
         mark_ns, counts = self._marks[0]
         elapsed_s = (t_ns - mark_ns) * 1e-9
         wanted = {

@@ -83,7 +83,7 @@ def check_plan(settings: Settings) -> None:
 
 
 def check_motion(q: Vector, dq: Vector, settings: Settings) -> None:
-    """Raise ArmMovedError if the arm moves or creeps. q, dq: (2,), or (n, 2) with n at least 1."""
+    """Raise ArmMovedError if velocity or travel is beyond that of an arm at rest. q, dq: (2,) or (n, 2), n > 0."""
     q, dq = np.atleast_2d(q), np.atleast_2d(dq)
     speed = np.abs(dq).max(axis=0)
     bound_rad_s = settings.safety.rest_velocity_rad_s
@@ -103,7 +103,7 @@ def check_motion(q: Vector, dq: Vector, settings: Settings) -> None:
 
 
 def measure_pose(q: Vector, dq: Vector, tau_J: Vector, settings: Settings) -> Pose:
-    """Check one window of samples at rest (n, 2 each) and reduce it to a pose. Raises TareRefusedError."""
+    """Return a pose: means and noise of a window of samples at rest (n, 2 each). Raises TareRefusedError if unfit."""
     tare = settings.tare
     if len(tau_J) < 2 * _BLOCKS:
         raise TareRefusedError(f"{len(tau_J)} complete samples in a pose are below {2 * _BLOCKS}")
@@ -145,14 +145,17 @@ def _bound(quantity: str, values: Vector, bound: float | Sequence[float], settin
 
 
 def gravity_columns(q: Vector, level_rad: float) -> Vector:
-    """Return Y_g (2, 2): the torques at rest of a unit a4 and a unit a5, by the scheme's own regressor."""
+    """Return Y_g (2, 2): the torques at rest of a unit a4 and a unit a5, by the scheme's own regressor.
+
+    level_rad: q1 at which link 1 is level.
+    """
     rest = np.zeros(JOINTS)
     columns: Vector = regressor(q, rest, rest, len(PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES), level_rad)
     return columns[:, list(_GRAVITY)]
 
 
 def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
-    """Solve the poses for the offsets and check the result against its bounds. Raises TareRefusedError."""
+    """Solve the poses for the offsets; return the solution. Raises TareRefusedError if it exceeds a bound."""
     solution = _solve(poses, settings)
     tare = settings.tare
     if settings.estimator.gravity:
@@ -171,7 +174,7 @@ def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
 
 
 def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
-    """Solve by least squares, without any check of the result."""
+    """Solve the poses by least squares. Raises TareRefusedError if they don't determine gravity; checks no result."""
     is_estimated = settings.estimator.gravity and settings.tare.gravity_model == "estimated"
     gravity = np.zeros(len(_GRAVITY))
     if settings.estimator.gravity and not is_estimated:
@@ -199,7 +202,7 @@ def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
 
 
 def _errors_of_unknowns(matrix: NDArray[np.float64], poses: Sequence[Pose], residual: Vector) -> Vector:
-    """Return the standard errors of the unknowns.
+    """Return the standard errors of the unknowns, one per column of the matrix of equations.
 
     An equation's error is the larger of two: the noise of its mean, and the disagreement of the poses.
     """

@@ -72,11 +72,11 @@ class TareSession:
         self._period_s = self.settings.bus.period_s
 
     def interrupt(self) -> None:
-        """End the tare. Safe in a signal handler."""
+        """Make `run` end at its next cycle, with KeyboardInterrupt. Safe in a signal handler."""
         self._is_interrupted = True
 
     def run(self) -> Tare:
-        """Boot the devices, measure, solve.
+        """Boot the devices, measure the poses, solve for the offsets; return the tare. Writes no file.
 
         Raises TareRefusedError, DeviceError, BusError, SilenceError; KeyboardInterrupt after `interrupt`.
         """
@@ -117,7 +117,7 @@ class TareSession:
         return max(1, round(duration_s / self._period_s))
 
     def _await_data(self) -> None:
-        """Wait until all devices have answered for a while. Raises TareRefusedError after a timeout."""
+        """Wait for `safety.commission_s` of cycles with complete data. Raises TareRefusedError after a timeout."""
         safety = self.settings.safety
         good, enough = 0, self._cycles(safety.commission_s)
         for _ in range(enough + self._cycles(safety.phase_timeout_s)):
@@ -145,7 +145,7 @@ class TareSession:
         return poses
 
     def _measure_next_pose(self, last: Pose, number: int) -> Pose:
-        """Wait until the arm has been moved and rests again, then measure it; start again if it moves meanwhile."""
+        """Wait until the arm has left the last pose and rests, then measure a pose; start again if the arm moves."""
         tare = self.settings.tare
         self.progress(
             f"pose {number} of {tare.poses}: move a joint by hand by more than {tare.move_deg:g} deg, then let go"
@@ -159,7 +159,10 @@ class TareSession:
                 self.progress(f"pose {number} of {tare.poses}: {reason}; let go of it")
 
     def _await_rest(self, last: Pose, number: int, cycles_left: int) -> int:
-        """Wait until the arm has left the last pose and rests for a while; return the remaining cycles."""
+        """Wait until the arm has left the last pose and rests for `tare.settle_s`; return the cycles then left.
+
+        Raises TareRefusedError if none is left.
+        """
         tare = self.settings.tare
         settle_cycles = self._cycles(tare.settle_s)
         has_moved = False
@@ -191,7 +194,7 @@ class TareSession:
         return state.is_complete
 
     def _measure(self) -> Pose:
-        """Measure one window at rest. Raises TareRefusedError."""
+        """Run cycles for `tare.window_s`; return the pose. Raises TareRefusedError for motion or unfit data."""
         settings = self.settings
         cycles = self._cycles(settings.tare.window_s)
         states: list[ArmState] = []
@@ -223,7 +226,7 @@ class TareSession:
                 raise TareRefusedError(f"{name} has sent nothing usable for {age} cycles, bus.max_age_cycles = {bound}")
 
     def _auto_zero(self, nodes: list[Any], sensors: tuple[Identity, ...]) -> None:
-        """Let the sensors set their own zero at rest, and check the remainder. Raises TareRefusedError, DeviceError."""
+        """Let the sensors set their own zero at rest; check the torque left. Raises TareRefusedError, DeviceError."""
         before = self._measure()
         solve_tare([before], self.settings)  # refuse if the arm is pushed
         for node, sensor in zip(nodes, sensors, strict=True):

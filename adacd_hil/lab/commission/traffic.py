@@ -41,7 +41,7 @@ class Traffic:
         self.error_frames = 0
 
     def count_frame(self, frame: Frame) -> None:
-        """Count one frame."""
+        """Add a frame to the statistics of its identifier; an error frame to the number of error frames."""
         if frame.is_error:
             self.error_frames += 1
             return
@@ -60,12 +60,12 @@ class Traffic:
             talk.longest = length
 
     def sorted(self) -> list[Talk]:
-        """Return the identifiers seen, ascending."""
+        """Return the statistics of each identifier seen, ascending by identifier."""
         return [self.talks[can_id] for can_id in sorted(self.talks)]
 
 
 def receive_until(bus: Bus, clock: Clock, end_ns: int) -> Frame | None:
-    """Wait for one frame until `end_ns`; None if no frame came. Raises BusError."""
+    """Wait for a frame until `end_ns` of the clock, and return it; None if none came. Raises BusError."""
     while (now_ns := clock.now_ns()) < end_ns:
         slice_ns = min(end_ns, now_ns + round(_SLICE_S * 1e9))
         frame = bus.receive((slice_ns - now_ns) * 1e-9)
@@ -76,7 +76,7 @@ def receive_until(bus: Bus, clock: Clock, end_ns: int) -> Frame | None:
 
 
 def listen(bus: Bus, clock: Clock, duration_s: float, traffic: Traffic) -> None:
-    """Count the frames on the bus for a duration, without sending. Raises BusError."""
+    """Receive frames for a duration, and add them to `traffic`; send nothing. Raises BusError."""
     end_ns = clock.now_ns() + round(duration_s * 1e9)
     while (frame := receive_until(bus, clock, end_ns)) is not None:
         traffic.count_frame(frame)

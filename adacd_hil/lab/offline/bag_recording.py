@@ -17,9 +17,10 @@ from adacd_hil.settings.schema import ConfigError
 
 
 def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> RecordedColumns:
-    """Read positions, efforts and, if all messages have them, velocities.
+    """Read positions, efforts and, if all messages have them, velocities of the map's joints from a bag.
 
-    Raises LogError if the bag can't be read or has no efforts, ConfigError if it lacks a topic or a joint.
+    span: as of `RecordedRows`. Raises LogError if the bag can't be read or has no efforts, ConfigError if it lacks a
+    topic or a joint.
     """
     wanted = described.columns.q or described.urdf.joint_names
     with opened_bag(path) as (topics, read_messages):
@@ -41,7 +42,7 @@ def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
 
 
 def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
-    """Return the topic to read: the wanted one, else the only one of JointState. Raises ConfigError."""
+    """Return the topic to read: `wanted`, else /joint_states, else the only one of JointState. Raises ConfigError."""
     found = joint_state_topics(topics)
     if wanted:
         if wanted in found:
@@ -70,7 +71,11 @@ class _States:
         self._lacks_effort: set[str] = set(wanted)
 
     def read(self, number: int, message: JointStateMessage, into: RecordedRows) -> list[float] | None:
-        """Return positions, efforts and velocities of the wanted joints; None if the message lacks them."""
+        """Return positions, efforts and velocities of the wanted joints; None if the message lacks one of the joints.
+
+        Missing efforts or velocities are nan. A message with arrays of wrong lengths is dropped: None, counted in
+        `into`. number: of the message, from 1.
+        """
         self._messages += 1
         places = self._places.setdefault(message.names, self._find(message.names))
         if places is None:
@@ -94,7 +99,7 @@ class _States:
         return row
 
     def check(self, is_stamped: bool) -> None:
-        """Raise LogError or ConfigError if the topic lacks the joints, efforts or stamps."""
+        """Raise LogError or ConfigError if all messages read lack the joints, efforts or, if is_stamped, stamps."""
         if not self._messages:
             raise LogError(f"{self._where} has no messages")
         if all(places is None for places in self._places.values()):

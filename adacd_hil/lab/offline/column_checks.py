@@ -99,19 +99,23 @@ def find_faults(
 
 
 def joined_names(names: list[str], count: int) -> str:
-    """Join the names of some joints; "all joints" if these are all of `count`."""
+    """Join joints' names with commas and "and"; return "all joints" if these are all `count`, more than two."""
     if len(names) == count > 2:
         return "all joints"
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def column_name(described: RecordingMap, key: str, joint: int) -> str:
-    """Return a joint's name with its column."""
+    """Return a joint's name, with its column in parentheses if the map names another. joint: from 0.
+
+    key: of `columns` in the map, such as "tau_J".
+    """
     name, columns = described.urdf.joint_names[joint], getattr(described.columns, key)
     return f"{name} ({columns[joint]})" if columns and columns[joint] != name else name
 
 
 def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
+    """Report torques that are constant, stuck, clipped, or far beyond the URDF's efforts."""
     n = described.joints
     constant = [joint for joint in range(n) if np.ptp(columns.tau_J[:, joint]) == 0.0]
     if constant:
@@ -141,7 +145,10 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[Recordin
 
 
 def largest_torques(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
-    """Return the largest torque (n,) of each joint, without outliers, and its effort (n,), inf where unknown."""
+    """Return each joint's 99 % quantile of |tau_J| (n,), and its effort in the URDF (n,), inf if unknown.
+
+    tau_J: (k, n).
+    """
     effort = np.where(np.isfinite(arm.torque_limit) & (arm.torque_limit > 0.0), arm.torque_limit, np.inf)
     return np.nanquantile(np.abs(tau_J), 0.99, axis=0), effort
 
@@ -161,13 +168,17 @@ def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[Reco
 
 
 def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, is_meant: NDArray[np.bool_]) -> str:
-    """Return the map's key that changes the unit of all joints, or the scale of some."""
+    """Return the line of the map that changes a unit: `units.KEY` if all joints are meant, else `scale.KEY`.
+
+    key: "q" or "tau_J". factor: on the scale of the joints meant. is_meant: (n,).
+    """
     if is_meant.all():
         return f'`units.{key}` = "{unit}", which the map has as "{getattr(described.units, key)}"'
     return described.scaled(key, np.where(is_meant, factor, 1.0))
 
 
 def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
+    """Report positions that never change, are noise, or are far beyond the URDF's limits of position or speed."""
     n, urdf = described.joints, described.urdf
     travel = np.ptp(columns.q, axis=0)
     still = [joint for joint in range(n) if travel[joint] < STILL_RAD]
@@ -237,7 +248,7 @@ def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[Recording
 
 
 def _spikes(column: Vector) -> NDArray[np.int64]:
-    """Return the rows of spikes, empty if there are too many to be spikes."""
+    """Return the rows of a column (k,) at which a single sample is far from its neighbours; empty if they are many."""
     if len(column) < _SPIKE_WINDOW:
         return np.zeros(0, np.int64)
     windows = np.lib.stride_tricks.sliding_window_view(column, _SPIKE_WINDOW)
@@ -270,7 +281,7 @@ def _of_rest(
 
 
 def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) -> Iterator[RecordingFinding]:
-    """Compare measured velocities with the slope of the positions."""
+    """Report the first joint whose velocities are in another joint's column, or aren't the slope of its positions."""
     n = described.joints
     products = np.zeros((n, n))
     window = derivative_window(described, recordings[0].period_s)
@@ -333,10 +344,10 @@ def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | 
 
 
 def plateau(torque: Vector) -> tuple[float, float] | None:
-    """Return the bound at which a torque stays within its noise, and the share of time there; None without one.
+    """Return the torque at which readings (k,) stop, as if clipped, and the share of readings there; None if none.
 
-    The last band below the extreme reading, as wide as the noise, holds far more readings than the band before it. A
-    joint that overcomes only friction looks like this, too.
+    Readings stop there if the band next to the extreme reading, as wide as the noise, holds far more of them than the
+    band beside it. A joint that overcomes only friction looks like this, too.
     """
     width, span = 2.0 * _PLATEAU_SIGMAS * float(white_noise(torque)), float(np.ptp(torque))
     if not 0.0 < width < _PLATEAU_WIDTH * span:
@@ -352,7 +363,7 @@ def plateau(torque: Vector) -> tuple[float, float] | None:
 
 
 def _clipped_at(torque: Vector) -> Iterator[float]:
-    """Yield the bounds at which readings are cut off."""
+    """Yield the smallest and the largest reading of a torque (k,), each only if it repeats as of a clipped sensor."""
     levels = np.unique(torque)
     if len(levels) < _FEWEST_LEVELS:
         return

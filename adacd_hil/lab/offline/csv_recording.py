@@ -51,7 +51,10 @@ class _Column(NamedTuple):
 
 
 def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> RecordedColumns:
-    """Read the columns of a map. Raises LogError if the file can't be read, ConfigError if it lacks a column."""
+    """Read the columns that a map names from a CSV file. span: as of `RecordedRows`.
+
+    Raises LogError if the file can't be read, ConfigError if it lacks a column.
+    """
     for key in ("q", "tau_J"):
         if not getattr(described.columns, key):
             raise ConfigError(f"missing key `columns.{key}`: which columns of {path}?")
@@ -86,7 +89,7 @@ def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
 
 
 def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows with their numbers from 1; empty ones, and comments below the first, are skipped."""
+    """Yield each row's number in the file, from 1, and its cells; skip empty rows, and comments below the first row."""
     form = described.csv
     with opened_text(path) as file:
         for _ in range(form.skip_rows):
@@ -99,7 +102,7 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
 
 @contextmanager
 def opened_text(path: Path) -> Iterator[TextIO]:
-    """Open a text file. Raises LogError if it is of another kind, or can't be read."""
+    """Open a text file for the block. Raises LogError if it is no text in UTF-8, or can't be read."""
     try:
         with _open_text(path) as file:
             yield file
@@ -110,7 +113,7 @@ def opened_text(path: Path) -> Iterator[TextIO]:
 
 
 def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
-    """Split lines into cells. Raises LogError."""
+    """Yield the cells of each line; a delimiter " " is any white space. Raises LogError, with `path`, for bad CSV."""
     if delimiter == " ":
         yield from (line.split() for line in lines)
         return
@@ -132,7 +135,10 @@ def _open_text(path: Path) -> TextIO:
 
 
 def _columns(path: Path, heads: list[str], cells: int, described: RecordingMap) -> list[_Column]:
-    """Find the columns: time, positions, torques, velocities, touches. Raises ConfigError."""
+    """Return the wanted columns in the order time, positions, torques, velocities, touches.
+
+    heads: the file's, [] without a header. cells: number of them in a row. Raises ConfigError if a column is missing.
+    """
     columns, units = described.columns, described.units
     number = partial(read_number, decimal=",") if described.csv.decimal == "," else float
     contact = (columns.contact,) if columns.contact else ()
@@ -143,7 +149,7 @@ def _columns(path: Path, heads: list[str], cells: int, described: RecordingMap) 
 
 
 def _time_column(path: Path, heads: list[str], cells: int, described: RecordingMap) -> _Column:
-    """Find the time column; without one, if the map gives a period, a nameless column. Raises ConfigError."""
+    """Return the time column; without one, if the map gives a period, a nameless column. Raises ConfigError."""
     name, units = described.columns.time, described.units
     read = _time_reader(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
     has_period = described.sampling.period_s > 0.0
@@ -158,7 +164,7 @@ def _time_column(path: Path, heads: list[str], cells: int, described: RecordingM
 
 
 def _place(path: Path, name: str, heads: list[str], cells: int) -> int:
-    """Find a column by its head or its number from 1. Raises ConfigError."""
+    """Return the index, from 0, of a column by its head, or by its number from 1. Raises ConfigError without one."""
     if name in heads:
         return heads.index(name)
     if name.isdecimal() and 1 <= int(name) <= cells:
@@ -179,7 +185,10 @@ class _RowReader:
         self._plain = [(column.place, column.read) for column in self._wanted]
 
     def read(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
-        """Return the numbers of a row, the time first; None for a skipped row, which is counted."""
+        """Return the numbers of a row, the time first; None for a skipped row.
+
+        A bad row is counted in `into`, a row of units noted there. number: the row's in the file, from 1.
+        """
         self._rows += 1
         self._first = self._first or number
         if len(cells) < self._cells:
@@ -198,7 +207,10 @@ class _RowReader:
         return row if self._has_time else [(self._rows - 1) * self._described.sampling.period_s, *row]
 
     def _slowly(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
-        """Read a row with a cell that isn't a number: empty, a unit, or unreadable."""
+        """Return the numbers of a row, nan for empty cells; None for a row with a cell that is no number.
+
+        A row of units is noted in `into`, an unreadable row counted there.
+        """
         row, wrong = [], []
         for column in self._wanted:
             text = cells[column.place].strip()
@@ -229,7 +241,7 @@ class _RowReader:
         return not any(map(str.isdigit, "".join(text for _, text in wrong)))
 
     def _remedy(self, text: str, column: _Column) -> str:
-        """Return a hint at the key of the map that would make a cell readable."""
+        """Return the words ", no number", with the key of the map that would make the cell readable, if any."""
         if self._described.csv.decimal == "." and text.count(",") == 1 and is_number(text, ","):
             return ', no number: `csv.decimal` = "," reads it'
         if column is self._columns[0] and is_iso_time(text):
@@ -243,7 +255,10 @@ def read_number(text: str, decimal: str) -> float:
 
 
 def _time_reader(read: Callable[[str], Decimal], decimal: str) -> Callable[[str], float]:
-    """Return a reader of times relative to the first one: ns since 1970 have more digits than a float."""
+    """Return a function that parses times, and subtracts the first of them.
+
+    Times in ns since 1970 have more digits than a float.
+    """
     first: Decimal | None = None
 
     def read_time(text: str) -> float:

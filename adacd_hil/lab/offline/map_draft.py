@@ -51,7 +51,7 @@ class MapDraft:
         return tuple(key for key in self.keys if key.reason)
 
     def text(self) -> str:
-        """Write the map as TOML."""
+        """Return the map as the text of a TOML file, each guess with its reason in a comment."""
         lines = [f"# Drafted from {self.recording.name}: check the guesses."]
         for section in dict.fromkeys(key.section for key in self.keys):
             lines += ["", f"[{section}]"]
@@ -62,7 +62,10 @@ class MapDraft:
 
 
 def draft_map(recording: Path, urdf: Path, map_path: Path) -> MapDraft:
-    """Draft the map of a recording, to be saved at map_path. Raises ConfigError, LogError."""
+    """Draft the map of a recording; write no file. Raises ConfigError, LogError.
+
+    map_path: file in which the caller will save the map; the URDF's path is relative to its folder.
+    """
     arm, locked = _read_arm(urdf)
     where = Path(os.path.relpath(urdf.resolve(), map_path.resolve().parent)).as_posix()
     keys = [DraftedKey("arm", "urdf", where, "")]
@@ -73,7 +76,10 @@ def draft_map(recording: Path, urdf: Path, map_path: Path) -> MapDraft:
 
 
 def _read_arm(urdf: Path) -> tuple[SerialArm, tuple[str, ...]]:
-    """Read the arm; if it branches, lock the joints of a gripper. Raises ConfigError."""
+    """Read the arm of a URDF; return it, and the names of locked joints. Raises ConfigError.
+
+    Joints with names of a gripper's are locked if the URDF can't be read otherwise.
+    """
     try:
         text = read_input(urdf)
         try:
@@ -114,7 +120,7 @@ def _of_table(recording: Path, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
-    """Draft the units that differ from the map's defaults."""
+    """Draft the units that differ from the map's defaults; for currents `scale.tau_J` and `arm.has_rotors`, too."""
     keys = []
 
     def add_unit(role: str, default: str, guessed: str, reason: str) -> str:
@@ -142,7 +148,7 @@ def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _angle_unit(q: Vector, arm: SerialArm) -> tuple[str, str]:
-    """Return "deg" and the reason if positions go far beyond the URDF's limits in radians, else "rad"."""
+    """Return the unit "deg" and the reason if positions go far beyond the URDF's limits in rad, else "rad"."""
     bound = np.maximum(np.abs(arm.position_low), np.abs(arm.position_high))
     bound = np.where(np.isfinite(bound) & (bound > 0.0), bound, 2.0 * np.pi)
     reach = np.nanmax(np.abs(q), axis=0)
@@ -154,7 +160,10 @@ def _angle_unit(q: Vector, arm: SerialArm) -> tuple[str, str]:
 
 
 def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
-    """Return the unit in which velocities equal the slope of the positions."""
+    """Return the unit in which velocities equal the slope of the positions; "rad/s" if none does.
+
+    angle: unit of the positions. step_s: interval of the rows.
+    """
     slope = np.gradient(guess.of("q"), axis=0) / step_s * (np.pi / 180.0 if angle == "deg" else 1.0)
     square = np.nansum(slope**2)
     factor = abs(float(np.nansum(slope * guess.of("dq")) / square)) if square > 0.0 else 1.0
@@ -162,7 +171,7 @@ def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
 
 
 def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
-    """Return "mNm" and the reason if torques exceed the effort of the URDF, but wouldn't in mNm, else "Nm"."""
+    """Return "mNm" and the reason if a torque is far beyond the effort of the URDF, else "Nm"."""
     largest, effort = largest_torques(tau, arm)
     over = np.nan_to_num(largest / effort)
     joint = int(np.argmax(over))
@@ -172,7 +181,7 @@ def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
 
 
 def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
-    """Draft the keys of a bag; it needs no key if it has the URDF's names on one topic."""
+    """Draft the keys of a bag that differ from the defaults: topic, stamp, names of joints, units. Raises LogError."""
     keys = []
     with opened_bag(recording) as (topics, read_messages):
         found = joint_state_topics(topics)
@@ -207,7 +216,10 @@ def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _bag_names(recording: Path, names: list[str], arm: SerialArm) -> tuple[str, ...]:
-    """Return the arm's joints among a bag's. Raises ConfigError."""
+    """Return the bag's names of the arm's joints, in the arm's order. Raises ConfigError.
+
+    By equal names, else by endings; else, if there are as many, all names of the bag in the order of their numbers.
+    """
     if set(arm.joint_names) <= set(names):
         return arm.joint_names
     chosen = []

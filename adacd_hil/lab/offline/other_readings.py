@@ -93,7 +93,10 @@ class _Equations(NamedTuple):
 def find_readings(
     described: RecordingMap, model: ArmModel, settings: OfflineSettings, fitted: list[Record], tested: list[Record]
 ) -> list[Reading]:
-    """Return the readings that explain the test far better than the map's; the simplest of nearly equal ones first."""
+    """Return the readings that explain the test far better than the map's, best first; [] if none does.
+
+    Of nearly equal ones only those with the fewest differences from the map are returned.
+    """
     fitted, tested = _thinned(fitted, settings), _thinned(tested, settings)
     step = _step(settings)
     settings = replace(settings, period_s=step * settings.period_s, fit_every=max(1, round(settings.fit_every / step)))
@@ -115,7 +118,7 @@ def find_readings(
 
 
 def is_possible(model: ArmModel, theta: Vector, q: Vector, dq: Vector) -> bool:
-    """Tell whether an arm can have these parameters: each joint has an inertia, and friction dissipates. q (k, n)."""
+    """Tell whether an arm can have these parameters: inertias are positive, friction dissipates. q, dq: (k, n)."""
     F_v, F_c = theta[model.place_of("F_v")], theta[model.place_of("F_c")]
     speed, square = np.abs(dq).mean(axis=0), (dq**2).mean(axis=0)
     idle = _IDLE_FRICTION * (np.abs(F_c).max() + np.abs(F_v).max() * speed.mean()) * speed
@@ -125,7 +128,10 @@ def is_possible(model: ArmModel, theta: Vector, q: Vector, dq: Vector) -> bool:
 
 
 def mass_rows(model: ArmModel, q: Vector, poses: int) -> Vector:
-    """Return the rows (m, n, p) whose product with theta is the inertia about each joint, in some poses of q (k, n)."""
+    """Return the rows (m, n, p) whose product with theta is the inertia about each joint.
+
+    They are of about `poses` poses, spread evenly over q (k, n).
+    """
     units = np.eye(model.joints)
     spread = q[:: max(1, len(q) // poses)]
     return np.array([[offline.mass_terms(model, pose, unit) for unit in units] for pose in spread])
@@ -136,7 +142,7 @@ def _step(settings: OfflineSettings) -> int:
 
 
 def _thinned(records: list[Record], settings: OfflineSettings) -> list[Record]:
-    """Thin the samples out and shorten the records to the longest time that is used."""
+    """Return the records with fewer samples, `_PERIOD_S` apart, and only the first `_MOST_S` of them in all."""
     step, room = _step(settings), round(_MOST_S / settings.period_s)
     kept = []
     for record in records:
@@ -148,7 +154,7 @@ def _thinned(records: list[Record], settings: OfflineSettings) -> list[Record]:
 
 
 def _equations(records: list[Record], settings: OfflineSettings, motion: _Motion) -> _Equations | None:
-    """Sum the normal equations of a reading of the motion; None if its numbers overflow."""
+    """Return the sum of the normal equations of all records for a reading of the motion; None if numbers overflow."""
     model = motion.model
     n, p = model.joints, len(model.parameter_names)
     found = _Equations(*(np.zeros(shape) for shape in ((n, p, p), (n, n, p), (n, n), (n,), (1,))))
@@ -177,7 +183,7 @@ def _judge(
     torques: _Torques,
     fitted: list[Record],
 ) -> Reading:
-    """Fit one reading, and test it."""
+    """Fit the arm for a reading of motion and torques; return the reading, with its unexplained share in the test."""
     signs, places, joints = np.array(torques.signs), list(torques.places), range(motion.model.joints)
     weight = 1.0 / fit.spread[places]
     A = np.tensordot(weight, fit.A, axes=1)
@@ -203,7 +209,10 @@ def _judge(
 
 
 def _torques(described: RecordingMap, most_turned: int) -> Iterator[_Torques]:
-    """Yield readings of torques: some or all turned, two exchanged, all in reverse order."""
+    """Yield readings of torques: some or all with the other sign, two exchanged, all in reverse order.
+
+    most_turned: most torques that have the other sign, unless all have.
+    """
     n, names = described.joints, described.urdf.joint_names
     straight, ones = tuple(range(n)), (1.0,) * n
     for choice in itertools.product((1.0, -1.0), repeat=min(n, _MOST_SIGNS)):
@@ -274,7 +283,7 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
 
 
 def _coupled(text: str, model: ArmModel, T: Vector) -> Iterator[_Motion]:
-    """Yield coupled positions, without and with the torques that do the same power."""
+    """Yield readings with the positions T q: with the torques as recorded, and with those that do the same power."""
     remedy = "record the joints' own positions and torques, or write them into new columns"
     yield _Motion(text, remedy, model, T)
     yield _Motion(f"{text}, and so do the torques", remedy, model, T, np.linalg.inv(T).T.astype(np.float64))

@@ -53,7 +53,11 @@ class RecordedRows:
     """Collects the rows of a recording one by one, and makes columns of them."""
 
     def __init__(self, path: Path, width: int, time_unit_s: float, span: TimeWindow | None) -> None:
-        """Start without rows. width: numbers of a row, the time first."""
+        """Start without rows.
+
+        width: numbers of a row, the time first. time_unit_s: one unit of these times, s. span: part to keep, in time
+        since the first row, of a file with more than `MOST_ROWS` rows; None: all.
+        """
         self.notes: list[str] = []
         self.count = 0
         """Rows so far."""
@@ -66,7 +70,7 @@ class RecordedRows:
         self._is_long = False  # only the span is kept
 
     def append(self, number: int, row: list[float]) -> None:
-        """Add a row; number: its place in the file, from 1. Raises LogError if there are too many."""
+        """Add a row, the time first. number: its place in the file, from 1. Raises LogError if there are too many."""
         self._block.append(number)
         self._block += row
         self.count += 1
@@ -74,7 +78,10 @@ class RecordedRows:
             self._flush()
 
     def drop(self, kind: str, first: str, count: int = 1) -> None:
-        """Count dropped rows. kind: text after the word "row"; first: description of the first of them."""
+        """Count dropped rows by kind; keep the description of the first row of each kind.
+
+        kind: text after the word "row". first: description of the first row of this call.
+        """
         if count:
             self._drops[kind] += count
             self._first_drops.setdefault(kind, first)
@@ -85,7 +92,12 @@ class RecordedRows:
         return self._is_long and self._span is not None and self._latest_s - self._begin_s > self._span.end_s + _SPARE_S
 
     def columns(self, described: RecordingMap, names: list[str], has_touches: bool = False) -> RecordedColumns:
-        """Return columns of all rows. names: of the values, for errors. Raises LogError."""
+        """Return all kept rows as columns in SI units.
+
+        names: of the value columns, for errors; more than 2 n include velocities. has_touches: the last number of a row
+        tells whether the arm is touched. Raises LogError for too few rows, too many bad ones, or a value above
+        `LARGEST`.
+        """
         self._flush()
         table = np.concatenate(self._kept) if self._kept else np.empty((0, self._width))
         self._check_drops(len(table))
@@ -107,7 +119,10 @@ class RecordedRows:
         return RecordedColumns(time_s, self._begin_s, values, touched, notes)
 
     def _flush(self) -> None:
-        """Sort out the latest block of rows, and keep those of the requested span."""
+        """Drop the bad rows of the latest block, and keep the others; of a long file only those of the requested span.
+
+        Raises LogError if more than `MOST_ROWS` are kept.
+        """
         if not self._block:
             return
         table = np.array(self._block).reshape(-1, self._width)
@@ -130,6 +145,7 @@ class RecordedRows:
             raise LogError(f"recording {self._path} has more than {MOST_ROWS} rows: {remedy}")
 
     def _drop_rows(self, table: Vector, is_wrong: NDArray[np.bool_], kind: str, words: str) -> None:
+        """Count the wrong rows of a table by `drop`; the table keeps them. words: of the first one, with {time}."""
         for number, time in table[is_wrong, :2][:1].tolist():
             first = words.format(time=f"{time * self._unit_s:.9g} s")
             self.drop(kind, f"row {number:.0f}: {first}", int(np.count_nonzero(is_wrong)))
@@ -147,7 +163,10 @@ class RecordedRows:
         ]
 
     def _check_drops(self, kept: int) -> None:
-        """Raise LogError if more than a few rows are unusable; repeated ones don't count."""
+        """Raise LogError if more rows were dropped than `_FEW_ROWS` and `_FEW_SHARE` allow. kept: number of kept rows.
+
+        A row with the time of the row before doesn't count.
+        """
         count = self._drops.total() - self._drops[_DOUBLED]
         if count > max(_FEW_ROWS, _FEW_SHARE * (kept + count)):
             kind, most = max((pair for pair in self._drops.items() if pair[0] != _DOUBLED), key=lambda pair: pair[1])

@@ -136,9 +136,10 @@ def identify(
     tested: ForeignRecording | None,
     watched: Sequence[ForeignRecording] = (),
 ) -> Identified:
-    """Fit recordings one after the other, test on another, and look for contacts in further ones.
+    """Fit one model to all recordings, test it on another one, and detect contacts in further ones.
 
-    tested: None takes the last part of the last fitted recording. Raises ConfigError, LogError.
+    tested: None: of the last recording the first `FIT_SHARE` of its time is fitted, and the rest tested. Samples during
+    a known touch are neither fitted nor tested. Raises ConfigError, LogError.
     """
     recordings = [recording.free for recording in fitted]
     if tested is None:
@@ -171,7 +172,7 @@ def identify(
 
 
 def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> OfflineCertificate:
-    """Join the certificates of all stretches, weighted by length."""
+    """Return one certificate of all stretches: means weighted by length, largest residual, smallest margins."""
     weights = np.array([len(record.q) for record in tested.records], np.float64)
     weights /= weights.sum()
     return OfflineCertificate(
@@ -190,7 +191,10 @@ def watch(
     lack_Nm: Vector,
     recording: ForeignRecording,
 ) -> Watched:
-    """Detect contacts in a recording, and compare them with its touches if these are known."""
+    """Detect contacts in a recording, and compare them with its touches if these are known.
+
+    lack_Nm: model error (n,), which widens the thresholds.
+    """
     detections = [offline.detect(model, part.record, estimate, settings, lack_Nm) for part in recording.stretches]
     spells: list[Spell] = []
     delays: list[float] = []
@@ -221,14 +225,17 @@ def watch(
 def _owners(
     stretch: RecordingStretch, samples: NDArray[np.int64], recording: ForeignRecording, settings: OfflineSettings
 ) -> NDArray[np.int64]:
-    """Return the touch that each contact belongs to, -1 without one, as far as the touches' times are known."""
+    """Return the index of the touch that each contact belongs to, -1 without one.
+
+    samples: index of each contact's first sample. A touch may begin `blur_s` earlier than recorded.
+    """
     firsts, ends = np.array(stretch.touches, np.int64).reshape(-1, 2).T
     onsets = firsts - round(recording.blur_s / recording.period_s)
     return owners(samples, onsets, explained_until(onsets, ends - 1 + round(settings.isolation_s / settings.period_s)))
 
 
 def draw_watched(identified: Identified, watched: Watched, name: str) -> Drawing:
-    """Draw one recording, a panel per joint."""
+    """Draw a recording's external torques, thresholds, contacts and touches, a panel per joint. name: the drawing's."""
     n = identified.model.joints
     with style():
         figure = Figure(figsize=(7.2, 0.9 + 1.3 * n), layout="constrained")

@@ -44,7 +44,7 @@ class RecordingStretch:
 
     @property
     def touches(self) -> list[tuple[int, int]]:
-        """First sample of each touch, and the one after its last."""
+        """Index of each touch's first sample, and of the sample after its last; empty if touches are unknown."""
         return [] if self.is_touched is None else _true_runs(self.is_touched)
 
 
@@ -81,18 +81,21 @@ class ForeignRecording:
         return [stretch.record for stretch in self.stretches]
 
     def between(self, start_s: float, end_s: float) -> "ForeignRecording":
-        """Return the part within a span of the recording's time, which begins with 0."""
+        """Return the part from one time to another, s since the recording's first row, without stretches too short."""
         parts = [_cut(stretch, self.period_s, start_s, end_s) for stretch in self.stretches]
         kept = tuple(part for part in parts if len(part.record.q) >= SHORTEST_SAMPLES)
         return replace(self, stretches=kept)
 
     @property
     def free(self) -> "ForeignRecording":
-        """Return the part without touches, as far as they are known."""
+        """The part without touches; the whole recording if touches are unknown."""
         return replace(self, stretches=tuple(part for stretch in self.stretches for part in self._untouched(stretch)))
 
     def _untouched(self, stretch: RecordingStretch) -> list[RecordingStretch]:
-        """Split a stretch at its touches, without samples whose derived velocity reaches into a touch."""
+        """Return the untouched parts of a stretch that are long enough; the whole stretch if touches are unknown.
+
+        Samples whose derived velocity reaches into a touch are left out.
+        """
         if stretch.is_touched is None:
             return [stretch]
         width = 2 * round(self.blur_s / self.period_s) + 1
@@ -106,17 +109,18 @@ def _true_runs(is_true: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def samples(recordings: Iterable[ForeignRecording], name: str) -> Vector:
-    """Return q, dq or tau_J of recordings, one after the other (k, n)."""
+    """Return all samples of the recordings, one recording after the other (k, n). name: "q", "dq" or "tau_J"."""
     return np.concatenate([getattr(record, name) for recording in recordings for record in recording.records])
 
 
 def read_recording(
     path: Path, described: RecordingMap, period_s: float = 0.0, span: TimeWindow | None = None
 ) -> ForeignRecording:
-    """Read a CSV file, an MCAP file or a rosbag. period_s: of the samples, if neither map nor recording determines it.
+    """Read a CSV file, an MCAP file or a rosbag.
 
-    span: the part to read of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError if it
-    can't be read or is too long, ConfigError if it lacks a column of the map.
+    period_s: of the samples, if the map gives none; 0: the median interval of the file's rows. span: the part to read
+    of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError if the file can't be read or is
+    too long, ConfigError if it lacks a column of the map.
     """
     read = read_bag if is_bag(path) else read_csv
     return recording_of(path, described, read(path, described, span), period_s)
@@ -125,7 +129,10 @@ def read_recording(
 def recording_of(
     path: Path, described: RecordingMap, given: RecordedColumns, period_s: float = 0.0
 ) -> ForeignRecording:
-    """Make a recording of columns; path: its name, for errors. Raises LogError."""
+    """Make a recording from columns: resample them at a fixed period, and split them at gaps. Raises LogError.
+
+    path: of the recording, also named in errors. period_s: if the map gives none; 0: the median interval of the rows.
+    """
     n = described.joints
     is_whole = np.isfinite(given.values).all(axis=1)
     time_s, values = given.time_s[is_whole] - given.begin_s, given.values[is_whole]
@@ -180,7 +187,7 @@ def recording_of(
 
 
 def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
-    """Return the recording's own period. Raises LogError if it is implausible, with the likely unit."""
+    """Return the median interval of the rows, s. Raises LogError, with the likely unit, if it is implausible."""
     period_s = float(np.median(np.diff(time_s)))
     if SHORTEST_PERIOD_S <= period_s <= LONGEST_PERIOD_S:
         return period_s
@@ -204,7 +211,10 @@ def _jitter(time_s: Vector, period_s: float) -> str:
 
 
 def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
-    """Drop velocities, which some drivers leave empty, if one never changes though its joint moves."""
+    """Return values and notes: without any velocities, with a note, if one never changes though its joint moves.
+
+    Some drivers leave velocities empty.
+    """
     n = described.joints
     idle = np.ptp(values[:, 2 * n :], axis=0) == 0.0
     moved = np.ptp(values[:, :n], axis=0) > 0.0
@@ -217,7 +227,10 @@ def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[V
 
 
 def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
-    """Remove jumps of a whole turn, as at +180 degrees of a joint without end stops."""
+    """Return the values with positions unwrapped that jump by a whole turn, and a note on each such joint.
+
+    Such a jump is at +180 degrees of a joint without end stops.
+    """
     notes = []
     values = values.copy()
     for joint in np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist():
@@ -231,7 +244,7 @@ def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, lis
 
 
 def derivative_window(described: RecordingMap, period_s: float) -> int:
-    """Return the number of samples in the window of a derived velocity."""
+    """Return the number of samples, odd, in the window of a derived velocity."""
     return max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
 
 

@@ -124,7 +124,10 @@ class SamplingSection:
 
 
 def units_by_slope(units: UnitsSection, factor: float) -> list[tuple[str, str]]:
-    """Return keys and units with which velocities, now `factor` times the slope of the positions, would equal it."""
+    """Return the changes of the map's units, (key, unit), of which each makes velocities equal the positions' slope.
+
+    factor: velocities over slope with the present units.
+    """
     found = [("dq", unit) for unit, value in _SPEED.items() if _is_near(factor * value / _SPEED[units.dq], 1.0)]
     found += [("q", unit) for unit, value in _ANGLE.items() if _is_near(factor * _ANGLE[units.q] / value, 1.0)]
     return [(key, unit) for key, unit in found if getattr(units, key) != unit]
@@ -177,7 +180,7 @@ class RecordingMap:
         return given or (1.0,) * self.joints
 
     def scaled(self, key: str, factors: Vector) -> str:
-        """Return the line of `scale.q` or `scale.tau_J` that multiplies it by factors (n,)."""
+        """Return the map's line `scale.KEY` with its present values times factors (n,). key: "q" or "tau_J"."""
         values = np.array(self._factors(getattr(self.scale, key))) * factors
         return f"`scale.{key}` = [{', '.join(f'{value:g}' for value in values)}]"
 

@@ -103,7 +103,7 @@ class Fitted:
 
 
 def judge_fit(fit: Fitted) -> Verdict:
-    """Judge a fit by its test."""
+    """Return the verdict on a fit: whether the model explains the torque of the test, reasons if not, next step."""
     joints = _shares(fit)
     columns = find_faults(fit.described, fit.fitted, fit.tested)
     plain = [found for found in columns if found.is_dead] or list(_of_length(fit))
@@ -124,7 +124,7 @@ def judge_fit(fit: Fitted) -> Verdict:
 
 
 def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[RecordingFinding]) -> list[RecordingFinding]:
-    """Return the likeliest cause of an unexplained torque, or of parameters that no arm has.
+    """Return findings, first the likeliest cause of an unexplained torque, or of parameters that no arm has.
 
     columns: defects of columns as possible causes; remarks if the torque is explained.
     """
@@ -149,13 +149,13 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Recor
 
 
 def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
-    """Tell for each torque whether it is within the sensor's noise behind the filter of the fit."""
+    """Return, per joint, whether its filtered torque is within `_NOISE_TIMES` the sensor's filtered noise."""
     noise = offline.filtered_noise_Nm(fit.settings)
     return [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
 
 
 def _shares(fit: Fitted) -> tuple[JointShare, ...]:
-    """Compute each joint's share and margin."""
+    """Return each joint's result of the test: explained share of its torque, margin, rms, explained or not."""
     parts = [offline.filtered(fit.model, record, fit.estimate, fit.settings) for record in fit.tested.records]
     torque, residual = (np.concatenate([getattr(part, name) for part in parts]) for name in ("torque", "residual"))
     unit = np.concatenate([part.unit for part in parts])
@@ -178,7 +178,7 @@ def _shares(fit: Fitted) -> tuple[JointShare, ...]:
 
 
 def percent(share: float) -> str:
-    """Format a share as a percentage; a negative one is 0."""
+    """Format a share as a percentage; a negative one as 0 %, nan as "-"."""
     if math.isnan(share):
         return "-"
     digits = 1 if share < 0.9995 else 2
@@ -210,7 +210,7 @@ def _of_length(fit: Fitted) -> Iterator[RecordingFinding]:
 
 
 def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[RecordingFinding]:
-    """Report the mistake of the map that explains at least this share of the torque."""
+    """Report the likeliest mistakes of the map, if correcting one explains at least the share `least` of the torque."""
     fitted = [record for recording in fit.fitted for record in recording.records]
     readings = find_readings(fit.described, fit.model, fit.settings, fitted, fit.tested.records)
     if not readings or 1.0 - readings[0].unexplained < least:
@@ -225,7 +225,7 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
 
 
 def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
-    """Report torques that are unrelated to the motion, or nearly so."""
+    """Report torques that are noise, unrelated to the motion, or mostly noise."""
     related, is_noise = _related_to_motion(fit), _is_noise(fit, joints)
     empty = [
         i for i, joint in enumerate(joints) if not joint.share >= NOTHING and (is_noise[i] or related[i] < NOTHING)
@@ -293,7 +293,10 @@ def _related_to_motion(fit: Fitted) -> Vector:
 
 
 def _predicted_share(fitted: Vector, tested: Vector) -> float:
-    """Return the share of a table's last column that a fit of the others to another table explains."""
+    """Return the share of the last column of `tested` that a least-squares fit explains.
+
+    The fit is of the last column of `fitted` by its other columns. Column 1: constant, filtered.
+    """
     coefficients = np.linalg.lstsq(fitted[:, :-1], fitted[:, -1], rcond=1e-6)[0]
     unit, torque = tested[:, 1], tested[:, -1]
     spread = torque - unit * (unit @ torque) / max(float(unit @ unit), 1e-18)
@@ -302,7 +305,7 @@ def _predicted_share(fitted: Vector, tested: Vector) -> float:
 
 
 def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
-    """Compare the torques with the masses of the URDF, and the inertia with that of any arm of this reach."""
+    """Report a unit by which torques differ from those of the URDF's masses, and an inertia beyond any arm's."""
     scale, sigma = _scale_of_urdf(fit)
     mass_kg = _mass_at_reach(fit)
     units, least = fit.described.units, min(joint.share for joint in joints)
@@ -330,7 +333,9 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFi
 
 
 def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
-    """Return the probable unit of torques if they are off by 1000; "" if they aren't.
+    """Return the probable unit of torques if the one of the map is wrong by a factor of 1000; "" if it isn't.
+
+    scale: torques over those that the URDF's masses need. mass_kg: of `_mass_at_reach`.
 
     Some URDFs have masses of a thousandth for the sake of a simulator: with a plausible inertia, torques are not mNm.
     """
@@ -343,7 +348,10 @@ def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
 
 
 def _scale_of_urdf(fit: Fitted) -> tuple[float | None, float]:
-    """Return the factor that the URDF's masses need, with its deviation; None if the URDF has no masses."""
+    """Return the ratio of the torques to those that the URDF's masses need, and its standard deviation.
+
+    None and 0 if the URDF has no masses.
+    """
     theta_full = fit.described.urdf.theta_full
     base = fit.model.place_of("base")
     expected = fit.model.base.map @ theta_full
@@ -357,7 +365,10 @@ def _scale_of_urdf(fit: Fitted) -> tuple[float | None, float]:
 
 
 def _mass_at_reach(fit: Fitted) -> float | None:
-    """Return the mass at the distance of the outermost joint that has the inertia about the first joint."""
+    """Return the mass, kg, that has the inertia about joint 1 if it is at the outermost joint of the stretched arm.
+
+    None if the arm has no reach, a joint slides, or the inertia isn't positive.
+    """
     arm = fit.described.urdf.chain
     reach_m = float(np.sum(np.linalg.norm(arm.translation[1:], axis=1)))
     if reach_m <= 0.0 or np.any(arm.is_prismatic):
@@ -421,7 +432,7 @@ def _of_excitation(fit: Fitted) -> Iterator[RecordingFinding]:
 
 
 def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
-    """Report unexplained joints if no cause was found."""
+    """Report each unexplained joint with its share and residual, whatever the cause."""
     for i, joint in enumerate(joints):
         if joint.is_explained or math.isnan(joint.share):
             continue
@@ -477,7 +488,7 @@ def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[Recordin
 
 
 def _column(described: RecordingMap, key: str, joints: Sequence[int]) -> str:
-    """Return a key of the map with the columns of some joints."""
+    """Return "`columns.KEY`" with the columns of these joints in parentheses, if the map names them."""
     columns = getattr(described.columns, key)
     named = f" ({', '.join(columns[i] for i in joints)})" if columns else ""
     return f"`columns.{key}`{named}"

@@ -114,7 +114,7 @@ _Form = tuple[CsvSection, tuple[str, ...], tuple[str, ...], int]
 
 
 def _form(path: Path, lines: list[str]) -> _Form:
-    """Find the form with the most columns. Raises LogError."""
+    """Return the form whose delimiter and decimal sign give the data the most columns. Raises LogError."""
     best: _Form | None = None
     for delimiter in DELIMITERS:
         for decimal in (".", ",") if delimiter != "," else (".",):
@@ -154,7 +154,7 @@ def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) ->
 
 
 def _values(rows: list[list[str]], count: int, decimal: str) -> tuple[Vector, bool]:
-    """Read the data; tell whether the first column has dates, which are read as nan. count: of columns."""
+    """Return the data (k, count), and whether the first column has dates, which are read as nan."""
     table: list[list[float]] = []
     is_iso = False
     for cells in rows[:_SEEN_ROWS]:
@@ -172,6 +172,7 @@ def _number(cell: str, decimal: str) -> float:
 
 
 def _by_heads(guess: TableGuess, joint_names: Sequence[str]) -> None:
+    """Set columns, units and reasons of a guess by the heads of the columns."""
     heads = [_taken_apart(place, text, joint_names) for place, text in enumerate(guess.heads)]
     heads = [head._replace(unit=guess.units_below[head.place] or head.unit) for head in heads]
     groups: dict[tuple[tuple[str, ...], str], list[_Head]] = {}
@@ -238,7 +239,11 @@ def _role(words: tuple[str, ...], unit: str) -> str:
 
 
 def _by_values(guess: TableGuess, n: int) -> None:
-    """Take the first column that grows for the time; positions are n columns whose slope the next n are."""
+    """Set columns and reasons of a guess by the values of the columns; n: number of joints.
+
+    The first column is the time if it grows. Positions are n columns whose slope are n later ones, the velocities; the
+    next n are torques. Without such columns, the first n are positions, the next n torques.
+    """
     values, heads = guess.values, guess.heads
     grows = [place for place in range(values.shape[1]) if np.all(np.diff(values[:, place]) > 0.0)]
     first = 0
@@ -267,7 +272,7 @@ def _take(guess: TableGuess, role: str, block: tuple[int, ...], reason: str) -> 
 
 
 def _is_slope(time: Vector, q: Vector, dq: Vector) -> bool:
-    """Tell whether columns are the slope of others, in any unit."""
+    """Tell whether dq (k, n) is the slope of q (k, n) over time (k,), in any unit."""
     slope = np.gradient(q, axis=0) / np.gradient(time)[:, None]
     moving = np.ptp(q, axis=0) > 0.0
     if not moving.any() or np.any(np.ptp(dq[:, moving], axis=0) == 0.0):
