@@ -302,7 +302,7 @@ class Cycle:
         if state is SchemeState.FAULT:
             self._faulted_cycle = cycle
         if state is SchemeState.MONITOR and not self._first_motion.is_certified:
-            self._first_motion.certify(self._pipeline.certificates)
+            self._first_motion.check_lengths(self._pipeline.certificates)
         self._kept.serve((state,))
 
     def _is_over(self, output: SchemeOutput | None) -> bool:

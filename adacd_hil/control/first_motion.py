@@ -153,8 +153,11 @@ class FirstMotion(EventSource):
             if readings.judge_blocks(is_torque_known=not self._open):
                 self.line = readings.name_causes(self._left()) or NO_CAUSE
 
-    def certify(self, certificates: tuple[Certificate, ...]) -> None:
-        """Compare the first certificate of the run, if any, with the configured lengths."""
+    def check_lengths(self, certificates: tuple[Certificate, ...]) -> None:
+        """Compare the first certificate of the run, if any, with the configured lengths; add an event if they differ.
+
+        Another event tells that they can't be compared. Set `is_certified`, also without a certificate.
+        """
         self.is_certified = True
         event = geometry_event(self._settings, certificates[0]) if certificates else None
         if event is not None:

@@ -137,7 +137,9 @@ class Session:
             self._cycle.interrupt()
 
     def run(self) -> SessionSummary:
-        """Run to the end. An early end is described in the summary; the log is closed and readable in any case.
+        """Run until the run is finished or interrupted, or a fault is not acknowledged; return the summary.
+
+        The summary describes an early end. The log is closed and readable in any case.
 
         Raises LogExistsError if there is a log already, LogError if it can't be created.
         """

@@ -140,7 +140,10 @@ class AnswerClock:
 
 
 def newest_sample(clocks: Sequence[AnswerClock], last: int, after: int) -> tuple[int, list[tuple[float, ...]]] | None:
-    """Return the newest SYNC up to `last` and behind `after` that all devices have answered, and their values."""
+    """Return the newest SYNC that all devices have answered, and the values of each device; None without one.
+
+    Only SYNCs later than `after`, up to `last`, count, of which the devices' values are kept.
+    """
     for ordinal in range(last, max(after, last - KEPT), -1):
         values = [found for clock in clocks if (found := clock.values_of(ordinal)) is not None]
         if len(values) == len(clocks):

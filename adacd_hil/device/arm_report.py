@@ -139,7 +139,10 @@ class DataWatch(EventSource):
 
 
 def describe_gaps(arm: Arm) -> list[str]:
-    """Count, per device, the last cycles without a usable frame in time, in words, one line each."""
+    """Return a line per device with gaps: in how many of the last cycles it had no usable frame in time.
+
+    Count the present cycle and those in `REMEMBERED_GAPS`; skip devices without a gap.
+    """
     present = [~arm.received >> place & 1 for place in range(len(arm.devices))]
     gaps = [bits << 1 | now for bits, now in zip(arm.gaps, present, strict=True)]
     cycles = REMEMBERED_GAPS.bit_length() + 1

@@ -260,7 +260,7 @@ class Master(EventSource):
         self._command(ENTER_PRE_OPERATIONAL)
 
     def leave_operational(self, node_id: int) -> None:
-        """Put one node back to pre-operational. Raises BusError."""
+        """Send one node the NMT command to enter pre-operational; do not wait for its reply. Raises BusError."""
         self._canopen.command(ENTER_PRE_OPERATIONAL, node_id)
 
     def _command(self, nmt_command: int) -> None:

@@ -109,7 +109,10 @@ class Settings:
 
     @property
     def mounting_deg(self) -> tuple[float, float]:
-        """Tilt of the plane of motion, and the q1 at which link 1 hangs down, deg; see `arm.mounting_deg`."""
+        """Tilt of the plane of motion (0: level, 90: upright), and the q1 at which link 1 hangs down; deg.
+
+        Without `arm.mounting_deg`: (90, -90) with `estimator.gravity`, else (0, 0).
+        """
         if self.arm.mounting_deg is not None:
             return self.arm.mounting_deg
         return (UPRIGHT_DEG, -90.0) if self.estimator.gravity else (0.0, 0.0)

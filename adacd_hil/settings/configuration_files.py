@@ -15,9 +15,9 @@ _LONGEST_CHAIN = 8
 
 
 def renewed(table: dict[str, Any]) -> dict[str, Any]:
-    """Return the configuration of a log with the keys of older versions replaced by today's.
+    """Return a log's configuration with today's keys: convert renamed ones, drop withdrawn ones.
 
-    A log holds every key of the version that wrote it. So a term whose key is missing was not in that version's model.
+    A missing term's key means that the version that wrote the log had no such term: set the term to 0.
     """
     certified = table.get("certified")
     if isinstance(certified, dict) and "cross_talk_std" not in certified:

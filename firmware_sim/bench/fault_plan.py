@@ -159,7 +159,10 @@ class FaultPlan:
         return self._change(rows, can_id, data) if rows else [(0, data)]
 
     def distort(self, position: Pair, velocity: Pair, torque: Pair) -> tuple[Pair, Pair, Pair]:
-        """Apply the faults to measured values, in the body's counts, joint 1 and 2 each. Once per SYNC."""
+        """Return the measured values with the active faults applied; call once per SYNC.
+
+        Pairs are joints 1 and 2, in counts of POSITION_LSB_RAD, VELOCITY_LSB_RAD_S and TORQUE_LSB_NM.
+        """
         if not self._distorting:
             return position, velocity, torque
         values = [list(position), list(velocity), list(torque)]

@@ -136,7 +136,7 @@ TRANSDUCER_STATE: Final = float_fields(
 
 
 def transducer_numbers(settings: SensorSettings, offset_Nm: tuple[float, float]) -> np.void:
-    """Pack the sensors' properties for compiled functions, one element of TRANSDUCER_NUMBERS."""
+    """Return the torque sensors' properties as one record of dtype TRANSDUCER_NUMBERS, for compiled functions."""
     numbers = pack_fields(settings, TRANSDUCER_NUMBERS)
     reach_Nm = np.array(settings.hysteresis_reach_Nm)
     numbers["gain"][:] = 1.0 + np.array(settings.gain_error)

@@ -45,7 +45,10 @@ def show(scenario: Scenario, is_whole: bool) -> str:
 
 
 def check(file: str, codec: Codec) -> ScenarioFinding:
-    """Return every problem that keeps a scenario from being played under a contract."""
+    """Check a scenario file against a contract; return its problems, or a summary if it has none.
+
+    A file that can't be read is a problem, too.
+    """
     try:
         table = read_table(file)
     except ConfigError as error:

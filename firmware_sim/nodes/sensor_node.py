@@ -149,7 +149,7 @@ class SensorNode(Application):
             self._zero_counts = self._autozero_sum / AUTOZERO_SAMPLES
 
     def _check_unchanged(self, index: int) -> Callable[[int], None]:
-        """Make a check that lets an object be written with the value that it has only."""
+        """Return a write check for sub-index 1 that refuses every value except the present one (VALUE_RANGE)."""
 
         def check(value: int) -> None:
             if value != self.device.value(index, 1):

@@ -126,7 +126,7 @@ def count_text(runs: Sequence[RunSummary]) -> str:
 
 
 def cells(run: RunSummary) -> tuple[str, ...]:
-    """Write a run under HEAD."""
+    """Return the texts of a run's row in the table of runs, in the order of HEAD."""
     return (
         run.name,
         NONE if run.started is None else f"{run.started:%Y-%m-%d %H:%M}",

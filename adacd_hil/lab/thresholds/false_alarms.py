@@ -74,7 +74,7 @@ class Tail:
         return float(_rates(threshold - self.level, self.scale, self.shape, self.rate_per_h))
 
     def threshold_at(self, rate_per_h: float) -> float:
-        """Return the threshold of a rate not above that of the level."""
+        """Return the threshold with this rate of alarms; `level` for a rate above `self.rate_per_h`."""
         return self.level + float(_excesses(rate_per_h, self.scale, self.shape, self.rate_per_h))
 
 

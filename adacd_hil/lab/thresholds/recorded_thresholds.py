@@ -177,9 +177,9 @@ class Thresholds:
 def calibrate_all(
     statistics: Statistics, rate_per_h: float
 ) -> tuple[dict[str, tuple[Vector, TailCalibration]], tuple[str, ...]]:
-    """Calibrate each detector; also return those whose tail can't be fitted.
+    """Find each detector's thresholds for a rate of false alarms; also return the names of detectors that failed.
 
-    Raises TooLittleMotionError if no tail can be fitted.
+    A detector fails if its tail can't be fitted. Raises TooLittleMotionError if all fail.
     """
     found: dict[str, tuple[Vector, TailCalibration]] = {}
     missing: list[str] = []

@@ -216,7 +216,10 @@ class Search:
         )
 
     def move(self, cosine: Vector, sine: Vector) -> Vector:
-        """Return q, dq and ddq (3, N, 2) over the period: the motion of `control.excitation`, at all times at once."""
+        """Compute q, dq and ddq (3, N, 2) of an excitation at all samples of the search.
+
+        cosine, sine (2, K): coefficients, in amplitudes of the trajectory, as in `ExcitationSettings`.
+        """
         cosine, sine = (self._amplitude * part.T for part in (cosine, sine))
         rate = self._rad_s[:, np.newaxis]
         return np.array(

@@ -65,7 +65,10 @@ def _filter(settings: Settings, factor: float) -> Changes:
 
 
 def _gain(settings: Settings, factor: float) -> Changes:
-    """Change the weight of a sample by a factor: P(0) times it, or the assumed residual over its square root."""
+    """Return the changed setting that weighs a sample `factor` times as much.
+
+    Certified scheme: `residual_Nm` / sqrt(factor). Paper's scheme: factor * `P0`.
+    """
     if settings.scheme == "certified":
         return {"certified.residual_Nm": in_toml(settings.certified.residual_Nm / factor**0.5)}
     return {"estimator.P0": in_toml([factor * each for each in settings.estimator.P0])}

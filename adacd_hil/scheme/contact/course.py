@@ -155,7 +155,10 @@ def _leave(k: CourseConstants, m: CourseMemory, state: int) -> None:
 
 @compiled
 def _is_due(k: CourseConstants, m: CourseMemory, cycle: int, joints: int, tau_ext: Vector) -> bool:
-    """Record the joints over their threshold; return whether a report is due. The final one closes the course."""
+    """Return whether a report of the contact is due, `due_cycles` after its detection; the last one clears `is_open`.
+
+    joints: bit i for joint i + 1 over its threshold. When a joint first crosses it, store the sign of its tau_ext.
+    """
     elapsed = cycle - m.detected_cycle
     for i in range(m.direction.shape[0]):
         if joints >> i & 1 and m.direction[i] == 0:

@@ -114,7 +114,10 @@ class Withdrawal:
 
     @property
     def beyond(self) -> list[int]:
-        """Joints, from 0, that stop only beyond their position limit, at the acceleration limit."""
+        """Indices, from 0, of the joints that can't stop within their position limit.
+
+        They brake at the acceleration limit from their position and velocity at the start of the withdrawal.
+        """
         limit = self._settings.arm.position_limit_rad
         return [i for i in range(JOINTS) if abs(self._soonest_stop(i)) > limit[i]]
 

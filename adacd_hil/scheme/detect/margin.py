@@ -141,7 +141,7 @@ def constants_of(settings: Settings) -> MarginConstants:
 
 @compiled
 def begin_tail(m: Memory) -> None:
-    """Begin with a model without residuals so far."""
+    """Empty the records of the largest residuals, as for a new model."""
     m.margin.peak[:] = 0.0
     m.margin.tail_Nm[:] = 0.0
     m.margin.tail_s = 0.0
@@ -158,7 +158,7 @@ def discard_tail(m: Memory) -> None:
 
 @compiled
 def follow_tail(k: Constants, m: Memory) -> None:
-    """Process one sample without contact."""
+    """Add the residuals of one contact-free sample to the largest ones; at the end of a block, fill `tail_Nm`."""
     own = m.margin
     filters = m.filters.r.shape[0]
     for c in range(m.filters.y.shape[0]):
@@ -206,7 +206,7 @@ def largest_share(m: Memory) -> float:
 
 @compiled
 def tail_factor(excursions_Hz: float, seen_s: float) -> float:
-    """Return m(T)."""
+    """Return m(T), the factor on the largest residual of seen_s that gives the largest one to expect in 1 / RATE."""
     share = math.log(excursions_Hz / RATE_HZ) / math.log(max(excursions_Hz * max(seen_s, 1.0), 1.01))
     return float(min(np.sqrt(max(share, 1.0)), LARGEST))
 
@@ -251,7 +251,7 @@ def begin_sight(m: Memory) -> None:
 
 @compiled
 def follow_test(k: Constants, m: Memory) -> None:
-    """Process one sample of a test, without contact."""
+    """Count the thresholds in force in one contact-free sample of a test, and keep the worst push and threshold."""
     own = m.margin
     for i in range(own.dim_s.shape[0]):
         h = m.sensitivity.wide_threshold[i]
@@ -263,7 +263,10 @@ def follow_test(k: Constants, m: Memory) -> None:
 
 @compiled
 def follow_sight(k: Constants, m: Memory) -> bool:
-    """Process one sample of monitoring, without contact; return whether a joint has been blind for too long."""
+    """Add one contact-free sample of monitoring to the mean smallest push; return whether to revoke the certificate.
+
+    True once the mean of a joint was over LESS times the worst of the test for BLIND_S.
+    """
     own = m.margin
     is_blind = False
     for i in range(own.dim_s.shape[0]):

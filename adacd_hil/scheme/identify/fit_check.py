@@ -128,7 +128,10 @@ def _keep_sample(m: Memory, W_f: Vector, tau_f: Vector) -> None:
 
 @compiled
 def unit_of(square: float, rows: float) -> float:
-    """Return u of residuals whose squares, over their variances, have this sum, in their hard moments."""
+    """Return u for the worst moments of residuals: HARD times their mean square, within SMALLEST_UNIT and LARGEST_UNIT.
+
+    square: sum of the residuals' squares over their variances. rows: number of residuals.
+    """
     return min(max(HARD * square / max(rows, 1.0), SMALLEST_UNIT), LARGEST_UNIT)
 
 
@@ -155,9 +158,10 @@ def _better_square(m: Memory, s: int) -> float:
 
 @compiled
 def last_step_before_change(k: Constants, m: Memory) -> int:
-    """Return the number of the last step, from 0, that the whole fit doesn't continue; NONE if it continues all.
+    """Return the number of the last step, from 0, that contradicts the whole fit; NONE if no step does.
 
-    If only the fit's later samples contradict it, that is the last step of all. -1: all steps are too young.
+    If only the samples after a step contradict the fit, return the last step of all. -1: all steps are younger than the
+    contradiction.
     """
     own = m.fit_check
     used, oldest = int(own.steps_used), max(int(own.steps_used) - own.steps_rows.shape[0], 0)
@@ -172,7 +176,10 @@ def last_step_before_change(k: Constants, m: Memory) -> int:
 
 @compiled
 def last_step_before_contradiction(k: Constants, m: Memory) -> int:
-    """Return the number of the last step before the fit changed, or a sample stands out; NONE without either."""
+    """Return the number of the last step before the fit changed, or before the first sample that it doesn't explain.
+
+    NONE if neither happened.
+    """
     changed = last_unsteady_step(m)
     first = first_unexplained(m)
     return changed if changed != NONE or first < 0 else int(first // k.step_samples) - 1
@@ -194,7 +201,7 @@ def first_unexplained(m: Memory) -> int:
 
 @compiled
 def limit_Nm(m: Memory) -> float:
-    """Return the largest residual that the fit explains, Nm."""
+    """Return the size up to which a residual counts as explained by the fit, Nm."""
     return float(LIMIT_NM + LIMIT_SHARE * better_rms(m))
 
 
@@ -206,7 +213,7 @@ def residual(m: Memory, s: int, joint: int) -> float:
 
 @compiled
 def last_unsteady_step(m: Memory) -> int:
-    """Return the number of the last step, from 0, since which the fit has changed; NONE if it hasn't."""
+    """Return the number of the last step, from 0, whose belief contradicts the fit's; NONE if none does."""
     used, steps = int(m.fit_check.steps_used), m.fit_check.steps_rows.shape[0]
     for number in range(used - 1, max(used - steps, 0) - 1, -1):
         if not changed_share(m, number % steps) <= 1.0:

@@ -69,7 +69,7 @@ def forget(m: Memory) -> None:
 
 @compiled
 def rest(m: Memory) -> None:
-    """Begin with a filter that has always been in this pose."""
+    """Set the filtered columns to their values after a long rest in the present pose."""
     m.missing_torque.X_f[:] = m.regressor.X
 
 
@@ -98,7 +98,7 @@ def keep(m: Memory, slot: int) -> None:
 
 @compiled
 def clear(k: Constants, m: Memory) -> None:
-    """Begin anew: with another arm, such as one with another payload, or with a certificate."""
+    """Empty the sums and the torque found before: for another arm or payload, or with a new certificate."""
     _clear_sums(m)
     m.missing_torque.last_found[:] = 0.0
     m.missing_torque.rms_Nm[:] = 0.0
@@ -147,10 +147,11 @@ def _rough_variance(k: Constants, m: Memory, joint: int) -> float:
 
 
 @compiled
-def is_found_in_time(k: Constants, m: Memory) -> bool:
-    """Record that a sample was learnt while the arm monitors.
+def is_confirmed(k: Constants, m: Memory) -> bool:
+    """Count a sample learnt while the arm monitors; return whether a torque by place is missing in the model.
 
-    Return whether two stretches agree, when a check is due.
+    Check after the first samples, then after stretches that double up to a limit; return False between checks. True:
+    the torque that an earlier stretch of samples showed explains this one, too.
     """
     own = m.missing_torque
     own.samples += 1.0
@@ -230,7 +231,7 @@ def _fill_missing(m: Memory) -> None:
 
 @compiled
 def _rms_Nm(m: Memory, joint: int) -> float:
-    """Return the rms difference of the two models on a joint's samples, Nm."""
+    """Return the rms difference of the models with and without torque by place on a joint's samples, Nm."""
     own = m.missing_torque
     apart = own.row
     for j in range(apart.shape[0]):

@@ -289,7 +289,7 @@ def _refine(k: Constants, m: Memory) -> int:
     cause = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
     if belief.learn(k, m):
         belief.wander(k.drift_std, m.filters.W_learnt, k.period_s * k.learn_every, m.models.P_belief)
-        if missing_torque.is_found_in_time(k, m):
+        if missing_torque.is_confirmed(k, m):
             cause = certificate.BY_PLACE
     if belief.test_candidate(k, m):
         cause = certificate.ANCHOR
