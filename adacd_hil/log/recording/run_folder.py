@@ -19,7 +19,6 @@ from adacd_hil.log.log_files import (
     failing_as,
     find_parts,
 )
-from adacd_hil.log.types.topics import CYCLE
 
 _FAILED_NAME = "failed-start-{}.mcap"
 
@@ -90,7 +89,9 @@ def _is_failed_start(path: Path) -> bool:
 
 def _has_no_cycle(file: IO[bytes]) -> bool:
     """Return whether a run's log has ended properly without a cycle, or has no message at all. Raises LogError."""
-    from adacd_hil.log.mcap.mcap_records import parse, read_end, read_record  # only needed for an existing log
+    # Only needed for an existing log, and slow to import.
+    from adacd_hil.log.mcap.mcap_records import parse, read_end, read_record
+    from adacd_hil.log.types.topics import CYCLE
 
     end = read_end(file)
     kinds: dict[int, list[Any]] = {Opcode.STATISTICS: [], Opcode.CHANNEL: [], Opcode.METADATA_INDEX: []}
