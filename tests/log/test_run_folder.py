@@ -7,6 +7,7 @@ import sys
 
 import pytest
 from hang import HANG_S
+from mcap.writer import Writer
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
 from adacd_hil.log.log_files import LogError, LogExistsError, log_in, part_path
@@ -93,18 +94,40 @@ def test_the_log_of_a_start_that_failed_is_kept_aside(tmp_path):
     assert len(read_log(path).scheme) == 3
 
 
-def test_a_log_with_nothing_in_it_is_kept_aside_though_its_host_was_killed(tmp_path):
-    path = tmp_path / "truth.mcap"
+def kill_host(path, before_death):
+    """Let a host that does this with its recorder die, and wait until the writer, which outlives it, has ended."""
     dies = (
-        "import os, sys; from pathlib import Path; from adacd_hil.log.recording.recorder import Recorder;"
-        "Recorder(Path(sys.argv[1]), metadata={'name': 'made'}, is_truth=True); os.kill(os.getpid(), 9)"
+        "import os, sys; from pathlib import Path; from adacd_hil.records import Event;"
+        "from adacd_hil.log.recording.recorder import Recorder;"
+        f"recorder = Recorder(Path(sys.argv[1]), metadata={{'name': 'made'}}, is_truth=True); {before_death};"
+        "os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", dies, str(path)], check=False, timeout=HANG_S)
     with path.open("rb") as log:
-        fcntl.flock(log, fcntl.LOCK_SH)  # the writer, which outlives the host, has the log locked until it has ended it
+        fcntl.flock(log, fcntl.LOCK_SH)
+
+
+def test_a_log_with_nothing_in_it_is_kept_aside_though_its_host_was_killed(tmp_path):
+    path = tmp_path / "truth.mcap"
+    kill_host(path, "pass")
     check_free(path)
     assert record(path, make_run(3)).is_complete
     assert (tmp_path / "failed-start-1.mcap").exists()
+
+
+def test_a_log_of_a_killed_host_that_has_logged_something_is_no_start_that_failed(tmp_path):
+    kill_host(tmp_path / "run.mcap", "recorder.event(0, Event('error', 'run', 'a clue'))")
+    with pytest.raises(LogExistsError):
+        Recorder(tmp_path / "run.mcap")
+
+
+def test_an_empty_file_of_another_program_is_not_moved(tmp_path):
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.finish()
+    with pytest.raises(LogExistsError):
+        Recorder(tmp_path / "run.mcap")
 
 
 def test_a_log_without_cycles_whose_end_is_missing_is_not_taken_for_a_start_that_failed(tmp_path):
