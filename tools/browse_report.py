@@ -197,7 +197,7 @@ def _take_pictures(tab: Tab, out: Path) -> None:
 
 
 def _whole(tab: Tab, width: int) -> dict[str, float]:
-    """Give the whole page as a clip, of a long one its beginning."""
+    """Return the whole page as a clip, of a long one its beginning."""
     box = tab.ask("Page.getLayoutMetrics")["cssContentSize"]
     return {"x": 0, "y": 0, "width": width, "height": min(box["height"], 16_000), "scale": 1}
 

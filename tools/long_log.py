@@ -61,11 +61,11 @@ class Block(NamedTuple):
     cycles: np.ndarray
 
     def times_ns(self) -> np.ndarray:
-        """Give when the cycle of each message was."""
+        """Return when the cycle of each message was."""
         return words_of(self.records)[self.starts + PUBLISH_TIME]
 
     def only(self, chosen: np.ndarray) -> "Block":
-        """Give some of the messages."""
+        """Return some of the messages."""
         ends = np.append(self.starts[1:], len(self.records))
         lengths = (ends - self.starts)[chosen]
         starts = np.cumsum(lengths) - lengths
@@ -79,7 +79,7 @@ class Block(NamedTuple):
 
 
 def words_of(records: np.ndarray) -> np.ndarray:
-    """Give the 8 bytes that begin at each byte, as one number."""
+    """Return the 8 bytes that begin at each byte, as one number."""
     words: np.ndarray = np.ndarray((len(records) - 7,), np.int64, records, strides=(1,))
     return words
 
@@ -144,7 +144,7 @@ class LongLog:
         return round((last_ns - first_ns) / (last - first) / 1e3) * 1000
 
     def between(self, from_ns: int, until_ns: int) -> list[Block]:
-        """Give the messages between two times since the beginning."""
+        """Return the messages between two times since the beginning."""
         found = []
         for block in self.blocks:
             since_ns = block.times_ns() - self.start_ns
@@ -155,7 +155,7 @@ class LongLog:
 
 
 def fields_of(message_type: MessageType) -> dict[str, int]:
-    """Give where the fields of a message are; none of one whose size varies."""
+    """Return where the fields of a message are; none of one whose size varies."""
     try:
         dtype = message_type.dtype
     except LogError:

@@ -171,7 +171,7 @@ def work_per_cycle(path: Path, begin_ns: NDArray[np.int64]) -> NDArray[np.float6
 
 
 def is_cpu_clock_fine() -> bool:
-    """Tell whether this kernel's account of CPU time moves in steps that tell cycles apart."""
+    """Return whether this kernel's account of CPU time moves in steps that tell cycles apart."""
     begin_ns = now_ns = time.process_time_ns()
     while now_ns == begin_ns:
         now_ns = time.process_time_ns()

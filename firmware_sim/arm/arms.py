@@ -107,7 +107,7 @@ class EmulatedArm:
         return alpha, beta, gamma
 
     def theta(self, payload_kg: float = 0.0) -> Vector:
-        """Give the dynamic parameters in the order of `records.PARAMETER_NAMES` (7,)."""
+        """Return the dynamic parameters in the order of `records.PARAMETER_NAMES` (7,)."""
         alpha, beta, gamma = self.inertia(payload_kg)
         return np.array([alpha + gamma, beta, gamma, *self.viscous_Nm_s, *self.coulomb_Nm])
 

@@ -204,7 +204,7 @@ class MechanicsSettings:
         return arm.viscous_Nm_s if self.sigma2_Nm_s is None else self.sigma2_Nm_s
 
     def eigenvalues(self, arm: EmulatedArm, payloads: Sequence[PayloadBody]) -> tuple[float, float]:
-        """Give the largest |Im λ| and |λ| in rad/s of the arm linearised about rest, bristles stuck and stops touched.
+        """Return the largest |Im λ| and |λ|, rad/s, of the arm linearised about rest, bristles stuck and stops touched.
 
         The largest of elbow angles from 0 to 180 degrees in steps of 45, with each of the payloads.
         """

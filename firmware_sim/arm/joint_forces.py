@@ -90,7 +90,7 @@ def dry_level(
 
 @compiled
 def drift_factor(drop_per_K: float, temperature_C: float) -> float:
-    """Give the factor of friction at a temperature, 1 at REFERENCE_C."""
+    """Return the factor of friction at a temperature, 1 at REFERENCE_C."""
     if drop_per_K == 0.0:
         return 1.0
     return math.exp(-drop_per_K * (temperature_C - REFERENCE_C))
@@ -114,7 +114,7 @@ def advance_bristle(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, l
 
 @compiled
 def warm(mechanics: np.void, joint: int, temperature_C: float, power_W: float, step_s: float) -> float:
-    """Give the lubricant's temperature after a step of constant friction power, °C."""
+    """Return the lubricant's temperature after a step of constant friction power, °C."""
     capacity_J_K = mechanics["heat_capacity_J_K"][joint]
     if capacity_J_K == 0.0:
         return temperature_C
@@ -140,7 +140,7 @@ def spring_torque(mechanics: np.void, joint: int, twist_rad: float, twist_rad_s:
 
 @compiled
 def ripple_torque(mechanics: np.void, joint: int, shaft_rad: float, motor_Nm: float) -> float:
-    """Give the ripple in Nm that adds to the motor torque."""
+    """Return the ripple in Nm that adds to the motor torque."""
     amplitude = mechanics["ripple_Nm"][joint] + mechanics["ripple_share"][joint] * abs(motor_Nm)
     if amplitude == 0.0:
         return 0.0
@@ -189,7 +189,7 @@ class Surroundings(NamedTuple):
 
 @compiled
 def gravity_torque(state: np.void, arm: np.void, mechanics: np.void, q1: float, q2: float) -> tuple[float, float]:
-    """Give tau_gravity of both joints in Nm, positive where it must be held along +q."""
+    """Return tau_gravity of both joints in Nm, positive where it must be held along +q."""
     gravity = mechanics["gravity_m_s2"]
     if gravity == 0.0:
         return 0.0, 0.0
@@ -268,7 +268,7 @@ def collect_forces(
 
 @compiled
 def is_free(joint: int, state: np.void, mechanics: np.void) -> bool:
-    """Tell whether a link is free of dry friction and brake, so that it never sticks."""
+    """Return whether a link is free of dry friction and brake, so that it never sticks."""
     is_braked = mechanics["stiffness_Nm_rad"][joint] == 0.0 and state["brake_Nm"][joint] != 0.0
     return bool(mechanics["is_free"][joint] != 0.0 and not is_braked)
 
@@ -305,7 +305,7 @@ def _motor_slip(joint: int, now: np.void, mechanics: np.void, forces: np.void) -
 def accelerate_links(
     now: np.void, around: Surroundings, slips: Slips, forces: np.void
 ) -> tuple[float, float, float, float]:
-    """Give ddq of both links and their dry friction, as `firmware_sim.arm.plant.accelerate` does."""
+    """Return ddq of both links and their dry friction, as `firmware_sim.arm.plant.accelerate` does."""
     link_Nm = forces["link_Nm"]
     return accelerate(
         around.state, forces, slips[0], slips[1], link_Nm[0], link_Nm[1], now["q"][1], now["dq"][0], now["dq"][1]
@@ -316,7 +316,7 @@ def accelerate_links(
 def find_friction(
     now: np.void, around: Surroundings, forces: np.void
 ) -> tuple[float, float, float, float, float, float]:
-    """Give ddq, friction of the joint and of a stiff joint's motor side, two each, from the forces of this instant."""
+    """Return ddq, friction of the joint and of a stiff joint's motor side, two each, from the present forces."""
     mechanics = around.mechanics
     ddq1, ddq2, dry1, dry2 = accelerate_links(now, around, decide(now, around, forces), forces)
     motor1, motor2 = 0.0, 0.0
@@ -331,7 +331,7 @@ def find_friction(
 
 @compiled
 def _motor_share(joint: int, dry_Nm: float, now: np.void, mechanics: np.void, forces: np.void) -> float:
-    """Give the motor-side part of a stiff joint's friction, Nm."""
+    """Return the motor-side part of a stiff joint's friction, Nm."""
     viscous = mechanics["motor_viscous_Nm_s"][joint] * forces["viscous_drift"][joint] * now["dq"][joint]
     if forces["coulomb_Nm"][joint] == 0.0:
         return float(viscous)

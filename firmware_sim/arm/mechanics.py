@@ -90,7 +90,7 @@ def work_space(touch_size: int) -> Vector:
 
 @compiled
 def _matrix(space: Vector) -> NDArray[np.float64]:
-    """Give a part of a work space as one row for each of its rows."""
+    """Return a part of a work space as one row for each of its rows."""
     return space.reshape((_ROWS, space.size // _ROWS))
 
 
@@ -351,7 +351,7 @@ def integrate_mechanics(
 
 @compiled
 def _has_stiff_motor(joint: int, mechanics: np.void, forces: np.void) -> bool:
-    """Tell whether a stiff joint has a rotor or friction on its motor side, so the sensor misses part of the torque."""
+    """Return whether a stiff joint has a rotor or friction on its motor side, which the sensor does not measure."""
     has_friction = mechanics["motor_viscous_Nm_s"][joint] != 0.0 or forces["motor_level_Nm"][joint] != 0.0
     is_stiff = mechanics["stiffness_Nm_rad"][joint] == 0.0
     return bool(is_stiff and (has_friction or mechanics["rotor_inertia_kg_m2"][joint] != 0.0))
@@ -399,7 +399,7 @@ def observe(
     elapsed_s: float,
     space: Vector,
 ) -> tuple[float, float, float, float, float, float]:
-    """Give the present true values, Nm: external torque, friction along +dq, gravity torque, two joints each.
+    """Return the present true values, Nm: external torque, friction along +dq, gravity torque, two joints each.
 
     Leaves the state of the simulation unchanged.
     """

@@ -114,7 +114,7 @@ def fit_payload(
 
 @compiled
 def mass_matrix(state: np.void, q2: float) -> tuple[float, float, float]:
-    """Give m11, m12, m22 of Jᵀ N J + R at the elbow angle q2, kg m²."""
+    """Return m11, m12, m22 of Jᵀ N J + R at the elbow angle q2, kg m²."""
     coupling = state["beta"] * math.cos(q2)
     if state["sigma"] != 0.0:
         coupling -= state["sigma"] * math.sin(q2)
@@ -138,7 +138,7 @@ def accelerate(
     dq1: float,
     dq2: float,
 ) -> tuple[float, float, float, float]:
-    """Give ddq1, ddq2 in rad/s² and the Coulomb friction of both joints in Nm, positive along +dq.
+    """Return ddq1, ddq2 in rad/s² and the Coulomb friction of both joints in Nm, positive along +dq.
 
     torque is motor plus external torque. A sticking joint has no acceleration; its friction is the holding torque,
     even where that is more than F_c.
@@ -204,7 +204,7 @@ def decide_slips(
 
 @compiled
 def _stop_torque(arm: np.void, joint: int, q: float, dq: float) -> float:
-    """Give the torque of a joint stop, Nm."""
+    """Return the torque of a joint stop, Nm."""
     if q > arm["stop_high_rad"][joint]:
         push = (
             -arm["stop_stiffness_Nm_rad"][joint] * (q - arm["stop_high_rad"][joint])
@@ -224,7 +224,7 @@ def _stop_torque(arm: np.void, joint: int, q: float, dq: float) -> float:
 def external_torque(
     arm: np.void, contact: Structured, elapsed_s: float, q1: float, q2: float, dq1: float, dq2: float
 ) -> tuple[float, float]:
-    """Give the external torque of the joint stops and a contact, one row of the table or empty."""
+    """Return the external torque of the joint stops and a contact, one row of the table or empty."""
     stop1, stop2 = _stop_torque(arm, 0, q1, dq1), _stop_torque(arm, 1, q2, dq2)
     if contact.size == 0:
         return stop1, stop2
@@ -236,7 +236,7 @@ def external_torque(
 
 @compiled
 def follow_target(tau_Nm: float, target_Nm: float, turn: float) -> tuple[float, float]:
-    """Give the motor torque in the middle and at the end of a step of `turn` time constants.
+    """Return the motor torque in the middle and at the end of a step of `turn` time constants.
 
     The torque's distance from its target decays. In the middle of the step stands the value with which Simpson's rule
     gives the exact impulse; the torque at the midpoint itself would be wrong by 1e-7 rad/s after a step of 3 Nm.

@@ -99,7 +99,7 @@ class TorqueNoise:
         self._next = _SAMPLES_AT_ONCE
 
     def draw(self) -> NDArray[np.float64]:
-        """Give the next sample (2,), Nm; valid until the next call."""
+        """Return the next sample (2,), Nm; valid until the next call."""
         if self._next == _SAMPLES_AT_ONCE:
             self._next = 0
             if self._is_on:

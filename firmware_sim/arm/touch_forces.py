@@ -110,7 +110,7 @@ TOUCH_TRUTH: Final = float_fields(
 
 @compiled
 def _own(state: Vector, row: int) -> np.void:
-    """Give a body's or a wall's part of the touch state, or of its rates, to read and to write."""
+    """Return a body's or a wall's part of the touch state, or of its rates, to read and to write."""
     place = TOUCH_HEADER + row * THING_PLACES
     part: np.void = state[place : place + THING_PLACES].view(THING_STATE)[0]
     return part
@@ -118,7 +118,7 @@ def _own(state: Vector, row: int) -> np.void:
 
 @compiled
 def _hand(state: Vector, row: int) -> np.void:
-    """Give a hand's part of the touch state, to read and to write."""
+    """Return a hand's part of the touch state, to read and to write."""
     place = TOUCH_HEADER + row * THING_PLACES
     part: np.void = state[place : place + THING_PLACES].view(HAND_STATE)[0]
     return part
@@ -126,7 +126,7 @@ def _hand(state: Vector, row: int) -> np.void:
 
 @compiled
 def _cosines(q1: float, q2: float) -> tuple[float, float, float, float]:
-    """Give the pose that the functions below take: cosine and sine of the angle of link 1, then of link 2."""
+    """Return the pose that the functions below take: cosine and sine of the angle of link 1, then of link 2."""
     return math.cos(q1), math.sin(q1), math.cos(q1 + q2), math.sin(q1 + q2)
 
 
@@ -134,7 +134,7 @@ def _cosines(q1: float, q2: float) -> tuple[float, float, float, float]:
 def _moved_point(
     link: float, point_m: float, length1_m: float, pose: Pose, dq1: float, dq2: float
 ) -> tuple[float, float, float, float]:
-    """Give a link's point in the world: x, y in m and their rates in m/s."""
+    """Return a link's point in the world: x, y in m and their rates in m/s."""
     c1, s1, c2, s2 = pose
     reach_m = length1_m if link == 2.0 else point_m
     x, y = reach_m * c1, reach_m * s1
@@ -152,7 +152,7 @@ def _moved_point(
 def _joint_torque(
     link: float, point_m: float, force_x: float, force_y: float, length1_m: float, pose: Pose
 ) -> tuple[float, float]:
-    """Give Jᵀ F of a force on a link's point, Nm."""
+    """Return Jᵀ F of a force on a link's point, Nm."""
     c1, s1, c2, s2 = pose
     if link == 2.0:
         torque2 = point_m * (force_y * c2 - force_x * s2)
@@ -188,7 +188,7 @@ def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float
 
 @compiled
 def _recede_rate(thing: np.void, own: np.void) -> float:
-    """Give the velocity of a body along its free direction, m/s: 0 instead of into the wall behind it.
+    """Return the velocity of a body along its free direction, m/s: 0 instead of into the wall behind it.
 
     Between ticks, speed ṡ against the wall is reset.
     """
@@ -199,7 +199,7 @@ def _recede_rate(thing: np.void, own: np.void) -> float:
 
 @compiled
 def _body_force(thing: np.void, own: np.void, pose: Pose, dq1: float, dq2: float) -> tuple[float, float, float, float]:
-    """Give a body's force on the arm, N, as x and y, its point in m, and the penetration in m."""
+    """Return a body's force on the arm, N, as x and y, its point in m, and the penetration in m."""
     depth_m, point_m, normal_x, normal_y, _ = _meet(thing, own, pose)
     if depth_m <= 0.0:
         return 0.0, 0.0, point_m, depth_m
@@ -212,7 +212,7 @@ def _body_force(thing: np.void, own: np.void, pose: Pose, dq1: float, dq2: float
 
 @compiled
 def _hand_force(thing: np.void, own: np.void, time_s: float, pose: Pose, dq1: float, dq2: float) -> tuple[float, float]:
-    """Give a hand's force on the arm, N, as x and y."""
+    """Return a hand's force on the arm, N, as x and y."""
     x, y, dx, dy = _moved_point(thing["link"], thing["point_m"], thing["length1_m"], pose, dq1, dq2)
     way_m = thing["speed_m_s"] * (time_s - thing["onset_s"])
     speed = thing["speed_m_s"]
@@ -235,7 +235,7 @@ def _hand_force(thing: np.void, own: np.void, time_s: float, pose: Pose, dq1: fl
 def _wall_force(
     thing: np.void, own: np.void, link: float, pose: Pose, dq1: float, dq2: float
 ) -> tuple[float, float, float, float]:
-    """Give a wall's force on the end of a link, N, as x and y, the end's place on its link and the penetration in m."""
+    """Return a wall's force on the end of a link, N (x, y), the end's place on its link and the penetration, m."""
     point_m = thing["length2_m"] if link == 2.0 else thing["length1_m"]
     x, y, dx, dy = _moved_point(link, point_m, thing["length1_m"], pose, dq1, dq2)
     normal_x, normal_y = own["free_x"], own["free_y"]
@@ -258,7 +258,7 @@ def touch(
     state: Vector,
     rates_out: Vector,
 ) -> tuple[float, float]:
-    """Give the external torque of all bodies, hands and walls, Nm, and fill the rates of their state.
+    """Return the external torque of all bodies, hands and walls, Nm, and fill the rates of their state.
 
     time_s: scenario time. Writes only rates_out, and leaves even that unchanged for an empty table: an integrator may
     call it at any stage of a step.

@@ -145,7 +145,7 @@ def contact_table(contacts: tuple[ContactSettings, ...]) -> Structured:
 
 @compiled
 def contact_force(contact: np.void, elapsed_s: float) -> float:
-    """Give the force in N of a contact, a row of the table, `elapsed_s` after its onset and before its end."""
+    """Return the force in N of a contact, a row of the table, `elapsed_s` after its onset and before its end."""
     duration_s = contact["duration_s"]
     if contact["shape"] == _HALF_SINE:
         return float(contact["force_N"] * math.sin(math.pi * elapsed_s / duration_s))
@@ -159,7 +159,7 @@ def contact_force(contact: np.void, elapsed_s: float) -> float:
 def aim(
     contact: np.void, force_N: float, length1_m: float, q1: float, q2: float, dq1: float, dq2: float
 ) -> tuple[float, float]:
-    """Give the world's angle of a contact's force, rad, and its size, N, which only frame "motion" changes."""
+    """Return the world's angle of a contact's force, rad, and its size, N, which only frame "motion" changes."""
     angle_rad = contact["angle_rad"]
     if contact["frame"] == _WORLD:
         return angle_rad, force_N
@@ -179,7 +179,7 @@ def aim(
 def contact_torque(
     contact: np.void, force_N: float, length1_m: float, q1: float, q2: float, dq1: float, dq2: float
 ) -> tuple[float, float]:
-    """Give the external torque of the two joints, J(q)ᵀ F, Nm: moments of the force about the two joint axes.
+    """Return the external torque of the two joints, J(q)ᵀ F, Nm: moments of the force about the two joint axes.
 
     force_N: as `contact_force` gives it. A force at the angle ψ has the moment p F sin(ψ − φ) about the joint at the
     other end of the lever p, which itself points along φ.
@@ -233,7 +233,7 @@ _REACH_M: Final = 20.0
 
 
 def _ends(lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> tuple[tuple[float, float], ...]:
-    """Give base, elbow and tip."""
+    """Return base, elbow and tip."""
     elbow = lengths_m[0] * math.cos(pose_rad[0]), lengths_m[0] * math.sin(pose_rad[0])
     angle = pose_rad[0] + pose_rad[1]
     return (0.0, 0.0), elbow, (elbow[0] + lengths_m[1] * math.cos(angle), elbow[1] + lengths_m[1] * math.sin(angle))

@@ -289,7 +289,7 @@ class BenchTime:
             self._nodes.move_arm(tick_count)
 
     def _has_rested(self, now_ns: int) -> bool:
-        """Tell whether the arm has stood still for a while, and no drive could move it; call while it may move."""
+        """Return whether the arm has stood still for a while, and no drive could move it; call while it may move."""
         is_powered = any(drive.motor_mode for drive in self._nodes.drives)
         if is_powered or max(map(abs, self._arm.drive_velocity_rad_s)) > REST_RAD_S:
             self._moving_ns = now_ns

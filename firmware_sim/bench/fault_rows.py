@@ -124,7 +124,7 @@ def _flip(row: FaultRow, data: bytes) -> bytes:
 
 
 def _freeze_counter(row: FaultRow, message: MessageCodec | None, frames: Sent) -> Sent:
-    """Give frames of a protected message the counter of the first one, and the CRC that goes with it."""
+    """Return frames of a protected message the counter of the first one, and the CRC that goes with it."""
     if message is None or message.profile is None:
         return frames
     changed = []
@@ -147,7 +147,7 @@ FRAME_CHANGES: dict[str, Callable[[FaultRow, MessageCodec | None, Sent], Sent]] 
 
 
 def name_streams(rows: Sequence[FaultSettings], seed: int) -> list[tuple[FaultSettings, str]]:
-    """Give each row the name of its stream."""
+    """Return each row the name of its stream."""
     counts: dict[str, int] = {}
     named = []
     for row in rows:

@@ -189,7 +189,7 @@ class Injector:
         return put if self.has_faults else outbox.put
 
     def receive(self, place: int, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
-        """Give a frame of the host, with its faults, to a node (or to `EVERYBODY`); return whether any is left."""
+        """Return a frame of the host, with its faults, to a node (or to `EVERYBODY`); return whether any is left."""
         if self.plan.is_quiet:
             take(data, t_ns)
             return True
@@ -203,7 +203,7 @@ class Injector:
         return bool(frames)
 
     def receive_by_all(self, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
-        """Give a frame of the host to all, with its faults, to a handler; return whether any is left."""
+        """Return a frame of the host to all, with its faults, to a handler; return whether any is left."""
         return self.receive(EVERYBODY, can_id, data, take, t_ns)
 
     def advance(self, now_ns: int, stamp_ns: int) -> None:

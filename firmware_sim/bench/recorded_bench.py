@@ -105,7 +105,7 @@ class RecordedCycles:
             yield RecordedCycle(attempt, cycle, tuple(answers))
 
     def _frames(self) -> Iterator[Answer]:
-        """Give SYNC, NMT and the answers, in the order of the bus."""
+        """Yield SYNC, NMT and the answers, in the order of the bus."""
         wanted = [self._sync_id, self._nmt_id, *self._answer_ids]
         for frames in self._source:
             is_data = ~frames["is_error"] & ~frames["is_remote"] & ~frames["is_extended"]

@@ -58,7 +58,7 @@ _FASTEST_BLOW_M_S: Final = 2.0
 
 
 def _largest_mobility(arm: EmulatedArm, link: int, points_m: Vector) -> float:
-    """Give the largest 1/mass, 1/kg, that the unloaded arm shows a force at these points of a link, in any pose."""
+    """Return the largest 1/mass, 1/kg, that the unloaded arm shows a force at these points of a link, in any pose."""
     alpha, beta, gamma = arm.inertia()
     length1_m = arm.link_length_m[0]
     elbow_rad, point_m = np.meshgrid(np.linspace(0.0, math.pi, _POSES), points_m)

@@ -85,7 +85,7 @@ overshoot."""
 
 @compiled
 def find_contact(course: np.void, contacts: Structured) -> Structured:
-    """Give the row of the contact in force at this tick, or an empty array; steps over those that have ended."""
+    """Return the row of the contact in force at this tick, or an empty array; steps over those that have ended."""
     tick = course["tick"] - course["start_tick"]
     index = int(course["contact"])
     while index < contacts.size and contacts[index]["end_tick"] <= tick:
@@ -98,7 +98,7 @@ def find_contact(course: np.void, contacts: Structured) -> Structured:
 
 @compiled
 def _elapsed_s(course: np.void, contact: Structured) -> float:
-    """Give the time since the onset of the contact in force, 0 without one."""
+    """Return the time since the onset of the contact in force, 0 without one."""
     if contact.size == 0:
         return 0.0
     return float((course["tick"] - course["start_tick"] - contact[0]["onset_tick"]) * TICK_S)
@@ -123,7 +123,7 @@ def _change_payload(state: np.void, arm: np.void, payloads: Structured) -> None:
 
 @compiled
 def _scenario_s(course: np.void) -> float:
-    """Give the scenario time of this tick in s, −1 before the scenario starts."""
+    """Return the scenario time of this tick in s, −1 before the scenario starts."""
     return float((course["tick"] - course["start_tick"]) * TICK_S) if course["start_tick"] >= 0.0 else -1.0
 
 

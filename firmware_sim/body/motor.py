@@ -113,7 +113,7 @@ def winding_temperature(numbers: np.void, state: np.void, joint: int) -> float:
 
 @compiled
 def available_torque(numbers: np.void, state: np.void, joint: int) -> float:
-    """Give the largest torque that the drive may ask for now, Nm."""
+    """Return the largest torque that the drive may ask for now, Nm."""
     limit_Nm = numbers["peak_Nm"][joint]
     if numbers["has_limits"] == 0.0:
         return float(limit_Nm)
@@ -128,7 +128,7 @@ def available_torque(numbers: np.void, state: np.void, joint: int) -> float:
 def command_torque(
     numbers: np.void, state: np.void, joint: int, wanted_Nm: float, tau_Nm: float, is_powered: bool
 ) -> float:
-    """Give the target at which the plant's torque loop brings the motor to where it is after this tick, Nm.
+    """Return the target at which the plant's torque loop brings the motor to where it is after this tick, Nm.
 
     wanted: the drive's set-point, within rated torque. tau: the motor's torque now. The plant's loop has 1 kHz; one
     of another bandwidth is exact at the ends of the ticks. Within a tick a slower one is off by a hundredth of the way
@@ -170,7 +170,7 @@ def heat_motor(numbers: np.void, state: np.void, joint: int, tau_Nm: float) -> N
 
 
 def error_code(is_overheated: float, is_overloaded: float) -> int:
-    """Give the error code that a motor calls for; overloaded: I²t is spent, and that is a fault. 0: no fault."""
+    """Return the error code that a motor calls for; overloaded: I²t is spent, and that is a fault. 0: no fault."""
     if is_overheated:
         return EXCESS_TEMPERATURE
     return CONTINUOUS_OVER_CURRENT if is_overloaded else 0

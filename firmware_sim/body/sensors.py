@@ -63,7 +63,7 @@ def encoder_numbers(settings: SensorSettings) -> np.void:
 
 @compiled
 def read_angle(numbers: np.void, joint: int, angle_rad: float, noise_counts: float) -> float:
-    """Give the angle that the drive reads, rad."""
+    """Return the angle that the drive reads, rad."""
     disc_rad = angle_rad + numbers["index_error_rad"][joint]
     if numbers["eccentricity_rad"][joint] != 0.0:
         disc_rad += numbers["eccentricity_rad"][joint] * math.sin(angle_rad + numbers["eccentricity_phase_rad"][joint])
@@ -159,7 +159,7 @@ def count_Nm(settings: SensorSettings, joint: int) -> float:
 
 
 def converter_ends(settings: SensorSettings, joint: int) -> tuple[int, int]:
-    """Give the lowest and the highest value that a sensor can send, in counts of the wire."""
+    """Return the lowest and the highest value that a sensor can send, in counts of the wire."""
     numbers = transducer_numbers(settings, (0.0, 0.0))
     return _convert(numbers, joint, -1e6), _convert(numbers, joint, 1e6)
 
@@ -266,7 +266,7 @@ def sample_torque(
     temperature_C: float,
     noise_Nm: float,
 ) -> int:
-    """Give the counts that the sensor of a joint sends at the SYNC at `tick`.
+    """Return the counts that the sensor of a joint sends at the SYNC at `tick`.
 
     tau, other: torque in the spring of this joint and of the other one, now.
     """

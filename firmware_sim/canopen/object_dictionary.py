@@ -280,7 +280,7 @@ class ObjectDictionary:
         return self._node.object_dictionary
 
     def has(self, index: int, subindex: int = 0) -> bool:
-        """Tell whether the EDS lists this object."""
+        """Return whether the EDS lists this object."""
         try:
             self._node._find_object(index, subindex)
         except canopen.SdoAbortedError:
@@ -446,7 +446,7 @@ def playable_contract(codec: Codec) -> EmulatedContract:
 
 
 def is_fd(codec: Codec) -> bool:
-    """Tell whether frames are longer than classic CAN allows."""
+    """Return whether frames are longer than classic CAN allows."""
     return any(message.length > CLASSIC_BYTES for message in codec.messages.values())
 
 

@@ -188,7 +188,7 @@ class ReceivePdo(PdoRecord):
             self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
 
     def is_late(self, t_ns: int) -> bool:
-        """Tell whether no frame has acted within the PDO's event timer; False without a timer or an earlier frame."""
+        """Return whether no frame has acted within the PDO's event timer; False without a timer or an earlier frame."""
         return self.timer_ns > 0 and self.acted_ns is not None and t_ns - self.acted_ns >= self.timer_ns
 
 
@@ -251,7 +251,7 @@ class Pdos:
         return any(pdo.is_command for pdo in self._receiving)
 
     def brings(self, index: int, subindex: int) -> bool:
-        """Tell whether an exchanged PDO brings values of an object."""
+        """Return whether an exchanged PDO brings values of an object."""
         return any((index, subindex) in pdo.layout.keys for pdo in self._receiving)
 
     def accept_values(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
@@ -335,7 +335,7 @@ class Pdos:
         return is_commanded
 
     def find_late(self, t_ns: int) -> bool:
-        """Tell whether the deadline of some RPDO is over."""
+        """Return whether the deadline of some RPDO is over."""
         return any(pdo.is_late(t_ns) for pdo in self._receiving)
 
     @property

@@ -28,7 +28,7 @@ most as wide, and the emulator's kernel filter is this one."""
 
 
 def _is_restricted(can_id: int) -> bool:
-    """Tell whether an identifier is not allowed for PDOs: CiA 301, table 34, and SYNC and EMCY."""
+    """Return whether an identifier is not allowed for PDOs: CiA 301, table 34, and SYNC and EMCY."""
     lowest = (0x000, 0x080, 0x101, 0x581, 0x601, 0x6E0, 0x701)
     highest = (0x07F, 0x100, 0x180, 0x5FF, 0x67F, 0x6FF, 0x7FF)
     return any(low <= can_id <= high for low, high in zip(lowest, highest, strict=True))

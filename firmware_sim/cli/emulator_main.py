@@ -109,7 +109,7 @@ _OPTIONS = (  # last first: click lists them the other way round
 
 
 def on_bus(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the options of the bus and of the devices on it."""
+    """Return a command the options of the bus and of the devices on it."""
     for option in _OPTIONS:
         command = option(command)
     return command

@@ -186,7 +186,7 @@ def describe_devices(codec: Codec, devices: list[PlacedDevice], settings: Settin
 
 
 def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
-    """Give encoder, gear and feed constant the values that come to the profile's increments."""
+    """Return encoder, gear and feed constant the values that come to the profile's increments."""
     scale = device.settings.scale
     told_in, told_out = _default(device, 0x6091, 1), _default(device, 0x6091, 2)
     gear = Fraction(told_in, told_out) if told_in and told_out else Fraction(scale.gear_ratio).limit_denominator(1000)
@@ -201,7 +201,7 @@ def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
 
 
 def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
-    """Give the values of a device's objects at power-on: those of its EDS, else those of the profile."""
+    """Return the values of a device's objects at power-on: those of its EDS, else those of the profile."""
     kind, scale = device.settings.kind, device.settings.scale
     made_up = {index: made for index, made in _made_up(kind, settings).items() if not device.has(index)}
     defaults: dict[tuple[int, int], int] = {}

@@ -371,7 +371,7 @@ class SyncListeners:
         self._unheard = [0] * len(self._devices)
 
     def takers(self, data: bytes) -> tuple[int, ...]:
-        """Give 1 for each device that takes SYNCs of this length, by its 0x1019; else 0."""
+        """Return 1 for each device that takes SYNCs of this length, by its 0x1019; else 0."""
         return self._takers.get(len(data), self._nobody)
 
     def tell(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, lost: int, t_ns: int) -> None:

@@ -175,7 +175,7 @@ class Standstill:
         self._since_ns = self._moving_ns = t_ns
 
     def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:
-        """Tell whether the motor stands still, or has braked for the longest time."""
+        """Return whether the motor stands still, or has braked for the longest time."""
         if abs(velocity_rad_s) > REST_RAD_S:
             self._moving_ns = t_ns
         return t_ns - self._moving_ns >= _REST_NS or t_ns - self._since_ns >= _LONGEST_BRAKING_NS

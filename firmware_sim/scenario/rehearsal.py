@@ -109,7 +109,7 @@ def told_arm(settings: Settings, layers: Sequence[ConfigurationLayer]) -> ToldAr
 def compose_scenario(
     told: ToldArm, truth: ArmTruth, counts: DeviceCounts, table: dict[str, Any], is_builtin: bool
 ) -> tuple[dict[str, Any], list[str]]:
-    """Give a scenario's table the arm of a configuration; return it, and the assumptions, a line each.
+    """Return a scenario's table the arm of a configuration; return it, and the assumptions, a line each.
 
     `is_builtin`: it comes with the package, so it is fitted to the size of the arm. Raises ConfigError.
     """
@@ -331,7 +331,7 @@ def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
 
 
 def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
-    """Give the sensors a range that their signals carry, and noise to it, where the scenario doesn't."""
+    """Return the sensors a range that their signals carry, and noise to it, where the scenario doesn't."""
     sensors = dict(said)
     for joint, (rated_Nm, most_Nm) in enumerate(zip(rated, counts.torque_range_Nm, strict=True)):
         if most_Nm < _LEAST_RANGE_SHARE * rated_Nm:

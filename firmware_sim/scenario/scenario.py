@@ -333,7 +333,7 @@ def _read(kind: str, name_or_file: str) -> dict[str, Any]:
 
 
 def named_profile(name_or_file: str) -> str | None:
-    """Give the profile that a scenario's file names, unchecked; None where it leaves that open. Raises ConfigError."""
+    """Return the profile that a scenario's file names, unchecked; None if it names none. Raises ConfigError."""
     profile = read_table(name_or_file).get("profile")
     return None if profile is None else str(profile)
 

@@ -39,7 +39,7 @@ DECISIONS_PER_H = 3600.0 / PERIOD_S * 2 * 2
 
 
 def threshold_sigma() -> float:
-    """Give z of the false-alarm rate that a day without alarm stands for."""
+    """Return z of the false-alarm rate that a day without alarm stands for."""
     return float(norm.isf(RATE_PER_H / DECISIONS_PER_H))
 
 
@@ -52,7 +52,7 @@ class Bound:
     steps: NDArray[np.float64]
 
     def distance(self, response: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Give d (n,) after each sample of a response (n, 2) that begins with its first row."""
+        """Return d (n,) after each sample of a response (n, 2) that begins with its first row."""
         whitened = whiten(response, self.coefficients)
         inverse = np.linalg.inv(self.covariance)
         result: NDArray[np.float64] = np.sqrt(np.cumsum(np.einsum("ki,ij,kj->k", whitened, inverse, whitened)))
@@ -64,12 +64,12 @@ class Bound:
         return np.stack([self.distance(self.steps[joint]) for joint in range(2)])
 
     def delay_s(self, joint: int, step_Nm: float) -> float:
-        """Give the median delay of a step, inf when it is not found within WINDOW_S."""
+        """Return the median delay of a step, inf when it is not found within WINDOW_S."""
         found = np.flatnonzero(step_Nm * self.step_distances[joint] >= threshold_sigma())
         return float((found[0] + 0.5) * PERIOD_S) if found.size else float("inf")
 
     def contact_delay_s(self, tau_ext: NDArray[np.float64]) -> float:
-        """Give the delay of a contact with this torque (n, 2), from its first sample on; inf when it is not found."""
+        """Return the delay of a contact with this torque (n, 2), from its first sample on; inf when it is not found."""
         response = np.zeros_like(tau_ext)
         for joint in range(2):
             impulse = np.diff(self.steps[joint][:RESPONSE_SAMPLES], axis=0, prepend=np.zeros((1, 2)))
@@ -79,7 +79,7 @@ class Bound:
         return float((found[0] + 0.5) * PERIOD_S) if found.size else float("inf")
 
     def smallest_Nm(self, joint: int, within_s: float = 0.1) -> float:
-        """Give the smallest step that is found in time."""
+        """Return the smallest step that is found in time."""
         return float(threshold_sigma() / self.step_distances[joint, round(within_s / PERIOD_S)])
 
 

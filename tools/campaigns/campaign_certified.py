@@ -28,7 +28,7 @@ class CertifiedScheme:
         self._settings = settings
 
     def adaptation_motion(self, is_payload: bool) -> Motion:  # noqa: ARG002
-        """Give the excitation of the configuration, or where it has none the paper's motion."""
+        """Return the excitation of the configuration, or where it has none the paper's motion."""
         excitation = Excitation(self._settings)
         if not excitation.is_on:
             return paper_motion(self.patience_s)

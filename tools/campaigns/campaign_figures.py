@@ -30,7 +30,7 @@ class Figure:
     is_floor: bool = False
 
     def is_good(self, value: float) -> bool:
-        """Tell whether a value is as wanted; one that was not measured is."""
+        """Return whether a value is as wanted; one that was not measured is."""
         if np.isnan(value):
             return True
         return value >= self.wanted if self.is_floor else value <= self.wanted
@@ -67,7 +67,7 @@ def figure_table(rows: Rows, schemes: Sequence[str], bounds: Bounds) -> FigureTa
 
 
 def is_all_good(table: FigureTable) -> bool:
-    """Tell whether no figure is missed."""
+    """Return whether no figure is missed."""
     return "MISSED" not in table.text
 
 
@@ -214,7 +214,7 @@ def _residual(rows: Rows, percent: float = 100.0) -> float:
 
 
 def _step_delay(rows: Rows, is_loaded: bool, joint: int, step_Nm: float) -> float:
-    """Give the median delay of a step on the profile where it is largest, s."""
+    """Return the median delay of a step on the profile where it is largest, s."""
     medians = []
     wanted = (is_loaded, joint, step_Nm, True)
     some = [row for row in rows["steps"] if (row["loaded"], row["joint"], row["step_Nm"], row["is_moving"]) == wanted]
@@ -225,7 +225,7 @@ def _step_delay(rows: Rows, is_loaded: bool, joint: int, step_Nm: float) -> floa
 
 
 def _smallest(rows: Rows, is_loaded: bool, joint: int) -> float:
-    """Give the smallest step from which on all are found in time in the median; inf for none."""
+    """Return the smallest step from which on all are found in time in the median; inf for none."""
     smallest = float("inf") if rows["steps"] else NAN
     for step_Nm in reversed(STEPS_NM):
         if not _step_delay(rows, is_loaded, joint, step_Nm) <= WITHIN_S:

@@ -50,7 +50,7 @@ class Scheme(Protocol):
     patience_s: float
 
     def adaptation_motion(self, is_payload: bool) -> Motion:
-        """Give the motion with which it adapts, `patience_s` long, from rest."""
+        """Return the motion with which it adapts, `patience_s` long, from rest."""
 
     def run(self, recording: Recording, begins: tuple[int, ...]) -> Outcome:
         """Play a recording; adapt anew from each cycle of `begins` on."""
@@ -66,7 +66,7 @@ class PaperScheme:
         self._settings = settings
 
     def adaptation_motion(self, is_payload: bool) -> Motion:  # noqa: ARG002
-        """Give the paper's motion as printed."""
+        """Return the paper's motion as printed."""
         return paper_motion(self.patience_s)
 
     def run(self, recording: Recording, begins: tuple[int, ...]) -> Outcome:
@@ -123,7 +123,7 @@ def _run_paper(
 
 
 def true_residual(recording: Recording, cutoff_rad_s: float, lag_s: float = 0.0) -> NDArray[np.float64]:
-    """Give tau_ext_hat (n, 2) of a filter with the true parameters of each instant, Nm.
+    """Return tau_ext_hat (n, 2) of a filter with the true parameters of each instant, Nm.
 
     lag_s: by how much the torque is delayed to meet the velocity.
     """
@@ -166,7 +166,7 @@ def _run_true(
 
 
 def scheme_named(configuration: str) -> Scheme:
-    """Give the scheme of a configuration: a built-in name or a TOML file. Raises ConfigError."""
+    """Return the scheme of a configuration: a built-in name or a TOML file. Raises ConfigError."""
     settings = load_settings(configuration, "S")
     if getattr(settings, "scheme", "paper") == "certified":
         from campaign_certified import CertifiedScheme

@@ -107,7 +107,7 @@ class Prelude:
 
 @cache
 def scheme_of(name: str) -> Scheme:
-    """Give a scheme, one per process."""
+    """Return a scheme, one per process."""
     return scheme_named(name)
 
 
@@ -276,7 +276,7 @@ def push_links(case: Case) -> list[Row]:
 
 @cache
 def profile_bound(profile: str, is_loaded: bool) -> Bound:
-    """Give the noise-limited bound of a profile, measured once per process."""
+    """Return the noise-limited bound of a profile, measured once per process."""
     return bound_of(profile_arm(profile, PAYLOAD_KG if is_loaded else 0.0))
 
 
@@ -329,7 +329,7 @@ def judge_contact(contact: ContactSettings, recording: Recording, outcome: Outco
 
 
 def predicted_change(before: NDArray[np.float64], after: NDArray[np.float64], motion: Motion) -> float:
-    """Give the largest change of predicted torque over a motion, Nm; parameters beyond seven are two offsets, a lag."""
+    """Return the largest change of predicted torque over a motion, Nm; parameters after seven: two offsets, a lag."""
     change = after - before
     largest = 0.0
     for k in range(0, len(motion.q_d), 20):

@@ -68,7 +68,7 @@ class LabArm:
         return ASYMMETRY if self.friction == "asymmetric" else 0.0
 
     def drift(self, seed: int, count: int) -> NDArray[np.float64]:
-        """Give the factors (n, 2) of viscous and Coulomb friction over a record; ones but in variant "drift"."""
+        """Return the factors (n, 2) of viscous and Coulomb friction over a record; ones but in variant "drift"."""
         if self.friction != "drift":
             return np.ones((count, 2))
         turns = np.random.default_rng([seed, 3]).uniform(0.0, 1.0, 2)
@@ -77,7 +77,7 @@ class LabArm:
 
 
 def profile_arm(profile: str, payload_kg: float = 0.0, friction: str = "plain", **changes: object) -> LabArm:
-    """Give profile P, S or M with the gains of the configuration `paper`; further fields of LabArm by name."""
+    """Return profile P, S or M with the gains of the configuration `paper`; further fields of LabArm by name."""
     controller = load_settings("paper", profile).controller
     built = LabArm(ARMS[profile], controller.Kp, controller.Kd, payload_kg, _known(friction))
     return replace(built, **changes)  # type: ignore[arg-type]

@@ -42,7 +42,7 @@ class Motion:
 
 
 def paper_motion(duration_s: float, is_synchronous: bool = False) -> Motion:
-    """Give the paper's motion between two corners, as printed (1.125 s and 4.5 s) or with a common half period."""
+    """Return the paper's motion between two corners, as printed (1.125 s and 4.5 s) or with a common half period."""
     settings = TrajectorySettings()
     half_period_s = np.array(_SYNCHRONOUS_HALF_PERIOD_S if is_synchronous else settings.half_period_s)
     motion = _still("synchronous" if is_synchronous else "paper", round(duration_s / PERIOD_S), np.zeros(2))
@@ -58,7 +58,7 @@ def random_moves(
     start: NDArray[np.float64] | None = None,
     speed_share: tuple[float, float] = (0.1, 1.0),
 ) -> Motion:
-    """Give quintic moves between random places, at random speeds, with random dwells; sometimes one joint rests.
+    """Return quintic moves between random places, at random speeds, with random dwells; sometimes one joint rests.
 
     `speed_share`: least and largest peak speed, as a share of SPEED_RAD_S.
     """
@@ -83,7 +83,7 @@ def random_moves(
 
 
 def multisine(seed: int, duration_s: float, tones: int = 5, band_Hz: tuple[float, float] = (0.05, 0.8)) -> Motion:
-    """Give a sum of sines per joint that begins at rest, within REACH_RAD and SPEED_RAD_S."""
+    """Return a sum of sines per joint that begins at rest, within REACH_RAD and SPEED_RAD_S."""
     generator = np.random.default_rng([seed, 2])
     t = np.arange(round(duration_s / PERIOD_S)) * PERIOD_S
     rate = 2.0 * np.pi * np.exp(generator.uniform(*np.log(band_Hz), (tones, 2)))
@@ -102,7 +102,7 @@ def multisine(seed: int, duration_s: float, tones: int = 5, band_Hz: tuple[float
 
 
 def random_motion(seed: int, duration_s: float) -> Motion:
-    """Give random moves or, one time in four, a multisine."""
+    """Return random moves or, one time in four, a multisine."""
     return multisine(seed, duration_s) if seed % 4 == 3 else random_moves(seed, duration_s)
 
 
@@ -112,7 +112,7 @@ def still(at: NDArray[np.float64], duration_s: float) -> Motion:
 
 
 def cut(motion: Motion, count: int) -> Motion:
-    """Give the first `count` cycles of a motion."""
+    """Return the first `count` cycles of a motion."""
     return Motion(motion.name, motion.q_d[:count], motion.dq_d[:count], motion.ddq_d[:count])
 
 
@@ -185,7 +185,7 @@ def _way(
 def _quintic(
     x: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Give the rest-to-rest quintic from 0 to 1 and its two derivatives by x."""
+    """Return the rest-to-rest quintic from 0 to 1 and its two derivatives by x."""
     value = x**3 * (10.0 + x * (-15.0 + 6.0 * x))
     return value, 30.0 * x**2 * (1.0 - x) ** 2, x * (60.0 + x * (-180.0 + 120.0 * x))
 

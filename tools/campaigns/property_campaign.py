@@ -136,7 +136,7 @@ def save(drawn: Drawn, played: Played, result: Result, folder: Path) -> None:
 
 
 def as_dict(result: Result) -> dict[str, object]:
-    """Give a result as JSON has it."""
+    """Return a result as JSON has it."""
     return {**asdict(result), "violations": [violation._asdict() for violation in result.violations]}
 
 

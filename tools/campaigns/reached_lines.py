@@ -194,7 +194,7 @@ def _line(played: Played) -> str:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """Give processes what measures them: Coverage.py begins with the interpreter, in the log's writer as well."""
+    """Return processes what measures them: Coverage.py begins with the interpreter, in the log's writer as well."""
     packages = folder / "packages"
     packages.mkdir()
     if importlib.util.find_spec("coverage") is None:
@@ -229,12 +229,12 @@ def _report(folder: Path, environment: dict[str, str]) -> dict[str, Any]:
 
 
 def is_counted(path: str) -> bool:
-    """Tell whether a file, named from the root, belongs to what runs on an arm or replays it."""
+    """Return whether a file, named from the root, belongs to what runs on an arm or replays it."""
     return not path.startswith(LEFT_OUT)
 
 
 def _functions(files: dict[str, Any]) -> Iterator[tuple[str, str, Reached]]:
-    """Give file, name and lines of each function."""
+    """Yield file, name and lines of each function."""
     for path, file in files.items():
         for name, function in file["functions"].items():
             if name:

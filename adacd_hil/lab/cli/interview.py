@@ -14,7 +14,7 @@ Answer = TypeVar("Answer")
 
 
 def is_terminal() -> bool:
-    """Tell whether a user can type answers."""
+    """Return whether a user can type answers."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 

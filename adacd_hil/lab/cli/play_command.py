@@ -239,7 +239,7 @@ def _as_text(described: dict[str, Any]) -> str:
 
 
 def may_move_an_arm(interface: str, channel: str) -> bool:
-    """Tell whether real drives may receive frames on this channel: it isn't certainly virtual."""
+    """Return whether real drives may receive frames on this channel: it isn't certainly virtual."""
     return not is_virtual(interface, channel)
 
 

@@ -127,7 +127,7 @@ def identity_of(eds: Path) -> tuple[int | None, int | None]:
 
 
 def is_of(identity: tuple[int | None, int | None], node: tuple[int | None, int | None]) -> bool:
-    """Tell whether an EDS of this vendor and product fits a node; a number that the EDS omits fits all."""
+    """Return whether an EDS of this vendor and product fits a node; a number that the EDS omits fits all."""
     return all(expected in (None, found) for expected, found in zip(identity, node, strict=True))
 
 
@@ -248,11 +248,11 @@ class _Record(NamedTuple):
     timer_ms: int
 
     def carries(self, *places: _Place) -> bool:
-        """Tell whether the PDO's default mapping has all these objects."""
+        """Return whether the PDO's default mapping has all these objects."""
         return set(places) <= set(self.entries)
 
     def can_be(self, transmission: int) -> bool:
-        """Tell whether the PDO has this transmission type or can be given it."""
+        """Return whether the PDO has this transmission type or can be given it."""
         return self.transmission in (None, transmission)
 
 
@@ -289,7 +289,7 @@ class _ProfileWriter(ABC):
         return None if variable is None else variable.default
 
     def is_factory(self, index: int, sub: int) -> bool:
-        """Tell whether a factory setting is all that is known of an object: it is writable, and was not read."""
+        """Return whether a factory setting is all that is known of an object: it is writable, and was not read."""
         return (index, sub) not in self.ratings.numbers and self.can_write(index, sub)
 
     def refuse(self, reason: str) -> ConfigError:
@@ -307,7 +307,7 @@ class _ProfileWriter(ABC):
 
     @property
     def is_fixed(self) -> bool:
-        """Tell whether no mapping can be written."""
+        """Return whether no mapping can be written."""
         return not any(record.room for is_received in (False, True) for record in self.records(is_received))
 
     def records(self, is_received: bool) -> list[_Record]:
@@ -377,7 +377,7 @@ class _ProfileWriter(ABC):
         """Raise ConfigError if the device lacks a function that a cycle needs."""
 
     def allows(self, feature: str) -> bool:
-        """Tell whether devices of this kind can have a feature."""
+        """Return whether devices of this kind can have a feature."""
         return self.kind == DRIVE or feature in ("heartbeat_consumer", "sync_counter")
 
     def watchdog(self) -> list[str]:

@@ -230,7 +230,7 @@ class _RowReader:
         return None
 
     def _is_of_units(self, wrong: list[tuple[_Column, str]]) -> bool:
-        """Tell whether a row names units. Raises ConfigError if one differs from the map's."""
+        """Return whether a row names units. Raises ConfigError if one differs from the map's."""
         for column, text in wrong:
             unit = unit_of(text)
             if unit and column.unit and unit != column.unit and not (column.unit == ISO):
@@ -282,12 +282,12 @@ def _iso_seconds(text: str) -> Decimal:
 
 
 def is_number(text: str, decimal: str) -> bool:
-    """Tell whether a text is a number with this decimal sign."""
+    """Return whether a text is a number with this decimal sign."""
     return _is_readable(text, partial(read_number, decimal=decimal))
 
 
 def is_iso_time(text: str) -> bool:
-    """Tell whether a text is a date and time of ISO 8601."""
+    """Return whether a text is a date and time of ISO 8601."""
     return _is_readable(text, _iso_seconds)
 
 

@@ -118,7 +118,7 @@ def find_readings(
 
 
 def is_possible(model: ArmModel, theta: Vector, q: Vector, dq: Vector) -> bool:
-    """Tell whether an arm can have these parameters: inertias are positive, friction dissipates. q, dq: (k, n)."""
+    """Return whether an arm can have these parameters: inertias are positive, friction dissipates. q, dq: (k, n)."""
     F_v, F_c = theta[model.place_of("F_v")], theta[model.place_of("F_c")]
     speed, square = np.abs(dq).mean(axis=0), (dq**2).mean(axis=0)
     idle = _IDLE_FRICTION * (np.abs(F_c).max() + np.abs(F_v).max() * speed.mean()) * speed

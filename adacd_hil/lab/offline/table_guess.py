@@ -103,7 +103,7 @@ def _split(path: Path, lines: list[str], delimiter: str) -> list[list[str]]:
 
 
 def _is_full(cells: list[str], decimal: str) -> bool:
-    """Tell whether a row has numbers only, except perhaps a date in the first cell."""
+    """Return whether a row has numbers only, except perhaps a date in the first cell."""
     return all(is_number(cell, decimal) for cell in cells[1:]) and (
         is_number(cells[0], decimal) or is_iso_time(cells[0])
     )
@@ -134,7 +134,7 @@ def _trimmed(cells: list[str]) -> list[str]:
 
 
 def _begins(rows: list[list[str]], decimal: str) -> bool:
-    """Tell whether rows of equally many numbers begin here, at least three a row."""
+    """Return whether rows of equally many numbers begin here, at least three a row."""
     count = len(rows[0]) if rows else 0
     return len(rows) == _FULL_ROWS and count >= 3 and all(len(row) == count and _is_full(row, decimal) for row in rows)
 
@@ -272,7 +272,7 @@ def _take(guess: TableGuess, role: str, block: tuple[int, ...], reason: str) -> 
 
 
 def _is_slope(time: Vector, q: Vector, dq: Vector) -> bool:
-    """Tell whether dq (k, n) is the slope of q (k, n) over time (k,), in any unit."""
+    """Return whether dq (k, n) is the slope of q (k, n) over time (k,), in any unit."""
     slope = np.gradient(q, axis=0) / np.gradient(time)[:, None]
     moving = np.ptp(q, axis=0) > 0.0
     if not moving.any() or np.any(np.ptp(dq[:, moving], axis=0) == 0.0):

@@ -143,7 +143,7 @@ def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:
 
 
 def went_wrong(contact: ReportedContact) -> bool:
-    """Tell whether a contact was missed, or named on a link that nobody touched or with a wrong direction."""
+    """Return whether a contact was missed, or named on a link that nobody touched or with a wrong direction."""
     is_missed = contact.is_armed and contact.detected_s is None
     return is_missed or contact.link_ok is False or contact.direction_ok is False
 
@@ -158,12 +158,12 @@ def left_out_text(metrics: Metrics, most: int) -> str:
 
 
 def has_paper(metrics: Metrics) -> bool:
-    """Tell whether the run is of the paper's experiment."""
+    """Return whether the run is of the paper's experiment."""
     return any(row.paper is not None for row in metrics.paper)
 
 
 def shown_beside(metrics: Metrics) -> Beside | None:
-    """Give the result of the paper's scheme on the same stream, which is shown where the paper's experiment was played.
+    """Return the result of the paper's scheme on the same stream if the paper's experiment was played, else None.
 
     report.json has it of every run.
     """

@@ -151,7 +151,7 @@ def report_tables(run: Run, metrics: Metrics) -> dict[str, str]:
 
 
 def _cells(value: Any, is_pair: bool) -> Sequence[Any]:
-    """Give a value, or that of each joint."""
+    """Return a value, or that of each joint."""
     if not is_pair:
         return (value,)
     return (None, None) if value is None else tuple(value)

@@ -19,7 +19,7 @@ _DIGITS: Final = 6
 def report_json(
     metrics: Metrics, metadata: Mapping[str, str], source: ReportSource, stretch: StretchOfRun | None = None
 ) -> dict[str, Any]:
-    """Give the content of report.json; the keys are described in `adacd_hil.lab.score.metrics`."""
+    """Return the content of report.json; the keys are described in `adacd_hil.lab.score.metrics`."""
     fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
     plain: dict[str, Any] = plain_values(
         {
@@ -61,7 +61,7 @@ def report_json(
 
 
 def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
-    """Give a stretch, s since the beginning of the log; null where it is not bounded."""
+    """Return a stretch, s since the beginning of the log; null where it is not bounded."""
     return {
         "from_s": stretch.found.start_s,
         "until_s": stretch.found.end_s,
@@ -72,5 +72,5 @@ def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
 
 
 def _evidence_json(evidence: CertifiedEvidence) -> dict[str, Any]:
-    """Give the evidence of the certified scheme; the keys are described in `adacd_hil.lab.score.margins`."""
+    """Return the evidence of the certified scheme; the keys are described in `adacd_hil.lab.score.margins`."""
     return {**vars(evidence), "smallest_margin": evidence.smallest_margin}

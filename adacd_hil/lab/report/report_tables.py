@@ -58,7 +58,7 @@ def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def push_table(evidence: CertifiedEvidence | None) -> Table | None:
-    """Give how small a push is found, and the threshold in force."""
+    """Return how small a push is found, and the threshold in force."""
     push = None if evidence is None else evidence.smallest_push
     if push is None:
         return None

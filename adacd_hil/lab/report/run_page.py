@@ -248,7 +248,7 @@ def _found(contact: ReportedContact) -> list[tuple[str, str]]:
 
 
 def _force(contact: ReportedContact) -> tuple[str, str]:
-    """Give the force as far as it is known: with its deviation, as a lower bound, or not at all."""
+    """Return the force as far as it is known: with its deviation, as a lower bound, or not at all."""
     location = Location[contact.location or Location.NOT_SOUGHT.name]
     if contact.force_N is None:
         return "force", NONE
@@ -262,7 +262,7 @@ def _force(contact: ReportedContact) -> tuple[str, str]:
 
 
 def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
-    """Give each joint's peak and impulse; a peak without its deviation if that is unknown."""
+    """Return each joint's peak and impulse; a peak without its deviation if that is unknown."""
     unknown = (None, None)
     impulses = contact.impulse_Nm_s or unknown
     impulse_sigmas = contact.impulse_sigma_Nm_s or unknown
@@ -365,7 +365,7 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> dict[str, Any]
 
 
 def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
-    """Give the numbers of the first screen: label, number, unit."""
+    """Return the numbers of the first screen: label, number, unit."""
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]
     times_s = [number_text(value, 2) for value in metrics.adaptation_s.values()]

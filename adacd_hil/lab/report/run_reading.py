@@ -127,7 +127,7 @@ def read_run(
 
 
 def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
-    """Give a run without a cycle, with metadata and settings of the log."""
+    """Return a run without a cycle, with metadata and settings of the log."""
     metadata = dict(stream.metadata)
     if "arm.dbc" in stream.attachments:
         metadata["dbc_sha256"] = hashlib.sha256(stream.attachments["arm.dbc"]).hexdigest()
@@ -300,12 +300,12 @@ class RunReading:
         return SETTLING_TIME_CONSTANTS / self._rows.run(self._shell, slice(0)).a_rad_s
 
     def is_settled(self, until_ns: int, last_ns: int) -> bool:
-        """Tell whether all that happens before a time is known: nothing has since the settling time before last_ns."""
+        """Return whether all events before a time are known: there was none in the settling time before last_ns."""
         before_ns = last_ns - round(self._settling_s * 1e9)
         return before_ns > until_ns and self._busy_ns < before_ns
 
     def outline(self) -> Run:
-        """Give the run so far, with the kept cycles and all that wait."""
+        """Return the run so far, with the kept cycles and all that wait."""
         zero_ns = next((t_ns for t_ns in (self._zero_ns, self._first_ns) if t_ns is not None), 0)
         run = replace(
             self._rows.run(self._shell),
@@ -340,7 +340,7 @@ class RunReading:
         self._settled -= self._rows.drop(first + np.flatnonzero(~is_kept))
 
     def _curves(self, shell: Run, rows: slice) -> Iterator[NDArray[np.float64]]:
-        """Give the curves that the report draws over the whole run."""
+        """Yield the curves that the report draws over the whole run."""
         for panel in panels_of(self._rows.run(shell, rows)):
             for trace in panel.traces:
                 yield trace.values
@@ -365,7 +365,7 @@ def _extremes_by_bucket(curves: Iterator[NDArray[np.float64]], index: Cycles, bu
 
 
 def _around(run: Run) -> list[Bounds]:
-    """Give the stretches of time of which every cycle is kept."""
+    """Return the stretches of time of which every cycle is kept."""
     onsets_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
     found_s = [(detection.t_ns - run.zero_ns) * 1e-9 for detection in find_detections(run)]
     around = [
@@ -537,13 +537,13 @@ class SchemeRows:
         return len(rows)
 
     def run(self, shell: Run, rows: slice = slice(None)) -> Run:
-        """Give a run with all or some of these rows, else as `shell`."""
+        """Return a run with all or some of these rows, else as `shell`."""
         columns = {name: self.column(name)[rows] for name in ("t_ns", *self._names)}
         return replace(shell, **_arrays(columns, shell.settings))
 
 
 def _arrays(columns: dict[str, NDArray[Any]], settings: Settings) -> dict[str, Any]:
-    """Give the fields of a run."""
+    """Return the fields of a run."""
     arrays: dict[str, Any] = {name: columns[name] for name in _PLAIN}
     arrays |= {"cycle": columns["cycle"].astype(np.int64), "t_ns": columns["t_ns"]}
     arrays["motion"] = MeasuredMotion(*(columns[name] for name in _MOTION))

@@ -122,7 +122,7 @@ def certificates_of(run: Run) -> list[tuple[float, bool, list[str]]]:
 
 
 def state_key(run: Run) -> list[tuple[str, str]]:
-    """Give colour and name of the states that the run has been in."""
+    """Return colour and name of the states that the run has been in."""
     there = {stay.state for stay in stays_of(run)}
     return [(colour, STATE_WORDS[state]) for state, colour in STATE_COLOURS.items() if state in there]
 
@@ -155,7 +155,7 @@ def _x(scale: _Scale, time_s: float) -> float:
 
 
 def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[list[Stay]]:
-    """Give the stays as they are drawn: of many, those that are narrower than a mark together."""
+    """Yield the stays as they are drawn: of many, those that are narrower than a mark together."""
     group: list[Stay] = []
     for stay in stays:
         is_narrow = len(stays) > MARKS and _x(scale, stay.end_s) - _x(scale, stay.start_s) < _NARROWEST

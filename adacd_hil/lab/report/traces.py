@@ -98,7 +98,7 @@ def _motion(run: Run) -> Iterator[TracePanel]:
 
 
 def _residuals(run: Run) -> Iterator[TracePanel]:
-    """Give each joint's residual of every model against the thresholds."""
+    """Yield each joint's residual of every model against the thresholds."""
     finest = FINEST["Nm"]
     ours = "identified" if run.certified is None else "certified"
     for joint in range(JOINTS):
@@ -122,7 +122,7 @@ def _residuals(run: Run) -> Iterator[TracePanel]:
 
 
 def _true_torque(run: Run) -> Vector:
-    """Give the true external torque in each cycle (n, 2); zero where the truth has no contact."""
+    """Return the true external torque in each cycle (n, 2); zero where the truth has no contact."""
     assert run.truth is not None
     torque = np.zeros((run.cycle.size, JOINTS))
     if run.truth.cycle.size:
@@ -141,7 +141,7 @@ def _in_view(threshold: Vector, residual: Vector) -> Vector:
 
 
 def _channels(run: Run) -> Iterator[TracePanel]:
-    """Give the channels of the certified scheme's bank, and the largest part of its threshold that any reaches."""
+    """Yield the channels of the certified scheme's bank, and the largest part of its threshold that any reaches."""
     stream = run.certified
     if stream is None:
         return
@@ -169,7 +169,7 @@ def _shares(stream: CertifiedStream) -> Vector:
 
 
 def _parameters(run: Run) -> Iterator[TracePanel]:
-    """Give the estimates theta_hat, a panel per unit."""
+    """Yield the estimates theta_hat, a panel per unit."""
     names = run.parameter_names
     for unit in dict.fromkeys(PARAMETER_UNITS[name] for name in names):
         chosen = [name for name in names if PARAMETER_UNITS[name] == unit]
@@ -184,7 +184,7 @@ def _parameters(run: Run) -> Iterator[TracePanel]:
 
 
 def _true_parameter(run: Run, name: str) -> Vector | None:
-    """Give a parameter's true value in each cycle (n,); None if it is unknown."""
+    """Return a parameter's true value in each cycle (n,); None if it is unknown."""
     truth = run.truth
     if truth is None or name not in PARAMETER_NAMES:
         return None
@@ -199,7 +199,7 @@ _TIMES: Final = ((LATENESS, "identified"), (COMPUTE, "joint1"), (SYNC_TO_COMMAND
 
 
 def timing_track(columns: CycleColumns, period_us: float, zero_ns: int, has_grid: bool) -> Track:
-    """Give the times, queues and skipped periods of the cycles, s since zero_ns; has_grid: not of lockstep."""
+    """Return the times, queues and skipped periods of the cycles, s since zero_ns; has_grid: not of lockstep."""
     panels = []
     for quantity, colour in _TIMES:
         values_us = columns.times_us(quantity)
@@ -223,7 +223,7 @@ def timing_track(columns: CycleColumns, period_us: float, zero_ns: int, has_grid
 
 
 def run_tracks(run: Run) -> list[Track]:
-    """Give the curves of a run: those of /scheme and those of /cycle."""
+    """Return the curves of a run: those of /scheme and those of /cycle."""
     is_next = None if run.bucket == 1 else np.diff(run.cycle, prepend=run.cycle[:1] - 2) == 1
     timing = timing_track(run.timing, run.settings.bus.period_us, run.zero_ns, is_realtime(run))
     return [Track("scheme", run.time_s(), panels_of(run), is_next), timing]

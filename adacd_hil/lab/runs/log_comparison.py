@@ -65,18 +65,18 @@ class RunReader:
         self._bounds = first + self.zero_cycle, end + self.zero_cycle
 
     def _wanted(self, series: Series) -> Series:
-        """Give the records of the cycles that are to be read."""
+        """Return the records of the cycles that are to be read."""
         if self._bounds is None or "cycle" not in series.fields:
             return series
         cycle = series.records["cycle"].astype(np.int64)
         return series.part((cycle >= self._bounds[0]) & (cycle < self._bounds[1]))
 
     def _is_over(self, series: Series) -> bool:
-        """Tell whether the reading has passed all cycles to compare."""
+        """Return whether the reading has passed all cycles to compare."""
         return self._bounds is not None and bool(len(series)) and int(series.records["cycle"][0]) >= self._bounds[1]
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Give the records of /scheme, piece by piece."""
+        """Yield the records of /scheme, piece by piece."""
         zero_ns = self.zero_ns
         for piece in self._stream:
             if self._is_over(piece.series["/scheme"]):

@@ -78,7 +78,7 @@ def trend_page(found: Sequence[Trend]) -> str:
 
 
 def _track_of(trend: Trend, name: str) -> Track:
-    """Give thresholds, friction, offsets and margins over the dates of the runs."""
+    """Return thresholds, friction, offsets and margins over the dates of the runs."""
     dated = [row for row, run in enumerate(trend.runs) if run.started is not None]
     at_s = [run.started.timestamp() for run in trend.runs if run.started is not None]
     panels = []

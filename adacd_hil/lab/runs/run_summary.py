@@ -103,7 +103,7 @@ class RunSummary:
 
 
 def find_runs(folder: Path) -> Iterator[Path]:
-    """Give the folders of runs in a folder, by name; only the folder itself if it is a run. Ignores links.
+    """Yield the folders of runs in a folder, by name; only the folder itself if it is a run. Ignores links.
 
     A folder whose log lacks its first part is also a run. A folder that can't be read is given as a run, so that the
     list names it.
@@ -217,7 +217,7 @@ def _headed(summary: RunSummary, info: LogInfo, settings: Settings | None) -> Ru
 
 
 def _started(log: Path, start_ns: int = 0) -> tuple[datetime | None, str]:
-    """Give when a run began, local time, and the source. start_ns: by the log, 0 in lockstep, which has no date."""
+    """Return when a run began, local time, and the source. start_ns: by the log, 0 in lockstep, which has no date."""
     try:
         if start_ns:
             return datetime.fromtimestamp(start_ns // 1_000_000_000).astimezone(), "log"
@@ -232,7 +232,7 @@ def _started(log: Path, start_ns: int = 0) -> tuple[datetime | None, str]:
 
 
 def _report_of(folder: Path, info: LogInfo) -> dict[str, Any] | None:
-    """Give report.json where it is of the whole of this log; None without one. Raises LogError, which says why not."""
+    """Return report.json if it is of the whole log; None without one. Raises LogError with the reason if it isn't."""
     path = folder / JSON_NAME
     if not path.exists():
         return None
@@ -337,7 +337,7 @@ def _first_adaptation(table: Mapping[str, Any]) -> str | None:
 
 
 def _threshold(table: Mapping[str, Any]) -> Pair | None:
-    """Give the smallest of the channels' median thresholds while the arm was watched for the first time."""
+    """Return the smallest of the channels' median thresholds while the arm was watched for the first time."""
     margins = table["certified"]["margins"]
     for section in _sections(table, "detection"):
         if channels := margins.get(section["label"]):
@@ -351,7 +351,7 @@ def _configured_threshold(settings: Settings | None) -> Pair | None:
 
 
 def _first_model(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Give friction and offsets of the first certificate without a payload, else what the paper's scheme identified."""
+    """Return friction and offsets of the first certificate without a payload, else those of the paper's scheme."""
     certified, section = table["certified"], _first_adaptation(table)
     if certified is None:
         return {"friction_Nm": _identified_friction(table["parameters"], section)}

@@ -89,7 +89,7 @@ class RunFilter:
     until: datetime | None = None
 
     def takes(self, run: RunSummary) -> bool:
-        """Tell whether a run meets all conditions."""
+        """Return whether a run meets all conditions."""
         if self.arms and not any(is_arm(run, arm) for arm in self.arms):
             return False
         if self.statuses and run.status not in self.statuses:
@@ -105,7 +105,7 @@ class RunFilter:
 
 
 def is_arm(run: RunSummary, arm: str) -> bool:
-    """Tell whether a run is of an arm: its name in the list, its configuration, or a pattern such as `lab-*`."""
+    """Return whether a run is of an arm: its name in the list, its configuration, or a pattern such as `lab-*`."""
     return any(name and fnmatch.fnmatchcase(name, arm) for name in (run.arm, run.config))
 
 

@@ -176,7 +176,7 @@ def _changes(runs: Sequence[RunSummary], values: Vector, std: Vector, share: flo
 
 
 def _is_meant(run: RunSummary, before: RunSummary) -> bool:
-    """Tell whether settings of the detection differ from those of the run before."""
+    """Return whether settings of the detection differ from those of the run before."""
     return any(key.startswith(_DETECTION) for key in _changed(run, before))
 
 

@@ -82,7 +82,7 @@ class ExcitationLimits(NamedTuple):
     torque_Nm: Vector
 
     def by_figure(self) -> dict[str, list[float] | None]:
-        """Give the limits by the names of `Figures`, in their units; None: no limit."""
+        """Return the limits by the names of `Figures`, in their units; None: no limit."""
         degrees = zip(("travel_deg", "velocity_deg_s", "acceleration_deg_s2"), self[:3], strict=True)
         torque = self.torque_Nm.tolist() if np.all(np.isfinite(self.torque_Nm)) else None
         return {name: np.degrees(limit).tolist() for name, limit in degrees} | {"torque_Nm": torque}

@@ -91,7 +91,7 @@ class Plan:
         return tuple(dict.fromkeys(key for changes in self.variants for key, _ in changes))
 
     def tasks(self, done: frozenset[str], rows_per_task: int) -> Iterator[Task]:
-        """Give the tasks whose rows are not done, lazily, subject by subject."""
+        """Yield the tasks whose rows are not done, lazily, subject by subject."""
         for subject in self.subjects:
             rows = [SweepRow(self._key(subject, changes), changes) for changes in self.variants]
             rows = [row for row in rows if row.key not in done]

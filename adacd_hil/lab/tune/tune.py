@@ -273,7 +273,7 @@ _LEAST_RATE: Final = 1e-6
 
 @contextmanager
 def _axes(title: str) -> Iterator[tuple[Figure, Axes]]:
-    """Give a figure and its axes, with room for a legend at the right."""
+    """Yield a figure and its axes, with room for a legend at the right."""
     with style():
         figure = Figure(figsize=(10.0, 4.6))
         axes = figure.subplots()

@@ -215,7 +215,7 @@ def _count(peaks: Vector, trials: tuple[Trial, ...] | None, thresholds: Vector) 
 
 
 def delay_ms(trial: Trial, thresholds: Vector) -> float | None:
-    """Give when some statistic is first over its threshold, ms after the onset; None: never."""
+    """Return when some statistic is first over its threshold, ms after the onset; None: never."""
     over = np.flatnonzero((trial.statistic > thresholds).any(axis=(1, 2)))
     return float(trial.since_s[over[0]]) * 1e3 if over.size else None
 
@@ -347,14 +347,14 @@ def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
 
 
 def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterator[TrueContact]:
-    """Give the contacts on the host's cycles, but for those of attempts that the log lacks."""
+    """Yield the contacts on the host's cycles, but for those of attempts that the log lacks."""
     for contact in contacts:
         if contact.attempt < len(begins):
             yield contact.counted_from(begins[contact.attempt])
 
 
 def _windows(contacts: Sequence[TrueContact], t_ns: Times, place: int | None) -> tuple[Window, ...]:
-    """Give the rows of contacts. place: of the log; None for a single log."""
+    """Return the rows of contacts. place: of the log; None for a single log."""
     onsets_ns = np.array([contact.onset_ns for contact in contacts], np.int64)
     until_ns = explained_until(onsets_ns, np.array([contact.forgotten_ns for contact in contacts], np.int64))
     firsts = np.searchsorted(t_ns, onsets_ns).tolist()

@@ -46,7 +46,7 @@ NO_FILES = TlsFiles()
 
 @contextlib.contextmanager
 def connect(scheduler: str, count: int, tls: TlsFiles = NO_FILES, preload: tuple[str, ...] = ()) -> Iterator["Workers"]:
-    """Give the workers of a Dask scheduler at an address, or, if that is empty, `count` processes of this machine.
+    """Yield the workers of a Dask scheduler at an address, or, if that is empty, `count` processes of this machine.
 
     preload: modules that the processes import before their first task.
 
