@@ -262,17 +262,17 @@ class _Finder(ast.NodeVisitor):
             if isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant):
                 continue  # documentation
             if self._depth == 0 and isinstance(statement, ast.Assign | ast.AnnAssign) and statement.value is not None:
-                self._drop_rows(statement.value)
+                self._count_wrong_rows(statement.value)
             self.visit(statement)
 
-    def _drop_rows(self, value: ast.expr) -> None:
+    def _count_wrong_rows(self, value: ast.expr) -> None:
         """Offer a table without each of its rows; of nested tables only dicts in dicts are tables again."""
         if isinstance(value, ast.Call):
             for argument in value.args:
-                self._drop_rows(argument)
+                self._count_wrong_rows(argument)
         elif isinstance(value, ast.BinOp):
-            self._drop_rows(value.left)
-            self._drop_rows(value.right)
+            self._count_wrong_rows(value.left)
+            self._count_wrong_rows(value.right)
         elif isinstance(value, ast.Tuple | ast.List | ast.Set) and len(value.elts) > 1:
             for index, row in enumerate(value.elts):
                 self._drop(row, value.elts[index - 1] if index else None, value.elts[index + 1 :])
@@ -281,7 +281,7 @@ class _Finder(ast.NodeVisitor):
             for index, (first, row) in enumerate(zip(rows, value.values, strict=True)):
                 self._drop(row, value.values[index - 1] if index else None, rows[index + 1 :], first)
                 if isinstance(row, ast.Dict):
-                    self._drop_rows(row)
+                    self._count_wrong_rows(row)
 
     def _drop(
         self, row: ast.expr, previous: ast.expr | None, following: Sequence[ast.expr], first: ast.expr | None = None

@@ -201,7 +201,7 @@ def quoted(path: Path) -> str:
 
 
 @contextmanager
-def checked_place(out: Path | None) -> Iterator[None]:
+def writable_folder(out: Path | None) -> Iterator[None]:
     """Before the block, make the folder of a result and test that a file can be written in it; None: do nothing.
 
     A folder that was made and is empty at the end is removed. Raises CommandError.

@@ -66,7 +66,7 @@ def host_cycles(cycle: Cycles, attempt: Cycles, begins: Cycles) -> Cycles:
 
     attempt: of each cycle (m,), from 0. begins: the host's number of the first cycle of each attempt (k,).
     """
-    return np.asarray(cycle + whole_rounds(begins)[np.minimum(attempt, len(begins) - 1)])
+    return np.asarray(cycle + cycle_offsets(begins)[np.minimum(attempt, len(begins) - 1)])
 
 
 def host_span(span: EmulatorSpan, begins: Cycles) -> Span:
@@ -79,7 +79,7 @@ def host_span(span: EmulatorSpan, begins: Cycles) -> Span:
     return Span(first, last if attempts[1] < len(begins) else _NEVER)
 
 
-def whole_rounds(begins: Cycles) -> Cycles:
+def cycle_offsets(begins: Cycles) -> Cycles:
     """Return per attempt the host's cycle numbers minus the emulator's (k,).
 
     begins: the host's number of the first cycle of each attempt (k,).

@@ -43,7 +43,7 @@ class LinkBody(NamedTuple):
     inertia_kg_m2: float
 
 
-def find_bodies(
+def bodies_of(
     theta: Sequence[float], length1_m: float, gravity_m_s2: float = GRAVITY_M_S2
 ) -> tuple[LinkBody, LinkBody]:
     """Return two rigid links with the parameters `theta` (p,), p = 7 or 9. Raises ValueError if no links have them.
@@ -88,7 +88,7 @@ def robot_description(settings: Settings) -> str:
     bodies: tuple[LinkBody, ...] = ()
     try:
         gravity_m_s2 = GRAVITY_M_S2 * math.sin(tilt_rad)
-        bodies = find_bodies(arm.cad_theta, arm.link_length_m[0], gravity_m_s2) if arm.cad_theta else ()
+        bodies = bodies_of(arm.cad_theta, arm.link_length_m[0], gravity_m_s2) if arm.cad_theta else ()
         reason = "arm.cad_theta is not given"
     except ValueError as error:
         reason = f"arm.cad_theta: {error}"

@@ -25,7 +25,7 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LogStream, Piece, Series
-from adacd_hil.log.types.record_arrays import FRAME_TOPICS, as_logged
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS, receivable_frames
 from adacd_hil.replay.log_source import CycleStretch, LogSource, Part, Places, find_resets
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
@@ -80,7 +80,7 @@ def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording
     """
     found = read_frames(path)
     sync_id = codec.message("Sync").can_id
-    frames = as_logged(_of_busiest_channel(found.frames, sync_id))
+    frames = receivable_frames(_of_busiest_channel(found.frames, sync_id))
     frames["is_tx"] = np.isin(frames["can_id"], [m.can_id for m in codec.messages.values() if "HOST" in m.senders])
     sync = np.flatnonzero((frames["can_id"] == sync_id) & ~frames["is_error"] & (frames["length"] > 0))
     if sync.size == 0:
@@ -267,7 +267,7 @@ class RecordingAlone:
         starts = sorted(begins)
         for attempt, (start, end) in enumerate(pairwise([*starts, len(number)])):
             mine = frames[begins[start] : begins.get(end, len(frames))]
-            kept = end - _disabling(mine, t_ns[start:end], self.codec)
+            kept = end - _count_disabling_cycles(mine, t_ns[start:end], self.codec)
             if kept > start:
                 ticks = Ticks(
                     number[start:kept], t_ns[start:kept], np.diff(number[start:kept], prepend=number[start] - 1)
@@ -291,7 +291,7 @@ class RecordingAlone:
         return notes
 
 
-def _disabling(frames: NDArray[Any], t_ns: Places, codec: Codec) -> int:
+def _count_disabling_cycles(frames: NDArray[Any], t_ns: Places, codec: Codec) -> int:
     """Return how many cycles at the end of an attempt command both drives off; at most as many as a host sends.
 
     t_ns: of the attempt's cycles (n,).

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.logged_run import Truth, whole_rounds
+from adacd_hil.log.logged_run import Truth, cycle_offsets
 from adacd_hil.records import JOINTS, ContactReport, Vector
 from adacd_hil.settings.configuration import Settings
 
@@ -106,7 +106,7 @@ class TrueContact:
 
     def counted_from(self, first_cycle: int) -> "TrueContact":
         """Return the contact with cycles counted by the host, whose attempt begins with `first_cycle`."""
-        return replace(self, cycle=self.cycle + int(whole_rounds(np.array(first_cycle))))
+        return replace(self, cycle=self.cycle + int(cycle_offsets(np.array(first_cycle))))
 
     def placed(
         self,
@@ -179,7 +179,7 @@ def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
     return until
 
 
-def owners(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times:
+def contacts_of_alarms(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times:
     """Return for each alarm (n,) the index of the contact that it is about; -1: of none, so that it is false.
 
     at (n,): times of the alarms. onsets (k,): of the contacts. until (k,): of `explained_until`.
@@ -197,9 +197,9 @@ def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossing
     still reacts, it can raise no alarm, and a crossing finds the contacts that begin meanwhile.
     """
     onsets, until = _bounds(contacts)
-    about = owners(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()
+    about = contacts_of_alarms(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()
     found = _first(about, [alarm.t_ns for alarm in alarms])
-    crossed = _first(owners(np.array(crossings_ns, np.int64), onsets, until).tolist(), crossings_ns)
+    crossed = _first(contacts_of_alarms(np.array(crossings_ns, np.int64), onsets, until).tolist(), crossings_ns)
     for place, contact in enumerate(contacts):
         if contact.is_reacting and place in crossed:
             found.setdefault(place, crossed[place])
@@ -233,7 +233,7 @@ class StreamJudge:
         begin before the last sample and aren't forgotten before the first.
         """
         rows = np.flatnonzero(is_over)
-        about = owners(t_ns[rows], *_bounds(contacts))
+        about = contacts_of_alarms(t_ns[rows], *_bounds(contacts))
         first = _first(about.tolist(), t_ns[rows].tolist())
         self._found = {contacts[place].number: at_ns for place, at_ns in first.items()} | self._found
         false_ns = t_ns[rows[(about < 0) & is_judged[rows]]]

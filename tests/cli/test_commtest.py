@@ -5,7 +5,7 @@ import re
 
 from rig import Rig
 
-from adacd_hil.lab.cli.commtest_command import as_text, describe, write_pictures
+from adacd_hil.lab.cli.commtest_command import as_text, describe, write_page
 from adacd_hil.lab.commission.communication_test import CommunicationReport, CommunicationTest, ZeroTorqueLoop
 from adacd_hil.lab.score.report_wording import number_text
 
@@ -52,7 +52,7 @@ def test_a_silent_device_and_a_missing_priority_are_warned_of():
 
 def test_the_page_has_the_curves_of_the_report_with_the_numbers_of_the_test(tmp_path):
     described, report = played(Rig(is_wall=True))
-    paths = write_pictures(tmp_path, report, described)
+    paths = write_page(tmp_path, report, described)
     assert [path.name for path in paths] == ["commtest.html"]
     page = paths[0].read_text(encoding="utf-8")
     slack = number_text(described["timing"]["times_us"]["slack"]["min"], 1)
@@ -64,4 +64,4 @@ def test_the_page_has_the_curves_of_the_report_with_the_numbers_of_the_test(tmp_
 def test_a_test_without_a_cycle_has_no_pictures(tmp_path):
     rig = Rig(is_wall=True)
     report = CommunicationTest(rig.settings, rig.arm, 1_000_000).report()
-    assert write_pictures(tmp_path, report, {}) == []
+    assert write_page(tmp_path, report, {}) == []

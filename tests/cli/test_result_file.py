@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from called import called
 
-from adacd_hil.cli.output import CommandError, checked_place, print_and_write
+from adacd_hil.cli.output import CommandError, print_and_write, writable_folder
 from adacd_hil.file_access import is_disk_full
 from adacd_hil.settings.run_settings import ExcitationSettings
 from adacd_hil.settings.schema import parse
@@ -27,7 +27,7 @@ sine = [[0.0, 0.0], [0.0, 0.0]]
 def test_a_place_is_tried_and_left_as_it_was(tmp_path):
     (tmp_path / "old.toml").write_text("kept")
     for out in (tmp_path / "old.toml", tmp_path / "new" / "newer" / "x.toml"):
-        with checked_place(out):
+        with writable_folder(out):
             assert not list(out.parent.glob(".*"))
     assert [path.name for path in tmp_path.iterdir()] == ["old.toml"]
     assert (tmp_path / "old.toml").read_text() == "kept"
@@ -43,7 +43,7 @@ def test_a_place_is_tried_and_left_as_it_was(tmp_path):
 )
 def test_a_place_that_takes_no_file_is_said_before_the_search(out, reason, tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(CommandError, match=rf"can't be written: {reason}"), checked_place(tmp_path / out):
+    with pytest.raises(CommandError, match=rf"can't be written: {reason}"), writable_folder(tmp_path / out):
         raise AssertionError("searched")
 
 

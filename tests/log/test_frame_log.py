@@ -11,7 +11,7 @@ from recorded_run import make_run, record
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.types.record_arrays import as_logged
+from adacd_hil.log.types.record_arrays import receivable_frames
 
 NOON_NS = 1_790_000_000_123_000_000
 """Whole milliseconds, as BLF's start."""
@@ -57,7 +57,7 @@ def test_lines_of_candump_are_read_as_they_stand(candump_log):
 
 
 def test_our_bus_end_has_neither_remote_frames_nor_29_bits_that_read_as_11(candump_log):
-    logged = as_logged(candump_log.frames)
+    logged = receivable_frames(candump_log.frames)
     assert [f"{can_id:X}" for can_id in logged["can_id"]] == [
         "44", "7FF", "18DAF110", "123", "123", "123", "204", "123",
     ]  # fmt: skip
@@ -140,7 +140,7 @@ def test_a_log_of_ours_gives_the_frames_that_its_reader_gives(tmp_path):
     record(path, run, epoch_ns=NOON_NS)
     log, own = read_frames(path), read_log(path)
     assert log.channels == ("vcan7",)
-    assert np.array_equal(as_logged(log.frames), own.frames)
+    assert np.array_equal(receivable_frames(log.frames), own.frames)
     assert (log.frames["is_fd"] == (log.frames["length"] > 8)).all()
     assert log.epoch_ns == NOON_NS
 

@@ -5,7 +5,7 @@ import os
 import numpy as np
 import pytest
 
-from adacd_hil.log.recording.ring import LEAST_BYTES, Ring, RingReader, room_of, split
+from adacd_hil.log.recording.ring import LEAST_BYTES, Ring, RingReader, padded_bytes, split
 
 MOST = 2**20
 
@@ -29,7 +29,7 @@ def packets_of(data):
 def test_what_is_put_comes_out_in_order(ring, reader):
     packets = [bytes([number]) * number for number in range(50)]
     assert all(ring.put_packet(packet) for packet in packets)
-    assert ring.waiting == reader.waiting == sum(map(room_of, range(50)))
+    assert ring.waiting == reader.waiting == sum(map(padded_bytes, range(50)))
     assert packets_of(reader.take_packets(MOST)) == packets
     assert reader.take_packets(MOST) == b""
     assert ring.waiting == 0
@@ -70,7 +70,7 @@ def test_a_packet_may_fill_the_ring(size, fits, ring, reader):
 def test_no_more_is_taken_than_asked_for_but_one_packet(ring, reader):
     packets = [b"a" * 100, b"b" * 100, b"c" * 500, b"d"]
     assert all(ring.put_packet(packet) for packet in packets)
-    assert packets_of(reader.take_packets(2 * room_of(100))) == packets[:2]
+    assert packets_of(reader.take_packets(2 * padded_bytes(100))) == packets[:2]
     assert packets_of(reader.take_packets(30)) == packets[2:3]
     assert packets_of(reader.take_packets(30)) == packets[3:]
 
@@ -91,7 +91,7 @@ def test_what_is_on_the_disk_is_counted(ring, reader):
 def test_a_packet_that_was_not_finished_is_not_there(ring, reader):
     """What a process leaves behind that is killed while it puts: HEAD has not moved."""
     ring.put_packet(b"whole")
-    place = os.fstat(ring.descriptor).st_size - ring.capacity + room_of(5)
+    place = os.fstat(ring.descriptor).st_size - ring.capacity + padded_bytes(5)
     os.pwrite(ring.descriptor, (100).to_bytes(4, "little"), place)
     assert packets_of(reader.take_packets(MOST)) == [b"whole"]
 

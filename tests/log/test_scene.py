@@ -23,7 +23,7 @@ from adacd_hil.lab.live.scene import (
     draw_joints,
     pack_scene,
     pack_transforms,
-    share_of_threshold,
+    residual_over_threshold,
     transforms_of,
 )
 from adacd_hil.records import ContactKind, ContactLevel, ContactReport, Location, Reaction, SchemeState
@@ -96,7 +96,7 @@ def test_a_joint_is_yellow_from_half_of_the_threshold_and_grey_while_detection_i
 
 @pytest.mark.parametrize("threshold", [math.inf, math.nan, 0.0])
 def test_without_a_threshold_there_is_no_share(threshold):
-    assert math.isnan(share_of_threshold(0.1, threshold))
+    assert math.isnan(residual_over_threshold(0.1, threshold))
 
 
 def test_a_force_whose_place_is_known_is_an_arrow_that_ends_there():

@@ -22,10 +22,10 @@ from adacd_hil.lab.commission.arm_draft import (
     Fact,
     PlanarArm,
     draft_arm,
+    draft_as_toml,
     draw_arm,
     planar_from_urdf,
     uniform_rods,
-    write_draft,
 )
 from adacd_hil.lab.commission.device_recognition import RecognisedDevice, choose_family, recognise
 from adacd_hil.lab.commission.host_checks import Status, look_for_socketcan
@@ -162,7 +162,7 @@ class Drafting:
         title += f" from {self.bus['interface']} {self.bus['channel']}." if self.bus else " without hardware."
         for period_us in _PERIODS_US if facts.period_us in _PERIODS_US else (facts.period_us,):
             draft = draft_arm(facts._replace(period_us=period_us))
-            text = write_draft(draft, title, self.writing.out.name)
+            text = draft_as_toml(draft, title, self.writing.out.name)
             if not self.writing.examine(text).is_late:
                 break
         summary: dict[str, Any] = {
@@ -273,7 +273,9 @@ class Drafting:
                     f"node {node.node_id}: {node.device_text}, neither drive nor sensor by 0x1000; give --drive-node "
                     "or --sensor-node for such a node"
                 )
-        chosen = [self._two(devices, kind, getattr(self.options, f"{kind}_node"), channel) for kind in (DRIVE, SENSOR)]
+        chosen = [
+            self._choose_two(devices, kind, getattr(self.options, f"{kind}_node"), channel) for kind in (DRIVE, SENSOR)
+        ]
         return chosen[0], chosen[1]
 
     def _ask_channel(self) -> str | None:
@@ -306,7 +308,7 @@ class Drafting:
         channel, _ = self.interview.ask("--channel or --no-bus", None, question, read, proposal)
         return None if channel == _NO_BUS else channel
 
-    def _two(
+    def _choose_two(
         self, devices: Sequence[RecognisedDevice], kind: str, given: tuple[int, int] | None, channel: str
     ) -> list[RecognisedDevice]:
         """Return the drives, or the sensors, of joint 1 and 2, asking for their node ids; warn if they are not given.
@@ -385,7 +387,7 @@ class Drafting:
             eds = Path(text)
             if not eds.is_file():
                 raise ConfigError(f"EDS {eds} is not there")
-            return self._write_drafts(eds, kind, {joint: device.ratings})[kind, joint]
+            return self._add_drafts(eds, kind, {joint: device.ratings})[kind, joint]
 
         question = f"EDS of the {kind} of joint {joint + 1} ({in_line(device.title)})"
         return self.interview.ask("--eds FILE", None, question, read)[0]
@@ -424,7 +426,7 @@ class Drafting:
                     f"{'; '.join(in_line(device.title) for device in same)}",
                     ExitCode.USAGE,
                 )
-            names |= self._write_drafts(
+            names |= self._add_drafts(
                 eds, kind, {joint: same[joint].ratings if same else DeviceRatings() for joint in fitting}
             )
         return names
@@ -445,7 +447,7 @@ class Drafting:
             found.append((eds, kind))
         return found
 
-    def _write_drafts(self, eds: Path, kind: str, ratings: dict[int, DeviceRatings]) -> dict[tuple[str, int], str]:
+    def _add_drafts(self, eds: Path, kind: str, ratings: dict[int, DeviceRatings]) -> dict[tuple[str, int], str]:
         """Draft profiles of an EDS, asking for missing values; add them and the EDS to the files to be written.
 
         ratings: by joint (0, 1) to draft for. Return the profiles' file names by kind and joint.

@@ -99,7 +99,7 @@ def run_commtest(
     described |= {"events": [f"{event.name}: {event.message}" for event in master.take_events()]}
     if recorder is not None:
         described |= {"log": str(recorder.path), "log_error": log_error}
-        described |= {"pictures": [str(path) for path in write_pictures(recorder.path.parent, report, described)]}
+        described |= {"pictures": [str(path) for path in write_page(recorder.path.parent, report, described)]}
     return described, _exit_code(report, fault, loop.is_interrupted, bool(log_error))
 
 
@@ -158,7 +158,7 @@ def _open_log(
     )
 
 
-def write_pictures(out: Path, report: CommunicationReport, described: dict[str, Any]) -> list[Path]:
+def write_page(out: Path, report: CommunicationReport, described: dict[str, Any]) -> list[Path]:
     """Write commtest.html into a folder, with tables and curves of the cycle's times as in the report of a run.
 
     described: the result of `run_commtest`. Return the files that were written, [] without a cycle. Raises LogError if

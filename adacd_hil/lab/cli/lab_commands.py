@@ -19,7 +19,7 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, answer, checked_place, explained, print_and_write
+from adacd_hil.cli.output import EPILOG, ExitCode, answer, explained, print_and_write, writable_folder
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.lab.cli.compare_command import compare
 from adacd_hil.lab.cli.history_command import history
@@ -171,7 +171,7 @@ def thresholds(
     from adacd_hil.lab.cli import thresholds_command as command
     from adacd_hil.lab.thresholds.detector_comparison import write_comparison
 
-    with checked_place(out):
+    with writable_folder(out):
         found, comparison = command.find(logs, rate_per_h, report is not None, stretch)
         text = command.as_json(found, comparison) if as_json else command.as_text(found, comparison)
         print_and_write(text, out, to_toml(found), as_json)
@@ -206,7 +206,7 @@ def excitation(
     from adacd_hil.lab.cli import excitation_command as command
     from adacd_hil.plain_values import json_text
 
-    with checked_place(out):
+    with writable_folder(out):
         found = command.search(config, profile, seconds, seed, out)
         text = json_text(found) if as_json else command.as_text(found)
         print_and_write(text, out, command.as_toml(config, found["excitation"]), as_json)

@@ -155,22 +155,22 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
             due_ns = drawn_ns + round(screen.redraw_s * 1e9)
             wake_ns = due_ns if end_ns is None else min(due_ns, end_ns)
             if (message := client.receive(max(0.0, (wake_ns - now_ns) * 1e-9))) is not None:
-                with _understood():
+                with _decoding():
                     monitor.accept_message(message)
             now_ns = clock.now_ns()
             if now_ns >= due_ns:
                 drawn_ns = now_ns
                 if is_live and not as_json:
-                    with _understood():
+                    with _decoding():
                         screen.draw_table(as_text(monitor.describe(), is_cut=screen.is_redrawn))
-        with _understood():
+        with _decoding():
             described = {"url": url} | monitor.describe()
     screen.end(json_text(described) if as_json else fold(as_text(described), terminal_columns()))
     return ExitCode.OK
 
 
 @contextlib.contextmanager
-def _understood() -> Iterator[None]:
+def _decoding() -> Iterator[None]:
     """Raise LogError in place of the block's decoding errors: the server doesn't serve a log of adacd-hil."""
     try:
         yield

@@ -10,7 +10,7 @@ from adacd_hil.device.contract import find_contract
 from adacd_hil.file_access import exists
 from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
 from adacd_hil.lab.cli.interview import Interview
-from adacd_hil.lab.commission.arm_draft import ArmDraft, Entry, write_draft
+from adacd_hil.lab.commission.arm_draft import ArmDraft, Entry, draft_as_toml
 from adacd_hil.log.log_files import log_in
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import settings_of
@@ -60,7 +60,7 @@ def draft_from_log(
     draft = ArmDraft(tuple(entries), tuple(warnings))
     title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]} from the log {path.name}."
     summary = {"from": str(path), "assumed": list(settings.assumed), "warnings": warnings}
-    written = write_draft(draft, title, files.out.name, base)
+    written = draft_as_toml(draft, title, files.out.name, base)
     files.examine(written)
     return written, summary
 

@@ -89,7 +89,7 @@ class Monitor:
     def _accept(self, frame: Frame) -> None:
         if self._bus.frames_lost != self._dropped:
             self._dropped = self._bus.frames_lost
-            self._view.skip_loss()
+            self._view.restart_counters()
         self._view.accept(frame)
 
     def describe(self) -> dict[str, Any]:

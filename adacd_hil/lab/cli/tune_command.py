@@ -10,13 +10,13 @@ from adacd_hil.cli.options import json_option, stretch_options
 from adacd_hil.cli.output import (
     CommandError,
     ExitCode,
-    checked_place,
     explained,
     format_table,
     print_and_write,
     quoted,
     show,
     suggest,
+    writable_folder,
 )
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import log_in
@@ -71,7 +71,7 @@ def tune(
     paths = [log_in(given) for given in logs]
     if len(set(paths)) < len(paths):
         raise CommandError("a log is given twice: a choice can't be checked on the log it was made on", ExitCode.USAGE)
-    with checked_place(out):
+    with writable_folder(out):
         base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
         with Progress() as progress:
             found = find(paths, rate_per_h, config, progress, stretch)

@@ -111,7 +111,7 @@ class ArmExamination:
         return np.array(values, dtype=np.float64).reshape(len(values), JOINTS)
 
 
-def check_bus(patient: ArmExamination) -> Finding:
+def open_arm_bus(patient: ArmExamination) -> Finding:
     """Check that the bus opens; leave it open for the further checks."""
     patient.connect()
     return ok(f"{patient.tap.channel} is open")
@@ -145,7 +145,7 @@ def check_nodes(patient: ArmExamination) -> Finding:
     return ok(", ".join(f"{node.name} (node {node.node_id})" for node in expected))
 
 
-def check_boot(patient: ArmExamination) -> Finding:
+def boot_nodes(patient: ArmExamination) -> Finding:
     """Reset the communication of the nodes, and check that each boots."""
     patient.reset()
     return ok("all nodes booted after a reset of communication")
@@ -172,7 +172,7 @@ def check_contract(patient: ArmExamination) -> Finding:
     return ok(f"wire version {codec.wire_version}, layout digest 0x{codec.layout_digest:08X}")
 
 
-def check_set_up(patient: ArmExamination) -> Finding:
+def set_up_nodes(patient: ArmExamination) -> Finding:
     """Identify and configure the nodes as at the start of a run; name SYNC period and heartbeat. Raises DeviceError."""
     patient.master.identify()
     patient.master.configure()
@@ -229,7 +229,7 @@ def check_protection(patient: ArmExamination) -> Finding:
     return ok("every cyclic frame has an end-to-end header")
 
 
-def check_cycle(patient: ArmExamination) -> Finding:
+def play_cycles(patient: ArmExamination) -> Finding:
     """Start the nodes, run cycles with disabled drives, and store the cycles for the further checks."""
     patient.tap.take_passed()
     patient.master.start()
@@ -464,16 +464,16 @@ class HandMotion:
 
 
 ARM_CHECKS: tuple[Check[ArmExamination], ...] = (
-    Check("bus", check_bus, ("kernel", "interface", "controller")),
+    Check("bus", open_arm_bus, ("kernel", "interface", "controller")),
     Check("other masters", check_other_masters, ("bus",)),
     Check("nodes", check_nodes, ("bus", "other masters")),
-    Check("boot", check_boot, ("bus", "other masters", "nodes")),
+    Check("boot", boot_nodes, ("bus", "other masters", "nodes")),
     Check("contract", check_contract, ("boot",)),
-    Check("set-up", check_set_up, ("boot", "contract")),
+    Check("set-up", set_up_nodes, ("boot", "contract")),
     Check("PDO map", check_pdo_map, ("boot", "set-up")),
     Check("torque scale", check_torque_scale, ("boot", "set-up")),
     Check("protection", check_protection),
-    Check("cycle", check_cycle, ("boot", "contract", "set-up", "PDO map")),
+    Check("cycle", play_cycles, ("boot", "contract", "set-up", "PDO map")),
     Check("rate", check_rate, ("cycle",)),
     Check("load", check_load, ("cycle",)),
     Check("heartbeat", check_heartbeats, ("cycle",)),

@@ -195,7 +195,7 @@ def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str])
     limits = _position_limits(arm)
     if abs(bent_deg) <= _BENT_DEG:
         return (0.0, 0.0), limits
-    straight = _limit_about(arm, sign, bent_deg)
+    straight = _limit_about_stretched(arm, sign, bent_deg)
     if straight > 0.0:
         return (0.0, round(-bent_deg, 2)), np.array((limits[0], straight))
     doubts.append(
@@ -205,7 +205,7 @@ def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str])
     return (0.0, 0.0), limits
 
 
-def _limit_about(arm: SerialArm, sign: int, bent_deg: float) -> float:
+def _limit_about_stretched(arm: SerialArm, sign: int, bent_deg: float) -> float:
     """Return the largest |q2| that joint 2's limits allow on both sides of the stretched arm, deg; 0 or less: none.
 
     sign: URDF direction to model direction of joint 2. bent_deg: the model's q2 at the URDF's zero.
@@ -633,7 +633,7 @@ extends = "{base}"
 """
 
 
-def write_draft(draft: ArmDraft, title: str, name: str, base: str = "certified") -> str:
+def draft_as_toml(draft: ArmDraft, title: str, name: str, base: str = "certified") -> str:
     """Return a draft as the text of a commented TOML file.
 
     title: its first comment. name: of the file, for the commands in its comments. base: configuration that it extends.

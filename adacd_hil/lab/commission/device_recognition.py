@@ -17,10 +17,10 @@ from adacd_hil.lab.commission.profile_draft import (
     KINDS,
     SENSOR,
     DeviceRatings,
-    count_of,
     identity_of,
     is_of,
     shipped_profiles,
+    torque_of_count,
 )
 from adacd_hil.lab.commission.survey import BETWEEN_READS_S, Node
 from adacd_hil.records import JOINTS
@@ -103,7 +103,7 @@ def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> i
 
 def _read_ratings(remote: Any, kind: str) -> DeviceRatings:
     if kind == SENSOR:
-        return DeviceRatings(torque_Nm=count_of(_number(remote, 0x6131, 1), _number(remote, 0x6132, 1)))
+        return DeviceRatings(torque_Nm=torque_of_count(_number(remote, 0x6131, 1), _number(remote, 0x6132, 1)))
     read = {place: _number(remote, *place, is_signed=place in _SIGNED) for place in _OF_DRIVES}
     return DeviceRatings({place: value for place, value in read.items() if value is not None})
 

@@ -326,7 +326,7 @@ def check_permissions(host: Host) -> Finding:
     return ok("CAP_NET_ADMIN: the interface's queue can be emptied")
 
 
-def check_scheduler(host: Host) -> Finding:
+def request_scheduler(host: Host) -> Finding:
     """Request scheduler, processor, locked memory and shallow idle states, and check that they are granted."""
     grant = host.request_realtime()
     if grant.missing:
@@ -406,7 +406,7 @@ HOST_CHECKS: tuple[Check[Host], ...] = (
     Check("queue", check_queue, ("interface",)),
     Check("mtu", check_mtu, ("interface",)),
     Check("permissions", check_permissions),
-    Check("scheduler", check_scheduler),
+    Check("scheduler", request_scheduler),
     Check("throttling", check_throttling),
     Check("preemption", check_preemption),
     Check("processor", check_processor),

@@ -671,7 +671,7 @@ class _SensorWriter(_ProfileWriter):
         """Return the torque of one count by read-only unit and digits; None if they are writable or missing."""
         if self.is_factory(0x6131, 1) or self.is_factory(0x6132, 1):
             return None
-        return count_of(self.number(0x6131, 1), self.number(0x6132, 1))
+        return torque_of_count(self.number(0x6131, 1), self.number(0x6132, 1))
 
     def frames(self) -> list[str]:
         torque = next((place for place in _TORQUE_OBJECTS if self.has(*place)), None)
@@ -691,7 +691,7 @@ class _SensorWriter(_ProfileWriter):
         return lines
 
 
-def count_of(unit: int | None, digits: int | None) -> float | None:
+def torque_of_count(unit: int | None, digits: int | None) -> float | None:
     """Return the torque of one count of a sensor by 0x6131 and 0x6132, Nm; None if the unit is not a torque."""
     if unit is None or digits is None or unit & 0x00FFFFFF != NEWTON_METRE:
         return None

@@ -399,7 +399,7 @@ class BusView:
             entry = self._entries[frame.can_id] = _Entry(self._codec.by_id.get(frame.can_id))
         entry.accept(frame)
 
-    def skip_loss(self) -> None:
+    def restart_counters(self) -> None:
         """Let the counters in protected frames jump once without being counted as lost frames.
 
         For frames that this computer has lost.

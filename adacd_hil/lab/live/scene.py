@@ -189,7 +189,7 @@ def transforms_of(shape: Shape, q: Vector) -> tuple[Transform, ...]:
     )
 
 
-def share_of_threshold(tau_ext_hat: float, threshold: float) -> float:
+def residual_over_threshold(tau_ext_hat: float, threshold: float) -> float:
     """Return |residual| / threshold of a joint; NaN while detection is off."""
     return abs(tau_ext_hat) / threshold if 0.0 < threshold < math.inf else math.nan
 
@@ -198,7 +198,7 @@ def draw_joints(state: SchemeState, tau_ext_hat: Vector, threshold: Vector) -> t
     """Return the shapes that show both joints and the state; tau_ext_hat, threshold (2,), Nm."""
     entities = []
     for index, link in enumerate(LINK_NAMES):
-        share = share_of_threshold(float(tau_ext_hat[index]), float(threshold[index]))
+        share = residual_over_threshold(float(tau_ext_hat[index]), float(threshold[index]))
         sphere = Sphere((0.0, 0.0, 0.0), _diameter_m(share), _color(share))
         label = Label((0.0, 0.0, 0.5 * _ABOVE_M), _joint_text(float(tau_ext_hat[index]), share), _LABEL_HEIGHT_M, INK)
         entities.append(Entity(JOINT_NAMES[index], link, spheres=(sphere,), labels=(label,)))

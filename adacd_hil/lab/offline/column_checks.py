@@ -144,7 +144,7 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[Recordin
     yield from _against_effort(described, columns)
 
 
-def largest_torques(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
+def torques_and_limits(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
     """Return each joint's 99 % quantile of |tau_J| (n,), and its effort in the URDF (n,), inf if unknown.
 
     tau_J: (k, n).
@@ -154,7 +154,7 @@ def largest_torques(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
 
 
 def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    largest, effort = largest_torques(columns.tau_J, described.urdf)
+    largest, effort = torques_and_limits(columns.tau_J, described.urdf)
     is_over = largest > _BEYOND_EFFORT * effort
     if "A" in described.units.tau_J or not is_over.any():
         return
@@ -343,7 +343,7 @@ def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | 
     return (first, last) if is_long and is_moving else None
 
 
-def plateau(torque: Vector) -> tuple[float, float] | None:
+def clipped_torque(torque: Vector) -> tuple[float, float] | None:
     """Return the torque at which readings (k,) stop, as if clipped, and the share of readings there; None if none.
 
     Readings stop there if the band next to the extreme reading, as wide as the noise, holds far more of them than the

@@ -198,7 +198,7 @@ class _RowReader:
         try:
             row = [read(cells[place]) for place, read in self._plain]
         except (ValueError, OverflowError):
-            row = self._slowly(number, cells, into)
+            row = self._read_unusual_row(number, cells, into)
         if row is None:
             return None
         if len(cells) > self._cells and any(map(str.strip, cells[self._cells :])):
@@ -206,7 +206,7 @@ class _RowReader:
             return None
         return row if self._has_time else [(self._rows - 1) * self._described.sampling.period_s, *row]
 
-    def _slowly(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
+    def _read_unusual_row(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
         """Return the numbers of a row, nan for empty cells; None for a row with a cell that is no number.
 
         A row of units is noted in `into`, an unreadable row counted there.

@@ -13,7 +13,7 @@ import numpy as np
 
 from adacd_hil.file_access import read_input
 from adacd_hil.lab.logs.joint_state_bags import JOINT_STATES, is_bag, joint_state_topics, opened_bag
-from adacd_hil.lab.offline.column_checks import largest_torques
+from adacd_hil.lab.offline.column_checks import torques_and_limits
 from adacd_hil.lab.offline.recording_map import ISO, TIME_S, CsvSection, UnitsSection, time_unit_of, units_by_slope
 from adacd_hil.lab.offline.table_guess import TableGuess, guess_table
 from adacd_hil.lab.serial_arm.urdf import SerialArm, UrdfError, read_urdf
@@ -172,7 +172,7 @@ def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
 
 def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
     """Return "mNm" and the reason if a torque is far beyond the effort of the URDF, else "Nm"."""
-    largest, effort = largest_torques(tau, arm)
+    largest, effort = torques_and_limits(tau, arm)
     over = np.nan_to_num(largest / effort)
     joint = int(np.argmax(over))
     if over[joint] <= _BEYOND_EFFORT:

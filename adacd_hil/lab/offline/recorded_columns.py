@@ -131,9 +131,9 @@ class RecordedRows:
         if np.isneginf(self._begin_s) and np.any(np.isfinite(time_s)):
             self._begin_s = float(time_s[np.isfinite(time_s)][0])
         before_s = np.fmax.accumulate(np.concatenate(([self._latest_s], time_s)))
-        self._drop_rows(table, time_s == before_s[:-1], _DOUBLED, "{time} once more")
-        self._drop_rows(table, time_s < before_s[:-1], "out of order", "time goes back to {time}")
-        self._drop_rows(table, ~np.isfinite(time_s), "without a time", "it has no time")
+        self._count_wrong_rows(table, time_s == before_s[:-1], _DOUBLED, "{time} once more")
+        self._count_wrong_rows(table, time_s < before_s[:-1], "out of order", "time goes back to {time}")
+        self._count_wrong_rows(table, ~np.isfinite(time_s), "without a time", "it has no time")
         is_later = np.isfinite(time_s) & (time_s > before_s[:-1])
         self._latest_s = float(before_s[-1])
         self._kept.append(table[is_later])
@@ -144,7 +144,7 @@ class RecordedRows:
             remedy = "cut it" if self._span is None else "choose a part with --from and --until"
             raise LogError(f"recording {self._path} has more than {MOST_ROWS} rows: {remedy}")
 
-    def _drop_rows(self, table: Vector, is_wrong: NDArray[np.bool_], kind: str, words: str) -> None:
+    def _count_wrong_rows(self, table: Vector, is_wrong: NDArray[np.bool_], kind: str, words: str) -> None:
         """Count the wrong rows of a table by `drop`; the table keeps them. words: of the first one, with {time}."""
         for number, time in table[is_wrong, :2][:1].tolist():
             first = words.format(time=f"{time * self._unit_s:.9g} s")

@@ -23,7 +23,7 @@ from adacd_hil.lab.serial_arm import offline
 from adacd_hil.lab.serial_arm.offline import ModelEstimate, OfflineCertificate, OfflineSettings
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
-from adacd_hil.score.judge import explained_until, owners
+from adacd_hil.score.judge import contacts_of_alarms, explained_until
 
 FIT_SHARE = 0.6
 """Share of a recording that is fitted if the rest of it is the test."""
@@ -201,7 +201,7 @@ def watch(
     touches: int | None = None
     for stretch, detection in zip(recording.stretches, detections, strict=True):
         samples = np.array([sample for sample, _, _ in detection.contacts], np.int64)
-        about = _owners(stretch, samples, recording, settings)
+        about = _touch_indices(stretch, samples, recording, settings)
         for (sample, link, direction), place in zip(detection.contacts, about.tolist(), strict=True):
             is_true = None if stretch.is_touched is None else place >= 0
             start_s = stretch.start_s + sample * recording.period_s
@@ -222,7 +222,7 @@ def watch(
     )
 
 
-def _owners(
+def _touch_indices(
     stretch: RecordingStretch, samples: NDArray[np.int64], recording: ForeignRecording, settings: OfflineSettings
 ) -> NDArray[np.int64]:
     """Return the index of the touch that each contact belongs to, -1 without one.
@@ -231,7 +231,9 @@ def _owners(
     """
     firsts, ends = np.array(stretch.touches, np.int64).reshape(-1, 2).T
     onsets = firsts - round(recording.blur_s / recording.period_s)
-    return owners(samples, onsets, explained_until(onsets, ends - 1 + round(settings.isolation_s / settings.period_s)))
+    return contacts_of_alarms(
+        samples, onsets, explained_until(onsets, ends - 1 + round(settings.isolation_s / settings.period_s))
+    )
 
 
 def draw_watched(identified: Identified, watched: Watched, name: str) -> Drawing:

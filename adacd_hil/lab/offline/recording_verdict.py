@@ -22,7 +22,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from adacd_hil.lab.offline.column_checks import CLIPPED_REMEDY, RecordingFinding, find_faults, joined_names, plateau
+from adacd_hil.lab.offline.column_checks import (
+    CLIPPED_REMEDY,
+    RecordingFinding,
+    clipped_torque,
+    find_faults,
+    joined_names,
+)
 from adacd_hil.lab.offline.other_readings import UNITS, find_readings, mass_rows
 from adacd_hil.lab.offline.recording_import import ForeignRecording, samples
 from adacd_hil.lab.offline.recording_map import RecordingMap
@@ -436,7 +442,7 @@ def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFin
     for i, joint in enumerate(joints):
         if joint.is_explained or math.isnan(joint.share):
             continue
-        bound = plateau(samples((*fit.fitted, fit.tested), "tau_J")[:, i])
+        bound = clipped_torque(samples((*fit.fitted, fit.tested), "tau_J")[:, i])
         largest, rms = fit.certificate.residual_max_Nm[i], fit.certificate.residual_rms_Nm[i]
         yield RecordingFinding(
             f"{joint.name}: {percent(joint.share)} is explained, {100.0 * WHOLE:.0f} % are needed; the residual "

@@ -143,12 +143,12 @@ def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
 def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[Detection]) -> Score:
     """Return which contacts a run's own scheme detected, and its false alarms.
 
-    Alarms about the weight of a changed payload are left out, see `is_of_weight`.
+    Alarms about the weight of a changed payload are left out, see `is_payload_alarm`.
     """
-    return judge(contacts, [detection for detection in detections if not is_of_weight(run, detection.row)])
+    return judge(contacts, [detection for detection in detections if not is_payload_alarm(run, detection.row)])
 
 
-def is_of_weight(run: Run, row: int) -> bool:
+def is_payload_alarm(run: Run, row: int) -> bool:
     """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet."""
     truth, armed = run.truth, np.flatnonzero(run.state[:row] == SchemeState.MONITOR)
     if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:

@@ -283,7 +283,7 @@ class PacketWriter:
             channels[group.slots] = group.channels
             log_ns[group.slots] = group.t_ns
             sizes[group.slots] = group.rows.shape[1]
-        self._move_up(log_ns, channels)
+        self._make_monotonic(log_ns, channels)
         ends = np.cumsum(sizes)
         records = np.empty(ends[-1] if count else 0, np.uint8)
         for group in groups:
@@ -299,7 +299,7 @@ class PacketWriter:
         if self._watch is not None:
             self._watch(records, channels, log_ns, ends)
 
-    def _move_up(self, log_ns: Numbers, channels: NDArray[np.uint16]) -> None:
+    def _make_monotonic(self, log_ns: Numbers, channels: NDArray[np.uint16]) -> None:
         """Raise, in place, log times that would run backwards in their topic, which readers don't expect."""
         order = np.argsort(channels, kind="stable")
         for places in np.split(order, np.flatnonzero(np.diff(channels[order])) + 1):

@@ -19,7 +19,7 @@ from adacd_hil.file_access import create_file
 from adacd_hil.log.log_files import LogError, LogExistsError, find_parts
 from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.processes import LiveService, WriterSetup, start_module
-from adacd_hil.log.recording.ring import Ring, room_of
+from adacd_hil.log.recording.ring import Ring, padded_bytes
 from adacd_hil.log.recording.run_folder import check_free, make_room
 from adacd_hil.log.types.topics import run_channels, truth_channels
 from adacd_hil.records import PARAMETER_NAMES, Event
@@ -179,7 +179,7 @@ class Recorder:
         """Add a packet as soon as there is room; return False if the writer is dead or the ring is too small."""
         is_put = False
         with contextlib.suppress(OSError):  # the writer is dead
-            while not is_put and room_of(len(data)) <= self._ring.capacity:
+            while not is_put and padded_bytes(len(data)) <= self._ring.capacity:
                 self._socket.send(processes.ROOM)
                 if self._socket.recv(processes.MOST_BYTES) == processes.NOTHING:
                     break

@@ -25,7 +25,7 @@ _GRAIN = 8
 LEAST_BYTES = mmap.PAGESIZE
 
 
-def room_of(size: int) -> int:
+def padded_bytes(size: int) -> int:
     """Return the bytes that a packet of `size` bytes takes in the ring."""
     return (_SIZE.size + size + _GRAIN - 1) & -_GRAIN
 
@@ -79,7 +79,7 @@ class Ring(_SharedRing):
         """Add a packet and return True; return False, without waiting, if there is no room for it."""
         size = len(packet)
         head = self._head
-        end = head + room_of(size)
+        end = head + padded_bytes(size)
         if end > self._room_until:
             self._room_until = self._counts[_TAIL] + self.capacity
             if end > self._room_until:
@@ -139,7 +139,7 @@ class RingReader(_SharedRing):
         return data
 
     def _first_bytes(self, start: int) -> int:
-        return room_of(_SIZE.unpack(self._copy(start, _SIZE.size))[0])
+        return padded_bytes(_SIZE.unpack(self._copy(start, _SIZE.size))[0])
 
 
 def split(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -150,7 +150,7 @@ def split(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         (size,) = _SIZE.unpack_from(data, place)
         starts.append(place + _SIZE.size)
         sizes.append(size)
-        place += room_of(size)
+        place += padded_bytes(size)
     return np.array(starts, np.int64), np.array(sizes, np.int64)
 
 
@@ -158,7 +158,7 @@ def _whole_bytes(data: bytes) -> int:
     """Return the length of the whole packets at the beginning of the data."""
     place = 0
     while place + _SIZE.size <= len(data):
-        end = place + room_of(_SIZE.unpack_from(data, place)[0])
+        end = place + padded_bytes(_SIZE.unpack_from(data, place)[0])
         if end > len(data):
             break
         place = end

@@ -175,7 +175,7 @@ def is_sendable(frames: NDArray[Any]) -> NDArray[np.bool_]:
     return np.asarray(is_plain(frames) & ~frames["is_error"] & ~is_short_fd)
 
 
-def as_logged(frames: NDArray[Any]) -> NDArray[Any]:
+def receivable_frames(frames: NDArray[Any]) -> NDArray[Any]:
     """Return the frames that a bus end of ours could receive, (k,) of LONG_FRAME_DTYPE; drop the others."""
     chosen = frames[is_plain(frames)]
     logged = np.zeros(len(chosen), LONG_FRAME_DTYPE)
