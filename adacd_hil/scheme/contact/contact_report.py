@@ -85,10 +85,11 @@ def last_rows(rows: Vector, kept: int, count: int) -> Vector:
 
 @compiled
 def _peak(tau: Vector, sigma: float) -> float:
-    """Return the largest torque of (n,) samples: a mean over a part of the contact, less the bias of a noisy maximum.
+    """Return the signed peak torque of (n,) samples: their largest moving mean, less the bias of a noisy maximum.
 
-    The mean is longer in a longer contact. A blow's top is short. When the arm begins to react, the torque of its drive
-    jumps, and through the lag the estimate rings for some ten samples around the truth.
+    sigma: standard deviation of a sample. The mean is longer in a longer contact. A blow's top is short. When the arm
+    begins to react, the torque of its drive jumps, and through the lag the estimate rings for some ten samples around
+    the truth.
     """
     largest = np.max(np.abs(tau))
     width = max(int(np.sum(np.abs(tau) > 0.5 * largest)) // TOP_PARTS, 1)
@@ -102,7 +103,7 @@ def _peak(tau: Vector, sigma: float) -> float:
 
 
 def _report(m: CourseMemory, link: int, direction: tuple[int, int], **evidence: Any) -> ContactReport:
-    """Return a report of the contact's course with a scheme's evidence, and record its link in the course."""
+    """Return the report of a contact, and store `link` in `m`. evidence: the report's fields that `m` doesn't have."""
     m.link = link
     return ContactReport(
         cycle=int(m.detected_cycle),
@@ -117,9 +118,10 @@ def _report(m: CourseMemory, link: int, direction: tuple[int, int], **evidence: 
 
 
 def integrated_report(m: CourseMemory, y: Vector, integral: Vector, peak: Vector, a_rad_s: float) -> ContactReport:
-    """Report a contact of the paper's scheme; its impulse is y / a + integral of y.
+    """Return the report of a contact in the paper's scheme, and store its link in `m`.
 
-    y, integral, peak (2,): filtered external torque, its integral and its peak since the contact began.
+    y, integral, peak (2,): filtered external torque, its integral and its peak since the contact began. The impulse is
+    y / a + integral.
     """
     direction = int(m.direction[0]), int(m.direction[1])
     link = 2 if direction[1] else 1
@@ -127,15 +129,15 @@ def integrated_report(m: CourseMemory, y: Vector, integral: Vector, peak: Vector
 
 
 def new_rows(settings: Settings) -> Vector:
-    """Return the memory of the last cycles, empty, for `recalled_report`."""
+    """Return zeros (2 m, 7) for the rows of the last m cycles, see `put_row`."""
     period_s = settings.bus.period_s
     return np.zeros((2 * (round(BEFORE_S / period_s) + 2 * round(KIND_S / period_s)), _COLUMNS))
 
 
 def compile_recalled(settings: Settings) -> None:
-    """Run each compiled function of `recalled_report`, for one row and for several.
+    """Compile the functions of `recalled_report` by a call of each, with one row and with several.
 
-    numpy takes one row's columns as contiguous.
+    Both are needed: numpy takes one row's columns as contiguous, which is another type.
     """
     every = np.ones((8, _COLUMNS))
     for count in (1, 2):
@@ -147,13 +149,19 @@ def compile_recalled(settings: Settings) -> None:
 
 
 def _early_rows(rows: Vector) -> int:
-    """Return how many of the last rows belong to the contact that is detected in this cycle."""
+    """Return the number of rows since the last one with both joints below half of their thresholds, or below sigma.
+
+    They belong to the contact that is detected in the cycle of the last row. All rows if there is no such row.
+    """
     below = np.all(np.abs(rows[:, TAU]) <= np.maximum(ONSET_FRACTION * rows[:, THRESHOLD], rows[:, SIGMA]), axis=1)
     return len(rows) - int(np.flatnonzero(below)[-1]) - 1 if np.any(below) else len(rows)
 
 
 def recalled_report(settings: Settings, m: CourseMemory, every_row: Vector, cycle: int) -> ContactReport:
-    """Report a contact of the certified scheme in this cycle, from the samples since it began."""
+    """Return the report of a contact in the certified scheme, from its rows so far; store link and `early_rows` in `m`.
+
+    every_row: memory that `put_row` writes. cycle: the present one.
+    """
     period_s, length_m = settings.bus.period_s, settings.arm.link_length_m
     elapsed, kept = cycle - int(m.detected_cycle), int(m.kept_rows)
     if elapsed == 0:
@@ -185,7 +193,7 @@ def recalled_report(settings: Settings, m: CourseMemory, every_row: Vector, cycl
 
 
 def _link(rows: Vector) -> int:
-    """Return the touched link, 1 or 2, from the torque of joint 2."""
+    """Return the touched link: 2 if the mean torque of joint 2 over the rows of a contact is certain, else 1."""
     mean = np.abs(np.mean(rows[:, TAU], axis=0))
     sigma = float(rows[-1, SIGMA][1]) * np.sqrt(CORRELATED_SAMPLES / rows.shape[0])
     return 2 if mean[1] > CERTAIN * sigma + CROSS_SHARE * mean[0] else 1
@@ -203,9 +211,10 @@ to 100 ms left at most 0.142, the 301 pushes that rise in 0.2 to 1 s at least 0.
 
 
 def classify(tau_ext_wide_hat: Vector, sigma: Vector, period_s: float) -> ContactKind:
-    """Return the kind of a contact from its external torque (n, 2) with the filter undone, the window's end the last.
+    """Return PUSH if at least LEFT of the largest torque remains at the end of the samples, else HIT.
 
-    sigma: its standard deviation (2,), Nm.
+    tau_ext_wide_hat: external torque (n, 2), Nm, with the filter undone, from the contact's beginning to the end of
+    its window; sigma: its standard deviation (2,), Nm.
     """
     share = share_left(tau_ext_wide_hat, sigma, max(1, round(END_S / period_s)))
     return ContactKind.PUSH if share >= LEFT else ContactKind.HIT
@@ -213,7 +222,10 @@ def classify(tau_ext_wide_hat: Vector, sigma: Vector, period_s: float) -> Contac
 
 @compiled
 def share_left(tau: Vector, sigma: Vector, end_samples: int) -> float:
-    """Return the ratio of the torque at the end to the largest, 0 to 1."""
+    """Return the ratio of the mean torque of the last `end_samples` to the largest torque; 0 without any torque.
+
+    tau (n, 2), sigma (2,): the joints' torques are added in units of their standard deviations.
+    """
     count = tau.shape[0]
     largest = 0.0
     for k in range(count):

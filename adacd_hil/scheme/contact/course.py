@@ -78,7 +78,7 @@ class CourseMemory:
 
 
 def fill_constants(settings: Settings, k: CourseConstants) -> None:
-    """Fill the constants for the scheme of the settings."""
+    """Fill `k` in place from the settings."""
     wish, is_paper = settings.reaction, settings.scheme == "paper"
     window_s = settings.detector.isolation_window_s
     chosen = (("withdraw",) * JOINTS,) * len(ContactLevel) if is_paper else (wish.contact, wish.collision)
@@ -94,7 +94,7 @@ def fill_constants(settings: Settings, k: CourseConstants) -> None:
 
 
 def begin(m: CourseMemory) -> None:
-    """Fill the course's memory before the first cycle."""
+    """Set the level to CONTACT before the first cycle; all else begins with 0."""
     m.level = ContactLevel.CONTACT
 
 
@@ -115,10 +115,13 @@ def follow(
     tau_ext_hat: Vector,
     tau_ext: Vector,
 ) -> bool:
-    """Process one cycle and return whether a report is due in it.
+    """Choose the reaction to a contact in this cycle; return whether a report of the contact is due.
 
-    supervisor: its memory, after its step. is_valid: there is a model to float with. tau_ext_hat: filtered, for the
-    reaction; tau_ext: gives the direction of a joint when it crosses its threshold.
+    Clear the contact when the supervisor has left the state of reaction.
+
+    supervisor: its memory, after its step. observation: bit COLLISION, and from bit CONTACT_SHIFT on one bit per joint
+    over its threshold. is_valid: there is a model to float with. tau_ext_hat: filtered, for the reaction; tau_ext:
+    gives the direction of a joint when it crosses its threshold.
     """
     if not IS_REACTING[supervisor.state]:
         _leave(k, m, supervisor.state)
@@ -144,7 +147,7 @@ def follow(
 
 @compiled
 def _leave(k: CourseConstants, m: CourseMemory, state: int) -> None:
-    """Forget the contact, which is over: the arm goes on."""
+    """Clear the contact, and the reaction unless `is_kept`; cancel its due reports only in state FAULT."""
     if m.is_reacting != 0:
         m.is_reacting, m.link = 0, 0
         if k.is_kept == 0:
@@ -176,7 +179,10 @@ def _is_due(k: CourseConstants, m: CourseMemory, cycle: int, joints: int, tau_ex
 def _reconsider(
     k: CourseConstants, m: CourseMemory, level: int, is_latched: bool, tau_ext_hat: Vector, is_valid: bool
 ) -> None:
-    """Choose the reaction anew if the level, the latch or the link has changed."""
+    """Choose the reaction anew if the contact has a higher level or another link.
+
+    Stop an arm that goes on along its path, if the supervisor has latched the contact. Judge a withdrawal in force.
+    """
     level = max(level, m.level)
     is_other = level != m.level or m.link != m.cause_link
     if is_other and m.cause_link != 0 and m.is_given_up == 0:
@@ -202,7 +208,10 @@ def _possible(reaction: int, is_valid: bool) -> int:
 
 @compiled
 def _react(m: CourseMemory, reaction: int, tau_ext_hat: Vector, is_pushed: bool) -> None:
-    """Begin a reaction; is_pushed: a withdrawal moves along tau_ext_hat."""
+    """Set the reaction, and count its cycles from 0.
+
+    is_pushed: set the direction of withdrawal to that of tau_ext_hat, else to zeros.
+    """
     m.reaction = reaction
     size = np.sqrt(tau_ext_hat[0] * tau_ext_hat[0] + tau_ext_hat[1] * tau_ext_hat[1]) if is_pushed else 0.0
     for i in range(m.way.shape[0]):
@@ -212,7 +221,10 @@ def _react(m: CourseMemory, reaction: int, tau_ext_hat: Vector, is_pushed: bool)
 
 @compiled
 def _judge(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: bool) -> None:
-    """Give up a withdrawal if it pushes against an obstacle on the other side."""
+    """Count a cycle of a withdrawal; change to the `two_sided` reaction if the torque has turned against it.
+
+    The torque must be turned for TURNED_CYCLES in a row, the first `blind_cycles` not counted.
+    """
     m.cycles += 1
     if m.cycles <= k.blind_cycles:
         return

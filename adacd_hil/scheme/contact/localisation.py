@@ -58,14 +58,14 @@ class Place(NamedTuple):
 
 
 def on_link1(tau_1: float, sigma_1: float, length1_m: float) -> Place:
-    """Return the smallest force on link 1 that has the moment `tau_1` about joint 1."""
+    """Return the smallest force on link 1 that has the moment `tau_1` about joint 1, with an unknown lever arm."""
     return Place(Location.LINK_1, tau_1 / length1_m, sigma_1 / length1_m)
 
 
 def on_link2(
     tau_ext_wide_hat: Vector, q2: Vector, sigma: Vector, length_m: tuple[float, float], tip_margin_m: float = 0.03
 ) -> Place:
-    """Return force and lever arm of one contact without friction on link 2; the force is that of its peak.
+    """Return the peak force and the lever arm of a contact on link 2, as of one touch without friction.
 
     tip_margin_m: distance past the tip up to which a touch, of the load for instance, counts as one of the link's end.
     """
@@ -74,20 +74,26 @@ def on_link2(
 
 
 def blind_angle(force_N: float, lever_m: float, threshold_2: float) -> float:
-    """Return the half-angle, rad, about link 2's axis within which a force there stays below joint 2's threshold."""
+    """Return the half-angle, rad, about link 2's axis within which a force of this size leaves joint 2 below threshold.
+
+    pi / 2: a force of any direction at this lever arm does. threshold_2: of joint 2, Nm.
+    """
     moment = abs(force_N * lever_m)
     return math.asin(threshold_2 / moment) if moment > threshold_2 else 0.5 * math.pi
 
 
 def blind_angle_of_link1(tau_1: float, q2: float, length_m: tuple[float, float], threshold_2: float) -> float:
-    """Return the half-angle, rad, within which a force at link 2's end would have read as this one on link 1."""
+    """Return the half-angle, rad, about link 2's axis within which a force at its end looks like a force on link 1.
+
+    tau_1: torque of joint 1, Nm, which that force would have caused; threshold_2: of joint 2, Nm.
+    """
     across = abs(math.sin(q2))
     return blind_angle(abs(tau_1) / (length_m[0] * across), length_m[1], threshold_2) if across > 0.0 else 0.0
 
 
 @compiled
 def _top(forces: Vector) -> float:
-    """Return the largest median over a part of the samples (n,)."""
+    """Return the moving median of forces (n,) that is largest in size, with its sign; window: n / TOP_PARTS forces."""
     count = forces.shape[0]
     width = max(count // TOP_PARTS, 1)
     step = max((count - width) // TOP_PLACES, 1)
@@ -103,7 +109,7 @@ def _top(forces: Vector) -> float:
 def _fit(
     tau: Vector, q2: Vector, sigma: Vector, length1_m: float, length2_m: float, tip_margin_m: float
 ) -> tuple[int, float, float, float, float]:
-    """Return location, force, its sigma, lever arm and its sigma."""
+    """Return the number of the Location, force, its sigma, lever arm and its sigma; N and m, inf where not known."""
     count = tau.shape[0]
     weight = np.zeros(count)
     for k in range(count):

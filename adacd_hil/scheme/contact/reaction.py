@@ -29,7 +29,7 @@ class JointWay(NamedTuple):
     target: float
 
     def at(self, elapsed_s: float) -> tuple[float, float, float]:
-        """Return position, velocity and acceleration at this time; before the start, those of the start."""
+        """Return position, velocity and acceleration this long after the start; before it, those of the start."""
         position, velocity = self.position, self.velocity
         remaining_s = max(elapsed_s, 0.0)
         for acceleration, duration_s in self.parts:
@@ -46,14 +46,14 @@ class JointWay(NamedTuple):
 
     @property
     def duration_s(self) -> float:
-        """Time until rest."""
+        """Return the time from the start until rest."""
         return sum(duration_s for _, duration_s in self.parts)
 
 
 def time_optimal(
     position: float, velocity: float, target: float, velocity_limit: float, acceleration_limit: float
 ) -> JointWay:
-    """Plan the fastest way to rest at `target` within the limits; a velocity over its limit is braked first."""
+    """Return a joint's fastest motion to rest at `target` within the limits; brake a velocity over its limit first."""
     stop = position + velocity * abs(velocity) / (2.0 * acceleration_limit)
     sign = math.copysign(1.0, target - stop)
     distance = sign * (target - position)
@@ -74,9 +74,9 @@ class Withdrawal:
     def __init__(
         self, settings: Settings, q_d: Vector, dq_d: Vector, tau_ext_hat: Vector, start: Vector | None = None
     ) -> None:
-        """Plan from the present motion. Without an external torque the arm just stops.
+        """Plan from the present desired motion; without an external torque plan a stop.
 
-        start: where the withdrawal began, if not here; the distance since then is not covered again.
+        start: positions where the withdrawal began, if it is planned anew on the way; subtract the distance since then.
         """
         distance = np.radians(settings.reaction.distance_deg)
         velocity_limit = np.minimum(
@@ -104,11 +104,11 @@ class Withdrawal:
 
     @property
     def duration_s(self) -> float:
-        """Time until all joints are at rest."""
+        """Return the time from the plan's start until all joints are at rest."""
         return max(profile.duration_s for profile in self._profiles)
 
     def evaluate(self, elapsed_s: float, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
-        """Fill the desired motion (2,) at this time since the plan was made."""
+        """Fill q_d, dq_d, ddq_d (2,) in place with the desired motion this long after the plan's start."""
         for i, profile in enumerate(self._profiles):
             q_d[i], dq_d[i], ddq_d[i] = profile.at(elapsed_s)
 
@@ -122,13 +122,13 @@ class Withdrawal:
         return [i for i in range(JOINTS) if abs(self._soonest_stop(i)) > limit[i]]
 
     def _soonest_stop(self, joint: int) -> float:
-        """Return where a joint stops that brakes with its acceleration limit at once, rad."""
+        """Return the position, rad, where a joint stops if it brakes at its limit from the plan's start."""
         profile = self._profiles[joint]
         limit = math.radians(self._settings.reaction.acceleration_limit_deg_s2[joint])
         return profile.position + profile.velocity * abs(profile.velocity) / (2.0 * limit)
 
     def describe_beyond(self, joint: int) -> str:
-        """Return a message that gives where such a joint stops."""
+        """Return a message for a joint of `beyond`, from 0: its speed, its position limit, and where it stops."""
         arm, wish = self._settings.arm, self._settings.reaction
         profile = self._profiles[joint]
         return (
@@ -147,7 +147,10 @@ def _withdraw(
     velocity_limit: float,
     acceleration_limit: float,
 ) -> JointWay:
-    """Plan one joint's motion over `displacement`, cut off at the position limit, never back against it."""
+    """Return one joint's motion over `displacement`, cut off at the position limit, but never against its direction.
+
+    A joint that can't stop before that limit brakes at once.
+    """
     sign = math.copysign(1.0, displacement or velocity)  # a joint that is not pushed just stops
     room = position_limit - sign * position
     forward = sign * velocity

@@ -48,7 +48,10 @@ def estimate_external(tau_f: Vector, tau_f_hat: Vector, dc_gain: float, tau_ext_
 
 @compiled
 def follow_standstill(dq: Vector, standstill_rad_s: float, decay: float, standstill: Vector) -> None:
-    """Filter with DC gain 1, into `standstill` (2,) from 0 to 1, each joint's indicator of standing still."""
+    """Update `standstill` (2,) in place: each joint's share of standstill in the filter's memory, 0 to 1.
+
+    decay: the filter's factor for one period.
+    """
     for i in range(dq.shape[0]):
         target = 1.0 if abs(dq[i]) < standstill_rad_s else 0.0
         standstill[i] = target + decay * (standstill[i] - target)
@@ -56,14 +59,14 @@ def follow_standstill(dq: Vector, standstill_rad_s: float, decay: float, standst
 
 @compiled
 def fill_threshold(threshold_Nm: Vector, standstill: Vector, F_c: Vector, threshold: Vector) -> None:
-    """Fill the thresholds in force (2,), Nm: those of the settings, and the friction that may hold at standstill."""
+    """Fill `threshold` (2,), Nm: threshold_Nm plus `standstill`, 0 to 1, times Coulomb friction F_c, at least 0."""
     for i in range(threshold.shape[0]):
         threshold[i] = threshold_Nm[i] + standstill[i] * max(F_c[i], 0.0)
 
 
 @compiled
 def joints_over(tau_ext_hat: Vector, threshold: Vector) -> int:
-    """Return the joints over their threshold, eq. (14), as bits; a value that is not a number counts as over."""
+    """Return the joints over their threshold, eq. (14), bit i for joint i + 1; NaN counts as over."""
     joints = 0
     for i in range(tau_ext_hat.shape[0]):
         if not (abs(tau_ext_hat[i]) <= threshold[i]):
@@ -81,13 +84,16 @@ ONSET_FRACTION = 0.5
 
 @compiled
 def forget(wide: Wide) -> None:
-    """Forget the samples of the mean."""
+    """Set the samples in `history` to 0, from which `undo_filter` forms its mean."""
     wide.history[:] = 0.0
 
 
 @compiled
 def undo_filter(tau_ext_hat: Vector, decay: float, history: Vector, tau_ext_wide_hat: Vector) -> None:
-    """Put this sample into `history` and fill tau_ext_wide_hat (2,)."""
+    """Put tau_ext_hat (2,) first in `history`; fill tau_ext_wide_hat (2,), the mean torque with the filter undone.
+
+    decay: E, the filter's factor for one period.
+    """
     for i in range(tau_ext_hat.shape[0]):
         for k in range(history.shape[0] - 1, 0, -1):
             history[k, i] = history[k - 1, i]
@@ -110,7 +116,8 @@ def follow_contact(
 ) -> None:
     """Update the integral (2,) Nm s and the peak (2,) Nm of each joint's contact in place.
 
-    A joint that counts as untouched begins anew, but not while a report is open: its contact may be over by the end.
+    Below ONSET_FRACTION of its threshold a joint is untouched: both begin with 0 again. is_reporting: keep them, as a
+    report is open, by whose end the contact may be over.
     """
     for i in range(tau_ext_hat.shape[0]):
         if abs(tau_ext_hat[i]) <= ONSET_FRACTION * threshold[i] and not is_reporting:

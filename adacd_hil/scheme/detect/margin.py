@@ -63,10 +63,11 @@ class MarginWatch:
     def __init__(
         self, joints: int, horizon_blocks: float = 3600.0, memory_blocks: float = 300.0, warn_share: float = 0.75
     ) -> None:
-        """Begin without a reference.
+        """Begin without blocks and without a reference.
 
-        horizon_blocks: 3600 blocks of 1 s are an hour. warn_share: part of the first margin below which `warning`
-        reports.
+        horizon_blocks: blocks over which the largest peak is expected: 3600 blocks of 1 s are an hour.
+        memory_blocks: memory of the mean and the deviation, and number of blocks after which the reference is set.
+        warn_share: part of the reference below which `warning` reports a margin.
         """
         self._forget = 1.0 / memory_blocks
         self._horizon = math.log(horizon_blocks)
@@ -79,7 +80,10 @@ class MarginWatch:
         """Margin per joint (n,) when the watch had settled; None until then."""
 
     def add_block(self, ratio: Vector) -> None:
-        """Add the largest ratio of each joint (n,) in one contact-free block; a value that isn't finite is ignored."""
+        """Add each joint's largest ratio (n,) of statistic to threshold in a contact-free block; ignore NaN and inf.
+
+        Set `reference` at block number `memory_blocks`.
+        """
         if not np.isfinite(ratio).all():
             return
         self._blocks += 1
@@ -90,7 +94,7 @@ class MarginWatch:
             self.reference = self.margin
 
     def forget(self) -> None:
-        """Forget everything: the model or the thresholds have changed."""
+        """Drop all blocks and the reference, as after a change of the model or the thresholds."""
         self._blocks = 0
         self.reference = None
 
@@ -106,7 +110,10 @@ class MarginWatch:
 
     @property
     def warning(self) -> str:
-        """Return which joint's margin has shrunk: `joint 1: margin 1.4 x, was 2.1 x`; "" if all are unchanged."""
+        """Return the joints whose margin has shrunk below `warn_share` of the reference, as text; "" without one.
+
+        Such as `joint 1: margin 1.4 x, was 2.1 x`.
+        """
         if self.reference is None:
             return ""
         margin = self.margin
@@ -127,7 +134,7 @@ BLOCK_S = 0.064
 
 
 def constants_of(settings: Settings) -> MarginConstants:
-    """Return `excursions_Hz`, `shown` (2 C - 1,) and `block_cycles`."""
+    """Return, by channel (2 C - 1,), `excursions_Hz` and `shown`; and `block_cycles`, `mean_cycles`."""
     a = np.array(settings.certified.cutoffs_rad_s)
     return MarginConstants(
         excursions_Hz=np.concatenate([a, a[1:]]) / np.pi,
@@ -187,9 +194,10 @@ def follow_tail(k: Constants, m: Memory) -> None:
 
 
 def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> float:
-    """Return the excursions over a threshold per hour for a Gaussian tail: 3600 nu (nu T)^(-1 / s²).
+    """Return the expected excursions over a threshold per hour for a Gaussian tail: 3600 nu (nu T)^(-1 / s²).
 
-    largest_share: s, largest residual in seen_s, T, over its threshold; 1 / s = m(T) gives RATE.
+    excursions_Hz: nu, independent excursions per second. seen_s: T. largest_share: s, largest residual in T over the
+    threshold; 1 / s = m(T) gives RATE. 0 without a residual.
     """
     if not largest_share > 0.0:
         return 0.0
@@ -198,7 +206,7 @@ def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> flo
 
 
 def largest_share(m: Memory) -> float:
-    """Return the largest residual seen without contact, as a share of its threshold."""
+    """Return the largest ratio of a residual without contact to its present threshold, of all channels and joints."""
     return float(
         np.max(m.margin.peak.max(axis=0) / np.maximum(np.maximum(m.sensitivity.h_model, m.margin.tail_Nm), 1e-12))
     )
@@ -286,7 +294,7 @@ def follow_sight(k: Constants, m: Memory) -> bool:
 
 
 def describe_sight(m: Memory) -> str:
-    """Return smallest push, thresholds and residuals of the last test as text, joints separated by strokes."""
+    """Return the smallest push, thresholds and residuals of the last test as text, joint 1 / joint 2."""
     seen = np.cumsum(m.margin.seen, axis=0)
     worst_Nm = m.margin.seen_worst_Nm
     median, most = ([_quantile(seen[:, i], worst_Nm[i], share) for i in range(JOINTS)] for share in (0.5, 0.99))
@@ -298,13 +306,16 @@ def describe_sight(m: Memory) -> str:
 
 
 def describe_push(m: Memory) -> str:
-    """Return the smallest pushes of the last test as a short text."""
+    """Return the smallest push per joint that is found at the worst moment of the last test, as a short text."""
     pushes = " / ".join(f"{value:.2f}" for value in m.margin.seen_push_Nm)
     return f"pushes of {pushes} Nm at the joints: found within {1e3 * WITHIN_S:g} ms (estimate)"
 
 
 def describe_dim(m: Memory) -> list[str]:
-    """Return the joints with less sight than in the test, and since when, a line each."""
+    """Return a line for each joint whose mean smallest push is over LESS times the worst of the test.
+
+    It gives both pushes, for how long, and the cause.
+    """
     own = m.margin
     return [
         f"joint {i + 1} sees less than was certified: for {own.dim_s[i]:g} s of motion it has found pushes from "
@@ -316,7 +327,7 @@ def describe_dim(m: Memory) -> list[str]:
 
 
 def _why_dim(m: Memory, joint: int) -> str:
-    """Return the main cause of a joint's raised thresholds as text."""
+    """Return the first cause that applies to the raised thresholds of a joint, from 0, as text."""
     if np.any(m.margin.tail_Nm[:, joint] > m.sensitivity.h_model[:, joint]):
         return "residuals of both signs have come near the thresholds: the arm moves otherwise than its model"
     if m.sensitivity.strain[joint] > STRAIN_NAMED:
@@ -332,7 +343,10 @@ def _why_dim(m: Memory, joint: int) -> str:
 
 
 def _quantile(seen: Vector, worst_Nm: float, share: float) -> float:
-    """Return the upper end of the bin below which this share of the cycles lies; the worst value if that is less."""
+    """Return the threshold, Nm, that this share of the cycles doesn't exceed, at most worst_Nm.
+
+    seen (bins,): cycles up to each bin. The result is the upper end of a bin.
+    """
     place = int(np.searchsorted(seen, share * seen[-1]))
     if place == BINS - 1:
         return float(worst_Nm)

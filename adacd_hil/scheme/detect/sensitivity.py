@@ -88,7 +88,7 @@ _SMOOTHED_FALL_RAD_S = 600.0
 
 
 def noise_constants(certified: CertifiedSettings, period_s: float) -> NoiseConstants:
-    """Return, by channel (2 C - 1,), (k_tau sigma_tau)² in Nm² and nu² in rad²/s⁴."""
+    """Return, by channel (2 C - 1,), (k_tau sigma_tau)² in Nm² and nu² in rad²/s⁴; and weights of a sample in means."""
     a, s = np.array(certified.cutoffs_rad_s), certified.smoothing_rad_s
     width = np.concatenate([a * s / (a + s), a[1:]])
     smoothed = np.minimum(_SMOOTHED_SHARE * s / (1.0 + a / _SMOOTHED_FALL_RAD_S), 1.0)
@@ -111,12 +111,11 @@ def noise_constants(certified: CertifiedSettings, period_s: float) -> NoiseConst
 
 @compiled
 def follow_standstill(k: Constants, m: Memory, dq: Vector) -> None:
-    """Filter with DC gain 1, into `still` (C, n) from 0 to 1, each joint's indicator of possible standstill; smooth it.
+    """Update by one sample each joint's share of standstill in each filter's memory, 0 to 1.
 
-    `low_speed` (C, n): the same for a joint that moves slowly or not at all, not smoothed.
-
-    A joint that turns round between two samples has stood still, and by its lag
-    friction may turn a sample or two before the measured velocity does.
+    Written: `still` (C, n); `still_smooth`, the same behind the second low-pass; `low_speed`, for a joint that moves
+    slowly or not at all. A joint that turns round between two samples has stood still: by its lag friction may turn a
+    sample or two before the measured velocity does.
     """
     own = m.sensitivity
     for c in range(own.still.shape[0]):
@@ -165,7 +164,7 @@ def follow_torque_step(k: Constants, m: Memory, tau_J: Vector) -> None:
 
 @compiled
 def follow_velocity_noise(k: Constants, m: Memory, dq: Vector, is_steady: bool) -> None:
-    """Add one sample to the roughness (n,) of the velocity: its noise over the settings', squared.
+    """Update `velocity_roughness` (n,), at least 1, by one sample: the velocity's noise over the settings', squared.
 
     Noise shows in the second difference of dq, motion does not: at 1 kHz 50 rad/s³ make 5e-5 rad/s of it, a coarse
     encoder's counts 1e-3 and more. A single jump, as of a blow, counts as JUMP deviations at most. After a gap, or on
@@ -192,7 +191,7 @@ def follow_velocity_noise(k: Constants, m: Memory, dq: Vector, is_steady: bool) 
 
 @compiled
 def keep_velocity_noise(k: Constants, m: Memory) -> None:
-    """Keep the largest roughness (n,) of a sample without contact, until motion shows less.
+    """Raise `roughness_kept` (n,) to the velocity's roughness in a sample without contact; let it decay in motion.
 
     At rest an encoder without counts shows no noise, but shows it again with the first count.
     """
@@ -206,7 +205,7 @@ def keep_velocity_noise(k: Constants, m: Memory) -> None:
 
 @compiled
 def strain(m: Memory, largest: float) -> None:
-    """Raise the strain of the joints that are over their threshold.
+    """Double the strain, up to `largest`, of each joint that is over a threshold in any channel.
 
     A contact while learning may be the model's failure. One contact may be a hand; repeated ones come from an error
     that no parameter explains, such as backlash. Then the arm is armed with higher thresholds rather than never.
@@ -221,9 +220,10 @@ def strain(m: Memory, largest: float) -> None:
 
 @compiled
 def relax(k: Constants, m: Memory) -> None:
-    """Update the strain (n,) by one sample without contact.
+    """Update `strain` and `peak_share` (n,) by one sample without contact.
 
-    It decays while the residual is well below its threshold.
+    The strain decays towards 1 while the residual has stayed below RELAXED of its threshold; `peak_share` is the
+    largest residual over its threshold.
     """
     own = m.sensitivity
     for i in range(own.strain.shape[0]):
@@ -241,8 +241,8 @@ def follow_unit(k: Constants, m: Memory, fit: int, share: float, is_monitored: b
     """Update the unit (n,) of the belief's variances by one sample without contact; share: weight of the sample.
 
     fit: index of the filter whose residual counts. In a faster one the velocity's noise would count as the model's
-    error. is_monitored: the unit is the smaller one of both signs; else it is that of all residuals, and both signs
-    begin with it.
+    error. is_monitored: the unit is the smaller one of those of positive and of negative residuals. Else it is that of
+    all residuals, with which both signs begin.
     """
     own = m.sensitivity
     for i in range(own.unit.shape[0]):
@@ -265,14 +265,14 @@ def follow_unit(k: Constants, m: Memory, fit: int, share: float, is_monitored: b
 
 @compiled
 def _approach(unit: float, square: float, share: float) -> float:
-    """Return the unit after one sample, within its bounds."""
+    """Return `unit` moved by `share` of its way to `square`, within SMALLEST_UNIT and LARGEST_UNIT."""
     unit += share * (square - unit)
     return float(min(max(unit, external_torque.SMALLEST_UNIT), external_torque.LARGEST_UNIT))
 
 
 @compiled
 def fill_thresholds(k: Constants, m: Memory, h: Vector) -> None:
-    """Fill h (2 C - 1, n) from the constants `k` and the state `m` of the kernel."""
+    """Fill h (2 C - 1, n) with the present thresholds of all channels, Nm; update `doubt` and `h_model` of `m`."""
     own = m.sensitivity
     filters = m.filters.r.shape[0]
     for i in range(h.shape[1]):
@@ -291,7 +291,7 @@ def fill_thresholds(k: Constants, m: Memory, h: Vector) -> None:
 
 @compiled
 def momentum_noise(m: Memory, joint: int) -> float:
-    """Return (M R M')_ii of a joint."""
+    """Return (M R M')_ii of a joint, from 0: its momentum's noise for velocities of roughness R and noise 1."""
     total = 0.0
     for j in range(m.regressor.M.shape[1]):
         total += m.sensitivity.velocity_roughness[j] * m.regressor.M[joint, j] ** 2
@@ -300,9 +300,10 @@ def momentum_noise(m: Memory, joint: int) -> float:
 
 @compiled
 def follow_friction(k: Constants, m: Memory, tau_J: Vector) -> None:
-    """Fill the torque (n,) that friction may hold at standstill, and its part in each filter (C, n) now, Nm.
+    """Fill `hold` (n,), the torque that friction may hold at rest, and `held` (C, n), its part in each filter, Nm.
 
-    Friction at rest is not noise that averages out: for a joint that mostly rested it is inf, so that it is not learnt.
+    Friction at rest is not noise that averages out: `held` of a joint that mostly rested is inf, so that it is not
+    learnt.
     """
     own = m.sensitivity
     for i in range(own.hold.shape[0]):
@@ -313,13 +314,16 @@ def follow_friction(k: Constants, m: Memory, tau_J: Vector) -> None:
 
 @compiled
 def held_Nm(m: Memory, joint: int, still: float) -> float:
-    """Return the torque that friction may hold in a filter with a share `still` of standstill in its memory."""
+    """Return the torque, Nm, that friction at rest may add to a filter's output; inf from a share RESTING on.
+
+    joint: from 0. still: share of standstill in the filter's memory, 0 to 1.
+    """
     return float(m.sensitivity.hold[joint] * still) if still < RESTING else np.inf
 
 
 @compiled
 def _static_friction(k: Constants, m: Memory, joint: int, load_Nm: float) -> float:
-    """Return the largest friction of a joint that stands still under a torque, by the belief, Nm."""
+    """Return the largest friction, Nm, that the model in use allows for a joint at standstill under load_Nm."""
     coulomb = int(k.first_coulomb) + joint
     total = max(m.models.theta[coulomb], 0.0) + np.sqrt(max(m.models.P[coulomb, coulomb], 0.0))
     further = 0.0
@@ -335,7 +339,10 @@ def _static_friction(k: Constants, m: Memory, joint: int, load_Nm: float) -> flo
 
 @compiled
 def _threshold(k: Constants, m: Memory, channel: int, joint: int, momentum: float, g: float) -> float:
-    """Return a channel's threshold without the part for standstill, and store its value without the floor."""
+    """Return a channel's threshold, Nm, without the part for rest; store it in `h_model` without the tail's floor.
+
+    momentum: result of `momentum_noise`. g: deviation by the model's uncertainty, Nm.
+    """
     own = m.sensitivity
     lost = own.lost[filter_bank.filter_of(channel, own.lost.shape[0]), joint]
     noise = k.noise.torque_variance[channel] * own.roughness[joint] + k.noise.velocity_variance[channel] * momentum
@@ -346,7 +353,7 @@ def _threshold(k: Constants, m: Memory, channel: int, joint: int, momentum: floa
 
 @compiled
 def fill_wide(k: Constants, m: Memory, c: int) -> None:
-    """Fill standard deviation and lower threshold (n,) of the external torque with filter c undone.
+    """Fill `wide_sigma` and `wide_threshold` (n,), Nm: deviation and threshold of the torque with filter c undone.
 
     The undone filter is a mean over five samples of its input: its noise is white torque noise over five, and the
     velocity's change over five samples. The slow filters detect a slow push first: the threshold is the least of all
@@ -366,7 +373,7 @@ def fill_wide(k: Constants, m: Memory, c: int) -> None:
 
 @compiled
 def _doubt(k: Constants, m: Memory, w: Vector, unit: float) -> float:
-    """Return w (u P + D) w'."""
+    """Return w (u P + D) w', Nm²: variance of the model's torque for a regressor's row w (p,); unit: u."""
     total = 0.0
     for j in range(w.shape[0]):
         total += unit * w[j] * linalg.dot(m.models.P[j], w) + (k.model_error[j] * m.models.theta[j] * w[j]) ** 2
@@ -375,7 +382,7 @@ def _doubt(k: Constants, m: Memory, w: Vector, unit: float) -> float:
 
 @compiled
 def joints_over(y: Vector, h: Vector) -> int:
-    """Return the joints that are over their threshold in any channel, as bits; NaN counts as over.
+    """Return the joints over their threshold in any channel, bit i for joint i + 1; NaN counts as over.
 
     A bare channel needs the smoothed one of its filter to agree, see AGREES. A push makes them rise together; the trace
     of an encoder's step or a gear's play, a sample or two long, is in the bare one alone.
@@ -403,7 +410,7 @@ MOST_FILLED = 8
 
 
 def begin(m: Memory) -> None:
-    """Begin with the settings' noise: roughness and strain of 1."""
+    """Set roughness, unit and strain to 1 before the first sample: noise and residuals as in the settings."""
     own = m.sensitivity
     for ones in (own.roughness, own.roughness_now, own.roughness_kept, own.velocity_roughness, own.unit, own.strain):
         ones[:] = 1.0
@@ -411,13 +418,13 @@ def begin(m: Memory) -> None:
 
 @compiled
 def begin_fit(m: Memory) -> None:
-    """Begin with the settings' residuals of a good model."""
+    """Set the unit to 1 as a fit begins: residuals count as the settings' of a good model until they are measured."""
     m.sensitivity.unit[:] = 1.0
 
 
 @compiled
 def lift(m: Memory) -> None:
-    """Lift all thresholds to infinity, so that no torque is over one."""
+    """Set `wide_threshold` (n,) to inf, so that no torque counts as over it."""
     m.sensitivity.wide_threshold[:] = np.inf
 
 
@@ -430,7 +437,10 @@ def take_peak_shares(m: Memory) -> Vector:
 
 @compiled
 def follow_lost(k: Constants, m: Memory, dq: Vector, steps: int, period_s: float, is_seen: bool) -> None:
-    """Process a sample that came `steps` periods, `period_s`, after the last; is_seen: samples were interpolated."""
+    """Update `lost` (C, n), the variance by missing samples, by a sample that came `steps` periods after the last.
+
+    period_s: the whole interval. is_seen: its missing samples were interpolated; False: it was cut out of time.
+    """
     lost, before = m.sensitivity.lost, m.gaps.last[1]
     for c in range(lost.shape[0]):
         turn = k.cutoff[c] * period_s

@@ -70,9 +70,10 @@ def constants_of(settings: Settings) -> AnchorConstants:
 
 
 def unanchored_joints(settings: Settings) -> list[int]:
-    """Return the joints whose torque offset has no bound within `beta_Nm` from outside a run.
+    """Return the joints, from 0, whose torque offset neither tare, last certificate nor reading at rest bounds.
 
-    Such bounds are a tare, a last certificate, and a motor that holds little without power.
+    A bound counts if it is `beta_Nm` at most. That of the reading at rest includes the torque that the motor holds
+    without power.
     """
     arm, history = settings.arm, settings.history
     bounds_Nm = (
@@ -89,7 +90,7 @@ def _or_unknown(values: tuple[float, ...] | None) -> Vector:
 
 
 def begin(k: Constants, m: Memory) -> None:
-    """Fill the anchors before the first sample: the tare, and the last certificate."""
+    """Set the anchors before the first sample: the tare and the last certificate; all others are missing."""
     own = m.anchor
     own.anchor_std[:] = np.inf
     own.anchor_std[TARE] = k.anchor.zero_std_Nm
@@ -99,9 +100,10 @@ def begin(k: Constants, m: Memory) -> None:
 
 @compiled
 def measure(k: Constants, m: Memory, tau_J: Vector, is_resting: bool) -> None:
-    """Add one sample before the drives are enabled to the reading at rest, which begins anew when the arm moves.
+    """Add one sample before the drives are enabled to the reading at rest; drop the reading if the arm moves.
 
-    It is a mean over about the last `rest_cycles` samples, so a person who leaned before and has gone is forgotten.
+    The reading is a mean over about the last `rest_cycles` samples, so a person who leaned before and has gone is
+    forgotten.
     """
     own = m.anchor
     own.rest_count = min(own.rest_count + 1.0, k.anchor.rest_cycles) if is_resting else 0.0
@@ -123,9 +125,9 @@ def _rest_variance(k: Constants, m: Memory, joint: int) -> float:
 
 @compiled
 def is_rest_refused(k: Constants, m: Memory) -> bool:
-    """Return whether a joint's reading at rest is excluded by its tare, beyond the torque that the motor side may hold.
+    """Return whether a joint's reading at rest differs from its tare by more than noise and the torque the motor holds.
 
-    Judges a complete reading only: the supervisor counts as many cycles, so no arm goes on without one.
+    False while the reading has fewer than `rest_cycles` samples: the supervisor counts as many before the arm goes on.
     """
     own = m.anchor
     if own.rest_count < k.anchor.rest_cycles:
@@ -145,7 +147,10 @@ def is_rest_refused(k: Constants, m: Memory) -> bool:
 
 @compiled
 def is_within(k: Constants, m: Memory, theta: Vector, P: Vector) -> bool:
-    """Return whether a model's offsets are within the bounds of all anchors. theta (p,), P (p, p)."""
+    """Return whether the torque offsets of a model are within the bounds of all anchors; store the bounds as evidence.
+
+    theta (p,), P (p, p): the model. The last certificate is used only for a joint without a bound of `beta_Nm`.
+    """
     first_coulomb, is_within = int(k.first_coulomb), True
     evidence.fit(k, m, theta, P, min(np.max(m.sensitivity.unit), 1.0))
     for i in range(m.anchor.anchor_Nm.shape[1]):
@@ -163,13 +168,13 @@ def is_within(k: Constants, m: Memory, theta: Vector, P: Vector) -> bool:
 
 @compiled
 def _variance(k: Constants, m: Memory, kind: int, joint: int) -> float:
-    """Return sigma_a² + b² t."""
+    """Return the variance of an anchor, Nm²: its own, and the sensor's drift since it was measured."""
     return float(m.anchor.anchor_std[kind, joint] ** 2 + k.anchor.zero_drift_Nm2_s * m.evidence.age_s[kind])
 
 
 @compiled
 def is_excluded(m: Memory, joint: int, offset_Nm: float) -> bool:
-    """Return whether an anchor excludes another offset of a joint, by the bounds of the last judged fit."""
+    """Return whether `offset_Nm` of a joint, from 0, is outside an anchor's bounds for the last judged fit."""
     bounds_Nm = m.evidence.limit[:KINDS, OFFSETS + joint]
     return not bool(np.all(np.abs(offset_Nm - m.anchor.anchor_Nm[:, joint]) <= bounds_Nm))
 
@@ -178,7 +183,8 @@ def is_excluded(m: Memory, joint: int, offset_Nm: float) -> bool:
 def innovation(k: Constants, m: Memory, joint: int, offset_Nm: float, variance_Nm2: float) -> float:
     """Return (o - a) / (P_oo + sigma_a² + b² t) for the joint's best known anchor, 1/Nm; 0 without an anchor.
 
-    theta less P_o times this is the model corrected by the anchor as by a measurement of its offset.
+    o, P_oo: the fit's offset_Nm and variance_Nm2. theta less the offset's column of P times the result is the model
+    corrected by the anchor as by a measurement of the offset. joint: from 0.
     """
     kind = int(np.argmin(m.anchor.anchor_std[:, joint]))
     known = _variance(k, m, kind, joint)
@@ -190,7 +196,7 @@ def innovation(k: Constants, m: Memory, joint: int, offset_Nm: float, variance_N
 
 
 def accept(m: Memory, offset_Nm: Vector, std_Nm: Vector) -> None:
-    """Replace all anchors by offsets (n,), and their deviations, that the user accepts as the sensors' zero."""
+    """Drop all anchors, and set anchor ACCEPTED to the offsets (n,) that the user accepts as the sensors' zero."""
     m.anchor.anchor_std[:] = np.inf
     m.anchor.anchor_Nm[ACCEPTED] = offset_Nm
     m.anchor.anchor_std[ACCEPTED] = std_Nm
@@ -198,33 +204,33 @@ def accept(m: Memory, offset_Nm: Vector, std_Nm: Vector) -> None:
 
 
 def accept_reading(m: Memory) -> None:
-    """Accept the reading at rest, which the tare excludes, and drop the tare."""
+    """Drop the tare as an anchor: the user accepts the reading at rest, which contradicts it."""
     m.anchor.anchor_std[TARE] = np.inf
 
 
 @compiled
 def is_open(k: Constants, m: Memory, joint: int) -> bool:
-    """Return whether the last judged offset lacks an anchor as close as the test's bound, `beta_Nm`."""
+    """Return whether no anchor bounds the last judged torque offset of a joint, from 0, to `beta_Nm` or closer."""
     return bool(not (np.min(m.evidence.limit[:KINDS, OFFSETS + joint]) <= k.beta_Nm))
 
 
 def tightest(k: Constants, m: Memory, joint: int) -> int | None:
-    """Return the anchor that bounds the last judged offset most closely; None without an anchor."""
+    """Return the number of the anchor that bounds a joint's last judged offset most closely; None if none is close."""
     return None if is_open(k, m, joint) else int(np.argmin(m.evidence.limit[:KINDS, OFFSETS + joint]))
 
 
 def open_joints(k: Constants, m: Memory) -> list[int]:
-    """Return the joints whose last judged offset has no anchor, from 0."""
+    """Return the joints, from 0, whose last judged torque offset no anchor bounds to `beta_Nm`."""
     return [i for i in range(JOINTS) if tightest(k, m, i) is None]
 
 
 def is_anchored(k: Constants, m: Memory) -> bool:
-    """Return whether each offset that was judged last has an anchor."""
+    """Return whether an anchor bounds the last judged torque offset of each joint to `beta_Nm`."""
     return not open_joints(k, m)
 
 
 def judged_Nm(m: Memory) -> Vector:
-    """Return the offsets, or readings at rest, that were judged last (n,)."""
+    """Return a copy of the torque offsets (n,) that anchors judged last: a fit's, or readings at rest."""
     return np.array(m.evidence.fitted[OFFSETS : OFFSETS + JOINTS])
 
 
@@ -242,9 +248,9 @@ def describe(k: Constants, m: Memory) -> str:
 
 
 def describe_refused(m: Memory, is_reading: bool) -> list[str]:
-    """Return which of the last judged torques an anchor excludes, and by how much, a line each.
+    """Return a line for each joint and anchor that contradict each other in the last judged torques, with the bound.
 
-    is_reading: it was the reading at rest; else the offsets of a fit.
+    is_reading: the judged torques were readings at rest, else torque offsets of a fit.
     """
     lines = []
     for i, value in enumerate(judged_Nm(m).tolist()):
@@ -267,7 +273,10 @@ LARGEST_OF_STD = 2.5
 
 @compiled
 def is_place_bounded(k: Constants, m: Memory) -> bool:
-    """Return whether the fit's torque by place keeps to `arm.position_torque_Nm`; fill `by_place_Nm`."""
+    """Return whether the fit's torque by place is at most `arm.position_torque_Nm` in each joint; fill `by_place_Nm`.
+
+    True, without filling, for a model without such a torque.
+    """
     if k.position_torque_Nm == 0.0:
         return True
     is_place_bounded = True
@@ -294,7 +303,7 @@ def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
 
 
 def describe_place(k: Constants, m: Memory) -> str:
-    """Return the size of the certified model's torque by place, Nm, as text; empty without such a torque."""
+    """Return the last checked torque by place of each joint, and its bound, as text; empty without such a torque."""
     if k.position_torque_Nm == 0.0:
         return ""
     return (
@@ -303,7 +312,7 @@ def describe_place(k: Constants, m: Memory) -> str:
 
 
 def describe_place_refused(k: Constants, m: Memory) -> list[str]:
-    """Return the size of each joint's torque by place that is too large, a line each."""
+    """Return a line for each joint whose torque by place exceeds `arm.position_torque_Nm`, with the torque."""
     limit = float(k.position_torque_Nm)
     return [
         f"joint {i + 1} has a torque of up to {torque:.3f} Nm that depends on where the arm is, bound {limit:g} Nm"

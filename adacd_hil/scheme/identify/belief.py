@@ -49,7 +49,11 @@ _SETTLED = 1e-9
 
 @compiled
 def begin_fit(k: Constants, m: Memory, is_payload: bool) -> None:
-    """Begin to learn, and use the belief as the model: the prior, or the certified arm with a payload."""
+    """Set the belief to the prior, use it as the model, and empty the ring of waiting samples.
+
+    Learn the lags again, and end a pause. is_payload: set the belief to the certified model instead, widened by an
+    unknown payload.
+    """
     own = m.models
     own.is_payload = 1.0 if is_payload else 0.0
     if is_payload:
@@ -66,7 +70,7 @@ def begin_fit(k: Constants, m: Memory, is_payload: bool) -> None:
 
 @compiled
 def freeze(k: Constants, m: Memory) -> None:
-    """Use the belief, made physically possible, as the model."""
+    """Move negative friction in the belief to 0, use the belief as the model, and empty the ring of waiting samples."""
     first_coulomb = int(k.first_coulomb)
     keep_non_negative(first_coulomb - JOINTS, first_coulomb + JOINTS, m.models.belief, m.models.P_belief)
     _use(m)
@@ -75,7 +79,7 @@ def freeze(k: Constants, m: Memory) -> None:
 
 @compiled
 def certify(k: Constants, m: Memory) -> None:
-    """Declare the model in use certified, and begin to refine it."""
+    """Store the model in use as the certified one, hold the lags, and begin the test of the first candidate."""
     m.models.promotions = 0.0
     _certify(m)
     hold_lags(k, m)
@@ -98,13 +102,13 @@ def _use(m: Memory) -> None:
 
 @compiled
 def pause(m: Memory, cycles: float) -> None:
-    """Stop learning for at least so many cycles: the arm is touched, or a filter has to settle."""
+    """Set `recovering_cycles`, for which the arm doesn't learn, to at least `cycles`."""
     m.models.recovering_cycles = max(m.models.recovering_cycles, cycles)
 
 
 @compiled
 def is_free(k: Constants, m: Memory, is_touched: bool) -> bool:
-    """Count a cycle; return whether the arm has been free of contact for long enough to learn."""
+    """Count down the cycles without learning; return whether none is left. A touch renews them."""
     if is_touched:
         pause(m, k.recover_cycles)
     elif m.models.recovering_cycles > 0.0:
@@ -114,7 +118,7 @@ def is_free(k: Constants, m: Memory, is_touched: bool) -> bool:
 
 @compiled
 def learn_and_use(k: Constants, m: Memory) -> bool:
-    """Learn this sample as `learn` does, and use the belief at once; return whether the belief has changed."""
+    """Learn from a sample as `learn` does; if the belief has changed, use it as the model, and return True."""
     has_learnt = learn(k, m)
     if has_learnt:
         _use(m)
@@ -123,7 +127,7 @@ def learn_and_use(k: Constants, m: Memory) -> bool:
 
 @compiled
 def begin(prior: Vector, prior_std: Vector, theta: Vector, P: Vector) -> None:
-    """Set theta (p,) and P (p, p) to the prior and its standard deviations (p,)."""
+    """Set theta (p,) to the prior, and P (p, p) to the diagonal of prior_std² (p,), in place."""
     theta[:] = prior
     P[:] = 0.0
     for j in range(theta.shape[0]):
@@ -132,7 +136,11 @@ def begin(prior: Vector, prior_std: Vector, theta: Vector, P: Vector) -> None:
 
 @compiled
 def add_payload(direction: Vector, payload_std_kg: float, rest_std: Vector, P: Vector) -> None:
-    """Widen P (p, p) in place by a payload: mass along `direction` (p,), and a rest, `rest_std` (p,)."""
+    """Add the uncertainty of an unknown payload to P (p, p) in place.
+
+    direction (p,): parameters of a point mass of 1 kg at the tip. rest_std (p,): deviation by which a payload differs
+    from a point mass.
+    """
     for j in range(direction.shape[0]):
         for k in range(direction.shape[0]):
             P[j, k] += payload_std_kg**2 * direction[j] * direction[k]
@@ -141,9 +149,10 @@ def add_payload(direction: Vector, payload_std_kg: float, rest_std: Vector, P: V
 
 @compiled
 def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
-    """Widen P (p, p) in place by a random walk of the parameters, `drift_std` (p,) per √s, as far as it shows.
+    """Add the variance of a random walk of the parameters over elapsed_s to P (p, p) in place.
 
-    The walk is scaled by |w| of the row of W_f (n, p) that shows a parameter most, at most 1. A parameter that hardly
+    drift_std (p,): deviation after 1 s, grows with √s. It is scaled by the largest |w| of a parameter in W_f (n, p),
+    at most 1. A parameter that hardly
     shows would otherwise be learnt from the error of the others, such as friction that grows with the load from a load
     that hardly varies, and be far off where it counts.
     """
@@ -156,9 +165,9 @@ def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
 
 @compiled
 def learn(k: Constants, m: Memory) -> bool:
-    """Put this sample, W_learnt (n, p) and tau_learnt (n,), into the ring; return whether the belief has changed.
+    """Put each `learn_every`-th sample into the ring; correct the belief by the sample that leaves the full ring.
 
-    The sample that has waited long enough, if there is one, corrects the belief.
+    Return whether it was corrected. The sample: `W_learnt` (n, p) and `tau_learnt` (n,) of the filters.
     """
     own = m.models
     W, tau_J, still = m.filters.W_learnt, m.filters.tau_learnt, m.sensitivity.still_smooth[filter_bank.LEARNT]
@@ -194,7 +203,10 @@ def learn(k: Constants, m: Memory) -> bool:
 
 @compiled
 def hold_lags(k: Constants, m: Memory) -> None:
-    """Stop learning the lags; their remaining uncertainty stays, and moves no other parameter."""
+    """Stop learning the lags: clear their covariances with other parameters in P_belief, keep their variances.
+
+    `learn` subtracts their torque from later samples.
+    """
     m.models.are_lags_held = 1.0
     P = m.models.P_belief
     first = int(k.first_offset) + m.ring.tau.shape[1]
@@ -217,7 +229,7 @@ def _take_out_lags(k: Constants, m: Memory, place: int) -> None:
 
 @compiled
 def discard(m: Memory) -> None:
-    """Discard the waiting samples; the next one comes first in the ring."""
+    """Empty the ring of waiting samples; they never correct the belief."""
     m.ring.used = 0.0
     m.ring.next = 0.0
     m.models.since_learnt = 0.0
@@ -250,7 +262,7 @@ def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
 
 @compiled
 def restart_candidate(m: Memory) -> None:
-    """Begin the next test with the present belief."""
+    """Freeze the present belief as the candidate, and begin its test: set its count, squares and worst share to 0."""
     own = m.models
     own.candidate_cycles = 0.0
     own.candidate_square = 0.0
@@ -262,7 +274,11 @@ def restart_candidate(m: Memory) -> None:
 
 @compiled
 def test_candidate(k: Constants, m: Memory) -> bool:
-    """Add one sample to the test; return whether an anchor alone excludes a candidate that passes it."""
+    """Add one sample to the candidate's test; at the test's end use a better candidate as the certified model.
+
+    Begin the next test then. Return True only at the end of a test that the candidate passes, but for an anchor that
+    excludes its torque offset: the certificate is to be revoked.
+    """
     own = m.models
     own.candidate_cycles += 1.0
     for c in range(m.filters.W_f.shape[0]):

@@ -55,10 +55,10 @@ class Certificate(NamedTuple):
 
 
 def last_of(settings: Settings) -> tuple[Vector, Vector, Vector]:
-    """Return value, variance and slack (Q,) of the last certificate per quantity, inf for the variance if unknown.
+    """Return value, variance and slack (Q,) of the last certificate per quantity of `evidence`.
 
-    A viscous friction is computed from two frictions. Their deviations count as independent, which overestimates its
-    own.
+    The variance is inf for an unknown quantity, and for all without a last certificate. A viscous friction is computed
+    from two frictions. Their deviations count as independent, which overestimates its own.
     """
     history = settings.history
     counts = (FRICTIONS, INERTIAS, JOINTS, JOINTS)
@@ -83,26 +83,27 @@ def begin(settings: Settings, m: Memory) -> None:
 
 
 def forget(m: Memory) -> None:
-    """Stop the comparison with the last certificate: the user confirms that the arm is free of contact."""
+    """Empty the last certificate's source of evidence: the user confirms that the arm is free of contact."""
     evidence.empty_source(m, LAST)
 
 
 def is_compared(m: Memory) -> bool:
-    """Return whether the last certificate is compared with the fit: not with a payload that was announced."""
+    """Return whether the fit is compared with a last certificate: there is one, and no payload was announced."""
     return bool(m.evidence.variance[LAST, 0] != np.inf and not m.models.is_payload)
 
 
 @compiled
 def withhold(m: Memory, cause: int) -> None:
-    """Record the contradiction that withholds a certificate or takes it back; NOTHING clears the record."""
+    """Set `withheld_by` to the contradiction that withholds or revokes the certificate; NOTHING: there is none."""
     m.certificate.withheld_by = cause
 
 
 @compiled
 def contradicted_by(k: Constants, m: Memory) -> int:
-    """Return the source that contradicts the fit: an anchor, the fit itself, kept beliefs, the last certificate.
+    """Return the first contradiction of the fit, one of ANCHOR to TOO_MUCH_BY_PLACE, or NOTHING.
 
-    NOTHING if all agree with it.
+    In order: anchors, the fit's own samples and steps, kept beliefs, bound on torque by place, last certificate. If the
+    fit contradicts itself, keep its steps from before the change.
     """
     if not anchor.is_within(k, m, m.models.belief, m.models.P_belief):
         return ANCHOR
@@ -122,7 +123,7 @@ def contradicted_by(k: Constants, m: Memory) -> int:
 
 @compiled
 def is_no_more(k: Constants, m: Memory) -> bool:
-    """Return whether friction and inertia of the fit are within those of the last certificate."""
+    """Return whether no friction or inertia of the fit exceeds the last certificate's limit; True with a payload."""
     is_agreed = True
     for q in range(m.evidence.fitted.shape[0]):
         excess = evidence.weigh(k, m, LAST, q)
@@ -131,7 +132,7 @@ def is_no_more(k: Constants, m: Memory) -> bool:
 
 
 def describe_more(m: Memory, date_utc: str) -> list[str]:
-    """Return the quantities of which the fit has more than the last certificate, and by how much, a line each."""
+    """Return a line for each quantity of which the fit has more than the last certificate allows, with its bound."""
     difference, limit = m.evidence.difference[LAST], m.evidence.limit[LAST]
     return [
         f"{what} is {float(difference[q]):.3f} {unit} more than in the certificate of {date_utc}, "
@@ -141,7 +142,10 @@ def describe_more(m: Memory, date_utc: str) -> list[str]:
 
 
 def certificate_of(k: Constants, m: Memory, text: str) -> Certificate:
-    """Return the certificate of the model in use, which has just been certified. text: of its event."""
+    """Return a certificate of the model in use: its parameters, frictions, inertias and offsets, with deviations.
+
+    text: of the event that tells of it.
+    """
     base, first, theta, P = int(k.first_offset), FRICTIONS, m.models.theta, m.models.P
     rows = k.evidence.columns[:OFFSETS]
     values = rows @ theta

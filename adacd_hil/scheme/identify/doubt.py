@@ -85,7 +85,10 @@ STANDING = 0.6
 
 
 def causes_of(settings: Settings, count: int) -> Vector:
-    """Return c (h, p): a payload of 1 kg, then by joint Coulomb and viscous friction."""
+    """Return the change of the parameters (h, p) by each cause of one unit.
+
+    h: a payload of 1 kg, then Coulomb and viscous friction of joint 1, of joint 2. count: number p of parameters.
+    """
     unit = np.eye(count)
     first = PARAMETER_NAMES.index("F_c1"), PARAMETER_NAMES.index("F_v1")
     rows = [regressor.payload_direction(settings.arm.link_length_m, count, settings.gravity_m_s2)]
@@ -95,7 +98,7 @@ def causes_of(settings: Settings, count: int) -> Vector:
 
 @compiled
 def clear(m: Memory) -> None:
-    """Forget the sums of a contact."""
+    """Set the sums, the count of rows and the peak of the last contact to 0."""
     own = m.doubt
     own.L[:] = 0.0
     own.b[:] = 0.0
@@ -107,7 +110,7 @@ def clear(m: Memory) -> None:
 
 @compiled
 def begin(k: Constants, m: Memory) -> None:
-    """Begin a contact, with the samples that were held back."""
+    """Clear the sums, and add the samples from before the contact that wait in the ring, but for joints at rest."""
     clear(m)
     _follow_peak(m)
     for s in range(int(m.ring.used)):
@@ -118,7 +121,7 @@ def begin(k: Constants, m: Memory) -> None:
 
 @compiled
 def weigh(k: Constants, m: Memory) -> None:
-    """Add one sample of a contact to the sums; at rest, friction explains any torque of the joint."""
+    """Add one sample of a contact to the sums, but for joints at rest, whose friction explains any torque."""
     _follow_peak(m)
     for i in range(m.filters.tau_f.shape[1]):
         still = m.sensitivity.still_smooth[filter_bank.LEARNT, i]
@@ -135,7 +138,10 @@ def _follow_peak(m: Memory) -> None:
 
 @compiled
 def _add(k: Constants, m: Memory, i: int, w: Vector, tau: float, still: float, R: float) -> None:
-    """Add one row w (p,) of joint i to the sums."""
+    """Add one row w (p,) of joint i, from 0, with its torque `tau` to the sums.
+
+    still: share of standstill in the filter's memory, 0 to 1. R: variance that weights the row.
+    """
     own = m.doubt
     r = linalg.misfit(w, m.models.theta, tau)
     own.rr += r * r / R
@@ -185,18 +191,20 @@ class Doubt:
         self._contradiction: CommonCause | None = None
 
     def forget(self) -> None:
-        """Forget all contacts: a new certificate begins."""
+        """Forget all contacts, and the odds of weak ones, as a new certificate begins."""
         self._contacts.clear()
         self._log_odds, self._weak = 0.0, 0
 
     def go_on(self, cycle: int) -> None:
-        """Record that the arm monitors from this cycle on."""
+        """Store the cycle from which on the arm monitors again, to measure the time until the next contact."""
         self._monitored_s = cycle * self._period_s
 
     def begin_contact(self, cycle: int, is_touched: bool, contradiction: CommonCause | None = None) -> None:
-        """Record that the arm reacts: to a touch, or to another cause such as a late host.
+        """Store how long the arm has monitored before it reacts in this cycle, and lower the odds of a wrong model.
 
-        contradiction: the contradiction of the certificate, if the arm reacts to that.
+        is_touched: it reacts to a contact; if that follows at once, raise the thresholds of its joints. Else the cause
+        is another, such as a late host, and the sums are cleared. contradiction: of the certificate, if the arm reacts
+        to that; `end_contact` returns it.
         """
         self._contradiction = contradiction
         self._waited_s = cycle * self._period_s - self._monitored_s
@@ -209,7 +217,10 @@ class Doubt:
             sensitivity.strain(self._m, MOST_STRAIN)
 
     def end_contact(self, cycle: int) -> CommonCause | None:
-        """Record that the contact has ended; return the common cause of the last ones, or None."""
+        """Store the contact that ends in this cycle; return the common cause of the last contacts, or None.
+
+        After a contradiction of the certificate store nothing and return the contradiction.
+        """
         if self._contradiction is not None:
             return self._contradiction
         now_s = cycle * self._period_s
@@ -223,7 +234,7 @@ class Doubt:
         return self._payload() or self._other() or self._alike() or self._unexplained()
 
     def describe_again(self) -> str | None:
-        """Return the possible cause of the last contact as text, if it came at once after going on from another."""
+        """Return a warning if the last contact came within HELD_S after the arm went on from another, or None."""
         if len(self._contacts) < 2 or self._contacts[-1].waited_s > HELD_S:
             return None
         waited_s = self._contacts[-1].waited_s
@@ -276,7 +287,10 @@ class Doubt:
         return None
 
     def _unexplained(self) -> CommonCause | None:
-        """Return the doubt to report if a person is unlikely to touch in this pattern, or None."""
+        """Return a cause without a name if a person is unlikely to touch as often or as lightly, or None.
+
+        So often: MANY contacts, each within HELD_S of going on. So lightly: weak contacts with odds over ODDS.
+        """
         last = list(self._contacts)[-MANY:]
         text = ""
         if len(last) == MANY and max(contact.waited_s for contact in last[1:]) < HELD_S:
@@ -291,13 +305,16 @@ class Doubt:
         )
 
     def _can_be(self, h: int, size: float) -> bool:
-        """Return whether an arm may have so much more of a friction than the model: friction is never negative."""
+        """Return whether friction h can be `size` more than the model's: not negative, nor implausibly large."""
         cause = self._k.causes[h]
         total = float(cause @ self._m.models.theta) + size
         return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._k.prior_std)
 
     def _common(self, contacts: list[_Weighed], h: int, spread: float) -> float | None:
-        """Return the size of cause h that explains each of the contacts, or None."""
+        """Return the size of cause h over all contacts; None if it doesn't explain each of them with about that size.
+
+        spread: largest difference of a contact's own size, as a part of the common one, beside 2 sigma.
+        """
         ww = sum(contact.ww[h] for contact in contacts)
         if not ww > 0.0:
             return None
@@ -311,7 +328,10 @@ class Doubt:
         return size
 
     def _size(self, contacts: list[_Weighed], h: int) -> tuple[float, float]:
-        """Return the size of cause h and twice its deviation; the first contact may have begun with the change."""
+        """Return the size of cause h and twice its standard deviation, from all contacts but the first.
+
+        The change may have happened during the first.
+        """
         ww = sum(contact.ww[h] for contact in contacts[1:])
         return float(sum(contact.rw[h] for contact in contacts[1:]) / ww), 2.0 * self._sigma(ww)
 
@@ -320,7 +340,7 @@ class Doubt:
 
 
 def _weighed(m: Memory, waited_s: float, now_s: float) -> _Weighed:
-    """Return a contact's sums, less the torque of each joint at rest, and less the residual of a good model."""
+    """Return a contact's sums without the torque that joints held at rest, and without the residual of a good model."""
     own, squares = m.doubt, m.doubt.L.diagonal()
     ss, rs, ws = np.maximum(squares[CAUSES:], 1e-12), own.b[CAUSES:], own.L[CAUSES:, :CAUSES].T
     rw = own.b[:CAUSES] - ws @ (rs / ss)
@@ -336,7 +356,7 @@ def _explained(contacts: list[_Weighed], h: int) -> float:
 
 
 def _named(count: int, h: int, size: float, deviation: float) -> CommonCause:
-    """Return cause h of this size as the contacts' common cause."""
+    """Return the description of cause h as the common cause of `count` contacts; size, deviation: in its unit."""
     if h == LOAD:
         text = f"{abs(size):.2f} ± {deviation:.2f} kg {'picked up' if size > 0.0 else 'put down'}"
     else:

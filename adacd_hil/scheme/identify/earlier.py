@@ -52,7 +52,10 @@ the arm bends. A mass shows in a1 and a3."""
 
 @compiled
 def forget(m: Memory) -> None:
-    """Drop the kept beliefs: a certificate stands, or the user confirms that the arm is free of contact."""
+    """Drop the kept beliefs; clear the count of refused fits and `has_lapsed`.
+
+    Called when a certificate stands, or the user confirms that the arm is free of contact.
+    """
     _drop(m)
     m.earlier.refused_fits = 0.0
     m.earlier.has_lapsed = 0.0
@@ -73,9 +76,10 @@ def is_keeping(m: Memory) -> bool:
 
 @compiled
 def keep(k: Constants, m: Memory) -> None:
-    """Keep the fit's belief and its earlier steps, unless beliefs are kept already: a touch may have begun.
+    """Keep the fit's present belief and its steps, as a touch may have begun; not if beliefs are kept already.
 
-    If the fit has changed on the way, keep only the steps from before the change.
+    If the fit has changed since a step, keep only the steps up to that one. Keep nothing before the second step. Set
+    the count of refused fits to 0 in any case.
     """
     m.earlier.refused_fits = 0.0
     if m.earlier.kept_count > 0.0 or m.fit_check.steps_used <= YOUNG_STEPS:
@@ -95,7 +99,10 @@ def keep(k: Constants, m: Memory) -> None:
 
 @compiled
 def keep_steps(k: Constants, m: Memory, last: int) -> None:
-    """Keep the fit's steps up to this number, unless beliefs are kept already."""
+    """Keep the fit's steps up to number `last`, from 0, without the first YOUNG_STEPS; -1 or less keeps none.
+
+    Do nothing if beliefs are kept already.
+    """
     if m.earlier.kept_count > 0.0:
         return
     _drop(m)
@@ -110,7 +117,10 @@ def keep_steps(k: Constants, m: Memory, last: int) -> None:
 
 @compiled
 def keep_belief(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float, age_s: float) -> None:
-    """Keep one belief; unit: of its residuals, age_s: since when."""
+    """Keep a belief as the next source of evidence; leave the source empty if a friction is clearly negative.
+
+    unit: scale of its variances, see `fit_check.unit_of`. age_s: time since the belief was held.
+    """
     s = KEPT + int(m.earlier.kept_count)
     if not _fill_source(k, m, s, theta, P, unit):
         evidence.empty_source(m, s)
@@ -120,7 +130,7 @@ def keep_belief(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float, 
 
 @compiled
 def _fill_source(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit: float) -> bool:
-    """Fill a source's rows from a belief; return whether all its frictions are at least about 0.
+    """Fill the rows of source `s` from a belief; return whether no friction is clearly below 0.
 
     A person who pushes the arm on makes friction look negative: a negative one counts as 0.
     """
@@ -136,9 +146,10 @@ def _fill_source(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit
 
 @compiled
 def is_no_more(k: Constants, m: Memory) -> bool:
-    """Return whether the fit has the kept beliefs' friction, no more inertia, and the same unanchored offsets.
+    """Return whether the fit agrees with the kept beliefs: same friction and unanchored offsets, no more inertia.
 
-    The fit's offsets keep to their anchors. A kept belief with other offsets comes from a lean, and is forgotten.
+    Drop a kept belief whose offset contradicts an anchor: it comes from a lean. True also if the kept beliefs lapse;
+    this drops all of them and sets `has_lapsed`.
     """
     is_no_more = True
     for s in range(KEPT, KEPT + int(m.earlier.kept_count)):
@@ -163,7 +174,10 @@ def is_no_more(k: Constants, m: Memory) -> bool:
 
 @compiled
 def _is_leant_on(k: Constants, m: Memory, s: int) -> bool:
-    """Return whether a kept belief's offset differs from the fit's where an anchor gives it, or excludes the other."""
+    """Return whether kept belief `s` has another torque offset than the fit, and an anchor speaks for the fit's.
+
+    An anchor does if it bounds the joint's offset, or excludes the kept belief's.
+    """
     for i in range(m.anchor.anchor_Nm.shape[1]):
         q = OFFSETS + i
         is_another = abs(evidence.excess(m, s, q)) > 1.0
@@ -174,9 +188,9 @@ def _is_leant_on(k: Constants, m: Memory, s: int) -> bool:
 
 @compiled
 def _lapses(k: Constants, m: Memory) -> bool:
-    """Record a refused fit; return whether the kept beliefs lapse: enough refused fits in a row agree against them.
+    """Count a fit that contradicts the kept beliefs; return whether enough such fits in a row agree to drop them.
 
-    A fit that disagrees with the refused fits before starts the count at 1.
+    Store the fit as source REFUSED. A fit that disagrees with the refused one before starts the count at 1.
     """
     own = m.earlier
     is_little, is_less, is_same, friction_Nm, else_Nm = True, True, True, 0.0, 0.0

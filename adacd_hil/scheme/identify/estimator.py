@@ -27,7 +27,10 @@ from adacd_hil.records import Vector
 def update(
     W_f: Vector, tau_f: Vector, R: float, is_least_squares: bool, theta_hat: Vector, P: Vector, v: Vector, K: Vector
 ) -> None:
-    """Correct theta_hat (p,), and P (p, p) if least squares, by one sample in place; v and K (p,) are scratch."""
+    """Correct theta_hat (p,), and P (p, p) if least squares, in place by the rows of one sample.
+
+    R: variance of a row. v, K (p,): overwritten as scratch.
+    """
     for i in range(W_f.shape[0]):
         correct(W_f[i], tau_f[i], R, is_least_squares, theta_hat, P, v, K)
 
@@ -36,9 +39,10 @@ def update(
 def correct(
     w: Vector, tau: float, R: float, is_least_squares: bool, theta_hat: Vector, P: Vector, v: Vector, K: Vector
 ) -> tuple[float, float]:
-    """Correct theta_hat (p,), and P (p, p) if least squares, by one row w (p,) of variance R; v and K are scratch.
+    """Correct theta_hat (p,), and P (p, p) if least squares, in place by one row w (p,) of variance R.
 
-    Return epsilon and its variance s, with theta_hat and P as they were.
+    Return the residual epsilon of theta_hat before the correction, and its variance s. v, K (p,): overwritten as
+    scratch.
     """
     count = theta_hat.shape[0]
     epsilon = -linalg.misfit(w, theta_hat, tau)
@@ -59,7 +63,7 @@ def correct(
 
 @compiled
 def reset_gain(P0: Vector, P: Vector) -> None:
-    """Set P (p, p) to the diagonal P0 (p,)."""
+    """Set P (p, p) in place to a diagonal matrix with P0 (p,) on its diagonal."""
     P[:] = 0.0
     for j in range(P0.shape[0]):
         P[j, j] = P0[j]

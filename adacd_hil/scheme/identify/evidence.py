@@ -73,20 +73,20 @@ def constants_of(settings: Settings, prior_std: Vector) -> EvidenceConstants:
 
 
 def _accelerations(settings: Settings) -> tuple[float, ...]:
-    """Return the largest accelerations on the trajectory that go with a1, a2, a3, rad/s²."""
+    """Return the largest factors of a1, a2, a3 in a joint's torque on the trajectory, rad/s²."""
     travel_rad = 2.0 * np.radians(settings.trajectory.amplitude_deg)
     first, second = QUINTIC_PEAK_ACCELERATION * travel_rad / np.square(settings.trajectory.half_period_s)
     return first, 2.0 * first + second, first + second
 
 
 def begin(m: Memory) -> None:
-    """Empty all sources."""
+    """Empty all sources: set their variances and limits to inf."""
     m.evidence.variance[:] = np.inf
     m.evidence.limit[:] = np.inf
 
 
 def set_source(m: Memory, s: int, value: Vector, variance: Vector, slack: Vector) -> None:
-    """Fill all rows of a source, `value` (Q,), without a floor."""
+    """Set value, variance and slack, each (Q,), of all quantities of source `s`; keep its floor."""
     m.evidence.value[s], m.evidence.variance[s], m.evidence.slack[s] = value, variance, slack
 
 
@@ -99,7 +99,7 @@ def follow(m: Memory, period_s: float) -> None:
 
 @compiled
 def set_age(m: Memory, first: int, last: int, age_s: float) -> None:
-    """Set the age of the knowledge of the sources first .. last - 1."""
+    """Set the age of the sources first .. last - 1: the time since their values were measured."""
     m.evidence.age_s[first:last] = age_s
 
 
@@ -115,7 +115,7 @@ def set_row(m: Memory, s: int, q: int, value: float, variance: float, floor: flo
 
 @compiled
 def empty_source(m: Memory, s: int) -> None:
-    """Empty the rows of a source."""
+    """Set the variances of source `s` to inf, so that it contradicts no fit; clear its last comparison."""
     m.evidence.variance[s] = np.inf
     m.evidence.difference[s] = 0.0
     m.evidence.limit[s] = np.inf
@@ -123,14 +123,17 @@ def empty_source(m: Memory, s: int) -> None:
 
 @compiled
 def skip_row(m: Memory, s: int, q: int) -> None:
-    """Skip a row in this comparison."""
+    """Clear the comparison of source `s` in quantity `q` until it is weighed again; keep its value."""
     m.evidence.difference[s, q] = 0.0
     m.evidence.limit[s, q] = np.inf
 
 
 @compiled
 def fit(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float) -> None:
-    """Fill the value and variance of each quantity for a model theta (p,), P (p, p); unit: of its residuals."""
+    """Set `fitted` and `fitted_variance` (Q,) to a model's value and variance of each quantity.
+
+    theta (p,), P (p, p): the model. unit: scale of the samples' part of its variances, see `split`.
+    """
     for q in range(m.evidence.fitted.shape[0]):
         value, variance = of_belief(k, q, theta, P, unit)
         put_fitted(m, q, value, variance)
@@ -152,15 +155,19 @@ def of_belief(k: Constants, q: int, theta: Vector, P: Vector, unit: float) -> tu
 
 @compiled
 def split(variance: float, prior: float, unit: float) -> float:
-    """Return a variance with only the samples' part of it, not the prior's, scaled by `unit`."""
+    """Return a variance after scaling the samples' part of it by `unit`, and not the prior's part.
+
+    The inverses of both parts add up to the inverse of `variance`.
+    """
     return 1.0 / (1.0 / prior + max(1.0 / variance - 1.0 / prior, 0.0) / unit)
 
 
 @compiled
 def weigh(k: Constants, m: Memory, s: int, q: int) -> float:
-    """Return the fit's excess of a quantity over a source's value, in limits; fill `difference`, `limit`.
+    """Return the fit's value of quantity `q` less that of source `s`, over its limit; fill `difference`, `limit`.
 
-    Negative: less. 0 if less doesn't count, or the source has no value.
+    The fit contradicts the source beyond ±1. 0 if the source has no value, or if only more of `q` counts and the fit
+    has less.
     """
     own = m.evidence
     difference = own.fitted[q] - own.value[s, q]
@@ -174,13 +181,13 @@ def weigh(k: Constants, m: Memory, s: int, q: int) -> float:
 
 @compiled
 def excess(m: Memory, s: int, q: int) -> float:
-    """Return the excess of a row as it was weighed last."""
+    """Return the result of the last `weigh` of source `s` and quantity `q`; 0 if the row was skipped since."""
     return float(m.evidence.difference[s, q] / m.evidence.limit[s, q])
 
 
 @compiled
 def foremost(m: Memory, first: int, last: int, q: int) -> int:
-    """Return the source among first .. last - 1 that contradicts a quantity most, as weighed last."""
+    """Return the source among first .. last - 1 whose last weighed excess of quantity `q` is largest in size."""
     worst = first
     for s in range(first, last):
         if not abs(excess(m, s, q)) <= abs(excess(m, worst, q)):
@@ -189,7 +196,7 @@ def foremost(m: Memory, first: int, last: int, q: int) -> int:
 
 
 def named(excesses: Vector) -> list[tuple[int, str, str]]:
-    """Return place, name and unit of each quantity with an excess (Q,) over 1; for a joint's friction only the largest.
+    """Return index, name and unit of each quantity with an excess (Q,) over 1; for a joint's friction only the largest.
 
     A viscous friction is named after the others.
     """

@@ -73,7 +73,7 @@ def step_samples_of(settings: Settings) -> int:
 
 @compiled
 def begin(m: Memory) -> None:
-    """Begin a fit: forget steps, samples and residuals."""
+    """Clear the steps, kept samples and sums of residuals of the fit before."""
     own = m.fit_check
     own.steps_used = 0.0
     own.fit_square = 0.0
@@ -86,14 +86,17 @@ def begin(m: Memory) -> None:
 
 @compiled
 def add_residual(m: Memory, square: float) -> None:
-    """Add the residual of a learnt row, squared, over its variance."""
+    """Add one row to the sum of squares and the count of the fit. square: its squared residual over its variance."""
     m.fit_check.fit_square += square
     m.fit_check.fit_rows += 1.0
 
 
 @compiled
 def follow(k: Constants, m: Memory, W_f: Vector, tau_f: Vector) -> None:
-    """Record that the fit has learnt a sample, W_f (n, p), tau_f (n,) of the filter by which it is tested."""
+    """Count a learnt sample and keep it for the check; every `step_samples` store the belief as a step.
+
+    W_f (n, p), tau_f (n,): the sample in the filter by which the fit is tested.
+    """
     own = m.fit_check
     _keep_sample(m, W_f, tau_f)
     own.fit_samples += 1.0
@@ -137,7 +140,10 @@ def unit_of(square: float, rows: float) -> float:
 
 @compiled
 def late_square(m: Memory) -> float:
-    """Return u of the fit's later half, so that a touch of its beginning doesn't count; 1 for a short fit."""
+    """Return the mean square of the residuals over their variances in the fit's later half; 1 before the second step.
+
+    The earlier half is left out, so that a touch of the beginning doesn't count.
+    """
     own = m.fit_check
     used = int(own.steps_used)
     if used < 2:
@@ -149,7 +155,7 @@ def late_square(m: Memory) -> float:
 
 @compiled
 def _better_square(m: Memory, s: int) -> float:
-    """Return u of the residuals up to step s, or of those after it, the smaller."""
+    """Return the mean square of the residuals over their variances, up to step s or after it, the smaller."""
     own = m.fit_check
     early = own.steps_square[s] / max(own.steps_rows[s], 1.0)
     late = (own.fit_square - own.steps_square[s]) / max(own.fit_rows - own.steps_rows[s], 1.0)
@@ -223,13 +229,16 @@ def last_unsteady_step(m: Memory) -> int:
 
 @compiled
 def changed_share(m: Memory, s: int) -> float:
-    """Return the distance of step s from the whole fit as a share of its limit."""
+    """Return the squared distance of step s from the whole fit over its limit; over 1: the fit has changed since."""
     return float(distance(m, s) / (STEADY * max(_better_square(m, s), SMALLEST_SQUARE)))
 
 
 @compiled
 def later_share(k: Constants, m: Memory, s: int) -> float:
-    """Return the torque between the fit and the model of the samples after step s, as a share of its limit."""
+    """Return the largest torque on the kept samples between the fit and the model after step s, over its limit.
+
+    Over 1: the samples after step s contradict the fit. inf if they determine no model.
+    """
     own = m.fit_check
     if not find_later(m, s):
         return np.inf
@@ -258,10 +267,10 @@ def better_rms(m: Memory) -> float:
 
 @compiled
 def distance(m: Memory, s: int) -> float:
-    """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of step s and the fit; inf if it has no factor.
+    """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of step s and the fit; inf if P_0 - P has no factor.
 
-    In units of the square roots of P_0's diagonal. Leaves the Cholesky factor in `factor`, and in `apart` the vector
-    whose square the distance is.
+    Leave the Cholesky factor of P_0 - P in `factor`, scaled by the square roots of P_0's diagonal, and in `apart` the
+    vector whose square is the result.
     """
     own = m.fit_check
     P_0, P, L, x = own.steps_P[s], m.models.P_belief, own.factor, own.apart
@@ -278,7 +287,7 @@ def distance(m: Memory, s: int) -> float:
 
 @compiled
 def find_later(m: Memory, s: int) -> bool:
-    """Fill `later` (p,): the model of the samples after step s less that of the fit; False if it is undefined."""
+    """Fill `later` (p,): parameters of the samples after step s less those of the fit; return False if undefined."""
     own = m.fit_check
     if not distance(m, s) < np.inf:
         return False
@@ -293,7 +302,7 @@ def find_later(m: Memory, s: int) -> bool:
 
 @compiled
 def _later_variance(m: Memory, s: int, w: Vector) -> float:
-    """Return w P (P_0 - P)^-1 P w', by the factor that `distance` has left in `factor`."""
+    """Return w P (P_0 - P)^-1 P w', the variance of the torque w `later`; call `find_later` for step s before."""
     x = m.fit_check.apart
     for j in range(x.shape[0]):
         x[j] = linalg.dot(m.models.P_belief[j], w) / np.sqrt(m.fit_check.steps_P[s, j, j])

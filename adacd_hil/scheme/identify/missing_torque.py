@@ -51,7 +51,10 @@ FIRST_S, LONGEST_S = 2.0, 16.0
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> TermConstants:
-    """Return the prior deviations (f,), and two counts of learnt samples. prior_std (p,)."""
+    """Return the prior deviations (f,), and the learnt samples before the first check and between later ones at most.
+
+    prior_std (p,): prior deviations of the model's own parameters.
+    """
     learn_s = settings.bus.period_s * settings.certified.learn_every
     return TermConstants(
         prior_std=np.concatenate([prior_std, np.full(JOINTS * PLACE_TERMS, EXPECTED_NM)]),
@@ -62,7 +65,7 @@ def constants_of(settings: Settings, prior_std: Vector) -> TermConstants:
 
 @compiled
 def forget(m: Memory) -> None:
-    """Forget the filtered columns."""
+    """Set the filtered columns of torque by place to 0."""
     m.missing_torque.X_f[:] = 0.0
     m.missing_torque.X_learnt[:] = 0.0
 
@@ -169,7 +172,11 @@ def is_confirmed(k: Constants, m: Memory) -> bool:
 
 @compiled
 def is_found(k: Constants, m: Memory) -> bool:
-    """Return whether the place explains the model's residual over all samples; fill `rms_Nm` (n,)."""
+    """Return whether a torque by place explains the residuals of all samples in the sums, and is missing in the model.
+
+    Fill `basic` and `full`, and `rms_Nm` (n,) with the torque of each joint, 0 if False. Always False for a model that
+    has such columns.
+    """
     own = m.missing_torque
     own.rms_Nm[:] = 0.0
     if k.position_torque_Nm != 0.0:
@@ -191,7 +198,10 @@ def is_found(k: Constants, m: Memory) -> bool:
 
 @compiled
 def scale_of(k: Constants, m: Memory, is_by_place: bool) -> Vector:
-    """Return the prior's deviations (f,) of the model, and of the columns by place or 0 for them."""
+    """Return the prior deviations (f,) of the parameters and of the columns by place, in `scale`, which is overwritten.
+
+    is_by_place: False sets those of the columns by place to 0, so that they explain no torque.
+    """
     scale, count = m.missing_torque.scale, m.models.belief.shape[0]
     scale[:] = k.missing_torque.prior_std
     if not is_by_place:
@@ -201,7 +211,10 @@ def scale_of(k: Constants, m: Memory, is_by_place: bool) -> Vector:
 
 @compiled
 def _is_found_again(k: Constants, m: Memory) -> bool:
-    """Return whether an earlier stretch's torque explains this one, of which `basic` is the model."""
+    """Return whether the torque found in an earlier stretch explains this stretch, too; fill `rms_Nm` (n,).
+
+    Fill `full` with this stretch's best model that has the earlier torque. False without an earlier torque.
+    """
     own = m.missing_torque
     own.rms_Nm[:] = 0.0
     last_found, count, basic, full = own.last_found, m.models.belief.shape[0], own.basic, own.full
@@ -264,7 +277,7 @@ def log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
 
 @compiled
 def squares_left(m: Memory, x: Vector) -> float:
-    """Return Σ (r - v x)² / R."""
+    """Return Σ (r - v x)² / R: the weighted squares that coefficients x (f,) leave in the samples of the sums."""
     own = m.missing_torque
     total = own.yy - 2.0 * linalg.dot(x, own.b)
     for i in range(own.L.shape[0]):

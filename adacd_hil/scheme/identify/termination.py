@@ -44,7 +44,7 @@ _SWEEPS = 12
 
 @compiled
 def begin(motion: Motion) -> None:
-    """Forget the evidence: ranges of position and velocity of the joints, and information."""
+    """Clear the ranges of the joints' position and velocity, the information matrix, and the count of samples."""
     motion.samples = 0.0
     motion.q_low[:] = np.inf
     motion.q_high[:] = -np.inf
@@ -55,7 +55,7 @@ def begin(motion: Motion) -> None:
 
 @compiled
 def is_quiet(tau_ext_hat: Vector, beta_Nm: float) -> bool:
-    """Return whether eq. (15) holds in this sample; a value that is not a number violates it."""
+    """Return whether |tau_ext_hat| is at most beta_Nm in each joint, eq. (15); False if a value is not a number."""
     is_within = True
     for i in range(tau_ext_hat.shape[0]):
         is_within = is_within and abs(tau_ext_hat[i]) <= beta_Nm
@@ -72,7 +72,7 @@ def widen(value: Vector, low: Vector, high: Vector) -> None:
 
 @compiled
 def has_moved(motion: Motion, travel_rad: float, velocity_rad_s: float) -> bool:
-    """Return whether each joint has travelled, and moved in both directions, as far and as fast as required."""
+    """Return whether each joint's range is at least `travel_rad`, and its speed at least `velocity_rad_s` both ways."""
     for i in range(motion.q_low.shape[0]):
         if not (motion.q_high[i] - motion.q_low[i] >= travel_rad):
             return False
@@ -92,7 +92,7 @@ def add_information(W_f: Vector, period_s: float, information: Vector) -> None:
 
 @compiled
 def gather(motion: Motion, q: Vector, dq: Vector, W_f: Vector, period_s: float) -> bool:
-    """Add a sample to the ranges of motion and the information; return whether a look at its eigenvalues is due."""
+    """Add a sample to the ranges of motion and the information matrix; return True every EXCITATION_EVERY samples."""
     widen(q, motion.q_low, motion.q_high)
     widen(dq, motion.dq_low, motion.dq_high)
     add_information(W_f, period_s, motion.information)
@@ -133,7 +133,7 @@ def eigenvalue_range(information: Vector, scale: Vector, scratch: Vector) -> tup
 
 @compiled
 def _rotate(matrix: Vector, j: int, k: int) -> None:
-    """Turn the symmetric `matrix` in the plane of j and k so that its element (j, k) becomes zero."""
+    """Rotate the symmetric `matrix` in place in the plane of axes j and k so that its element (j, k) becomes zero."""
     if matrix[j, k] == 0.0:
         return
     half_difference = 0.5 * (matrix[k, k] - matrix[j, j])
@@ -155,7 +155,7 @@ def _rotate(matrix: Vector, j: int, k: int) -> None:
 
 @compiled
 def begin_fit(m: Memory) -> None:
-    """Begin a fit of the certified scheme."""
+    """Clear the evidence of the fit before in the certified scheme, with excitation 0 and condition inf."""
     begin(m.motion)
     m.fit.excitation = 0.0
     m.fit.condition = np.inf
@@ -163,7 +163,7 @@ def begin_fit(m: Memory) -> None:
 
 @compiled
 def follow(k: Constants, m: Memory, q: Vector, dq: Vector, W_f: Vector) -> bool:
-    """Add a sample, W_f (n, p), to the evidence of a fit; return whether that is complete."""
+    """Add a sample, W_f (n, p), to the evidence of a fit; return whether it is complete, see `is_complete`."""
     if gather(m.motion, q, dq, W_f, k.period_s):
         smallest, largest = eigenvalue_range(m.motion.information, k.scale, m.motion.scratch)
         m.fit.excitation = smallest
@@ -173,7 +173,10 @@ def follow(k: Constants, m: Memory, q: Vector, dq: Vector, W_f: Vector) -> bool:
 
 @compiled
 def begin_test(k: Constants, m: Memory, square: float) -> None:
-    """Begin the test of a frozen model. square: mean square of the fit's residuals over that of the settings."""
+    """Begin the test of a frozen model: clear its count and the joints' speeds, and set the largest residual allowed.
+
+    square: mean square of the fit's residuals over that of the settings.
+    """
     m.fit.tested = 0.0
     m.fit.test_limit_Nm = test_limit_Nm(k, square)
     m.motion.dq_low[:] = np.inf
@@ -184,7 +187,8 @@ def begin_test(k: Constants, m: Memory, square: float) -> None:
 def test(k: Constants, m: Memory, dq: Vector, tau_ext_hat: Vector) -> int:
     """Add a sample to the test; return -1 if the model is refuted, 1 if it has passed, 0 if the test goes on.
 
-    Samples of a joint at rest prove no model and are skipped.
+    Refuted: a joint's |tau_ext_hat| is over `test_limit_Nm`. Passed: `test_cycles` samples, and each joint has once
+    reached `velocity_rad_s`.
     """
     own = m.motion
     m.fit.tested += 1.0
@@ -206,7 +210,10 @@ TEST_SHARE = 6.0
 
 @compiled
 def is_complete(k: Constants, m: Memory) -> bool:
-    """Return whether the evidence for a fit is complete, from the constants `k` and the state `m` of the kernel."""
+    """Return whether a fit can be frozen: enough samples, each parameter known, enough excitation and motion.
+
+    With a payload the first two are enough.
+    """
     own = m.motion
     is_payload = m.models.is_payload != 0.0
     if own.samples < k.fit_cycles[1 if is_payload else 0]:
@@ -232,9 +239,9 @@ def test_limit_Nm(k: Constants, square: float) -> float:
 
 
 def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dict[str, str]) -> list[str]:
-    """Return the conditions that a fit waits for, and the motion that fulfils each, a line each.
+    """Return a line for each unmet condition of `is_complete`, with the motion that fulfils it.
 
-    `k`, `m`: as for `is_complete`.
+    names: of the parameters, in the belief's order. units: by parameter's name.
     """
     own = m.motion
     lines = []
@@ -287,6 +294,6 @@ _MOTIONS = {
 
 
 def _motion_for(name: str) -> str:
-    """Return the motion that shows a parameter, as text."""
+    """Return the text of a motion by which the parameter `name` is learnt."""
     found = (text for key, text in _MOTIONS.items() if name.startswith(key))
     return next(found, "move joint {} slowly, and with dwells").format(name[-1])

@@ -65,14 +65,11 @@ WEIGH = 32  # weigh the evidence for each cause of a contact of the certified mo
 
 @compiled
 def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool, is_first: bool) -> None:
-    """Begin to learn: from the prior, or a payload on top of the certified arm.
+    """Reset belief, filters, fit and residuals, to learn from the prior, or a payload on top of the certified arm.
 
-    is_first: the first attempt on the present arm; otherwise an earlier attempt failed, and its samples stay as
-    evidence.
-
-    The belief learnt before is forgotten, so a contact on the way leaves no trace, whenever it is detected.
-
-    Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
+    is_first: the first attempt on the present arm. False: an earlier attempt failed; its samples stay as evidence of a
+    torque by place. The belief learnt before is dropped, so a contact on the way leaves no trace, whenever it is
+    detected. Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
     """
     k, m = constants[0], memory[0]
     if is_first:
@@ -93,7 +90,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
 
 @compiled
 def begin_test(constants: Structured, memory: Structured) -> None:
-    """Freeze the belief, made physically possible, as the model in use, and begin its test."""
+    """Freeze the belief, without negative friction, as the model in use, and reset the counts of its test."""
     k, m = constants[0], memory[0]
     belief.freeze(k, m)
     margin.begin_sight(m)
@@ -102,7 +99,7 @@ def begin_test(constants: Structured, memory: Structured) -> None:
 
 @compiled
 def begin_refinement(constants: Structured, memory: Structured) -> None:
-    """Begin to refine the model that has just been certified."""
+    """Store the model in use as certified, begin to test candidates, and drop kept beliefs and missing torque."""
     k, m = constants[0], memory[0]
     belief.certify(k, m)
     earlier.forget(m)
@@ -148,9 +145,9 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
 
 @compiled
 def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
-    """Advance the bank to this sample and estimate the external torque from each filter.
+    """Advance the bank to this sample, missing samples interpolated, and fill the torques of the block.
 
-    Return whether the filters took the sample in; after a gap they only resume.
+    steps: periods since the fresh sample before. Return False after a gap: the filters resume from the sample.
     """
     nominal_s: float = k.period_s
     period_s: float = out.period_s
@@ -213,7 +210,11 @@ def _take_sample(
 
 @compiled
 def _watch(k: Constants, m: Memory, out: CertifiedBlock, is_fresh: bool) -> int:
-    """Compare with the thresholds; return CONTACT, COLLISION and the joints over their threshold, or 0."""
+    """Fill the thresholds and compare the residuals with them; return bits of an observation, or 0.
+
+    The bits: CONTACT, COLLISION, and from CONTACT_SHIFT on one per joint over its threshold. is_fresh: False keeps the
+    thresholds of the sample before.
+    """
     if is_fresh:
         sensitivity.fill_thresholds(k, m, m.sensitivity.h)
         out.threshold[:] = m.sensitivity.h[filter_bank.SLOW]
@@ -231,7 +232,10 @@ def _watch(k: Constants, m: Memory, out: CertifiedBlock, is_fresh: bool) -> int:
 
 @compiled
 def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode: int) -> int:
-    """Learn, test or refine with this sample; return the result as bits of an observation."""
+    """Learn, test or refine with this sample, by `mode`; return the result as bits of an observation, or 0.
+
+    The bits: FITTED, CERTIFIED, REFUTED, WITHHELD. is_touched: a joint is over its threshold in this cycle.
+    """
     was_free = m.models.recovering_cycles == 0.0
     is_free = belief.is_free(k, m, is_touched)
     if is_touched and was_free and mode & (LEARN | TEST):
@@ -256,7 +260,7 @@ def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode
 
 @compiled
 def _follow_noise(k: Constants, m: Memory, is_free: bool, mode: int) -> None:
-    """Learn the noise of a sample without contact, or discard the samples that wait to be cleared of contact."""
+    """Add a sample to the noise of velocity and the largest residuals; discard waiting samples if not `is_free`."""
     if not is_free:
         belief.discard(m)
         margin.discard_tail(m)
@@ -268,7 +272,7 @@ def _follow_noise(k: Constants, m: Memory, is_free: bool, mode: int) -> None:
 
 @compiled
 def _test(k: Constants, m: Memory, dq: Vector) -> int:
-    """Add this sample to the test of the frozen model; return its result as bits of an observation."""
+    """Add this sample to the test of the frozen model; return CERTIFIED, REFUTED with or without WITHHELD, or 0."""
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_test_share, False)
     margin.follow_test(k, m)
     result = termination.test(k, m, dq, m.filters.r[filter_bank.SLOW])
@@ -283,7 +287,10 @@ def _test(k: Constants, m: Memory, dq: Vector) -> int:
 
 @compiled
 def _refine(k: Constants, m: Memory) -> int:
-    """Learn on beside the model in use, and replace it after a test; return the bits of evidence against the model."""
+    """Learn on beside the model in use, and replace it by a better tested candidate.
+
+    Return WITHHELD if something contradicts the certificate, with the cause in `withheld_by`, else 0.
+    """
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_share, True)
     sensitivity.relax(k, m)
     cause = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
@@ -299,7 +306,7 @@ def _refine(k: Constants, m: Memory) -> int:
 
 @compiled
 def _fill_model(k: Constants, m: Memory, out: CertifiedBlock) -> None:
-    """Fill the block's fields of the model and the bank."""
+    """Fill the block's fields of the model in use, of the channels, and of the fit's progress."""
     base, joints = int(k.first_offset), m.filters.y.shape[1]
     for j in range(m.models.theta.shape[0]):
         if j < base:

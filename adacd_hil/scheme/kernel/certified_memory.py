@@ -43,7 +43,10 @@ def parameter_names(settings: Settings) -> tuple[str, ...]:
 
 
 def _by_kind(values: tuple[float, ...], names: tuple[str, ...]) -> Vector:
-    """Return, per parameter, the value of its kind; values in the order of `CertifiedSettings`."""
+    """Return the value for each name (p,) by its kind.
+
+    values: of inertia, viscous and Coulomb friction, gravity, offset, lag, further friction.
+    """
     inertia, viscous, coulomb, gravity, offset, lag, further = values
     prefixes = (("F_v", viscous), ("F_c", coulomb), ("offset", offset), ("lag", lag))
     exact = {"a1": inertia, "a2": inertia, "a3": inertia, "a4": gravity, "a5": gravity}
@@ -84,9 +87,9 @@ def _first_of(term: str, names: tuple[str, ...]) -> int:
 
 
 def _enough_std_of(settings: Settings) -> Vector:
-    """Return the standard deviation required of each parameter (p,).
+    """Return the standard deviation that each parameter (p,) must reach for a complete fit.
 
-    For an offset it is combined with the bound on the torque by place.
+    That of an offset is combined with the bound on the torque by place.
     """
     std = _by_kind(settings.certified.enough_std, parameter_names(settings))
     base = len(settings.estimator.parameter_names)
@@ -96,9 +99,9 @@ def _enough_std_of(settings: Settings) -> Vector:
 
 
 def _payload_rest_std_of(settings: Settings, count: int) -> Vector:
-    """Return the deviation of a payload's parameters (p,) from a mass at the tip.
+    """Return the standard deviation (p,) by which a payload's parameters differ from those of a point mass at the tip.
 
-    Those of gravity follow from the same shift.
+    count: p. Those of gravity follow from those of inertia; 0 for all others.
     """
     inertia_std, arm = settings.certified.payload_inertia_std, settings.arm
     std = np.zeros(count)
@@ -109,7 +112,7 @@ def _payload_rest_std_of(settings: Settings, count: int) -> Vector:
 
 
 def constants_of(settings: Settings) -> Structured:
-    """Return the settings as the record that the compiled step reads."""
+    """Return the constants (1,) of the certified scheme's compiled step."""
     certified, names = settings.certified, parameter_names(settings)
     period_s = settings.bus.period_s
     cutoff = np.array(certified.cutoffs_rad_s)
@@ -187,13 +190,13 @@ def constants_of(settings: Settings) -> Structured:
 
 
 def _waiting_of(settings: Settings) -> int:
-    """Return the number of learnt samples that wait for so long as the settings say."""
+    """Return the number of learnt samples in `certified.hold_back_s`, which wait in the ring; at least 1."""
     learn_s = settings.bus.period_s * settings.certified.learn_every
     return max(round(settings.certified.hold_back_s / learn_s), 1)
 
 
 def sizes_of(settings: Settings) -> dict[str, int]:
-    """Return the sizes named in the records of `Memory`."""
+    """Return the sizes of arrays by the names that the annotations of `Memory` use."""
     count = len(parameter_names(settings))
     return {
         "n": JOINTS,
@@ -216,7 +219,7 @@ def sizes_of(settings: Settings) -> dict[str, int]:
 
 
 def new_memory(settings: Settings) -> Structured:
-    """Return the memory before the first sample: a gap, and the prior as the belief."""
+    """Return the kernel's memory (1,) before the first sample: after a gap, with the prior as belief and model."""
     memory = zeros_of(Memory, sizes_of(settings))
     k: Constants = constants_of(settings)[0]
     m: Memory = memory[0]

@@ -97,7 +97,7 @@ _PAPER_MODE[[SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED]] = pap
 
 
 def new_course(settings: Settings) -> tuple[Structured, Structured]:
-    """Return constants and memory (1,) before the first cycle."""
+    """Return constants and memory (1,) of the supervisor and of the contact's course, before the first cycle."""
     constants, memory = zeros_of(RunConstants, _SIZES), zeros_of(RunMemory, _SIZES)
     k: RunConstants = constants[0]
     m: RunMemory = memory[0]
@@ -111,7 +111,7 @@ def new_course(settings: Settings) -> tuple[Structured, Structured]:
 
 @compiled
 def interval_s(m: RunMemory, sample: Sample) -> float:
-    """Return the time from the last fresh sample to this one, s, and remember this one's time in `m`.
+    """Return the time from the last complete sample to this one, s, and store this one's time in `m`.
 
     0 for the first sample, an incomplete sample, and a run that doesn't measure intervals (`m.is_measured` = 0).
     """
@@ -141,8 +141,9 @@ def certified_cycle(
 ) -> int:
     """Run one cycle of the certified scheme; return bits of tasks for Python, or 0.
 
-    place: index of the cycle in samples, decisions and blocks. values: memory of the block (size,). rows: those of
-    `contact_report.put_row`.
+    With a bit of BEFORE_CONTACT the cycle is not over: Python runs the tasks, then `end_certified`. place: index of the
+    cycle in samples, decisions and blocks; `decisions` and `blocks` are filled there. values: the numbers of `block`
+    (size,), same memory. rows: those of `contact_report.put_row`.
     """
     sample, decision, run = samples[place], decisions[place], course_memory[0]
     period_s = interval_s(run, sample)
@@ -175,7 +176,10 @@ def end_certified(
     course_memory: Structured,
     rows: Vector,
 ) -> int:
-    """End a cycle of the certified scheme in the state reached; return bits of further tasks for Python."""
+    """Advance the contact's course and fill the decision at the end of a cycle of the certified scheme.
+
+    Return bits of further tasks for Python, REPORT to PUSHED. place: index of the cycle.
+    """
     k, m, out, run = constants[0], memory[0], block[0], course_memory[0]
     decision, contact, state = decisions[place], run.contact, run.supervisor.state
     contact_report.put_row(
@@ -245,7 +249,10 @@ def end_paper(
     course_constants: Structured,
     course_memory: Structured,
 ) -> int:
-    """End a cycle of the paper's scheme in the state reached; return bits of further tasks for Python."""
+    """Advance the contact's course and fill the decision at the end of a cycle of the paper's scheme.
+
+    Return REPORT if a report is due, else 0. place: index of the cycle.
+    """
     tau_ext_hat = block[0].tau_ext_hat
     return follow_contact(
         course_constants[0], course_memory[0], samples[place], decisions[place], tau_ext_hat, tau_ext_hat
@@ -254,7 +261,11 @@ def end_paper(
 
 @compiled
 def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, decision: Decision) -> int:
-    """Run the supervisor on the kernel's findings; return bits of tasks for Python before the contact's course."""
+    """Run the supervisor; return LEFT, REFUSED or ACCEPTED as bits, tasks for Python before the contact's course.
+
+    observation: the kernel's findings, see `transitions`. Fill previous state, findings and joints in contact of
+    `decision`. A pending refusal that the user accepts in this cycle doesn't withhold a certificate.
+    """
     asked, previous = 0, m.supervisor.state
     if sample.request == Request.ACCEPT:
         asked |= ACCEPTED
@@ -298,9 +309,9 @@ def follow_contact(
 def run_certified(
     samples: Structured, decisions: Structured, blocks: Vector, first: int, arrays: tuple[Any, ...]
 ) -> tuple[int, int]:
-    """Run cycles from `first` until one has a task for Python; return its place and the bits of its tasks.
+    """Run cycles of the certified scheme from `first` until one has a task for Python; return its place and its bits.
 
-    arrays: arguments of `certified_cycle` from `constants` on, in its order.
+    place: samples.size without such a cycle. arrays: arguments of `certified_cycle` from `constants` on, in its order.
     """
     for place in range(first, samples.size):
         asked = certified_cycle(samples, decisions, blocks, place, *arrays)
@@ -313,7 +324,10 @@ def run_certified(
 def run_paper(
     samples: Structured, decisions: Structured, blocks: Vector, first: int, arrays: tuple[Any, ...]
 ) -> tuple[int, int]:
-    """Run cycles of `paper_cycle` in the way of `run_certified`."""
+    """Run cycles of the paper's scheme from `first` until one has a task for Python; return its place and its bits.
+
+    place: samples.size without such a cycle. arrays: arguments of `paper_cycle` from `constants` on, in its order.
+    """
     for place in range(first, samples.size):
         asked = paper_cycle(samples, decisions, blocks, place, *arrays)
         if asked:

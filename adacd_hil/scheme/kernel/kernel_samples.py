@@ -36,7 +36,7 @@ SAMPLE = described(Sample, {"n": JOINTS})
 
 
 def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
-    """Write one cycle into an element of SAMPLE (1,)."""
+    """Write arm state and request of one cycle into `samples` (1,), of type SAMPLE."""
     age = max(*arm.age_q, *arm.age_tau_J)
     sampled_ns = arm.t_ns if arm.sampled_ns is None else arm.sampled_ns
     counts = arm.cycle, arm.periods, arm.steps, sampled_ns, age, arm.fault, request
@@ -44,7 +44,7 @@ def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
 
 
 def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
-    """Return n cycles as SAMPLE (n,)."""
+    """Return the arm states and requests of n cycles as an array of type SAMPLE (n,)."""
     samples = np.zeros(arms.cycle.size, SAMPLE)
     for name in ("cycle", "periods", "steps", "sampled_ns", "fault", "is_complete", "is_enabled", "is_late"):
         samples[name] = getattr(arms, name)
@@ -57,7 +57,7 @@ def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
 
 @compiled
 def put_sample(block: Structured, sample: Sample, period_s: float) -> None:
-    """Write a sample into the block, the input of a kernel's next step."""
+    """Write q, dq, tau_J of a sample, and the interval before it, into the block for the kernel's next step."""
     out: SchemeBlock = block[0]
     for i in range(out.q.shape[0]):
         out.q[i] = sample.q[i]
@@ -67,7 +67,7 @@ def put_sample(block: Structured, sample: Sample, period_s: float) -> None:
 
 
 def limits_of(settings: Settings) -> Limits:
-    """Return the limits for checks of a measurement alone."""
+    """Return the limits of position and speed, and those of rest, that `observe` checks."""
     return Limits(
         position_limit_rad=settings.arm.position_limit_rad,
         velocity_limit_rad_s=settings.arm.velocity_limit_rad_s,
@@ -78,7 +78,7 @@ def limits_of(settings: Settings) -> Limits:
 
 @compiled
 def observe(limits: Limits, nominal_s: float, block: Structured, steps: int, too_fast: int) -> int:
-    """Return the findings of the measurements alone, and UNSEEN; fill period_s with the nominal one if not measured.
+    """Return the findings of q, dq, tau_J as bits of an observation, with UNSEEN set; fill a period_s not measured.
 
     steps: periods since the fresh sample before it. too_fast: the bit of a joint beyond its velocity limit.
     """
@@ -103,9 +103,10 @@ def observe(limits: Limits, nominal_s: float, block: Structured, steps: int, too
 
 @compiled
 def is_filled(steps: int, period_s: float, nominal_s: float, most: int) -> bool:
-    """Return whether a sample is close enough after the one before it. steps: periods between them, over period_s.
+    """Return whether the samples missing before a sample may be interpolated, or none is missing.
 
-    most: largest number of missing samples that may be interpolated between them.
+    steps: periods since the sample before. period_s: measured time since then, which must be near steps * nominal_s.
+    most: largest number of missing samples.
     """
     if not 1 <= steps <= most + 1:
         return False

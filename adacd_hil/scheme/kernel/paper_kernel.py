@@ -108,7 +108,7 @@ class PaperConstants:
 
 
 def constants_of(settings: Settings) -> Structured:
-    """Return the settings as the record that the compiled step reads."""
+    """Return the constants (1,) of the paper's compiled step."""
     count = len(settings.estimator.parameter_names)
     period_s = settings.bus.period_s
     hold = filter_bank.first_order_hold(settings.filter.a_rad_s, settings.filter.b_rad_s, period_s)
@@ -164,7 +164,7 @@ def numbers_of(settings: Settings) -> Numbers:
 
 @compiled
 def begin_adaptation(constants: Structured, memory: Structured, block: Structured) -> None:
-    """Forget the filters' past, the gain and the evidence; keep theta_hat. The arm is at rest.
+    """Reset filters, gain P and evidence to begin an adaptation of an arm at rest; keep theta_hat.
 
     Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
     """
@@ -211,10 +211,10 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
 
 @compiled
 def _filter(c: PaperConstants, m: PaperMemory, out: SchemeBlock, steps: int) -> tuple[bool, float]:
-    """Advance the filters to this sample and estimate the external torque with both models.
+    """Advance the filters to this sample, and fill the torques by the estimate and by the CAD model.
 
-    Return whether they took the sample in, and the time that it covers: the measured interval, after a gap the nominal
-    one.
+    steps: periods since the fresh sample before. Return whether the filters took the sample in, False after a gap, and
+    the time, s, that it covers: the measured interval, after a gap the nominal one.
     """
     a, b = c.a_rad_s, c.b_rad_s
     nominal_s: float = c.period_s
@@ -263,7 +263,7 @@ def _advance(
 
 @compiled
 def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: SchemeBlock) -> None:
-    """Compare the filtered torque with both predictions."""
+    """Fill the torques predicted by the estimate and by the CAD model, and the external torque by each."""
     external_torque.follow_standstill(dq, c.standstill_rad_s, decay, m.standstill)
     external_torque.predict(m.W_f, out.theta_hat, out.tau_f_hat)
     external_torque.predict(m.W_f, c.theta_cad, out.tau_f_cad)
@@ -274,7 +274,7 @@ def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: S
 
 @compiled
 def _learn(c: PaperConstants, m: PaperMemory, out: SchemeBlock, period_s: float) -> int:
-    """Test the estimate of this sample by eq. (15), then correct it; return ADAPTED if the adaptation is over."""
+    """Test the estimate by eq. (15) on this sample, then correct it; return ADAPTED if the adaptation is over, or 0."""
     if termination.gather(m.motion, out.q, out.dq, m.W_f, period_s):
         out.excitation = termination.eigenvalue_range(m.motion.information, c.scale, m.motion.scratch)[0]
     m.quiet_cycles = m.quiet_cycles + 1.0 if termination.is_quiet(out.tau_ext_hat, c.beta_Nm) else 0.0
@@ -293,7 +293,11 @@ def _learn(c: PaperConstants, m: PaperMemory, out: SchemeBlock, period_s: float)
 def _watch(
     c: PaperConstants, m: PaperMemory, out: SchemeBlock, period_s: float, is_fresh: bool, is_reporting: bool
 ) -> int:
-    """Compare with the thresholds; return the joints over their threshold, and COLLISION if one is a collision."""
+    """Fill the thresholds and compare the torques with them; return bits of an observation, or 0 without a contact.
+
+    The bits: CONTACT and COLLISION, which this scheme doesn't tell apart, and from CONTACT_SHIFT on one per joint.
+    is_reporting: a report is open, so the contact's impulse and peak are kept.
+    """
     F_c = out.theta_hat[regressor.F_C1 : regressor.F_C2 + 1]
     external_torque.fill_threshold(c.threshold_Nm, m.standstill, F_c, out.threshold)
     if is_fresh:
@@ -314,9 +318,10 @@ def _watch(
 def step_beside(
     constants: Structured, memory: Structured, block: Structured, sample: Sample, period_s: float, main: CertifiedBlock
 ) -> None:
-    """Process a sample beside the scheme in charge, and write the results into that scheme's block.
+    """Process a sample in the paper's scheme while the certified scheme decides; write the results into `main`.
 
-    main: the block of the scheme in charge. It learns from `begin_adaptation` until eq. (15) holds, then it is armed.
+    main: the certified scheme's block. The paper's scheme learns from `begin_adaptation` until eq. (15) holds, then its
+    thresholds are in force.
     """
     m, own = memory[0], block[0]
     put_sample(block, sample, period_s)

@@ -69,7 +69,7 @@ class FirstOrderHold(NamedTuple):
 
 @compiled
 def first_order_hold(a_rad_s: float, b_rad_s: float, period_s: float) -> FirstOrderHold:
-    """Return the discretisation of b / (s + a) for inputs that are straight lines over one period."""
+    """Return the coefficients of the filter b / (s + a) for inputs that are straight lines over one period."""
     missing = -math.expm1(-a_rad_s * period_s)  # 1 - E without cancellation
     dc_gain = b_rad_s / a_rad_s
     weight_new = dc_gain * (1.0 - missing / (a_rad_s * period_s))
@@ -78,7 +78,7 @@ def first_order_hold(a_rad_s: float, b_rad_s: float, period_s: float) -> FirstOr
 
 @compiled
 def advance_torque(hold: FirstOrderHold, tau_old: Vector, tau_new: Vector, tau_f: Vector) -> None:
-    """Advance tau_f (2,) over one period in place; tau_new becomes tau_old."""
+    """Advance tau_f (2,) over one period in place; copy tau_new to tau_old."""
     for i in range(tau_f.shape[0]):
         tau_f[i] = hold.decay * tau_f[i] + (hold.weight_old * tau_old[i] + hold.weight_new * tau_new[i])
         tau_old[i] = tau_new[i]
@@ -112,7 +112,10 @@ def resume(
     S: Vector,
     W_f: Vector,
 ) -> None:
-    """Start again from this sample after a gap, with W_f (2, p) and tau_f as they were. a, b: of F(s), rad/s."""
+    """Set S and input_old (2, p), tau_old (2,) in place so that the filters go on from this sample after a gap.
+
+    W_f (2, p) and tau_f stay as they were. a, b: of F(s), rad/s.
+    """
     for i in range(W_f.shape[0]):
         tau_old[i] = tau_new[i]
         for j in range(W_f.shape[1]):
@@ -137,7 +140,10 @@ Hz tracking loop, over hours of motion, 2026-11."""
 
 @compiled
 def filter_of(channel: int, filters: int) -> int:
-    """Return the filter of a channel: C smoothed ones, then the bare ones of all filters but the slow one."""
+    """Return the index of a channel's filter, from 0. filters: C.
+
+    Channels, from 0: C smoothed ones, then the bare ones of all filters but the slow one.
+    """
     return channel if channel < filters else channel - filters + 1
 
 
@@ -148,7 +154,10 @@ def channels_of(settings: Settings) -> tuple[tuple[float, float | None], ...]:
 
 
 def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> float:
-    """Return the response to a step of 1 of a low-pass, or of two in a row: 1 - (b e^(-a t) - a e^(-b t)) / (b - a)."""
+    """Return the output of a low-pass, after_s after a step of 1 at its input.
+
+    Of cut-off a, or with b_rad_s of two in a row: 1 - (b e^(-a t) - a e^(-b t)) / (b - a).
+    """
     if b_rad_s is None:
         return 1.0 - math.exp(-a_rad_s * after_s)
     a, b = a_rad_s, b_rad_s if b_rad_s != a_rad_s else b_rad_s * (1.0 + 1e-6)
@@ -157,7 +166,7 @@ def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> floa
 
 @compiled
 def forget(m: Memory) -> None:
-    """Forget the filtered torque and motion."""
+    """Set the filtered torque and regressor, and the learnt ones, to 0."""
     own = m.filters
     own.W_f[:] = 0.0
     own.tau_f[:] = 0.0
@@ -167,7 +176,7 @@ def forget(m: Memory) -> None:
 
 @compiled
 def rest(m: Memory) -> None:
-    """Begin with filters that have always been in this pose, with gravity's torque there.
+    """Set each filter's regressor and torque to their values after a long rest in the present pose, gravity included.
 
     From 0, that torque would be a step: the columns of the lag would have its derivative.
     """
@@ -179,7 +188,7 @@ def rest(m: Memory) -> None:
 
 @compiled
 def choose_rates(k: Constants, m: Memory, period_s: float) -> None:
-    """Fill each filter's coefficients for one period."""
+    """Fill `rates` (3, C) with each filter's coefficients for a period of period_s, see `FirstOrderHold`."""
     decay, old, new = m.filters.rates[0], m.filters.rates[1], m.filters.rates[2]
     if period_s == k.period_s:
         decay[:] = k.decay
@@ -191,7 +200,7 @@ def choose_rates(k: Constants, m: Memory, period_s: float) -> None:
 
 @compiled
 def discretise(cutoff_rad_s: Vector, period_s: float, decay: Vector, weight_old: Vector, weight_new: Vector) -> None:
-    """Fill the coefficients of each filter (C,) for one period."""
+    """Fill decay, weight_old, weight_new (C,) of filters with DC gain 1 for one period, see `FirstOrderHold`."""
     for c in range(cutoff_rad_s.shape[0]):
         decay[c], weight_old[c], weight_new[c] = first_order_hold(cutoff_rad_s[c], cutoff_rad_s[c], period_s)
 
@@ -222,7 +231,7 @@ def take_sample(k: Constants, m: Memory, tau_J: Vector, is_seen: bool) -> None:
 
 @compiled
 def fill_lag(cutoff_rad_s: Vector, tau_J: Vector, tau_f: Vector, first_column: int, W_f: Vector) -> None:
-    """Fill the columns of the lag, one per joint from `first_column` on: the filtered derivative of the torque."""
+    """Fill the columns of the lag in W_f (C, n, p), from `first_column` on: the filtered derivative of each tau_J."""
     for c in range(cutoff_rad_s.shape[0]):
         for i in range(tau_J.shape[0]):
             W_f[c, i, first_column + i] = cutoff_rad_s[c] * (tau_J[i] - tau_f[c, i])
@@ -230,7 +239,7 @@ def fill_lag(cutoff_rad_s: Vector, tau_J: Vector, tau_f: Vector, first_column: i
 
 @compiled
 def fill_cross_talk(tau_f: Vector, first_column: int, W_f: Vector) -> None:
-    """Fill the columns of cross-talk, one per joint from `first_column` on: the other joint's filtered torque.
+    """Fill the columns of cross-talk in W_f (C, n, p), from `first_column` on: the other joint's filtered torque.
 
     For two joints. The other joint's torque is itself distorted by cross-talk, but that error is of second order.
     """

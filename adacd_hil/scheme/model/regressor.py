@@ -83,7 +83,7 @@ def _fill_friction_and_gravity(q: Vector, dq: Vector, level_rad: float, W: Vecto
 
 @compiled
 def regressor(q: Vector, dq: Vector, ddq: Vector, parameter_count: int, level_rad: float) -> Vector:
-    """Return W (2, p) of eq. (17)."""
+    """Return the regressor W (2, p) of eq. (17), tau = W theta. level_rad: q1 at which link 1 is level."""
     W = np.zeros((JOINTS, parameter_count))
     fill_momentum(q, ddq, W)  # M ddq
     s2 = np.sin(q[1])
@@ -105,7 +105,7 @@ def inverse_dynamics(q: Vector, dq: Vector, ddq: Vector, theta: Vector, level_ra
 
 @compiled
 def fill_mass_matrix(q: Vector, theta: Vector, M: Vector) -> None:
-    """Fill M(q) (2, 2), kg m²."""
+    """Fill M (2, 2) with the mass matrix at q, kg m²."""
     c2 = np.cos(q[1])
     M[0, 0] = theta[A1] + 2.0 * theta[A2] * c2
     M[0, 1] = M[1, 0] = theta[A3] + theta[A2] * c2
@@ -113,7 +113,7 @@ def fill_mass_matrix(q: Vector, theta: Vector, M: Vector) -> None:
 
 
 def mass_matrix(q: Vector, theta: Vector) -> Vector:
-    """Return M(q) (2, 2), kg m²."""
+    """Return the mass matrix M(q) (2, 2), kg m²."""
     M = np.zeros((JOINTS, JOINTS))
     fill_mass_matrix(q, theta, M)
     return M
@@ -143,7 +143,7 @@ def smooth_sign(dq: float, still_rad_s: float, width_rad_s: float) -> float:
 
 @compiled
 def bend_bristles(dq: Vector, period_s: float, still_rad_s: float, dahl_rad: Vector, bent: Vector) -> None:
-    """Advance the bristles of each length (2,) by one period: `bent` (2, n) from -1 to 1, where they slide."""
+    """Advance `bent` (2, n), the bristles' bend of each length dahl_rad (2,), by one period; -1 or 1: they slide."""
     for length in range(bent.shape[0]):
         for i in range(dq.shape[0]):
             if abs(dq[i]) >= still_rad_s:
@@ -161,9 +161,10 @@ def fill_terms(
     first_column: int,
     Y_h: Vector,
 ) -> None:
-    """Fill the columns of the optional terms, numbers as in `FRICTION_TERMS`, from `first_column` on.
+    """Fill the columns of Y_h (n, p) for the optional friction terms, from `first_column` on, by term and then joint.
 
-    speeds: still, width w and v_s, rad/s. bent (2, n): of the bristles, see `bend_bristles`.
+    terms: their indices in `FRICTION_TERMS`. speeds: still, width w and v_s, rad/s. bent (2, n): of the bristles, see
+    `bend_bristles`.
     """
     count = dq.shape[0]
     still_rad_s, width_rad_s, stribeck_rad_s = speeds
@@ -189,7 +190,7 @@ PLACE_TERMS = len(POSITION_TERMS)
 
 @compiled
 def fill_position(q: Vector, X: Vector) -> None:
-    """Fill X (n, PLACE_TERMS) with the columns at q (n,), in the order of `POSITION_TERMS`."""
+    """Fill X (n, PLACE_TERMS) with the columns of torque by place at q (n,), in the order of `POSITION_TERMS`."""
     total = np.sum(q)
     sin_sum, cos_sum = np.sin(total), np.cos(total)
     for i in range(q.shape[0]):
@@ -210,7 +211,10 @@ def put_position_columns(X: Vector, first_column: int, Y_h: Vector) -> None:
 
 @compiled
 def fill(k: Constants, m: Memory, q: Vector, dq: Vector, tau_J: Vector, period_s: float) -> None:
-    """Fill Y_p, Y_h (n, p), offsets and further friction included, X, and M (n, n) of the model in use."""
+    """Fill the regressor's memory for a sample: Y_p, Y_h (n, p) with all terms, X, and M (n, n) of the model in use.
+
+    Advance the bristles by period_s.
+    """
     own = m.regressor
     base, first_coulomb, count = int(k.first_offset), int(k.first_coulomb), q.shape[0]
     bend_bristles(dq, period_s, k.still_rad_s, k.dahl_rad, own.bent)

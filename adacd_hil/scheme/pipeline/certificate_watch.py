@@ -77,16 +77,19 @@ class CertificateWatch:
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
-        """All certificates that were not taken back, in order."""
+        """Return the certificates that were not taken back, in order."""
         return tuple(self._certificates)
 
     @property
     def is_refusing(self) -> bool:
-        """Whether a refusal has followed the last certificate, the user's last reply and the enabling."""
+        """Return whether a refusal stands: without a reply, a certificate or the enabling of the drives since."""
         return self._refusal is not None
 
     def enter(self, previous: SchemeState, state: SchemeState) -> Event | None:
-        """Process a new state; return the event of a new certificate, or None."""
+        """Store the certificate and return its event if the arm has just passed its test; else return None.
+
+        A certificate, or the enabling of the drives, ends a refusal.
+        """
         if state is SchemeState.ENABLE:
             self._refusal = None
         if state is not SchemeState.MONITOR or previous is not SchemeState.CERTIFY:
@@ -102,7 +105,7 @@ class CertificateWatch:
         return BriefedEvent.of(Event(level, "certificate", text), self._certified_in_brief(known_by))
 
     def _certified_in_brief(self, known_by: str) -> str:
-        """Return the text of a certificate's promises and of its limits."""
+        """Return a certificate's short text: unanchored joints, the smallest push, and a weak basis of its friction."""
         texts = [margin.describe_push(self._m)]
         joints = " and ".join(f"joint {i + 1}" for i in anchor.open_joints(self._k, self._m))
         if joints:
@@ -118,9 +121,10 @@ class CertificateWatch:
         return f"friction and inertia: within what {self._last} allows" if is_compared else THIS_RUN_ONLY
 
     def refuse(self) -> Event | None:
-        """Record, before its traces are gone, that the reading at rest or a fit is refused.
+        """Store a refusal of the reading at rest or of a fit, with its cause; return the event to report, or None.
 
-        Return the event to report.
+        None for a cause that is known already, but for each REPORT_EACH-th refused fit in a row. Call it before the
+        kernel forgets the fit.
         """
         before, m, cause = self._refusal, self._m, int(self._m.certificate.withheld_by)
         offsets = slice(int(self._k.first_offset), int(self._k.first_offset) + JOINTS)
@@ -136,13 +140,13 @@ class CertificateWatch:
         return Event("warning", name, "; ".join((*lines, *again, consequence, remedy)))
 
     def doubt(self, verdict: CommonCause) -> Event:
-        """Return the event that contacts have taken the certificate back, with the reason."""
+        """Take the certificate back because of contacts, and return the event with their common cause."""
         self._take_back()
         remedy = "`changed` learns it" if verdict.is_payload else "`relearn` learns the arm anew"
         return Event("warning", "revoked", f"{verdict.text}: the certificate is taken back, {remedy}")
 
     def revoke(self) -> Event:
-        """Record, before the kept evidence is forgotten, that the user takes the certificate back; return the event."""
+        """Take the certificate back for the user and return the event; call it before kept beliefs are dropped."""
         if earlier.is_keeping(self._m):
             self._vouched_against = _THE_RUN
         self._take_back()
@@ -167,7 +171,7 @@ class CertificateWatch:
         return BriefedEvent.of(Event("warning", "touch", text), brief)
 
     def contradiction(self) -> CommonCause:
-        """Return the contradiction of the certificate while the arm monitors: offset, torque by place, blindness."""
+        """Return the kernel's contradiction of a certificate in MONITOR: offset, torque by place, or less sight."""
         return CommonCause("; ".join(self._describe(int(self._m.certificate.withheld_by))), is_payload=False)
 
     def _describe(self, cause: int) -> list[str]:
@@ -190,7 +194,11 @@ class CertificateWatch:
         return lines
 
     def accept(self) -> Event:
-        """Accept the last refused fit or reading at the user's request; return the event to report."""
+        """Drop the evidence that refuses a fit or reading, at the user's request; return the event to report.
+
+        For offsets that an anchor excludes, set the refused offsets as the new anchor. Without a refusal do nothing and
+        return a warning.
+        """
         refusal, self._refusal = self._refusal, None
         if refusal is None:
             return Event("warning", "anchor", "nothing to accept: no certificate is withheld")
@@ -213,7 +221,7 @@ class CertificateWatch:
         return Event("warning", _CONTRADICTIONS[refusal.cause][0], text)
 
     def describe(self) -> list[str]:
-        """Return the present refusal, a line per cause; empty without a refusal."""
+        """Return the lines of the present refusal: causes, number of refused fits, remedy; empty without a refusal."""
         if self._refusal is None:
             return []
         is_reading = self._refusal.cause == certificate.READING

@@ -70,7 +70,7 @@ class CertifiedPipeline(Pipeline):
     )
 
     def compile_cycle(self) -> None:
-        """Run each compiled function of the cycle once, on copies."""
+        """Compile each function of the cycle by a call on copies, so that no later cycle compiles."""
         constants, memory = self.numbers.constants, self.numbers.memory.copy()
         k, m = constants[0], memory[0]
         certified_kernel.begin_adaptation(constants, memory, False, True)
@@ -88,32 +88,36 @@ class CertifiedPipeline(Pipeline):
         super().compile_cycle()
 
     def compile_longest(self) -> None:
-        """Compile the learning from a sample, half of a step's compile time, and the paper's scheme."""
+        """Compile the learning from a sample and the paper's scheme, about half of `compile_cycle`'s work."""
         constants, memory, block, _ = self.numbers
         certified_kernel.improve(constants[0], memory.copy()[0], block.copy()[0], False, certified_kernel.LEARN)
         constants, memory, block = self._paper
         paper_kernel.step(constants, memory.copy(), block.copy(), 1, 1, paper_kernel.LEARN)
 
     def describe_missing(self) -> list[str]:
-        """Return the conditions that an adaptation still waits for, a line each."""
+        """Return the lines of a present refusal, and a line for each condition that the fit still misses."""
         return [*self._watch.describe(), *termination.describe_missing(self._k, self._m, self._names, PARAMETER_UNITS)]
 
     def describe_withheld(self) -> list[str]:
-        """Return the contradictions of a certificate that is withheld, a line each."""
+        """Return the lines of a present refusal: its contradictions and the remedy; empty without a refusal."""
         return self._watch.describe()
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
-        """The certificates of the run that were not taken back, in order."""
+        """Return the certificates of the run that were not taken back, in order."""
         return self._watch.certificates
 
     def take_events(self) -> list[Event]:
-        """Return the events since the last call."""
+        """Return the events since the last call, and clear them."""
         events, self._events = self._events, []
         return events
 
     def _follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:
-        """Process the kernel's findings, and run the first actions of a new state."""
+        """Report acceptance and refusal, weigh a contact, and run the first actions of a new state.
+
+        asked: bits of the tasks, see `kernel.cycle`. previous: state before this cycle. observation: the cycle's
+        findings, see `transitions`.
+        """
         state = self.state
         if asked & ACCEPTED:
             self._events.append(self._watch.accept())
@@ -133,7 +137,11 @@ class CertifiedPipeline(Pipeline):
         return recalled_report(self._settings, self._course.contact, self._rows, cycle)
 
     def _attend(self, asked: int, cycle: int) -> None:  # noqa: ARG002
-        """Forget the samples of a touch, judge the margin, and report a push on the arm at rest."""
+        """Run the tasks in `asked`, bits of `kernel.cycle`, at a cycle's end.
+
+        FORGET: learn anew without the samples of a touch. SECOND: judge the margin. PUSHED: report a push on the arm at
+        rest.
+        """
         if asked & FORGET:
             self._learn_anew(is_first=False)
         if asked & SECOND:
@@ -146,7 +154,7 @@ class CertifiedPipeline(Pipeline):
             self._events.append(event)
 
     def _judge_margin(self) -> None:
-        """Judge the residuals' margin to thresholds in a second of monitoring, and the smallest detectable contact."""
+        """Add the last second's largest residuals to the margin; report a margin or sight that has become worse."""
         self._margin.add_block(sensitivity.take_peak_shares(self._m))
         dim = "; ".join(margin.describe_dim(self._m))
         for name, warning in (("margin", self._margin.warning), ("sight", dim)):
@@ -155,9 +163,10 @@ class CertifiedPipeline(Pipeline):
             self._warned = self._warned | {name} if warning else self._warned - {name}
 
     def _weigh(self, state: SchemeState, previous: SchemeState, cycle: int, is_touched: bool) -> SchemeState:
-        """Weigh a contact of the certified model as it proceeds.
+        """Store the beginning or end of a contact in MONITOR; stop the arm if contacts have a common cause.
 
-        Return the next state, STOPPED if the model is doubted.
+        Return the state after that. A common cause takes the certificate back, unless the reaction lets the arm go on.
+        Else report a contact that followed soon on another.
         """
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
             is_contradicted = self._course.supervisor.cause == SchemeEvent.CONTRADICTED
@@ -178,7 +187,7 @@ class CertifiedPipeline(Pipeline):
         return state
 
     def _enter(self, state: SchemeState, previous: SchemeState) -> None:
-        """Run the first actions of a new state, and the last ones of the state before."""
+        """Run the first actions of ADAPT, CERTIFY, and of MONITOR after a passed test."""
         if state is SchemeState.ADAPT:
             self._begin_adaptation(previous)
         elif state is SchemeState.CERTIFY:
@@ -192,7 +201,10 @@ class CertifiedPipeline(Pipeline):
             self._feed_forward()
 
     def _begin_adaptation(self, previous: SchemeState) -> None:
-        """Begin to learn anew: a payload on top of the certified arm; if that has failed, the whole arm."""
+        """Begin an adaptation: of a payload if the arm is certified, of the whole arm if not, or if a test was failed.
+
+        Revoke the certificate first if that is the cause.
+        """
         cause = self._course.supervisor.cause
         if cause == SchemeEvent.REVOKED:
             self._revoke()
@@ -205,7 +217,9 @@ class CertifiedPipeline(Pipeline):
         self._learn_anew(is_first)
 
     def _learn_anew(self, is_first: bool) -> None:
-        """Begin to learn, and forget the model learnt before.
+        """Begin to learn from the prior, or from the certified arm with a payload; drop the present fit.
+
+        is_first: the adaptation begins; False: it begins again.
 
         Runs, too, once a contact that interrupted an adaptation has been reported: the adaptation may have learnt the
         contact's beginning. Or the arm is free of contact now, and the adaptation had learnt an earlier one. Then the
@@ -214,7 +228,7 @@ class CertifiedPipeline(Pipeline):
         certified_kernel.begin_adaptation(*self.numbers[:2], self._is_payload, is_first)
 
     def _revoke(self) -> None:
-        """Take back the certificate: forget the arm's model and stop the feedforward."""
+        """Take back the certificate, drop the kept beliefs, and set the feedforward's model to 0."""
         self._is_payload = self._course.is_model_valid = False
         self.theta_ff = np.zeros(self.theta_ff.size)
         self._events.append(self._watch.revoke())
@@ -222,5 +236,5 @@ class CertifiedPipeline(Pipeline):
         paper_kernel.begin_adaptation(*self._paper)
 
     def _feed_forward(self) -> None:
-        """Use the model in use for the feedforward from now on."""
+        """Copy the parameters of the model in use to `theta_ff`, the feedforward's model."""
         self.theta_ff = np.array(self._m.models.theta[: self.theta_ff.size])

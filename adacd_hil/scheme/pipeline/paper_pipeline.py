@@ -35,7 +35,7 @@ class PaperPipeline(Pipeline):
         self._end_arrays = self.numbers.block, self._course_constants, self._course_memory
 
     def compile_cycle(self) -> None:
-        """Run every compiled function of the cycle once, on copies."""
+        """Compile each function of the cycle by a call on copies, so that no later cycle compiles."""
         paper_kernel.begin_adaptation(*(array.copy() for array in self.numbers[:3]))
         super().compile_cycle()
 
@@ -43,7 +43,10 @@ class PaperPipeline(Pipeline):
         return integrated_report(self._course.contact, self.tau_ext_hat, self._m.integral, self._m.peak, self._a_rad_s)
 
     def _follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:  # noqa: ARG002
-        """Begin an adaptation, or take over its result."""
+        """Begin an adaptation on entering ADAPT; at its end use its estimate as the feedforward's model.
+
+        After REVOKED set the feedforward's model to 0 first.
+        """
         state = self.state
         if previous is SchemeState.ADAPT and state is SchemeState.MONITOR:
             self.theta_ff = self.numbers.block[0].theta_hat.copy()

@@ -67,7 +67,7 @@ _STATES, _FAULTS, _REACTIONS = tuple(SchemeState), tuple(FaultReason), tuple(Rea
 
 
 def layout_of(settings: Settings) -> Layout:
-    """Return the layout of the block of the pipeline selected by the settings."""
+    """Return the layout of the values that the selected scheme writes per cycle, its block."""
     count = len(settings.estimator.parameter_names)
     if settings.scheme == "certified":
         return certified_layout(count, settings.further_count, settings.channel_count)
@@ -123,11 +123,11 @@ class Pipeline(ABC):
 
     @property
     def state(self) -> SchemeState:
-        """The scheme's present state."""
+        """Return the scheme's state after the last cycle."""
         return SchemeState(self._course.supervisor.state)
 
     def compile_cycle(self) -> None:
-        """Run each compiled function of the cycle once, on copies, so that no later call compiles."""
+        """Compile each function of the cycle by a call on copies, so that no later cycle compiles."""
         inverse_dynamics(np.zeros(2), np.zeros(2), np.zeros(2), self.theta_ff, 0.0)
         supervisor.doubt(self._course_memory["supervisor"].copy()[0])
         course.goes_on(self._course.contact)
@@ -136,21 +136,25 @@ class Pipeline(ABC):
         self._end(samples, decisions, 0, *(array.copy() for array in self._end_arrays))
 
     def compile_longest(self) -> None:
-        """Compile the second half of `compile_cycle`'s work, for another process at the same time.
+        """Compile about half of `compile_cycle`'s work, for a second process at the same time.
 
-        Skip if the whole takes only a moment.
+        Do nothing for a scheme whose compilation takes only a moment.
         """
 
     @abstractmethod
     def _follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:
-        """Run the first actions of a new state, and the last ones of the state before, after the supervisor's step."""
+        """Run a scheme's actions on a change of state, after the supervisor's step and before a contact's report.
+
+        asked: bits of the tasks, see `kernel.cycle`. previous: state before this cycle. observation: the cycle's
+        findings, see `transitions`.
+        """
 
     @abstractmethod
     def _report(self, cycle: int) -> ContactReport:
-        """Return the contact's report that is due in this cycle."""
+        """Return the report of the present contact, due in this cycle."""
 
     def _attend(self, asked: int, cycle: int) -> None:
-        """Run the tasks at the end of a cycle."""
+        """Run a scheme's tasks in `asked`, bits of `kernel.cycle`, at the end of a cycle; none by default."""
 
     def describe_missing(self) -> list[str]:
         """Return the conditions that an adaptation still waits for, a line each.
@@ -160,20 +164,20 @@ class Pipeline(ABC):
         return []
 
     def describe_withheld(self) -> list[str]:
-        """Return the contradictions of a certificate that is withheld, a line each."""
+        """Return the contradictions for which a certificate is withheld, as lines; empty for the paper's scheme."""
         return []
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
-        """The certificates of the run that were not taken back, in order; empty for the paper's scheme."""
+        """Return the run's certificates that were not taken back, in order; empty for the paper's scheme."""
         return ()
 
     def take_events(self) -> list[Event]:
-        """Return the events since the last call: a margin that has shrunk, a certificate."""
+        """Return the events since the last call, such as a new certificate, and clear them."""
         return []
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:
-        """Process one cycle and return its output."""
+        """Process the sample and request of one cycle; return its state, torques and a contact's report, if due."""
         fill_sample(self._sample, arm, request)
         asked = self._cycle(self._sample, self._decision, self._block, 0, *self._cycle_arrays)
         contact = self._finish(asked, self._sample, self._decision, 0) if asked else None
@@ -195,7 +199,10 @@ class Pipeline(ABC):
         )
 
     def run(self, arms: ArmBatch, requests: NDArray[np.uint8]) -> SchemeBatch:
-        """Process n cycles with the results of `step` on each. requests (n,): values of `Request`."""
+        """Process n cycles and return their outputs as columns, the same as `step` on each.
+
+        requests (n,): values of `Request`.
+        """
         count = arms.cycle.size
         samples, decisions = samples_of(arms, requests), np.zeros(count, DECISION)
         blocks = np.empty((count, self.numbers.values.size))
@@ -218,7 +225,10 @@ class Pipeline(ABC):
         )
 
     def _finish(self, asked: int, samples: Structured, decisions: Structured, place: int) -> ContactReport | None:
-        """Run the tasks that a cycle has for Python, and end it; return the contact's report that is due, or None."""
+        """Run the tasks that the compiled cycle leaves to Python, and end the cycle; return a due report, or None.
+
+        asked: bits of the tasks. place: row of the cycle in samples and decisions.
+        """
         cycle = int(samples["cycle"][place])
         if asked & BEFORE_CONTACT:
             previous, observation = SchemeState(decisions["previous_state"][place]), decisions["observation"][place]

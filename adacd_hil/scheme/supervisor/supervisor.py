@@ -172,7 +172,7 @@ def fill_constants(settings: Settings, k: SupervisorConstants) -> None:
 
 
 def begin(m: SupervisorMemory) -> None:
-    """Fill the supervisor's memory before the first cycle."""
+    """Set the state to INIT, and the origin to MONITOR, before the first cycle."""
     m.state, m.origin = SchemeState.INIT, SchemeState.MONITOR
 
 
@@ -180,7 +180,7 @@ def begin(m: SupervisorMemory) -> None:
 def supervise(
     k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
 ) -> None:
-    """Process one cycle and change to the new state.
+    """Count the cycle's findings, take its request, and change the state if an event of the table has happened.
 
     observation: its bits, see `transitions`. is_reporting: a contact's report is not final yet. goes_on: the reaction
     in force lets the arm move on, so that a contact clears without rest.
@@ -197,7 +197,7 @@ def supervise(
 
 @compiled
 def doubt(m: SupervisorMemory) -> None:
-    """Record, once a contact is over, that the model is wrong: hold the arm until the user decides how to go on.
+    """Move to STOPPED after a contact, latched, because the model is wrong: hold the arm until the user decides.
 
     An acknowledgement then takes back the knowledge of the arm; a payload may change without an announcement.
     """
@@ -209,7 +209,7 @@ def doubt(m: SupervisorMemory) -> None:
 
 @compiled
 def _count(m: SupervisorMemory, arm: Sample, observation: int) -> None:
-    """Count this cycle and its findings: rest, motion, missing data, late host."""
+    """Count periods in the state, and cycles in a row at rest, in motion, without contact, blind, and with old data."""
     m.phase_periods += arm.periods
     if IS_LEARNING[m.state]:
         m.learning_periods += arm.periods
@@ -222,7 +222,7 @@ def _count(m: SupervisorMemory, arm: Sample, observation: int) -> None:
 
 @compiled
 def _take(m: SupervisorMemory, request: int) -> None:
-    """Keep a request if this state serves it sooner or later."""
+    """Set the request's bit in `pending` if it may wait in this state; else drop it."""
     if _keeps(m, request, m.state):
         m.pending |= 1 << request
         if request == Request.PAYLOAD:
@@ -233,7 +233,11 @@ def _take(m: SupervisorMemory, request: int) -> None:
 
 @compiled
 def _keeps(m: SupervisorMemory, request: int, state: int) -> bool:
-    """Return whether a request waits in a state; an operator who changes a payload may touch the arm."""
+    """Return whether a request stays pending in a state.
+
+    PAYLOAD_CHANGED waits during a reaction only if the model is in doubt or the payload was being changed: an operator
+    who changes it may touch the arm.
+    """
     if request == Request.PAYLOAD_CHANGED and IS_REACTING[state]:
         return bool(m.is_doubted != 0 or m.origin == SchemeState.PAYLOAD)
     return bool(_IS_KEPT[request, state])
@@ -246,21 +250,24 @@ def _is_pending(m: SupervisorMemory, request: int) -> bool:
 
 @compiled
 def _has_grown(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> bool:
-    """Return whether a contact that would clear itself now needs an acknowledgement."""
+    """Return whether a contact that clears itself must be acknowledged from this cycle on.
+
+    So after a collision, a late host, `patience_cycles`, or a payload to which the user has attributed the contact.
+    """
     is_over = observation & COLLISION != 0 or arm.is_late != 0 or m.phase_periods >= k.patience_cycles
     return bool(is_over or _is_payload_announced(k, m))
 
 
 @compiled
 def _is_announced(m: SupervisorMemory) -> bool:
-    """Return whether a change of payload is due in MONITOR or STOPPED; it ends a stop only if announced in it."""
+    """Return whether an announced change of payload ends the state; STOPPED only if it was announced in STOPPED."""
     is_awaited = _is_pending(m, Request.PAYLOAD) and m.state == SchemeState.MONITOR
     return bool(m.is_announced_here != 0 or is_awaited)
 
 
 @compiled
 def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
-    """Return whether the user has attributed the contact to the payload: to its weight, where gravity acts.
+    """Return whether the user has said that a changed payload, or its weight in gravity, caused the contact.
 
     The weight counts only if announced since the contact began: an earlier announcement cannot exclude a person's
     touch.
@@ -271,7 +278,7 @@ def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
 
 @compiled
 def _enter(m: SupervisorMemory, state: int, event: int) -> None:
-    """Enter a state, and drop the requests that it has served or that have no meaning there."""
+    """Enter another state by `event`, reset its counts, and drop the requests that don't wait there."""
     if state == m.state:
         return
     if state == SchemeState.REACT:
@@ -296,7 +303,10 @@ def _enter(m: SupervisorMemory, state: int, event: int) -> None:
 def _event(
     k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
 ) -> int:
-    """Return the first event of this cycle that applies in this state."""
+    """Return the event of this cycle: a fault, a contact, or progress of the state, in this order; else NONE.
+
+    Without any of them, a state that lasts too long is a fault. Store the reason of a fault in `m.fault`.
+    """
     fault = 0
     if _IS_CHECKED[m.state]:
         fault = _check(k, m, arm, observation)
@@ -326,7 +336,7 @@ def _touch(m: SupervisorMemory, arm: Sample, observation: int) -> int:
 def _progress(
     k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
 ) -> int:
-    """Return the event that completes this state, or 0 if it is not complete."""
+    """Return the event other than fault and contact that ends the state in this cycle, or NONE."""
     state = m.state
     event: int = SchemeEvent.NONE
     is_still = m.still_cycles >= k.rest_cycles
@@ -367,7 +377,7 @@ def _released(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observat
 
 @compiled
 def _verdict(state: int, observation: int) -> int:
-    """Return the result of learning or testing the model in this cycle as an event, or 0."""
+    """Return the event of a completed fit (ADAPTED, FITTED) or test (REFUTED, CERTIFIED) in this cycle, or NONE."""
     event: int = SchemeEvent.NONE
     if state == SchemeState.ADAPT and observation & ADAPTED:
         event = SchemeEvent.ADAPTED
@@ -398,7 +408,7 @@ def _begun(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
 
 @compiled
 def _settled(k: SupervisorConstants, m: SupervisorMemory, is_still: bool, goes_on: bool) -> int:
-    """Return the event that ends REACT in this cycle, or 0."""
+    """Return the event that ends REACT in this cycle: AT_REST if latched, else CLEARED; NONE if it lasts."""
     event: int = SchemeEvent.NONE
     if m.is_latched != 0:
         if is_still:
@@ -422,7 +432,10 @@ def _is_commissioned(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, o
 
 @compiled
 def _overdue(k: SupervisorConstants, m: SupervisorMemory) -> int:
-    """Return the fault of a phase that has taken too long, or NONE. In REACT a learning arm's clock stops."""
+    """Return the fault of a state that has lasted too long, or NONE.
+
+    Learning states share one time limit, in which REACT doesn't count.
+    """
     spent = m.learning_periods if IS_LEARNING[m.state] else m.phase_periods
     is_over = spent >= k.limit_periods[m.state]
     return int(_OVERDUE[m.state]) if is_over else FaultReason.NONE
@@ -430,7 +443,7 @@ def _overdue(k: SupervisorConstants, m: SupervisorMemory) -> int:
 
 @compiled
 def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> int:
-    """Return the reason why the arm must stop, or NONE."""
+    """Return the first fault in this cycle's data, limits, drives or timing, or NONE."""
     state = m.state
     fault: int = FaultReason.NONE
     is_thrown = state == SchemeState.REACT and m.phase_periods <= k.rebound_cycles
@@ -467,12 +480,15 @@ class KeptRequest:
         return carried
 
     def ask(self, request: Request, state: SchemeState) -> None:
-        """Record a request; state: that of the cycle before."""
+        """Keep a request to finish, or to change the payload in a state that serves it; ignore all others.
+
+        FINISH replaces a kept request and is not replaced. state: that of the cycle before.
+        """
         is_kept = request is Request.FINISH or (request is Request.PAYLOAD and state in KEPT_IN[request])
         if is_kept and self.request is not Request.FINISH:
             self.request = request
 
     def serve(self, states: Iterable[int]) -> None:
-        """Drop a request to change the payload once cycles have reached PAYLOAD. states: those reached."""
+        """Drop a kept request to change the payload if `states`, those of the last cycles, contain PAYLOAD."""
         if self.request is Request.PAYLOAD and SchemeState.PAYLOAD in states:
             self.request = Request.NONE

@@ -152,7 +152,7 @@ def next_state(state: int, event: int, origin: int) -> int:
 
 @compiled
 def leads_on(state: int, event: int) -> bool:
-    """Return whether the table has this pair."""
+    """Return whether the event moves the scheme out of the state, by the table."""
     return bool(_NEXT[state, event] != STAYS)
 
 
