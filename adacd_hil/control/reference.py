@@ -117,7 +117,7 @@ class Reference(EventSource):
             self._approach()
 
     def is_parked(self, cycle: int) -> bool:
-        """Whether the arm has arrived in the corner after `park` and has settled."""
+        """Return whether the arm has settled in the corner after `park`; True, too, while it is stopped anywhere."""
         if not self._is_parking or self._state is SchemeState.REACT:
             return False
         if self._state is SchemeState.STOPPED:

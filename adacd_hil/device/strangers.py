@@ -87,7 +87,11 @@ class Strangers(RateLimitedEvents):
         self._contradictions: dict[str, deque[int]] = {}
 
     def accept(self, frame: Frame, cycle: int) -> bool:
-        """Take a frame that was received in a cycle; return False when another sender may have sent it."""
+        """Judge a frame received in a cycle; return True if only this host may send its identifier.
+
+        Append an event, at a limited rate: a warning for an SDO request that only reads, else an error. NMT to nodes of
+        other arms gives no event.
+        """
         doing = self._doing.get(frame.can_id)
         if doing is None:
             return False
