@@ -35,7 +35,10 @@ class ConfigurationFindings(NamedTuple):
 
 
 def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
-    """Return all errors and likely mistakes of a configuration."""
+    """Return all errors and likely mistakes of a configuration, by its name or file.
+
+    profile: name of one of its `[profiles]` to apply. The checks stop at the first kind of error.
+    """
     try:
         layers = configuration_layers(name_or_file, profile)
         settings = parse(Settings, resolved_table(layers))
@@ -58,7 +61,7 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
 
 
 def profile_guesses(settings: Settings) -> dict[str, float]:
-    """Return the guesses in the profiles of the devices, as `my-drive.toml: scale.gear_ratio`."""
+    """Return the values that device profiles list as assumed, by a key such as `my-drive.toml: scale.gear_ratio`."""
     found = {}
     for kind, names in (("drive", settings.devices.drive), ("sensor", settings.devices.sensor)):
         for name in dict.fromkeys(names):
@@ -79,7 +82,7 @@ _MOST_NAMED = 4
 
 
 def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
-    """Name the guessed values of a configuration in one line, without measured ones; "" if there are none."""
+    """Return a line that names up to four guessed values of a configuration, without measured ones; "" if none."""
     guesses = [f"`{key}`" for key in (*profile_guesses(settings), *settings.assumed) if key not in measured]
     more = f" and {len(guesses) - _MOST_NAMED} more" if len(guesses) > _MOST_NAMED else ""
     named = f"{', '.join(guesses[:_MOST_NAMED])}{more}"
@@ -135,7 +138,10 @@ _LOOKS: tuple[Callable[[Settings], Iterator[str]], ...] = (_over, _radians, _unk
 
 
 def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
-    """Warn of a file that describes its own arm but inherits numbers of an emulated one."""
+    """Yield a warning for the paper's scheme, and for each number of an emulated arm that an own arm inherits.
+
+    layers: the configuration and all that it extends, the base first.
+    """
     own = [layer for layer in layers if layer.origin not in builtin_names() and "[profiles." not in layer.origin]
     if not own:
         return
@@ -151,7 +157,7 @@ def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
 
 
 def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
-    """Return for each key the topmost layer that sets it."""
+    """Return, by key such as `arm.sign`, the origin of the last of the layers that sets it, and so decides."""
     found = {}
     for origin, table in layers:
         for section, content in table.items():
@@ -161,7 +167,7 @@ def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
 
 
 def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
-    """Warn of torque sensors whose frames can't carry the rated torque."""
+    """Yield a warning for each torque sensor whose frame can't carry the joint's rated torque."""
     for joint, rated_Nm in enumerate(settings.arm.rated_torque_Nm):
         message = codec.message(f"Sensor{joint + 1}Torque")
         signal = message.values[message.place("torque")]

@@ -30,21 +30,21 @@ class Controller:
         self._cycles_left = 0
 
     def compile_law(self) -> None:
-        """Call the compiled part once, so that it doesn't compile in the cycle."""
+        """Compile `fill_torque` by a call, so that it doesn't compile in the cycle."""
         zeros = np.zeros(JOINTS)
         fill_torque(
             zeros, zeros, zeros, zeros, zeros, self._theta, self._Kp, self._Kd, self._level_rad, np.zeros(JOINTS)
         )
 
     def feed_forward(self, theta: Vector) -> None:
-        """Blend the feedforward to these parameters (p,); ignore the same array again."""
+        """Begin to blend the feedforward to theta (p,) over HANDOVER_S; do nothing for the same array as last."""
         if theta is self._new or not self._has_feedforward:
             return
         self._old, self._new = self._theta, theta
         self._cycles_left = self._handover_cycles
 
     def torque(self, q: Vector, dq: Vector, q_d: Vector, dq_d: Vector, ddq_d: Vector, tau_d: Vector) -> None:
-        """Fill the desired torque `tau_d` (2,), Nm, from measured and desired motion; call it once a cycle."""
+        """Fill the desired torque `tau_d` (2,), Nm, and advance the feedforward's blending by one cycle."""
         if self._cycles_left > 0:
             self._cycles_left -= 1
             share = self._cycles_left / self._handover_cycles
@@ -65,7 +65,7 @@ def fill_torque(
     level_rad: float,
     tau_d: Vector,
 ) -> None:
-    """Fill the desired torque tau_d (2,), Nm, of the law in the head of this file; theta (p,) is fed forward."""
+    """Fill tau_d (2,) = Kp (q_d - q) + Kd (dq_d - dq) + W(q_d, dq_d, ddq_d) theta, Nm."""
     feedforward = inverse_dynamics(q_d, dq_d, ddq_d, theta, level_rad)
     for i in range(JOINTS):
         tau_d[i] = Kp[i] * (q_d[i] - q[i]) + Kd[i] * (dq_d[i] - dq[i]) + feedforward[i]
@@ -101,11 +101,15 @@ class Floating:
         self._is_braking = [True] * JOINTS
 
     def begin(self) -> None:
-        """Restart: brake every joint that moves."""
+        """Set all joints to be braked until they stand, or move with the push."""
         self._is_braking = [True] * JOINTS
 
     def torque(self, q: Vector, dq: Vector, tau_ext_hat: Vector, theta: Vector, tau_d: Vector) -> None:
-        """Fill the desired torque `tau_d` (2,), Nm; theta (p,): model of friction and gravity, zeros for none."""
+        """Fill the desired torque `tau_d` (2,), Nm, of the floating law.
+
+        tau_ext_hat (2,): a joint that it pushes along its motion is no longer braked. theta (p,): model of friction and
+        gravity, zeros for none.
+        """
         tau_d[:] = regressor.inverse_dynamics(q, np.zeros(JOINTS), np.zeros(JOINTS), theta, self._level_rad)
         friction = theta[regressor.F_V1 : regressor.F_C2 + 1]
         for i in range(JOINTS):

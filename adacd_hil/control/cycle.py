@@ -89,7 +89,7 @@ class Cycle:
         clock: Clock,
         touched_ns: Callable[[], int | None] = lambda: None,
     ) -> None:
-        """Prepare. `clock`: measures durations within a cycle; `touched_ns`: as of `RunNarration`."""
+        """Make the cycle's objects. `clock`: measures durations within a cycle. `touched_ns`: see `RunNarration`."""
         self._period_s = settings.bus.period_s
         self._frame_checks = Recurrence(FRAME_CHECKS_S, self._period_s)
         self._progress = progress
@@ -133,21 +133,21 @@ class Cycle:
         self._kept = KeptRequest()
 
     def carry(self, request: Request) -> None:
-        """Repeat an unserved request of the attempt before, once the drives are enabled. Call before `run`."""
+        """Store an unserved request of the attempt before; `run` repeats it once the drives are enabled."""
         self._kept = KeptRequest(request)
 
     @property
     def unserved(self) -> Request:
-        """The user's request that was not served: the end of the run, or a stop to change the payload; else NONE."""
+        """Return the user's unserved request to end the run (FINISH) or to change the payload (PAYLOAD), else NONE."""
         return self._kept.request
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
-        """The certificates of this attempt that were not taken back, in order."""
+        """Return the certificates of this attempt that were not taken back, in order."""
         return self._pipeline.certificates
 
     def compile(self) -> None:
-        """Compile everything the loop calls; to be done before the drives are enabled."""
+        """Compile all functions that the loop calls; call it before the drives are enabled."""
         self._pipeline.compile_cycle()
         self._reference.compile_motion()
         self._controller.compile_law()
@@ -158,9 +158,9 @@ class Cycle:
         self._interrupts += 1
 
     def run(self, recorder: Recorder) -> RunResult:
-        """Run cycles until the run is finished, faulted or interrupted, then disable the drives.
+        """Run and log cycles until the run is finished, faulted or interrupted; disable the drives; return the result.
 
-        Raises BusError, of it SilenceError in lockstep.
+        After a fault the cycles go on for FAULT_LINGER_S. Raises BusError, of it SilenceError in lockstep.
         """
         output = None
         self._pacer.resume()
@@ -195,18 +195,21 @@ class Cycle:
 
     @property
     def reached(self) -> tuple[int, SchemeState]:
-        """Number of cycles so far, and the present state."""
+        """Return the number of cycles so far, and the present state."""
         return self._arm.cycle + 1, self._state
 
     def _look_after_devices(self, arm: ArmState, output: SchemeOutput) -> None:
-        """Stop drives that a command has not stopped; else read the devices' parameters again."""
+        """After a fault, stop drives that a command has not stopped; with power, read the devices' parameters again."""
         if self._faulted_cycle is not None:
             self._escalation.step(arm.cycle - self._faulted_cycle, arm.t_ns, output.fault)
         elif output.state in POWERED:
             self._master.parameters.step(arm.cycle, arm.t_ns)
 
     def _request(self, cycle: int) -> Request:
-        """Return the scheme's request of this cycle; act on a request to end the run."""
+        """Return this cycle's request for the scheme: an interruption's, a carried one, or the operator's.
+
+        Store requests that wait to be served. On FINISH begin to park the arm.
+        """
         if self._interrupts and not self._is_finishing:
             return self._finish()
         elapsed_s = None if self._enabled_cycle is None else (cycle - self._enabled_cycle) * self._period_s
@@ -224,7 +227,7 @@ class Cycle:
         return Request.FINISH
 
     def _follow(self, arm: ArmState, output: SchemeOutput) -> None:
-        """Turn the desired motion, or the arm's yielding to a push, into a desired torque."""
+        """Fill the desired torque: that of the floating law while the arm floats, else that of the controller."""
         if output.is_model_valid:
             self._controller.feed_forward(output.theta_ff)
         if self._reference.is_floating:
@@ -236,8 +239,8 @@ class Cycle:
     def _limit(self, arm: ArmState, output: SchemeOutput, now_ns: int) -> tuple[ArmCommand, GateFlag]:
         """Return the command of this cycle, with the desired torque limited, and the gate's changes to the torque.
 
-        The torque is zero if the cycle took too long, for example because the process was stopped: then the torque is
-        stale.
+        now_ns: time at which the command leaves. The torque is zero if that is too long after SYNC, for example because
+        the process was stopped: then the torque is stale.
         """
         is_stale = now_ns - self._exchange.sync_ns > self._stale_ns
         is_open = output.state in POWERED and arm.is_enabled and not is_stale
@@ -255,7 +258,7 @@ class Cycle:
         command: ArmCommand,
         flags: GateFlag,
     ) -> None:
-        """Hand the cycle to the logger and remember where the scheme stands."""
+        """Hand messages and events of the cycle to the recorder, print those for the user, and store a new state."""
         t_ns = arm.t_ns
         if self._first_cycle < 0:
             self._first_cycle = arm.cycle
@@ -318,7 +321,7 @@ class Cycle:
         return is_overdue or self._state not in POWERED or self._reference.is_parked(output.cycle)
 
     def _disable(self, recorder: Recorder, quick_stop: bool) -> None:
-        """Send zero torque and disabled drives for a while, without the scheme."""
+        """Send zero torque and the command to disable the drives for DISABLE_CYCLES cycles, without the scheme."""
         self._tau_c[:] = 0.0
         command = ArmCommand(self._tau_c, enable=False, quick_stop=quick_stop)
         for _ in range(DISABLE_CYCLES):

@@ -20,9 +20,10 @@ _MODULE = "adacd_hil.control.cycle_compilation"
 
 @contextmanager
 def compiling_cycle(settings: Settings, further: Sequence[Any] = ()) -> Iterator[None]:
-    """Compile the functions of the cycle, and `further` ones, in the block, with progress for the listeners.
+    """Report the progress of compiling the cycle's functions, and `further` ones, while the `with` block compiles them.
 
-    If there is a second processor and anything to compile, a second process helps; it ends with the block.
+    With a second processor and anything to compile, start a second process that compiles the longest ones; end it
+    with the block.
     """
     helpers: list[subprocess.Popen[bytes]] = []
 

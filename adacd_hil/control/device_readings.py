@@ -105,7 +105,7 @@ class Reading(NamedTuple):
 
     @property
     def joint(self) -> int:
-        """The joint that this reading changes, 0 or 1."""
+        """Return the joint, 0 or 1, whose factors this reading changes; 1 if it changes none."""
         return 0 if (self.position[0], self.torque[0], self.motor[0]) != (1.0, 1.0, 1.0) else 1
 
     def allows(self, found: Sequence[TorqueRatio | None], error: float) -> bool:
@@ -131,7 +131,7 @@ class Reading(NamedTuple):
 
     @property
     def row(self) -> tuple[float, ...]:
-        """Pack the reading for `add_block`: two exchanges, factors on position and torque (2 each), turned gravity."""
+        """Return numbers (7,) for `add_block`: two exchanges, factors on position and on torque, turned gravity."""
         return (self.is_drive_exchanged, self.is_sensor_exchanged, *self.position, *self.torque, self.is_turned)
 
 
@@ -201,9 +201,10 @@ def add_block(
 
 @compiled
 def solve_readings(normals: Vector, count: int, blocks: int, shares: Vector, solutions: Vector) -> None:
-    """Solve the normal equations (h, k, k) of so many blocks: unexplained share (h,) of squares, unknowns (h, k - 1).
+    """Solve the normal equations (h, k, k) of each reading; fill `shares` (h,) and `solutions` (h, k - 1) in place.
 
-    By Cholesky factors of the equations, scaled to a diagonal of ones.
+    count: parameters p. blocks: number in the equations. shares: unexplained part of the torques' squares. By Cholesky
+    factors of the equations, scaled to a diagonal of ones.
     """
     size = normals.shape[1] - 1
     L, x, unit = np.zeros((size, size)), np.zeros(size), np.zeros(size)
@@ -230,7 +231,7 @@ class DeviceReadings:
     """Fits all readings to the blocks of a motion."""
 
     def __init__(self, settings: Settings) -> None:
-        """Start without blocks."""
+        """Prepare the normal equations of all readings, without blocks."""
         self._settings = settings
         self._level_rad = settings.level_rad
         self._count = len(settings.estimator.parameter_names)
@@ -244,21 +245,22 @@ class DeviceReadings:
         self._refuted = 0  # rounds in a row in which the configuration was refuted
 
     def compile_readings(self) -> None:
-        """Compile the functions that `add_means` calls."""
+        """Compile the functions that add and judge blocks, by calls on copies."""
         zero = np.zeros(JOINTS)
         add_block(self._rows, zero, zero, zero, zero, zero, self._level_rad, self._count, self._normals.copy())
         solve_readings(self._normals, self._count, 1, self._shares.copy(), self._solutions.copy())
         is_positive_definite(self._solutions[0])
 
     def add_means(self, q: Vector, dq: Vector, ddq: Vector, tau_J: Vector, dtau_J: Vector) -> None:
-        """Add the means of a block, (2,) each."""
+        """Add the means of a block, (2,) each, to the equations of all readings."""
         add_block(self._rows, q, dq, ddq, tau_J, dtau_J, self._level_rad, self._count, self._normals)
         self._blocks += 1
 
     def judge_blocks(self, is_torque_known: bool) -> bool:
-        """Judge every few blocks; return whether the configuration is refuted.
+        """Return whether the configuration is refuted: another reading was far better in several judgements in a row.
 
-        is_torque_known: torque scales are judged only if the commanded torques have confirmed them.
+        Judge at every fourth block, return False between. is_torque_known: the commanded torques have confirmed the
+        sensors' scales; without that a wrong scale of torque as the best reading doesn't count.
         """
         if self._blocks < _FEWEST_BLOCKS or self._blocks % _JUDGED_EVERY:
             return False
@@ -271,7 +273,8 @@ class DeviceReadings:
     def left(self, found: Sequence[TorqueRatio | None], error: float) -> list[Reading]:
         """Return the readings that neither equation nor torques refute, best first; the best of each kind and joint.
 
-        Empty if the best reading of all is refuted but explains far more than the others: then the right one is not
+        found: ratios of the torque sensors, by node; None: unknown. error: possible relative error of a scale. Empty if
+        the best reading of all is refuted but explains far more than the others: then the right one is not
         among them.
         """
         if self._blocks < _SUSPECT_BLOCKS:
@@ -293,14 +296,15 @@ class DeviceReadings:
         return list(texts.values())
 
     def is_unlike_an_arm(self) -> bool:
-        """Whether the configured devices give an inertia that no arm has, or the motion is too short to know."""
+        """Return whether the configured devices give an inertia that no arm has, or the blocks are too few to know."""
         self._solve(())
         return 0 < self._blocks < _SUSPECT_BLOCKS or not is_positive_definite(self._solutions[0])
 
     def name_causes(self, left: Sequence[Reading]) -> str:
-        """Describe the remaining causes, their unexplained shares, and the remedies; "" without a cause.
+        """Return a text of the causes left, their unexplained shares and remedies.
 
-        If even the best reading explains little, the cause is not among the readings, or there are several.
+        left: result of the method `left`. "" without a wrong reading, with too many, or if the best explains little:
+        then the cause is not among the readings, or there are several.
         """
         wrong = [reading for reading in left if reading.kind != "configured"]
         places = [self._readings.index(reading) for reading in wrong]
@@ -375,12 +379,12 @@ class DeviceReadings:
 
     @property
     def _hangs_deg(self) -> float:
-        """The q1 at which link 1 points down, deg, in the reading of the mounting."""
+        """Return the q1 at which link 1 points down, deg, by the reading of the mounting."""
         return (self._settings.mounting_deg[1] + self._turned_deg + 180.0) % 360.0 - 180.0
 
     @property
     def _freedom(self) -> int:
-        """Number of torques beyond the unknowns of the equation, at least 1."""
+        """Return the number of measured torques less that of the equation's unknowns, at least 1."""
         return max(JOINTS * self._blocks - (self._normals.shape[1] - 1), 1)
 
     def _rank(self, place: int) -> float:
@@ -389,19 +393,19 @@ class DeviceReadings:
         return float(self._shares[place]) if is_right else math.inf
 
     def _is_distinct(self, place: int) -> bool:
-        """Whether a reading differs from the configuration: not by gravity in a small motion, nor by a small angle."""
+        """Return whether a reading counts: all do, but turned gravity in a small motion, or turned by a small angle."""
         if not self._readings[place].is_turned:
             return True
         return self._blocks >= _MOUNTING_BLOCKS and abs(self._turned_deg) >= _TURNED_DEG
 
     @property
     def _turned_deg(self) -> float:
-        """Angle by which gravity is turned, deg, in the direction of +q."""
+        """Return the angle, deg, toward +q, by which the last solution turns gravity against the configuration."""
         mounted = self._solutions[-1]
         return math.degrees(math.atan2(mounted[-2:].sum(), mounted[A4 : A5 + 1].sum()))
 
     def _may_be_arms(self, places: Sequence[int]) -> list[bool]:
-        """Tell for each reading whether its inertia, within its error, is that of a possible arm."""
+        """Return for each place of a reading whether its inertia, within its error, is that of a possible arm."""
         normals = self._normals[list(places), :-1, :-1]
         size = np.sqrt(np.maximum(np.diagonal(normals, axis1=1, axis2=2), 1e-12))
         scaled = normals / (size[:, :, np.newaxis] * size[:, np.newaxis, :])
@@ -412,7 +416,7 @@ class DeviceReadings:
         return [may_be_arm(self._solutions[place], slack[row]) for row, place in enumerate(places)]
 
     def _solve(self, among: Iterable[int]) -> int:
-        """Solve for all readings; return the index of the best of some, 0 if `among` is empty."""
+        """Update the solutions of all readings; return the index in `among` of the best one, 0 if `among` is empty."""
         solve_readings(self._normals, self._count, max(self._blocks, 1), self._shares, self._solutions)
         return min(among, key=self._rank, default=0)
 

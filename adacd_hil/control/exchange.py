@@ -26,7 +26,7 @@ class Exchange:
     """
 
     def __init__(self, settings: Settings, bus: Tap, arm: Arm, master: Master, pacer: Pacer, clock: Clock) -> None:
-        """`clock`: measures durations within a cycle."""
+        """Prepare the first cycle. `clock`: measures durations within a cycle."""
         self.sync_ns = 0
         self.feedback_ns = 0
         self.queues = NOTHING_QUEUED
@@ -45,12 +45,14 @@ class Exchange:
         self._said_lost = bus.frames_lost
 
     def turn(self) -> tuple[Tick, ArmState]:
-        """Wait for the next cycle and read the arm, see `read`; the cycle ends by `end`."""
+        """Wait for the next cycle, then read the arm by `read`; return the cycle's beginning and the arm's state."""
         tick = self._pacer.next()
         return tick, self.read(tick)
 
     def read(self, tick: Tick) -> ArmState:
-        """Begin with SYNC and take in the devices' samples of it.
+        """Send SYNC, unless another host does, take the devices' frames until all are in, and return the arm's state.
+
+        Stop to wait after a share of the period; the missing values are then old ones.
 
         Raises BusError, of it SilenceError in lockstep.
         """
@@ -84,9 +86,9 @@ class Exchange:
         self.events.say(self.sync_ns, "late", Event("warning", "late commands", text), count)
 
     def _await_feedback(self, last_ns: int) -> int:
-        """Take frames until all of this cycle are in or the time for them is over; return when that was.
+        """Take frames until all of this cycle are in or the time for them is over; return that moment, ns.
 
-        `last_ns`: when the last frame came that is in already.
+        `last_ns`: time of the last frame taken so far.
         """
         bus, arm, sync_ns = self._bus, self._arm, self.sync_ns
         patience_s = self._patience_s
@@ -129,12 +131,12 @@ class Exchange:
             self._master.accept(frame)
 
     def leave(self) -> int:
-        """Let the host's work since the feedback take its time; return when its commands leave, ns."""
+        """Return the time at which this cycle's commands leave, ns; in lockstep, move the clock by modelled work."""
         self._bus.held_ns = leaving_ns = self._pacer.spend(self.feedback_ns)
         return leaving_ns
 
     def end(self, tick: Tick, arm: ArmState, command: ArmCommand, log_queue_bytes: int = 0) -> CycleRecord:
-        """Hand the commands to the bus, and a heartbeat when it is due; return the record of the cycle.
+        """Send the commands, and a heartbeat if one is due; return the record of the cycle's times and counts.
 
         `log_queue_bytes`: bytes that wait for the log's writer. Raises BusError.
         """
@@ -173,7 +175,7 @@ class Exchange:
 
 
 def say_trouble(events: RateLimitedEvents, frame: Frame) -> None:
-    """Report the errors that the bus's controller signals in an error frame.
+    """Add an event for an error frame of the bus's controller, limited in rate by kind of error.
 
     A controller without an acknowledging node signals thousands a second; every frame is in the log anyway.
     """

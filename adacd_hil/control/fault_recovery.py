@@ -59,7 +59,10 @@ class SelfChecks:
         self.line = ""
 
     def judge(self, arm: ArmState, state: SchemeState) -> Request:
-        """Check a cycle; `state`: of the scheme after the previous one. Return the request for the scheme."""
+        """Check a cycle for changed parameters, wrong torque or motion; return the scheme's request to fault, or NONE.
+
+        Store the first failure in `reason` and `line`. `state`: of the scheme after the previous cycle.
+        """
         if not arm.is_enabled:
             return Request.NONE
         if self._parameters.difference:
@@ -163,7 +166,7 @@ class FaultReport:
         self._commission.count_cycle(state, arm)
 
     def list_causes(self, fault: FaultReason) -> list[str]:
-        """Describe the causes of a fault, one line each: first those of its reason."""
+        """Return the causes of a fault as lines: first those of its reason, then those of devices and bus."""
         return [
             *([self._checks.line] if fault is self._checks.reason else ()),
             *self._checks.suspicions(fault),
@@ -213,7 +216,7 @@ class CommissionReport:
                     self._worst[joint, place] = max(self._worst.get((joint, place), 0.0), abs(value))
 
     def list_unrest(self) -> list[str]:
-        """Name the causes, the most frequent first, one line each; empty if every cycle was good."""
+        """Return a line for each counted cause, the most frequent first; empty if every cycle was good."""
         lines = [
             f"{self._text(cause)} in {count} of {self._cycles} cycles" for cause, count in self._causes.most_common()
         ]
@@ -262,7 +265,10 @@ class Recovery:
         return True
 
     def await_acknowledgement(self) -> bool:
-        """Wait for the user's answer to a fault; True: start again, on an emptied bus; False: end the run."""
+        """Wait for the user's answer to a fault, and empty the bus if it is to recover.
+
+        Return True to start again; False to end the run, also when it is interrupted meanwhile.
+        """
         start_ns = self._clock.now_ns()
         is_announced = False
         while not self._is_interrupted():
@@ -320,9 +326,10 @@ class StopEscalation(RateLimitedEvents):
         self._due = 0
 
     def step(self, cycles: int, t_ns: int, fault: FaultReason) -> None:
-        """Send NMT pre-operational if it is due; `cycles`: since FAULT. Raises BusError.
+        """Send NMT pre-operational to each drive that is still enabled so long after FAULT, and report it.
 
-        After FOREIGN_FRAMES it is due at once: another node may command the drive against the quick stop.
+        `cycles`: since FAULT; due after PATIENCE_CYCLES, and again after as many. Raises BusError. After FOREIGN_FRAMES
+        it is due in the next cycle: another node may command the drive against the quick stop.
         """
         patience = 1 if fault is FaultReason.FOREIGN_FRAMES else PATIENCE_CYCLES
         if cycles < max(self._due, patience):

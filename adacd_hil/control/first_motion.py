@@ -76,7 +76,7 @@ _COLUMNS: Final = 7
 
 
 def is_shown(event: Event) -> bool:
-    """Return whether the operator sees an event as it happens."""
+    """Return whether an event is printed as it happens: one of geometry, or a warning of the first motion."""
     return event.name == GEOMETRY or (event.name == "first motion" and event.level == "warning")
 
 
@@ -108,16 +108,20 @@ class FirstMotion(EventSource):
 
     @property
     def is_on(self) -> bool:
-        """Whether a joint is still to be judged."""
+        """Return whether a joint, or the device readings, are still to be judged, without a contradiction so far."""
         return bool(self._open or self._readings) and not self.line
 
     def compile_readings(self) -> None:
-        """Compile the functions that `note` calls."""
+        """Compile the functions of the device readings that `note` calls."""
         if self._readings is not None:
             self._readings.compile_readings()
 
     def note(self, arm: ArmState, state: SchemeState, tau_c: Vector) -> None:
-        """Take in a cycle; `tau_c` (2,): its commanded torque, Nm. `state`: of the scheme before it."""
+        """Add a cycle to the blocks, and judge the joints; put a contradiction in `line`, remarks in `events`.
+
+        `tau_c` (2,): its commanded torque, Nm. `state`: of the scheme after the cycle before. Stop judging after 60 s
+        with power.
+        """
         if not self.is_on:
             return
         self._powered += arm.periods if state in POWERED else 0
@@ -139,7 +143,10 @@ class FirstMotion(EventSource):
         self._read(self._short.add_cycle(arm, acting), state)
 
     def _read(self, block: "_Block | None", state: SchemeState) -> None:
-        """Fit the arm's equation to a further block; put the causes in `line` if the fit refutes the configuration."""
+        """Add a short block, if any, to the device readings; put the causes in `line` if they refute the configuration.
+
+        Drop the readings in MONITOR.
+        """
         readings = self._readings
         if readings is None or self.line:
             return
@@ -164,7 +171,7 @@ class FirstMotion(EventSource):
             self.events.append(event)
 
     def suspicion(self) -> str:
-        """Describe the likely causes of an arm that runs away, by its first motion; empty if nothing is likely."""
+        """Return the likely causes of an arm that runs away in its first motion, as text; empty if none is likely."""
         if self._readings is None or self.line:
             return ""
         if scales := self._suspect_scales():
@@ -193,7 +200,10 @@ class FirstMotion(EventSource):
         ]
 
     def _suspect_scales(self) -> str:
-        """Name the joint whose sensor measures far more or less than its command, though correlated with it."""
+        """Return a text on the joint whose sensor measures far more or less than its command, though in step with it.
+
+        Empty if there is none.
+        """
         _, tau_c, tau_J, _, _, _, both = self._pushed
         found = [
             (abs(math.log(ratio)), joint, ratio)
@@ -344,7 +354,10 @@ class _Blocks:
         self._seen = 0
 
     def add_cycle(self, arm: ArmState, acting: Vector) -> _Block | None:
-        """Take in a cycle; return the block that it completes, if any. The cycle also begins the next block."""
+        """Add a cycle; return the block that it completes, or None. That cycle also begins the next block.
+
+        acting (2,): commanded torque that acts in this cycle, Nm.
+        """
         last = np.array((arm.q, arm.dq, arm.tau_J, acting))
         if self._seen == 0:
             self._sums[:], self._first = 0.0, last
@@ -368,7 +381,9 @@ def is_of_other(ratio: TorqueRatio) -> bool:
 
 
 def ratio_of(normal: NDArray[np.float64], blocks: int) -> TorqueRatio:
-    """Solve the normal equations (8, 8) of a joint that has moved in so many blocks.
+    """Return a joint's ratios of sensed to commanded torque by its normal equations (8, 8), the torque in the last row.
+
+    blocks: number in which the joint has moved.
 
     If the motion can't separate unknowns, the ridge shrinks them; the shrinkage is added to their standard deviation.
     """

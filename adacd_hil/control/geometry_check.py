@@ -7,7 +7,7 @@ so a link that is s times as long as configured, its masses in their places, has
 
     link 1:  a2 → s a2,  a1 - a3 → s² (a1 - a3),  a3 unchanged     link 2:  a2 → s a2,  a3 → s² a3,  a1 - a3 unchanged
 
-relative to `arm.cad_theta`. With gravity a5 = m2 c2 g', and l1 = g' a2 / a5; g' = g sin(tilt) acts in the plane of the
+relative to `arm.cad_theta`. With gravity a5 = m2 c2 g', and l1 = g' a2 / a5; g' = g sin(tilt) acts in the plane
 of motion, and a tilt smaller than configured makes l1 longer. An a5 below 0 is gravity in the other direction.
 """
 
@@ -31,7 +31,11 @@ _SEEN: Final = 0.1
 
 
 def geometry_event(settings: Settings, certificate: Certificate) -> Event | None:
-    """Compare the configured lengths with a certificate of the arm without payload; None if they agree."""
+    """Compare the configured link lengths with a certificate of the arm without payload; return the event to report.
+
+    A warning if a length or the mounting contradicts the certificate, an info if a smaller tilt explains it or torques
+    can't check a length; None if the lengths agree.
+    """
     theta, lengths = certificate.parameters, settings.arm.link_length_m
     cad, is_upright = settings.arm.cad_theta, len(theta) > A5
     has_masses = any(cad[: A3 + 1])

@@ -61,7 +61,7 @@ class CertificateRecord:
         self.known(HistorySettings())
 
     def known(self, settings: HistorySettings) -> HistorySettings:
-        """Return settings with this as the last certificate. Raises ValueError if values are missing."""
+        """Return the settings with this record as the last certificate. Raises ValueError if values are missing."""
         return dataclasses.replace(
             settings,
             date_utc=self.date_utc,
@@ -74,7 +74,7 @@ class CertificateRecord:
         )
 
     def digest_after(self, before: str) -> str:
-        """Return this record's digest after a predecessor's."""
+        """Return the SHA-256 of `before`, the predecessor's digest, and of this record without its own."""
         return _digest(before + to_toml(dataclasses.replace(self, digest="")))
 
 
@@ -101,12 +101,12 @@ class History:
 
     @property
     def last(self) -> CertificateRecord:
-        """The newest certificate."""
+        """Return the newest certificate."""
         return self.certificates[-1]
 
 
 def devices_digest(devices: Sequence[DeviceRecord]) -> str:
-    """Return the digest of the devices, the predecessor of the first certificate's."""
+    """Return the SHA-256 of the devices, which stands in for a predecessor's digest before the first certificate."""
     return _digest("\n".join(map(to_toml, devices)))
 
 
@@ -115,7 +115,10 @@ def _digest(text: str) -> str:
 
 
 def _difference(devices: Sequence[DeviceRecord], identities: Sequence[Identity], path: Path) -> str:
-    """Return the first difference between devices and a history's, "" if they are the same."""
+    """Return the first found device that a history doesn't have, as text; "" if it has all.
+
+    devices: of the history in `path`. identities: of the devices found.
+    """
     known = {record.name: record for record in devices}
     for identity in identities:
         record = known.get(identity.name)
@@ -127,7 +130,7 @@ def _difference(devices: Sequence[DeviceRecord], identities: Sequence[Identity],
 
 
 def read_history(path: Path) -> History:
-    """Read an arm's history. Raises ConfigError."""
+    """Return the history of a file. Raises ConfigError if it is missing, invalid, or its digests are wrong."""
     if not path.exists():
         raise ConfigError(f"history {path} does not exist; `adacd-hil run --history` makes one")
     return _parse(path, read_input(path))
@@ -154,16 +157,19 @@ class UsedHistory:
 
     @property
     def is_first_run(self) -> bool:
-        """Whether the arm has no certificate yet."""
+        """Return whether there is no history file yet, so no certificate of the arm."""
         return self.history is None
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Remarks for the log."""
+        """Return remarks for the log: that it is the arm's first run, or none."""
         return (f"{self.path}: the arm's first run, its friction is unknown",) if self.is_first_run else ()
 
     def apply(self, settings: Settings) -> Settings:
-        """Return the settings with the last certificate in section `history`, its age as drift of the sensors."""
+        """Return the settings with the last certificate in section `history`; unchanged in a first run.
+
+        Widen the deviations of its torque offsets by the sensors' drift since.
+        """
         if self.history is None:
             return settings
         known = self.history.last.known(settings.history)
@@ -172,7 +178,7 @@ class UsedHistory:
         return dataclasses.replace(settings, history=dataclasses.replace(known, offset_std_Nm=std_Nm))
 
     def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
-        """Compare the devices with the history's; return its summary as events. Raises DeviceError for a difference."""
+        """Compare the devices with the history's; return a summary as event. Raises DeviceError if they differ."""
         if self.history is None:
             return [Event("warning", "history", self.warnings[0])]
         if difference := _difference(self.history.devices, identities, self.path):
@@ -188,15 +194,15 @@ class UsedHistory:
         return {} if self.is_first_run else {HISTORY_NAME: self.text}
 
     def metadata(self) -> dict[str, str]:
-        """Describe the history for the log's metadata."""
+        """Return file and number of certificates for the log's metadata."""
         return {"history": str(self.path), "history_certificates": self._count()}
 
     def add_certificates(
         self, certificates: Sequence[Certificate], identities: Sequence[Identity], origin: "Origin"
     ) -> str:
-        """Append certificates and write the history in one step; return a summary. Raises OSError, ConfigError.
+        """Append certificates of a run to the history file, in one step; return a summary. Raises OSError, ConfigError.
 
-        Certificates that another run has appended meanwhile are kept.
+        Read the file again first, so that certificates of another run are kept; identities: of the devices found.
         """
         devices, records = tuple(DeviceRecord(*identity) for identity in identities), []
         if self.path.exists():

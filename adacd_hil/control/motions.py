@@ -16,7 +16,7 @@ from adacd_hil.settings.configuration import Settings
 def corner_to_corner(
     elapsed_s: float, amplitude: Vector, half_period_s: Vector, q: Vector, dq: Vector, ddq: Vector
 ) -> None:
-    """Fill the motion from -amplitude to the other corner and back, each joint by its own half period."""
+    """Fill q, dq, ddq (2,) of the endless motion between -amplitude and +amplitude; each joint has a half period."""
     for i in range(JOINTS):
         index = np.floor(elapsed_s / half_period_s[i])
         direction = 1.0 if index % 2.0 == 0.0 else -1.0
@@ -37,7 +37,7 @@ class QuinticMove:
     def __init__(
         self, start: Vector, end: Vector, speed_rad_s: Vector, acceleration_rad_s2: Vector, shortest_s: float
     ) -> None:
-        """Plan the move. start, end (2,); limits (2,); shortest_s: least duration, s."""
+        """Plan the move. start, end (2,): positions. speed, acceleration (2,): limits. shortest_s: least duration."""
         self._start, self._end, self._travel = start.copy(), end.copy(), end - start
         distance = np.abs(self._travel)
         by_speed_s = QUINTIC_PEAK_SPEED * distance / speed_rad_s
@@ -45,7 +45,7 @@ class QuinticMove:
         self.duration_s = max(shortest_s, float(by_speed_s.max()), float(by_acceleration_s.max()))
 
     def evaluate(self, elapsed_s: float, q: Vector, dq: Vector, ddq: Vector) -> None:
-        """Fill the motion (2,) at this time since the start; after the end, the end position at rest."""
+        """Fill q, dq, ddq (2,) this long after the start; after `duration_s`, the end position at rest."""
         if elapsed_s >= self.duration_s:
             q[:], dq[:], ddq[:] = self._end, 0.0, 0.0
             return
@@ -88,7 +88,10 @@ class Pace:
         return self.share == 1.0 and self.change == 0.0
 
     def step(self, wanted: float, dq: Vector, ddq: Vector) -> None:
-        """Move the share one period closer to the wanted one. dq, ddq (2,): of the planned path at this place."""
+        """Move `share` one period closer to the wanted share, and update `change` and `lag_s`.
+
+        dq, ddq (2,): planned velocity and acceleration at the present place of the path.
+        """
         if wanted != self._to:
             self._from, self._to, self._phase = self.share, wanted, 0.0
         before = self.share
@@ -100,7 +103,7 @@ class Pace:
         self.lag_s += (1.0 - self.share) * self._period_s
 
     def _phase_step(self, dq: Vector, ddq: Vector) -> float:
-        """Return how far one period may advance the change, as a part of it."""
+        """Return the part of the present change of pace by which one period may advance it, within the limits."""
         step, x = self._period_s / CHANGE_S, self._phase
         steepest = min(max(x, 0.5), x + step)  # where d(share)/dx is largest in this period
         slope = abs(self._to - self._from) * 6.0 * steepest * (1.0 - steepest)
@@ -131,7 +134,7 @@ class Excitation:
         self.is_on = bool(period_s and self._rad_s.size)
 
     def peaks_deg(self) -> tuple[Vector, Vector, Vector]:
-        """Return the largest |q|, |dq| and |ddq| (2,) of a period in deg, deg/s and deg/s², at 1000 points of it."""
+        """Return the largest |q|, |dq| and |ddq|, (2,) each, of 1000 points of a period, in deg, deg/s and deg/s²."""
         motion = np.zeros((1000, 3, JOINTS))
         for row, elapsed_s in zip(motion, np.linspace(0.0, 2.0 * np.pi / self._rad_s[0], len(motion)), strict=True):
             self.evaluate(float(elapsed_s), *row)
@@ -139,7 +142,7 @@ class Excitation:
         return q, dq, ddq
 
     def evaluate(self, elapsed_s: float, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
-        """Fill the desired motion (2,) at this time since its start; it repeats forever."""
+        """Fill q_d, dq_d, ddq_d (2,) of the periodic motion this long after its start."""
         cosine, sine = np.cos(self._rad_s * elapsed_s), np.sin(self._rad_s * elapsed_s)
         q_d[:] = self._corner + self._cosine @ (cosine - 1.0) + self._sine @ sine
         dq_d[:] = self._sine @ (self._rad_s * cosine) - self._cosine @ (self._rad_s * sine)
@@ -165,7 +168,7 @@ class Admittance:
         self._bound = (settings.arm.position_limit_rad - np.radians(wish.position_margin_deg)).tolist()
 
     def step(self, tau_ext_hat: Vector, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
-        """Advance the desired motion (2,) each by one period."""
+        """Advance q_d, dq_d, ddq_d (2,) in place by one period under the external torque, Nm."""
         for i in range(JOINTS):
             speed, tau = float(dq_d[i]), float(tau_ext_hat[i])
             push = math.copysign(max(abs(tau) - self._deadband[i], 0.0), tau)
@@ -186,7 +189,7 @@ _TOLERANCE = 1e-3
 
 
 def motion_problems(settings: Settings) -> list[str]:
-    """List the arm's limits that trajectory and excitation exceed, a line each; empty if none."""
+    """Return a line for each of the arm's limits that trajectory or excitation exceeds; empty if none."""
     arm, trajectory = settings.arm, settings.trajectory
     travel = 2.0 * np.array(trajectory.amplitude_deg)
     half_period_s = np.array(trajectory.half_period_s)

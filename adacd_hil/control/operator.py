@@ -44,7 +44,7 @@ class ScriptedOperator:
         self._acknowledge_fault_after_s = settings.acknowledge_fault_after_s
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Acknowledge as many faults as the settings allow, each after its time."""
+        """Return RECOVER, after the time of the settings, for as many faults as they allow; WAIT before, END later."""
         if self._faults_left == 0:
             return FaultAnswer.END
         if elapsed_s < self._acknowledge_fault_after_s:
@@ -53,7 +53,7 @@ class ScriptedOperator:
         return FaultAnswer.RECOVER
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return the script's request at this time."""
+        """Return the script's next request if it is due, or ACKNOWLEDGE a given time after a stop, else NONE."""
         if elapsed_s is None or state is SchemeState.FAULT:
             return Request.NONE
         if self._script and elapsed_s >= self._script[0].at_s:
@@ -105,7 +105,7 @@ class RunNarration:
         self._enabled_ns: int | None = None
 
     def event(self, t_ns: int, text: str) -> None:
-        """Print an event of a cycle."""
+        """Print a text with the time since the drives were enabled. t_ns: of its cycle."""
         since = "" if self._enabled_ns is None else f"{(t_ns - self._enabled_ns) * 1e-9:.2f} s"
         self._progress(f"{since:>9}  {text}")
 
@@ -137,7 +137,7 @@ class RunNarration:
         return f"{what}{found}: {_REACTIONS[contact.reaction]}"
 
     def contact(self, t_ns: int, contact: ContactReport) -> None:
-        """Print the link of a contact once it is final: the first alarm may be of the other joint."""
+        """Print link and peak of a contact if its report is final; earlier reports may have the other link."""
         if contact.is_final:
             first, second = contact.tau_ext_peak
             peak = f"{first:+.1f} / {second:+.1f} Nm at the joints"

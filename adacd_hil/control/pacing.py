@@ -110,10 +110,13 @@ class Pacer(Protocol):
     spin_ns: int
 
     def next(self) -> Tick:
-        """Wait for the next cycle and return its beginning."""
+        """Wait until the next cycle begins; return its number, time and lateness."""
 
     def spend(self, feedback_ns: int) -> int:
-        """Let the host's work after the feedback take its time; return the time at which its commands leave."""
+        """Return the time at which the cycle's commands leave, ns; in lockstep, first move the clock by modelled work.
+
+        feedback_ns: time of the last feedback.
+        """
 
     def resume(self) -> None:
         """End an intended pause: the next cycle skips the pause's periods and doesn't count them as overruns."""
@@ -126,7 +129,7 @@ class GridPacer:
     """
 
     def __init__(self, clock: Clock, period_ns: int, latency: HostLatency | None = None) -> None:
-        """`latency`: how long the host's work takes by a clock that doesn't go on while it works."""
+        """`latency`: the modelled time of the host's work for a virtual clock, None in real time."""
         self.overruns = 0
         self.spin_ns = 0
         self._latency = latency
@@ -136,7 +139,10 @@ class GridPacer:
         self._cycle = -1
 
     def next(self) -> Tick:
-        """Sleep until the next grid point that is still ahead; the first call sets the grid."""
+        """Sleep until the next grid point and return the tick; if whole periods were missed, skip and count them.
+
+        The first call sets the grid.
+        """
         if self._start_ns is None:
             self._start_ns = -(-self._clock.now_ns() // self._period_ns) * self._period_ns
         previous = self._cycle
@@ -155,13 +161,13 @@ class GridPacer:
         return Tick(self._cycle, now_ns, self._cycle - previous, now_ns - due_ns)
 
     def spend(self, feedback_ns: int) -> int:
-        """Move a virtual clock by the modelled latency; in real time, read the clock."""
+        """Move a virtual clock to feedback_ns plus the modelled latency; return the clock's time."""
         if self._latency is not None:
             self._clock.sleep_until_ns(feedback_ns + self._latency.draw_ns())
         return self._clock.now_ns()
 
     def resume(self) -> None:
-        """Let the next cycle begin on the next grid point that is ahead."""
+        """Skip the periods of a pause, without counting them as overruns."""
         if self._start_ns is not None:
             self._cycle = max(self._cycle, (self._clock.now_ns() - self._start_ns) // self._period_ns)
 
@@ -187,7 +193,7 @@ class FollowingPacer:
         self._periods_ns: list[float] = []
 
     def next(self) -> Tick:
-        """Wait for SYNC. Raises BusError when SYNC is overdue, or has another period than the configured one."""
+        """Wait for SYNC and return the cycle that it begins. Raises BusError if it is overdue or has a wrong period."""
         frames, place = self._receive()
         sync = frames[place]
         periods = self._count(sync)
@@ -200,15 +206,18 @@ class FollowingPacer:
         return Tick(self._cycle, sync.t_ns, 1 + skipped, lateness_ns, tuple(frames[:place]), tuple(frames[place + 1 :]))
 
     def spend(self, feedback_ns: int) -> int:  # noqa: ARG002 (the protocol's signature)
-        """Read the clock."""
+        """Return the clock's time, ns."""
         return self._clock.now_ns()
 
     def resume(self) -> None:
-        """Leave the periods up to the next SYNC out of the overruns."""
+        """Don't count the periods up to the next SYNC as overruns."""
         self._is_resuming = True
 
     def _receive(self) -> tuple[list[Frame], int]:
-        """Receive up to SYNC and all that waits behind it; also return the place of the last SYNC."""
+        """Return the frames up to SYNC and all that wait behind it, and the index of the last SYNC among them.
+
+        Raises BusError if SYNC doesn't come in time.
+        """
         bus, clock = self._bus, self._clock
         frames: list[Frame] = []
         place = -1
@@ -238,7 +247,7 @@ class FollowingPacer:
         return frame.can_id == self._sync_id and not frame.is_error
 
     def _count(self, sync: Frame) -> int:
-        """Count the periods since the SYNC before, at least 1; 0 for the first."""
+        """Return the periods since the SYNC before, at least 1; 0 for the first. Raises BusError for a wrong period."""
         last = self._last
         if last is None:
             return 0
@@ -251,7 +260,7 @@ class FollowingPacer:
         return max(periods, 1)
 
     def _judge(self, period_ns: float) -> None:
-        """Compare the period of SYNC with the configured one, once. Raises BusError."""
+        """Compare the median period of the first SYNCs with the configured one, once. Raises BusError if it differs."""
         if len(self._periods_ns) == _JUDGED_SYNCS:
             return
         self._periods_ns.append(period_ns)
@@ -289,10 +298,9 @@ def calibrate(clock: Clock, period_ns: int, cpu_count: int) -> SpinCalibration:
 
 
 def prepare_spin(pacer: Pacer, settings: Settings, clock: Clock, grant: RealtimeGrant) -> dict[str, str]:
-    """Let the pacer spin for as long as the settings or a measurement say; return both in words for a log's metadata.
+    """Set the pacer's `spin_ns` by the settings, or by a measurement; return both as text for a log's metadata.
 
-    To be called once real-time priority has been granted. Nothing is measured in virtual time, nor where SYNC is
-    followed.
+    Call it once real-time priority has been granted. In virtual time, or if SYNC is followed, do nothing and return {}.
     """
     if isinstance(clock, VirtualClock) or settings.bus.follows:
         return {}
@@ -304,7 +312,7 @@ def prepare_spin(pacer: Pacer, settings: Settings, clock: Clock, grant: Realtime
 
 
 def make_pacer(settings: Settings, clock: Clock, tap: Tap, sync_id: int) -> Pacer:
-    """Make the pacer that goes with a clock: with a VirtualClock the host's work takes a modelled time."""
+    """Return the pacer: one that follows SYNC by the settings, or one on a grid, with latency for a VirtualClock."""
     bus = settings.bus
     if bus.follows:
         return FollowingPacer(tap, clock, bus.period_ns, sync_id, bus.sync_timeout_ms * 1_000_000)

@@ -98,7 +98,7 @@ class Reference(EventSource):
         """Joints that brake beyond their position limit in this state; reported once."""
 
     def compile_motion(self) -> None:
-        """Evaluate every kind of motion once, so that it doesn't compile in the cycle."""
+        """Compile every kind of motion by evaluating it once, so that it doesn't compile in the cycle."""
         zeros, scratch = np.zeros(JOINTS), np.zeros((3, JOINTS))
         self._follow(0.0, *scratch)
         if self._excitation.is_on:
@@ -107,11 +107,11 @@ class Reference(EventSource):
 
     @property
     def is_floating(self) -> bool:
-        """Whether there is no desired motion: the arm yields."""
+        """Return whether the arm yields to a push, reaction FLOAT, without a desired motion."""
         return self._state in REACTING and self._reaction is Reaction.FLOAT
 
     def park(self) -> None:
-        """Go to the start corner from the next step on, and stay there; while the arm is stopped, stay in place."""
+        """Begin the way to the start corner, where the arm stays; while it reacts or is stopped, leave it in place."""
         self._is_parking = True
         if self._state not in REACTING:
             self._approach()
@@ -126,7 +126,7 @@ class Reference(EventSource):
         return self._arrival_cycle is not None and cycle >= self._arrival_cycle + settle_cycles
 
     def step(self, arm: ArmState, output: SchemeOutput) -> None:
-        """Fill the desired motion of this cycle."""
+        """Fill `q_d`, `dq_d`, `ddq_d` for this cycle; leave them as they are while the feedback is old."""
         if output.state is not output.previous_state:
             self._enter(output, arm)
         elif self._waits(arm):
@@ -143,7 +143,10 @@ class Reference(EventSource):
         self._advance(arm.cycle)
 
     def _waits(self, arm: ArmState) -> bool:
-        """Pause the desired motion while the feedback is old; then continue or restart. Return whether it is paused."""
+        """Return whether the desired motion pauses in this cycle, because the feedback is older than OLD_CYCLES.
+
+        Delay its path by the pause. After more than LOST_CYCLES of pause restart it from the measured motion.
+        """
         if max(arm.age_q) > OLD_CYCLES:
             self._waited_cycles += arm.periods
             self._start_cycle += arm.periods
@@ -165,7 +168,10 @@ class Reference(EventSource):
             self._approach()
 
     def _is_yielding(self, arm: ArmState, output: SchemeOutput) -> bool:
-        """Fill the desired motion of a reaction without a plan, or plan anew after a blow; return whether full."""
+        """Fill the desired motion of FLOAT and ADMITTANCE; return False for other reactions, which follow a path.
+
+        If a blow has just thrown the arm, restart the reaction from the measured motion.
+        """
         if self._reaction is Reaction.FLOAT:
             self._stay(arm)
             return True
@@ -203,7 +209,7 @@ class Reference(EventSource):
         return self._slow_share if self._reaction is Reaction.SLOW_DOWN and self._state in REACTING else 1.0
 
     def _follow_on(self, cycle: int) -> None:
-        """Begin the motion of the state when the arm has reached the corner."""
+        """Begin excitation or trajectory when the way to the corner is over, but not while parking or in PAYLOAD."""
         late = self._pace.lag_s / self._period_s
         has_come = self._arrival_cycle is not None and cycle - late >= self._arrival_cycle
         if not has_come or self._is_parking or self._state is SchemeState.PAYLOAD:
@@ -213,7 +219,7 @@ class Reference(EventSource):
         self._start_cycle, self._arrival_cycle = self._arrival_cycle, None
 
     def _enter(self, output: SchemeOutput, arm: ArmState) -> None:
-        """Choose the motion of a state that begins in this cycle."""
+        """Begin the motion of a new state: the reaction, braking, the way to the corner, or none; else go on."""
         state, previous = output.state, self._state
         self._state = state
         self._beyond.clear()
@@ -239,7 +245,7 @@ class Reference(EventSource):
             self._path, self._arrival_cycle, self._is_stopping = None, None, False
 
     def _react(self, output: SchemeOutput, arm: ArmState) -> None:
-        """Begin the reaction to a contact: brake, withdraw, or yield; a reaction on the path changes no motion."""
+        """Begin the reaction to a contact: brake, withdraw, or yield; NONE and SLOW_DOWN keep the path."""
         self._reaction = output.reaction
         self._contact_cycle = arm.cycle
         if self._reaction in _ON_PATH:
@@ -273,7 +279,7 @@ class Reference(EventSource):
         return float(np.max(ahead)) >= THROWN_rad_s
 
     def _follow_thrown(self, arm: ArmState) -> None:
-        """Continue from the measured motion; otherwise the controller would pull the arm back to the contact."""
+        """Restart the reaction from the measured motion; else the controller would pull the arm back to the contact."""
         if self._reaction is Reaction.ADMITTANCE:
             self._q_d[:], self._dq_d[:] = arm.q, arm.dq
             self._warn_beyond(self._stop_from(arm.q, arm.dq))
@@ -284,13 +290,13 @@ class Reference(EventSource):
             self._withdraw(self._stop_from(arm.q, arm.dq), arm.cycle)
 
     def _withdraw(self, withdrawal: Withdrawal, cycle: int) -> None:
-        """Begin a withdrawal from the present motion."""
+        """Make a withdrawal, or a stop, the path from this cycle on; report joints that exceed their limit."""
         self._warn_beyond(withdrawal)
         self._start(withdrawal.evaluate, cycle)
         self._arrival_cycle, self._is_stopping = None, False
 
     def _warn_beyond(self, withdrawal: Withdrawal) -> None:
-        """Report, once per state, joints that can't stop within their position limit."""
+        """Add an event for each joint that can't stop within its position limit, once per state."""
         for joint in withdrawal.beyond:
             if joint not in self._beyond:
                 self.events.append(Event("warning", MOTION, withdrawal.describe_beyond(joint)))
@@ -303,11 +309,11 @@ class Reference(EventSource):
         self._withdraw(self._stop_from(self._q_d, self._dq_d), cycle)
 
     def _approach(self) -> None:
-        """Come to rest, then go to the corner."""
+        """Begin to stop the arm on its path; `_stop` then starts the way to the corner."""
         self._arrival_cycle, self._is_stopping = None, True
 
     def _stop(self, cycle: int) -> None:
-        """Go to the corner if the arm is at rest; without a path to come to rest on, brake."""
+        """Start the way to the corner if the desired motion is at rest; brake if it moves without a path."""
         if self._pace.share == 0.0 or not (np.any(self._dq_d) or np.any(self._ddq_d)):
             self._go(cycle)
         elif self._path is None:

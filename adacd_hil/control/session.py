@@ -68,13 +68,13 @@ class ArmFile(Protocol):
     """A file about an arm that a run uses, such as a tare or a history."""
 
     def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
-        """Compare the devices with the file's; return remarks as events. Raises DeviceError for a difference."""
+        """Compare the devices found with the file's; return remarks as events. Raises DeviceError if they differ."""
 
     def attachments(self) -> dict[str, bytes]:
-        """Return what the log keeps of the file, by name."""
+        """Return the contents that the log keeps of the file, by the attachment's name."""
 
     def metadata(self) -> dict[str, str]:
-        """Describe the file for the log's metadata."""
+        """Return entries about the file for the log's metadata."""
 
 
 class Attempt(NamedTuple):
@@ -94,7 +94,7 @@ class Ending(NamedTuple):
 
     @property
     def is_faulted(self) -> bool:
-        """Whether it ended by a fault that the user may acknowledge."""
+        """Return whether the attempt ended by a fault or an error, which the user may acknowledge."""
         return self.result is None or self.result.fault is not FaultReason.NONE
 
 
@@ -127,11 +127,11 @@ class Session:
 
     @property
     def is_lockstep(self) -> bool:
-        """Whether cycles follow each other at once instead of on the grid."""
+        """Return whether the run is in lockstep, by its clock: cycles follow each other at once, not on the grid."""
         return isinstance(self.clock, VirtualClock)
 
     def interrupt(self) -> None:
-        """Park the arm and end the run; a second call stops at once. Safe in a signal handler."""
+        """Ask the run to park the arm and end; by a second call, to end at once. Safe in a signal handler."""
         self._is_interrupted = True
         if self._cycle is not None:
             self._cycle.interrupt()
@@ -201,7 +201,7 @@ class Session:
         return request_realtime(self.settings.realtime_request)
 
     def _prepare(self, tap: Tap, pacer: Pacer) -> Attempt:
-        """Make and compile the objects of a new attempt."""
+        """Make and compile the objects of a new attempt, and return them; pass on an interruption so far."""
         arm = Arm(self.settings, self.codec, tap)
         master = Master(self.settings, self.codec, tap, watch_host=not self.is_lockstep)
         cycle = Cycle(self.settings, tap, arm, master, pacer, self.operator, self.progress, self.clock, self.touched_ns)
@@ -212,7 +212,10 @@ class Session:
         return Attempt(arm, master, cycle)
 
     def _attempt(self, attempt: Attempt, recorder: Recorder, tap: Tap) -> Ending:
-        """Boot the devices and run until the run is finished, interrupted or faulted."""
+        """Boot the devices, run until the run is finished, interrupted or faulted, and return how the attempt ended.
+
+        Log and print an error of bus or devices instead of raising it.
+        """
         arm, master, cycle = attempt
         ending = Ending(None, "", is_bus_failed=False)
         try:
@@ -235,7 +238,7 @@ class Session:
         return ending
 
     def _boot(self, master: Master, recorder: Recorder, tap: Tap) -> None:
-        """Reset the devices and configure them in Pre-operational. Raises DeviceError."""
+        """Reset and identify the devices, compare them with the files, and configure them. Raises DeviceError."""
         master.reset()
         self._identities = identities = tuple(master.identify())
         for identity in identities:

@@ -100,7 +100,7 @@ class Tare:
 
     @property
     def sensors(self) -> tuple[SensorRecord, SensorRecord]:
-        """The sensors in joint order."""
+        """Return the sensors in joint order."""
         return self.sensor1, self.sensor2
 
     def measured_ns(self) -> int:
@@ -109,7 +109,7 @@ class Tare:
 
 
 def read_tare(path: Path) -> Tare:
-    """Read a tare file. Raises ConfigError."""
+    """Return the tare of a file. Raises ConfigError if it is missing or invalid."""
     if not path.exists():
         raise ConfigError(f"tare {path} does not exist; `adacd-hil tare` makes one")
     table = read_toml(path, "tare")
@@ -120,7 +120,7 @@ def read_tare(path: Path) -> Tare:
 
 
 def write_tare(tare: Tare, path: Path) -> Path | None:
-    """Write a tare file in one step; keep the old one as `.1` and return its path, None without one. Raises OSError.
+    """Write a tare file in one step; copy the old one to `.1` and return the copy's path, or None. Raises OSError.
 
     At each moment the path holds a whole file.
     """
@@ -151,7 +151,7 @@ class UsedTare:
     warnings: tuple[str, ...]
 
     def apply(self, settings: Settings) -> Settings:
-        """Return the settings with the tare's `arm.torque_offset_Nm` and its standard deviation."""
+        """Return the settings with the tare's torque offsets and their standard deviations in section `arm`."""
         arm = dataclasses.replace(
             settings.arm, torque_offset_Nm=self.tare.offset_Nm, torque_offset_std_Nm=self.offset_std_Nm(settings.tare)
         )
@@ -167,7 +167,10 @@ class UsedTare:
         return max(first, SMALLEST_STD_NM), max(second, SMALLEST_STD_NM)
 
     def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
-        """Compare the sensors with the tare's; return its summary as events. Raises DeviceError for a difference."""
+        """Compare the sensors found with the tare's; return summary and warnings as events.
+
+        Raises DeviceError if a sensor is another one.
+        """
         for sensor, identity in zip(self.tare.sensors, sensor_identities(identities), strict=True):
             if difference := sensor.difference(identity):
                 raise DeviceError(f"{difference} of tare {self.path}; tare again")
@@ -188,12 +191,15 @@ class UsedTare:
         }
 
     def describe_offset(self) -> str:
-        """Format the offsets of both joints, Nm."""
+        """Return the offsets of both joints, Nm, as text."""
         return ", ".join(repr(offset) for offset in self.tare.offset_Nm)
 
 
 def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
-    """Read a tare for a run with these settings. now_ns: wall clock. Raises ConfigError if it can't be used."""
+    """Read a tare for a run with these settings, with warnings about its age. now_ns: wall clock.
+
+    Raises ConfigError if it is missing, too old, or measured with another sign, mounting or zero of the arm.
+    """
     tare = read_tare(path)
     if tare.sign != settings.arm.sign:
         raise ConfigError(
