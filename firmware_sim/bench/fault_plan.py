@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import NEVER_NS
+from firmware_sim.arm.sensing import TORQUE_LSB_NM
 from firmware_sim.bench.fault_rows import (
     ANY_FRAME,
     FRAME_CHANGES,
@@ -68,8 +69,19 @@ class NodeAction(NamedTuple):
 class FaultPlan:
     """The faults of one scenario over time."""
 
-    def __init__(self, rows: Sequence[FaultSettings], seed: int, period_ns: int, codec: Codec) -> None:
-        """Begin before power-on. `period_ns`: SYNC's. Raises ConfigError for a frame that the contract hasn't."""
+    def __init__(
+        self,
+        rows: Sequence[FaultSettings],
+        seed: int,
+        period_ns: int,
+        codec: Codec,
+        torque_count_Nm: tuple[float, float] = (TORQUE_LSB_NM, TORQUE_LSB_NM),
+    ) -> None:
+        """Begin before power-on. `period_ns`: SYNC's. `torque_count_Nm`: one count of each sensor.
+
+        Raises ConfigError for a frame that the contract hasn't.
+        """
+        self._torque_count_Nm = torque_count_Nm
         self.mask = 0
         """Bit i: row i is active."""
         self.is_quiet = True
@@ -161,7 +173,7 @@ class FaultPlan:
     def distort(self, position: Pair, velocity: Pair, torque: Pair) -> tuple[Pair, Pair, Pair]:
         """Return the measured values with the active faults applied; call once per SYNC.
 
-        Pairs are joints 1 and 2, in counts of POSITION_LSB_RAD, VELOCITY_LSB_RAD_S and TORQUE_LSB_NM.
+        Pairs are the devices' in order, in counts of POSITION_LSB_RAD, VELOCITY_LSB_RAD_S and `torque_count_Nm`.
         """
         if not self._distorting:
             return position, velocity, torque
@@ -170,7 +182,8 @@ class FaultPlan:
             which, lsb = SIGNALS[row.settings.signal or ""]
             for node in row.settings.nodes:
                 joint = node % 2
-                values[which][joint] = distort_value(row, node, values[which][joint], lsb)
+                count = lsb or self._torque_count_Nm[joint]
+                values[which][joint] = distort_value(row, node, values[which][joint], count)
         (position1, position2), (velocity1, velocity2), (torque1, torque2) = values
         return (position1, position2), (velocity1, velocity2), (torque1, torque2)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
 from adacd_hil.wire.time_marks import NEVER_NS
-from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, VELOCITY_LSB_RAD_S
 from firmware_sim.scenario.faults import NODES, FaultSettings
 
 EVERYBODY = -1
@@ -28,7 +28,12 @@ _DBC_NAMES = {
     "sdo_request": "SdoRequest",
     "sdo_response": "SdoResponse",
 }
-SIGNALS = {"position": (0, POSITION_LSB_RAD), "velocity": (1, VELOCITY_LSB_RAD_S), "torque": (2, TORQUE_LSB_NM)}
+SIGNALS: dict[str, tuple[int, float | None]] = {
+    "position": (0, POSITION_LSB_RAD),
+    "velocity": (1, VELOCITY_LSB_RAD_S),
+    "torque": (2, None),
+}
+"""Place of each signal among the measured values, and its count; a torque's is the sensor's."""
 _INSTANT_KINDS = ("reboot", "drive_fault")
 
 Sent = list[tuple[int, bytes]]

@@ -20,6 +20,7 @@ from adacd_hil.wire.time_marks import DEVICE_MARK, NEVER_NS, MarkKind, pack_mark
 from firmware_sim.arm.sensing import Measurement
 from firmware_sim.bench.fault_plan import ActionKind, FaultPlan, NodeAction
 from firmware_sim.bench.fault_rows import EVERYBODY
+from firmware_sim.body.sensors import count_Nm
 from firmware_sim.canopen.object_dictionary import Send
 from firmware_sim.nodes.device import EmulatedDevice
 from firmware_sim.nodes.drive_node import DriveNode
@@ -135,7 +136,8 @@ class Injector:
         self, scenario: Scenario, seed: int, period_ns: int, codec: Codec, outbox: Outbox, on_event: OnEvent | None
     ) -> None:
         """Begin before power-on. Raises ConfigError when a fault is about a frame that the contract hasn't."""
-        self.plan = FaultPlan(scenario.faults, seed, period_ns, codec)
+        first, second = (count_Nm(scenario.sensors, joint) for joint in scenario.wiring.sensor_joint)
+        self.plan = FaultPlan(scenario.faults, seed, period_ns, codec, (first, second))
         self.has_faults = bool(scenario.faults)
         self.now_ns = 0
         self.on_event = on_event

@@ -3,7 +3,7 @@
 import statistics
 
 import pytest
-from bench_host import CODEC
+from bench_host import CODEC, quiet_scenario
 from test_faults import UNTIMED, example
 
 from adacd_hil.settings.schema import ConfigError, parse
@@ -13,6 +13,7 @@ from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
 from firmware_sim.bench.fault_plan import ActionKind, FaultPlan, NodeAction
 from firmware_sim.bench.fault_rows import EVERYBODY
+from firmware_sim.bench.injector import Injector
 from firmware_sim.canopen.object_dictionary import CONTRACTS
 from firmware_sim.scenario.faults import FaultSettings
 
@@ -368,6 +369,28 @@ def test_a_value_jumps_by_its_step_or_saturates_at_its_bound_and_no_other_does(r
     found = active(row).distort(*values)
     values[which][joint] = seen
     assert [list(pair) for pair in found] == values
+
+
+@pytest.mark.parametrize(
+    ("row", "counts", "seen"),
+    [
+        (JUMP | {"step": -1.5}, 100, 100 - round(0.75 / TORQUE_LSB_NM)),
+        (SENSED | {"node": "sensor1", "value": 2.0}, 9000, round(1.0 / TORQUE_LSB_NM)),
+    ],
+)
+def test_a_torque_of_a_sensor_with_a_wide_range_changes_by_its_own_counts(row, counts, seen):
+    rows = [parse(FaultSettings, row | {"at_s": 0.0})]
+    plan = FaultPlan(rows, 1, PERIOD_NS, CODEC, (2.0 * TORQUE_LSB_NM, TORQUE_LSB_NM))
+    plan.advance(0)
+    assert plan.distort((0, 0), (0, 0), (counts, counts))[2] == (seen, counts)
+
+
+def test_a_wide_sensor_of_an_own_arm_jumps_by_the_step_in_nm():
+    sensors = {"torque_range_Nm": [100.0, 50.0], "torque_bits": [16, 16]}
+    faults = [JUMP | {"step": -1.5, "at_s": 0.0}]
+    injector = Injector(quiet_scenario(sensors=sensors, faults=faults), 1, PERIOD_NS, CODEC, None, None)
+    injector.plan.advance(0)
+    assert injector.plan.distort((0, 0), (0, 0), (100, 100))[2] == (100 - round(0.75 / TORQUE_LSB_NM), 100)
 
 
 # SYNC
