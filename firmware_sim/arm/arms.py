@@ -36,7 +36,7 @@ STOP_DAMPING_NM_S: Final = (10.0, 2.0)
 
 
 def pack_fields(settings: object, layout: np.dtype[np.void]) -> np.void:
-    """Make one element of a layout for compiled functions; its fields that the settings have, too, are filled."""
+    """Return a record of dtype `layout`, its fields filled from attributes of the same name, else 0."""
     numbers: np.void = np.zeros(1, layout)[0]
     for name in layout.names or ():
         if hasattr(settings, name):
@@ -97,7 +97,7 @@ class EmulatedArm:
                 raise ConfigError(f"`own_arm.{key}` = {list(getattr(self, key))} must be +1 or -1 for each device")
 
     def inertia(self, payload_kg: float = 0.0) -> tuple[float, float, float]:
-        """Lump the masses into α, β, γ, kg m²."""
+        """Return α, β, γ of the mass matrix, kg m², with a payload at the tip."""
         (length1_m, length2_m), (mass1_kg, mass2_kg) = self.link_length_m, self.mass_kg
         (center1_m, center2_m), (inertia1_kg_m2, inertia2_kg_m2) = self.center_m, self.inertia_kg_m2
         alpha = inertia1_kg_m2 + mass1_kg * center1_m**2
@@ -107,12 +107,12 @@ class EmulatedArm:
         return alpha, beta, gamma
 
     def theta(self, payload_kg: float = 0.0) -> Vector:
-        """Return the dynamic parameters in the order of `records.PARAMETER_NAMES` (7,)."""
+        """Return the dynamic parameters with a payload at the tip, in the order of `records.PARAMETER_NAMES` (7,)."""
         alpha, beta, gamma = self.inertia(payload_kg)
         return np.array([alpha + gamma, beta, gamma, *self.viscous_Nm_s, *self.coulomb_Nm])
 
     def numbers(self) -> np.void:
-        """Pack the empty arm for compiled functions, one element of ARM_NUMBERS."""
+        """Return the arm without payload as one record of dtype ARM_NUMBERS, for compiled functions."""
         numbers = pack_fields(self, ARM_NUMBERS)
         numbers["alpha"], numbers["beta"], numbers["gamma"] = self.inertia()
         numbers["current_loop_rad_s"][:] = CURRENT_LOOP_RAD_S
@@ -125,7 +125,7 @@ class EmulatedArm:
 
     @property
     def wiring(self) -> "Wiring":
-        """How the devices are at the joints."""
+        """Joint and sign of each device, joints counted from 0."""
         drive, sensor = (tuple(joint - 1 for joint in places) for places in (self.drive_joint, self.sensor_joint))
         torque = tuple(turn * up for turn, up in zip(self.drive_sign, self.motor_sign, strict=True))
         zero = tuple(round(math.radians(zero_deg) / POSITION_LSB_RAD) for zero_deg in self.zero_deg)
@@ -181,7 +181,7 @@ class Wiring:
     zero_counts: Joints = (0, 0)
 
     def read(self, measured: Measurement) -> Measurement:
-        """Order the samples of the joints by the devices' places, each counted the device's way."""
+        """Return measured values of the joints by the devices' places, with each device's sign and zero."""
         positions, velocities, torques = measured
         (d1, d2), (s1, s2) = self.drive_joint, self.sensor_joint
         (up1, up2), (turn1, turn2) = self.drive_sign, self.sensor_sign

@@ -169,7 +169,7 @@ class MechanicsSettings:
             )
 
     def arm_numbers(self, arm: EmulatedArm) -> np.void:
-        """Pack the arm with its stops for compiled functions, one element of ARM_NUMBERS."""
+        """Return an arm with the joint stops set here as one record of dtype ARM_NUMBERS, for compiled functions."""
         numbers = arm.numbers()
         low_deg, high_deg = self._stops_deg(arm)
         numbers["stop_low_rad"], numbers["stop_high_rad"] = np.radians(low_deg), np.radians(high_deg)
@@ -183,7 +183,7 @@ class MechanicsSettings:
         return self.stop_low_deg, self.stop_high_deg
 
     def numbers(self, arm: EmulatedArm) -> np.void:
-        """Pack for compiled functions, one element of MECHANICS_NUMBERS."""
+        """Return the mechanics of an arm as one record of dtype MECHANICS_NUMBERS, for compiled functions."""
         numbers = pack_fields(self, MECHANICS_NUMBERS)
         surplus = [max(0.0, self.static_Nm[joint] - arm.coulomb_Nm[joint]) for joint in range(2)]
         numbers["surplus_Nm"] = surplus
@@ -246,7 +246,10 @@ class MechanicsSettings:
         return oscillation, largest
 
     def substeps(self, arm: EmulatedArm, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
-        """Choose the substeps of a 100 µs tick; touch_rad_s: fastest rate of bodies, hands and walls."""
+        """Return the integration steps per 100 µs tick that the fastest rates need, 1 to LARGEST_SUBSTEPS.
+
+        touch_rad_s: fastest rate of bodies, hands and walls.
+        """
         oscillation, largest = self.eigenvalues(arm, payloads)
         oscillation = max(oscillation, touch_rad_s)
         needed = max(oscillation / LARGEST_OSCILLATION, largest / LARGEST_DECAY) * TICK_S

@@ -90,7 +90,7 @@ def dry_level(
 
 @compiled
 def drift_factor(drop_per_K: float, temperature_C: float) -> float:
-    """Return the factor of friction at a temperature, 1 at REFERENCE_C."""
+    """Return the factor of friction at a temperature, exp(-k (T - 25)), 1 at REFERENCE_C; drop_per_K: k."""
     if drop_per_K == 0.0:
         return 1.0
     return math.exp(-drop_per_K * (temperature_C - REFERENCE_C))
@@ -140,7 +140,7 @@ def spring_torque(mechanics: np.void, joint: int, twist_rad: float, twist_rad_s:
 
 @compiled
 def ripple_torque(mechanics: np.void, joint: int, shaft_rad: float, motor_Nm: float) -> float:
-    """Return the ripple in Nm that adds to the motor torque."""
+    """Return the torque ripple that adds to the motor torque, Nm; shaft_rad: angle q_m of the motor side."""
     amplitude = mechanics["ripple_Nm"][joint] + mechanics["ripple_share"][joint] * abs(motor_Nm)
     if amplitude == 0.0:
         return 0.0
@@ -205,7 +205,7 @@ def gravity_torque(state: np.void, arm: np.void, mechanics: np.void, q1: float, 
 
 @compiled
 def set_drift(state: np.void, mechanics: np.void, forces: np.void) -> None:
-    """Set the factors of friction at the joints' temperatures."""
+    """Set the factors of friction in `forces` by the joints' temperatures."""
     for joint in range(2):
         temperature_C = state["temperature_C"][joint]
         forces["viscous_drift"][joint] = drift_factor(mechanics["viscous_drop_per_K"][joint], temperature_C)
@@ -222,7 +222,10 @@ def collect_forces(
     elapsed_s: float,
     forces: np.void,
 ) -> None:
-    """Fill forces, friction levels and touch rates of this instant. elapsed_s: since the contact's onset."""
+    """Fill `forces`, friction levels included, and `touch_rates` for the state `now`.
+
+    time_s: scenario time. elapsed_s: since the contact's onset.
+    """
     state, arm, mechanics = around.state, around.arm, around.mechanics
     q1, q2, dq1, dq2 = now["q"][0], now["q"][1], now["dq"][0], now["dq"][1]
     ext1, ext2 = external_torque(arm, around.contact, elapsed_s, q1, q2, dq1, dq2)
@@ -268,14 +271,14 @@ def collect_forces(
 
 @compiled
 def is_free(joint: int, state: np.void, mechanics: np.void) -> bool:
-    """Return whether a link is free of dry friction and brake, so that it never sticks."""
+    """Return whether a link never sticks: no dry friction acts on it, nor the closed brake of a stiff joint."""
     is_braked = mechanics["stiffness_Nm_rad"][joint] == 0.0 and state["brake_Nm"][joint] != 0.0
     return bool(mechanics["is_free"][joint] != 0.0 and not is_braked)
 
 
 @compiled
 def decide(now: np.void, around: Surroundings, forces: np.void) -> Slips:
-    """Decide the slips of both links and both motors from the forces of this instant."""
+    """Return the slips of both links and both motors, 1, -1 or 0 (sticks), by the present forces."""
     state, mechanics = around.state, around.mechanics
     slip1, slip2 = decide_slips(
         state, forces, forces["link_Nm"][0], forces["link_Nm"][1], now["q"][1], now["dq"][0], now["dq"][1]
@@ -289,7 +292,7 @@ def decide(now: np.void, around: Surroundings, forces: np.void) -> Slips:
 
 @compiled
 def _motor_slip(joint: int, now: np.void, mechanics: np.void, forces: np.void) -> int:
-    """Decide the slip of one motor; only an elastic joint with motor-side Coulomb friction has one."""
+    """Return the slip of one motor, 0 if it sticks; 1 unless the joint is elastic with dry motor-side friction."""
     if mechanics["stiffness_Nm_rad"][joint] == 0.0 or forces["motor_level_Nm"][joint] == 0.0:
         return 1
     velocity = now["dq_m"][joint]

@@ -84,13 +84,13 @@ class _StepWork(NamedTuple):
 
 
 def work_space(touch_size: int) -> Vector:
-    """Allocate the work space of a step, for a touch state of `touch_size` values."""
+    """Return the work space of an integration step, zeros, for a touch state of `touch_size` values."""
     return np.zeros(_FORCES_END + _ROWS * touch_size)
 
 
 @compiled
 def _matrix(space: Vector) -> NDArray[np.float64]:
-    """Return a part of a work space as one row for each of its rows."""
+    """Return a part of a work space as a matrix of _ROWS rows that shares its memory."""
     return space.reshape((_ROWS, space.size // _ROWS))
 
 
@@ -104,7 +104,7 @@ def _collect(row: int, around: Surroundings, time_s: float, elapsed_s: float, wo
 def _fill_rates(row: int, rates: int, around: Surroundings, slips: Slips, work: _StepWork) -> None:
     """Fill the row `rates` with the derivative of the state in `row`.
 
-    Forces of the same instant are in the work space. Bristles and motor torques go their own way.
+    Needs the forces of the same state in the work space. Leaves the rates of bristles and motor torques out.
     """
     now, rate, forces, mechanics = work.rows[row], work.rows[rates], work.forces, around.mechanics
     ddq1, ddq2, _, _ = accelerate_links(now, around, slips, forces)
@@ -142,7 +142,7 @@ def _set_stage(rates: int, length_s: float, mechanics: np.void, work: _StepWork)
 
 @compiled
 def _set_bristles(row: int, length_s: float, mechanics: np.void, work: _StepWork) -> None:
-    """Advance the bristles to `row` by the mean velocity between start and `row`."""
+    """Set the bristles of `row`, `length_s` after the start row, by the mean velocity between the two rows."""
     start, now = work.rows[_START], work.rows[row]
     for joint in range(2):
         sigma0 = mechanics["sigma0_Nm_rad"][joint]
@@ -155,7 +155,7 @@ def _set_bristles(row: int, length_s: float, mechanics: np.void, work: _StepWork
 
 @compiled
 def _combine(values: NDArray[np.float64], count: int, sixth_s: float) -> None:
-    """Fill `count` places of the end row from the start and four rows of rates."""
+    """Fill `count` places of the end row by RK4's sum of the start and the four rows of rates."""
     for place in range(count):
         inner = values[_K2, place] + values[_K3, place]
         values[_END, place] = values[_START, place] + sixth_s * (values[_K1, place] + 2.0 * inner + values[_K4, place])
@@ -172,7 +172,7 @@ def _runge_kutta(
     step_s: float,
     work: _StepWork,
 ) -> None:
-    """Fill the end row: one step of classical RK4 with constant slips. The first rates stand in the work space."""
+    """Fill the end row by one step of classical RK4 with constant slips; needs the first rates in the row _K1."""
     touch, mechanics = work.touch, around.mechanics
     start, stage, end = work.rows[_START], work.rows[_STAGE], work.rows[_END]
     half_s = 0.5 * step_s
@@ -197,7 +197,7 @@ def _runge_kutta(
 
 @compiled
 def _margin(around: Surroundings, slips: Slips, work: _StepWork) -> float:
-    """Say how well the slips still fit at the end row: negative when a joint ought to have stopped or broken away."""
+    """Return by how much the slips still fit at the end row; negative: a joint has stopped or broken away."""
     now, forces, mechanics = work.rows[_END], work.forces, around.mechanics
     margin = np.inf
     friction1, friction2 = 0.0, 0.0
@@ -219,7 +219,7 @@ def _margin(around: Surroundings, slips: Slips, work: _StepWork) -> float:
 
 @compiled
 def _take_end(around: Surroundings, slips: Slips, work: _StepWork) -> None:
-    """Make the end row the start; a velocity that has passed zero is zero."""
+    """Copy the end row to the start row; a velocity that has passed zero is set to 0."""
     work.rows[_START] = work.rows[_END]
     for index in range(work.touch.shape[1]):
         work.touch[_START, index] = work.touch[_END, index]
@@ -249,7 +249,7 @@ def _step(
 ) -> None:
     """Advance the start row by a substep, cutting it where a slip changes.
 
-    Its forces stand in the work space, and those of the new start do afterwards.
+    Needs the forces of the start row in the work space, and leaves those of the new start there.
     """
     left_s = step_s
     for cut in range(_LARGEST_CUTS):
@@ -284,7 +284,7 @@ def _step(
 
 @compiled
 def _load(around: Surroundings, touch_state: Vector, work: _StepWork) -> None:
-    """Take the mechanical state into the start row."""
+    """Fill the start row from mechanical state and touch state, and set rotor inertia and drift of friction."""
     start, state, mechanics = work.rows[_START], around.state, around.mechanics
     for joint in range(2):
         start["q"][joint] = state["q"][joint]
@@ -359,7 +359,7 @@ def _has_stiff_motor(joint: int, mechanics: np.void, forces: np.void) -> bool:
 
 @compiled
 def _set_joint_torque(around: Surroundings, work: _StepWork) -> None:
-    """Set the torque through the sensors from the forces of the start row."""
+    """Set `tau_J` of the mechanical state, the torque through the sensors, from the forces of the start row."""
     state, mechanics, forces = around.state, around.mechanics, work.forces
     state["tau_J"][0], state["tau_J"][1] = forces["joint_Nm"][0], forces["joint_Nm"][1]
     if not (_has_stiff_motor(0, mechanics, forces) or _has_stiff_motor(1, mechanics, forces)):

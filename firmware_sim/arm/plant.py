@@ -88,7 +88,9 @@ def fit_payload(
     beside_m: float = 0.0,
     inertia_kg_m2: float = 0.0,
 ) -> None:
-    """Change the payload, a body with its centre of mass at (along, beside) from the tip in the frame of link 2.
+    """Set the payload in `state`: a body with its centre of mass at (along, beside) from the tip, along link 2.
+
+    Updates inertia, and velocities of a moving arm.
 
     An added mass was at rest: it shares the momentum of the moving arm, M q̇ stays. A mass that is taken off leaves with
     its speed: q̇ stays. At rest both change only the inertia.
@@ -204,7 +206,7 @@ def decide_slips(
 
 @compiled
 def _stop_torque(arm: np.void, joint: int, q: float, dq: float) -> float:
-    """Return the torque of a joint stop, Nm."""
+    """Return the torque of the joint stop that a joint (0 or 1) is beyond, Nm; 0 between the stops."""
     if q > arm["stop_high_rad"][joint]:
         push = (
             -arm["stop_stiffness_Nm_rad"][joint] * (q - arm["stop_high_rad"][joint])
@@ -224,7 +226,10 @@ def _stop_torque(arm: np.void, joint: int, q: float, dq: float) -> float:
 def external_torque(
     arm: np.void, contact: Structured, elapsed_s: float, q1: float, q2: float, dq1: float, dq2: float
 ) -> tuple[float, float]:
-    """Return the external torque of the joint stops and a contact, one row of the table or empty."""
+    """Return the external torque of joint stops and contact on both joints, Nm.
+
+    contact: one row of the table, or empty. elapsed_s: since its onset.
+    """
     stop1, stop2 = _stop_torque(arm, 0, q1, dq1), _stop_torque(arm, 1, q2, dq2)
     if contact.size == 0:
         return stop1, stop2
@@ -236,7 +241,9 @@ def external_torque(
 
 @compiled
 def follow_target(tau_Nm: float, target_Nm: float, turn: float) -> tuple[float, float]:
-    """Return the motor torque in the middle and at the end of a step of `turn` time constants.
+    """Return the motor torque in the middle and at the end of a step, Nm, for a lag of first order.
+
+    turn: length of the step in time constants of the torque loop.
 
     The torque's distance from its target decays. In the middle of the step stands the value with which Simpson's rule
     gives the exact impulse; the torque at the midpoint itself would be wrong by 1e-7 rad/s after a step of 3 Nm.

@@ -48,13 +48,13 @@ class DriveMode(IntEnum):
 
 @compiled
 def to_counts(value: float, lsb: float) -> int:
-    """Quantise to the nearest multiple of `lsb`."""
+    """Return a value in counts of `lsb`, rounded to the nearest."""
     return math.floor(value / lsb + 0.5)
 
 
 @compiled
 def torque_counts(torque_Nm: float, count_Nm: float = TORQUE_LSB_NM) -> int:
-    """Convert as the torque sensor's converter does; saturates at TORQUE_COUNTS."""
+    """Return a torque in counts of `count_Nm`, rounded to the nearest, limited to TORQUE_COUNTS."""
     return min(max(to_counts(torque_Nm, count_Nm), _LOWEST_COUNT), _HIGHEST_COUNT)
 
 
@@ -67,7 +67,7 @@ def track(
     tick_s: float,
     tracking_rad_s: float = TRACKING_RAD_S,
 ) -> tuple[float, float]:
-    """Advance the drive's tracking loop by one tick: new position estimate rad, new velocity estimate rad/s.
+    """Return the drive's estimates after one more tick of its tracking loop: position, rad, and velocity, rad/s.
 
     before, now: encoder positions at the two ends of the tick, taken as joined by a straight line. tracking: ω.
     Exact for

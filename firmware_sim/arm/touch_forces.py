@@ -110,7 +110,7 @@ TOUCH_TRUTH: Final = float_fields(
 
 @compiled
 def _own(state: Vector, row: int) -> np.void:
-    """Return a body's or a wall's part of the touch state, or of its rates, to read and to write."""
+    """Return a body's or a wall's part of the touch state, or of its rates, as a writable view; row: in the table."""
     place = TOUCH_HEADER + row * THING_PLACES
     part: np.void = state[place : place + THING_PLACES].view(THING_STATE)[0]
     return part
@@ -118,7 +118,7 @@ def _own(state: Vector, row: int) -> np.void:
 
 @compiled
 def _hand(state: Vector, row: int) -> np.void:
-    """Return a hand's part of the touch state, to read and to write."""
+    """Return a hand's part of the touch state as a writable view; row: in the table."""
     place = TOUCH_HEADER + row * THING_PLACES
     part: np.void = state[place : place + THING_PLACES].view(HAND_STATE)[0]
     return part
@@ -134,7 +134,7 @@ def _cosines(q1: float, q2: float) -> tuple[float, float, float, float]:
 def _moved_point(
     link: float, point_m: float, length1_m: float, pose: Pose, dq1: float, dq2: float
 ) -> tuple[float, float, float, float]:
-    """Return a link's point in the world: x, y in m and their rates in m/s."""
+    """Return x, y, m, and their rates, m/s, in the world, of the point `point_m` from the joint that carries a link."""
     c1, s1, c2, s2 = pose
     reach_m = length1_m if link == 2.0 else point_m
     x, y = reach_m * c1, reach_m * s1
@@ -162,7 +162,7 @@ def _joint_torque(
 
 @compiled
 def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float, float, float]:
-    """Return where a body's link meets it: penetration and point along the link, m; normal x, y; distance across, m.
+    """Return how a body meets its link: penetration and point along the link, m; normal x, y; distance across, m.
 
     The normal points from the link to the body; the last is the signed distance of its centre from the link's line.
     """
@@ -296,7 +296,7 @@ def touch(
 
 @compiled
 def _appear(thing: np.void, own: np.void, hand: np.void, pose: Pose) -> None:
-    """Put a thing in place, unless the arm is there; a hand remembers where the point is."""
+    """Set a thing as present unless the arm is in its place; store where a hand grasps, and the way that it guides."""
     if thing["kind"] == HAND:
         hand["start_x_m"], hand["start_y_m"], _, _ = _moved_point(
             thing["link"], thing["point_m"], thing["length1_m"], pose, 0.0, 0.0
@@ -328,7 +328,7 @@ def _appear(thing: np.void, own: np.void, hand: np.void, pose: Pose) -> None:
 
 @compiled
 def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
-    """Stop a body at its wall and choose its side, between ticks; say whether the arm touches it."""
+    """Stop a body at the wall behind it and set its side, between ticks; return whether the arm touches it."""
     if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
         own["shift_rate_m_s"] = 0.0
     depth_m, point_m, normal_x, normal_y, across_m = _meet(thing, own, pose)
@@ -344,7 +344,9 @@ def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
 
 @compiled
 def change_touch(things: Structured, time_s: float, q1: float, q2: float, state: Vector, is_prescribed: bool) -> None:
-    """Apply the changes between ticks: things come and go, hands grasp, a body stops at its wall, the energy restarts.
+    """Apply the changes between ticks to `state`: things come and go, a body stops at its wall.
+
+    The energy restarts at 0 while nothing touches the arm.
 
     Call it at the start of each tick and before `describe_touch`; twice at the same instant is once. is_prescribed:
     whether a prescribed contact is in force. The free direction of a body that has not moved turns with the normal.
@@ -397,7 +399,7 @@ def describe_touch(
     length1_m: float,
     out: np.void,
 ) -> tuple[float, float]:
-    """Fill an element of TOUCH_TRUTH; give the external torque of all that touches, Nm.
+    """Fill `out`, a record of TOUCH_TRUTH, and return the external torque of all contacts on both joints, Nm.
 
     contact, contact_index, elapsed_s: the prescribed contact in force, an empty array without one.
     """

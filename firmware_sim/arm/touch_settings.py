@@ -71,7 +71,7 @@ _PUSH: Final = SHAPES.index("push")
 
 
 def ticks(duration_s: float) -> int:
-    """Round a time to the 100 µs grid."""
+    """Return a time, s, in ticks of 100 µs, rounded to the nearest."""
     return round(duration_s / TICK_S)
 
 
@@ -119,7 +119,7 @@ class ContactSettings:
         return self.force_N * self.duration_s
 
     def row(self) -> tuple[float, ...]:
-        """Pack the contact for compiled functions, in the order of CONTACT."""
+        """Return the contact's values for compiled functions, in the order of CONTACT's fields."""
         duration_s = (self.end_tick - self.onset_tick) * TICK_S
         return (
             self.onset_tick,
@@ -139,7 +139,7 @@ class ContactSettings:
 
 
 def contact_table(contacts: tuple[ContactSettings, ...]) -> Structured:
-    """Pack contacts (n,), with the fields of CONTACT."""
+    """Return contacts as a table (n,) of CONTACT for compiled functions."""
     return np.array([contact.row() for contact in contacts], dtype=CONTACT)
 
 
@@ -233,7 +233,7 @@ _REACH_M: Final = 20.0
 
 
 def _ends(lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> tuple[tuple[float, float], ...]:
-    """Return base, elbow and tip."""
+    """Return base, elbow and tip in the world (x, y), m, of an arm in a pose (q1, q2)."""
     elbow = lengths_m[0] * math.cos(pose_rad[0]), lengths_m[0] * math.sin(pose_rad[0])
     angle = pose_rad[0] + pose_rad[1]
     return (0.0, 0.0), elbow, (elbow[0] + lengths_m[1] * math.cos(angle), elbow[1] + lengths_m[1] * math.sin(angle))

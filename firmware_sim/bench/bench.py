@@ -137,11 +137,11 @@ class Bench:
         self.time.outlive_host()
 
     def release(self) -> None:
-        """Let time go by the given clock again: the host in lockstep has gone."""
+        """End lockstep when its host has gone: time follows the given clock again."""
         self._outbox.is_paced = False
 
     def on_frame(self, frame: Frame) -> None:
-        """Take one frame from the bus."""
+        """Take one frame from the bus: run a cycle on SYNC, and pass the others to the devices that receive them."""
         can_id, data, t_ns, is_error = frame
         if is_error:
             return
@@ -188,7 +188,7 @@ class Bench:
         self.injector.receive_by_all(0x700 + self._host_id, data, take, t_ns)
 
     def _sdo_handler(self, can_id: int) -> Handler:
-        """Let every device with this node id answer."""
+        """Return a handler that passes SDO requests with this identifier to every device that receives it."""
 
         def answer(data: bytes, t_ns: int) -> None:
             for place, device in enumerate(self.devices):
@@ -212,7 +212,7 @@ class Bench:
             self._answer(data, t_ns, late_ns)
 
     def _judge(self, data: bytes, t_ns: int) -> bool:
-        """Place a SYNC among those before and count the cycles; tell whether devices take it."""
+        """Compare a SYNC with those before it, and count cycles and lost SYNCs; return whether devices take it."""
         order = self._order
         last = order.counter
         overflow = self._nodes.listeners.overflow if data else 0
@@ -276,7 +276,10 @@ class Bench:
         return is_undisturbed and self._nodes.has_all_answers
 
     def _sample_and_send(self, data: bytes, takers: Sequence[int]) -> None:
-        """Give the nodes their samples, and let them send; `takers`: 1 for each that takes this SYNC."""
+        """Call `on_sync` of the nodes with their measured values, then send their answers.
+
+        takers: 1 for each device that takes this SYNC, else 0.
+        """
         now_ns = self.time.now_ns
         drive1, drive2 = self.drives
         sensor1, sensor2 = self.sensors
@@ -309,5 +312,5 @@ class Bench:
                 send()
 
     def _listen(self) -> None:
-        """Find anew which frames the nodes send and receive, as `BenchNodes.listen` does."""
+        """Update the frames that the nodes send and receive, by `BenchNodes.listen`."""
         self._nodes.listen()

@@ -101,7 +101,7 @@ class BenchNodes:
         self.listeners = SyncListeners(self.devices)
 
     def listen(self) -> None:
-        """Find anew which frames the nodes send on SYNC and receive, after a change of their PDOs."""
+        """Update `senders`, `commands` and `has_all_answers` after a change of the nodes' PDOs."""
         self.senders = tuple((i, send) for i, device in enumerate(self.devices) for send in device.pdos.on_sync)
         self.has_all_answers = self.answers == frozenset().union(*(device.pdos.answers for device in self.devices))
         commands: dict[int, tuple[tuple[int, Handler], ...]] = {}
@@ -111,13 +111,13 @@ class BenchNodes:
         self.commands = commands
 
     def poll(self, t_ns: int) -> int:
-        """Act on timers that are due; return when to look again."""
+        """Let all nodes act on their timers that are due at `t_ns`; return when the next one is due, ns."""
         drive1, drive2 = self.drives
         sensor1, sensor2 = self.sensors
         return min(drive1.poll(t_ns), drive2.poll(t_ns), sensor1.poll(t_ns), sensor2.poll(t_ns))
 
     def latch_motors(self) -> None:
-        """Take over the drives' present set-points and modes, by joint, until the next call."""
+        """Store the drives' present set-points and modes, by joint; `move_arm` uses them until the next call."""
         drive1, drive2 = self.drives
         torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
         modes = (drive1.motor_mode, drive2.motor_mode)
@@ -129,7 +129,7 @@ class BenchNodes:
         self._motor_Nm, self._motor_modes = torque_Nm, modes
 
     def move_arm(self, tick_count: int) -> None:
-        """Let the arm move with the latched set-points."""
+        """Move the arm with the latched set-points for `tick_count` ticks of 100 µs."""
         self._arm.advance(self._motor_Nm, self._motor_modes, tick_count)
 
     def lose_sync(self, heard: Sequence[int], t_ns: int) -> None:
@@ -139,7 +139,7 @@ class BenchNodes:
                 drive.on_lost_sync(t_ns)
 
     def sample(self) -> Measurement:
-        """Measure the arm, by the places of the devices."""
+        """Return the measured values of the arm in counts, by the places of the devices."""
         measured = self._arm.sample()
         return self.wiring.read(measured) if self.is_crossed else measured
 
@@ -181,6 +181,6 @@ def _scale_of(own: EmulatedArm | None, place: int) -> DriveScale:
 
 
 def _check_period(period_us: int) -> None:
-    """Accept whole ticks, and 0."""
+    """Refuse a period, µs, that is not 0 to 100 ms in whole ticks of 100 µs (VALUE_RANGE)."""
     if not 0 <= period_us <= _LONGEST_PERIOD_US or period_us * 1000 % TICK_NS:
         refuse(Abort.VALUE_RANGE)

@@ -51,12 +51,12 @@ class TruthFeed:
         self._sync_stamp_ns = self._sync_cycle = 0
 
     def add_sync_row(self, cycle: int, stamp_ns: int) -> None:
-        """Add the row of a SYNC."""
+        """Call `on_truth` with the present truth as that of a SYNC; later rows count from this SYNC."""
         self._sync_stamp_ns, self._sync_cycle = stamp_ns, cycle
         self.add_later_row(0, 0)
 
     def add_later_row(self, periods: int, period_ns: int) -> None:
-        """Add the row of so many periods after the last SYNC."""
+        """Call `on_truth` with the present truth as that of `periods` periods after the last SYNC."""
         self.cycle = self._sync_cycle + periods
         if self.on_truth is not None:
             self._fill(self._block)
@@ -98,7 +98,7 @@ class TruthLog(Recorder):
         self.cycle(t_ns, ((ChannelId.TRUTH, pack_truth(cycle, block)),))
 
     def write_event(self, t_ns: int, level: str, name: str, text: str) -> None:
-        """Log something that happened: a fault that begins or ends. `level`: info, warning or error."""
+        """Log the beginning or end of a fault as an event. `level`: info, warning or error."""
         self.event(t_ns, Event(level, name, text))
 
     def discard(self) -> None:
@@ -155,11 +155,11 @@ class BenchTime:
         return self._has_rested(self.now_ns)
 
     def begin(self, t_ns: int) -> None:
-        """Let time begin at `t_ns`."""
+        """Set the time of bench and arm to `t_ns`."""
         self.now_ns = self._arm_ns = t_ns
 
     def advance(self, dt_ns: int) -> None:
-        """Let time pass for the arm and its devices; the arm moves by whole ticks."""
+        """Advance the bench's time by `dt_ns`, and move the arm by the whole ticks that have passed."""
         self.now_ns += dt_ns
         self._move_arm(self.now_ns)
 
@@ -183,13 +183,13 @@ class BenchTime:
             self._sync_ns += dt_ns
 
     def reach_sync(self, lost: int) -> None:
-        """Let the period before this SYNC pass, by SYNC, and those of `lost` SYNCs before it."""
+        """Advance by the periods of `lost` SYNCs, then by the one before this SYNC; by wall, do nothing."""
         if not self._is_wall and self.has_begun:
             self.pass_lost_syncs(lost)
             self.advance(self._nodes.period_ns)
 
     def pass_lost_syncs(self, count: int) -> None:
-        """Let the periods of lost SYNCs pass, by SYNC."""
+        """Advance by `count` periods; the drives count a lost SYNC at the end of each."""
         for _ in range(count):
             self.advance(self._nodes.period_ns)
             for drive in self._nodes.drives:
@@ -197,30 +197,30 @@ class BenchTime:
             self._nodes.latch_motors()
 
     def delay_sample(self, late_ns: int) -> None:
-        """Let the arm move until this SYNC reaches the devices, by SYNC."""
+        """Move the arm to `late_ns` after the bench's time, when a late SYNC reaches the devices."""
         self._move_arm(self.now_ns + late_ns)
 
     def end_sync(self, cycle: int, stamp_ns: int) -> None:
-        """Add the row of a SYNC that has been answered, or that no device heard."""
+        """Latch the drives' set-points, and add the row of truth of a SYNC, answered or heard by no device."""
         self._sync_ns, self._has_outlived = self.now_ns, False
         self._nodes.latch_motors()
         self._rows.add_sync_row(cycle, self.host_ns if self._outbox.is_paced else stamp_ns)
 
     def poll(self, t_ns: int) -> None:
-        """Let the nodes act on timers that are due, and remember when to look again."""
+        """Let the nodes act on timers that are due at `t_ns`, and set `due_ns` to the next one."""
         self.due_ns = self._nodes.poll(t_ns)
         if self._injector.has_faults:
             self.due_ns = min(self.due_ns, self._injector.due_ns, self._outbox.due_ns)
 
     def advance_faults(self, stamp_ns: int, ahead_ns: int = 0) -> None:
-        """Let faults begin and end that are due by now, or within `ahead_ns`."""
+        """Begin and end the faults that are due within `ahead_ns` of now, and let babbling nodes send."""
         if self._injector.has_faults:
             is_paced = self._outbox.is_paced
             self._injector.advance(self.now_ns + ahead_ns, self.host_ns + ahead_ns if is_paced else stamp_ns)
             self._injector.flood(self._nodes.period_ns)
 
     def take_mark(self, data: bytes, _t_ns: int) -> None:
-        """Let time pass until the host's next frame, or until something is sent."""
+        """On an ADVANCE mark, let time pass to the mark's time or until a frame is sent; then send a GRANT mark."""
         mark = unpack_mark(data)
         if mark is None or mark[0] is not MarkKind.ADVANCE:
             return
@@ -261,14 +261,14 @@ class BenchTime:
         self._is_orphaned = False
 
     def _act_at(self, t_ns: int) -> None:
-        """Reach `t_ns` and act on everything that is due then."""
+        """Advance to `t_ns`: faults, held frames and the nodes' timers that are due then act."""
         self.reach(t_ns)
         self.advance_faults(t_ns)
         self._outbox.release(self.now_ns)
         self.poll(self.now_ns)
 
     def _advance_without_sync(self, dt_ns: int) -> None:
-        """Let time pass that no SYNC divides; a row of truth per period, as long as the arm moves."""
+        """Advance by `dt_ns` without a SYNC; add a row of truth per period as long as the arm moves."""
         end_ns, period_ns = self.now_ns + dt_ns, self._nodes.period_ns
         first = _FIRST_OVERDUE if self._is_wall else 1
         self._nodes.latch_motors()

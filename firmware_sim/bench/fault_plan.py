@@ -148,13 +148,13 @@ class FaultPlan:
         return edges
 
     def actions(self) -> list[NodeAction]:
-        """Take the actions on nodes that are due now, in order."""
+        """Return the actions on nodes that are due now, in order, and remove them from the plan."""
         taken, self._actions = self._actions, []
         self._find_quiet()
         return taken
 
     def transmit(self, node: int, can_id: int, data: bytes) -> list[tuple[int, int, bytes]]:
-        """Apply the faults to a frame that a node sends; return delay in ns, identifier, data of each."""
+        """Return the frames that faults make of one that a node sends: delay in ns, identifier, data; [] if lost."""
         if node in self._silent:
             return []
         rows = self._sending.get((node, can_id)) or self._sending.get((node, ANY_FRAME))
@@ -163,7 +163,7 @@ class FaultPlan:
         return [(delay_ns, can_id, changed) for delay_ns, changed in self._change(rows, can_id, data)]
 
     def receive(self, node: int, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
-        """Apply the faults to a frame of the host on its way to a node; return delay in ns and data of each.
+        """Return the frames that faults make of a host's frame to a node: delay in ns and data; [] if it is lost.
 
         For a frame to all devices call it with `EVERYBODY` first, then with each of the returned frames for each node.
         """
@@ -188,7 +188,7 @@ class FaultPlan:
         return (position1, position2), (velocity1, velocity2), (torque1, torque2)
 
     def sync_delay_ns(self) -> int:
-        """Draw how late this SYNC reaches the devices. Once per SYNC."""
+        """Draw the delay with which this SYNC reaches the devices, ns; call once per SYNC."""
         return sum(row.late_ns() for row in self._slowing if row.hit())
 
     def babble(self, period_ns: int) -> list[tuple[int, int, bytes]]:
@@ -227,7 +227,7 @@ class FaultPlan:
         return edges
 
     def _begin(self, row: FaultRow) -> None:
-        """Queue the actions of a row without length."""
+        """Queue the actions of a reboot or drive fault without duration: off and on, or failure and repair."""
         settings = row.settings
         for node in settings.nodes:
             if settings.kind == "reboot" and not settings.duration_ns:
@@ -237,7 +237,7 @@ class FaultPlan:
                 self._actions += [NodeAction(ActionKind.FAIL, node, code), NodeAction(ActionKind.MEND, node)]
 
     def _take_over(self) -> None:
-        """Make the tables of the active rows, and queue the actions on nodes that follow."""
+        """Set mask and tables by the rows that are active now, and queue the actions on nodes that follow."""
         active = [row for row in self._rows if row.is_active]
         self.mask = sum(1 << row.index for row in active)
         self._distorting = _of(active, *_VALUE_KINDS)
@@ -313,7 +313,7 @@ class FaultPlan:
             self._actions.append(NodeAction(ActionKind.EMERGENCY, node, row.settings.code or 0))
 
     def _change(self, rows: tuple[FaultRow, ...], can_id: int, data: bytes) -> Sent:
-        """Let the rows act on one frame, one after the other."""
+        """Return the frames that rows make of one frame, one row after the other: delay in ns and data."""
         frames: Sent = [(0, data)]
         for row in rows:
             if row.settings.kind == "reorder":
@@ -323,7 +323,7 @@ class FaultPlan:
         return frames
 
     def _swap(self, row: FaultRow, can_id: int, frames: Sent) -> Sent:
-        """Hold a frame back until the next with its identifier has overtaken it."""
+        """Hold a frame back until the next with its identifier has overtaken it; return the frames to send now."""
         if can_id in row.held:
             overtaken = row.held.pop(can_id)
             if not row.is_active:
@@ -336,7 +336,7 @@ class FaultPlan:
         return []
 
     def _plan_next(self) -> None:
-        """Find out when something begins, ends or happens next."""
+        """Set the times at which the next row begins, ends or sends, in the scenario's time and since power-on."""
         by_scenario = [row for row in self._rows if not row.settings.is_from_power_on]
         by_power = [row for row in self._rows if row.settings.is_from_power_on]
         self._next_scenario_ns = min((row.due_ns for row in by_scenario), default=NEVER_NS)

@@ -66,7 +66,7 @@ class FaultRow:
 
     @property
     def flood_ns(self) -> int:
-        """When the next frame of a flood is due."""
+        """Time at which the next frame of a flood (`babble`, `emcy_storm`) is due, ns; NEVER_NS if none is."""
         rate_Hz = self.settings.rate_Hz or 0.0
         return self.begin_ns + round(self.sent * 1e9 / rate_Hz) if rate_Hz and self.hits_left > 0 else NEVER_NS
 
@@ -94,7 +94,10 @@ class FaultRow:
 
 
 def distort_value(row: FaultRow, node: int, counts: int, lsb: float) -> int:
-    """Return one value with the row's effect."""
+    """Return a measured value as the fault changes it; unchanged if the fault doesn't hit it.
+
+    node: index in NODES; a stuck value is kept for each. lsb: of one count, in the unit of the signal.
+    """
     settings = row.settings
     if not row.hit():
         return counts
@@ -116,7 +119,7 @@ def _delay(row: FaultRow, _message: MessageCodec | None, frames: Sent) -> Sent:
 
 
 def _flip(row: FaultRow, data: bytes) -> bytes:
-    """Flip the bits of the mask, or random ones."""
+    """Return data with the bits of the row's mask flipped, or else with as many random bits as the row says."""
     settings = row.settings
     bits = int.from_bytes(data, "little")
     if settings.mask is not None:
@@ -129,7 +132,7 @@ def _flip(row: FaultRow, data: bytes) -> bytes:
 
 
 def _freeze_counter(row: FaultRow, message: MessageCodec | None, frames: Sent) -> Sent:
-    """Return frames of a protected message the counter of the first one, and the CRC that goes with it."""
+    """Return protected frames with the counter of the first frame that was hit and a CRC for it; others unchanged."""
     if message is None or message.profile is None:
         return frames
     changed = []
@@ -152,7 +155,7 @@ FRAME_CHANGES: dict[str, Callable[[FaultRow, MessageCodec | None, Sent], Sent]] 
 
 
 def name_streams(rows: Sequence[FaultSettings], seed: int) -> list[tuple[FaultSettings, str]]:
-    """Return each row the name of its stream."""
+    """Return each row with the seed of its random stream, a text: rows that are alike get different ones."""
     counts: dict[str, int] = {}
     named = []
     for row in rows:
@@ -163,7 +166,10 @@ def name_streams(rows: Sequence[FaultSettings], seed: int) -> list[tuple[FaultSe
 
 
 def find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Place]:
-    """Return node and identifier of the frames that a row is about. Raises ConfigError."""
+    """Return node and identifier of the frames that a row is about.
+
+    Raises ConfigError if the contract lacks a frame, or if a frame has no counter to freeze.
+    """
     if row.frame is None:
         return frozenset()
     if row.frame == "any":

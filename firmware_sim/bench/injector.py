@@ -68,26 +68,29 @@ class Outbox:
         self._send(can_id, data)
 
     def put_later(self, due_ns: int, can_id: int, data: bytes) -> None:
-        """Send a frame at `due_ns`."""
+        """Hold a frame until `due_ns`; `release` or `send_released` then sends it."""
         self.hold(due_ns, lambda: self._put(can_id, data))
 
     def hold(self, due_ns: int, act: Callable[[], None]) -> None:
-        """Hold a function until `due_ns`; `release` then calls it."""
+        """Hold a function until `due_ns`; `release` or `send_released` then calls it."""
         self._order += 1
         heapq.heappush(self._held, Held(due_ns, self._order, act))
 
     def release(self, now_ns: int) -> None:
-        """Release everything that is due by now."""
+        """Send the held frames and call the held functions that are due by `now_ns`, in order."""
         while self._held and self._held[0].due_ns <= now_ns:
             heapq.heappop(self._held).act()
 
     def collect(self, now_ns: int) -> None:
-        """Begin the answer to a SYNC that isn't plain: frames that are put from now on wait for `send_released`."""
+        """Hold the frames that are put from now on, as due at `now_ns`, until `send_released`."""
         self._now_ns = now_ns
         self._is_open = True
 
     def send_released(self, sync_ns: int, until_ns: int) -> None:
-        """Send all that is released before `until_ns`; in lockstep, say when after `sync_ns`, and when it is all."""
+        """End `collect`, send the held frames and call the held functions that are due before `until_ns`.
+
+        In lockstep, RELEASE marks give the host their times after `sync_ns`, and an END mark follows the last.
+        """
         self._is_open = False
         if self.is_paced:
             self.mark(MarkKind.RELEASE)
@@ -102,7 +105,7 @@ class Outbox:
             self.mark(MarkKind.END)
 
     def mark(self, kind: MarkKind, t_ns: int = 0) -> None:
-        """Send a mark."""
+        """Send a mark to a host in lockstep. `t_ns`: as `MarkKind` defines it for the kind."""
         self._send(DEVICE_MARK, pack_mark(kind, t_ns))
 
 
@@ -114,7 +117,7 @@ class Departure:
         self._frames: list[tuple[int, bytes]] = []
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Let a frame wait for the others."""
+        """Add a frame to those that `go` sends."""
         self._frames.append((can_id, data))
 
     def go(self) -> None:
@@ -153,15 +156,15 @@ class Injector:
     def attach(
         self, devices: Sequence[EmulatedDevice], drives: Sequence[DriveNode], sensors: Sequence[SensorNode]
     ) -> None:
-        """Connect the nodes."""
+        """Set the nodes on which faults act."""
         self._devices, self._drives, self._sensors = devices, drives, sensors
 
     def power_on(self, t_ns: int) -> None:
-        """Let the time since power-on begin."""
+        """Set `t_ns` as the time of power-on, from which some faults count."""
         self.now_ns = self._power_on_ns = t_ns
 
     def start(self, t_ns: int) -> None:
-        """Let the scenario's time begin."""
+        """Set `t_ns` as the time at which the scenario begins."""
         self._started_ns = t_ns
 
     @property
@@ -175,7 +178,7 @@ class Injector:
         return min(self.now_ns + self.plan.wait_ns, self._flooded_ns if self.plan.is_flooding else NEVER_NS)
 
     def sender(self, place: int) -> Send:
-        """Return the function by which a device sends."""
+        """Return the function by which a device sends its frames, which applies the faults. `place`: index in NODES."""
         outbox, plan = self._outbox, self.plan
 
         def put(can_id: int, data: bytes) -> None:
@@ -191,7 +194,10 @@ class Injector:
         return put if self.has_faults else outbox.put
 
     def receive(self, place: int, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
-        """Return a frame of the host, with its faults, to a node (or to `EVERYBODY`); return whether any is left."""
+        """Call `take` with a frame of the host, as faults change, repeat or delay it; return False if it is lost.
+
+        place: of the node that receives it, or EVERYBODY.
+        """
         if self.plan.is_quiet:
             take(data, t_ns)
             return True
@@ -205,11 +211,14 @@ class Injector:
         return bool(frames)
 
     def receive_by_all(self, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
-        """Return a frame of the host to all, with its faults, to a handler; return whether any is left."""
+        """Call `take` with a host's frame to all nodes, as faults change or delay it; return False if it is lost."""
         return self.receive(EVERYBODY, can_id, data, take, t_ns)
 
     def advance(self, now_ns: int, stamp_ns: int) -> None:
-        """Let faults begin and end by now, and act on nodes. `stamp_ns`: stamp of their events."""
+        """Begin and end the faults that are due by `now_ns`: report events stamped `stamp_ns`, and act on nodes.
+
+        In lockstep, a mark tells the host when frames begin or cease to be acknowledged.
+        """
         self.now_ns = now_ns
         scenario_ns = -1 if self._started_ns is None else now_ns - self._started_ns
         for edge in self.plan.advance(scenario_ns, now_ns - self._power_on_ns):
@@ -227,21 +236,24 @@ class Injector:
         return 0 if self.plan.is_quiet else min(self.plan.sync_delay_ns(), period_ns - 1)
 
     def flood(self, period_ns: int) -> None:
-        """Let babbling nodes send their frames of the period that begins now."""
+        """Hold the frames of babbling nodes in the period that begins now, each until its time."""
         if self.plan.is_flooding:
             self._flooded_ns = self.now_ns + period_ns
             for offset_ns, can_id, data in self.plan.babble(period_ns):
                 self._outbox.put_later(self.now_ns + offset_ns, can_id, data)
 
     def hear(self, sync_id: int, data: bytes) -> tuple[int, ...]:
-        """Return how often each node hears a SYNC that is on the bus once."""
+        """Return how often each device hears a SYNC that is sent once: 0 off the bus or if it is lost."""
         plan = self.plan
         return tuple(
             len(plan.receive(place, sync_id, data)) * device.is_on_bus for place, device in enumerate(self._devices)
         )
 
     def sync(self, heard: Sequence[int], measured: Measurement, now_ns: int) -> None:
-        """Give a SYNC to the nodes that hear it, with their measured values."""
+        """Call `on_sync` of the nodes that hear a SYNC, with measured values that faults have changed.
+
+        heard: how often each device hears it, as from `hear`.
+        """
         position, velocity, torque = self.plan.distort(*measured)
         for joint, drive in enumerate(self._drives):
             if heard[joint]:

@@ -77,7 +77,7 @@ def _largest_mobility(arm: EmulatedArm, link: int, points_m: Vector) -> float:
 
 
 def _row(kind: int, arm: EmulatedArm, thing: BodySettings | HandSettings | WallSettings) -> np.void:
-    """Fill the columns that all things have."""
+    """Return a row of THING with kind, times and link lengths filled in; the other fields are NaN."""
     row: np.void = np.full(THING.itemsize // 8, np.nan).view(THING)[0]
     row["kind"] = kind
     row["onset_s"] = ticks(thing.at_s) * TICK_S
@@ -126,7 +126,7 @@ def _wall_row(arm: EmulatedArm, wall: WallSettings) -> np.void:
 
 
 def touch_table(scenario: Scenario) -> Structured:
-    """Pack a scenario's bodies, hands and walls (n,), with the fields of THING; n = 0 without any."""
+    """Return a scenario's bodies, hands and walls as a table (n,) of THING for compiled functions."""
     arm = scenario.arm
     rows = [_body_row(arm, body) for body in scenario.bodies]
     rows += [_hand_row(arm, hand) for hand in scenario.hands]
@@ -142,7 +142,7 @@ def initial_touch_state(things: Structured) -> Vector:
 
 
 def largest_rate_rad_s(things: Structured) -> float:
-    """Bound the fastest rate, rad/s, that touching gives the unloaded arm; 0 for an empty table.
+    """Return a bound of the fastest rate that bodies, hands and walls give the unloaded arm, rad/s; 0 without any.
 
     Things that can be there at the same time add up: squares of the springs' rates, and the dampers' rates.
     """
@@ -173,7 +173,7 @@ _ENCODER_STREAM: Final = (2,)
 
 
 def payload_table(payloads: tuple[PayloadSettings, ...]) -> Structured:
-    """Pack payload changes (n,), rows of PAYLOAD_CHANGE."""
+    """Return payload changes as a table (n,) of PAYLOAD_CHANGE for compiled functions."""
     rows = [(change.tick, change.mass_kg, *change.center_m, change.inertia_kg_m2) for change in payloads]
     return np.array(rows, dtype=PAYLOAD_CHANGE)
 
@@ -225,7 +225,7 @@ class BodyParts(NamedTuple):
 
 
 def _pack_numbers(scenario: Scenario) -> Vector:
-    """Pack the properties of the arm and its devices, by the names in BODY_NUMBERS."""
+    """Return the properties of the arm and its devices as a flat array, laid out by BODY_NUMBERS."""
     vector = np.zeros(BODY_NUMBERS.itemsize // 8)
     numbers: np.void = vector.view(BODY_NUMBERS)[0]
     numbers["arm"] = scenario.mechanics.arm_numbers(scenario.arm)
@@ -285,7 +285,7 @@ class Body:
         self._compile()
 
     def _put_at_start(self) -> None:
-        """Fill the state at power-on."""
+        """Set the state at power-on: the start pose at rest, with payload and settled sensors."""
         state: np.void = self._state_vector.view(BODY_STATE)[0]
         for name in ("q", "q_m", "q_encoder"):
             self._arm[name] = self.scenario.start_rad
@@ -324,7 +324,7 @@ class Body:
         )  # fmt: skip
 
     def start_scenario(self) -> None:
-        """Let scenario time start now: both drives are enabled and show torque mode. Later calls have no effect."""
+        """Start the scenario time now, once both drives are enabled; later calls have no effect."""
         if self._course["start_tick"] < 0.0:
             self._course["start_tick"] = self._course["tick"]
 
@@ -367,7 +367,7 @@ class Body:
     def advance(
         self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int], tick_count: int = PERIOD_TICKS
     ) -> None:
-        """Advance by ticks of 100 µs. Set-points (2,) and `DriveMode` (2,) hold for the whole of it."""
+        """Advance the arm by ticks of 100 µs with constant set-points (2,), Nm, and `DriveMode` (2,), by joint."""
         while tick_count > 0:
             count = tick_count
             if self._encoder_noise.is_on:
@@ -392,7 +392,7 @@ class Body:
             )
 
     def sample(self) -> Measurement:
-        """Measure now. Call it once per SYNC: each call draws new noise."""
+        """Return the measured values of now in counts. Call it once per SYNC: each call draws new noise."""
         sample_body(self._state_vector, self._number_vector, self._noise.draw(), self._walk.draw(), self._counts)
         q1, q2, dq1, dq2, tau1, tau2 = self._counts.tolist()
         return Measurement((q1, q2), (dq1, dq2), (tau1, tau2))

@@ -85,7 +85,10 @@ overshoot."""
 
 @compiled
 def find_contact(course: np.void, contacts: Structured) -> Structured:
-    """Return the row of the contact in force at this tick, or an empty array; steps over those that have ended."""
+    """Return the row of the contact in force at this tick (1,), or an empty array; skip contacts that have ended.
+
+    Sets `course["contact"]` to the index of the contact in force or the next one.
+    """
     tick = course["tick"] - course["start_tick"]
     index = int(course["contact"])
     while index < contacts.size and contacts[index]["end_tick"] <= tick:
@@ -98,7 +101,7 @@ def find_contact(course: np.void, contacts: Structured) -> Structured:
 
 @compiled
 def _elapsed_s(course: np.void, contact: Structured) -> float:
-    """Return the time since the onset of the contact in force, 0 without one."""
+    """Return the time since the onset of the contact in force, s; 0 without one."""
     if contact.size == 0:
         return 0.0
     return float((course["tick"] - course["start_tick"] - contact[0]["onset_tick"]) * TICK_S)
@@ -129,7 +132,7 @@ def _scenario_s(course: np.void) -> float:
 
 @compiled
 def _torque_target(arm: np.void, joint: int, mode: int, setpoint_Nm: float, velocity_rad_s: float) -> float:
-    """Return a drive's set-point for its torque loop, Nm, within its rated torque."""
+    """Return the torque that a drive wants in a `DriveMode`, Nm: set-point or braking, within its rated torque."""
     limit_Nm = arm["rated_torque_Nm"][joint]
     if mode == _TORQUE:
         return float(min(max(setpoint_Nm, -limit_Nm), limit_Nm))
@@ -145,7 +148,7 @@ def _torque_target(arm: np.void, joint: int, mode: int, setpoint_Nm: float, velo
 
 @compiled
 def _read_encoder(course: np.void, numbers: np.void, joint: int, angle_rad: float, noise_counts: float) -> None:
-    """Take the encoder's position at the end of a tick and advance the drive's velocity. angle: that of its shaft."""
+    """Store the encoder's reading of its shaft's angle at the end of a tick, and advance the drive's velocity by it."""
     now_rad = read_angle(numbers["encoder"], joint, angle_rad, noise_counts)
     course["estimate_rad"][joint], course["velocity_rad_s"][joint] = track(
         course["encoder_rad"][joint],
@@ -160,7 +163,7 @@ def _read_encoder(course: np.void, numbers: np.void, joint: int, angle_rad: floa
 
 @compiled
 def _measure_tick(state: np.void, numbers: np.void, encoder_noise: NDArray[np.float64]) -> None:
-    """Let motors, encoders and torque sensors see the end of a tick."""
+    """Update encoders, motor temperatures and torque sensors by the arm's state at the end of a tick."""
     arm, course, motor = state["arm"], state["course"], numbers["motor"]
     tick = course["tick"]
     noise = encoder_noise[int(tick) % (2 * NOISE_TICKS)]
@@ -193,7 +196,11 @@ def advance_body(
     substeps: int,
     work: Vector,
 ) -> None:
-    """Advance the body by `tick_count` ticks."""
+    """Advance the body's state, touch state included, by `tick_count` ticks of 100 µs, in place.
+
+    State and numbers: laid out by BODY_STATE and BODY_NUMBERS. mode1, mode2: `DriveMode`. substeps: integration
+    steps per tick. work: from `work_space`.
+    """
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     now, course, motors = state["arm"], state["course"], state["motor"]
     arm, mechanics, motor = numbers["arm"], numbers["mechanics"], numbers["motor"]
@@ -224,7 +231,10 @@ def advance_body(
 def sample_body(
     state_vector: Vector, number_vector: Vector, noise: Vector, walk: Vector, out: NDArray[np.int64]
 ) -> None:
-    """Quantise the devices' measurements: position, velocity, torque counts, two each (6,)."""
+    """Write the measured values to `out` (6,): counts of position, velocity and torque, two each.
+
+    noise, walk (2,): noise of the torque sensors, Nm, and steps of their zeros' walk.
+    """
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     arm, course, transducers = state["arm"], state["course"], state["transducer"]
     tick = course["tick"]

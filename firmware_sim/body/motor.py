@@ -71,7 +71,7 @@ MOTOR_STATE: Final = float_fields(
 
 
 def motor_numbers(settings: DriveSettings, rated_torque_Nm: tuple[float, float]) -> np.void:
-    """Pack the drives' properties for compiled functions, one element of MOTOR_NUMBERS."""
+    """Return the drives' properties as one record of dtype MOTOR_NUMBERS, for compiled functions."""
     numbers = pack_fields(settings, MOTOR_NUMBERS)
     plant_way = math.expm1(-2.0 * math.pi * CURRENT_LOOP_HZ * TICK_S)
     for joint in range(2):
@@ -128,7 +128,9 @@ def available_torque(numbers: np.void, state: np.void, joint: int) -> float:
 def command_torque(
     numbers: np.void, state: np.void, joint: int, wanted_Nm: float, tau_Nm: float, is_powered: bool
 ) -> float:
-    """Return the target at which the plant's torque loop brings the motor to where it is after this tick, Nm.
+    """Return the target, Nm, with which the plant's 1 kHz torque loop gives the motor's torque after this tick.
+
+    Sets `is_limited` in the state if the drive wants more than it may.
 
     wanted: the drive's set-point, within rated torque. tau: the motor's torque now. The plant's loop has 1 kHz; one
     of another bandwidth is exact at the ends of the ticks. Within a tick a slower one is off by a hundredth of the way
@@ -146,7 +148,7 @@ def command_torque(
 
 @compiled
 def heat_motor(numbers: np.void, state: np.void, joint: int, tau_Nm: float) -> None:
-    """Carry I²t and temperature over a tick at whose end the motor gives `tau_Nm`. Only if HAS_LIMITS."""
+    """Advance a motor's I²t and temperature by a tick at whose end it gives `tau_Nm`; call only with `has_limits`."""
     current_Nm = tau_Nm / numbers["gain"][joint]
     square = current_Nm * current_Nm
     winding_away_K = numbers["winding_rise_K_Nm2"][joint] * square - state["winding_K"][joint]
@@ -170,7 +172,10 @@ def heat_motor(numbers: np.void, state: np.void, joint: int, tau_Nm: float) -> N
 
 
 def error_code(is_overheated: float, is_overloaded: float) -> int:
-    """Return the error code that a motor calls for; overloaded: I²t is spent, and that is a fault. 0: no fault."""
+    """Return the error code 0x603F that a motor calls for, 0 without a fault; excess temperature comes first.
+
+    is_overloaded: I²t is spent, and the drive's reaction to that is a fault.
+    """
     if is_overheated:
         return EXCESS_TEMPERATURE
     return CONTINUOUS_OVER_CURRENT if is_overloaded else 0

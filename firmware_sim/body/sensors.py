@@ -55,7 +55,7 @@ NOISE_TICKS: Final = 64
 
 
 def encoder_numbers(settings: SensorSettings) -> np.void:
-    """Pack the encoders' properties for compiled functions, one element of ENCODER_NUMBERS."""
+    """Return the encoders' properties as one record of dtype ENCODER_NUMBERS, for compiled functions."""
     numbers = pack_fields(settings, ENCODER_NUMBERS)
     numbers["lsb_rad"][:] = [2.0 * math.pi / (1 << bits) for bits in settings.encoder_bits]
     return numbers
@@ -63,7 +63,7 @@ def encoder_numbers(settings: SensorSettings) -> np.void:
 
 @compiled
 def read_angle(numbers: np.void, joint: int, angle_rad: float, noise_counts: float) -> float:
-    """Return the angle that the drive reads, rad."""
+    """Return the angle that an encoder reads at a true angle, rad: with errors of its disc, in whole counts."""
     disc_rad = angle_rad + numbers["index_error_rad"][joint]
     if numbers["eccentricity_rad"][joint] != 0.0:
         disc_rad += numbers["eccentricity_rad"][joint] * math.sin(angle_rad + numbers["eccentricity_phase_rad"][joint])
@@ -87,7 +87,7 @@ class EncoderNoise:
         self._drawn = 0  # ticks
 
     def draw(self, last_tick: int) -> None:
-        """Provide the ticks up to `last_tick`, at most NOISE_TICKS after the one before them."""
+        """Fill `table` with the noise of the ticks up to `last_tick`, at most NOISE_TICKS new ones per call."""
         while self._drawn <= last_tick:
             first = self._drawn % (2 * NOISE_TICKS)
             rows = self.table[first : first + NOISE_TICKS]
@@ -166,7 +166,7 @@ def converter_ends(settings: SensorSettings, joint: int) -> tuple[int, int]:
 
 @compiled
 def _convert(numbers: np.void, joint: int, torque_Nm: float) -> int:
-    """Convert as the sensor's converter does, then to counts of the wire; saturates."""
+    """Return a torque in counts of the wire, rounded to the converter's bits and limited to its range."""
     lsb_Nm = numbers["lsb_Nm"][joint]
     highest = numbers["highest"][joint]
     code = min(max(math.floor(torque_Nm / lsb_Nm + 0.5), -1.0 - highest), highest)
@@ -184,7 +184,10 @@ def _bridge(numbers: np.void, joint: int, tau_Nm: float, other_Nm: float, temper
 def settle_transducer(
     numbers: np.void, state: np.void, tau1_Nm: float, tau2_Nm: float, temperature1_C: float, temperature2_C: float
 ) -> None:
-    """Power on under a steady load, from a state of zeros: the amplifier has settled, the spring has no memory yet."""
+    """Set both sensors' `state`, which is all 0, as at power-on under a steady load, without hysteresis so far.
+
+    tau: torques in the springs.
+    """
     state["bridge_Nm"][0] = _bridge(numbers, 0, tau1_Nm, tau2_Nm, temperature1_C)
     state["bridge_Nm"][1] = _bridge(numbers, 1, tau2_Nm, tau1_Nm, temperature2_C)
     for joint in range(2):
@@ -238,7 +241,7 @@ def sense_torque(
     temperature1_C: float,
     temperature2_C: float,
 ) -> None:
-    """Advance both sensors' `state` by the tick that began at `tick`; call it only if HAS_MEMORY.
+    """Advance both sensors' `state` by the tick that began at `tick`; call only with `has_memory`.
 
     Torques in the springs and joint temperatures: at the end of the tick.
     """
@@ -248,7 +251,10 @@ def sense_torque(
 
 @compiled
 def walk_offset(state: np.void, tick: float, step_Nm: Vector) -> None:
-    """Let the zeros walk up to `tick`. step_Nm (2,): normal numbers times the walk's rms after one second."""
+    """Add a random step to the walk of both sensors' zeros, for the time since the last step.
+
+    step_Nm (2,): normal numbers times the walk's rms after one second.
+    """
     root_s = math.sqrt((tick - state["walk_tick"]) * TICK_S)
     state["walk_Nm"][0] += step_Nm[0] * root_s
     state["walk_Nm"][1] += step_Nm[1] * root_s

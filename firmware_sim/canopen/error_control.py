@@ -106,7 +106,10 @@ class ErrorReporter:
             dictionary.serve(0x2210, _COUNT_SUB + watchdog, lambda w=watchdog: self._counts[w] & 0xFFFF)  # type: ignore[misc]
 
     def report_error(self, code: int, t_ns: int, number: int = 0, time_ms: int = 0) -> None:
-        """Send an EMCY. `number`, `time_ms`: the manufacturer's part, which watchdog and when on the device's clock."""
+        """Add a code other than 0 to the history, and send an EMCY once the inhibit time is over.
+
+        number: of the watchdog, 0 for none. time_ms: on the device's clock.
+        """
         if code != 0:
             self._history.appendleft(code)
         if self._is_valid and self._is_allowed():
@@ -114,14 +117,17 @@ class ErrorReporter:
             self.send_waiting(t_ns)
 
     def report_at_once(self, code: int, t_ns: int) -> None:
-        """Send an EMCY without regard to the inhibit time and to those that wait."""
+        """Add a code to the history, and send an EMCY now, before those that wait for the inhibit time."""
         self._history.appendleft(code)
         if self._is_valid and self._is_allowed():
             self._allowed_ns = t_ns + self._inhibit_ns
             self._send(self._cob_id, _EMERGENCY.pack(code, self._register(), 0, 0))
 
     def trip(self, watchdog: Watchdog, t_ns: int, time_ms: int) -> None:
-        """Note and report a watchdog that isn't tripped yet. `time_ms`: on the device's clock."""
+        """Add a watchdog to `tripped`, count it, and send its EMCY; ignore one that is tripped.
+
+        time_ms: on the device's clock.
+        """
         if watchdog in self.tripped:
             return
         self.tripped.add(watchdog)
@@ -130,24 +136,24 @@ class ErrorReporter:
         self.report_error(ERROR_CODES[watchdog], t_ns, watchdog, time_ms)
 
     def clear(self, watchdog: Watchdog, t_ns: int, time_ms: int) -> None:
-        """Report that the cause of a tripped watchdog has gone."""
+        """Remove a watchdog from `tripped` and send an EMCY with code 0. Raises KeyError if it isn't tripped."""
         self.tripped.remove(watchdog)
         self.report_error(0, t_ns, watchdog, time_ms)
 
     def forget_messages(self) -> None:
-        """Forget the messages that wait and the history, as without power."""
+        """Drop the waiting messages and the history, as a loss of power does."""
         self._waiting.clear()
         self._history.clear()
         self._allowed_ns = 0
 
     def forget_trips(self) -> None:
-        """Forget the watchdogs that have tripped, as at a reset of the node."""
+        """Clear the tripped watchdogs and their counts without an EMCY, as a reset of the node does."""
         self.tripped.clear()
         self._last = self._last_ms = 0
         self._counts = dict.fromkeys(Watchdog, 0)
 
     def send_waiting(self, t_ns: int) -> int:
-        """Send messages that the inhibit time held back; return when to look again."""
+        """Send the waiting messages that the inhibit time allows; return when the next may follow, else NEVER_NS."""
         while self._waiting and t_ns >= self._allowed_ns:
             self._allowed_ns = t_ns + self._inhibit_ns
             self._send(self._cob_id, self._waiting.popleft())
@@ -184,7 +190,7 @@ class HeartbeatProducer:
         dictionary.watch(0x1017, 0, self._set_period)
 
     def begin_heartbeats(self, t_ns: int) -> None:
-        """Begin a period."""
+        """Make the next heartbeat due one period after `t_ns`; never if the period is 0."""
         self._due_ns = t_ns + self._period_ns if self._period_ns else NEVER_NS
 
     def send_due(self, t_ns: int) -> int:
@@ -226,7 +232,7 @@ class HeartbeatConsumer:
         self._find(t_ns)
 
     def find_silence(self, t_ns: int) -> int:
-        """Notice a silence; return when to look again."""
+        """Report the heartbeat as lost if its timeout is over; return when to call again, ns."""
         if t_ns >= self._due_ns:
             self._due_ns = NEVER_NS
             self.is_lost = True
@@ -246,7 +252,7 @@ class HeartbeatConsumer:
 
 
 def _check_node(value: int) -> None:
-    """Accept a node that can exist, or a time of 0: off."""
+    """Refuse a value of 0x1016 with a timeout and a node id outside 1 to 127 (VALUE_RANGE)."""
     if value & 0xFFFF and not 1 <= value >> 16 <= 127:
         refuse(Abort.VALUE_RANGE)
 
@@ -273,7 +279,7 @@ class SyncOrder:
     """Judges every SYNC on the bus by its counter and, where time doesn't go by SYNC, by its time."""
 
     def __init__(self, is_timed: bool) -> None:
-        """`is_timed`: when a SYNC comes says something that its counter doesn't."""
+        """`is_timed`: judge the time of a SYNC, too; False where time goes by SYNC."""
         self.kind = SyncKind.RIGHT
         """Of the last SYNC."""
         self.is_taken = True
@@ -295,7 +301,7 @@ class SyncOrder:
         return (counter - self.counter) % overflow if counter and self.counter else 1
 
     def judge(self, counter: int, overflow: int, t_ns: int, period_ns: int) -> None:
-        """Judge a SYNC of the right length.
+        """Set `kind`, `is_taken`, `counter` and `periods` by a SYNC of the right length.
 
         `counter`: 0 without one. `overflow`: 0x1019. `period_ns`: 0x1006; 0: not set, so no SYNC is early.
         """
@@ -352,7 +358,7 @@ class SyncCounts:
         return self.odd <= TOLERATED
 
     def count_sync(self, kind: SyncKind, lost: int) -> None:
-        """Count a SYNC, and those that were lost before it."""
+        """Count a SYNC by its kind, and `lost` SYNCs before it; forget odd ones after `CLEAN_SYNCS` right ones."""
         self._counts[_LOST_SUB] += lost
         if kind is not SyncKind.RIGHT:
             self._counts[kind.value] += 1

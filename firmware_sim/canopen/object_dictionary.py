@@ -76,12 +76,12 @@ Refusal = canopen.SdoAbortedError
 
 
 def refuse(code: Abort) -> NoReturn:
-    """Answer the SDO request in progress with an abort."""
+    """Raise `Refusal` with an abort code, which the SDO server answers to the request in progress."""
     raise canopen.SdoAbortedError(code)
 
 
 def one_of(*allowed: int) -> Callable[[int], None]:
-    """Make a check that refuses every value but the listed ones."""
+    """Return a check that refuses every value except those listed (VALUE_RANGE)."""
 
     def check(value: int) -> None:
         if value not in allowed:
@@ -188,7 +188,7 @@ def _compare_lengths(length: int, expected: int) -> None:
 
 @cache
 def read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
-    """Read an EDS or a DCF of any encoding and ending; nodes never change the result."""
+    """Read an EDS or a DCF, whatever its encoding; `node_id` replaces $NODEID. Cached: don't change the result."""
     stream = io.StringIO(readable_eds(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff")))
     stream.name = "object dictionary.eds"
     return canopen.import_od(stream, node_id)
@@ -294,15 +294,15 @@ class ObjectDictionary:
         return len(self.objects[index])
 
     def find(self, index: int, subindex: int) -> ODVariable:
-        """Return an object; an absent one refuses the SDO request in progress."""
+        """Return an object; raise `Refusal` if the EDS lacks it."""
         return self._node._find_object(index, subindex)
 
     def serve(self, index: int, subindex: int, read: Callable[[], int]) -> None:
-        """Answer reads of an object with a live value. An object that the EDS lacks stays absent."""
+        """Set `read` as the source of an object's value. An object that the EDS lacks stays absent."""
         self._readers[index, subindex] = read
 
     def reader(self, index: int, subindex: int) -> Callable[[], int]:
-        """Return a function that gives the present value of a numeric object, the live one where it is served."""
+        """Return a function that returns the present value of a numeric object, by `serve` or as written."""
         return self._readers.get((index, subindex)) or (lambda: self.value(index, subindex))
 
     def watch(
@@ -312,7 +312,7 @@ class ObjectDictionary:
         apply: Callable[[int], None] | None = None,
         check: Callable[[int], None] | None = None,
     ) -> None:
-        """Act on writes of an object: `check` may `refuse`, then `apply` takes the value over.
+        """Register functions for writes of an object: `check` may `refuse` the value, then `apply` gets it.
 
         `apply` also gets the default when a reset restores it. An object that the EDS lacks is never written.
         """
@@ -324,7 +324,7 @@ class ObjectDictionary:
             self._appliers.setdefault((index, subindex), []).append(apply)
 
     def value(self, index: int, subindex: int = 0) -> int:
-        """Return the present value of a numeric object; an absent one refuses the SDO request in progress."""
+        """Return the present value of a numeric object; raise `Refusal` if the EDS lacks it."""
         variable = self._node._find_object(index, subindex)
         return int(variable.decode_raw(self._node.get_data(index, subindex)))
 
@@ -333,14 +333,14 @@ class ObjectDictionary:
         return self.value(index, subindex) if self.has(index, subindex) else default
 
     def default_or(self, default: int, index: int, subindex: int = 0) -> int:
-        """Return the EDS's value of a numeric object, `default` without one."""
+        """Return the EDS's default of a numeric object, `default` if the EDS has none."""
         if not self.has(index, subindex):
             return default
         value = self._node._find_object(index, subindex).default
         return default if value is None else int(value)
 
     def take_over(self, index: int, subindex: int, value: int) -> bool:
-        """Write an object as an SDO request would; False when it is refused."""
+        """Write an object with the checks of an SDO request; return False if it is refused."""
         try:
             data = self._node._find_object(index, subindex).encode_raw(value)
             self._node.set_data(index, subindex, data, check_writable=True)
@@ -424,12 +424,15 @@ CONTRACTS = {
 
 
 def contract_of(codec: Codec) -> EmulatedContract:
-    """Find the contract of a DBC by its file name; any other DBC is played by our own devices."""
+    """Return the emulated contract with a DBC's file name; for others `arm`, or `arm_fd` with longer frames."""
     return CONTRACTS.get(codec.path.stem, CONTRACTS["arm_fd" if is_fd(codec) else "arm"])
 
 
 def playable_contract(codec: Codec) -> EmulatedContract:
-    """Find the contract with the layout of a DBC, wherever its nodes are. Raises ConfigError if no contract has it."""
+    """Return the emulated contract with the frame layout of a DBC, whatever its node ids.
+
+    Raises ConfigError if no contract has it.
+    """
     for contract in CONTRACTS.values():
         if codec.path == contract.path:
             return contract

@@ -51,7 +51,7 @@ class TransmitPdo(PdoRecord):
             self._sender = self.message.sender()
 
     def bind(self) -> None:
-        """Take over a new mapping."""
+        """Prepare reading and sending for the present type and mapping."""
         self._reads = tuple(self._pdos.dictionary.reader(*key) for key in self.layout.keys)
         is_asynchronous = self.type == 0 or self.type in EVENT_DRIVEN
         self.is_compared = is_asynchronous and not self._pdos.events.intersection(self.layout.keys)
@@ -59,13 +59,13 @@ class TransmitPdo(PdoRecord):
         self.send = self._make_sender()
 
     def begin_sending(self, t_ns: int) -> None:
-        """Become active: an event-driven PDO begins with a frame."""
+        """Make an event-driven PDO that has become active due at once, and stop its timer."""
         self.is_due = True
         self._allowed_ns = t_ns
         self._timer_due_ns = NEVER_NS
 
     def _make_sender(self) -> Callable[[], None]:
-        """Bind everything that sending needs, so that a frame costs little more than reading its values."""
+        """Return the function that sends a frame of the present values, protected if the mapping has a header."""
         pdos, can_id, layout, reads, sender = self._pdos, self.can_id, self.layout, self._reads, self._sender
         send, header_bytes, length = pdos.send, layout.header_bytes, layout.length
         pack, pack_into = layout.packing.pack, layout.packing.pack_into
@@ -116,7 +116,7 @@ class TransmitPdo(PdoRecord):
             self.send()
 
     def compare(self) -> None:
-        """Find an event in a PDO whose events are the changes of its content."""
+        """Set `is_due` if the content has changed, in a PDO whose events are such changes."""
         if self.is_compared:
             content = self.layout.packing.pack(*[read() for read in self._reads])
             if content != self._sent:
@@ -124,7 +124,7 @@ class TransmitPdo(PdoRecord):
                 self.is_due = True
 
     def poll(self, t_ns: int) -> int:
-        """Send an event-driven PDO when an event or its timer asks for it; return when to look again."""
+        """Send a frame for an event, after the inhibit time, or by the event timer; return when to call again, ns."""
         if (self.is_due and t_ns >= self._allowed_ns) or t_ns >= self._timer_due_ns:
             self.is_due = False
             self._allowed_ns = t_ns + self.inhibit_ns
@@ -154,14 +154,14 @@ class ReceivePdo(PdoRecord):
         self._is_length_wrong = False
 
     def restart_sequence(self) -> None:
-        """Forget the sequence of the protected frames, and the last one."""
+        """Accept any counter in the next protected frame, drop a waiting frame, and end the deadline."""
         if self.receiver is not None:
             self.receiver.restart_sequence()
         self.forget()
         self.acted_ns = None
 
     def bind(self) -> None:
-        """Take over a new mapping."""
+        """Set the functions that take received values by the present mapping."""
         self.writes = tuple(self._pdos.writer(*key) for key in self.layout.keys)
         self.is_command = False
 
@@ -170,7 +170,10 @@ class ReceivePdo(PdoRecord):
         self.pending = None
 
     def on_frame(self, data: bytes, t_ns: int) -> None:
-        """Take a frame in at the bench's time; a frame that fails a check has no effect."""
+        """Check a frame; store its values until SYNC, or write them at once, as the transmission type says.
+
+        t_ns: by the bench. A frame that fails the check of length or protection changes no object.
+        """
         layout = self.layout
         if len(data) != layout.length:
             self._is_length_wrong = True
@@ -188,7 +191,7 @@ class ReceivePdo(PdoRecord):
             self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
 
     def is_late(self, t_ns: int) -> bool:
-        """Return whether no frame has acted within the PDO's event timer; False without a timer or an earlier frame."""
+        """Return whether the last frame acted longer ago than the event timer; False without timer or earlier frame."""
         return self.timer_ns > 0 and self.acted_ns is not None and t_ns - self.acted_ns >= self.timer_ns
 
 
@@ -255,7 +258,7 @@ class Pdos:
         return any((index, subindex) in pdo.layout.keys for pdo in self._receiving)
 
     def accept_values(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
-        """Give received values of an object to a function instead of writing the object as SDO does."""
+        """Pass values of an object that PDOs bring to `write`, instead of writing the object as SDO does."""
         self._writers[index, subindex] = write
 
     def writer(self, index: int, subindex: int) -> Callable[[int], object]:
@@ -263,17 +266,17 @@ class Pdos:
         return self._writers.get((index, subindex)) or (lambda value: self.dictionary.take_over(index, subindex, value))
 
     def handlers(self) -> list[tuple[int, Callable[[bytes, int], None]]]:
-        """List the identifiers that are received now, with the functions that take their frames."""
+        """Return the identifiers of the RPDOs that are exchanged now, with the functions that take their frames."""
         return [(pdo.can_id, pdo.on_frame) for pdo in self._receiving]
 
     def set_operational(self, is_operational: bool, t_ns: int) -> None:
-        """Begin or end the exchange with the NMT state."""
+        """Begin or end the exchange of PDOs, as the device enters or leaves Operational."""
         self._is_operational = is_operational
         self._now_ns = t_ns
         self.refresh()
 
     def refresh(self) -> None:
-        """Find anew which PDOs are exchanged, after a change of the NMT state or of a PDO's objects, and bind them."""
+        """Update which PDOs are exchanged, after a change of the NMT state or of a PDO's objects; call `on_refresh`."""
         self._receiving = tuple(pdo for pdo in self.receive if self._is_operational and pdo.is_active)
         sending = tuple(pdo for pdo in self.transmit if self._is_operational and pdo.is_active)
         exchanged: tuple[ReceivePdo | TransmitPdo, ...] = (*self._receiving, *sending)
@@ -305,18 +308,18 @@ class Pdos:
                 return
 
     def restart_sequences(self) -> None:
-        """Begin all end-to-end sequences anew."""
+        """Restart the counters of all protected frames, sent and received, and drop frames that wait for SYNC."""
         pdos: tuple[ReceivePdo | TransmitPdo, ...] = (*self.receive, *self.transmit)
         for pdo in pdos:
             pdo.restart_sequence()
 
     def act_on_sync(self, t_ns: int) -> bool:
-        """Let the frames that waited for SYNC act; return whether a command has acted since the SYNC before."""
+        """Write the values of frames that waited for SYNC; return whether a command has acted since the SYNC before."""
         is_commanded, self._is_commanded = self._is_commanded, False
         return self._act(self._waiting, t_ns) or is_commanded
 
     def act_at_once(self, pdo: ReceivePdo, t_ns: int) -> None:
-        """Apply a frame that doesn't wait for SYNC."""
+        """Write the pending values of an RPDO that doesn't wait for SYNC, and call `act`."""
         self._is_commanded |= self._act((pdo,), t_ns)
         self.act(t_ns)
 
@@ -335,7 +338,7 @@ class Pdos:
         return is_commanded
 
     def find_late(self, t_ns: int) -> bool:
-        """Return whether the deadline of some RPDO is over."""
+        """Return whether some RPDO is late: its last frame acted longer ago than its event timer."""
         return any(pdo.is_late(t_ns) for pdo in self._receiving)
 
     @property
@@ -357,13 +360,13 @@ class Pdos:
                 pdo.is_due = True
 
     def compare(self) -> bool:
-        """Look for changes of content; tell whether a frame is due."""
+        """Compare the content of PDOs whose events are its changes with that sent; return whether such a PDO is due."""
         for pdo in self._compared:
             pdo.compare()
         return any(pdo.is_due for pdo in self._compared)
 
     def poll(self, t_ns: int) -> int:
-        """Send frames that are due by event or time; return when to look again."""
+        """Send event-driven PDOs that are due; return when to call again, ns."""
         due_ns = NEVER_NS
         for pdo in self._asynchronous:
             due_ns = min(due_ns, pdo.poll(t_ns))

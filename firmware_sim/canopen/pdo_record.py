@@ -155,7 +155,7 @@ class PdoRecord:
         self._refresh()
 
     def _lay_out(self, count: int) -> None:
-        """Lay out the first `count` entries, or refuse and leave everything as it is."""
+        """Set `layout` by the first `count` entries; refuse and change nothing if they can't be mapped."""
         layout = lay_out(self._dictionary, self._entries[:count], self.is_received, self._longest)
         if layout.header_bytes and not self._has_data_ids(layout.header_bytes):
             refuse(Abort.INCOMPATIBLE)
@@ -207,7 +207,9 @@ def check_entry(dictionary: ObjectDictionary, value: int, is_received: bool) -> 
 
 
 def lay_out(dictionary: ObjectDictionary, values: Sequence[int], is_received: bool, longest: int) -> PdoLayout:
-    """Place the mapped objects in a frame of at most `longest` bytes; refuse a mapping that can't be.
+    """Return the layout of a frame with the mapped objects (`values`: entries as in `check_entry`), in their order.
+
+    Refuses a mapping that is invalid or takes more than `longest` bytes.
 
     A header must lead and be whole. Frames of more than 8 bytes have one of CAN FD's lengths.
     """

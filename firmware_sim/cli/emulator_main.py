@@ -109,7 +109,7 @@ _OPTIONS = (  # last first: click lists them the other way round
 
 
 def on_bus(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a command the options of the bus and of the devices on it."""
+    """Return a command with the options of the bus and of the devices on it; a decorator."""
     for option in _OPTIONS:
         command = option(command)
     return command
@@ -310,7 +310,10 @@ def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
 
 
 def _log_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> None:
-    """Log truth and faults of a bench, stamped by the host's clock in lockstep, else by the wall clock."""
+    """Make a bench write its truth and faults to a log, stamped by the host's clock in lockstep, else by wall clock.
+
+    epoch_ns: wall clock minus the bench's clock.
+    """
 
     def stamp(t_ns: int) -> int:
         return t_ns if bench.is_paced else t_ns + epoch_ns
@@ -320,7 +323,7 @@ def _log_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> None:
 
 
 def _serve(service: Service) -> None:
-    """Announce the nodes, print "ready", and serve until the end."""
+    """Request real-time priority, announce the nodes, print "ready" on stderr, and serve until the end."""
     # As a host does: with less, on a processor that both share and fill, the arm would never answer in time.
     for line in request_realtime().missing:
         _complain(f"not granted: {line}")
@@ -371,7 +374,7 @@ def _report(
 
 
 def _check_contract(log: Path, codec: Codec) -> None:
-    """Raise LogError when the metadata of a log of ours name another contract."""
+    """Raise LogError if an MCAP log's metadata name a contract other than the codec's; ignore other formats."""
     digest = run_metadata(log).get("layout_digest", "") if log.suffix.lower() == ".mcap" else ""
     own = f"0x{codec.layout_digest:08X}"
     if digest and digest.casefold() != own.casefold():
@@ -399,7 +402,7 @@ def _report_played(bench: RecordedBench, cycles: RecordedCycles | None, as_json:
 
 
 def _refuse_beside_config() -> None:
-    """Raise ConfigError for options whose values the configuration gives."""
+    """Raise ConfigError if an option is given beside --config whose value the configuration sets."""
     context = click.get_current_context()
     for name, option in (("contract", "--contract"), ("node_offset", "--node-offset"), ("host_node", "--host-node")):
         if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:

@@ -65,7 +65,7 @@ _SIGNED8, _UNSIGNED16, _UNSIGNED32 = 0x0002, 0x0006, 0x0007  # data types, CiA 3
 
 
 def _made_up(kind: str, settings: Settings) -> dict[int, MadeUp]:
-    """List the objects that every device of a kind has, in its EDS or not."""
+    """Return the objects, by index, that every device of a kind has, even if its EDS lacks them."""
     made = {
         0x1006: MadeUp("SYNC period", _UNSIGNED32, 0),
         0x1017: MadeUp("heartbeat time", _UNSIGNED16, settings.bus.heartbeat_ms),
@@ -91,7 +91,7 @@ class Rehearsal(NamedTuple):
 def rehearse(
     config: str, scenario: str, truth: str | None = None, profile: str | None = None, seed: int | None = None
 ) -> Rehearsal:
-    """Compose the arm of a configuration. Raises ConfigError, CodecError."""
+    """Return the arm of a configuration with a scenario, to be played. Raises ConfigError, CodecError."""
     layers = configuration_layers(config, profile)
     settings = parse(Settings, resolved_table(layers))
     return rehearse_settings(settings, layers, scenario, truth, seed)
@@ -104,7 +104,10 @@ def rehearse_settings(
     truth_name: str | None = None,
     seed: int | None = None,
 ) -> Rehearsal:
-    """Compose the arm of a configuration that was resolved from `layers`. Raises ConfigError, CodecError."""
+    """Return the arm of a configuration with a scenario, to be played; `layers`: those that gave the settings.
+
+    Without a truth and keys of an own arm, the profile's arm and our own devices. Raises ConfigError, CodecError.
+    """
     codec = load_contract(settings)
     devices = place_devices(settings)
     told = told_arm(settings, layers)
@@ -129,7 +132,7 @@ def rehearse_settings(
 
 
 def _omissions(devices: list[PlacedDevice], contract: EmulatedContract) -> list[str]:
-    """Name the objects that were made up because an EDS omits them, a line for each EDS."""
+    """Return a line for each EDS with the objects that it omits and the emulator adds."""
     lines: dict[str, None] = {}
     for device, description in zip(devices, contract.devices, strict=True):
         if names := ", ".join(f"0x{index:04X} ({made.name})" for index, made in description.made_up.items()):
@@ -148,7 +151,7 @@ def _habits_by_vendor() -> dict[int, HabitSettings]:
 
 
 def _maker_habits(device: PlacedDevice) -> HabitSettings:
-    """Return the ways of the drives of a device's maker, by the vendor id of its EDS."""
+    """Return the habits of a maker's drives, by the vendor id in the device's EDS; the default habits if unknown."""
     vendor = _default(device, 0x1018, 1) or device.objects.device_information.vendor_number
     return _habits_by_vendor().get(vendor, HabitSettings())
 
@@ -180,13 +183,13 @@ def _can_be_set(device: PlacedDevice, index: int, sub: int) -> bool:
 
 
 def describe_devices(codec: Codec, devices: list[PlacedDevice], settings: Settings) -> EmulatedContract:
-    """Describe the devices by their own EDS."""
+    """Return the contract of a DBC whose devices are described by their own EDS files."""
     described = tuple(_describe(device, settings) for device in devices)
     return EmulatedContract(codec.path.name, "", "", described, settings.bus.period_us)
 
 
 def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
-    """Return encoder, gear and feed constant the values that come to the profile's increments."""
+    """Return values of encoder, gear and feed constant (0x608F, 0x6091, 0x6092) that give the profile's increments."""
     scale = device.settings.scale
     told_in, told_out = _default(device, 0x6091, 1), _default(device, 0x6091, 2)
     gear = Fraction(told_in, told_out) if told_in and told_out else Fraction(scale.gear_ratio).limit_denominator(1000)
@@ -201,7 +204,7 @@ def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
 
 
 def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
-    """Return the values of a device's objects at power-on: those of its EDS, else those of the profile."""
+    """Return a device's description: its EDS, and the values at power-on that the profile adds or replaces."""
     kind, scale = device.settings.kind, device.settings.scale
     made_up = {index: made for index, made in _made_up(kind, settings).items() if not device.has(index)}
     defaults: dict[tuple[int, int], int] = {}

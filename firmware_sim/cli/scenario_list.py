@@ -25,7 +25,7 @@ class ScenarioFinding:
 
 
 def describe_all() -> list[dict[str, Any]]:
-    """Describe the scenarios that come with the package, by group and name."""
+    """Return name, group, content, duration and expectation of the package's scenarios, sorted by group and name."""
     scenarios = sorted((load_scenario(name) for name in builtin_scenarios()), key=lambda one: (one.group, one.name))
     return [
         {
@@ -40,7 +40,7 @@ def describe_all() -> list[dict[str, Any]]:
 
 
 def show(scenario: Scenario, is_whole: bool) -> str:
-    """Write a scenario as TOML that loads to the same: all differences from the defaults, or everything."""
+    """Return a scenario as TOML that loads to the same; `is_whole`: with defaults, else only differences from them."""
     return to_toml(scenario) if is_whole else to_short_toml(scenario)
 
 

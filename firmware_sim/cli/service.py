@@ -29,7 +29,7 @@ class StopRequest:
         self.is_made = False
 
     def make(self, *_signal: object) -> None:
-        """Ask for the end; callable as a signal handler."""
+        """Set `is_made`, and end waits of the terminal; callable as a signal handler."""
         self.is_made = True
         hurry()
 
@@ -64,7 +64,7 @@ class Service:
         self._gone_ns = NEVER_NS  # when the host was found to have gone
 
     def boot(self) -> None:
-        """Announce the nodes, having dropped earlier frames of the bus. Raises BusError."""
+        """Drop earlier frames of the bus, power the bench on, and send the nodes' boot-up messages. Raises BusError."""
         while self._bus.receive(0.0) is not None and not self._stop.is_made:
             pass
         self._time_ns = self._heard_ns = self._clock.now_ns()
@@ -72,7 +72,10 @@ class Service:
         self._departure.go()
 
     def run(self) -> None:
-        """Serve; an interface that goes down is awaited, as by a device whose cable is pulled. Raises BusError."""
+        """Carry frames and time until a stop is requested, with `is_once` until the host has gone.
+
+        Waits for an interface that has gone down. Raises BusError.
+        """
         while not self._stop.is_made:
             try:
                 frame = self._serve()
@@ -83,7 +86,10 @@ class Service:
                 return
 
     def _serve(self) -> Frame | None:
-        """Wait for one frame and act on it; without one, let time pass."""
+        """Wait for one frame, pass it and the time to the bench, and send the answers.
+
+        Returns the frame, None if none came in time.
+        """
         bench = self._bench
         cycle = bench.cycle
         frame = self._bus.receive(self._patience_s())
@@ -149,7 +155,10 @@ class Service:
 
 @contextmanager
 def stop_by_signal() -> Iterator[StopRequest]:
-    """Let SIGINT, SIGTERM and SIGHUP ask for the end instead of ending the process; an ignored SIGHUP stays so."""
+    """Yield a request that SIGINT, SIGTERM and SIGHUP make, instead of ending the process; restore handlers at the end.
+
+    An ignored SIGHUP stays ignored.
+    """
     stop = StopRequest()
     numbers = [signal.SIGINT, signal.SIGTERM]
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # not started to outlive its terminal

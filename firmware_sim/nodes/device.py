@@ -51,10 +51,10 @@ class Application:
         return False
 
     def act(self, t_ns: int) -> None:
-        """Act on a frame that doesn't wait for SYNC; its values have been written."""
+        """Act on the values of a received PDO that doesn't wait for SYNC; they have been written."""
 
     def mind_length(self, is_right: bool, t_ns: int) -> None:
-        """Take note of the length of a frame for the device."""
+        """Act on an RPDO frame with a wrong length, or on the first one with the right length after it."""
 
     def leave_operational(self, t_ns: int) -> None:
         """React to leaving Operational; EMCY messages can still be sent."""
@@ -69,13 +69,13 @@ class Application:
         """Act on the return of the master's heartbeat."""
 
     def distrust_sync(self, t_ns: int) -> None:
-        """Act on SYNCs that can't serve as a time base."""
+        """Act on SYNCs with too many odd ones among them to serve as a time base."""
 
     def note_error(self) -> None:
-        """Take note that the error register, 0x1001, may have changed."""
+        """Act on a possible change of the error register, 0x1001."""
 
     def restart_node(self, is_node_reset: bool) -> None:
-        """Begin anew: communication only, or all of the device."""
+        """Reset the application's state; `is_node_reset`: False at a reset of the communication only."""
 
 
 class EmulatedDevice(ObjectDictionary):
@@ -142,19 +142,19 @@ class EmulatedDevice(ObjectDictionary):
         return bool(_OF_SYNC & self.tripped)
 
     def attach(self, application: Application) -> None:
-        """Connect the application."""
+        """Set the application; it then gets the frames and state changes that concern it."""
         self._application = application
         self.pdos.act, self.pdos.mind_length = application.act, application.mind_length
 
     def power_on(self, t_ns: int) -> None:
-        """Give the device power: its time begins, then it boots, with its defaults if it was off."""
+        """Switch the power on: begin the device's time, send the boot-up message, and enter Pre-operational."""
         self.is_powered = True
         self.is_on_bus = not self._is_bus_off
         self.power_on_ns = self.clock.own_ns(t_ns)
         self._boot(self.power_on_ns)
 
     def power_off(self, _t_ns: int) -> None:
-        """Take the power away: the device neither sends nor hears, and forgets all written values."""
+        """Switch the power off: the device neither sends nor hears, and forgets all written values."""
         self.is_powered = self.is_on_bus = False
         self._errors.forget_messages()
         self.is_operational = False
@@ -170,7 +170,7 @@ class EmulatedDevice(ObjectDictionary):
             self._enter(NmtState.PRE_OPERATIONAL, self.clock.own_ns(t_ns))
 
     def return_to_bus(self, t_ns: int) -> None:
-        """Let the controller take part again; the device reports it."""
+        """End `leave_bus`: a powered device takes part in the bus again and sends an EMCY (0x8140)."""
         self._is_bus_off = False
         self.is_on_bus = self.is_powered
         if self.is_on_bus:
@@ -181,13 +181,13 @@ class EmulatedDevice(ObjectDictionary):
         self._errors.report_at_once(code, self.clock.own_ns(t_ns))
 
     def _boot(self, t_ns: int) -> None:
-        """Announce the device and enter Pre-operational."""
+        """Send the boot-up message, begin the heartbeats, and enter Pre-operational."""
         self._send(0x700 + self.node_id, bytes([NmtState.INITIALISING]))
         self._producer.begin_heartbeats(t_ns)
         self._enter(NmtState.PRE_OPERATIONAL, t_ns)
 
     def on_nmt(self, data: bytes, t_ns: int) -> None:
-        """Obey an NMT command, if it is for this device."""
+        """Change the NMT state or reset the device by an NMT command; ignore one for another device."""
         if len(data) != 2 or data[1] not in (0, self.node_id) or not self.is_on_bus:
             return
         self.now_ns = t_ns = self.clock.own_ns(t_ns)
@@ -200,7 +200,7 @@ class EmulatedDevice(ObjectDictionary):
             self._boot(t_ns)
 
     def on_sdo(self, data: bytes, t_ns: int) -> None:
-        """Answer an SDO request."""
+        """Answer an SDO request of 8 bytes; ignore it off the bus, in Stopped and within `pause_ns` of an answer."""
         if not self.is_on_bus:
             return
         self.now_ns = t_ns = self.clock.own_ns(t_ns)
@@ -222,11 +222,11 @@ class EmulatedDevice(ObjectDictionary):
             self._enter(NmtState.PRE_OPERATIONAL, t_ns)
 
     def find_heartbeat(self, t_ns: int) -> None:
-        """Let the application know that the master is back."""
+        """Report the return of the master's heartbeat to the application."""
         self._application.find_heartbeat(t_ns)
 
     def note_sync(self, kind: SyncKind, lost: int, t_ns: int) -> None:
-        """Take note of a SYNC in Operational, be it taken or not, and of those that were lost before it."""
+        """Count a SYNC and the `lost` ones before it; trip or clear the watchdogs of SYNC. Only in Operational."""
         if not (self.is_operational and self.is_on_bus):
             return
         t_ns = self.clock.own_ns(t_ns)
@@ -244,12 +244,12 @@ class EmulatedDevice(ObjectDictionary):
                 self._application.distrust_sync(t_ns)
 
     def trip(self, watchdog: Watchdog, t_ns: int) -> None:
-        """Report a watchdog that trips; once, until it has cleared."""
+        """Trip a watchdog and send its EMCY; do nothing while it is tripped."""
         self._errors.trip(watchdog, t_ns, self._time_ms(t_ns))
         self._application.note_error()
 
     def clear(self, watchdog: Watchdog, t_ns: int) -> None:
-        """Report that the cause of a tripped watchdog has gone, by an EMCY with code 0."""
+        """Clear a watchdog whose cause has gone, with an EMCY of code 0; do nothing if it isn't tripped."""
         if watchdog in self.tripped:
             self._errors.clear(watchdog, t_ns, self._time_ms(t_ns))
             self._application.note_error()
@@ -263,7 +263,10 @@ class EmulatedDevice(ObjectDictionary):
         self._errors.report_error(0, t_ns)
 
     def poll(self, t_ns: int) -> int:
-        """Act on timers that are due by its own clock; return when the next one is."""
+        """Send heartbeats and EMCYs that are due and find a lost heartbeat; return when the next timer is due.
+
+        Both times by the device's own clock, ns.
+        """
         return min(self._producer.send_due(t_ns), self._consumer.find_silence(t_ns), self._errors.send_waiting(t_ns))
 
     def _is_locked_at_work(self, index: int, subindex: int) -> bool:
@@ -303,7 +306,7 @@ class EmulatedDevice(ObjectDictionary):
             self._application.enter_operational(t_ns)
 
     def _reset(self, is_node_reset: bool) -> None:
-        """Restore the EDS values: the communication profile's, or all."""
+        """Restore the EDS values, of the communication profile or of all objects, and reset the application."""
         self.restore(0xFFFF if is_node_reset else 0x1FFF)
         self.pdos.restart_sequences()
         if is_node_reset:
@@ -329,14 +332,14 @@ class NodeClock:
         self._rate = _BILLION  # own ns in a second of the bench
 
     def set_drift(self, drift_ppm: float, t_ns: int) -> None:
-        """Run fast by `drift_ppm` from the bench's `t_ns` on."""
+        """Let the clock run fast by `drift_ppm` from the bench's `t_ns` on, without a jump."""
         self._own_since_ns = self.own_ns(t_ns)
         self._since_ns = t_ns
         self._rate = _BILLION + round(drift_ppm * 1000)
         self.is_true = self._rate == _BILLION and self._own_since_ns == t_ns
 
     def own_ns(self, t_ns: int) -> int:
-        """Return the device's time."""
+        """Return the device's time at the bench's `t_ns`."""
         if self.is_true:
             return t_ns
         return self._own_since_ns + (t_ns - self._since_ns) * self._rate // _BILLION
@@ -367,7 +370,7 @@ class SyncListeners:
         self._sort()
 
     def forget_unheard(self) -> None:
-        """Take the next SYNC for the first."""
+        """Forget the SYNCs that devices have not heard, so that none counts as lost before the next one."""
         self._unheard = [0] * len(self._devices)
 
     def takers(self, data: bytes) -> tuple[int, ...]:
@@ -375,7 +378,11 @@ class SyncListeners:
         return self._takers.get(len(data), self._nobody)
 
     def tell(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, lost: int, t_ns: int) -> None:
-        """Report the kind of a SYNC and how many were lost before it. `heard`: how often each device hears it."""
+        """Report the kind of a SYNC to the devices that hear it, with the number of SYNCs lost before it.
+
+        heard: how often each device hears it. takers: 1 for each device that takes its length, else 0. lost: SYNCs
+        that the counter skipped.
+        """
         for place, device in enumerate(self._devices):
             self._unheard[place] += lost
             if heard[place] == 0:
@@ -388,14 +395,14 @@ class SyncListeners:
         self._remember()
 
     def ignore(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, t_ns: int) -> None:
-        """Report the kind of a SYNC that no device answers."""
+        """Report the kind of a SYNC that no device answers to the devices; `heard`, `takers` as in `tell`."""
         for place, device in enumerate(self._devices):
             for _ in range(heard[place]):
                 device.note_sync(kind if takers[place] else SyncKind.WRONG_LENGTH, 0, t_ns)
         self._remember()
 
     def miss(self, count: int) -> None:
-        """Count SYNCs that none of the devices has heard."""
+        """Count `count` SYNCs as lost for every device."""
         self._unheard = [unheard + count for unheard in self._unheard]
         self._remember()
 

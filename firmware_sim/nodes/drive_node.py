@@ -140,7 +140,7 @@ class DriveNode(Application):
         serve(0x6077, 0, lambda: self._torque_permille)
 
     def _configure(self) -> None:
-        """Act on written objects, by SDO or PDO."""
+        """Register checks of, and reactions to, writes of the drive's objects by SDO or PDO."""
         device = self.device
         device.open_at_work |= {_CONTROLWORD}
         self._pdos.events = _EVENTS
@@ -196,7 +196,9 @@ class DriveNode(Application):
         return self.state is _ENABLED and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None
 
     def on_sync(self, position: int, velocity: int, t_ns: int, *, is_distorted: bool = False) -> None:
-        """Let the pending command act. `position`, `velocity`: sampled at this SYNC, in the body's LSBs.
+        """Store the measured values, carry out the pending command, check the watchdogs, and command the motor.
+
+        `position`, `velocity`: sampled at this SYNC, in the body's LSBs.
 
         `is_distorted`: the velocity isn't the motor's, so it counts where the contract has an LSB of its own, too.
         """
@@ -230,7 +232,7 @@ class DriveNode(Application):
             self.has_news = True
 
     def act(self, t_ns: int) -> None:
-        """Obey a command that doesn't wait for SYNC."""
+        """Carry out the command of a PDO that doesn't wait for SYNC."""
         if self._received_word is not None:
             self._obey_received(t_ns)
         self._drive_motor()
@@ -243,7 +245,10 @@ class DriveNode(Application):
             self.device.clear(Watchdog.LENGTH, t_ns)
 
     def on_lost_sync(self, t_ns: int) -> None:
-        """Live through a period whose SYNC never came, in a bench that counts periods by SYNC counters."""
+        """Count a period without SYNC as one without a command; check the motor and standstill, and command the motor.
+
+        For benches that count periods by SYNC counters.
+        """
         t_ns = self._clock.own_ns(t_ns)
         self._miss_command(t_ns)
         self._watch_motor(t_ns)
@@ -252,7 +257,7 @@ class DriveNode(Application):
         self._drive_motor()
 
     def poll(self, t_ns: int) -> int:
-        """Act on timers that are due; return when the next one is."""
+        """Act on timers that are due, and send frames that are; return when the next timer is due, by the bench, ns."""
         t_ns = self._clock.own_ns(t_ns)
         due_ns = self.device.poll(t_ns)
         self._feel_failure(t_ns)
@@ -277,11 +282,11 @@ class DriveNode(Application):
         self._feel_failure(self._clock.own_ns(t_ns))
 
     def mend(self) -> None:
-        """Remove the cause of a failure; the fault stays latched."""
+        """Remove the cause that `fail` set; the fault stays latched until it is reset."""
         self._failure = 0
 
     def _feel_failure(self, t_ns: int) -> None:
-        """Enter Fault for a failure that lasts, again after a reset."""
+        """Latch the fault of a failure that lasts, again after each reset."""
         if self._failure and self.device.is_powered:
             self._latch(self._failure, None, t_ns)
 
@@ -336,7 +341,7 @@ class DriveNode(Application):
         self._received_word = controlword
 
     def _obey_received(self, t_ns: int) -> None:
-        """Carry out the controlword of a PDO."""
+        """Carry out the controlword that a PDO brought, if any, and forget it."""
         controlword, self._received_word = self._received_word, None
         if controlword is None:
             return
@@ -379,7 +384,7 @@ class DriveNode(Application):
         self._apply(event, t_ns)
 
     def _ramp_down(self, event: DriveEvent, t_ns: int) -> None:
-        """Shut down or disable operation by way of its option code."""
+        """Shut down or disable operation, at once or by braking, as the event's option code says."""
         stop = RAMPS[self.device.value_or(0, _RAMPED[event])]
         if stop is DISABLE:
             self._apply(event, t_ns)
@@ -426,7 +431,7 @@ class DriveNode(Application):
         self.device.report_no_error(t_ns)
 
     def _fault(self, cause: Watchdog, t_ns: int, is_found_by_time: bool = False) -> None:
-        """Latch a fault; the first one counts."""
+        """Latch the fault of a watchdog; ignored while a fault is latched."""
         self._latch(ERROR_CODES[cause], cause, t_ns, is_found_by_time)
 
     def _latch(self, code: int, cause: Watchdog | None, t_ns: int, is_found_by_time: bool = False) -> None:
@@ -446,7 +451,7 @@ class DriveNode(Application):
             self.device.trip(cause, t_ns)
 
     def _watch_motor(self, t_ns: int) -> None:
-        """Fault when the motor's state calls for it; note when limits come and go."""
+        """Latch a fault that the motor's state calls for; set `has_news` when a torque limit comes or goes."""
         motor = self._motor
         if not motor.is_ideal and (code := motor.error_code()):
             self._latch(code, None, t_ns)
@@ -480,7 +485,7 @@ class DriveNode(Application):
             self._fault(Watchdog.COMMAND, t_ns)
 
     def _watch_bus(self, t_ns: int) -> int:
-        """Fault when SYNC or commands stay away for too long; return when to look again."""
+        """Latch a fault if SYNC or commands stay away for too long; return when to check again, ns."""
         due_ns = NEVER_NS
         if self.is_free_running:
             due_ns = self._patience.sync_due_ns
@@ -512,7 +517,7 @@ class DriveNode(Application):
             self._apply(DriveEvent.QUICK_STOP_DONE, t_ns)
 
     def _drive_motor(self) -> None:
-        """Command the motor as the state allows: torque only in Operation enabled with mode 10."""
+        """Set the motor's torque set-point: 0 except in Operation enabled with mode 10."""
         self._demand = self._limits.demand() if self._follows_target else 0
         self.torque_Nm = self._demand * self._rated_mNm * 1e-6
 
@@ -522,7 +527,7 @@ class DriveNode(Application):
         return max(-0x8000, min(0x7FFF, permille))
 
     def _keep_habits(self, t_ns: int) -> None:
-        """Show the mode, and come to Operation enabled, in the drive's own time."""
+        """Update the mode shown on 0x6061, and enter Operation enabled, with the delays of the drive's habits."""
         if self._enabling_ns is not None and t_ns - self._enabling_ns >= self._habits.enable_s * 1e9:
             self._enabling_ns = None
             self._apply(DriveEvent.ENABLE_OPERATION, t_ns)
@@ -540,7 +545,7 @@ class DriveNode(Application):
             refuse(Abort.DEVICE_STATE)
 
     def _want_mode(self, mode: int) -> None:
-        """Take another mode over: at the next SYNC while the motor has torque, at once elsewhere."""
+        """Store a wanted mode; it is set at the next SYNC in Operation enabled, at once in other states."""
         self._wanted_mode = mode
         if not self.is_enabled:
             self._change_mode()

@@ -120,7 +120,9 @@ def find_transition(state: DriveState, event: DriveEvent) -> StateTransition | N
 
 
 def decode_command(controlword: int, previous: int) -> DriveEvent | None:
-    """Name the command of a controlword, None without one (CiA 402-2, command coding).
+    """Return the command of a controlword, None if it has none (CiA 402-2, command coding).
+
+    `previous`: the controlword before it.
 
     Fault reset is the rising edge of bit 7; while bit 7 stays set, a controlword carries no command.
     """
@@ -171,11 +173,11 @@ class Standstill:
         self._since_ns = self._moving_ns = 0
 
     def begin_braking(self, t_ns: int) -> None:
-        """Begin braking."""
+        """Start the times of standstill and of the longest braking at `t_ns`."""
         self._since_ns = self._moving_ns = t_ns
 
     def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:
-        """Return whether the motor stands still, or has braked for the longest time."""
+        """Return whether the motor has stood still for 10 ms, or has braked for 1 s. Call while it brakes."""
         if abs(velocity_rad_s) > REST_RAD_S:
             self._moving_ns = t_ns
         return t_ns - self._moving_ns >= _REST_NS or t_ns - self._since_ns >= _LONGEST_BRAKING_NS
@@ -207,7 +209,7 @@ class TorqueLimits:
         self._combine()
 
     def demand(self) -> int:
-        """Return 0x6074 of an enabled drive."""
+        """Return the torque demand 0x6074, per mille: target plus offset, within the limits."""
         wanted = self.target + self._offset
         if self._low <= wanted <= self._high:
             return wanted
@@ -288,7 +290,7 @@ class Patience:
         return self.sync_ns + self._period_us * self._tenth_periods * 100
 
     def forget_command(self) -> None:
-        """Forget the last command."""
+        """Forget the last command, so that a command counts as missing until the next one."""
         self.silent_syncs = _NO_COMMAND_YET
 
     def _set_syncs(self, syncs: int) -> None:
@@ -304,7 +306,10 @@ class Patience:
 
 
 def velocity_lsb(codec: Codec, number: int, factor: float) -> float | None:
-    """Return the LSB of velocity in rad/s, the contract's divided by `factor`; None when it is the body's own."""
+    """Return a drive's LSB of velocity, rad/s: the contract's divided by `factor`; None if it is VELOCITY_LSB_RAD_S.
+
+    number: of the drive, 1 or 2.
+    """
     signals = codec.message(f"Drive{number}Feedback").signals
     scale = next(signal.scale for signal in signals if signal.name == "velocity") / factor
     return None if scale == VELOCITY_LSB_RAD_S else scale

@@ -79,7 +79,7 @@ class SensorNode(Application):
         device.attach(self)
 
     def on_sync(self, counts: int) -> None:
-        """Take the torque that was sampled at this SYNC, in the converter's counts."""
+        """Store the torque sampled at this SYNC, in the converter's counts; update status and a running autozero."""
         status = self._error_bits
         if counts >= self._highest_count:
             status |= STATUS_POSITIVE_OVERLOAD | STATUS_NOT_VALID
@@ -98,11 +98,11 @@ class SensorNode(Application):
             self.has_news = True
 
     def set_error(self, bits: int) -> None:
-        """Let the sensor find fault with itself, from its next sample on: bits of 0x6150, 0: no error."""
+        """Set error bits of the status 0x6150 from the next sample on; 0: no error."""
         self._error_bits = bits
 
     def poll(self, t_ns: int) -> int:
-        """Act on timers that are due; return when the next one is."""
+        """Act on timers that are due, and send frames that are; return when the next timer is due, by the bench, ns."""
         clock = self.device.clock
         t_ns = clock.own_ns(t_ns)
         due_ns = self.device.poll(t_ns)

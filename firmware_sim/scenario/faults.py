@@ -251,7 +251,7 @@ def _check_hex(key: str, text: str | None, longest: int) -> None:
 
 
 def check_rows(rows: Sequence[FaultSettings]) -> None:
-    """Check rules between rows. Raises ConfigError."""
+    """Raise ConfigError if there are more than MOST_ROWS rows, or if two of them change the same node's id."""
     if len(rows) > MOST_ROWS:
         raise ConfigError(f"`faults` has {len(rows)} rows, {MOST_ROWS} at most")
     renamed: dict[str | None, int] = {}
@@ -265,7 +265,7 @@ def check_rows(rows: Sequence[FaultSettings]) -> None:
 
 
 def device_ids(rows: Iterable[FaultSettings], right_ids: Sequence[int]) -> tuple[int, ...]:
-    """Return the node ids that the devices have, in the order of `NODES`, for `right_ids` by the contract."""
+    """Return the node ids of the devices, in the order of `NODES`: `right_ids`, changed by faults of node ids."""
     ids = list(right_ids)
     for row in rows:
         place = NODES.index(row.node) if row.node in NODES else -1

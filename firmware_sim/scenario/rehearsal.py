@@ -99,7 +99,7 @@ class ToldArm(NamedTuple):
 
 
 def told_arm(settings: Settings, layers: Sequence[ConfigurationLayer]) -> ToldArm:
-    """Find the user's own keys in the layers of a configuration."""
+    """Return a configuration with its keys that are neither built in nor of an emulated profile."""
     own = [layer for layer in layers if layer.origin not in builtin_names() and "[profiles." not in layer.origin]
     table = resolved_table(own)
     keys = {f"{name}.{key}" for name, section in table.items() if isinstance(section, dict) for key in section}
@@ -109,7 +109,7 @@ def told_arm(settings: Settings, layers: Sequence[ConfigurationLayer]) -> ToldAr
 def compose_scenario(
     told: ToldArm, truth: ArmTruth, counts: DeviceCounts, table: dict[str, Any], is_builtin: bool
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return a scenario's table the arm of a configuration; return it, and the assumptions, a line each.
+    """Return a scenario's table with the arm of a configuration and a truth put in, and the assumptions, a line each.
 
     `is_builtin`: it comes with the package, so it is fitted to the size of the arm. Raises ConfigError.
     """
@@ -185,7 +185,7 @@ def _by_place(truth: ArmTruth, what: str, by_joint: Pair) -> Pair:
 
 
 def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
-    """Find lengths and masses."""
+    """Return the links' lengths, masses and inertia, and append a line to `assumed` for each assumption."""
     arm = told.settings.arm
     told_m = truth.arm.link_length_m or arm.link_length_m
     if not told.has_geometry and truth.arm.link_length_m is None and truth.arm.mass_kg is None:
@@ -277,7 +277,7 @@ def _from_cad(length_m: Pair, theta: Sequence[float]) -> _Links:
 
 
 def _joint_inertia(links: _Links) -> Pair:
-    """Return the inertia about each joint with the arm stretched, kg m²: about joint 1 its least, without β."""
+    """Return the inertia about each joint, kg m²: α + γ, as with the elbow at 90 degrees, and γ."""
     (l1, _), (m1, m2), (c1, c2), (i1, i2) = links.length_m, links.mass_kg, links.center_m, links.inertia_kg_m2
     gamma = i2 + m2 * c2**2
     return i1 + m1 * c1**2 + m2 * l1**2 + gamma, gamma
@@ -313,7 +313,7 @@ def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -
 
 
 def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
-    """Place the devices as in the host's configuration, but for the truth's wiring."""
+    """Return joints and signs of the devices, as keys of `own_arm`: the configuration's, changed by the truth."""
     wiring = truth.wiring
     drive_joint, sensor_joint = (
         (2, 1) if wiring.swapped in (what, "joints") else (1, 2) for what in ("drives", "sensors")
@@ -331,7 +331,10 @@ def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
 
 
 def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
-    """Return the sensors a range that their signals carry, and noise to it, where the scenario doesn't."""
+    """Return the scenario's `said` sensor settings, completed by range, noise and encoder bits.
+
+    Appends a line to `assumed` for each addition. Raises ConfigError if the frames carry too little torque.
+    """
     sensors = dict(said)
     for joint, (rated_Nm, most_Nm) in enumerate(zip(rated, counts.torque_range_Nm, strict=True)):
         if most_Nm < _LEAST_RANGE_SHARE * rated_Nm:
@@ -363,7 +366,10 @@ def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: l
 
 
 def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
-    """Mount the arm as in the host's configuration, and let its brakes hold it."""
+    """Return the scenario's `said` mechanics, completed by the configuration's mounting and by holding brakes.
+
+    Appends a line to `assumed` for each assumption.
+    """
     mechanics, settings = dict(said), told.settings
     holding = settings.arm.holding_torque_Nm
     if settings.mounting_deg[0] > 0.0 and "tilt_deg" not in mechanics:
@@ -391,7 +397,7 @@ _LENGTHS: Final = ("x_m", "y_m", "radius_m", "room_m")
 
 
 def _fit(table: dict[str, Any], settings: Settings, links: _Links, rated: Pair, assumed: list[str]) -> None:
-    """Fit a scenario that was made for profile P to the arm, in place."""
+    """Scale a scenario's table that was made for profile P to the arm, in place: places, forces, payloads."""
     length_m = links.length_m
     longer = length_m[0] / _MODEL.link_length_m[0], length_m[1] / _MODEL.link_length_m[1]
     alpha, _, gamma = _MODEL.inertia()

@@ -140,7 +140,7 @@ class ScenarioOutcome(NamedTuple):
 
 
 def deviations(expect: ExpectSettings, outcome: ScenarioOutcome) -> tuple[str, ...]:
-    """List the differences of a run from its expectation, a line each."""
+    """Return the differences of an outcome from an expectation, a text each; () if it is as expected."""
     found = []
     for key in ("end", "fault"):
         wanted, got = getattr(expect, key), getattr(outcome, key)
@@ -281,7 +281,7 @@ class Scenario:
 
     @property
     def wiring(self) -> Wiring:
-        """How the devices are at the joints."""
+        """Joint and sign of each device."""
         return STRAIGHT if self.own_arm is None else self.own_arm.wiring
 
     @property
@@ -297,7 +297,7 @@ class Scenario:
 
 
 def builtin_scenarios() -> list[str]:
-    """Name the scenarios that come with the package."""
+    """Return the names of the scenarios that come with the package."""
     return toml_names(_FOLDER / "scenarios")
 
 
@@ -309,7 +309,10 @@ def load_scenario(name_or_file: str, profile: str | None = None, seed: int | Non
 def resolve_scenario(
     name_or_file: str, table: dict[str, Any], profile: str | None = None, seed: int | None = None
 ) -> Scenario:
-    """Resolve a scenario's table. Raises ConfigError."""
+    """Check a scenario's table and return the scenario; a given `profile` and `seed` are written into the table.
+
+    name_or_file: named in the ConfigError that it raises.
+    """
     if profile is not None:
         table["profile"] = profile
     if seed is not None:
@@ -419,12 +422,15 @@ class ArmTruth:
 
 
 def truth_names() -> list[str]:
-    """Name the truths that come with the package."""
+    """Return the names of the truths that come with the package."""
     return toml_names(_FOLDER / "truths")
 
 
 def load_truth(name_or_file: str) -> tuple[ArmTruth, dict[str, Any]]:
-    """Read a truth, a built-in name or a TOML file, and its sections of a scenario, unchecked. Raises ConfigError."""
+    """Read a truth, a built-in name or a TOML file; return it and its sections of a scenario, these unchecked.
+
+    Raises ConfigError.
+    """
     table = _read("truth", name_or_file)
     sections = {key: table.pop(key) for key in SCENARIO_SECTIONS if key in table}
     try:

@@ -23,7 +23,7 @@ class NextStep(NamedTuple):
 
 
 def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[NextStep], list[NextStep]]:
-    """List the next steps, the gravest first, and what else to try."""
+    """Return the next steps, the gravest first, STEPS at most, and further ones."""
     log = _quoted(source.log_name)
     steps = [NextStep("The log is not whole: see what it lacks.", f"adacd-hil log check {log}")] * bool(source.problem)
     if run.cycle.size == 0:
@@ -43,7 +43,7 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
 
 
 def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
-    """List the repairs of each kind of failure."""
+    """Return a next step for each kind of failure that the run shows."""
     has_stopped = bool(metrics.fault) or (not metrics.adaptation_s and run.stretch is None)
     stopped = _checked(run, "Mend the cause above.")
     late = _checked(run, "Frames came late or were lost, more than allowed.")
@@ -74,7 +74,7 @@ def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
 
 
 def _checked(run: Run, text: str) -> NextStep:
-    """Return the check of host, bus and arm as the next step; without a command for an arm in the host's process."""
+    """Return a next step: `text`, and the check of host, bus and arm; for an emulated arm, a demo to play again."""
     interface, channel = run.metadata.get("interface", ""), run.metadata.get("channel", "")
     if interface in ("", EMBEDDED):
         played = f" --scenario {_quoted(run.metadata['scenario'])}" if run.metadata.get("scenario") else ""
@@ -86,7 +86,7 @@ def _checked(run: Run, text: str) -> NextStep:
 
 
 def _configuration(run: Run) -> str:
-    """Name the configuration as a command takes it: a built-in one, or the file that bears the arm's name."""
+    """Return a run's configuration, quoted, as a command takes it: a built-in name, or `<arm's name>.toml`."""
     name = run.metadata.get("config", "")
     return _quoted(name) if name in builtin_names() else _quoted(f"{name or 'my-arm'}.toml")
 
@@ -96,7 +96,7 @@ def _quoted(text: str) -> str:
 
 
 def origin_words(run: Run) -> list[str]:
-    """Name the arm, its bus, and the scenario."""
+    """Return phrases on a run's arm, bus, scenario and version, as far as the log names them."""
     said = run.metadata
     name, profile, interface = said.get("config", ""), said.get("profile", ""), said.get("interface", "")
     is_own = name not in builtin_names()

@@ -71,7 +71,7 @@ class Table(NamedTuple):
 
 
 def make_table(head: Sequence[object], rows: Iterable[Sequence[object]], left: Sequence[int] = (0,)) -> Table:
-    """Make a table of cells, and of contents of cells without a class."""
+    """Return a table; contents that aren't a `Cell` become cells without a class. left: columns aligned left."""
 
     def line(contents: Sequence[object]) -> list[Cell]:
         return [content if isinstance(content, Cell) else Cell(content) for content in contents]
@@ -95,7 +95,7 @@ def render_page(
     traces: "Traces | None" = None,
     **values: Any,
 ) -> str:
-    """Write a page whose template extends `page.html.j2`. traces: its curves; without any it has no script.
+    """Return the HTML of a page whose template extends `page.html.j2`. traces: its curves; None: a page without script.
 
     over: a line over the headline; problems: of the log, and further findings, a line each.
     """
@@ -105,7 +105,7 @@ def render_page(
 
 
 def render(template: str, **values: Any) -> str:
-    """Write a template with these values."""
+    """Return the text of a template filled with values; raises an error of Jinja2 for a missing one."""
     return _environment().get_template(template).render(values) + "\n"
 
 
@@ -131,13 +131,13 @@ def _environment() -> Environment:
 
 @cache
 def _asset(name: str) -> dict[str, str]:
-    """Read a style or a script, with the digest by which the content security policy allows it."""
+    """Return text and digest of a style or script; the content security policy allows it by the digest."""
     text = f"\n{resources.files(_PACKAGE).joinpath('assets', name).read_text(encoding='utf-8').strip()}\n"
     return {"text": text, "digest": b64encode(hashlib.sha256(text.encode()).digest()).decode()}
 
 
 def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:
-    """Choose the first contacts to be listed, and of the others as many that went wrong."""
+    """Return the contacts to be listed: the first `most`, and of the others at most as many that went wrong."""
     later = [contact for contact in metrics.contacts[most:] if went_wrong(contact)]
     return (*metrics.contacts[:most], *later[:most])
 
@@ -149,7 +149,7 @@ def went_wrong(contact: ReportedContact) -> bool:
 
 
 def left_out_text(metrics: Metrics, most: int) -> str:
-    """Return a sentence on the contacts that are not listed; empty if all are."""
+    """Return a sentence on the contacts that `shown_contacts` leaves out; "" if none."""
     count, shown = len(metrics.contacts), len(shown_contacts(metrics, most))
     if shown == count:
         return ""
@@ -158,7 +158,7 @@ def left_out_text(metrics: Metrics, most: int) -> str:
 
 
 def has_paper(metrics: Metrics) -> bool:
-    """Return whether the run is of the paper's experiment."""
+    """Return whether the run played the paper's experiment, so that figures of the paper stand beside its own."""
     return any(row.paper is not None for row in metrics.paper)
 
 
@@ -171,7 +171,7 @@ def shown_beside(metrics: Metrics) -> Beside | None:
 
 
 def paper_head(metrics: Metrics) -> tuple[str, ...]:
-    """Name the columns of paper against measured; the paper's own is there where its experiment was played."""
+    """Return the head of the table of `paper_cells`; with the paper's column if its experiment was played."""
     if metrics.evidence is None:
         return ("", "paper", "measured") if has_paper(metrics) else ("", "measured")
     paper = ("paper (printed)", "paper's scheme, same stream") if has_paper(metrics) else ()
@@ -192,7 +192,10 @@ _PLAIN_NAMES: Final = {
 
 
 def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
-    """Write a row per quantity."""
+    """Return a row of texts per quantity: name, the paper's value, its scheme's on the same stream, the measured one.
+
+    Columns as in `paper_head`.
+    """
     rows = []
     for row in metrics.paper:
         if row.paper is None and row.measured == NONE:
@@ -204,7 +207,7 @@ def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
 
 
 def stretch_text(stretch: StretchOfRun) -> str:
-    """Describe the stretch of a log that was read, and the reason if it differs from the requested one."""
+    """Return a phrase on the stretch of a log that was read, and why it differs from the requested one."""
     start_s, end_s = stretch.found
     text = (
         "the log"

@@ -97,7 +97,7 @@ def write_report(
     stretch: TimeWindow = WHOLE,
     progress: Progress = lambda _: None,
 ) -> Report:
-    """Read a log, or a stretch of it, and the emulator's truth if there is one, and write the report into `out_dir`.
+    """Read a log, or a stretch of it, with the emulator's truth if there is one; write and return its report.
 
     Raises LogError, ConfigError when a log can't be read, and LogError when the report can't be written.
     """
@@ -106,7 +106,7 @@ def write_report(
 
 
 def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: RunGatherer | None = None) -> Report:
-    """Write the report of a run that is in memory. Raises LogError when it can't be written.
+    """Write the report of a run that is in memory into `out_dir`; return it. Raises LogError if it can't be written.
 
     gathered: the sums over all cycles; None: the run has all of its cycles.
     """
@@ -138,7 +138,7 @@ _CSV_DIGITS: Final = 9
 
 
 def report_tables(run: Run, metrics: Metrics) -> dict[str, str]:
-    """Write each table, by its file's name."""
+    """Return the tables of contacts, parameters and states as CSV, by file name."""
     names = [field.name for field in dataclasses.fields(ReportedContact)]
     pairs = [name for name in names if any(isinstance(getattr(c, name), tuple) for c in metrics.contacts)]
     head = [column for name in names for column in ((f"{name}_1", f"{name}_2") if name in pairs else (name,))]
@@ -151,7 +151,7 @@ def report_tables(run: Run, metrics: Metrics) -> dict[str, str]:
 
 
 def _cells(value: Any, is_pair: bool) -> Sequence[Any]:
-    """Return a value, or that of each joint."""
+    """Return the cells of a value: one, or for a pair that of each joint, empty if it is None."""
     if not is_pair:
         return (value,)
     return (None, None) if value is None else tuple(value)

@@ -61,7 +61,7 @@ def report_json(
 
 
 def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
-    """Return a stretch, s since the beginning of the log; null where it is not bounded."""
+    """Return found and requested stretch and motion start by the keys of report.json, s since the log began."""
     return {
         "from_s": stretch.found.start_s,
         "until_s": stretch.found.end_s,

@@ -34,14 +34,14 @@ from adacd_hil.score.wording import NONE, number_of
 
 
 def paper_table(metrics: Metrics) -> Table:
-    """Put the paper's figures beside the measured ones."""
+    """Return the table of the paper's figures beside the measured ones."""
     rows = [[*cells[:-1], Cell(cells[-1], "strong")] for cells in paper_cells(metrics)]
     head = paper_head(metrics)
     return make_table(head, rows, left=range(len(head)))
 
 
 def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
-    """List threshold over residual of each channel and section."""
+    """Return the table of residual, threshold and margin per section and channel; None without margins."""
     if evidence is None or not evidence.margins:
         return None
     head = ("section", "filter, rad/s", "", "largest residual, Nm", "threshold, Nm", "margin")
@@ -58,7 +58,7 @@ def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def push_table(evidence: CertifiedEvidence | None) -> Table | None:
-    """Return how small a push is found, and the threshold in force."""
+    """Return the table of the smallest push found within 100 ms and the threshold in force; None if unknown."""
     push = None if evidence is None else evidence.smallest_push
     if push is None:
         return None
@@ -80,7 +80,7 @@ def counted_sentence(metrics: Metrics) -> str:
 
 
 def _first_and_worst(evidence: CertifiedEvidence) -> dict[str, tuple[ChannelMargin, ...]]:
-    """Choose the first sections, and the one with the smallest margin."""
+    """Return the margins of the first SECTIONS sections, and of the one with the smallest margin, by label."""
     labels = list(evidence.margins)
     worst = min(labels, key=lambda label: min(min(row.margin) for row in evidence.margins[label]))
     shown = {*labels[:SECTIONS], worst}
@@ -88,7 +88,7 @@ def _first_and_worst(evidence: CertifiedEvidence) -> dict[str, tuple[ChannelMarg
 
 
 def further_table(evidence: CertifiedEvidence | None) -> Table | None:
-    """List all parameters of the certified scheme with the standard deviations that it gives them."""
+    """Return the table of the certified scheme's parameters with their standard deviations; None without any."""
     if evidence is None or not evidence.estimates:
         return None
     estimates = dict(islice(evidence.estimates.items(), ADAPTATIONS))
@@ -105,7 +105,7 @@ def further_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def sections_table(metrics: Metrics, run: Run) -> Table:
-    """Make a row per section, with its frozen residuals."""
+    """Return the table of sections: kind, times, and largest residuals of the frozen models."""
     threshold = run.settings.detector.threshold_Nm
     rows = []
     for section in metrics.sections[:SECTIONS]:
@@ -138,13 +138,13 @@ def _judged(values: tuple[float, float] | None, threshold: tuple[float, float]) 
 
 
 def _symbol(name: str) -> tuple[str, str]:
-    """Part a parameter's name from its index: F_v1, a1, offset1."""
+    """Return a parameter's name as stem and index: F_v1 as F and v1, a1 as a and 1."""
     stem, index = name.split("_", 1) if "_" in name else (name.rstrip("0123456789"), name.lstrip(ascii_letters))
     return stem, index
 
 
 def parameters_table(metrics: Metrics, run: Run) -> Table | None:
-    """Put the identified parameters beside the true ones and the CAD model's."""
+    """Return the table of identified, true and CAD parameters; None without identified ones."""
     if not metrics.parameters:
         return None
     cad = dict(zip(run.parameter_names, run.settings.arm.cad_theta, strict=True)) if run.has_cad else {}
@@ -164,7 +164,7 @@ def parameters_table(metrics: Metrics, run: Run) -> Table | None:
 
 
 def data_table(data: CyclicData) -> Table | None:
-    """List how much of the cyclic data came in time."""
+    """Return the table of the share of cyclic data that was missing, old or repeated; None without a cycle."""
     if not data.cycles:
         return None
     rows = [
@@ -185,7 +185,7 @@ def _share(share: float | None) -> str:
 
 
 def origin_table(metrics: Metrics, run: Run, source: ReportSource) -> Table:
-    """List where the run comes from."""
+    """Return the table of a run's origin: log, stretch and metadata."""
     log = [("log", source.log_name), ("frames", metrics.frames), ("packets dropped", metrics.dropped)]
     if run.stretch is not None:
         log.append(("stretch", stretch_text(run.stretch)))
@@ -209,7 +209,7 @@ _QUEUES: Final = {
 
 
 def timing_tables(evidence: TimingEvidence) -> dict[str, Table | bool | None] | None:
-    """Make the tables of `timing.html.j2`: percentiles, counts, queues and ages. None without a cycle.
+    """Return the tables of `timing.html.j2` by name: times, counts, queues and ages; None without a cycle.
 
     is_modelled: the times come from a model, which has no queues.
     """
@@ -225,7 +225,7 @@ def timing_tables(evidence: TimingEvidence) -> dict[str, Table | bool | None] | 
 
 
 def _times_table(evidence: TimingEvidence) -> Table:
-    """Make a row per time; slack at the end under a head of its own, because its small values are the bad ones."""
+    """Return the table of times, µs; slack comes last, under a head of low percentiles: its small values are bad."""
     reserves = [quantity for quantity in QUANTITIES if quantity.is_reserve]
     rows = [_time_row(quantity, evidence, PERCENTILE_NAMES) for quantity in QUANTITIES if not quantity.is_reserve]
     reaction = evidence.reaction

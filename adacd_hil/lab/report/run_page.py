@@ -94,7 +94,10 @@ class ArmDrawing:
 
 
 def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, description: str) -> ArmDrawing:
-    """Draw the arm at the joint angles q, rad (2,)."""
+    """Return a drawing of the arm at joint angles q, rad (2,), with the arrow of a push, None: without.
+
+    description: of the picture, in words.
+    """
     angles = (float(q[0]), float(q[0] + q[1]))
     l1, l2 = (1000.0 * length for length in length_m)
     elbow = _along((0.0, 0.0), angles[0], l1)
@@ -120,7 +123,7 @@ def _along(start: _Point, angle: float, distance: float) -> _Point:
 def _arrow(
     push: Push, links: tuple[Stroke, Stroke], angles: tuple[float, float], reach: float
 ) -> tuple[list[Stroke], list[_Point]]:
-    """Draw the force and the spread of its place; give the strokes, and the corners of the arrowhead."""
+    """Return the strokes of a force's arrow and of the spread of its place, and the corners of the arrowhead."""
     start, end, _ = links[push.link - 1]
     angle = angles[push.link - 1]
     lever = 0.5 * math.dist(start, end) if push.lever_m is None else 1000.0 * push.lever_m
@@ -149,7 +152,7 @@ _CONTACT_HEAD: Final = (
 
 
 def contacts_table(metrics: Metrics) -> Table | None:
-    """Make a row per contact, marked where something went wrong, with the delay of the paper's scheme if it is known.
+    """Return the table of contacts, wrong cells marked, with the delay of the paper's scheme if it is known.
 
     None without contacts.
     """
@@ -186,7 +189,7 @@ def contacts_table(metrics: Metrics) -> Table | None:
 
 
 def contact_cards(metrics: Metrics, run: Run) -> list[dict[str, Any]]:
-    """Describe each of the first contacts: the report with its uncertainty, the truth, the arm.
+    """Return the content of the first contacts' cards: report with uncertainty, truth, and drawing of the arm.
 
     stretch_s: the part of the traces that a script shows.
     """
@@ -248,7 +251,7 @@ def _found(contact: ReportedContact) -> list[tuple[str, str]]:
 
 
 def _force(contact: ReportedContact) -> tuple[str, str]:
-    """Return the force as far as it is known: with its deviation, as a lower bound, or not at all."""
+    """Return name and text of a contact's force: with deviation, as a lower bound, "not known", or NONE."""
     location = Location[contact.location or Location.NOT_SOUGHT.name]
     if contact.force_N is None:
         return "force", NONE
@@ -262,7 +265,7 @@ def _force(contact: ReportedContact) -> tuple[str, str]:
 
 
 def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
-    """Return each joint's peak and impulse; a peak without its deviation if that is unknown."""
+    """Return name and text of each joint's peak torque and impulse; a peak without its deviation if unknown."""
     unknown = (None, None)
     impulses = contact.impulse_Nm_s or unknown
     impulse_sigmas = contact.impulse_sigma_Nm_s or unknown
@@ -277,7 +280,7 @@ def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
 
 
 def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> ArmDrawing | None:
-    """Draw the arm where it was when the contact was found, or began; None without measured positions."""
+    """Return a drawing of the arm when a contact was found, or else began; None without measured positions."""
     if run.motion is None:
         return None
     at_s = contact.at_s if contact.detected_s is None else contact.detected_s
@@ -290,7 +293,11 @@ def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> ArmDrawing |
 
 
 def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Push | None:
-    """Return the place of a contact's force in the drawing: the reported one, else the true one, else None."""
+    """Return the force of a contact for the drawing, on the link that was found, or else the true one; None without.
+
+    Place and size are those reported; if the place is unknown, half the largest size at an unknown place.
+    strongest_N: largest force to be shown.
+    """
     link = contact.link if contact.link_detected is None else contact.link_detected
     if link is None:
         return None
@@ -305,7 +312,7 @@ def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Pus
 
 
 def report_page(metrics: Metrics, run: Run, source: ReportSource) -> str:
-    """Write the page."""
+    """Return the HTML of a run's report."""
     steps, more_steps = next_steps(metrics, run, source)
     since_ns = None if run.log_start_ns is None else run.zero_ns - run.log_start_ns
     return render_page(
@@ -365,7 +372,7 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> dict[str, Any]
 
 
 def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
-    """Return the numbers of the first screen: label, number, unit."""
+    """Return label, number and unit of each figure on the first screen, without unknown ones."""
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]
     times_s = [number_text(value, 2) for value in metrics.adaptation_s.values()]

@@ -99,7 +99,9 @@ def read_run(
     progress: Progress = lambda _: None,
     full_cycles: int = FULL_CYCLES,
 ) -> ReadRun:
-    """Read a log, or a stretch of it, and the emulator's truth if there is one. Raises LogError, ConfigError.
+    """Return the run in a log, or in a stretch of it, with the emulator's truth if there is one.
+
+    Raises LogError, ConfigError.
 
     The truth of another run is left out, and is a problem of the source. Raises LogError also for a stretch without a
     cycle. full_cycles: of a log with more, some are kept.
@@ -162,7 +164,7 @@ def _read(
     bounds_ns: Bounds | None = None,
     until_ns: int | None = None,
 ) -> None:
-    """Read a log: all, the part between two times, or as far as it takes to know what happens at a time."""
+    """Add the pieces of a log to `reading`: all, those within `bounds_ns`, or until `until_ns` is settled."""
     milestones = Milestones(lambda count: progress(f"{stream.path}: {count} cycles read"))
     cycles = 0
     for piece in stream:
@@ -183,7 +185,7 @@ def _read(
 def _with_ending(
     run: Run, gathered: RunGatherer, stream: LogStream, truth: TruthTable | None, truth_problem: str
 ) -> ReadRun:
-    """Add the ending, the problems and the counts of the log."""
+    """Return a run with the ending and counts of its log, and the problems of log and truth in the source."""
     ending = stream.summary.get(ENDING_KEY, "")
     if ending and ending not in PLANNED_ENDINGS:
         run = replace(run, broken_off=one_line(ending))
@@ -235,7 +237,7 @@ class RunReading:
         self._last_cycle = -1
 
     def add_piece(self, series: Mapping[str, Series], events: list[LoggedEvent]) -> None:
-        """Take in the next piece of the log."""
+        """Add the next piece of the log, and sum up the cycles that have settled."""
         self._reports += [report for _, report in contacts_of(series["/contact"])]
         self._events += events
         self._checks += _checks_of(series["/frame_checks"])
@@ -268,7 +270,7 @@ class RunReading:
             self._busy_ns = max(self._busy_ns, int(scheme.t_ns[busy[-1]]))
 
     def _edges(self, scheme: Series) -> Rows:
-        """List the first and last row and the rows beside changes of the state or of arming of the paper's scheme."""
+        """Return the first and last row of a piece, and those beside changes of the state or of the paper's arming."""
         state = scheme.records["state"].astype(np.int64)
         is_armed = np.zeros(len(state), np.bool_)
         if "paper_is_armed" in scheme.fields:
@@ -281,7 +283,7 @@ class RunReading:
         return np.concatenate((ends, changes - 1, changes, changes + 1, switches - 1, switches))
 
     def _onset_rows(self, scheme: Series, cycle: Cycles) -> Rows:
-        """List the rows in which true contacts begin, and the ones before them."""
+        """Return the rows of a piece in which true contacts begin, and the rows before them."""
         if self._clock is not None:
             rows, cycles = self._clock.place_rows(scheme, self._attempts.begins)
             onsets = cycles[self._is_onset[rows]]
@@ -300,12 +302,15 @@ class RunReading:
         return SETTLING_TIME_CONSTANTS / self._rows.run(self._shell, slice(0)).a_rad_s
 
     def is_settled(self, until_ns: int, last_ns: int) -> bool:
-        """Return whether all events before a time are known: there was none in the settling time before last_ns."""
+        """Return whether contacts, reactions and adaptations before `until_ns` are over at the last cycle, `last_ns`.
+
+        They are if the settling time before `last_ns` begins after `until_ns` and has none.
+        """
         before_ns = last_ns - round(self._settling_s * 1e9)
         return before_ns > until_ns and self._busy_ns < before_ns
 
     def outline(self) -> Run:
-        """Return the run so far, with the kept cycles and all that wait."""
+        """Return the run so far, with the kept cycles and those not summed up yet."""
         zero_ns = next((t_ns for t_ns in (self._zero_ns, self._first_ns) if t_ns is not None), 0)
         run = replace(
             self._rows.run(self._shell),
@@ -321,7 +326,7 @@ class RunReading:
         return replace(run, truth=host_truth(self._truth, self._attempts.begins, self._last_cycle, time_s))
 
     def _settle(self, end: int) -> None:
-        """Gather the rows up to one, and keep of them those that are drawn."""
+        """Sum up the rows before `end`; of a long run, drop those of them that are not drawn."""
         outline = self.outline()
         shell = replace(self._shell, truth=None, motion_start_ns=outline.motion_start_ns)
         self.sums.untouched.add_untouched(self._rows.run(shell, slice(self._settled, end)), outline)
@@ -346,26 +351,29 @@ class RunReading:
                 yield trace.values
 
     def finished(self) -> Run:
-        """Return the run with the cycles that were kept, at the end of the log; `sums` then has all of them."""
+        """Sum up the last cycles, so that `sums` has all; return the run with the kept cycles. Call at the end."""
         self._settle(self._rows.count)
         timing = self._times.columns()
         return replace(self.outline(), timing=timing, all_cycles=self._rows.cycles, bucket=self._bucket)
 
 
 def _bucket_of(cycles: int, most: int, bucket: int) -> int:
-    """Double the size of buckets until there are at most so many."""
+    """Return the size of buckets, cycles: `bucket`, doubled until at most `most` buckets hold all cycles."""
     while cycles > most * bucket:
         bucket *= 2
     return bucket
 
 
 def _extremes_by_bucket(curves: Iterator[NDArray[np.float64]], index: Cycles, bucket: int) -> Rows:
-    """Choose of every bucket of cycles, by their index, the rows in which a curve is smallest and largest."""
+    """Return, of every bucket of cycles, the rows in which a curve is smallest or largest.
+
+    index: of each row among all cycles. bucket: cycles per bucket.
+    """
     return extreme_rows(curves, np.flatnonzero(np.diff(index // bucket, prepend=-1)))
 
 
 def _around(run: Run) -> list[Bounds]:
-    """Return the stretches of time of which every cycle is kept."""
+    """Return the times around the first contacts, detections and adaptations, whose cycles are all kept."""
     onsets_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
     found_s = [(detection.t_ns - run.zero_ns) * 1e-9 for detection in find_detections(run)]
     around = [
@@ -381,7 +389,7 @@ _CHECKS: Final = "_checks"
 
 
 def _checks_of(series: Series) -> list[CheckCounts]:
-    """Take the counts out of a piece of /frame_checks, if it has any."""
+    """Return the counts of a piece of /frame_checks; [] if it has none."""
     devices = tuple(name.removesuffix(_CHECKS) for name in series.fields if name.endswith(_CHECKS))
     if not len(series) or not devices:
         return []
@@ -440,7 +448,7 @@ class ThinnedTimes:
         self._waiting = 0
 
     def add_columns(self, columns: CycleColumns) -> None:
-        """Take in the next cycles."""
+        """Add the next cycles; of a long run, drop those without an extreme value."""
         if not len(columns):
             return
         self._parts.append(columns)
@@ -466,7 +474,7 @@ class ThinnedTimes:
         self._index = [np.concatenate([*self._index[:kept], index])]
 
     def columns(self) -> CycleColumns:
-        """Return the columns that were kept."""
+        """Return the columns of the kept cycles."""
         self._thin()
         return CycleColumns.joined(self._parts)
 
@@ -493,7 +501,7 @@ class SchemeRows:
         self._begin(empty)
 
     def _begin(self, scheme: Series) -> None:
-        """Make room for rows of such fields."""
+        """Allocate the block of rows, with the fields of `scheme` that a report reads."""
         names = [name for name in ("cycle", *_PLAIN, *_MOTION, *_CERTIFIED, *_PAPER) if name in scheme.fields]
         own = [("t_ns", np.dtype(np.int64)), ("index", np.dtype(np.int64)), ("is_kept", np.dtype(np.bool_))]
         fields = [*own, *((name, scheme.records.dtype[name]) for name in names)]
@@ -501,7 +509,7 @@ class SchemeRows:
         self._rows = np.empty(_ROOM, np.dtype(fields, align=True))
 
     def add_records(self, scheme: Series, kept: Rows) -> None:
-        """Take in a piece. kept: its rows that are never dropped."""
+        """Add the records of a piece of /scheme. kept: its rows that are never dropped."""
         if self.count == 0:
             self._begin(scheme)  # only a record shows the fields of a log
         end = self.count + len(scheme)
@@ -524,26 +532,26 @@ class SchemeRows:
         return self._rows[name][: self.count]
 
     def mark_kept(self, rows: slice, around_ns: list[Bounds]) -> None:
-        """Mark those of some rows that lie within some times as never to be dropped."""
+        """Mark those of `rows` that lie within some times (first and last ns each) as never to be dropped."""
         t_ns, is_kept = self.column("t_ns")[rows], self.column("is_kept")[rows]
         for start_ns, end_ns in around_ns:
             is_kept[np.searchsorted(t_ns, start_ns) : np.searchsorted(t_ns, end_ns, side="right")] = True
 
     def drop(self, rows: Rows) -> int:
-        """Drop some rows; return how many."""
+        """Remove rows; return their number."""
         left = np.delete(self._rows[: self.count], rows)
         self.count = len(left)
         self._rows[: self.count] = left
         return len(rows)
 
     def run(self, shell: Run, rows: slice = slice(None)) -> Run:
-        """Return a run with all or some of these rows, else as `shell`."""
+        """Return `shell` with the cycles of all or some of the gathered rows."""
         columns = {name: self.column(name)[rows] for name in ("t_ns", *self._names)}
         return replace(shell, **_arrays(columns, shell.settings))
 
 
 def _arrays(columns: dict[str, NDArray[Any]], settings: Settings) -> dict[str, Any]:
-    """Return the fields of a run."""
+    """Return the fields of `Run` from columns of /scheme."""
     arrays: dict[str, Any] = {name: columns[name] for name in _PLAIN}
     arrays |= {"cycle": columns["cycle"].astype(np.int64), "t_ns": columns["t_ns"]}
     arrays["motion"] = MeasuredMotion(*(columns[name] for name in _MOTION))
@@ -566,10 +574,10 @@ def _arrays(columns: dict[str, NDArray[Any]], settings: Settings) -> dict[str, A
 
 
 def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[Run, Bounds]:
-    """Extend a stretch as little as needed to cut no contact and no adaptation.
+    """Extend a stretch so that it cuts no contact and no adaptation; return `shell` for reading it, and its bounds.
 
-    run: has the cycles in which contacts and adaptations begin or end. Returns what is known of the stretch before it
-    is read, and its bounds.
+    run: has the cycles in which contacts and adaptations begin or end. start_ns: beginning of the log. The returned
+    run has motion start, truth and stretch.
     """
     zero_ns = run.zero_ns
     first_s, last_s = ((bound_ns - zero_ns) * 1e-9 for bound_ns in stretch.bounds_ns(start_ns))

@@ -82,7 +82,7 @@ class Timeline:
 
 
 def stays_of(run: Run) -> list[Stay]:
-    """Split a run by its states."""
+    """Return the stretches of a run in one state each, in order of time."""
     if run.state.size == 0:
         return []
     edges = np.flatnonzero(run.state[1:] != run.state[:-1]) + 1
@@ -96,7 +96,7 @@ def stays_of(run: Run) -> list[Stay]:
 
 
 def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
-    """List warnings, errors, faults and false alarms by time; of too many, the bad ones stay."""
+    """Return warnings, errors, faults and false alarms by time; of too many, warnings are left out first."""
     notices = [
         Notice((t_ns - run.zero_ns) * 1e-9, event.level == "error", f"{event.name}: {event.message}")
         for t_ns, event in run.events
@@ -113,7 +113,7 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
 
 
 def certificates_of(run: Run) -> list[tuple[float, bool, list[str]]]:
-    """List when certificates were given or taken back, s, whether the latter, and their clauses, by time."""
+    """Return, for each certificate given or taken back: time, s, whether it was taken back, and its clauses."""
     return [
         ((t_ns - run.zero_ns) * 1e-9, event.name == "revoked", event.message.split("; "))
         for t_ns, event in run.events
@@ -122,13 +122,13 @@ def certificates_of(run: Run) -> list[tuple[float, bool, list[str]]]:
 
 
 def state_key(run: Run) -> list[tuple[str, str]]:
-    """Return colour and name of the states that the run has been in."""
+    """Return colour and name of each coloured state that the run has been in, as a key to the timeline."""
     there = {stay.state for stay in stays_of(run)}
     return [(colour, STATE_WORDS[state]) for state, colour in STATE_COLOURS.items() if state in there]
 
 
 def timeline_of(run: Run, metrics: Metrics) -> Timeline | None:
-    """Lay out the marks; None of a run without cycles."""
+    """Return the timeline of a run, with all marks placed; None for a run without cycles."""
     if run.state.size == 0:
         return None
     time_s, stays = run.time_s(), stays_of(run)
@@ -155,7 +155,7 @@ def _x(scale: _Scale, time_s: float) -> float:
 
 
 def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[list[Stay]]:
-    """Yield the stays as they are drawn: of many, those that are narrower than a mark together."""
+    """Yield the stays in groups, one mark each; of more than MARKS stays, narrow neighbours form a group."""
     group: list[Stay] = []
     for stay in stays:
         is_narrow = len(stays) > MARKS and _x(scale, stay.end_s) - _x(scale, stay.start_s) < _NARROWEST
@@ -244,7 +244,7 @@ def _ticks(scale: _Scale) -> Iterator[tuple[float, str]]:
 
 
 def traces_of(run: Run, metrics: Metrics) -> Traces | None:
-    """Pack the curves of a run, with its states, contacts and faults; None of a run of less than two cycles."""
+    """Return the curves of a run, packed, with states, contacts and bad notices; None with fewer than two cycles."""
     if run.cycle.size < 2:
         return None
     marks = {

@@ -80,7 +80,7 @@ class Track(NamedTuple):
 
 
 def panels_of(run: Run) -> tuple[TracePanel, ...]:
-    """List the panels that the run has something for."""
+    """Return the panels of a run's curves, without those for which it has no data."""
     return (*_residuals(run), *_motion(run), *_channels(run), *_parameters(run))
 
 
@@ -98,7 +98,7 @@ def _motion(run: Run) -> Iterator[TracePanel]:
 
 
 def _residuals(run: Run) -> Iterator[TracePanel]:
-    """Yield each joint's residual of every model against the thresholds."""
+    """Yield a panel per joint: the residual of every model, with its threshold and the true external torque."""
     finest = FINEST["Nm"]
     ours = "identified" if run.certified is None else "certified"
     for joint in range(JOINTS):
@@ -133,7 +133,7 @@ def _true_torque(run: Run) -> Vector:
 
 
 def _in_view(threshold: Vector, residual: Vector) -> Vector:
-    """Leave out the threshold where it is above every residual, as while a model is uncertain, or infinite."""
+    """Return a threshold (n,) with NaN where it is above all residuals and three times its smallest value."""
     largest = float(np.max(np.abs(residual[np.isfinite(residual)]), initial=0.0))
     finite = threshold[np.isfinite(threshold)]
     ceiling = max(largest, _NEAR * float(finite.min())) if finite.size else 0.0
@@ -141,7 +141,7 @@ def _in_view(threshold: Vector, residual: Vector) -> Vector:
 
 
 def _channels(run: Run) -> Iterator[TracePanel]:
-    """Yield the channels of the certified scheme's bank, and the largest part of its threshold that any reaches."""
+    """Yield panels of the bank's channels per joint, and of the largest ratio of a channel to its threshold."""
     stream = run.certified
     if stream is None:
         return
@@ -199,7 +199,10 @@ _TIMES: Final = ((LATENESS, "identified"), (COMPUTE, "joint1"), (SYNC_TO_COMMAND
 
 
 def timing_track(columns: CycleColumns, period_us: float, zero_ns: int, has_grid: bool) -> Track:
-    """Return the times, queues and skipped periods of the cycles, s since zero_ns; has_grid: not of lockstep."""
+    """Return a track of the cycles' times, queues and skipped periods over the time since `zero_ns`.
+
+    has_grid: False in lockstep, where lateness and queues are left out.
+    """
     panels = []
     for quantity, colour in _TIMES:
         values_us = columns.times_us(quantity)
@@ -223,7 +226,7 @@ def timing_track(columns: CycleColumns, period_us: float, zero_ns: int, has_grid
 
 
 def run_tracks(run: Run) -> list[Track]:
-    """Return the curves of a run: those of /scheme and those of /cycle."""
+    """Return the tracks of a run's curves: of the cycles in /scheme, and of those in /cycle."""
     is_next = None if run.bucket == 1 else np.diff(run.cycle, prepend=run.cycle[:1] - 2) == 1
     timing = timing_track(run.timing, run.settings.bus.period_us, run.zero_ns, is_realtime(run))
     return [Track("scheme", run.time_s(), panels_of(run), is_next), timing]
@@ -245,7 +248,7 @@ class Packed(NamedTuple):
 
 
 def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = None) -> float:
-    """Choose a step: half the standard deviation of a series' white noise, but no finer than `finest`.
+    """Return the step to round a series to: half the deviation of its white noise, but at least `finest`.
 
     is_next (n,): samples that follow the one before at once; None: all do.
     """
@@ -257,7 +260,7 @@ def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = N
 
 
 def pack(values: Vector, step: float) -> Packed:
-    """Pack a series (n,) in steps of `step`, or coarser where its range asks for more than 2^30 of them."""
+    """Return a series (n,) as text, rounded to `step`, or coarser if its range has more than 2^30 steps."""
     is_finite = np.isfinite(values)
     finite = values[is_finite]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
@@ -292,7 +295,7 @@ class Traces(NamedTuple):
 def pack_tracks(
     tracks: Sequence[Track], period_s: float, marks: dict[str, Any] | None = None, is_dated: bool = False
 ) -> Traces | None:
-    """Pack the curves of a page; None without any.
+    """Return the curves of a page, packed for its script; None if no track has two samples and a panel.
 
     period_s: eight of it are the shortest part that is shown. marks: bands, contacts and faults of the run. is_dated:
     the abscissa is the time since 1970.

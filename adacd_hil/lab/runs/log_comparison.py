@@ -61,22 +61,22 @@ class RunReader:
         return self._zero[1]
 
     def only(self, first: int, end: int) -> None:
-        """Limit the reading to the cycles between two numbers since motion start."""
+        """Limit the reading to the cycles from `first` to before `end`, counted since motion start."""
         self._bounds = first + self.zero_cycle, end + self.zero_cycle
 
     def _wanted(self, series: Series) -> Series:
-        """Return the records of the cycles that are to be read."""
+        """Return the records within the limits set by `only`; all without limits or a field `cycle`."""
         if self._bounds is None or "cycle" not in series.fields:
             return series
         cycle = series.records["cycle"].astype(np.int64)
         return series.part((cycle >= self._bounds[0]) & (cycle < self._bounds[1]))
 
     def _is_over(self, series: Series) -> bool:
-        """Return whether the reading has passed all cycles to compare."""
+        """Return whether the records begin after the last cycle set by `only`; False without limits."""
         return self._bounds is not None and bool(len(series)) and int(series.records["cycle"][0]) >= self._bounds[1]
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Yield the records of /scheme, piece by piece."""
+        """Yield the records of /scheme, piece by piece, and gather states, parameters, contacts and times."""
         zero_ns = self.zero_ns
         for piece in self._stream:
             if self._is_over(piece.series["/scheme"]):
@@ -126,7 +126,7 @@ class RunReader:
 
 
 def _reports(contacts: Series) -> Iterator[ContactReport]:
-    """Read the reports of /contact, of any version's enums."""
+    """Yield the records of /contact as reports, with the log's numbers for enums."""
     there = [name for name in ContactReport._fields if name in contacts.fields]
     for record in contacts.records:
         yield ContactReport(**{name: record[name].tolist() for name in there})
@@ -199,7 +199,7 @@ class LogComparison:
         return not self.fields and self.only == (0, 0)
 
     def by_key(self) -> dict[str, Any]:
-        """Return it by the keys of `compare --json`."""
+        """Return the comparison by the keys of `compare --json`."""
         runs = [
             {
                 "log": run.path,
@@ -242,7 +242,7 @@ class _Differences:
         self._zero_cycle = zero_cycle
 
     def take(self, first: NDArray[Any], second: NDArray[Any], since: NDArray[np.int64]) -> None:
-        """Compare rows of equal cycles since motion start (n,)."""
+        """Add the differences between the two logs' rows of the same cycles; since (n,): cycles since motion start."""
         names, others = _fields(first), _fields(second)
         self.missing |= set(names) ^ set(others)
         for name in names:
@@ -345,12 +345,15 @@ def _walk_together(
 
 
 def _next_rows(stream: Iterator[NDArray[Any]]) -> NDArray[Any] | None:
-    """Return the next rows that there are; None at the end."""
+    """Return the next array of the stream that isn't empty; None at its end."""
     return next((rows for rows in stream if len(rows)), None)
 
 
 def match_contacts(first: list[Contact], second: list[Contact]) -> list[ContactPair]:
-    """Match detections by time, the nearest ones first; others stand alone. In order of time."""
+    """Return pairs of contacts of two runs, in order of time, None in place of a missing partner.
+
+    Matches detections within MATCH_S of each other, the nearest ones first.
+    """
     order = sorted(range(len(second)), key=lambda k: second[k][0])
     times_s = [second[k][0] for k in order]
     distances = []

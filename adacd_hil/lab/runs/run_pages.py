@@ -39,7 +39,7 @@ class ListedRun(NamedTuple):
 
 
 def runs_page(folder: Path, listed: Sequence[ListedRun]) -> str:
-    """Write the list, which lies in `folder`."""
+    """Return the page with the list of runs; links to the reports are relative to `folder`."""
     runs = [each.run for each in listed]
     count = count_text(runs)
     return render_page(
@@ -59,7 +59,7 @@ def _place(folder: Path, report: Path | None) -> str:
 
 
 def trend_page(found: Sequence[Trend]) -> str:
-    """Write a page with a section for each arm."""
+    """Return the page with the trends, a section for each arm."""
     sections = [
         (trend, f"trend{number}", _changes_table(trend), _runs_table(trend)) for number, trend in enumerate(found)
     ]
@@ -78,7 +78,7 @@ def trend_page(found: Sequence[Trend]) -> str:
 
 
 def _track_of(trend: Trend, name: str) -> Track:
-    """Return thresholds, friction, offsets and margins over the dates of the runs."""
+    """Return a track with the curves of thresholds, friction, offsets and margins over the dates of the runs."""
     dated = [row for row, run in enumerate(trend.runs) if run.started is not None]
     at_s = [run.started.timestamp() for run in trend.runs if run.started is not None]
     panels = []

@@ -129,7 +129,10 @@ def _has_run(folder: Path, names: Sequence[str]) -> bool:
 
 
 def summarise(folder: Path, name: str = "") -> RunSummary:
-    """Sum up the run in a folder, in some milliseconds if it has a report. Never raises."""
+    """Return the summary of the run in a folder, from its report if it has one, else from its log's events.
+
+    name: of the run in the list; "": the folder's. Never raises: status BROKEN or RUNNING tells of problems.
+    """
     log = folder / LOG_NAME
     started, started_by = _started(log)
     broken = RunSummary(folder.resolve().name if name in ("", ".") else name, log, BROKEN, "", started, started_by)
@@ -152,7 +155,7 @@ def summarise(folder: Path, name: str = "") -> RunSummary:
 
 
 def _figured(headed: RunSummary, info: LogInfo) -> RunSummary:
-    """Add the figures: of the report, else of the events."""
+    """Return the summary with the figures of the run's report, or else of the log's events."""
     try:
         table = _report_of(headed.log.parent, info)
         return _unjudged(headed, "") if table is None else _with_report(headed, table)
@@ -163,7 +166,10 @@ def _figured(headed: RunSummary, info: LogInfo) -> RunSummary:
 
 
 def judged(summary: RunSummary) -> RunSummary:
-    """Read the whole log of a run that is not judged, and judge it, against the emulator's truth where it has one."""
+    """Return the summary with the judge's figures: reads the whole log, and the emulator's truth if there is one.
+
+    Returns summaries of another status than NOT_JUDGED unchanged; a log that can't be judged gets BROKEN.
+    """
     from adacd_hil.lab.report.report_json import report_json
     from adacd_hil.lab.report.run_reading import read_run  # it compiles
     from adacd_hil.lab.score.evaluation import evaluate
@@ -179,7 +185,7 @@ def judged(summary: RunSummary) -> RunSummary:
 
 
 def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:
-    """Sum up a report of the run in a folder, whichever part of the log it is of. table: as in report.json."""
+    """Return the summary of a run with the figures of a report, even one of a stretch. table: as in report.json."""
     log = folder / LOG_NAME
     empty = RunSummary(name, log, BROKEN, "")
     try:
@@ -197,7 +203,7 @@ def _settings(log: Path) -> Settings | None:
 
 
 def _headed(summary: RunSummary, info: LogInfo, settings: Settings | None) -> RunSummary:
-    """Add the figures of the log's head and end."""
+    """Return the summary with the data of a log's metadata and settings: date, arm, duration and such."""
     said = info.metadata
     config, profile = said.get("config", ""), said.get("profile", "")
     started, started_by = _started(summary.log, info.start_ns if info.metadata.get(EPOCH_KEY, "0") != "0" else 0)
@@ -217,7 +223,10 @@ def _headed(summary: RunSummary, info: LogInfo, settings: Settings | None) -> Ru
 
 
 def _started(log: Path, start_ns: int = 0) -> tuple[datetime | None, str]:
-    """Return when a run began, local time, and the source. start_ns: by the log, 0 in lockstep, which has no date."""
+    """Return when a run began, local time, and the source: "log", "folder" (its name) or "file"; (None, "") if unknown.
+
+    start_ns: by the log; 0 in lockstep, which has no date.
+    """
     try:
         if start_ns:
             return datetime.fromtimestamp(start_ns // 1_000_000_000).astimezone(), "log"
@@ -259,7 +268,10 @@ def _damage(error: BaseException) -> str:
 
 
 def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
-    """Add the figures of a log's events."""
+    """Return the summary as NOT_JUDGED, with contacts and certificate of the log's events; BROKEN for a damaged log.
+
+    problem: why the report is not used; it begins the verdict.
+    """
     try:
         info = read_info(summary.log)
     except LogError as error:
@@ -280,7 +292,7 @@ def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
 
 
 def _told_certificate(info: LogInfo) -> CertificateState:
-    """Find the last certificate in the events."""
+    """Return the state of the last certificate that the log's events tell of."""
     found = CertificateState(NO_CERTIFICATE, None)
     start_ns: int | None = None
     for t_ns, event in info.milestones:
@@ -296,7 +308,7 @@ def _told_certificate(info: LogInfo) -> CertificateState:
 
 
 def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
-    """Add the figures of a report. A damaged one raises LookupError, TypeError, ValueError, AttributeError."""
+    """Return the summary with the figures of a report. Raises one of _DAMAGES if the report is damaged."""
     log, certified = table["log"], table["certified"]
     is_good = _flag(table["is_clean"]) and _flag(log["is_complete"])
     missing = f" The log is not whole: {_text(log['problem'])}" if log["problem"] else ""
@@ -332,7 +344,7 @@ def _sections(table: Mapping[str, Any], kind: str) -> list[Mapping[str, Any]]:
 
 
 def _first_adaptation(table: Mapping[str, Any]) -> str | None:
-    """Name the section with the first model that was certified or identified."""
+    """Return the label of the first complete adaptation in a report, None without one."""
     return next((_text(each["label"]) for each in _sections(table, "adaptation") if _flag(each["is_complete"])), None)
 
 
@@ -361,7 +373,7 @@ def _first_model(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _identified_friction(parameters: Mapping[str, Any], section: str | None) -> Pair | None:
-    """Return the friction that the paper's scheme has identified, without deviation."""
+    """Return the friction at FRICTION_AT_RAD_S that the paper's scheme identified in a section, Nm; None if unknown."""
     if section is None or section not in parameters:
         return None
     values = {name: _number(pair[1]) for name, pair in parameters[section].items()}
@@ -373,7 +385,7 @@ def _identified_friction(parameters: Mapping[str, Any], section: str | None) -> 
 
 
 def _number(value: Any) -> float | None:
-    """Take a number. Raises TypeError for any other value."""
+    """Return a value of a report as float, None if null or not finite. Raises TypeError if it is no number."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):

@@ -105,17 +105,17 @@ class RunFilter:
 
 
 def is_arm(run: RunSummary, arm: str) -> bool:
-    """Return whether a run is of an arm: its name in the list, its configuration, or a pattern such as `lab-*`."""
+    """Return whether a run's arm or configuration has the name `arm`, which may be a pattern such as `lab-*`."""
     return any(name and fnmatch.fnmatchcase(name, arm) for name in (run.arm, run.config))
 
 
 def in_order(runs: Iterable[RunSummary]) -> list[RunSummary]:
-    """Sort runs by their beginnings, the oldest first; those without a date come before."""
+    """Return runs sorted by their beginnings, the oldest first; those without a date come before."""
     return sorted(runs, key=lambda run: (run.started is not None, run.started and run.started.timestamp(), run.name))
 
 
 def count_text(runs: Sequence[RunSummary]) -> str:
-    """Return a phrase with the number of runs and of those that are not good."""
+    """Return a phrase with the number of runs, and of those not good, not judged and still running."""
     text = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     bad = sum(run.status not in (GOOD, NOT_JUDGED, RUNNING) for run in runs)
     parts = [f"{bad} not good"] if bad else []
@@ -153,7 +153,7 @@ def certificate_text(run: RunSummary) -> str:
 
 
 def _flat(column: Column) -> list[str]:
-    """Name a column, or those of each joint."""
+    """Return the name of a column in CSV and Parquet, or two names for a value per joint."""
     if not column.joints:
         return [column.name]
     stem, unit = column.name.rsplit("_", 1)
@@ -166,7 +166,7 @@ def _values(column: Column, run: RunSummary) -> Sequence[Any]:
 
 
 def as_csv(runs: Sequence[RunSummary]) -> str:
-    """Write the table as CSV."""
+    """Return the table of runs as CSV, with the head of COLUMNS."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow([name for column in COLUMNS for name in _flat(column)])
@@ -175,7 +175,7 @@ def as_csv(runs: Sequence[RunSummary]) -> str:
 
 
 def write_parquet(runs: Sequence[RunSummary], path: Path) -> None:
-    """Write the table as Parquet, in one step. Raises LogError without pyarrow, or when it can't be written."""
+    """Write the table of runs as Parquet, in one step. Raises LogError without pyarrow, or if it can't be written."""
     arrow, parquet = import_pyarrow()
     columns: Mapping[str, Any] = {
         name: arrow.array([_values(column, run)[place] for run in runs], type=getattr(arrow, column.kind)())

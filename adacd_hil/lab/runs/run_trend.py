@@ -103,7 +103,10 @@ class Trend:
 
 
 def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE) -> list[Trend]:
-    """Make the trend of each arm among judged runs, by name of the arm. Those that are not judged are left out."""
+    """Return the trend of each arm, sorted by name; runs that are not judged are listed as left out.
+
+    threshold_share: share of a threshold from which a difference counts as a change.
+    """
     by_arm: dict[str, list[RunSummary]] = {}
     for run in in_order(runs):
         by_arm.setdefault(arm_of(run), []).append(run)
@@ -111,7 +114,7 @@ def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE)
 
 
 def arm_of(run: RunSummary) -> str:
-    """Name the arm of a run; one that was emulated in the host's process is another."""
+    """Return the name of a run's arm; ", emulated" is added if it was emulated in the host's process."""
     return f"{run.arm or 'unknown arm'}{', emulated' if run.interface == EMBEDDED else ''}"
 
 
@@ -151,7 +154,10 @@ def _columns(pairs: Sequence[tuple[float, float] | None]) -> Vector:
 
 
 def _changes(runs: Sequence[RunSummary], values: Vector, std: Vector, share: float | None) -> tuple[TrendChange, ...]:
-    """Find the runs whose value differs too much from the first one since the last change; share: of that value."""
+    """Return the runs whose value differs too much from the first one since the last change, for each joint.
+
+    share: of that first value; None: compare by deviations `std`, LAST_SIGMAS.
+    """
     found: list[TrendChange] = []
     for joint in range(JOINTS):
         first: int | None = None

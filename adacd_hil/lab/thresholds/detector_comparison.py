@@ -81,7 +81,7 @@ class Comparison:
         }
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-        """Return head and rows for a terminal, best detector first; a dash if fewer than half are found."""
+        """Return head and rows of the table for a terminal, best detector first; a dash: median step not found."""
         head = ("detector", "joint", *(f"{torque:g} Nm" for torque in STEPS_NM), f"found at {STEPS_NM[0]:g} Nm")
         order = {name: place for place, name in enumerate(self.ranking)}
         rows = [
@@ -157,7 +157,11 @@ def _ratios(
     before: int,
     after: int,
 ) -> Vector:
-    """Return the largest ratio of statistic to threshold since the onset (detectors, onsets, after, n)."""
+    """Return each detector's largest ratio of statistic to threshold since the onset (detectors, onsets, after, n).
+
+    found: as from `calibrate_all`. starts: first sample of each stretch of `before` samples without and `after`
+    samples with a step of `torque_Nm`; phases_s: time from the sample to the onset.
+    """
     period_s = statistics.motion.period_s
     largest = np.zeros((len(found), len(starts), after, JOINTS))
     for k, (start, phase_s) in enumerate(zip(starts.tolist(), phases_s.tolist(), strict=True)):
@@ -173,7 +177,7 @@ def _ratios(
 
 
 def _delays_ms(ratios: Vector, phases_s: Vector, period_s: float) -> Vector:
-    """Turn the ratios since the onset (..., onsets, after, n) into delays (..., onsets, n), ms; infinite if late."""
+    """Return delays (..., onsets, n), ms, from the ratios since the onset (..., onsets, after, n); inf: not found."""
     over = ratios > 1.0
     first = over.argmax(axis=-2) * period_s - phases_s[:, None]
     return np.where(over[..., -1, :], np.maximum(first, 0.0) * 1e3, _LATE)

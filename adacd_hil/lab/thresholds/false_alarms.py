@@ -79,17 +79,17 @@ class Tail:
 
 
 def _rates(excess: float, scale: Vector | float, shape: Vector | float, rate_per_h: Vector | float) -> Vector:
-    """Return the alarms per hour of tails at an excess over their level; 0 beyond the end of a tail."""
+    """Return the alarms per hour that tails predict at an excess over their level; 0 past the end of a tail."""
     return np.asarray(np.nan_to_num(rate_per_h / inv_boxcox(max(excess, 0.0) / scale, shape)))
 
 
 def _excesses(wanted_per_h: float, scale: Vector | float, shape: Vector | float, rate_per_h: Vector | float) -> Vector:
-    """Return the excess over their level at which tails have the wanted rate."""
+    """Return the excess over their level at which tails predict the wanted rate; 0 for a rate above the level's."""
     return np.asarray(scale * boxcox(np.maximum(rate_per_h / wanted_per_h, 1.0), shape))
 
 
 def _moments_fit(excesses: Vector) -> tuple[Vector, Vector]:
-    """Fit scale and shape to excesses (..., m), sorted along the last axis, by probability-weighted moments."""
+    """Return scale and shape of tails by probability-weighted moments; excesses (..., m): sorted along last axis."""
     count = excesses.shape[-1]
     weights = 1.0 - (np.arange(1, count + 1) - 0.35) / count
     first = excesses.mean(axis=-1)
@@ -106,7 +106,7 @@ def counted_hours(peaks: Vector) -> float:
 
 
 def threshold_by_count(peaks: Vector, alarms: float) -> float:
-    """Find the lowest threshold with at most that many alarms in the recording."""
+    """Return the lowest threshold that gives at most `alarms` alarms in block maxima (B,)."""
     low, high = float(np.nanmin(peaks)), float(np.nanmax(peaks))
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
@@ -118,7 +118,10 @@ def threshold_by_count(peaks: Vector, alarms: float) -> float:
 
 
 def fit_tail(peaks: Vector) -> Tail:
-    """Fit the tail of block maxima (B,). Raises TooLittleMotionError with fewer than 25 clusters to fit."""
+    """Return the tail fitted to block maxima (B,), NaN where not free.
+
+    Raises TooLittleMotionError if motion or separate alarms are too few.
+    """
     hours = counted_hours(peaks)
     least, most = FITTED_CLUSTERS
     if hours * _S_PER_H < 4.0 * least * CLUSTER_S or float(np.nanmax(peaks)) <= float(np.nanmin(peaks)):
@@ -153,7 +156,7 @@ class TailCalibration:
 
 
 def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
-    """Find the threshold for a rate, with one-sided confidence bounds, from block maxima (B,).
+    """Return the threshold for a rate of false alarms, with one-sided confidence bounds, from block maxima (B,).
 
     Raises TooLittleMotionError.
     """
@@ -182,8 +185,9 @@ def largest_ratio(peaks: Vector, thresholds: Vector) -> Vector:
 
 
 def calibrate_detector(peaks: Vector, rate_per_h: float) -> tuple[Vector, TailCalibration]:
-    """Find the thresholds (channels, n) of a detector, which alarms on any channel and joint; peaks (B, channels, n).
+    """Return a detector's thresholds (channels, n) for a rate of alarms on any channel and joint, and the calibration.
 
+    peaks (B, channels, n): block maxima.
     The calibration is of all of them together: of the largest ratio of statistic to threshold; its `threshold` is 1.
     Raises TooLittleMotionError.
     """
@@ -197,7 +201,7 @@ def calibrate_detector(peaks: Vector, rate_per_h: float) -> tuple[Vector, TailCa
 
 
 def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[float, float]:
-    """Return the gains of the filter for white noise of 1 per sample: of the torque, Nm per Nm, and of the momentum.
+    """Return the gains of a low-pass filter of the stream for white noise: of the torque, Nm per Nm, and the momentum.
 
     The second is in Nm per kg m² rad/s. The stream takes the mean of two torques minus lag times their slope.
     """
@@ -210,7 +214,7 @@ def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[
 
 
 def peak_factor(rate_per_h: float, bandwidth_rad_s: float) -> float:
-    """Return the number of standard deviations that Gaussian noise of a bandwidth exceeds so often (Rice's formula)."""
+    """Return the number of standard deviations that Gaussian noise exceeds `rate_per_h` times an hour (Rice)."""
     crossings_per_h = 2.0 * bandwidth_rad_s / (2.0 * math.pi) * _S_PER_H
     return math.sqrt(2.0 * math.log(max(crossings_per_h / rate_per_h, math.e)))
 
@@ -238,10 +242,9 @@ def find_limits(
     lag_s: float,
     rate_per_h: float,
 ) -> tuple[dict[str, float], float]:
-    """Split the threshold of a low-pass channel of one joint by its causes, from contact-free motion (N,).
+    """Return the threshold of a joint's low-pass channel by cause, each alone, and with an exact model, Nm.
 
-    Returns the threshold that each cause alone would need, Nm, and the threshold with an exact model, lag and friction:
-    all noise and resolution together.
+    From contact-free motion (N,). With exact model, lag and friction, only noise and resolution need a threshold.
 
     Random causes count with the height that Gaussian noise exceeds at the wanted rate. The rest of the stream while the
     joint moves is model error. An error of the lag counts with the steepest torque, one of the friction as it is;

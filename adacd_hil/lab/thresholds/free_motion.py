@@ -68,7 +68,7 @@ class LoggedMotion:
     level_rad: float = 0.0
 
     def pieces(self) -> Iterator[Motion]:
-        """Read the samples, in order. Raises LogError."""
+        """Yield the samples, read from the log piece by piece, in order. Raises LogError."""
         place, before = 0, None
         for scheme in schemes(self.path, self.bounds_ns):
             end = place + len(scheme)
@@ -101,7 +101,9 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
 def read_motion(
     path: Path, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None, watch: Watch = lambda _: None
 ) -> LoggedMotion:
-    """Find the contact-free motion in a log, or in a stretch of it. Raises LogError without any.
+    """Return the motion in a log, or in a stretch of it, with its contact-free samples marked.
+
+    Raises LogError if none is free of contact.
 
     watch: called with each piece of its /scheme.
     """
@@ -162,7 +164,7 @@ def _intervals(scheme: Any, cycle: NDArray[np.int64], before: int | None, period
 
 
 def _spread(is_bad: Mask, samples: int) -> Mask:
-    """Mark the samples that have a bad one within so many samples."""
+    """Return the mask of the samples with a bad one at most `samples` away."""
     spread = maximum_filter1d(is_bad.view(np.uint8), 2 * samples + 1, mode="constant", cval=0)
     return np.asarray(spread.view(np.bool_))
 
@@ -199,7 +201,7 @@ def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
 
 
 def _windows(logs: Sequence[LoggedMotion]) -> list[Mask]:
-    """Choose samples of each log (N,)."""
+    """Return the mask (N,) of each log's samples to process: all, or windows with free motion, evenly spread."""
     if sum(len(log.is_free) for log in logs) <= MOST_SAMPLES:
         return [np.ones(len(log.is_free), np.bool_) for log in logs]
     has_free = [np.logical_or.reduceat(log.is_free, np.arange(0, len(log.is_free), WINDOW)) for log in logs]
@@ -215,7 +217,10 @@ def _windows(logs: Sequence[LoggedMotion]) -> list[Mask]:
 
 
 def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
-    """Take some samples; a sample whose predecessor is not taken follows a gap, and is not free."""
+    """Return the samples of `rows`; one whose predecessor is not among them is marked as after a gap and as not free.
+
+    was_chosen: whether the sample before the motion was taken.
+    """
     if rows.all() and was_chosen:
         return motion
     is_first = rows & ~np.concatenate(([was_chosen], rows[:-1]))
@@ -226,7 +231,7 @@ def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
 def torque_streams(
     pieces: Iterable[Motion], lag_s: float, standstill_rad_s: float
 ) -> Iterator[tuple[Motion, tuple[Vector, Vector]]]:
-    """Yield each piece of a motion with its stream of `lab.detectors.detectors`.
+    """Yield each piece of a motion with the stream on which the detectors of `lab.detectors.detectors` run.
 
     The stream: z, and the torque that friction may hold, (n, 2) each, Nm.
     """

@@ -42,7 +42,7 @@ _CHECKED_ALARMS: Final = 20.0  # alarms in the held-out half that are enough to 
 
 
 def find_lag(motion: Motion) -> tuple[float, Vector]:
-    """Identify the velocity's lag behind the torque, s: of both joints together, and of each (n,); from 0 to 5 ms.
+    """Return the velocity's lag behind the torque, s, from 0 to 5 ms: of both joints together, and of each (n,).
 
     If the torque never changes, the default lag is returned.
     """
@@ -89,7 +89,7 @@ class Statistics:
 def run_detectors(
     logs: Sequence[LoggedMotion], settings: detectors.DetectorBankSettings, progress: Progress = lambda _: None
 ) -> Statistics:
-    """Run every detector over the motion of logs. Raises LogError, TooLittleMotionError."""
+    """Run every detector over the motion of logs and return their statistics. Raises LogError, TooLittleMotionError."""
     motion = sample_of(logs)
     lag_s, lag_of_joint_s = find_lag(motion)
     _, (z, held_Nm) = next(torque_streams([motion], lag_s, settings.standstill_rad_s))
@@ -112,7 +112,10 @@ def _peaks(
     settings: detectors.DetectorBankSettings,
     progress: Progress,
 ) -> Vector:
-    """Run the detectors over all motion, the logs one after the other (B, channels, n); NaN unless a block is free."""
+    """Return the largest statistic per block, channel and joint (B, channels, n) over the logs, one after the other.
+
+    NaN in blocks that are not wholly free of contact.
+    """
     block = round(BLOCK_S / logs[0].period_s)
     free = np.concatenate([log.is_free for log in logs])
     peaks = np.zeros((-(-len(free) // block), len(settings.channels), JOINTS))
@@ -195,7 +198,10 @@ def calibrate_all(
 
 
 def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence[str] = ()) -> Thresholds:
-    """Calibrate all detectors. Raises TooLittleMotionError."""
+    """Return thresholds of all detectors for a rate of false alarms, with bounds, checks and causes.
+
+    logs: names of the logs, stored in the result. Raises TooLittleMotionError if no detector's tail can be fitted.
+    """
     calibrated, missing = calibrate_all(statistics, rate_per_h)
     rows, channels = [], []
     limits = channel_limits(statistics, rate_per_h)
@@ -240,7 +246,10 @@ def check_prediction(peaks: Vector) -> tuple[float, float] | None:
 
 
 def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple[tuple[str, ...], tuple[float, ...]]]:
-    """Return, per low-pass channel, the largest cause of its threshold and what an exact model needs, per joint."""
+    """Return, by low-pass channel, the largest cause of its threshold, and the threshold with an exact model, Nm.
+
+    Both per joint.
+    """
     settings, motion, free = statistics.settings, statistics.motion, statistics.is_free
     places = np.flatnonzero(free)
     masses = np.array([mass_matrix(motion.q[k], motion.theta[k]) for k in places[:: max(1, places.size // 200)]])
@@ -292,7 +301,7 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
 def thresholds_of_logs(
     paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None
 ) -> tuple[Thresholds, Statistics]:
-    """Read logs, or a stretch of each, and calibrate all detectors on their contact-free motion.
+    """Return all detectors' thresholds from the contact-free motion of logs, or of a stretch of each, and statistics.
 
     Raises LogError for a log that can't be used, TooLittleMotionError if all together are too short.
     """

@@ -157,7 +157,7 @@ class Search:
         )
 
     def overshoot(self, excitation: ExcitationSettings) -> float:
-        """Return the part by which a motion is over the limit that it keeps worst; 0 or less: it keeps all."""
+        """Return by which share of a limit a motion exceeds it, at worst; 0 or less: the motion keeps all limits."""
         motion = self.move(np.array(excitation.cosine), np.array(excitation.sine))
         return max(float(used.max()) for used in self._used(motion, self._regressors(motion))) - 1.0
 
@@ -168,7 +168,7 @@ class Search:
         progress: Callable[[str], None] = lambda _: None,
         iterations: int = ITERATIONS,
     ) -> ExcitationSettings:
-        """Search and return the best motion found, never a worse one than the present.
+        """Search for an excitation; return the best motion found, never a worse one than the present.
 
         goes_on: asked with the number of climbs so far whether there is to be another; the first is always made. The
         climbs are those of `seed`, in order, however many. Raises NoExcitationError.
@@ -207,7 +207,7 @@ class Search:
         return ExcitationSettings(self._period_s, *rows)  # type: ignore[arg-type]  # JOINTS rows each
 
     def _complete(self, free: Vector) -> tuple[Vector, Vector]:
-        """Return cosine and sine (2, K) of which all but the first harmonic are given, so that it begins at rest."""
+        """Return cosine and sine (2, K) of a motion from rest; free: its harmonics from the second on, flat."""
         cosine, sine = free.reshape(2, JOINTS, -1)
         order = self._order[1:]
         return (
@@ -237,7 +237,7 @@ class Search:
         return W
 
     def _used(self, motion: Vector, W: Vector) -> list[Vector]:
-        """Return which part of each limit is used, (N, 2) each."""
+        """Return the share of each limit that a motion uses at each sample, (N, 2) per limit; over 1: exceeded."""
         parts = [np.abs(value) / limit for value, limit in zip(motion, self.limits[:3], strict=True)]
         return parts if self._theta is None else [*parts, np.abs(W @ self._theta) / self.limits.torque_Nm]
 

@@ -110,7 +110,10 @@ class Plan:
 def plan_logs(
     logs: Sequence[Path], variants: Sequence[Mapping[str, str]], config: str, profile: str, version: str
 ) -> Plan:
-    """Plan replays of logs. Raises OSError when one can't be looked at."""
+    """Return the plan of a sweep that replays each log with each variant of the settings.
+
+    Raises OSError if a log's size and date can't be read.
+    """
     subjects = []
     for path in logs:
         status = path.stat()
@@ -126,7 +129,7 @@ def plan_scenarios(
     profile: str,
     version: str,
 ) -> Plan:
-    """Plan runs of the emulated arm."""
+    """Return the plan of a sweep that runs the emulated arm with each scenario, seed and variant of the settings."""
     subjects = (Subject(scenario=scenario, seed=seed) for scenario in scenarios for seed in seeds)
     return Plan(tuple(dict.fromkeys(subjects)), _tuples(variants), config, profile, version)
 
@@ -145,7 +148,7 @@ Values = dict[str, Value]
 
 
 def row_labels(subject: Subject, row: SweepRow) -> Values:
-    """Name a row: its key, its subject, and the settings that are varied."""
+    """Return the columns that identify a row: its key, its subject, and its varied settings."""
     changes: Mapping[str, str] = dict(row.changes)
     return {
         "key": row.key,
@@ -157,12 +160,12 @@ def row_labels(subject: Subject, row: SweepRow) -> Values:
 
 
 def failed(subject: Subject, row: SweepRow, error: str) -> Values:
-    """Make the row of a failed task, with its error."""
+    """Return the row of a task that failed, with its error in one line."""
     return row_labels(subject, row) | {"status": "failed", "error": " ".join(error.split())}
 
 
 def replay_task(task: Task) -> list[Values]:
-    """Replay a log with the settings of each row; it is decoded once for all of them."""
+    """Replay a log with the settings of each row; return a row of results or of an error for each, in order."""
     subject = task.subject
     path = Path(subject.log)
     found: dict[str, Values] = {}
@@ -184,7 +187,7 @@ def replay_task(task: Task) -> list[Values]:
 
 
 def _replay_all(path: Path, variants: list[Settings]) -> list[Replay | str]:
-    """Replay with each of the settings, or say why one can't be."""
+    """Return the replay of a log with each of the settings, or the error's text in place of one that is refused."""
     try:
         return list(replay_many(path, variants))
     except REFUSALS as refusal:
@@ -194,7 +197,7 @@ def _replay_all(path: Path, variants: list[Settings]) -> list[Replay | str]:
 
 
 def finished(subject: Subject, row: SweepRow, found: Replay) -> Values:
-    """Make a row of a replay."""
+    """Return the row of results of a replay."""
     score = found.score
     delays_ms = () if score is None else score.delays_ms
     took_s = found.adaptation_s
@@ -251,13 +254,16 @@ class SweepStore:
         return frozenset(keys)
 
     def write_part(self, rows: Iterable[Values]) -> None:
-        """Write a part."""
+        """Write rows as the next part of the folder."""
         path = self._parts / f"{self._next:06d}.parquet"
         self._next += 1
         _write(self._parquet, path, _table(list(rows)))
 
     def join(self, keys: Iterable[str], about: Mapping[str, str]) -> Path:
-        """Write the table of these rows in this order, the last result of each; return its path."""
+        """Write the table of the rows with these keys, in this order, and the plan `about`; return the table's path.
+
+        Of several results of a row, the last good one counts, else the last. Keys without a result are left out.
+        """
         rows: dict[str, Values] = {}
         for path in self._paths():
             for row in self._read(path).to_pylist():
@@ -325,7 +331,10 @@ def run_sweep(
     progress: Progress,
     rows_per_task: int = ROWS_PER_TASK,
 ) -> SweepOutcome:
-    """Compute the rows that the store lacks. Raises LogError when the cluster is lost."""
+    """Compute the rows of a plan that the store lacks, and write them to it every few seconds.
+
+    Raises LogError if the cluster is lost.
+    """
     clock = MonotonicClock()
     begin_ns = written_ns = clock.now_ns()
     done = store.done()
@@ -405,7 +414,10 @@ class _Flights:
         return next(self._tasks, None)
 
     def _land_broken(self) -> Iterator[list[Values]]:
-        """Take the tasks out of flight that ended as a worker died."""
+        """Replace dead workers, and queue the tasks that ended with them to be tried again.
+
+        Yields the rows of a task that has failed too often.
+        """
         self._progress("a worker process has died: killed, or out of memory")
         self._workers.replace_dead()
         wait(self._flying)
@@ -417,7 +429,7 @@ class _Flights:
             yield from self._fail(tasks[0], "the worker process died each time", self._suspects)
 
     def _fail(self, task: Task, error: str, again: deque[Task]) -> Iterator[list[Values]]:
-        """Try a task again, or give rows that say why it failed."""
+        """Queue a task in `again`; after RETRIES, yield its rows with the error instead."""
         self._failures[task] += 1
         if self._failures[task] <= RETRIES:
             again.append(task)

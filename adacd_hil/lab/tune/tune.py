@@ -71,7 +71,9 @@ def tune(
     progress: Progress,
     stretch: TimeWindow = WHOLE,
 ) -> Tuning:
-    """Find thresholds, filter and gain. config: name or file of the settings to start from.
+    """Find thresholds, filter and gain for a rate of false alarms from logs.
+
+    config: name or file of the settings to start from.
 
     stretch: of each log; the replays begin with the log, and only their results in the stretch count.
 
@@ -111,7 +113,10 @@ def _choices(
     progress: Progress,
     notes: list[str],
 ) -> tuple[list[Changes], list[Choice]]:
-    """Choose thresholds for each filter and gain; drop, with a note, those that never monitor contact-free motion."""
+    """Return filters and gains with the thresholds chosen for each; drop, with a note, those without free motion.
+
+    Appends to `notes`. Raises TooLittleMotionError if the unchanged settings have none.
+    """
     chosen: list[tuple[Changes, Choice]] = []
     for changes, observed in zip(tried, observe_candidates(logs, tried, progress), strict=True):
         try:
@@ -124,7 +129,10 @@ def _choices(
 
 
 def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: Progress) -> list[TuningOutcome]:
-    """Replay all logs with each of the variants. Raises LogError, ConfigError, CodecError."""
+    """Replay all logs with each variant of the settings; return the outcome of each.
+
+    Raises LogError, ConfigError, CodecError.
+    """
     results: list[list[tuple[TunedLog, Replay]]] = [[] for _ in variants]
     for log in logs:
         progress(f"replaying {log.path} with the thresholds found")
@@ -174,9 +182,9 @@ def problems_of(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate
 
 
 def best_of(judged: Sequence[Candidate]) -> Candidate | None:
-    """Return the fit candidate with the smallest median delay of the half that thresholds are chosen on.
+    """Return the fit candidate with the smallest median delay in the half to choose on; None if none is fit.
 
-    Of a rate that is extrapolated too far, only the logs' own filter and gain, which come first, are looked at.
+    If the rate is extrapolated more than FARTHEST-fold, only the first one is considered: the logs' filter and gain.
     """
     looked_at = judged[:1] if judged[0].choice.extrapolation > FARTHEST else judged
     fit = [candidate for candidate in looked_at if not candidate.problems]
@@ -190,7 +198,9 @@ def _delays(candidate: Candidate) -> tuple[float, ...]:
 
 
 def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
-    """Find the configuration that a suggestion extends. config: as the user named it; None: the log's own.
+    """Return name and settings of the configuration that a suggestion extends.
+
+    config: as the user named it; None: the log's own.
 
     Raises ConfigError when the log's own isn't one that comes with the package.
     """
@@ -201,7 +211,10 @@ def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
 
 
 def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settings) -> str:
-    """Write a suggestion as TOML that `load_settings` reads."""
+    """Return a suggestion as TOML that `load_settings` reads, with its origin in comments.
+
+    base_name, base: of the configuration that it extends, as from `base_of`.
+    """
     own = tuning.logs[0].settings
     differing = [key for key in changed_keys(keep_facts(own, base), own) if key != "name"]
     lines = [*_provenance(tuning, best)]

@@ -39,7 +39,7 @@ Places = NDArray[np.int64]
 
 
 def candidates(settings: Settings) -> list[Changes]:
-    """List the changes of filter and gain to try, the unchanged settings first. Leaves out invalid settings."""
+    """Return the changes of filter and gain to try, {} first: the unchanged settings. Leaves out invalid settings."""
     tried: list[Changes] = []
     for filter_factor in _FILTER_FACTORS:
         for gain_factor in _GAIN_FACTORS:
@@ -57,7 +57,10 @@ def candidates(settings: Settings) -> list[Changes]:
 
 
 def _filter(settings: Settings, factor: float) -> Changes:
-    """Change the cut-offs; of the paper's filter b, too, which keeps its gain at rest."""
+    """Return the changed settings that multiply the filter's cut-offs by `factor`.
+
+    The paper's filter: a and b, so its gain at rest stays.
+    """
     if settings.scheme == "certified":
         return {"certified.cutoffs_rad_s": in_toml([factor * each for each in settings.certified.cutoffs_rad_s])}
     pair = {"a_rad_s": settings.filter.a_rad_s, "b_rad_s": settings.filter.b_rad_s}
@@ -75,14 +78,17 @@ def _gain(settings: Settings, factor: float) -> Changes:
 
 
 def in_toml(value: float | Sequence[float]) -> str:
-    """Write a number, or several, with four digits."""
+    """Return a number, or an array of several, as TOML with four significant digits."""
     if isinstance(value, int | float):
         return repr(float(f"{value:.4g}"))
     return "[" + ", ".join(in_toml(each) for each in value) + "]"
 
 
 def thresholds_as_changes(settings: Settings, thresholds: Vector) -> Changes:
-    """Write thresholds (1, n) of `observe_candidates` as settings, rounded up, within the configuration's bounds."""
+    """Return chosen thresholds (1, channels) as changed settings, rounded up, within the configuration's bounds.
+
+    Paper's scheme: Nm per joint. Certified scheme: one factor on `noise_sigmas` and `model_sigmas`.
+    """
     up = 1.0005  # so that four digits are never below the chosen value
     if settings.scheme == "certified":
         factor = up * float(thresholds[0, 0])
@@ -93,7 +99,7 @@ def thresholds_as_changes(settings: Settings, thresholds: Vector) -> Changes:
 
 
 def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progress: Progress) -> list[Observed]:
-    """Replay the logs with every candidate. Raises LogError, ConfigError, CodecError."""
+    """Replay the logs with every candidate; return the statistics of each. Raises LogError, ConfigError, CodecError."""
     gathered: list[list[ShownLog]] = [[] for _ in tried]
     for log in logs:
         progress(f"replaying {log.path} with {len(tried)} filters and gains")
@@ -119,7 +125,7 @@ def _show_to(shown: "Sequence[ShownLog]") -> Watch:
 
 
 def name_of(changes: Mapping[str, str]) -> str:
-    """Name a candidate by its changed settings."""
+    """Return the name of a candidate, its changed settings; "as it is" without a change."""
     return ", ".join(f"{key}={value}" for key, value in changes.items() if key != "filter.b_rad_s") or "as it is"
 
 
@@ -146,7 +152,7 @@ class ShownLog:
         self._trials: dict[int, Trial] = {}
 
     def take_stretch(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Add a stretch; skips cycles that the log lacks."""
+        """Add a replayed stretch to the peaks and to the contacts in it; skip cycles that the log lacks."""
         rows = np.minimum(np.searchsorted(self._log.t_ns, ticks.t_ns), len(self._log.t_ns) - 1)
         known = np.flatnonzero(self._log.t_ns[rows] == ticks.t_ns)
         if known.size == 0:
@@ -167,7 +173,7 @@ class ShownLog:
             self._close(window)
 
     def _take_window(self, window: Window, rows: Places, statistic: Vector, is_armed: NDArray[np.bool_]) -> None:
-        """Add the cycles of a stretch to a contact; skips a contact at whose beginning the candidate is not armed."""
+        """Add a stretch's cycles that lie in a contact; skip a contact at whose onset the candidate isn't armed."""
         first, end = np.searchsorted(rows, (window.first, window.last + 1)).tolist()
         if first < len(rows) and rows[first] == window.first and is_armed[first]:
             self._parts[window.number] = []
@@ -183,7 +189,10 @@ class ShownLog:
         self._trials[window.number] = rising(Trial(since_s, statistic, window.is_chosen_on))
 
     def _statistic_of(self, block: Vector) -> Vector:
-        """Return the statistic that the thresholds to be chosen bound (k, 1, channels)."""
+        """Return the statistic that chosen thresholds are compared with (k, 1, channels), from k cycles of /scheme.
+
+        Certified scheme: largest ratio to the thresholds in force. Paper's scheme: residual less its allowance, Nm.
+        """
         if self._is_certified:
             bank, threshold = (block[:, self._slices[name]] for name in ("tau_ext_bank", "threshold_bank"))
             return np.asarray((np.abs(bank) / threshold).max(axis=1))[:, None, None]
@@ -191,21 +200,21 @@ class ShownLog:
         return np.asarray(np.abs(block[:, self._slices["tau_ext_hat"]]) - allowance)[:, None, :]
 
     def peaks(self) -> Vector:
-        """Return the peaks (B, 1, channels), NaN where not all of a block could be counted."""
+        """Return the largest statistic per block (B, 1, channels), NaN in blocks not wholly free or without MONITOR."""
         peaks = np.where(np.isfinite(self._peaks), self._peaks, np.nan)
         whole = np.logical_and.reduceat(self._log.motion.is_free, np.arange(len(peaks)) * self._log.block)
         peaks[~whole] = np.nan
         return peaks
 
     def trials(self) -> list[Trial]:
-        """Return the statistics during the contacts for which the log's scheme was armed."""
+        """Return the statistics during each contact for which the log's scheme was armed; ends unfinished ones."""
         for window in list(self._open):
             self._close(window)
         return [self._trials[window.number] for window in self._windows]
 
 
 def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: None) -> list[Observed]:
-    """Run all detectors over logs. Raises LogError, TooLittleMotionError."""
+    """Run all detectors over logs; return the statistics of each. Raises LogError, TooLittleMotionError."""
     settings = detectors.DetectorBankSettings()
     statistics = run_detectors([log.motion for log in logs], settings, progress)
     is_chosen_on = chosen_blocks(logs)
@@ -222,13 +231,13 @@ def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: N
 
 
 def chosen_blocks(logs: Sequence[TunedLog]) -> NDArray[np.bool_]:
-    """Tell of each block of the logs' joined motion whether thresholds are chosen on it, by its first cycle (B,)."""
+    """Return, per block of the logs' joined motion (B,), whether thresholds are chosen on its first cycle."""
     chosen = [np.repeat(log.is_chosen_on, log.block)[: len(log.motion.is_free)] for log in logs]
     return np.concatenate(chosen)[:: logs[0].block]
 
 
 def _trials(log: TunedLog, statistics: Statistics) -> Iterator[Trial]:
-    """Run the detectors over each contact that the log's scheme was armed for."""
+    """Yield the detectors' statistics during each contact for which the log's scheme was armed."""
     waiting = sorted((window for window in log.windows or () if window.is_armed), key=lambda window: window.first)
     if not waiting:
         return

@@ -65,7 +65,7 @@ class Trial(NamedTuple):
 
 
 def rising(trial: Trial) -> Trial:
-    """Leave out the samples in which no statistic is larger than in all before."""
+    """Return a trial without the samples in which no statistic is larger than in all samples before."""
     if not len(trial.since_s):
         return trial
     flat = trial.statistic.reshape(len(trial.since_s), -1)
@@ -87,7 +87,7 @@ class Observed:
     trials: tuple[Trial, ...] | None
 
     def half(self, is_chosen_on: bool) -> Vector:
-        """Return the peaks of one half, NaN elsewhere."""
+        """Return the peaks of the half that thresholds are chosen on, or of the other one, NaN elsewhere."""
         return np.where((self.is_chosen_on == is_chosen_on)[:, None, None], self.peaks, np.nan)
 
 
@@ -150,7 +150,7 @@ class Choice:
 
     @property
     def method(self) -> str:
-        """Say where the thresholds come from."""
+        """A phrase that names the source of the thresholds."""
         if self.calibration is None:
             return "the largest value seen: too little motion for a tail"
         if self.extrapolation <= 1.0:
@@ -159,9 +159,10 @@ class Choice:
 
 
 def choose(observed: Observed, rate_per_h: float) -> Choice:
-    """Choose thresholds on the first half and count on the other. Raises TooLittleMotionError without any motion.
+    """Return thresholds chosen on one half of the motion, with the alarms and contacts found that they give on both.
 
-    They are those at which the tail's upper 95 % bound is the wanted rate.
+    For these thresholds the tail's upper 95 % bound is `rate_per_h`; without a tail they are the largest values seen.
+    Raises TooLittleMotionError if the half to choose on has no contact-free motion.
     """
     first = observed.half(True)
     if np.isnan(first).all():
@@ -215,7 +216,7 @@ def _count(peaks: Vector, trials: tuple[Trial, ...] | None, thresholds: Vector) 
 
 
 def delay_ms(trial: Trial, thresholds: Vector) -> float | None:
-    """Return when some statistic is first over its threshold, ms after the onset; None: never."""
+    """Return the time from a contact's onset until some statistic is over its threshold, ms; None: never."""
     over = np.flatnonzero((trial.statistic > thresholds).any(axis=(1, 2)))
     return float(trial.since_s[over[0]]) * 1e3 if over.size else None
 
@@ -261,7 +262,9 @@ def read_logs(
     stretch: TimeWindow = WHOLE,
     progress: Progress = lambda _: None,
 ) -> list[TunedLog]:
-    """Read logs, or a stretch of each. config: name or file of the settings to start from, in place of the logs' own.
+    """Read logs, or a stretch of each, with contact-free motion and true contacts, for tuning.
+
+    config: name or file of the settings to start from, in place of the logs' own.
 
     Raises LogError, ConfigError, CodecError; LogError also when their settings are not the same.
     """
@@ -278,7 +281,7 @@ def read_logs(
 
 
 def _tunable(settings: Settings) -> Settings:
-    """Return the settings with only those that the scheme's numbers depend on."""
+    """Return the default settings with a log's values of those on which the scheme's numbers depend."""
     names = ("scheme", "filter", "estimator", "termination", "detector", "certified")
     return dataclasses.replace(Settings(), **{name: getattr(settings, name) for name in names})
 
@@ -326,7 +329,7 @@ class _Index:
         self._threshold.frombytes(scheme["threshold"].astype(np.float64).tobytes())
 
     def joined(self) -> HostCycles:
-        """Return all cycles; no cycle can be added after that."""
+        """Return all cycles that were added, without a copy; no cycle can be added after that."""
         return HostCycles(
             np.frombuffer(self._cycle, np.int64),
             np.frombuffer(self._t_ns, np.int64),
@@ -336,7 +339,7 @@ class _Index:
 
 
 def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
-    """List the first cycle of each attempt, those before the stretch included."""
+    """Return the first cycle of each attempt of a log, attempts before the stretch included."""
     attempts = parts.attempts
     if motion.bounds_ns is not None:
         attempts = AttemptBegins()
@@ -347,14 +350,14 @@ def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
 
 
 def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterator[TrueContact]:
-    """Yield the contacts on the host's cycles, but for those of attempts that the log lacks."""
+    """Yield the contacts with cycles counted as the host does, from `begins`; skip attempts that the log lacks."""
     for contact in contacts:
         if contact.attempt < len(begins):
             yield contact.counted_from(begins[contact.attempt])
 
 
 def _windows(contacts: Sequence[TrueContact], t_ns: Times, place: int | None) -> tuple[Window, ...]:
-    """Return the rows of contacts. place: of the log; None for a single log."""
+    """Return each contact's rows in a log, and its half: by `place` of the log, or alternating if that is None."""
     onsets_ns = np.array([contact.onset_ns for contact in contacts], np.int64)
     until_ns = explained_until(onsets_ns, np.array([contact.forgotten_ns for contact in contacts], np.int64))
     firsts = np.searchsorted(t_ns, onsets_ns).tolist()

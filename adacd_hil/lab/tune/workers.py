@@ -86,12 +86,12 @@ class DaskWorkers:
         return _IN_FLIGHT * max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
 
     def submit(self, work: Callable[..., Any], task: Any) -> "Future[Any]":
-        """Begin a task."""
+        """Send a task to a worker, which calls `work` with it; return the future result."""
         future: Future[Any] = self._executor.submit(work, task)
         return future
 
     def replace_dead(self) -> None:
-        """Leave the restart to the scheduler."""
+        """Do nothing: the scheduler restarts workers that have died."""
 
 
 class ProcessWorkers:
@@ -110,11 +110,14 @@ class ProcessWorkers:
         return ProcessPoolExecutor(self.room, self._context, initializer=_begin)
 
     def submit(self, work: Callable[..., Any], task: Any) -> "Future[Any]":
-        """Begin a task. Its future, or this call, raises BrokenExecutor when a process has died."""
+        """Send a task to a process, which calls `work` with it; return the future result.
+
+        The future, or this call, raises BrokenExecutor if a process has died.
+        """
         return self._pool.submit(work, task)
 
     def replace_dead(self) -> None:
-        """Start new processes after one has died."""
+        """End all processes and start new ones, after one has died."""
         self.end()
         self._pool = self._open()
 
@@ -161,7 +164,10 @@ def _end_with_parent() -> None:
 
 
 def _security_of(scheduler: str, tls: TlsFiles) -> Any:
-    """Read the certificates for an address; None where it is not of TLS. Raises ConfigError."""
+    """Return Dask's security settings with the certificates for an address; None if it isn't a TLS address.
+
+    Raises ConfigError.
+    """
     from distributed.security import Security
 
     if not scheduler.startswith(TLS):
