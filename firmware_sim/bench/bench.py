@@ -129,11 +129,14 @@ class Bench:
         self.time.poll(t_ns)
 
     def advance_to(self, t_ns: int) -> None:
-        """Let time pass without frames: heartbeats, event timers, watchdogs; by wall clock the body moves too."""
+        """Advance the time to `t_ns` without frames: heartbeats, event timers and watchdogs act when they are due.
+
+        In clock mode `wall` the arm moves, too.
+        """
         self.time.advance_to(t_ns)
 
     def outlive_host(self) -> None:
-        """Let time pass without a host, by SYNC, until the arm is at rest, for 5 s at most."""
+        """In clock mode `sync`, advance the time without a host until the arm is at rest, by 5 s at most."""
         self.time.outlive_host()
 
     def release(self) -> None:
@@ -229,7 +232,10 @@ class Bench:
         return True
 
     def _ignore_sync(self, data: bytes, takers: Sequence[int]) -> None:
-        """Let the devices take note of a SYNC that no device answers."""
+        """Report a SYNC that no device answers to the devices that hear it, and let due timers act.
+
+        takers: 1 for each device that takes SYNCs of this length, else 0.
+        """
         listeners, is_quiet = self._nodes.listeners, self.injector.is_quiet
         heard = listeners.everybody if is_quiet else self.injector.hear(self._sync_id, data)
         listeners.ignore(heard, takers, self._order.kind, self.time.now_ns)
@@ -254,7 +260,10 @@ class Bench:
         self.time.end_sync(self.cycle, t_ns)
 
     def _miss_sync(self, data: bytes, t_ns: int) -> None:
-        """Let the period of a SYNC pass, by SYNC, if a fault keeps it from all devices; their other frames go out."""
+        """Advance by the period of a SYNC that a fault keeps from all devices, and send their other frames.
+
+        Only in clock mode `sync`.
+        """
         is_counted = self._order.counter != 0 and any(self._nodes.listeners.takers(data)) and self._judge(data, t_ns)
         if is_counted and self.time.has_begun:
             self._nodes.listeners.miss(self._lost_syncs + 1)

@@ -133,7 +133,7 @@ class BenchNodes:
         self._arm.advance(self._motor_Nm, self._motor_modes, tick_count)
 
     def lose_sync(self, heard: Sequence[int], t_ns: int) -> None:
-        """Let the drives that have not heard a SYNC count its period; `heard`: how often each node has."""
+        """Report a lost SYNC to the drives that have not heard it; `heard`: how often each node has heard it."""
         for drive, has_heard in zip(self.drives, heard, strict=False):  # the drives come first
             if not has_heard:
                 drive.on_lost_sync(t_ns)

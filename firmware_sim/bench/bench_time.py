@@ -164,13 +164,13 @@ class BenchTime:
         self._move_arm(self.now_ns)
 
     def advance_to(self, t_ns: int) -> None:
-        """Let time pass without frames: heartbeats, event timers and watchdogs act when they are due."""
+        """Advance the time to `t_ns` without frames: heartbeats, event timers and watchdogs act when they are due."""
         while self.due_ns <= t_ns:
             self._act_at(max(self.due_ns, self.now_ns))
         self.reach(t_ns)
 
     def reach(self, t_ns: int) -> None:
-        """Let the bench's time reach `t_ns` by the clock; by SYNC the arm waits meanwhile, unless its host has died.
+        """Advance the bench's time to `t_ns` by the clock; in clock mode `sync` the arm waits unless its host died.
 
         A host that dies sends no SYNC. The reaction of its drives must end, so their braking goes by time.
         """
@@ -183,7 +183,7 @@ class BenchTime:
             self._sync_ns += dt_ns
 
     def reach_sync(self, lost: int) -> None:
-        """Advance by the periods of `lost` SYNCs, then by the one before this SYNC; by wall, do nothing."""
+        """In clock mode `sync`, advance by the periods of `lost` SYNCs, then by the period before this SYNC."""
         if not self._is_wall and self.has_begun:
             self.pass_lost_syncs(lost)
             self.advance(self._nodes.period_ns)
@@ -243,9 +243,9 @@ class BenchTime:
         self._granted = self._outbox.sent
 
     def outlive_host(self) -> None:
-        """Let time pass without a host, by SYNC, until the arm is at rest, for 5 s at most.
+        """In clock mode `sync`, advance the time without a host until the arm is at rest, by 5 s at most.
 
-        The drives then miss their SYNC as by the clock. Once per host; by the clock time passes anyway.
+        The drives then miss SYNC as in clock mode `wall`. Later calls do nothing until the next SYNC.
         """
         if self._is_wall or not self.has_begun or self._has_outlived:
             return

@@ -131,7 +131,7 @@ class FaultPlan:
         return bool(self._babbling)
 
     def advance(self, scenario_ns: int, since_power_on_ns: int = _BEFORE_NS) -> list[FaultEdge]:
-        """Let time pass; return the rows that begin and end, in order.
+        """Set the time; begin and end the rows that are due, and queue their actions; return these edges in order.
 
         scenario_ns: since both drives were enabled, negative before. since_power_on_ns: negative if no time counts
         from there. Neither goes back.
@@ -248,7 +248,7 @@ class FaultPlan:
         self._switch(active)
 
     def _sort_frames(self) -> None:
-        """Find the rows of each frame, in their order."""
+        """Set the tables of the rows that act on each frame, sent and received, in the order of the rows."""
         rows = _of([row for row in self._rows if row.is_active or row.held], *_FRAME_KINDS)
         received = [row for row in rows if row.settings.is_received]
         sent = [row for row in rows if not row.settings.is_received]

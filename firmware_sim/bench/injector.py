@@ -169,7 +169,7 @@ class Injector:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether no fault changes frames or values now."""
+        """Whether no fault acts on frames or values and no action on a node waits."""
         return self.plan.is_quiet
 
     @property

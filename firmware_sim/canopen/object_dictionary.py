@@ -247,7 +247,7 @@ class _DictionaryNode(canopen.LocalNode):
         self.sdo._index = self.sdo._subindex = 0  # an abort before the first transfer needs an index to name
 
     def _find_object(self, index: int, subindex: int) -> ODVariable:
-        """Find an object; unlike canopen's own, arrays and variables have no sub-indices that the EDS lacks."""
+        """Return an object; raise `Refusal` if the EDS lacks it, also for sub-indices that canopen would add."""
         if index < _FIRST_INDEX or index not in self.object_dictionary:
             refuse(Abort.NO_OBJECT)
         entry = self.object_dictionary[index]
@@ -403,7 +403,7 @@ class EmulatedContract:
     period_us: int = 0
 
     def describe_device(self, place: int) -> DeviceDescription:
-        """Describe the device at a place: drive 1, drive 2, sensor 1, sensor 2."""
+        """Return the description of a device; place: 0 drive 1, 1 drive 2, 2 sensor 1, 3 sensor 2."""
         if self.devices:
             return self.devices[place]
         return DeviceDescription(contract_folder() / (self.drive_eds if place < JOINTS else self.sensor_eds))

@@ -244,7 +244,7 @@ class EmulatedDevice(ObjectDictionary):
                 self._application.distrust_sync(t_ns)
 
     def trip(self, watchdog: Watchdog, t_ns: int) -> None:
-        """Trip a watchdog and send its EMCY; do nothing while it is tripped."""
+        """Trip a watchdog and send its EMCY, unless it is tripped; report to the application by `note_error`."""
         self._errors.trip(watchdog, t_ns, self._time_ms(t_ns))
         self._application.note_error()
 

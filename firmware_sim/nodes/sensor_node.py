@@ -120,7 +120,7 @@ class SensorNode(Application):
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def note_error(self) -> None:
-        """Make the status frame due, since the error register may have changed."""
+        """Set `has_news`, so that the status frame is sent: the error register may have changed."""
         self.has_news = True
 
     @property

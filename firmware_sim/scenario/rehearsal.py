@@ -256,7 +256,7 @@ def _heavy_enough(length_m: Pair, rated_Nm: Pair) -> Pair:
 
 
 def _from_cad(length_m: Pair, theta: Sequence[float]) -> _Links:
-    """Find two links with the inertia of `arm.cad_theta`. Raises ConfigError where no links have it."""
+    """Return two links with the inertia of `arm.cad_theta`, `theta`. Raises ConfigError if no links can have it."""
     a1, a2, a3 = theta[:3]
     l1, l2 = length_m
     alpha, beta, gamma = a1 - a3, a2, a3

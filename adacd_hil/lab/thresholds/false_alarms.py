@@ -70,7 +70,7 @@ class Tail:
     largest: float  # value observed
 
     def rate_at(self, threshold: float) -> float:
-        """Return the predicted alarms per hour at a threshold not below the level."""
+        """Return the alarms per hour that the tail predicts at a threshold; `self.rate_per_h` below `self.level`."""
         return float(_rates(threshold - self.level, self.scale, self.shape, self.rate_per_h))
 
     def threshold_at(self, rate_per_h: float) -> float:
