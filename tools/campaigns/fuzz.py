@@ -54,7 +54,7 @@ def main() -> int:
 
 
 def fuzz_in_process(count: int, seed: int) -> int:
-    """Return every frame to every receiver; the devices get them with the host's services, and damaged ones without."""
+    """Pass every frame to every receiver; the devices get them with the host's services, and damaged ones without."""
     with tempfile.TemporaryDirectory() as folder:
         legal = record_legal_traffic(Path(folder))
     print(f"{len(legal)} legal frames to begin with, seed {seed}", file=sys.stderr)
@@ -81,7 +81,7 @@ def fuzz_in_process(count: int, seed: int) -> int:
 
 
 def survive(frames: Iterable[CanFrame], receivers: Sequence[Receiver]) -> bool:
-    """Return frames to receivers; False after a violation, which is printed."""
+    """Pass frames to receivers; return False after a violation, which is printed."""
     for frame in frames:
         for receiver in receivers:
             try:

@@ -194,7 +194,7 @@ def _line(played: Played) -> str:
 
 
 def _environment(folder: Path) -> dict[str, str]:
-    """Return processes what measures them: Coverage.py begins with the interpreter, in the log's writer as well."""
+    """Return the environment of a measured process: Coverage.py begins with its interpreter, in the writer, too."""
     packages = folder / "packages"
     packages.mkdir()
     if importlib.util.find_spec("coverage") is None:
