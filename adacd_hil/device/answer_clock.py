@@ -97,9 +97,9 @@ class AnswerClock:
         return self._is_usual(offset_ns)
 
     def is_straggler(self, behind: int) -> bool:
-        """Return whether a frame that answers no SYNC was overtaken. `behind`: by its counter, 0 without one.
+        """Return whether a frame that answers no new SYNC is a delayed answer; note it, so that a second call is False.
 
-        Each straggler counts once.
+        `behind`: how far its counter is behind the last answer's, 0 without a counter.
         """
         if behind == 0:
             was_guess, self._is_guess = self._is_guess, False

@@ -64,7 +64,8 @@ class DataWatch(EventSource):
         self._over: set[str] = set()
         self._missing = [0] * len(self._names)  # of the present window
         self._repeats_before = list(arm.repeats)
-        self._cycles = self._all_cycles = self._incomplete = self._late = 0
+        self._cycles = self._all_cycles = self._incomplete = 0
+        self._late = self._all_late = 0  # cycles with an older sample: of the window, of ended ones
         self._in_a_row = self._rows = 0  # cycles without a sample; rows of them in the present window
         self._has_rows = False
 
@@ -114,11 +115,12 @@ class DataWatch(EventSource):
             self.events.append(Event("info", "data", text))
         self._rows = 0
         self._all_cycles += self._cycles
-        self._cycles = self._incomplete = 0
+        self._all_late += self._late
+        self._cycles = self._incomplete = self._late = 0
         self._missing = [0] * len(self._names)
 
     def shares(self) -> DataShares:
-        """Return the shares of missing and late data over all cycles of the attempt."""
+        """End a last window that is long enough; return the shares of missing and late data over ended windows."""
         if self._cycles >= SHORTEST_DATA_WINDOW * self._window_cycles:
             self._end_window()
         cycles = max(self._all_cycles, 1)
@@ -127,7 +129,7 @@ class DataWatch(EventSource):
         return DataShares(
             cycles=self._all_cycles,
             incomplete=share[0],
-            late=self._late / cycles,
+            late=self._all_late / cycles,
             no_new_data=dict(zip(self._names, share[1 : 1 + count], strict=True)),
             repeated=dict(zip(self._names, share[1 + count :], strict=True)),
             excesses=tuple(

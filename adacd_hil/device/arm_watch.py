@@ -96,7 +96,10 @@ class ArmWatch:
         self._looks = Recurrence(_LOOKS * settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Take in one cycle; return its state unchanged, or with the fault set."""
+        """Return the arm's state of this cycle, with a fault or `is_late` set if a device or the host has failed.
+
+        Update `lost` when a look at the heartbeats is due. A fault that is set already stays.
+        """
         if self._looks.is_due(arm.cycle):
             self.lost = self._watch(arm.t_ns)
         if self.lost and arm.fault is FaultReason.NONE:

@@ -65,3 +65,13 @@ def test_a_tenth_of_a_second_is_said_at_its_end_by_device(cycles):
         ("info", "incomplete cycles: 0.0% of the last 1000 cycles, 10.0% allowed"),
         ("info", "no frame of drive1 in time: 0.0% of the last 1000 cycles, 5.0% allowed"),
     ]
+
+
+def test_the_share_of_late_cycles_is_of_the_same_cycles_as_the_others(cycles):
+    late = SimpleNamespace(is_enabled=True, is_complete=True)
+    cycles.play(*[True] * 950)
+    cycles.arm.missing_frames = 1
+    for _ in range(50 + 20):  # the last 20 begin a second that is too short to be judged
+        cycles.watch.note(late)
+    shares = cycles.watch.shares()
+    assert (shares.cycles, shares.late, shares.incomplete) == (1000, 0.05, 0.05)
