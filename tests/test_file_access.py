@@ -10,7 +10,7 @@ import pytest
 
 from adacd_hil.file_access import InUseError, check_unused, create_file, exists, open_input, place_file, read_input
 from adacd_hil.file_replacement import Replacement, replace_file, replacing, tidied
-from adacd_hil.log.mcap.chunked_file import MAGIC
+from adacd_hil.log.mcap.record_layout import MAGIC
 
 
 def make_socket(path: Path) -> None:

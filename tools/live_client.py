@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from adacd_hil.lab.live.client import LiveMessage, live_client
-from adacd_hil.lab.live.feed import EVERY_RECORD, rate_of
+from adacd_hil.lab.live.feed import EVERY_MESSAGE, rate_of
 from adacd_hil.log.log_files import LogError
 
 WALL_NS = 1_000_000_000_000_000_000
@@ -43,7 +43,7 @@ class Topic:
         """Compare with the rate of the topic. Frames of one cycle count once."""
         times_ns = np.array(self.log_ns)
         described: dict[str, Any] = {"received": len(times_ns), "bytes": self.received_bytes}
-        if rate_Hz != EVERY_RECORD and len(times_ns) > 1:
+        if rate_Hz != EVERY_MESSAGE and len(times_ns) > 1:
             slots = np.unique(times_ns // (1_000_000_000 // rate_Hz))
             expected = int(slots[-1] - slots[0]) + 1
             lasted_s = (times_ns[-1] - times_ns[0]) * 1e-9

@@ -15,6 +15,7 @@ Logs of both sides are made: run.mcap, and truth.mcap where there is one, in par
 import argparse
 import os
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -177,14 +178,15 @@ class Writer:
         part = part_path(self._path, self._number)
         self._sink = Sink(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644))
         self._part_ns: int | None = None
+        self._counts: Counter[int] = Counter()
         # Nobody knows when a script would have asked for what in the repetitions: replay takes the requests as given.
         metadata = {**self._log.metadata, "operator": "repeated", PART_KEY: str(self._number)}
         return McapFile(self._sink, tuple(self._log.channels), self._log.attachments, metadata)
 
     def _end(self, ending: str) -> None:
         self._file.flush()
-        topics = {self._file.ids[channel.id]: channel.topic for channel in self._log.channels}
-        frames = count_frames(topics, self._file.counts)
+        topics = {channel.id: channel.topic for channel in self._log.channels}
+        frames = count_frames(topics, self._counts)
         self._file.finish(
             {ENDING_KEY: ending, DROPPED_KEY: "0", "frames": str(frames), "messages": str(self._file.messages)}
         )
@@ -205,10 +207,19 @@ class Writer:
         if is_attempt:
             for number, place in self._log.first_cycle_at.items():
                 words[block.starts[block.channels == number] + place] += later_ns // self._log.cycle_ns
-        ids = np.array([self._file.ids.get(number, 0) for number in range(int(block.channels.max()) + 1)], np.uint16)
-        ends = np.append(block.starts[1:], len(records))
         times_ns = words[block.starts + LOG_TIME]
-        self._file.add_messages(records, ids[block.channels], times_ns, ends, np.array([len(ends)]))
+        columns = (
+            block.starts,
+            np.append(block.starts[1:], len(records)),
+            block.channels,
+            times_ns,
+            words[block.starts + PUBLISH_TIME],
+        )
+        data = records.tobytes()
+        self._counts.update(block.channels.tolist())
+        for start, end, channel, log_ns, publish_ns in zip(*(column.tolist() for column in columns), strict=True):
+            self._file.add_message(self._file.ids[channel], log_ns, data[start + MESSAGE_HEAD : end], publish_ns)
+            self._file.end_packet()
         self._part_ns = int(times_ns[0]) if self._part_ns is None else self._part_ns
         is_long = int(times_ns[-1]) - self._part_ns >= PART_S * SECOND_NS
         if is_long or self._file.record_bytes >= PART_BYTES:

@@ -10,7 +10,6 @@ code in ISO 11898-1.
 
 import logging
 import re
-import struct
 import zlib
 from pathlib import Path
 
@@ -18,7 +17,6 @@ import cantools
 from cantools.database.can import Database, Message, Signal
 
 from adacd_hil.file_access import read_input
-from adacd_hil.wire.codec_columns import MessageTable, SignalCodec
 from adacd_hil.wire.e2e import (
     PROFILES,
     E2eProfile,
@@ -27,16 +25,10 @@ from adacd_hil.wire.e2e import (
     Protection,
 )
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
+from adacd_hil.wire.message_table import MessageTable, SignalCodec, container_struct
 
 logging.getLogger("cantools").addHandler(logging.NullHandler())  # our errors replace its output on the terminal
 
-_FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h"} | {
-    (4, False): "I",
-    (4, True): "i",
-    (8, False): "Q",
-    (8, True): "q",
-}
-"""Letter of the module struct for a container, by bytes and whether it is signed."""
 _MOST_MESSAGES = 1000
 """Most messages of a contract: its budget takes 3 s to compute, and four times that for twice as many."""
 WIRE_VERSION = "WireVersion"
@@ -58,13 +50,12 @@ class MessageCodec(MessageTable):
         """Layout, sender and receiver of the end-to-end header; None without protection."""
         super().__init__(message.name, message.frame_id, message.length, _lay_out(message))
         self.senders: tuple[str, ...] = tuple(message.senders)
-        self._struct = _container_struct(self.signals)
         self.values = self.signals[0 if self.profile is None else len(self.profile.signals) :]
         """The signals behind the end-to-end header."""
         # The hot path: values that each fill a container of their own need no shifting.
         is_plain = all(signal.mask == 0 for signal in self.values)
         self._scales = tuple((signal.scale, signal.offset) for signal in self.values)
-        self._body = _container_struct(self.values) if is_plain else None
+        self._body = container_struct(self.values) if is_plain else None
         self._body_offset = self.header_bytes
 
     @property
@@ -108,7 +99,7 @@ class MessageCodec(MessageTable):
         for signal, value in zip(self.values, values, strict=True):
             raw = _quantise(signal, value)
             containers[signal.container] |= (raw & signal.mask) << signal.shift if signal.mask else raw
-        return bytearray(self._struct.pack(*containers))
+        return bytearray(self.containers.pack(*containers))
 
     def decode(self, data: bytes) -> tuple[float, ...]:
         """Decode all signals to physical values, in the order of `signals`.
@@ -117,16 +108,7 @@ class MessageCodec(MessageTable):
         """
         if len(data) != self.length:
             raise CodecError(f"{self.name} has {len(data)} bytes, {self.length} expected")
-        containers = self._struct.unpack(data)
-        values = []
-        for signal in self.signals:
-            raw = containers[signal.container]
-            if signal.mask:
-                raw = (raw >> signal.shift) & signal.mask
-                if signal.is_signed and raw > signal.mask >> 1:
-                    raw -= signal.mask + 1
-            values.append(raw * signal.scale + signal.offset)
-        return tuple(values)
+        return super().decode(data)
 
     def decode_values(self, data: bytes) -> tuple[float, ...]:
         """Decode the signals behind the end-to-end header, in the order of `values`; the length must be right."""
@@ -160,12 +142,6 @@ class MessageCodec(MessageTable):
         frame = bytearray(self.length)
         self._body.pack_into(frame, self._body_offset, *raw)
         return frame
-
-
-def _container_struct(signals: tuple[SignalCodec, ...]) -> struct.Struct:
-    """Make the struct of the containers that hold signals."""
-    formats = {signal.container: _FORMATS[signal.size, signal.is_signed and not signal.mask] for signal in signals}
-    return struct.Struct("<" + "".join(formats.values()))
 
 
 def _quantise(signal: SignalCodec, value: float) -> int:

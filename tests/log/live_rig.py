@@ -3,7 +3,6 @@
 import io
 from pathlib import Path
 
-import numpy as np
 from hang import HANG_S
 from made_log import MemorySink
 from mcap.reader import make_reader
@@ -14,12 +13,12 @@ from adacd_hil.lab.live.feed import LiveFeed
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.scene import Shape
 from adacd_hil.log.recording.log_file import McapFile
-from adacd_hil.log.recording.packet import ROOM, pack_cycle, pack_event
+from adacd_hil.log.recording.packet import pack_cycle, pack_event, unpack
 from adacd_hil.log.recording.packet_writer import PacketWriter
 from adacd_hil.log.recording.processes import WriterSetup
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import Event
-from adacd_hil.wire.codec_columns import plain_tables
+from adacd_hil.wire.message_table import plain_tables
 
 EPOCH_NS = 1_700_000_000_000_000_000
 URDF = '<robot name="a"/>'
@@ -54,8 +53,7 @@ class Feed:
         self._file = McapFile(self.sink, channels, {}, {})
         told = setup_of(setup, parameter_count=parameter_count)
         self.live = None if setup is None else LiveFeed(setup, told, self._file.ids, EPOCH_NS)
-        show = self.live.show if self.live else None
-        self._writer = PacketWriter(self._file, messages, EPOCH_NS, show)
+        self._writer = PacketWriter(self._file, messages, EPOCH_NS)
         self._packets: list[bytes] = []
 
     def cycles(self, run: Run, packets_at_once: int) -> None:
@@ -73,9 +71,10 @@ class Feed:
         self._packets.append(pack_event(t_ns, 0, event))
 
     def write(self) -> None:
-        edges = np.cumsum([0, *map(len, self._packets)])
-        data = np.frombuffer(b"".join(self._packets) + bytes(ROOM), np.uint8)
-        assert self._writer.write_packets(data, edges[:-1], np.diff(edges)) == 0
+        self._writer.shown = []
+        assert all(self._writer.write_packet(unpack(packet)) for packet in self._packets)
+        if self.live is not None:
+            self.live.show(self._writer.shown)
         self._packets = []
 
     def file(self) -> bytes:

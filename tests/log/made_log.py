@@ -6,15 +6,14 @@ import zlib
 from dataclasses import dataclass
 
 import can
-import numpy as np
 import zstandard
-from mcap.data_stream import ReadDataStream
+from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, AttachmentIndex, Channel, Chunk, ChunkIndex, Footer, MetadataIndex, Schema
+from mcap.records import Attachment, AttachmentIndex, Chunk, ChunkIndex, Footer, MetadataIndex
 from mcap.records import SummaryOffset as GroupOffset
 
-from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile, encode
+from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
 from adacd_hil.log.mcap.record_layout import MAGIC
 from adacd_hil.log.types.message_types import ENCAPSULATION, Member, number_type
 
@@ -57,27 +56,18 @@ def make_log(
 ):
     """Make a log: in each chunk a message of every topic for each of its numbers; `times`: log and publish time."""
     target = MemorySink()
-    file = ChunkedFile(target, library, profile)
+    file = ChunkedFile(target, profile, library)
     for name, data in attachments.items():
         file.add_attachment(Attachment(create_time=0, log_time=0, name=name, media_type="text/plain", data=data))
     if run is not None:
         file.add_metadata("run", run)
-    file.define_schema(Schema(id=1, name=TYPE.name, encoding="ros2msg", data=text.encode()))
-    for number, topic in enumerate(topics, start=1):
-        fields = {"fields": " ".join(TYPE.fields)}
-        file.define_channel(Channel(id=number, topic=topic, message_encoding="cdr", metadata=fields, schema_id=1))
+    schema = file.define_schema(TYPE.name, "ros2msg", text.encode())
+    channels = [file.define_channel(topic, "cdr", schema, {"fields": " ".join(TYPE.fields)}) for topic in topics]
     for start, stop in chunks:
-        rows = [
-            (channel, *times(number), number) for number in range(start, stop) for channel in range(1, len(topics) + 1)
-        ]
-        records = [message(channel, log, make_payload(number), publish) for channel, log, publish, number in rows]
-        file.add_messages(
-            np.frombuffer(b"".join(records), np.uint8),
-            np.array([row[0] for row in rows], np.uint16),
-            np.array([row[1] for row in rows], np.int64),
-            np.cumsum([len(record) for record in records]),
-            np.empty(0, np.int64),
-        )
+        for number in range(start, stop):
+            log_ns, publish_ns = times(number)
+            for channel in channels:
+                file.add_message(channel, log_ns, make_payload(number), publish_ns)
         file.flush()
     if summary is not None:
         file.add_metadata("summary", summary)
@@ -109,7 +99,9 @@ class Part:
 
 def new(record):
     """Make a part of one of mcap's records."""
-    data = encode(record)
+    builder = RecordBuilder()
+    record.write(builder)
+    data = builder.end()
     return Part(data[0], data[9:])
 
 

@@ -45,7 +45,7 @@ from adacd_hil.records import (
     SchemeState,
     scheme_layout,
 )
-from adacd_hil.wire.codec_columns import MessageTable
+from adacd_hil.wire.message_table import MessageTable
 
 CHANNELS = (*run_channels(9, tuple(CODEC.messages.values())), *truth_channels())
 STAMP = struct.pack("<II", 12, 34)

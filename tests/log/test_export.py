@@ -14,7 +14,7 @@ from adacd_hil.lab.cli.log_command import export
 from adacd_hil.lab.logs.python_can_files import McapReader
 from adacd_hil.lab.logs.signal_tables import choose_topics, export_tables
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.mcap.chunked_file import MAGIC
+from adacd_hil.log.mcap.record_layout import MAGIC
 from adacd_hil.log.reader import read_log
 from adacd_hil.wire.dbc_decoder import load_decoder
 

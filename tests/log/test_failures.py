@@ -21,7 +21,7 @@ from adacd_hil.log.recording import recorder as recorder_module
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
-from adacd_hil.wire.codec_columns import MessageTable
+from adacd_hil.wire.message_table import MessageTable
 
 CONTROL_PROCESS = """
 import sys

@@ -1,35 +1,28 @@
-"""The fast way from packets to the file against the straightforward one: the same bytes, whatever the bus does."""
+"""Packets become messages of the file: which, in which order, with which times, and in which chunks."""
 
+import io
 import struct
 
-import mcap.writer
+import cantools
 import numpy as np
 import pytest
 from made_log import MemorySink
-from recorded_run import CODEC, LONG_ID, PERIOD_NS, fd_codec, make_run
+from mcap.reader import make_reader
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader
+from recorded_run import CODEC, fd_codec
 
-from adacd_hil import __version__
-from adacd_hil.log.log_files import FIELDS_KEY, RUN_METADATA, SUMMARY_METADATA
+from adacd_hil.log.mcap.chunked_file import CHUNK_BYTES
 from adacd_hil.log.recording.log_file import McapFile
-from adacd_hil.log.recording.packet import ROOM, pack_cycle, pack_event
+from adacd_hil.log.recording.packet import pack_cycle, pack_event, unpack
 from adacd_hil.log.recording.packet_writer import PacketWriter
-from adacd_hil.log.types.message_types import (
-    ENCAPSULATION,
-    body_struct,
-    pack_can_frame,
-    pack_fd_frame,
-    pack_joint_state,
-    pack_log,
-)
-from adacd_hil.log.types.topics import SCHEME, ChannelId, pack_truth, run_channels, truth_channels
-from adacd_hil.records import TRUTH_LAYOUT, Event, scheme_layout
+from adacd_hil.log.types.message_types import unpack_log
+from adacd_hil.log.types.topics import ChannelId, run_channels
+from adacd_hil.records import Event
 from adacd_hil.wire.bus import Frame
 
 EPOCH_NS = 1_700_000_000_987_654_321
 BITS_ID = 0x3A6
-ATTACHMENTS = {"arm.dbc": b"text", "run.toml": b'name = "x"\n'}
-METADATA = {"interface": "embedded"}
-SUMMARY = {"ending": "closed"}
 PLACES = (
     "0|3@1- (0.25,-1)",
     "3|1@1+ (1,0)",
@@ -47,213 +40,151 @@ BITS = (
 """Messages with every kind of place for a signal."""
 
 
-SCHEME_BLOCK = body_struct(SCHEME.head, has_block=True).size
+MESSAGES = tuple(CODEC.messages.values())
 
 
-class ReferenceWriter:
-    """The straightforward log: one packet at a time, each message packed by itself, mcap's own writer."""
+class CountingSink(MemorySink):
+    """A file, and how many packets each write has completed."""
 
-    def __init__(self, sink, channels, attachments, metadata, messages, epoch_ns, parameter_count):
-        self._epoch_ns = epoch_ns
-        self._by_id = {message.can_id: (index, message) for index, message in enumerate(messages)}
-        slices = scheme_layout(parameter_count).slices
-        self._joints = [slices[name] for name in ("q", "dq", "tau_J")]
-        self._dropped = 0
-        self._writer = mcap.writer.Writer(sink, chunk_size=240 * 1024, enable_crcs=True, enable_data_crcs=True)
-        self._writer.start("ros2", f"adacd-hil {__version__}; {mcap.writer.LIBRARY_IDENTIFIER}")
-        for name, data in attachments.items():
-            kind = "application/toml" if name.endswith(".toml") else "text/plain"
-            self._writer.add_attachment(0, 0, name, kind, data)
-        self._writer.add_metadata(RUN_METADATA, metadata)
-        self._ids, schema_ids = {}, {}
-        for channel in channels:
-            kind = channel.type
-            if kind.name not in schema_ids:
-                schema_ids[kind.name] = self._writer.register_schema(kind.name, "ros2msg", kind.text.encode())
-            fields = {"offered_qos_profiles": ""}
-            if kind.fields:
-                fields[FIELDS_KEY] = " ".join(kind.fields)
-            self._ids[channel.id] = self._writer.register_channel(channel.topic, "cdr", schema_ids[kind.name], fields)
-        self._latest_ns = dict.fromkeys(self._ids, 0)
+    def __init__(self):
+        super().__init__()
+        self.packets = []
 
-    def _add(self, channel, log_time_ns, publish_time_ns, payload):
-        self._latest_ns[channel] = log_time_ns = max(log_time_ns, self._latest_ns[channel])
-        self._writer.add_message(self._ids[channel], log_time_ns, payload, publish_time_ns)
-
-    def _look_at(self, time_ns, dropped):
-        if dropped != self._dropped:
-            notice = Event("warning", "log", f"{dropped - self._dropped} packets are missing before this")
-            self._add(ChannelId.EVENTS, time_ns, time_ns, pack_log(stamp(time_ns), notice))
-            self._dropped = dropped
-
-    def event(self, t_ns, dropped, event):
-        time_ns = t_ns + self._epoch_ns
-        self._look_at(time_ns, dropped)
-        self._add(ChannelId.EVENTS, time_ns, time_ns, pack_log(stamp(time_ns), event))
-
-    def cycle(self, t_ns, dropped, messages, frames):
-        time_ns = t_ns + self._epoch_ns
-        self._look_at(time_ns, dropped)
-        for is_tx, frame in frames:
-            self._frame(is_tx, frame, time_ns)
-        for channel, body in messages:
-            self._add(channel, time_ns, time_ns, ENCAPSULATION + stamp(time_ns) + body)
-            if channel == ChannelId.SCHEME:
-                parts = [body[SCHEME_BLOCK + 8 * s.start : SCHEME_BLOCK + 8 * s.stop] for s in self._joints]
-                self._add(ChannelId.JOINT_STATES, time_ns, time_ns, pack_joint_state(stamp(time_ns), *parts))
-
-    def _frame(self, is_tx, frame, publish_ns):
-        time_ns = frame.t_ns + self._epoch_ns
-        if len(frame.data) > 8:
-            channel = ChannelId.TO_CAN_BUS_FD if is_tx else ChannelId.FROM_CAN_BUS_FD
-            payload = pack_fd_frame(stamp(time_ns), frame.can_id, frame.data, frame.is_error)
-        else:
-            channel = ChannelId.TO_CAN_BUS if is_tx else ChannelId.FROM_CAN_BUS
-            payload = pack_can_frame(stamp(time_ns), frame.can_id, frame.data, len(frame.data), frame.is_error)
-        self._add(channel, time_ns, publish_ns, payload)
-        index, message = self._by_id.get(frame.can_id, (0, None))
-        if message is not None and not frame.is_error and len(frame.data) == message.length:
-            values = message.decode(frame.data)
-            body = struct.pack(f"<{len(values)}d", *values)
-            self._add(ChannelId.DECODED_FIRST + index, time_ns, publish_ns, ENCAPSULATION + stamp(time_ns) + body)
-
-    def flush(self):
-        self._writer.flush()
-
-    def finish(self, summary):
-        self._writer.flush()
-        self._writer.add_metadata(SUMMARY_METADATA, summary)
-        self._writer.finish()
+    def write(self, data, packets=0):
+        self.packets.append(packets)
+        return super().write(data)
 
 
-def stamp(time_ns):
-    return struct.pack("<II", *divmod(time_ns, 1_000_000_000))
+class Rig:
+    """A file that is fed with packets."""
+
+    def __init__(self, messages=MESSAGES, epoch_ns=0):
+        self.sink = CountingSink()
+        self.file = McapFile(self.sink, run_channels(7, messages), {}, {})
+        self.writer = PacketWriter(self.file, messages, epoch_ns)
+
+    def write(self, *packets):
+        """Write packets; return for each whether the file holds it."""
+        return [(packet := unpack(data)) is not None and self.writer.write_packet(packet) for data in packets]
+
+    def messages(self):
+        """End the file; return its messages as (topic, log time, publish time, payload), in their order."""
+        self.file.finish({})
+        reader = make_reader(io.BytesIO(self.sink.getvalue()), validate_crcs=True)
+        return [
+            (channel.topic, message.log_time, message.publish_time, message.data)
+            for _, channel, message in reader.iter_messages(log_time_order=False)
+        ]
+
+    def chunks(self):
+        reader = StreamReader(io.BytesIO(self.sink.getvalue()), emit_chunks=True)
+        return [record for record in reader.records if isinstance(record, Chunk)]
 
 
-class Pair:
-    """The same packets to both writers, to ours in batches of random size."""
-
-    def __init__(self, channels, messages=(), epoch_ns=0, parameter_count=7, seed=1):
-        self._generator = np.random.default_rng(seed)
-        self.sinks = MemorySink(), MemorySink()
-        self._file = McapFile(self.sinks[0], channels, ATTACHMENTS, METADATA)
-        self.writer = PacketWriter(self._file, messages, epoch_ns)
-        arguments = (channels, ATTACHMENTS, METADATA, messages, epoch_ns, parameter_count)
-        self._reference = ReferenceWriter(self.sinks[1], *arguments)
-        self._packets = []
-        self.lost = 0
-
-    def cycle(self, t_ns, dropped, messages, frames):
-        self._reference.cycle(t_ns, dropped, messages, frames)
-        self.ours_only(pack_cycle(t_ns, dropped, messages, frames))
-
-    def event(self, t_ns, dropped, event):
-        self._reference.event(t_ns, dropped, event)
-        self.ours_only(pack_event(t_ns, dropped, event))
-
-    def ours_only(self, packet):
-        self._packets.append(packet)
-        if self._generator.random() < 0.02:
-            self._write()
-
-    def _write(self):
-        edges = np.cumsum([0, *map(len, self._packets)])
-        data = np.frombuffer(b"".join(self._packets) + bytes(ROOM), np.uint8)
-        self.lost += self.writer.write_packets(data, edges[:-1], np.diff(edges))
-        self._packets = []
-
-    def flush(self):
-        self._write()
-        self._file.flush()
-        self._reference.flush()
-
-    def files(self):
-        self._write()
-        self._file.finish(SUMMARY)
-        self._reference.finish(SUMMARY)
-        ours, theirs = (sink.getvalue() for sink in self.sinks)
-        return ours, theirs
+CYCLE = [(ChannelId.CYCLE, bytes(48))]
+SYNC = CODEC.message("Sync")
 
 
-def odd_frames(generator, t_ns):
-    """Make frames of any kind in any order, some of them stamped long before the others."""
-    ids = (*(message.can_id for message in CODEC.messages.values()), LONG_ID, *range(BITS_ID, BITS_ID + 3), 0x18DAF110)
-    frames = []
-    for _ in range(generator.integers(0, 30)):
-        length = int(generator.choice((*range(9), 8, 8, 8, 24, 64)))
-        stamp_ns = t_ns - int(generator.integers(0, 3) * generator.integers(0, 5 * PERIOD_NS))
-        is_error = bool(generator.random() < 0.1)
-        frame = Frame(int(generator.choice(ids)), generator.bytes(length), stamp_ns, is_error)
-        frames.append((bool(generator.integers(2)), frame))
-    return frames
+def stamp_ns(payload):
+    sec, nanosec = struct.unpack_from("<II", payload, 4)
+    return sec * 10**9 + nanosec
 
 
-def assert_same(files):
-    ours, theirs = files
-    assert len(ours) == len(theirs)
-    assert ours == theirs
+@pytest.mark.parametrize("epoch_ns", [0, EPOCH_NS])
+def test_a_cycle_is_its_frames_each_with_its_decoded_message_then_its_bodies(epoch_ns):
+    frames = [
+        (True, Frame(SYNC.can_id, b"\x07", 1010)),
+        (False, Frame(0x7A5, b"123", 1020)),
+        (False, Frame(SYNC.can_id, b"\x08", 1030, is_error=True)),
+        (False, Frame(SYNC.can_id, b"12", 1040)),
+        (True, Frame(0x7A5, bytes(12), 1050)),
+    ]
+    joints = np.arange(8.0)
+    scheme = bytes(56) + joints.tobytes() + bytes(1000)
+    rig = Rig(epoch_ns=epoch_ns)
+    packets = (
+        pack_cycle(1000, 0, [(ChannelId.SCHEME, scheme), *CYCLE], frames),
+        pack_event(1500, 0, Event("info", "n", "m")),
+    )
+    assert rig.write(*packets) == [True, True]
+    messages = rig.messages()
+    assert [(topic, log_ns - epoch_ns, publish_ns - epoch_ns) for topic, log_ns, publish_ns, _ in messages] == [
+        ("/to_can_bus", 1010, 1000),
+        ("/decoded/Sync", 1010, 1000),
+        ("/from_can_bus", 1020, 1000),
+        ("/from_can_bus", 1030, 1000),
+        ("/from_can_bus", 1040, 1000),
+        ("/to_can_bus_fd", 1050, 1000),
+        ("/scheme", 1000, 1000),
+        ("/joint_states", 1000, 1000),
+        ("/cycle", 1000, 1000),
+        ("/events", 1500, 1500),
+    ]
+    assert [stamp_ns(payload) for *_, payload in messages] == [log_ns for _, log_ns, *_ in messages]
+    assert struct.unpack_from("<d", messages[1][-1], 12) == (7.0,)
+    assert unpack_log(messages[-1][-1]) == Event("info", "n", "m")
+    assert rig.writer.frames == 5
 
 
-@pytest.mark.long
-@pytest.mark.slow
-@pytest.mark.parametrize(("epoch_ns", "parameter_count"), [(0, 7), (EPOCH_NS, 9)])
-def test_a_run_is_written_as_the_straightforward_way_would(epoch_ns, parameter_count):
-    messages = tuple(fd_codec(BITS).messages.values())
-    pair = Pair(run_channels(parameter_count, messages), messages, epoch_ns, parameter_count)
+@pytest.mark.parametrize("contract", [CODEC, fd_codec(BITS)], ids=["classic", "every kind of place"])
+def test_each_message_of_the_dbc_is_decoded_as_cantools_does(contract):
     generator = np.random.default_rng(5)
-    run = make_run(600, parameter_count=parameter_count, has_fd=True)
-    dropped = 0
-    for number, cycle in enumerate(run.cycles):
-        if number % 190 == 189:
-            pair.flush()
-        dropped += number % 97 == 96
-        frames = cycle.frames + odd_frames(generator, cycle.t_ns)
-        pair.cycle(cycle.t_ns, dropped, cycle.messages(), frames)
-        if cycle.event is not None:
-            dropped += 1
-            pair.event(cycle.t_ns, dropped, cycle.event)
-    files = pair.files()
-    assert_same(files)
-    assert pair.lost == 0
-    assert pair.writer.dropped == dropped > 0
-    assert len(files[0]) > 600_000
+    peer = cantools.database.load_string(contract.text.decode())
+    frames = [
+        Frame(message.can_id, generator.bytes(message.length), number)
+        for number, message in enumerate([*contract.messages.values()] * 5)
+    ]
+    rig = Rig(tuple(contract.messages.values()))
+    assert rig.write(pack_cycle(0, 0, [], [(False, frame) for frame in frames])) == [True]
+    decoded = [message for message in rig.messages() if message[0].startswith("/decoded/")]
+    assert len(decoded) == len(frames) >= 5 * 20
+    for frame, (topic, *_, payload) in zip(frames, decoded, strict=True):
+        theirs = peer.decode_message(frame.can_id, frame.data, decode_choices=False)
+        names = [signal.name for signal in contract.message(topic.removeprefix("/decoded/")).signals]
+        values = struct.unpack_from(f"<{len(names)}d", payload, 12)
+        assert values == pytest.approx([theirs[name] for name in names], rel=1e-15), topic
 
 
-@pytest.mark.slow
-def test_the_truth_is_written_as_the_straightforward_way_would():
-    pair = Pair(truth_channels())
-    generator = np.random.default_rng(6)
-    for number in range(1000):
-        block = generator.normal(size=TRUTH_LAYOUT.size)
-        pair.cycle(number * PERIOD_NS, 0, [(ChannelId.TRUTH, pack_truth(number, block))], [])
-        if number % 250 == 249:
-            pair.flush()
-    assert_same(pair.files())
+def test_a_frame_stamped_late_has_its_stamp_but_a_log_time_that_does_not_run_backwards():
+    rig = Rig()
+    rig.write(
+        pack_cycle(1000, 0, [], [(False, Frame(1, b"", 900)), (False, Frame(1, b"", 400)), (True, Frame(1, b"", 500))])
+    )
+    found = [(topic, log_ns, stamp_ns(payload)) for topic, log_ns, _, payload in rig.messages()]
+    assert found == [("/from_can_bus", 900, 900), ("/from_can_bus", 900, 400), ("/to_can_bus", 500, 500)]
 
 
-def test_a_chunk_ends_after_the_message_that_overruns_it_not_after_the_one_that_fills_it():
-    pair = Pair(run_channels(7))
-    pair.cycle(0, 0, [(ChannelId.CYCLE, b"")], [])
-    pair.flush()
-    record_bytes = 480  # 512 of them make 240 KiB
-    for number in range(1100):
-        pair.cycle(number, 0, [(ChannelId.CYCLE, bytes(record_bytes - 43))], [])
-    assert_same(pair.files())
+def test_an_event_reports_the_packets_that_are_missing_before_it():
+    rig = Rig()
+    rig.write(pack_cycle(1, 0, CYCLE, []), pack_cycle(2, 3, CYCLE, []), pack_cycle(3, 3, CYCLE, []))
+    rig.writer.lose(2)
+    rig.write(pack_event(4, 4, Event("info", "n", "m")), pack_cycle(5, 4, CYCLE, []))
+    messages = rig.messages()
+    assert [topic[1:] for topic, *_ in messages] == ["cycle", "events", "cycle", "cycle", "events", "events", "cycle"]
+    assert [unpack_log(payload).message for topic, *_, payload in messages if topic == "/events"] == [
+        "3 packets are missing before this",
+        "3 packets are missing before this",
+        "m",
+    ]
 
 
-@pytest.mark.slow
+def test_a_chunk_ends_behind_the_packet_that_fills_it_and_is_written_with_the_count_of_its_packets():
+    rig = Rig()
+    body = [(ChannelId.CYCLE, bytes(CHUNK_BYTES // 100 - 43))]  # 100 of their records fill a chunk
+    assert all(rig.write(*[pack_cycle(number, 0, body, []) for number in range(250)]))
+    rig.file.flush()
+    assert [packets for packets in rig.sink.packets if packets] == [101, 101, 48]
+    assert len(rig.messages()) == 250
+    assert [chunk.message_end_time for chunk in rig.chunks()] == [100, 201, 249]
+
+
 def test_a_cycle_may_be_larger_than_a_chunk():
-    messages = tuple(CODEC.messages.values())
-    pair = Pair(run_channels(7, messages), messages)
-    generator = np.random.default_rng(7)
-    frames = [(False, Frame(0x181, generator.bytes(8), number)) for number in range(9000)]
-    pair.cycle(0, 0, [], frames)
-    pair.cycle(1, 0, [(ChannelId.CYCLE, bytes(48))], frames[:10])
-    assert_same(pair.files())
-
-
-def test_a_log_without_messages_is_written_as_the_straightforward_way_would():
-    assert_same(Pair(run_channels(7)).files())
+    rig = Rig()
+    frames = [(False, Frame(0x181, number.to_bytes(8, "little"), number)) for number in range(9000)]
+    assert rig.write(pack_cycle(0, 0, [], frames), pack_cycle(1, 0, CYCLE, [])) == [True, True]
+    messages = rig.messages()
+    assert len(messages) == 2 * 9000 + 1
+    assert [payload[-8:] for topic, *_, payload in messages if topic == "/from_can_bus"] == [f.data for _, f in frames]
 
 
 WRONG = {
@@ -270,11 +201,8 @@ WRONG = {
 
 @pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG.keys())
 def test_nothing_of_a_packet_that_makes_no_sense_is_written(wrong):
-    pair = Pair(run_channels(7))
-    cycle = ([(ChannelId.CYCLE, bytes(48))], [(False, Frame(1, b"12", 3))])
-    pair.cycle(3, 0, *cycle)
-    pair.ours_only(wrong)
-    pair.cycle(4, 0, *cycle)
-    assert_same(pair.files())
-    assert pair.lost == 1
-    assert pair.writer.frames == 2
+    rig = Rig()
+    good = pack_cycle(3, 0, CYCLE, [(False, Frame(1, b"12", 3))])
+    assert rig.write(good, wrong, good) == [True, False, True]
+    assert [topic for topic, *_ in rig.messages()] == ["/from_can_bus", "/cycle"] * 2
+    assert rig.writer.frames == 2

@@ -1,12 +1,12 @@
-"""The live view's records: from the writer into a ring that a process of its own looks into, and which are shown.
+"""The live view's messages: from the writer into a ring that a process of its own looks into, and which are shown.
 
-The writer never waits for that process. Records that find the ring full are not shown; a process that is stopped, dead
+The writer never waits for that process. Messages that find the ring full are not shown; a process that is stopped, dead
 or busy with five hundred viewers does not delay the log. Only the writer's start waits until it listens or fails.
 
-**Topics**: those of a log, fewer records of them, and three that are drawn from these.
+**Topics**: those of a log, fewer messages of them, and three that are drawn from these.
 
 A person watches, and the network may be a radio, so each topic has a rate. The decimator keeps a rate by log time: it
-divides time into slots of 1 / rate, and shows all records of the first cycle in each slot. So frames of one cycle stay
+divides time into slots of 1 / rate, and shows all messages of the first cycle in each slot. So frames of one cycle stay
 together, and a topic that comes more seldom than its rate is shown whole.
 
 Encoding (`cdr`), schemas (`ros2msg`) and stamps are those of the file.
@@ -18,12 +18,11 @@ import os
 import socket
 import struct
 import subprocess
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.scene import (
@@ -41,36 +40,23 @@ from adacd_hil.lab.live.scene import (
     transforms_of,
 )
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD
 from adacd_hil.log.recording import processes
-from adacd_hil.log.recording.processes import WriterSetup, start_module
+from adacd_hil.log.recording.processes import LoggedMessage, WriterSetup, start_module
 from adacd_hil.log.recording.ring import Ring
 from adacd_hil.log.types.message_types import ENCAPSULATION, JOINT_STATE_DTYPE, MessageType
 from adacd_hil.log.types.topics import DECODED, RUN_TOPICS, ChannelId, LogChannel, unpack_contact
 from adacd_hil.log.viewer_layout import SCENE_TOPIC
 from adacd_hil.records import SchemeState
 
-_HEAD = struct.Struct("<Q")
-
-
-class Batch(NamedTuple):
-    """Message records that follow each other, as the writer lays them down for the file.
-
-    records: their bytes (b,) uint8; channels: the file's numbers (n,) uint16; log_ns: log times (n,) int64; ends: where
-    each record ends (n,) int64.
-    """
-
-    records: NDArray[np.uint8]
-    channels: NDArray[np.uint16]
-    log_ns: NDArray[np.int64]
-    ends: NDArray[np.int64]
+_HEAD = struct.Struct("<HqqI")
+"""Of a message in a batch: channel, log time, publish time, bytes of the payload that follows."""
 
 
 class ServerSetup(NamedTuple):
     """Setup of the view's process.
 
     live: its address and admitted viewers. setup: of the log. ids: the file's number of each channel. start_ns: log
-    time before the first record.
+    time before the first message.
     """
 
     live: LiveView
@@ -79,21 +65,22 @@ class ServerSetup(NamedTuple):
     start_ns: int
 
 
-def pack_batch(batch: Batch) -> bytes:
-    """Return a batch as bytes: the number of its records, their times, ends and channels, then the records."""
-    columns = (batch.log_ns, batch.ends, batch.channels, batch.records)
-    return _HEAD.pack(len(batch.ends)) + b"".join(column.tobytes() for column in columns)
+def pack_batch(messages: Iterable[LoggedMessage]) -> bytes:
+    """Return messages as bytes."""
+    parts = []
+    for channel, log_ns, publish_ns, payload in messages:
+        parts += [_HEAD.pack(channel, log_ns, publish_ns, len(payload)), payload]
+    return b"".join(parts)
 
 
-def unpack_batch(data: bytes) -> Batch:
-    """Return the batch in bytes of `pack_batch`; its arrays are views of `data`."""
-    (count,) = _HEAD.unpack_from(data)
-    place = _HEAD.size
-    log_ns = np.frombuffer(data, np.int64, count, place)
-    ends = np.frombuffer(data, np.int64, count, place + 8 * count)
-    channels = np.frombuffer(data, np.uint16, count, place + 16 * count)
-    records = np.frombuffer(data, np.uint8, -1, place + 18 * count)
-    return Batch(records, channels, log_ns, ends)
+def unpack_batch(data: bytes) -> Iterator[LoggedMessage]:
+    """Yield the messages in bytes of `pack_batch`."""
+    place = 0
+    while place < len(data):
+        channel, log_ns, publish_ns, size = _HEAD.unpack_from(data, place)
+        place += _HEAD.size
+        yield LoggedMessage(channel, log_ns, publish_ns, data[place : place + size])
+        place += size
 
 
 START_TIMEOUT_S = 30.0
@@ -102,12 +89,12 @@ RING_BYTES = 8 * 1024 * 1024
 
 
 class LiveFeed:
-    """Records for the live view. `url`: where it is; `process`: serves it; `hidden`: batches without room."""
+    """Messages for the live view. `url`: where it is; `process`: serves it; `hidden`: batches without room."""
 
     def __init__(self, live: LiveView, setup: WriterSetup, ids: dict[int, int], start_ns: int) -> None:
         """Start the view's process, and wait until it listens on the address of `live`. Raises LogError.
 
-        setup: of the log. ids: the file's number of each channel, by ours. start_ns: log time before the first record.
+        setup: of the log. ids: the file's number of each channel, by ours. start_ns: log time before the first message.
         """
         self.hidden = 0
         self._is_watched = False
@@ -162,20 +149,14 @@ class LiveFeed:
         """Bytes that the view's process has not taken yet."""
         return self._ring.waiting
 
-    def show(
-        self,
-        records: NDArray[np.uint8],
-        channels: NDArray[np.uint16],
-        log_ns: NDArray[np.int64],
-        ends: NDArray[np.int64],
-    ) -> None:
-        """Hand message records that follow each other to the view's process, see Batch; without a viewer, do nothing.
+    def show(self, messages: Sequence[LoggedMessage]) -> None:
+        """Hand messages that follow each other to the view's process; without a viewer, do nothing.
 
         If the ring is full, drop them and count the batch in `hidden`.
         """
-        if not len(ends) or not self.is_watched:
+        if not messages or not self.is_watched:
             return
-        if not self._ring.put_packet(pack_batch(Batch(records, channels, log_ns, ends))):
+        if not self._ring.put_packet(pack_batch(messages)):
             self.hidden += 1
             return
         self._say(processes.WAKE)
@@ -196,39 +177,35 @@ class LiveFeed:
 
 RATES_HZ = {TRANSFORMS_TOPIC: 50, SCENE_TOPIC: 10, **{topic.name: topic.rate_Hz for topic in RUN_TOPICS}}
 DECODED_RATE_HZ = 10
-EVERY_RECORD = 0
+EVERY_MESSAGE = 0
 """The rate of topics without a limit, as /events, /contact and /frame_checks."""
 
 
 def rate_of(topic: str) -> int:
-    """Return the rate at which a topic is shown, Hz; EVERY_RECORD: all its records are shown."""
-    return DECODED_RATE_HZ if topic.startswith(DECODED) else RATES_HZ.get(topic, EVERY_RECORD)
+    """Return the rate at which a topic is shown, Hz; EVERY_MESSAGE: all its messages are shown."""
+    return DECODED_RATE_HZ if topic.startswith(DECODED) else RATES_HZ.get(topic, EVERY_MESSAGE)
 
 
 class Decimator:
-    """Chooses the records of one topic that are shown."""
+    """Chooses the messages of one topic that are shown."""
 
     def __init__(self, rate_Hz: int) -> None:
         self._slot_ns = 1_000_000_000 // rate_Hz if rate_Hz else 0
         self._slot = -1
         self._first_ns = -1  # the first cycle of the slot
 
-    def choose(self, cycles_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which of the next records are shown (n,): those of the first cycle in each slot of 1 / rate.
+    def takes(self, cycle_ns: int) -> bool:
+        """Return whether the next message is shown: whether its cycle is the first one in its slot of 1 / rate.
 
-        cycles_ns (n,): times of the records' cycles, which never run backwards.
+        cycle_ns: time of the message's cycle, which never runs backwards.
         """
-        if not self._slot_ns or not len(cycles_ns):
-            return np.ones(len(cycles_ns), np.bool_)
-        slots = cycles_ns // self._slot_ns
-        begins = np.diff(slots, prepend=self._slot) != 0
-        latest = np.maximum.accumulate(np.where(begins, np.arange(len(slots)), -1))
-        firsts_ns = np.where(latest < 0, self._first_ns, cycles_ns[latest])
-        self._slot, self._first_ns = int(slots[-1]), int(firsts_ns[-1])
-        return np.asarray(cycles_ns == firsts_ns)
+        if not self._slot_ns:
+            return True
+        if (slot := cycle_ns // self._slot_ns) != self._slot:
+            self._slot, self._first_ns = slot, cycle_ns
+        return cycle_ns == self._first_ns
 
 
-_PUBLISH_TIME = slice(MESSAGE_HEAD - 8, MESSAGE_HEAD)
 _BODY = len(ENCAPSULATION) + 8
 """Offset of a body in a payload, bytes: after the stamp."""
 
@@ -242,12 +219,12 @@ class Shown(NamedTuple):
 
 
 class LiveTopics:
-    """The topics that are served. `latest_ns`: log time of the latest record; before the first, of the beginning."""
+    """The topics that are served. `latest_ns`: log time of the latest message; before the first, of the beginning."""
 
     def __init__(self, setup: LiveView, channels: Iterable[LogChannel], ids: dict[int, int], start_ns: int) -> None:
         """Prepare the topics of a log, and three that are drawn from them.
 
-        ids: the file's number of each channel, by ours. start_ns: log time before the first record.
+        ids: the file's number of each channel, by ours. start_ns: log time before the first message.
         """
         channels = tuple(channels)
         self.latest_ns = start_ns
@@ -273,26 +250,20 @@ class LiveTopics:
         """Return the message with the arm's URDF, for a viewer that has just subscribed to it."""
         return Shown(self.robot, self.latest_ns, self._description)
 
-    def choose(self, batch: Batch, wanted: Collection[int]) -> Iterator[Shown]:
-        """Yield the messages of a batch that are shown, in its order, and those that are drawn from them.
+    def choose(self, messages: Iterable[LoggedMessage], wanted: Collection[int]) -> Iterator[Shown]:
+        """Yield the messages that are shown, in their order, and those that are drawn from them.
 
         wanted: channels to which viewers have subscribed; others yield nothing.
         """
-        if not len(batch.ends):
-            return
-        self.latest_ns = max(self.latest_ns, int(batch.log_ns.max()))
-        starts = np.concatenate(([0], batch.ends[:-1]))
-        is_shown = np.zeros(len(batch.ends), np.bool_)
-        for channel in self._sources(wanted):
-            places = np.flatnonzero(batch.channels == channel)
-            at = starts[places][:, np.newaxis] + np.arange(MESSAGE_HEAD)[_PUBLISH_TIME]
-            is_shown[places] = self._decimators[channel].choose(batch.records[at].view(np.int64)[:, 0])
-        for place in np.flatnonzero(is_shown).tolist():
-            payload = batch.records[starts[place] + MESSAGE_HEAD : batch.ends[place]].tobytes()
-            shown = Shown(int(batch.channels[place]), int(batch.log_ns[place]), payload)
-            if shown.channel in wanted:
+        sources = self._sources(wanted)
+        for channel, log_ns, publish_ns, payload in messages:
+            self.latest_ns = max(self.latest_ns, log_ns)
+            if channel not in sources or not self._decimators[channel].takes(publish_ns):
+                continue
+            shown = Shown(channel, log_ns, payload)
+            if channel in wanted:
                 yield shown
-            with contextlib.suppress(ValueError, IndexError, struct.error):  # a record without sense isn't drawn
+            with contextlib.suppress(ValueError, IndexError, struct.error):  # a message without sense isn't drawn
                 yield from self._drawn_from(shown, wanted)
 
     def _sources(self, wanted: Collection[int]) -> set[int]:
@@ -311,13 +282,10 @@ class LiveTopics:
             yield Shown(self.transforms, log_ns, pack_transforms(log_ns, transforms_of(self._shape, q)))
         elif channel == self._contact and self.scene in wanted:
             yield self._draw(log_ns, draw_contact(self._shape, unpack_contact(payload[_BODY:])))
-        elif channel == self._scheme and self.scene in wanted and self._is_scene_due(log_ns):
+        elif channel == self._scheme and self.scene in wanted and self._scene_decimator.takes(log_ns):
             record = np.frombuffer(payload, self._scheme_dtype)[0]
             state = SchemeState(int(record["state"]))
             yield self._draw(log_ns, *draw_joints(state, record["tau_ext_hat"], record["threshold"]))
-
-    def _is_scene_due(self, log_ns: int) -> bool:
-        return bool(self._scene_decimator.choose(np.array([log_ns]))[0])
 
     def _draw(self, log_ns: int, *entities: Entity) -> Shown:
         return Shown(self.scene, log_ns, pack_scene(log_ns, entities))

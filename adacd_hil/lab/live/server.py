@@ -185,15 +185,14 @@ class LiveServer:
 
     def _show_some(self) -> None:
         """Send a part of the ring's packets to the viewers; the rest follows after other tasks."""
-        data = self._ring.take_packets(_AT_ONCE_BYTES)
-        for start, size in zip(*(numbers.tolist() for numbers in split(data)), strict=True):
-            self._show(data[start : start + size])
+        for batch in split(self._ring.take_packets(_AT_ONCE_BYTES)):
+            self._show(batch)
         if self._ring.waiting:
             asyncio.get_running_loop().call_soon(self._show_some)
 
-    def _show(self, data: bytes) -> None:
+    def _show(self, batch: bytes) -> None:
         wanted = {channel for viewer in self._viewers for channel in viewer.by_channel}
-        for shown in self._topics.choose(unpack_batch(data), wanted):
+        for shown in self._topics.choose(unpack_batch(batch), wanted):
             self._tell_time(shown.log_ns)
             for viewer in self._viewers:
                 viewer.put_message(shown)

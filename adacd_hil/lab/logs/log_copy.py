@@ -4,11 +4,13 @@ Records stay as they are, but for the numbers of their channels.
 """
 
 import contextlib
+import struct
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
-from mcap.records import Attachment, Channel, Header, Schema
+from mcap.records import Attachment, Channel, Header
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
@@ -28,13 +30,13 @@ from adacd_hil.log.log_files import (
     failing_as,
     is_part_name,
 )
-from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
+from adacd_hil.log.mcap.chunked_file import ChunkedFile
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end
 from adacd_hil.log.types.record_arrays import count_frames
 
-_CHANNEL = 9
-"""Offset of the channel's number in a message record, bytes."""
+_MESSAGE_HEAD = struct.Struct("<BQHIQQ")
+"""A message record before its payload: opcode, length, channel, sequence, log time, publish time."""
 
 
 class LogCopy:
@@ -50,10 +52,11 @@ class LogCopy:
         self._log = log
         self._wanted = topics
         self._target = _CopyTarget(path)
-        self._file = ChunkedFile(self._target, LIBRARY, _common_profile(log.parts.values()))
+        self._file = ChunkedFile(self._target, _common_profile(log.parts.values()))
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._metadata: set[str] = set()
         self._topics: dict[int, str] = {}  # by the copy's number of the channel
+        self._counts: Counter[int] = Counter()  # messages of each of its channels
         self._numbers = np.full(CHANNEL_NUMBERS, -1, np.int32)  # of each channel of the source
 
     @property
@@ -72,14 +75,13 @@ class LogCopy:
         is_taken = numbers >= 0 if is_chosen is None else (numbers >= 0) & is_chosen
         if not is_taken.any():
             return
-        channels = numbers[is_taken].astype(np.uint16)
-        data = np.frombuffer(contents.data, np.uint8)
-        records, ends = _gather(data, contents.starts[is_taken], contents.ends[is_taken])
-        starts = np.concatenate(([0], ends[:-1]))
-        records[starts + _CHANNEL] = channels & 0xFF
-        records[starts + _CHANNEL + 1] = channels >> 8
-        log_times = contents.log_times[is_taken].astype(np.int64)
-        self._file.add_messages(records, channels, log_times, ends, np.empty(0, np.int64))
+        self._counts.update(numbers[is_taken].tolist())
+        for place in np.flatnonzero(is_taken).tolist():
+            start, end = int(contents.starts[place]), int(contents.ends[place])
+            *_, sequence, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(contents.data, start)
+            payload = contents.data[start + _MESSAGE_HEAD.size : end]
+            self._file.add_message(int(numbers[place]), log_ns, payload, publish_ns, sequence)
+            self._file.end_packet()
 
     def _follow(self) -> None:
         """Copy the metadata, and define the channels, that the other log has read since the last call."""
@@ -99,15 +101,11 @@ class LogCopy:
                 return
             key = schema.name, schema.encoding, schema.data
             if key not in self._schemas:
-                self._schemas[key] = len(self._schemas) + 1
-                self._file.define_schema(
-                    Schema(id=self._schemas[key], data=schema.data, encoding=schema.encoding, name=schema.name)
-                )
+                self._schemas[key] = self._file.define_schema(*key)
             schema_id = self._schemas[key]
-        number = len(self._topics) + 1
-        if number >= CHANNEL_NUMBERS:
+        if len(self._topics) + 1 >= CHANNEL_NUMBERS:
             raise LogError(f"more than {CHANNEL_NUMBERS - 1} channels don't go into one file")
-        self._file.define_channel(Channel(number, channel.topic, channel.message_encoding, channel.metadata, schema_id))
+        number = self._file.define_channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)
         self._numbers[channel.id] = number
         self._topics[number] = channel.topic
 
@@ -119,14 +117,13 @@ class LogCopy:
         self._follow()
         self._file.flush()
         summary = {
-            "frames": str(count_frames(self._topics, self._file.counts)),
+            "frames": str(count_frames(self._topics, self._counts)),
             "messages": str(self._file.messages),
             DROPPED_KEY: str(self._log.dropped),
             ENDING_KEY: ending,
             "source": self._log.path.name,
             **more,
         }
-        self._file.flush_definitions()
         self._file.add_metadata(SUMMARY_METADATA, summary)
         self._file.complete()
         self._target.commit()
@@ -148,24 +145,11 @@ def _is_ros(header: Header) -> bool:
     return header.profile == ROS_PROFILE or (header.profile == "" and header.library.startswith(f"{PRODUCT} "))
 
 
-def _gather(
-    data: NDArray[np.uint8], starts: NDArray[np.int64], ends: NDArray[np.int64]
-) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Copy stretches of `data` one after the other; return the copy, and where each stretch ends in it."""
-    lengths = ends - starts
-    new_ends = np.cumsum(lengths)
-    if len(starts) and (starts[1:] == ends[:-1]).all():
-        return data[starts[0] : ends[-1]].copy(), new_ends
-    shifts = starts - (new_ends - lengths)
-    return data[np.arange(lengths.sum()) + np.repeat(shifts, lengths)], new_ends
-
-
 class _CopyTarget:
     """A temporary file beside its final name, renamed by `commit`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._position = 0
         if is_part_name(path):
             raise LogError(f"log {path} would be taken for a part of the log beside it; give another name")
         if path.is_file() and not path.is_symlink() and path.stat().st_size and not _is_copy(path):
@@ -180,11 +164,7 @@ class _CopyTarget:
             self._file.write(data)
         except OSError as error:
             raise self._error(error) from None
-        self._position += len(data)
         return len(data)
-
-    def tell(self) -> int:
-        return self._position
 
     def commit(self) -> None:
         try:

@@ -1,6 +1,6 @@
 """Chunks, opened and read: decompressed within bounds, their messages as columns, many chunks ahead of the reader.
 
-Neither a chunk nor a whole file may open to more than makes sense. Our chunks have 256 KiB before compression and
+Neither a chunk nor a whole file may open to more than makes sense. Our chunks have some 240 KiB before compression and
 shrink to 40 %; those of others have 1 to 16 MiB. A file of a few kilobytes that opens to gigabytes is refused.
 
 Files are read from front to back, so that one that is being written, or cut, is read as far as it goes. The message

@@ -15,12 +15,11 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path, PurePath
 
-from mcap.records import Attachment, Schema
-from mcap.records import Channel as ChannelRecord
+from mcap.records import Attachment
 
 from adacd_hil.file_access import create_file
 from adacd_hil.log.log_files import FIELDS_KEY, QOS_KEY, ROS_PROFILE, RUN_METADATA, SUMMARY_METADATA
-from adacd_hil.log.mcap.chunked_file import LIBRARY, ChunkedFile
+from adacd_hil.log.mcap.chunked_file import ChunkedFile
 from adacd_hil.log.types.topics import LogChannel
 
 WAITING_BYTES = 32 * 1024 * 1024
@@ -202,7 +201,7 @@ class McapFile(ChunkedFile):
     def __init__(
         self, sink: Sink, channels: tuple[LogChannel, ...], attachments: dict[str, bytes], metadata: dict[str, str]
     ) -> None:
-        super().__init__(sink, LIBRARY, ROS_PROFILE)
+        super().__init__(sink, ROS_PROFILE)
         self.ids: dict[int, int] = {}
         """The file's channel ids, by our channel ids."""
         self.types = {channel.id: channel.type for channel in channels}
@@ -216,22 +215,14 @@ class McapFile(ChunkedFile):
         """Bytes before the first chunk."""
 
     def _define(self, channels: tuple[LogChannel, ...]) -> None:
-        """Assign ids from 1 to schemas and channels; the first chunk begins with them."""
-        schema_ids: dict[str, int] = {}
-        for number, channel in enumerate(channels, start=1):
+        """Define schemas and channels; the first chunk begins with them."""
+        schemas: dict[str, int] = {}
+        for channel in channels:
             name, text = channel.type.name, channel.type.text
-            if name not in schema_ids:
-                schema_ids[name] = len(schema_ids) + 1
-                self.define_schema(Schema(id=schema_ids[name], name=name, encoding="ros2msg", data=text.encode()))
-            record = ChannelRecord(
-                id=number,
-                topic=channel.topic,
-                message_encoding="cdr",
-                schema_id=schema_ids[name],
-                metadata={QOS_KEY: "", **({FIELDS_KEY: " ".join(channel.type.fields)} if channel.type.fields else {})},
-            )
-            self.define_channel(record)
-            self.ids[channel.id] = number
+            if name not in schemas:
+                schemas[name] = self.define_schema(name, "ros2msg", text.encode())
+            metadata = {QOS_KEY: "", **({FIELDS_KEY: " ".join(channel.type.fields)} if channel.type.fields else {})}
+            self.ids[channel.id] = self.define_channel(channel.topic, "cdr", schemas[name], metadata)
 
     def finish(self, summary: dict[str, str]) -> None:
         """Write the chunk in progress and `summary` as metadata, then end the file."""

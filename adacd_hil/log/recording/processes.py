@@ -12,13 +12,19 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, NamedTuple, Protocol
 
 from adacd_hil.log.types.topics import LogChannel
-from adacd_hil.wire.codec_columns import MessageTable
+from adacd_hil.wire.message_table import MessageTable
+
+
+class LoggedMessage(NamedTuple):
+    """A message of the log. channel: the file's number; log_ns, publish_ns: its times."""
+
+    channel: int
+    log_ns: int
+    publish_ns: int
+    payload: bytes
 
 
 class LiveFeed(Protocol):
@@ -29,14 +35,8 @@ class LiveFeed(Protocol):
     @property
     def is_watched(self) -> bool: ...  # noqa: D102
 
-    def show(
-        self,
-        records: NDArray[np.uint8],
-        channels: NDArray[np.uint16],
-        log_ns: NDArray[np.int64],
-        ends: NDArray[np.int64],
-    ) -> None:
-        """Send consecutive message records (b,) to viewers; channels, log_ns, ends (n,): one entry per record."""
+    def show(self, messages: Sequence[LoggedMessage]) -> None:
+        """Send consecutive messages to viewers."""
 
     def end_view(self) -> None:
         """End the view without waiting for viewers."""

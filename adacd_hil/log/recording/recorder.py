@@ -25,7 +25,7 @@ from adacd_hil.log.types.topics import run_channels, truth_channels
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec_columns import MessageTable, plain_tables
+from adacd_hil.wire.message_table import MessageTable, plain_tables
 
 START_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 60.0

@@ -13,9 +13,7 @@ may be wrong; a packet taken too early is invalid, and is counted as such.
 import mmap
 import os
 import struct
-
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Iterator
 
 _HEAD, _TAIL, _DROPPED, _PEAK, _WRITTEN = range(5)
 _COUNTS_BYTES = mmap.PAGESIZE
@@ -142,16 +140,13 @@ class RingReader(_SharedRing):
         return padded_bytes(_SIZE.unpack(self._copy(start, _SIZE.size))[0])
 
 
-def split(data: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return where each packet begins in data that `RingReader.take_packets` returned, and its size (n,)."""
-    starts, sizes = [], []
+def split(data: bytes) -> Iterator[bytes]:
+    """Yield each packet in data that `RingReader.take_packets` returned."""
     place = 0
     while place < len(data):
         (size,) = _SIZE.unpack_from(data, place)
-        starts.append(place + _SIZE.size)
-        sizes.append(size)
+        yield data[place + _SIZE.size : place + _SIZE.size + size]
         place += padded_bytes(size)
-    return np.array(starts, np.int64), np.array(sizes, np.int64)
 
 
 def _whole_bytes(data: bytes) -> int:

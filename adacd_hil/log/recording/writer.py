@@ -4,9 +4,6 @@ It shares only the ring and a message socket with the control process: not its C
 session, so that Ctrl-C reaches only the control process. It ends the log on the control process's message or death,
 after it has taken all packets left in the ring.
 
-The writer gathers packets and writes many at a time, at the latest when a chunk has to end: see packet_writer.py. It
-writes more often while the live view has a viewer.
-
 In lockstep the files depend on the packets only, bit for bit; so chunks end by log time, and packets are lost only to a
 full disk. In real time chunks end by the clock, so that data reach the disk during silence, too; if the disk is too
 slow or full, packets are dropped and counted, and the ring is still emptied. After a full disk, another part is tried.
@@ -19,14 +16,13 @@ import socket
 import struct
 import sys
 
-import numpy as np
-
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.log.log_files import CONTINUED, ENDING_KEY, PART_KEY, PRODUCT, LogError, part_path
 from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS
-from adacd_hil.log.recording import packet, processes
+from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.log_file import McapFile, Sink
-from adacd_hil.log.recording.packet_writer import Numbers, PacketWriter, Rows
+from adacd_hil.log.recording.packet import unpack
+from adacd_hil.log.recording.packet_writer import PacketWriter
 from adacd_hil.log.recording.processes import LiveFeed, LiveService, WriterSetup, read_setup
 from adacd_hil.log.recording.ring import RingReader, split
 from adacd_hil.log.recording.run_folder import is_there
@@ -37,11 +33,8 @@ POLL_PERIOD_US = 25_000
 costs the writer as much as writing two cycles."""
 RETRY_PERIOD_NS = 5_000_000_000
 """Time before a disk that failed is tried again."""
-SHOW_PERIOD_NS = 45_000_000
-"""Interval of writing in real time while the live view has a viewer: every second poll of the ring. At every poll the
-writer would take 10 % of a processor instead of 6 %."""
-BATCH_BYTES = 256 * 1024
-"""Most bytes of packets that are gathered, about 400 cycles: more would be no cheaper per cycle."""
+TAKEN_BYTES = 64 * 1024
+"""Most bytes of packets that are taken at once, about 100 cycles."""
 
 
 class WriterProcess:
@@ -59,12 +52,8 @@ class WriterProcess:
         self._file = self._begin_file()
         self._clock = clock or MonotonicClock()
         self.live = self._open(setup.live) if setup.live else None
-        watch = self.live.show if self.live else None
-        self._packets = PacketWriter(self._file, setup.messages, setup.epoch_ns, watch)
-        self._gathered: list[bytes] = []
-        self._gathered_bytes = 0
+        self._packets = PacketWriter(self._file, setup.messages, setup.epoch_ns)
         self._flushed_ns = 0 if setup.is_blocking else self._clock.now_ns()
-        self._shown_ns = self._flushed_ns
         self._failed_ns: int | None = None  # time at which the disk failed, or was last tried
         self._part_ns: tuple[int, int] | None = None  # t_ns of the first and the last packet of the part
         self._lost = 0  # packets that were taken but are in no file
@@ -81,12 +70,12 @@ class WriterProcess:
         while True:
             word = self._hear()
             if word == processes.ROOM:
-                self._take_some()
-                _send(self._connection, processes.ROOM)  # before taking the rest, so that both sides work at once
+                taken = self._ring.take_packets(TAKEN_BYTES)
+                _send(self._connection, processes.ROOM)  # before writing, so that both sides work at once
+                self._write(taken)
             self._take()
             if word in (processes.END, processes.NOTHING):
                 break
-        self._write()
         self._end(self._finish("closed" if word == processes.END else "control process died"))
 
     def _end(self, summary: dict[str, str]) -> None:
@@ -114,29 +103,18 @@ class WriterProcess:
     def _take(self) -> None:
         """Take all packets waiting in the ring; in real time, flush by the clock."""
         while True:
-            self._take_some()
-            if self._gathered_bytes >= BATCH_BYTES or (self._setup.is_blocking and self._is_watched):
-                self._write()
+            self._write(self._ring.take_packets(TAKEN_BYTES))
             if not self._setup.is_blocking:
                 self._look_at_clock()
             if not self._ring.waiting:
                 return
 
-    def _take_some(self) -> None:
-        if data := self._ring.take_packets(BATCH_BYTES):
-            self._gathered.append(data)
-            self._gathered_bytes += len(data)
-
     def _look_at_clock(self) -> None:
-        """Flush or show if it is time, and retry a disk that has failed."""
+        """Flush if it is time, and retry a disk that has failed."""
         now_ns = self._clock.now_ns()
         if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
-            self._write()
             self._flush(now_ns)
             self._look_at_disk(now_ns)
-        elif self._is_watched and now_ns - self._shown_ns >= SHOW_PERIOD_NS:
-            self._shown_ns = now_ns
-            self._write()
 
     @property
     def _is_watched(self) -> bool:
@@ -209,45 +187,24 @@ class WriterProcess:
             "messages": str(self._messages + self._file.messages),
         }
 
-    def _write(self) -> None:
-        """Write the gathered packets; in lockstep end chunks by log time."""
-        data = b"".join(self._gathered)
-        starts, sizes = split(data)
-        self._gathered = []
-        self._gathered_bytes = 0
-        if not len(starts):
-            return
+    def _write(self, taken: bytes) -> None:
+        """Write packets from the ring; in lockstep end chunks by log time."""
         if self._sink.error or (not self._setup.is_blocking and self._sink.is_behind):
-            self._lose(len(starts))
+            self._lose(sum(1 for _ in split(taken)))
             return
         self._note_lost()
-        block = np.frombuffer(data + bytes(packet.ROOM), np.uint8)
-        is_whole = packet.is_whole(block, starts, sizes)
-        self._lost += int(np.count_nonzero(~is_whole))
-        starts, sizes = starts[is_whole], sizes[is_whole]
-        times_ns = packet.times_ns(block, starts)
-        if self._setup.is_blocking:
-            self._write_by_log_time(block, starts, sizes, times_ns)
-        else:
-            self._write_packets(block, starts, sizes, times_ns)
-
-    def _write_by_log_time(self, block: Rows, starts: Numbers, sizes: Numbers, times_ns: Numbers) -> None:
-        first = 0
-        while first < len(starts):
-            is_due = times_ns[first:] - self._flushed_ns >= FLUSH_PERIOD_NS
-            if is_due[0]:
-                self._flush(int(times_ns[first]))
-                is_due[0] = False
-            stop = first + int(np.argmax(is_due)) if is_due.any() else len(starts)
-            self._write_packets(block, starts[first:stop], sizes[first:stop], times_ns[first:stop])
-            first = stop
-
-    def _write_packets(self, block: Rows, starts: Numbers, sizes: Numbers, times_ns: Numbers) -> None:
-        if not len(starts):
-            return
-        first_ns = int(times_ns[0]) if self._part_ns is None else self._part_ns[0]
-        self._part_ns = first_ns, int(times_ns[-1])
-        self._lost += self._packets.write_packets(block, starts, sizes)
+        self._packets.shown = [] if self._is_watched else None
+        for data in split(taken):
+            packet = unpack(data)
+            if packet is None:
+                self._lost += 1
+                continue
+            if self._setup.is_blocking and packet.t_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
+                self._flush(packet.t_ns)
+            self._part_ns = packet.t_ns if self._part_ns is None else self._part_ns[0], packet.t_ns
+            self._lost += not self._packets.write_packet(packet)
+        if self.live is not None and self._packets.shown:
+            self.live.show(self._packets.shown)
 
     def _note_lost(self) -> None:
         """Count the packets that the sink has dropped since the last call as lost."""

@@ -64,8 +64,8 @@ from adacd_hil.records import (
     certified_layout,
     scheme_layout,
 )
-from adacd_hil.wire.codec_columns import MessageTable
 from adacd_hil.wire.e2e import E2eStatus
+from adacd_hil.wire.message_table import MessageTable
 
 PACKAGE = "adacd_hil_msgs/msg"
 DECODED = "/decoded/"

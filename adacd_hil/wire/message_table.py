@@ -1,16 +1,21 @@
-"""The table of a message's signals, from which both codecs are made, and the column codec: many frames at a time.
+"""The table of a message's signals, by which its frames are decoded.
 
 A signal is a whole container of 1, 2, 4 or 8 bytes, or bits of one byte; containers cover the frame without gaps.
-`value = raw * scale + offset`, each step rounded to float64. So both codecs give the same values, bit for bit:
-`MessageCodec` (adacd_hil.wire.codec) for one frame, `ColumnCodec` for an array of frames.
+`value = raw * scale + offset`, each step rounded to float64.
 """
 
+import struct
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
+_FORMATS = {(1, False): "B", (1, True): "b", (2, False): "H", (2, True): "h"} | {
+    (4, False): "I",
+    (4, True): "i",
+    (8, False): "Q",
+    (8, True): "q",
+}
+"""Letter of the module struct for a container, by bytes and whether it is signed."""
 
 
 @dataclass(frozen=True)
@@ -56,30 +61,31 @@ class MessageTable:
     length: int
     signals: tuple[SignalCodec, ...]
 
+    @cached_property
+    def containers(self) -> struct.Struct:
+        """The struct of the integers that make up a frame."""
+        return container_struct(self.signals)
+
+    def decode(self, data: bytes) -> tuple[float, ...]:
+        """Decode all signals to physical values, in the order of `signals`. Raises struct.error for a wrong length."""
+        containers = self.containers.unpack(data)
+        values = []
+        for signal in self.signals:
+            raw = containers[signal.container]
+            if mask := signal.mask:
+                raw = (raw >> signal.shift) & mask
+                if raw > mask >> 1 and signal.is_signed:
+                    raw -= mask + 1
+            values.append(raw * signal.scale + signal.offset)
+        return tuple(values)
+
 
 def plain_tables(messages: Iterable[MessageTable]) -> tuple[MessageTable, ...]:
     """Return the tables of messages without their codecs, so that another process can receive them."""
     return tuple(MessageTable(one.name, one.can_id, one.length, one.signals) for one in messages)
 
 
-class ColumnCodec:
-    """Decodes the frames of one message."""
-
-    def __init__(self, message: MessageTable) -> None:
-        self.length = message.length
-        self.count = len(message.signals)
-        sizes = {signal.container: signal.size for signal in message.signals}
-        self._begins = {container: sum(sizes[before] for before in range(container)) for container in sizes}
-        self._signals = message.signals
-
-    def decode(self, data: NDArray[np.uint8], values: NDArray[np.float64]) -> None:
-        """Decode `data` (n, length), each row in one piece, into `values` (n, signals)."""
-        for column, signal in enumerate(self._signals):
-            begin, size, mask = self._begins[signal.container], signal.size, signal.mask
-            form = f"<{'i' if signal.is_signed and not mask else 'u'}{size}"
-            raw: NDArray[Any] = data[:, begin : begin + size].view(form)[:, 0]
-            if mask:
-                raw = (raw.astype(np.int64) >> signal.shift) & mask
-                if signal.is_signed:
-                    raw -= (raw > mask >> 1) * np.int64(mask + 1)
-            values[:, column] = raw.astype(np.float64) * signal.scale + signal.offset
+def container_struct(signals: Iterable[SignalCodec]) -> struct.Struct:
+    """Return the struct of the containers that hold signals."""
+    formats = {signal.container: _FORMATS[signal.size, signal.is_signed and not signal.mask] for signal in signals}
+    return struct.Struct("<" + "".join(formats.values()))
