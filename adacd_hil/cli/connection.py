@@ -25,7 +25,7 @@ from adacd_hil.wire.dbc_decoder import DbcDecoder, load_decoder
 from adacd_hil.wire.open_bus import open_bus
 
 MOST_BLIND_CYCLES = 5
-"""Most cycles without data that is allowed on a real arm: half a degree at 100 deg/s and 1 ms."""
+"""Most cycles without data that are allowed on a real arm: half a degree at 100 deg/s and 1 ms."""
 
 
 def make_clock(name: str) -> Clock:
