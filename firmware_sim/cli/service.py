@@ -172,7 +172,7 @@ def stop_by_signal() -> Iterator[StopRequest]:
 
 
 def open_devices_end(interface: str, channel: str, clock: Clock, codec: Codec) -> Bus:
-    """Open the devices' end of a bus; CAN FD only where the contract has such frames. Raises BusMissingError."""
+    """Return the devices' end of a bus, open; CAN FD only if the contract has such frames. Raises BusMissingError."""
     heard = {message.can_id for message in codec.messages.values() if "HOST" in message.senders} | LISTENED_IDS
     heard.add(HOST_MARK)
     options: dict[str, Any] = {"is_fd": True} if is_fd(codec) else {}
