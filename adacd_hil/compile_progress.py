@@ -12,7 +12,8 @@ from typing import Any
 Listener = Callable[[Callable[[], str]], None]
 """Called with a function that returns the line; the listener calls that function to show it.
 
-Each begin and end of a compilation is a call, and every 20 ms of waiting for another process that compiles."""
+It is called at the beginning and end of each compilation, and every 20 ms while this process waits for another one
+that compiles."""
 
 _listeners: list[Listener] = []
 

@@ -176,7 +176,7 @@ class _Claims:
         self._lock(what, fcntl.LOCK_UN)
 
     def _lock(self, what: str, operation: int) -> bool:
-        """Lock or unlock a function's byte; False: another process has it. True also where locks don't work."""
+        """Lock or unlock a function's byte; return False if another process has it, True if locks don't work here."""
         if self._descriptor is None:
             return True
         byte = int.from_bytes(hashlib.sha256(what.encode()).digest()[:7], "big")
@@ -212,7 +212,7 @@ class _Locator(_CacheLocator):
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> "_Locator | None":
-        """Make the locator of a function of the two packages; None for others' functions."""
+        """Return the locator of a function of the two packages; None for others' functions."""
         is_ours = any(Path(py_file).resolve().is_relative_to(_ROOT / package) for package in _PACKAGES)
         return cls(py_func) if is_ours else None
 
@@ -242,7 +242,7 @@ class _CacheFile(IndexDataCacheFile):
         self._shipped = IndexDataCacheFile(str(shipped), base, stamp)  # type: ignore[no-untyped-call]
 
     def load(self, key: Any) -> Any:
-        """Load the code for a key; None: there is none."""
+        """Return the code for a key; None: there is none."""
         found = super().load(key)  # type: ignore[no-untyped-call]
         return self._shipped.load(key) if found is None else found  # type: ignore[no-untyped-call]
 
@@ -271,7 +271,7 @@ class _SharedCache(FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load the code compiled for these types; None: this process has to compile it, then save it."""
+        """Return the code compiled for these types; None: this process has to compile it, then save it."""
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         if found is None and _claims.claim(self._claim(sig)):
             found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
@@ -325,7 +325,7 @@ class _Compilation(event.Listener):
         self._on_first: Callable[[], None] | None = None
 
     def new_count(self, functions: Sequence[Any]) -> CompileCount:
-        """Start a count of these functions and all that they call."""
+        """Start and return a count of these functions and all that they call."""
         self._count = CompileCount(functions_below(functions), lambda function: function._cache.version())
         return self._count
 

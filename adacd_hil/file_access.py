@@ -22,7 +22,7 @@ _ANOTHER = "another one is there already, which is left as it is"
 
 
 def open_input(path: Path) -> BufferedReader:
-    """Open a regular file for reading. Raises OSError that names it."""
+    """Return a regular file, open for reading. Raises OSError that names it."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except ValueError as error:  # a NUL in the name
@@ -40,7 +40,7 @@ def open_input(path: Path) -> BufferedReader:
 
 
 def read_input(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
-    """Read a whole regular file of at most so many bytes. Raises OSError that names it."""
+    """Return the whole content of a regular file of at most so many bytes. Raises OSError that names it."""
     with open_input(path) as file:
         data = file.read(most_bytes + 1)
     if data is None:  # as of /proc/kmsg, which is a regular file

@@ -123,8 +123,8 @@ class _SchedulingAttributes(ctypes.Structure):
 def request_realtime(request: RealtimeRequest | None = None) -> RealtimeGrant:
     """Request real-time scheduling, a processor, locked memory and shallow idle states; call it after compiling.
 
-    Refusals are listed in the grant, not raised. Children inherit neither scheduler nor locked memory; see
-    `RealtimeGrant.unpinned` for the processor.
+    Return the grant, which lists the refusals; none is raised. Children inherit neither scheduler nor locked memory;
+    see `RealtimeGrant.unpinned` for the processor.
     """
     request = request or RealtimeRequest()
     libc = ctypes.CDLL(None, use_errno=True)

@@ -165,7 +165,7 @@ class Terminal(io.TextIOBase):
         return self._descriptor
 
     def isatty(self) -> bool:
-        """Whether the stream is a terminal."""
+        """Return whether the stream is a terminal whose reader has not gone."""
         return not self._is_gone and os.isatty(self._descriptor)
 
     def writable(self) -> bool:

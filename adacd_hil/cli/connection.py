@@ -143,7 +143,7 @@ class Connection:
         return " ".join(f"{option} {shlex.quote(str(value))}" for option, value in given if value is not None)
 
     def settings(self) -> Settings:
-        """Read the configuration; --dbc, if given, becomes its contract. Raises ConfigError."""
+        """Return the settings of the configuration; --dbc, if given, becomes its contract. Raises ConfigError."""
         return self.with_contract(load_settings(self.config, self.profile))
 
     def with_contract(self, settings: Settings) -> Settings:

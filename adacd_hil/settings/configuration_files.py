@@ -15,7 +15,7 @@ _LONGEST_CHAIN = 8
 
 
 def renewed(table: dict[str, Any]) -> dict[str, Any]:
-    """Return a log's configuration for today's keys; other removed keys stay, and `parse` refuses them.
+    """Return a log's configuration, some of its old keys changed to today's; `parse` refuses the other removed keys.
 
     `safety.commission_cycles` becomes `safety.commission_s`. Withdrawn keys of `detector` are dropped. If
     `certified.cross_talk_std` is missing, the version that wrote the log had no such term, so that it becomes 0.

@@ -110,7 +110,7 @@ class FaultPlan:
 
     @property
     def wait_ns(self) -> int:
-        """Longest time, ns, from the last `advance` to the next: until a row begins, ends or sends an EMCY."""
+        """Longest time from the last `advance` to the next one, ns: until a row begins, ends or sends an EMCY."""
         wait_ns = NEVER_NS
         for now_ns, next_ns in (
             (self._scenario_ns, self._next_scenario_ns),
@@ -194,7 +194,8 @@ class FaultPlan:
     def babble(self, period_ns: int) -> list[tuple[int, int, bytes]]:
         """Return the flood's frames within `period_ns` from the last `advance` on: offset in ns, identifier, data.
 
-        Each frame is returned once, also by overlapping calls, and counted. Nodes that are all off the bus send none.
+        Each frame is counted and returned once, also by overlapping calls. While all nodes of a row are off the bus,
+        its frames are only counted.
         """
         frames = []
         for row in self._babbling:

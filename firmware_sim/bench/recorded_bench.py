@@ -3,9 +3,9 @@
 Object dictionary, NMT and CiA 402 states, heartbeats, status frames, EMCY and watchdogs are those of `Bench`, so any
 host can boot and command the devices. Torque has no effect: the arm repeats its recorded motion.
 
-The bench reads the recording as the host asks for it. An attempt begins with the first SYNC, and after an NMT reset, so
-a run that recovered from a fault has several. In each the cycles count from its first SYNC by the SYNC counter, as the
-bench counts them; SYNCs that were lost leave a gap.
+The bench reads the recording as the host asks for it. An attempt begins with the first SYNC of the recording, and with
+the first after an NMT reset, so a run that recovered from a fault has several. In each the cycles count from its first
+SYNC by the SYNC counter, as the bench counts them; SYNCs that were lost leave a gap.
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -145,7 +145,7 @@ class Service:
         return self._has_been_operational and (is_silent or not self._bench.is_operational)
 
     def _is_settled(self) -> bool:
-        """Whether the arm of a host that has gone is at rest, or has been given the time for it."""
+        """Return whether the arm of a host that has gone is at rest, or has been given the time for it."""
         self._bench.outlive_host()
         self._departure.go()
         now_ns = self._clock.now_ns()

@@ -270,7 +270,7 @@ class EmulatedDevice(ObjectDictionary):
         return min(self._producer.send_due(t_ns), self._consumer.find_silence(t_ns), self._errors.send_waiting(t_ns))
 
     def _is_locked_at_work(self, index: int, subindex: int) -> bool:
-        """Whether SDO may not write an object now: while the device is at work, only objects in `open_at_work`."""
+        """Return whether SDO may not write an object now: while the device is at work, only those in `open_at_work`."""
         return self._application.is_at_work and (index, subindex) not in self.open_at_work
 
     def _check_period(self, period_us: int) -> None:

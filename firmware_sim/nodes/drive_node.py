@@ -463,7 +463,7 @@ class DriveNode(Application):
             self.has_news = True
 
     def _is_cause_present(self, t_ns: int) -> bool:
-        """Whether the drive fails, its motor calls for a fault, or a watchdog that stops it is or would be tripped."""
+        """Return whether the drive fails, its motor calls for a fault, or a watchdog stops it, or would at once."""
         if self._failure or self._tripped - WARNINGS or self._motor.error_code():
             return True
         return self._cause is Watchdog.COMMAND and self._is_command_missing(t_ns)
