@@ -49,7 +49,7 @@ def setting(
     choices: tuple[str, ...] = (),
     meaning: str,
 ) -> Any:
-    """Return the field of one setting, required if it has no default. Bounds are inclusive, for each element of a tuple."""
+    """Return the field of one setting, required if it has no default. Bounds are inclusive and hold in tuples, too."""
     metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "meaning": meaning}
     if isinstance(default, type):
         return dataclasses.field(default_factory=default, metadata=metadata)
