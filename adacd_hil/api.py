@@ -8,6 +8,7 @@ Everything else may move; these names stay. docs/api.md has examples.
 | `detect`, `fit`, `Arm`, `Detection`, `Model`, `Verdict`, `ArrayError` | the scheme over arrays of any serial arm |
 | `Detector`, `register_detector`, `check_detector` | a detector of your own |
 | `Bus`, `Frame` | another CAN interface |
+| `RunContact`, `RunEvent`, `ArrayContact` | contacts and events in these results |
 | `SchemeState`, `ContactReport`, `Certificate`, `LogError` | types of the results |
 """
 
@@ -62,7 +63,7 @@ PLACES = {
 
 
 def __getattr__(name: str) -> object:
-    """Import a name at its first use: some modules compile functions, some import plot libraries."""
+    """Return a public name, imported only now: some modules compile functions, some import plot libraries."""
     if name not in PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; there are {', '.join(__all__)}")
     from importlib import import_module

@@ -1,6 +1,7 @@
 """The only reader of time: integer nanoseconds, monotonic in a run.
 
-`t_ns` is always a value of one of these clocks. Wall-clock time appears once, in the log's header.
+In a run `t_ns` is always a value of one of these clocks. Wall-clock time is for dates: in the log's header, a tare, the
+history, names of folders.
 """
 
 import ctypes
@@ -45,7 +46,7 @@ class MonotonicClock:
         return time.monotonic_ns()
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Sleep until `t_ns` in one system call; the kernel may wake us later, never earlier.
+        """Sleep until `t_ns` in one system call; the kernel may wake the process later, never earlier.
 
         A signal's handler runs when the signal comes, and the sleep goes on after it. Raises OSError.
         """
@@ -73,7 +74,7 @@ class VirtualClock:
 
 
 def wall_ns() -> int:
-    """Return the wall clock, ns since 1970; for log headers only."""
+    """Return the wall clock, ns since 1970; for dates only, since it may be set while a run lasts."""
     return time.time_ns()
 
 
@@ -89,10 +90,10 @@ def wall_offset_ns() -> int:
 
 
 def format_date(t_ns: int) -> str:
-    """Write wall-clock time, ns since 1970, as ISO 8601 in UTC."""
+    """Return wall-clock time, ns since 1970, as ISO 8601 in UTC, whole seconds."""
     return datetime.fromtimestamp(t_ns // _NS_PER_S, tz=UTC).strftime(_DATE)
 
 
 def date_ns(date_utc: str) -> int:
-    """Parse a date as `format_date` writes it; return ns since 1970. Raises ValueError."""
+    """Return the ns since 1970 of a date as `format_date` returns it. Raises ValueError."""
     return int(datetime.strptime(date_utc, _DATE).replace(tzinfo=UTC).timestamp()) * _NS_PER_S

@@ -10,7 +10,10 @@ from types import ModuleType
 from typing import Any
 
 Listener = Callable[[Callable[[], str]], None]
-"""Called several times a second with a function that makes the line; the listener calls that function to show it."""
+"""Called with a function that returns the line; the listener calls that function to show it.
+
+It is called at the beginning and end of each compilation, and every 20 ms while this process waits for another one
+that compiles."""
 
 _listeners: list[Listener] = []
 
@@ -73,7 +76,7 @@ class CompileCount:
         return bool(self._expected)
 
     def count_function(self, function: Any) -> None:
-        """Count a function that has been compiled, and all that it calls."""
+        """Count a function that has been compiled, and all that it calls, if expected; then call the listeners."""
         self._done |= {
             name for name in functions_below([function], is_all=True) if not self._expected or name in self._expected
         }

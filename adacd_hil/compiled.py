@@ -4,7 +4,7 @@ The on-disk cache is keyed by the text of every module with compiled functions a
 numba alone looks only at the file of the function itself; it would use old code of an edited callee, and the old value
 of an edited constant.
 
-A function that one process is compiling is not compiled by another at the same time (`_SharedCache`). The code is for
+Another process waits 120 s at most for a function that one process is compiling (`_SharedCache`). The code is for
 every processor of the architecture, so that a wheel can bring it along (`tools/wheel`). On the one machine measured it
 was as fast as code for that processor, with the same bits.
 """
@@ -93,10 +93,12 @@ def _digest(sources: dict[str, bytes]) -> str:
 
 
 def cache_folder(digest: str) -> Path:
-    """Make the folder for compiled code of a source state: in NUMBA_CACHE_DIR, the user's cache or the temporary one.
+    """Make and return the folder for compiled code of a state of the sources.
 
-    Code in the folder is executed. So the folder and its parent must belong to this user alone; else the next place is
-    tried, at last a new temporary folder. Raises OSError if all fail.
+    It is in NUMBA_CACHE_DIR, the user's cache or the temporary folder.
+
+    Code in the folder is executed. So only this user may write in the folder and its parent; else the next place is
+    tried, at last a new temporary folder. A NUMBA_CACHE_DIR that is not used is warned of. Raises OSError if all fail.
     """
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
@@ -148,7 +150,7 @@ _MOST_POLLS = 6000
 class _Claims:
     """Marks the functions that a process is compiling, by locks on single bytes of one file; they end with the process.
 
-    Calls have no circle, so neither has waiting; the kernel would refuse one.
+    Calls have no circle, so neither has waiting; each wait ends after 120 s.
     """
 
     def __init__(self) -> None:
@@ -159,7 +161,8 @@ class _Claims:
     def claim(self, what: str) -> bool:
         """Lock a function, by its full name, for this process; wait, 120 s at most, while another one holds it.
 
-        Return whether another process held the lock, and so may have compiled the function. Without file locks: False.
+        Return whether another process held the lock, and so may have compiled the function; after 120 s return True
+        without the lock. Without file locks: False.
         """
         for polls in range(_MOST_POLLS):
             if self._lock(what, fcntl.LOCK_EX | fcntl.LOCK_NB):
@@ -173,7 +176,7 @@ class _Claims:
         self._lock(what, fcntl.LOCK_UN)
 
     def _lock(self, what: str, operation: int) -> bool:
-        """Lock or unlock a function's byte; False: another process has it. True also where locks don't work."""
+        """Lock or unlock a function's byte; return False if another process has it, True if locks don't work here."""
         if self._descriptor is None:
             return True
         byte = int.from_bytes(hashlib.sha256(what.encode()).digest()[:7], "big")
@@ -190,7 +193,7 @@ _claims = _Claims()
 
 
 def _name_of_layout(record: numba.types.Record) -> tuple[str, tuple[str]]:
-    """Name a record in the symbols of compiled code.
+    """Return the name of a record in the symbols of compiled code.
 
     numba names it by a count of its process (numba's issue 7654). Two processes then save code of two layouts below one
     symbol, and a third one that loads both runs the code of the first with the memory of the second.
@@ -209,7 +212,7 @@ class _Locator(_CacheLocator):
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> "_Locator | None":
-        """Make the locator of a function of the two packages; None for others' functions."""
+        """Return the locator of a function of the two packages; None for others' functions."""
         is_ours = any(Path(py_file).resolve().is_relative_to(_ROOT / package) for package in _PACKAGES)
         return cls(py_func) if is_ours else None
 
@@ -239,7 +242,7 @@ class _CacheFile(IndexDataCacheFile):
         self._shipped = IndexDataCacheFile(str(shipped), base, stamp)  # type: ignore[no-untyped-call]
 
     def load(self, key: Any) -> Any:
-        """Load the code for a key; None: there is none."""
+        """Return the code for a key; None: there is none."""
         found = super().load(key)  # type: ignore[no-untyped-call]
         return self._shipped.load(key) if found is None else found  # type: ignore[no-untyped-call]
 
@@ -268,7 +271,7 @@ class _SharedCache(FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load the code compiled for these types; None: this process has to compile it, then save it."""
+        """Return the code compiled for these types; None: this process has to compile it, then save it."""
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         if found is None and _claims.claim(self._claim(sig)):
             found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
@@ -294,12 +297,12 @@ class _SharedCache(FunctionCache):
 
 
 def compiled(function: Function) -> Function:
-    """Compile `function` at its first call; division by zero gives inf or nan, as in numpy."""
+    """Return `function`, to be compiled at its first call; division by zero gives inf or nan, as in numpy."""
     return _compiled(function)
 
 
 def released(function: Function) -> Function:
-    """Compile `function` as `compiled` does, without the GIL while it runs; for functions that take long."""
+    """Return `function` as `compiled` does; it releases the GIL while it runs, for functions that take long."""
     return _compiled(function, nogil=True)
 
 
@@ -322,7 +325,7 @@ class _Compilation(event.Listener):
         self._on_first: Callable[[], None] | None = None
 
     def new_count(self, functions: Sequence[Any]) -> CompileCount:
-        """Start a count of these functions and all that they call."""
+        """Start and return a count of these functions and all that they call."""
         self._count = CompileCount(functions_below(functions), lambda function: function._cache.version())
         return self._count
 

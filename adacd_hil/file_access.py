@@ -22,7 +22,7 @@ _ANOTHER = "another one is there already, which is left as it is"
 
 
 def open_input(path: Path) -> BufferedReader:
-    """Open a regular file for reading. Raises OSError that names it."""
+    """Return a regular file, open for reading. Raises OSError that names it."""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except ValueError as error:  # a NUL in the name
@@ -40,7 +40,7 @@ def open_input(path: Path) -> BufferedReader:
 
 
 def read_input(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
-    """Read a whole regular file of at most so many bytes. Raises OSError that names it."""
+    """Return the whole content of a regular file of at most so many bytes. Raises OSError that names it."""
     with open_input(path) as file:
         data = file.read(most_bytes + 1)
     if data is None:  # as of /proc/kmsg, which is a regular file
@@ -51,7 +51,7 @@ def read_input(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
 
 
 def exists(path: Path) -> bool:
-    """Return whether a file or folder of that name exists; False for a name that no file can have."""
+    """Return whether a file or folder of that name exists; False, too, where that can't be found out."""
     try:
         return path.exists()
     except (OSError, ValueError):
@@ -93,7 +93,7 @@ def check_unused(path: Path) -> None:
 
 
 def _owner(descriptor: int) -> str:
-    """Name the process that holds the lock of a file; proc(5), /proc/locks."""
+    """Return words for the process that holds the lock of a file; proc(5), /proc/locks."""
     status = os.fstat(descriptor)
     place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
     with contextlib.suppress(OSError):
@@ -105,7 +105,7 @@ def _owner(descriptor: int) -> str:
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Return whether an error, or an error that caused it, means that the disk or the quota is full."""
+    """Return whether an error, or one that caused it, means that the disk or quota is full, or a file too large."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in _NO_ROOM:
             return True
@@ -114,7 +114,7 @@ def is_disk_full(error: BaseException | None) -> bool:
 
 
 def in_words(error: BaseException) -> str:
-    """Describe an error in one line; an OSError by file and reason, without its number."""
+    """Return the text of an error; of an OSError file and reason, without its number."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return str(error)

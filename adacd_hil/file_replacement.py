@@ -114,7 +114,7 @@ def _create_beside(path: Path) -> Path:
 
 
 def dangling_link(path: Path) -> Path | None:
-    """Return the first link on a path, or the path itself, whose target doesn't exist; None if there is none."""
+    """Return the path, or the lowest folder above it, that is a link without a target; None if there is none."""
     for place in (path, *path.parents):
         with contextlib.suppress(OSError):
             if place.is_symlink() and not place.exists():

@@ -19,7 +19,7 @@ class GivenPath(click.Path):
         super().__init__(path_type=Path, file_okay=file_okay, dir_okay=dir_okay)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert a path; refuse an empty name."""
+        """Return a path as `click.Path` does; refuse an empty name."""
         if value == "":
             self.fail("the name is empty", param, ctx)
         return super().convert(value, param, ctx)
@@ -32,7 +32,7 @@ class WrittenPath(GivenPath):
     """A path to write to: refused if a folder of it would have to be made at a link without a target."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Convert a path; refuse a dangling link."""
+        """Return a path as `GivenPath` does; refuse a dangling link."""
         path = Path(super().convert(value, param, ctx))
         link = dangling_link(path if self.dir_okay else path.parent)  # a file would replace the link
         if link is not None:

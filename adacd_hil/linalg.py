@@ -51,8 +51,9 @@ def add_row(v: Vector, r: float, R: float, L: Vector, b: Vector) -> None:
 
 @compiled
 def factor(A: Vector, least: float) -> bool:
-    """Put the Cholesky factor L, A = L L', into the lower half of A; False if A is not positive definite.
+    """Replace the lower half of A by its Cholesky factor L, A = L L'; return whether A is positive definite.
 
+    Otherwise the lower half is of no use.
     least: a squared pivot below this counts as this; 0: it makes A not positive definite.
     """
     for j in range(A.shape[0]):

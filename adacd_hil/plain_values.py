@@ -11,7 +11,7 @@ from typing import Any
 def plain_values(value: Any, digits: int | None = None) -> Any:
     """Return a value in JSON's types: a record by its fields, an array as lists, null for infinity and NaN.
 
-    digits: significant digits of numbers that are not whole; None: all.
+    digits: significant digits of floats; None: all.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
@@ -29,5 +29,5 @@ def plain_values(value: Any, digits: int | None = None) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """Write a value's plain values as JSON for a file or standard output."""
+    """Return a value's plain values as JSON for a file or standard output."""
     return json.dumps(plain_values(value), indent=2, allow_nan=False)

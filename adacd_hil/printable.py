@@ -10,16 +10,16 @@ _MOST_LETTERS = 2000
 
 
 def plain(text: str) -> str:
-    """Escape control characters of a text, except tabs and newlines, as JSON does, with four hexadecimal digits."""
+    """Return a text, its control characters, except tabs and newlines, escaped as in JSON by four hex digits."""
     return _CONTROL.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def in_line(text: str) -> str:
-    """Escape control characters as `plain` does, and also tabs and newlines, so that the text stays in its line."""
+    """Return a text escaped as by `plain`, tabs and newlines, too, so that it stays in its line."""
     return plain(text).replace("\n", "\\u000a").replace("\t", "\\u0009")
 
 
 def one_line(text: object) -> str:
-    """Put a text into one line, without control characters, cut at 2000 letters."""
+    """Return a text in one line, white space as single spaces, control characters escaped, cut at 2000 letters."""
     line = plain(" ".join(str(text).split()))
     return line if len(line) <= _MOST_LETTERS else f"{line[:_MOST_LETTERS]} …"

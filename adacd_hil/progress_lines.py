@@ -48,7 +48,10 @@ class Progress:
         self._lines.put((line, self._has_cursor))
 
     def count(self, line: Callable[[], str]) -> None:
-        """Queue a count with the seconds so far, which the next line overwrites, unless the last count is recent."""
+        """Queue a count with the seconds since counting began, unless that or the last count is recent.
+
+        On a terminal the next line overwrites it.
+        """
         now_ns = self._clock.now_ns()
         if not self._is_counting:
             self._is_counting, self._begun_ns, self._counted_ns = True, now_ns, now_ns
@@ -69,7 +72,7 @@ class Progress:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Print all queued lines, then end."""
+        """End once all queued lines are printed, after CLOSE_TIMEOUT_S at the latest."""
         self._listening.close()
         self._lines.put(None)
         self._thread.join(self.CLOSE_TIMEOUT_S)

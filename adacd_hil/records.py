@@ -109,9 +109,9 @@ class SchemeBlock:
 class CertifiedBlock(SchemeBlock):
     """The block of the certified scheme: the fields of `SchemeBlock`, then its own.
 
-    Sizes: further parameters (offsets, lags, friction terms), all parameters, bank: joints times channels of the
-    detector bank. tau_f, tau_ext_hat and threshold are those of the slowest filter. The bank holds first the smoothed
-    channel of each filter, then the unsmoothed channels of all filters but the slowest.
+    Sizes: further parameters (offsets, lags, friction terms, cross-talk, torques by place), all parameters, bank:
+    joints times channels of the detector bank. tau_f, tau_ext_hat and threshold are those of the slowest filter. The
+    bank holds first the smoothed channel of each filter, then the unsmoothed channels of all filters but the slowest.
     """
 
     tau_ext_bank: Annotated[Vector, "bank", "Nm", "estimated external torque of each channel"]
@@ -148,12 +148,12 @@ def _layout(block: type, sizes: dict[str, int]) -> Layout:
 
 
 def scheme_layout(parameter_count: int) -> Layout:
-    """Lay out `SchemeBlock` for `parameter_count` dynamic parameters (7, or 9 with gravity)."""
+    """Return the layout of `SchemeBlock` for `parameter_count` dynamic parameters (7, or 9 with gravity)."""
     return _layout(SchemeBlock, block_sizes(parameter_count))
 
 
 def certified_layout(parameter_count: int, further_count: int, channel_count: int) -> Layout:
-    """Lay out `CertifiedBlock`; channel_count: of the detector bank."""
+    """Return the layout of `CertifiedBlock`; channel_count: of the detector bank, per joint."""
     return _layout(CertifiedBlock, block_sizes(parameter_count, further_count, channel_count))
 
 
@@ -192,15 +192,15 @@ TRUTH_LAYOUT = Layout(
 
 
 class SchemeState(IntEnum):
-    """States of the scheme. The comment beside each value says how to leave it."""
+    """States of the scheme. The comment beside each value says how to leave it; a fault leads from each to FAULT."""
 
     INIT = 0  # the first complete cycle; or FAULT when it doesn't come
     COMMISSION = 1  # enough complete cycles at rest; or FAULT when they don't come
-    ENABLE = 2  # both drives report Operation enabled; a contact; or FAULT on timeout
+    ENABLE = 2  # both drives report Operation enabled; a motion, back to COMMISSION; a contact; or FAULT on timeout
     ADAPT = 3  # eq. (15) with excitation proven, or all that a test of the fit needs; a contact; or FAULT on timeout
-    MONITOR = 4  # a contact, or the announcement of a payload change
+    MONITOR = 4  # a contact; a late host; evidence against the certificate; the announcement of a payload change
     REACT = 5  # after a collision: at rest; after a contact: it has cleared
-    STOPPED = 6  # the user acknowledges
+    STOPPED = 6  # the user acknowledges, takes the certificate back, or announces or reports a payload change
     PAYLOAD = 7  # the user announces that the payload has been changed; a contact
     FAULT = 8  # latched; the user acknowledges, then INIT
     CERTIFY = 9  # theta frozen, tested on motion not used for the fit; out: certified; refuted; a contact
@@ -341,7 +341,7 @@ class Location(IntEnum):
     INCONSISTENT = 6  # no single normal force on link 2 fits: several contacts, as in a clamp, or friction
 
     def force_text(self, force_N: float) -> str:
-        """Format a force in N: "≥" before a lower bound, a dash where it is unknown."""
+        """Return the text of a force in N, with "≥" before a lower bound; a dash where it is unknown."""
         if self in (Location.KNOWN, Location.UNCERTAIN):
             return f"{force_N:.1f}"
         return f"≥ {abs(force_N):.1f}" if self is Location.LINK_1 else "–"
@@ -379,7 +379,7 @@ class ContactReport(NamedTuple):
 
 
 class SchemeOutput(NamedTuple):
-    """Decision of the scheme in one cycle. `block` is laid out by `scheme_layout`."""
+    """Decision of the scheme in one cycle. `block` is laid out by `scheme_layout` or `certified_layout`."""
 
     cycle: int
     state: SchemeState

@@ -6,7 +6,7 @@ from difflib import SequenceMatcher
 from pathlib import Path
 
 _SHORTEST, _LONGEST = 2, 64
-"""Letters of a word that is compared with names."""
+"""Fewest and most letters of a word that is compared with names."""
 _LIKE = 0.66
 """Least share of common letters of a word and the name that is meant: "amr" and "arm" have 0.67, "Kx" and "Kp" 0.5."""
 
@@ -14,8 +14,8 @@ _LIKE = 0.66
 def nearest_name(word: str, known: Iterable[str]) -> str | None:
     """Return the known name that is most like `word` in each of its dotted parts; None if none is like it.
 
-    Case is ignored. Units may be missing: `threshold` stands for `threshold_Nm`. Of equally near names the first is
-    returned.
+    None, too, for a word of less than 2 or more than 64 letters. Case is ignored. Units may be missing: `threshold`
+    stands for `threshold_Nm`. Of equally near names the first is returned.
     """
     if not _SHORTEST <= len(word) <= _LONGEST:
         return None

@@ -74,6 +74,7 @@ class RealtimeGrant:
     """The grant of the operating system.
 
     `cpu`: the processor that the process stays on, None for any. `cpus`: processors that it was allowed before.
+    `is_awake`: idle states with a long wake-up are forbidden.
     """
 
     scheduler: str
@@ -85,7 +86,7 @@ class RealtimeGrant:
 
     @contextmanager
     def unpinned(self) -> Iterator[None]:
-        """Run on any processor while the block lasts; a child that is started in it doesn't inherit the pinning."""
+        """Run on any of `cpus` while the block lasts; a child that is started in it doesn't inherit the pinning."""
         if self.cpu is not None:
             os.sched_setaffinity(0, self.cpus)
         try:
@@ -122,8 +123,8 @@ class _SchedulingAttributes(ctypes.Structure):
 def request_realtime(request: RealtimeRequest | None = None) -> RealtimeGrant:
     """Request real-time scheduling, a processor, locked memory and shallow idle states; call it after compiling.
 
-    Refusals are listed in the grant, not raised. Children inherit neither scheduler nor locked memory; see
-    `RealtimeGrant.unpinned` for the processor.
+    Return the grant, which lists the refusals; none is raised. Children inherit neither scheduler nor locked memory;
+    see `RealtimeGrant.unpinned` for the processor.
     """
     request = request or RealtimeRequest()
     libc = ctypes.CDLL(None, use_errno=True)
@@ -216,7 +217,10 @@ def _lock_memory(libc: ctypes.CDLL) -> str:
 
 
 def _keep_awake() -> tuple[bool, list[Refusal]]:
-    """Forbid idle states with a long wake-up, for as long as this process lives: the file must stay open."""
+    """Forbid idle states with a long wake-up, for as long as this process lives: the file must stay open.
+
+    Return whether they are forbidden, and the refusals; False and none where the kernel has no such file.
+    """
     try:
         os.write(os.open(_DMA_LATENCY, os.O_WRONLY), bytes(4))  # the longest latency to bear, int32 in µs
     except FileNotFoundError:
@@ -228,7 +232,7 @@ def _keep_awake() -> tuple[bool, list[Refusal]]:
 
 
 def isolated_cpus(folder: Path = _SYSTEM_CPUS) -> tuple[int, ...]:
-    """Return the processors that the kernel keeps free of ordinary work, from a list such as "2-3,7"."""
+    """Return the processors that the kernel keeps free of ordinary work, from a list such as "2-3,7"; () if unknown."""
     try:
         text = (folder / "isolated").read_text().strip()
     except OSError:
@@ -249,7 +253,7 @@ def freeze_garbage() -> None:
 
 @contextmanager
 def frozen_garbage() -> Iterator[None]:
-    """Collect garbage once; the collection is disabled while the block lasts."""
+    """Collect garbage once; the collection is disabled while the block lasts, and enabled after it."""
     freeze_garbage()
     try:
         yield
@@ -259,7 +263,7 @@ def frozen_garbage() -> Iterator[None]:
 
 
 def scheduler_name() -> str:
-    """Name the scheduler this process runs under."""
+    """Return the name of the scheduler that this process runs under."""
     names = {
         os.SCHED_OTHER: "SCHED_OTHER",
         os.SCHED_FIFO: "SCHED_FIFO",

@@ -14,7 +14,10 @@ from typing import NoReturn
 
 
 def start_program(load: Callable[[], Callable[[], NoReturn]], interrupted: int, line: str = "") -> NoReturn:
-    """Call `load`, which imports the command line, and run its result; interrupted: exit status after Ctrl-C."""
+    """Call `load`, which imports the command line, then call the function that it returns.
+
+    interrupted: exit status after Ctrl-C. line: printed to standard error at a Ctrl-C in `load`, unless it is empty.
+    """
     try:
         with _ending_at_once(interrupted, line):
             main = load()

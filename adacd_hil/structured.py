@@ -38,7 +38,11 @@ _NUMBERS: dict[Any, type[np.generic]] = {float: np.float64, int: np.int64, bool:
 
 
 def described(kind: type[Any], sizes: Mapping[str, int]) -> Record:
-    """Describe a record of a class. sizes: of the dimensions that it and the classes in it name."""
+    """Return the description of a record of a class.
+
+    sizes: of the dimensions that the class and the classes in it name. Raises ValueError for a field whose name is
+    numpy's own.
+    """
     return _described(
         tuple(_field_of(name, hint, sizes) for name, hint in get_type_hints(kind, include_extras=True).items())
     )
@@ -50,14 +54,17 @@ def zeros_of(kind: type[Any], sizes: Mapping[str, int]) -> Structured:
 
 
 def packed(values: Any) -> Structured:
-    """Put an instance of a dataclass into one record (1,); its fields are numbers, arrays and such instances."""
+    """Return one record (1,) of an instance of a dataclass, all float64.
+
+    Its fields are numbers, arrays and such instances.
+    """
     record = np.zeros(1, _described_as(values))
     _fill(record[0], values)
     return record
 
 
 def float_fields(shapes: Mapping[str, Shape]) -> Record:
-    """Describe a record of float64 fields of these shapes, whose names are given as data: `record["name"]`."""
+    """Return the description of a record of float64 fields of these shapes; read a field as `record["name"]`."""
     return _flat(tuple(shapes.items()))
 
 

@@ -26,7 +26,7 @@ def fit_table(
     is_cut: bool = False,
     names: int = 1,
 ) -> list[str]:
-    """Align lines of cells; columns in `right` to the right. Each cell is escaped to text of one line.
+    """Return lines of cells as aligned text; columns in `right` to the right. Each cell is escaped to text of one line.
 
     No line is wider than `width`, of at least 20; None: no limit. is_cut: each row is one line, its cells cut.
     names: number of columns that identify a row; each part begins with them, if they leave room for others.
@@ -66,7 +66,7 @@ def _least_room(column: int, lines: Sequence[Sequence[str]]) -> int:
 
 
 def _parts(least: Sequence[int], width: int, names: int) -> list[list[int]]:
-    """Choose the columns of each part: as many as fit."""
+    """Return the columns of each part: as many as fit."""
     if _sum([*least[:names], max(least[names:], default=0)]) > width:
         names = 1
     parts = [list(range(names))]
@@ -78,7 +78,7 @@ def _parts(least: Sequence[int], width: int, names: int) -> list[list[int]]:
 
 
 def _shrunk(natural: list[int], least: list[int], width: int) -> list[int]:
-    """Narrow the widest columns until the part fits, if necessary below `least`."""
+    """Return the widths of a part's columns, the widest narrowed until the part fits, if necessary below `least`."""
     widths = [min(one, width) for one in natural]
     while _sum(widths) > width:
         able = [place for place, one in enumerate(widths) if one > least[place]] or range(len(widths))
@@ -90,7 +90,10 @@ def _shrunk(natural: list[int], least: list[int], width: int) -> list[int]:
 
 
 def _rows(line: Sequence[str], widths: Sequence[int]) -> list[tuple[str, ...]]:
-    """Wrap the cells of a line; continued lines of the first cell are indented, to tell them from a new row."""
+    """Return the rows of a line with its cells wrapped.
+
+    Continued lines of the first cell are indented, to tell them from a new row.
+    """
     cells = [
         _wrapped(cell, width, "" if column else "  ")
         for column, (cell, width) in enumerate(zip(line, widths, strict=True))
@@ -113,7 +116,7 @@ def _wrapped(text: str, width: int, indent: str) -> list[str]:
 
 
 def _broken(word: str, room: int) -> str:
-    """Split a word that doesn't fit into a line, at the joints of a path or a key."""
+    """Return a word that doesn't fit into a line, with spaces where it may split: at the joints of a path or a key."""
     parts = [""]
     for piece in _JOINT.split(word):
         if len(parts[-1]) + len(piece) > room:

@@ -35,8 +35,8 @@ _PIECE = 1024
 def terminal_columns(stream: "TextIO | Terminal | None" = None) -> int | None:
     """Return the width to which text for a stream (default: standard output) is laid out; None: lines are not folded.
 
-    It is the environment variable COLUMNS, else the terminal's width. A stream that isn't a terminal has none, except
-    standard output if COLUMNS is set.
+    It is the environment variable COLUMNS, else the terminal's width, else 80; at least 20. A stream that isn't a
+    terminal has none, except standard output if COLUMNS is set.
     """
     is_output = stream is None or stream is sys.stdout
     stream = stream or sys.stdout
@@ -62,7 +62,7 @@ _FIRST_FIELD = re.compile(r"\s*(?:\S+ )*\S+\s{2,}")
 
 
 def fold(text: str, width: int | None) -> str:
-    """Fold lines that are longer than `width` between words. None: nothing is folded.
+    """Return a text, its lines that are longer than `width` folded between words. None: nothing is folded.
 
     If a line begins with a word and a gap, such as a time, its continuation is aligned below the text after the gap,
     else it is indented by two letters. A longer word, such as a path, is left whole, so that it can be copied.
@@ -84,7 +84,9 @@ def _parts(line: str, width: int) -> list[str]:
 
 
 def wrap_words(text: str, width: int, indent: str, is_breaking: bool = False) -> list[str]:
-    """Wrap a line between words, but not between a number and its unit; `indent` begins each part but the first.
+    """Return the parts of a line, wrapped between words but not between a number and its unit.
+
+    `indent` begins each part but the first.
 
     is_breaking: words that are longer than a part are split, too.
     """
@@ -100,7 +102,7 @@ def wrap_words(text: str, width: int, indent: str, is_breaking: bool = False) ->
 
 
 def keep_units(text: str, gap: str, most: int | None = None) -> str:
-    """Replace the space between a number and its unit by `gap`, unless the two have more than `most` letters."""
+    """Return a text with `gap` between a number and its unit, unless the two have more than `most` letters."""
     return _QUANTITY.sub(
         lambda found: found[0] if most and len(found[0]) > most else f"{found[1]}{gap}{found[2]}", text
     )
@@ -121,12 +123,12 @@ _MARK = re.compile(rf"^(\s*\d+\.\d\d s  |)({'|'.join(map(re.escape, _MARKS))})(?
 
 
 def for_people(text: str, stream: "TextIO | Terminal") -> str:
-    """Lay a text out for a stream: escape control characters, fold lines, colour marks if the stream has colours."""
+    """Return a text for a stream: control characters escaped, lines folded, marks coloured if it has colours."""
     return painted(fold(plain(text), terminal_columns(stream)), stream)
 
 
 def painted(text: str, stream: "TextIO | Terminal") -> str:
-    """Colour the marks of an escaped text, if the stream has colours."""
+    """Return an escaped text, its marks coloured if the stream has colours."""
     if not has_colour(stream):
         return text
     return _MARK.sub(lambda found: f"{found[1]}\x1b[{_MARKS[found[2]]}m{found[2]}\x1b[0m", text)
@@ -163,7 +165,7 @@ class Terminal(io.TextIOBase):
         return self._descriptor
 
     def isatty(self) -> bool:
-        """Whether the stream is a terminal."""
+        """Return whether the stream is a terminal whose reader has not gone."""
         return not self._is_gone and os.isatty(self._descriptor)
 
     def writable(self) -> bool:
@@ -171,14 +173,20 @@ class Terminal(io.TextIOBase):
         return True
 
     def write(self, text: str) -> int:
-        """Write a text with control characters escaped. Raises OSError where the stream is needed."""
+        """Write a text with control characters escaped; return its length. Raises OSError as `write_raw`.
+
+        Where the stream isn't needed, `for_people` lays the text out.
+        """
         if not isinstance(text, str):
             raise TypeError(f"{self.name} takes text, not {type(text).__name__}")
         self.write_raw(plain(text) if self._is_needed else for_people(text, self))
         return len(text)
 
     def write_raw(self, text: str) -> None:
-        """Write a text without escaping, for our own cursor movements. Raises OSError."""
+        """Write a text without escaping, for our own cursor movements.
+
+        Raises OSError if the stream is needed and can't be written, unless its reader has gone.
+        """
         data = text.encode(self.encoding, self.errors)
         if not data or self._is_gone or not self._acquire():
             return
@@ -196,7 +204,7 @@ class Terminal(io.TextIOBase):
         self._patience = _PATIENCE_POLLS
 
     def _acquire(self) -> bool:
-        """Wait until no other thread writes; return False when the wait is over."""
+        """Take the lock once no other thread writes, and return True; return False if the wait is given up."""
         polls = 0
         while not self._lock.acquire(timeout=_POLL_MS / 1000):
             polls += 1
@@ -248,14 +256,14 @@ def write_result(text: str) -> None:
 
 
 def moves_cursor(stream: "TextIO | Terminal") -> bool:
-    """Return whether a stream is a terminal that can overwrite a line; not with TERM=dumb."""
+    """Return whether a stream is a terminal that can overwrite a line; not with TERM=dumb or without TERM."""
     return _is_terminal(stream) and os.environ.get("TERM", "dumb") != "dumb"
 
 
 def has_colour(stream: "TextIO | Terminal") -> bool:
-    """Return whether colours may be written: to terminals except with TERM=dumb.
+    """Return whether colours may be written: to the terminals of `moves_cursor`.
 
-    NO_COLOR, set to any value, forbids them; otherwise FORCE_COLOR or CLICOLOR_FORCE, other than 0, force them.
+    NO_COLOR, unless empty, forbids them; otherwise FORCE_COLOR or CLICOLOR_FORCE, unless empty or 0, force them.
     """
     if os.environ.get("NO_COLOR"):
         return False

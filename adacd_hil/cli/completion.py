@@ -36,7 +36,7 @@ complete_truth = _complete_toml("firmware_sim", "truths")
 
 
 def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return the groups and keys that begin with `incomplete`; for an option KEY=VALUE, `KEY=` or the key's choices."""
+    """Return the groups that begin with `incomplete`, else the keys; for an option KEY=VALUE, `KEY=` or its choices."""
     from adacd_hil.settings.setting_keys import known_keys, sections
 
     known = {key: row for key, row in known_keys().items() if not row.is_in_row}
@@ -60,7 +60,7 @@ def complete_interface(_ctx: Context, _param: Parameter, incomplete: str) -> lis
 
 
 def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return this machine's CAN interfaces that begin with `incomplete`; [] if another bus than SocketCAN is given."""
+    """Return this machine's CAN interfaces that begin with `incomplete`; [] if --interface is not SocketCAN."""
     if ctx.params.get("interface") not in (None, "socketcan"):
         return []
     from adacd_hil.wire.can_interface import can_interfaces
@@ -69,7 +69,10 @@ def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[C
 
 
 def complete_run(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return those of the 30 newest folders in `runs` with a log that begin with `incomplete`; the shell adds files."""
+    """Return those of the 30 last folders in `runs` with a log that begin with `incomplete`; the shell adds files.
+
+    The links come first, then the newest dates.
+    """
     from adacd_hil.cli.output import RUNS
     from adacd_hil.log.log_files import LOG_NAME
 

@@ -25,7 +25,7 @@ from adacd_hil.wire.dbc_decoder import DbcDecoder, load_decoder
 from adacd_hil.wire.open_bus import open_bus
 
 MOST_BLIND_CYCLES = 5
-"""Most cycles without data that is allowed on a real arm: half a degree at 100 deg/s and 1 ms."""
+"""Most cycles without data that are allowed on a real arm: half a degree at 100 deg/s and 1 ms."""
 
 
 def make_clock(name: str) -> Clock:
@@ -143,7 +143,7 @@ class Connection:
         return " ".join(f"{option} {shlex.quote(str(value))}" for option, value in given if value is not None)
 
     def settings(self) -> Settings:
-        """Read the configuration; --dbc, if given, becomes its contract. Raises ConfigError."""
+        """Return the settings of the configuration; --dbc, if given, becomes its contract. Raises ConfigError."""
         return self.with_contract(load_settings(self.config, self.profile))
 
     def with_contract(self, settings: Settings) -> Settings:

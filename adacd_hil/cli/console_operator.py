@@ -74,9 +74,9 @@ class ConsoleOperator:
         return self._script.request(elapsed_s, state)
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Return RECOVER if the user typed `ack`, END for `finish`, else WAIT; drop other typed requests.
+        """Return RECOVER if the user typed `ack`, END for `finish`, else WAIT; drop the requests typed before.
 
-        After the terminal's end, return the script's answer. elapsed_s: since the fault.
+        After the terminal's end, if neither was typed, return the script's answer. elapsed_s: since the fault.
         """
         while self._asked:
             request = self._asked.popleft()

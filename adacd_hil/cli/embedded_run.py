@@ -91,7 +91,7 @@ def run_embedded(
 ) -> tuple[SessionSummary, Path]:
     """Run host and emulated arm in this process, with both logs in `out`; return the summary and the path of the truth.
 
-    Raises ConfigError, CodecError, LogError, OSError.
+    Raises ConfigError, CodecError, LogError, OSError, CommandError for a configuration of several arms.
     """
     settings, scenario = cast.settings, cast.scenario
     check_shared("lockstep", settings)  # an arm in this process is alone on its bus

@@ -64,7 +64,10 @@ clock_option = functools.partial(
 
 
 def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
-    """Add --from and --until to a command, which receives both as `stretch`, a `TimeWindow`."""
+    """Return a command with --from and --until, which receives both as `stretch`, a `TimeWindow`.
+
+    It raises CommandError if they are not times, or not in this order.
+    """
 
     @functools.wraps(command)
     def bounded(*args: Any, from_s: float | None, until_s: float | None, **kwargs: Any) -> ExitCode:
@@ -111,7 +114,7 @@ def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
 
 
 def on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Add the options of a bus to a command, which receives a `Connection` as its first argument."""
+    """Return a command with the options of a bus, which receives a `Connection` as its first argument."""
     return _connected(command, is_required=True)
 
 
@@ -190,7 +193,7 @@ def require_extra(asked_for: str, *modules: str) -> None:
 
 
 def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
-    """Add the options of the live view to a command, which receives `live`: a LiveView, or None without --live."""
+    """Return a command with the options of the live view, which receives `live`: a LiveView, or None without --live."""
 
     @functools.wraps(command)
     def run(
@@ -227,7 +230,7 @@ def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str,
 
 
 def _check_port(host: str, port: int) -> None:
-    """Raise CommandError if another program listens on the port: before minutes are spent on compiling."""
+    """Raise CommandError if the port can't be listened on, such as one in use, before time is spent on compiling."""
     try:
         places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM) if port else ()
         for family, kind, protocol, _, address in places:

@@ -178,7 +178,7 @@ def suggest(*next_commands: str) -> None:
 
 
 def _as_typed(line: str) -> str:
-    """Return a command folded to the terminal's width, with backslashes outside of quotes: a shell still accepts it."""
+    """Return a command folded to the terminal's width, with backslashes that a shell accepts; not if it has quotes."""
     columns = terminal_columns(sys.stderr)
     command, mark, comment = line.partition("   # ")
     if columns is None or len(line) <= columns:

@@ -1,6 +1,6 @@
 """Settings of the arm, its devices and its bus: sections `arm`, `devices`, `bus`, `data` and `lockstep`.
 
-Angles in degrees exist only in settings, in fields labelled `_deg`; the properties beside them give radians.
+Fields labelled `_deg` are in degrees; properties in radians beside some of them are for the code.
 """
 
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ from adacd_hil.settings.schema import ConfigError, setting
 UPRIGHT_DEG = 90.0
 """Tilt of a plane of motion in which all of gravity acts."""
 SLIGHT_TILT_DEG = 2.0
-"""Tilt below which gravity may be left out of the model: 3 % of it acts, and `arm.position_torque_Nm` covers it."""
+"""Largest tilt at which the model may leave gravity out: 3 % of it acts, for `arm.position_torque_Nm` to cover."""
 
 
 @dataclass(frozen=True)
 class ArmSettings:
-    """The arm, as far as the host may know it."""
+    """The arm as the host knows it, and properties that only the emulator uses."""
 
     profile: str = setting("P", choices=("P", "S", "M"), meaning="emulated arm that this configuration is for")
     link_length_m: tuple[float, float] = setting((0.35, 0.30), unit="m", low=0.01, high=5.0, meaning="joint to joint")
@@ -224,12 +224,12 @@ class BusSettings:
 DATA_WINDOW_S = 1.0
 """Shares of missing data are judged over this time."""
 SHORTEST_DATA_WINDOW = 0.2
-"""Part of that time that is judged, too, when the attempt ends in it."""
+"""Smallest part of that time that is judged when the attempt ends in it."""
 
 
 @dataclass(frozen=True)
 class DataSettings:
-    """How much of the cyclic data may be missing. Shares are of the cycles of any second with enabled drives."""
+    """How much of the cyclic data may be missing. Shares are of the cycles of each second with enabled drives."""
 
     blind_cycles: int = setting(
         5,

@@ -99,12 +99,15 @@ class Settings:
 
     @property
     def channel_count(self) -> int:
-        """Number of residuals per joint with a threshold: one smoothed per filter, one bare for all but the slowest."""
+        """Number of residuals per joint with a threshold; 0 for the paper's scheme.
+
+        Each filter has a smoothed one, each but the slowest also an unsmoothed one.
+        """
         return max(2 * self.filter_count - 1, 0)
 
     @property
     def cad_theta(self) -> Vector:
-        """The CAD model's parameters (p,)."""
+        """The CAD model's parameters (p,); (0,) without CAD model."""
         return np.array(self.arm.cad_theta, dtype=np.float64)
 
     @property

@@ -11,13 +11,14 @@ from adacd_hil.settings.schema import WITHDRAWN, ConfigError, parse
 from adacd_hil.settings.toml_files import builtin_folder, builtin_names, find_toml, read_toml
 
 _LONGEST_CHAIN = 8
-"""Most configurations that may extend each other in a row."""
+"""Most configurations that one configuration may extend, directly and by those that it extends."""
 
 
 def renewed(table: dict[str, Any]) -> dict[str, Any]:
-    """Return a log's configuration with today's keys: convert renamed ones, drop withdrawn ones.
+    """Return a log's configuration, some of its old keys changed to today's; `parse` refuses the other removed keys.
 
-    A missing term's key means that the version that wrote the log had no such term: set the term to 0.
+    `safety.commission_cycles` becomes `safety.commission_s`. Withdrawn keys of `detector` are dropped. If
+    `certified.cross_talk_std` is missing, the version that wrote the log had no such term, so that it becomes 0.
     """
     certified = table.get("certified")
     if isinstance(certified, dict) and "cross_talk_std" not in certified:
@@ -38,7 +39,7 @@ def renewed(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Merge two TOML tables, section by section; `over` wins."""
+    """Return two TOML tables merged, section by section; `over` wins."""
     merged = dict(base)
     for key, value in over.items():
         if isinstance(value, dict) and isinstance(merged.get(key), dict):
@@ -56,22 +57,23 @@ class ConfigurationLayer(NamedTuple):
 
 
 def load_settings(name_or_file: str = "paper", profile: str | None = None) -> Settings:
-    """Resolve a configuration: a built-in name, or a TOML file merged over the one it `extends` (default `paper`).
+    """Return the settings of a configuration: a built-in name, or a TOML file merged over the one it `extends`.
 
-    `profile` picks the `[profiles.X]` table. Raises ConfigError.
+    A file without `extends` extends `paper`. `profile` picks the `[profiles.X]` table; None: `arm.profile` picks it.
+    Raises ConfigError.
     """
     return parse(Settings, resolved_table(configuration_layers(name_or_file, profile)))
 
 
 def resolved_table(layers: Sequence[ConfigurationLayer]) -> dict[str, Any]:
-    """Merge the layers of a configuration, later over earlier."""
+    """Return the layers of a configuration merged, later over earlier."""
     return functools.reduce(merge, (layer.table for layer in layers), {})
 
 
 def configuration_layers(name_or_file: str, profile: str | None = None) -> list[ConfigurationLayer]:
-    """Read a configuration and all that it extends, the base first. Raises ConfigError.
+    """Return the layers of a configuration and of all that it extends, the base first. Raises ConfigError.
 
-    A profile's values come first: keys of the files override them.
+    The profile's layers precede those of the files, whose keys override them.
     """
     files = _load_chain(name_or_file)
     table = resolved_table(files)
@@ -102,7 +104,7 @@ def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
 
 
 def _find_beside(table: dict[str, Any], folder: Path) -> None:
-    """Make the paths of device and contract files absolute if the files lie in the configuration's folder."""
+    """Put the configuration's folder before the paths of device and contract files that exist in it."""
 
     def found(name: Any) -> Any:
         is_beside = isinstance(name, str) and Path(name).suffix and exists(folder / name)
@@ -118,7 +120,10 @@ def _find_beside(table: dict[str, Any], folder: Path) -> None:
 
 
 def _load_chain(name_or_file: str, seen: tuple[str, ...] = ()) -> list[ConfigurationLayer]:
-    """Read a configuration and all that it extends; relative paths start in the folder of the file that names them."""
+    """Return the files of a configuration and of all that it extends, the base first. Raises ConfigError.
+
+    Relative paths start in the folder of the file that names them.
+    """
     if name_or_file in seen:
         raise ConfigError(f"configuration {name_or_file} extends itself")
     if len(seen) > _LONGEST_CHAIN:

@@ -213,7 +213,7 @@ class ReactionSettings:
 
 @dataclass(frozen=True)
 class SafetySettings:
-    """Checks before torque."""
+    """Checks before torque and in the first motion, and the EMCY codes that a run tolerates."""
 
     commission_s: float = setting(
         0.2, unit="s", low=0.01, high=100.0, meaning="time at rest with complete data before the drives are enabled"
@@ -248,8 +248,8 @@ class SafetySettings:
 class TareSettings:
     """Tare of the joint torque sensors: poses, durations, limits of spread and drift, age.
 
-    The bounds on spread and drift are a small part of the detection threshold (0.15 Nm): an offset that is wrong by the
-    threshold reads as a contact.
+    The bound on drift is a small part of the detection threshold (0.15 Nm): an offset that is wrong by the threshold
+    reads as a contact. Bounds on single samples are larger: the offset is the mean of many.
     """
 
     poses: int = setting(1, low=1, high=50, meaning="poses to measure in")
@@ -300,7 +300,7 @@ class TareSettings:
     )
 
     def drift_variance(self, age_s: float) -> float:
-        """Return the variance of a sensor's zero, Nm², after a drift of so many seconds."""
+        """Return the variance of a sensor's zero, Nm², `age_s` after its measurement, by time and temperature."""
         return (self.drift_Nm_K * self.temperature_K) ** 2 + self.drift_Nm_sqrt_s**2 * age_s
 
 

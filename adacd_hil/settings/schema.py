@@ -49,7 +49,7 @@ def setting(
     choices: tuple[str, ...] = (),
     meaning: str,
 ) -> Any:
-    """Declare one setting. Bounds are inclusive and hold for each element of a tuple; no default means required."""
+    """Return the field of one setting, required if it has no default. Bounds are inclusive and hold in tuples, too."""
     metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "meaning": meaning}
     if isinstance(default, type):
         return dataclasses.field(default_factory=default, metadata=metadata)
@@ -60,7 +60,7 @@ Section = TypeVar("Section")
 
 
 def parse(section: type[Section], table: dict[str, Any], where: str = "") -> Section:
-    """Make a `section` from a TOML table.
+    """Return a `section` made from a TOML table; where: the dotted name before its keys in messages.
 
     Raises ConfigError with every unknown key, missing key, wrong type and value outside its bounds; of a list of plain
     values the first. Conditions on several keys are checked only if each key is valid by itself; the first violation is
@@ -92,7 +92,7 @@ def parse(section: type[Section], table: dict[str, Any], where: str = "") -> Sec
 
 
 def _read_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
-    """Convert a value to its type. Raises ConfigError."""
+    """Return a value of a TOML table converted to its type. Raises ConfigError."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         hint = next(option for option in typing.get_args(hint) if option is not type(None))
     if dataclasses.is_dataclass(hint):
@@ -125,7 +125,7 @@ def _unknown(key: str, known: Iterable[str], where: str) -> str:
 
 
 def describe_gone(key: str) -> str:
-    """Say in one line what there is in place of a key of older versions; "" for one that never was."""
+    """Return one line that names the successor of a removed key, or the remedy; "" for any other key."""
     if key in WITHDRAWN:
         return f"unknown key `{key}`: {WITHDRAWN[key]}"
     return f"unknown key `{key}`; its successor is {SUCCESSORS[key]}" if key in SUCCESSORS else ""
@@ -136,7 +136,10 @@ def _is_required(field: "dataclasses.Field[Any]") -> bool:
 
 
 def _parse_scalar(hint: Any, value: Any, key: str, metadata: Any) -> Any:
-    """Convert a value that is no list or table, within its bounds and choices. Raises ConfigError."""
+    """Return a value that is no list or table, in its type.
+
+    Raises ConfigError for another type, and for a value outside its bounds or choices.
+    """
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
@@ -190,7 +193,7 @@ _OTHER_UNITS = {
 
 
 def _other_unit(value: float, metadata: Any) -> str:
-    """Return a hint if a value out of bounds would be within them in another unit."""
+    """Return a hint if a value out of bounds would be within them in another unit, else ""."""
     for unit, worth in _OTHER_UNITS.get(metadata["unit"], ()):
         if value and metadata["low"] <= value * worth <= metadata["high"]:
             return f"; {value:g} {unit} are {value * worth:g} {metadata['unit']}"

@@ -93,7 +93,7 @@ KIND_S = 0.1
 FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long")
 """Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.model.regressor`."""
 CROSS_TALK = "cross_talk"
-"""Share of the other joint's torque in a torque sensor's value, Nm/Nm."""
+"""Name of the parameter: share of the other joint's torque in a torque sensor's value, Nm/Nm."""
 
 _KINDS = "inertia kg m², viscous Nm s/rad, Coulomb Nm, gravity Nm, torque offset Nm, lag s, further friction Nm"
 

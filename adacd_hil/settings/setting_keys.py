@@ -1,8 +1,8 @@
 """The keys of a configuration: their list, their values in words, and changes of single ones.
 
 `known_keys` lists every key with type, default, bounds, unit and meaning. `apply_settings` changes single keys: a key
-is dotted, `detector.threshold_Nm`; a value is TOML, where a word needs no quotes and a number stands for a list of that
-number. Settings that determined the numbers of a log can't be changed for its replay.
+is dotted, `detector.threshold_Nm`; a value is TOML, where a word needs no quotes and a single value stands for a list
+of it, unless the list may be absent. Settings that determined the numbers of a log can't be changed for its replay.
 """
 
 import dataclasses
@@ -25,9 +25,9 @@ class KnownKey(NamedTuple):
     key: str
     kind: Any
     default: str
-    """As TOML; `required` if there is no default, `none` if the setting is absent by default."""
+    """As `in_words` formats it; `required` if there is no default, `none` if the setting is absent by default."""
     bounds: str
-    """The choices, or the bounds with the unit; empty without bounds."""
+    """The choices, or the bounds with the unit; without bounds the unit alone, which may be empty."""
     meaning: str
     choices: tuple[str, ...]
 
@@ -68,7 +68,7 @@ def known_keys() -> dict[str, KnownKey]:
 
 
 def value_of(settings: Settings, key: str) -> Any:
-    """Return the value of a dotted key."""
+    """Return the value of a dotted key. Raises AttributeError for an unknown key."""
     value: Any = settings
     for part in key.split("."):
         value = getattr(value, part)
@@ -76,7 +76,7 @@ def value_of(settings: Settings, key: str) -> Any:
 
 
 def in_words(value: Any) -> str:
-    """Format a value as in a configuration, numbers with six significant digits at most."""
+    """Return the text of a value as in a configuration; None is `none`, a float has six significant digits at most."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value))
         return f"{{{', '.join(f'{name} = {in_words(inner)}' for name, inner in fields)}}}"
@@ -88,7 +88,10 @@ def in_words(value: Any) -> str:
 
 
 def explain_unknown(key: str) -> str:
-    """Return one line that a key is unknown, with its successor, the nearest known key, or the keys of its section."""
+    """Return a line for a key that is not a setting: if it is a section, with that section's keys.
+
+    Otherwise with the key's successor, the nearest known key, the other keys of its section, or all sections.
+    """
     keys = [name for name, known in known_keys().items() if not known.is_in_row]
     below = [known for known in keys if known.startswith(f"{key}.")]
     if below:
@@ -139,7 +142,7 @@ def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
 
 
 def refuse_facts(changes: Mapping[str, str]) -> None:
-    """Raise ConfigError if a key determined the numbers of a log, such as a sign or a device."""
+    """Raise ConfigError if one of the changed keys determined the numbers of a log, such as a sign or a device."""
     facts = {f"arm.{name}" for name in _FACTS} | {"bus.period_us", "realtime.sample_period"}
     for key in changes:
         if key in facts or key.startswith("devices."):
@@ -156,7 +159,10 @@ def _read_value(key: str, text: str) -> Any:
 
 
 def _spread(value: Any, kind: Any, present: Any) -> Any:
-    """Repeat a single value to a list as long as the present one, if the setting is a list."""
+    """Return a single value repeated to a list if the setting is a list that can't be absent; else return the value.
+
+    The list is as long as the present one, or as the type says if there is none.
+    """
     if typing.get_origin(kind) is tuple and not isinstance(value, list):
         elements = [element for element in typing.get_args(kind) if element is not Ellipsis]
         count = len(present) if isinstance(present, list) else len(elements)
@@ -165,10 +171,10 @@ def _spread(value: Any, kind: Any, present: Any) -> Any:
 
 
 def keep_facts(own: Settings, other: Settings) -> Settings:
-    """Return `other` with the settings of a log's arm, bus, devices and sample period.
+    """Return `other` with those settings of `own`, a log's, that determined the numbers of the log.
 
-    Signs, torque offsets, rated torques, the contract and the sample period determined the numbers of the log, so that
-    no configuration may change them afterwards. Holding torque and position-dependent torque come from the log, too, if
+    These are bus, devices, sample period, and of the arm profile, signs, torque offsets and rated torques: no
+    configuration may change them afterwards. Holding torque and position-dependent torque come from the log, too, if
     it has them.
     """
     facts = {name: getattr(own.arm, name) for name in _FACTS}
@@ -182,7 +188,7 @@ def keep_facts(own: Settings, other: Settings) -> Settings:
 
 
 def parse_changes(given: Sequence[str]) -> dict[str, str]:
-    """Parse `key=value` texts of repeated options. Raises ConfigError."""
+    """Return the value by key of `key=value` texts; of one key the last value counts. Raises ConfigError."""
     changes: dict[str, str] = {}
     for text in given:
         key, equals, value = text.partition("=")
@@ -193,13 +199,13 @@ def parse_changes(given: Sequence[str]) -> dict[str, str]:
 
 
 def parse_variations(given: Sequence[str]) -> list[dict[str, str]]:
-    """Parse `key=a,b,c` texts of repeated options; return every combination. Raises ConfigError."""
+    """Return every combination of values of `key=a,b,c` texts; [{}] without texts. Raises ConfigError."""
     lists = [[(key, value) for value in split_list(text)] for key, text in parse_changes(given).items()]
     return [dict(choice) for choice in itertools.product(*lists)]
 
 
 def split_list(text: str) -> list[str]:
-    """Split a text at its commas outside brackets and quotes."""
+    """Return the parts of a text between its commas outside brackets and quotes, without spaces around them."""
     parts, depth, quote, start = [], 0, "", 0
     for place, letter in enumerate(text):
         if quote:
@@ -217,7 +223,7 @@ def split_list(text: str) -> list[str]:
 
 
 def changed_keys(before: Settings, after: Settings) -> dict[str, tuple[str, str]]:
-    """Return the settings that differ, by key: both values, formatted."""
+    """Return the settings that differ, by key: both values as Python writes them; `unset` for an absent one."""
     tables = [_flat(tomllib.loads(to_toml(settings)), "") for settings in (before, after)]
     keys = [*tables[0], *(key for key in tables[1] if key not in tables[0])]
     words = {key: (tables[0].get(key, "unset"), tables[1].get(key, "unset")) for key in keys}

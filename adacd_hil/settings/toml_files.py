@@ -22,9 +22,9 @@ _MOST_NAMES = 12
 
 
 def read_toml(path: Path, kind: str = "configuration") -> dict[str, Any]:
-    """Read one TOML file; errors call it `kind`.
+    """Return the table of one TOML file; errors call it `kind`.
 
-    Raises ConfigError if it is missing, not a regular file, too large or not TOML.
+    Raises ConfigError if it can't be read, or is not a regular file, too large or not TOML.
     """
     try:
         return parse_toml(read_input(path, _MOST_TOML_BYTES))
@@ -36,7 +36,7 @@ def read_toml(path: Path, kind: str = "configuration") -> dict[str, Any]:
 
 
 def _instead(path: Path, kind: str) -> str:
-    """Suggest the file with the nearest name beside it, or the command that writes one."""
+    """Return a hint: the file with the nearest name beside it, else the command that writes a configuration."""
     try:
         beside = sorted(other.name for other in path.parent.glob("*.toml"))
     except OSError:
@@ -47,7 +47,7 @@ def _instead(path: Path, kind: str) -> str:
 
 
 def parse_toml(text: bytes | str) -> dict[str, Any]:
-    """Parse TOML, tables at most 16 deep and integers of 64 bits. Raises ConfigError with the reason.
+    """Return the table of a TOML text, at most 16 deep, with integers of 64 bits. Raises ConfigError with the reason.
 
     A byte order mark at the beginning, as editors on Windows write it, is ignored.
     """
@@ -67,7 +67,7 @@ def parse_toml(text: bytes | str) -> dict[str, Any]:
 
 
 def _check_extent(table: dict[str, Any]) -> None:
-    """Raise ConfigError for tables that are too deep and for integers of more than 64 bits, which float can't hold."""
+    """Raise ConfigError for tables or lists that are too deep, and for integers of more than 64 bits."""
     waiting: list[tuple[str, Any, int]] = [("", table, 0)]
     while waiting:
         key, value, depth = waiting.pop()
@@ -97,7 +97,10 @@ def toml_names(folder: Traversable) -> list[str]:
 
 
 def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
-    """Return the file of a built-in name, or the given path. Raises ConfigError with the nearest built-in name."""
+    """Return the file of a built-in name, or the given path; a path with a suffix may be missing.
+
+    Raises ConfigError for any other name, with the nearest built-in one.
+    """
     names = toml_names(folder)
     if name_or_file in names:
         return Path(str(folder / f"{name_or_file}.toml"))
@@ -111,14 +114,14 @@ def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
 
 
 def to_toml(settings: Any) -> str:
-    """Write settings as TOML that `parse` reads back to the same value."""
+    """Return settings as TOML that `parse` reads back to the same value."""
     lines: list[str] = []
     _write_section(settings, "", lines)
     return "\n".join(lines).strip() + "\n"
 
 
 def to_short_toml(settings: Any) -> str:
-    """Write the settings that differ from their defaults, one row a line, as TOML that `parse` reads back."""
+    """Return the settings that differ from their defaults as TOML that `parse` reads back, one row of a list a line."""
     lines: list[str] = []
     _write_section(settings, "", lines, is_short=True)
     return "\n".join(lines).strip() + "\n"
@@ -168,7 +171,7 @@ _TOML_ESCAPES = {code: f"\\u{code:04X}" for code in (*range(0x20), 0x7F)} | {
 
 
 def toml_value(value: Any) -> str:
-    """Write a value as TOML that reads back to the same value."""
+    """Return a number, a text or a tuple of such values as TOML that reads back to the same value."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

@@ -60,7 +60,7 @@ MECHANICAL_STATE: Final = float_fields(
     {
         "q": PAIR,  # joint position, rad
         "dq": PAIR,  # joint velocity, rad/s
-        "tau_m": PAIR,  # motor torque = joint torque, Nm
+        "tau_m": PAIR,  # motor torque, Nm
         "payload_kg": (),  # part of the inertia below
         "alpha": (),  # kg m², with payload, as β and γ
         "beta": (),

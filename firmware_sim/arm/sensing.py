@@ -89,7 +89,7 @@ def track(
 
 
 class TorqueNoise:
-    """The noise of both torque sensors, drawn block by block from one seed."""
+    """Random numbers of both torque sensors, noise or steps of their zeros, drawn block by block from one seed."""
 
     def __init__(self, seed: int | np.random.SeedSequence, rms_Nm: float | tuple[float, float]) -> None:
         self._generator = np.random.default_rng(seed)
@@ -111,7 +111,7 @@ class TorqueNoise:
 
 
 class Measurement(NamedTuple):
-    """Measurement of the devices at one SYNC, as raw counts of the two joints; the properties give SI units."""
+    """Measurement of the devices at one SYNC, as raw counts; the properties are in SI units, by the default LSBs."""
 
     position_counts: tuple[int, int]
     velocity_counts: tuple[int, int]

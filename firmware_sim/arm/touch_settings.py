@@ -12,7 +12,7 @@ the motion reverses, and zero at rest. Shapes, t from 0 to duration d:
 
 Onset and end lie on the 100 µs grid of the drives, so their jumps never fall inside an integration step.
 
-Bodies, hands and walls have a body of their own.
+Bodies, hands and walls react to the arm's motion; a body may recede.
 
 Points and angles are in the world's frame: origin in joint 1, x along link 1 at q₁ = 0. Forces:
 `firmware_sim.arm.touch_forces`.
@@ -111,7 +111,7 @@ class ContactSettings:
 
     @property
     def impulse_N_s(self) -> float:
-        """Force integrated over time."""
+        """Force integrated over time, N s, without the factor of frame "motion"."""
         if self.shape == "half_sine":
             return self.force_N * self.duration_s * 2.0 / math.pi
         if self.shape == "push":

@@ -201,7 +201,7 @@ class Bench:
         return answer
 
     def _on_sync(self, data: bytes, t_ns: int) -> None:
-        """Run one cycle."""
+        """Run one cycle, or report a SYNC that no device takes to the devices that hear it."""
         takers = self._nodes.listeners.takers(data)
         if not (any(takers) and self._judge(data, t_ns)):
             self._ignore_sync(data, takers)

@@ -1,7 +1,7 @@
 """The time of a bench, and the log of its truth.
 
-`BenchTime.advance` moves the arm and the bench's time; no other function moves the arm. A SYNC samples the arm where it
-is. The clock mode determines the caller of `advance`:
+`BenchTime.advance` moves the arm and the bench's time; besides it only `BenchTime.delay_sample` moves the arm. A SYNC
+samples the arm where it is. The clock mode determines the caller of `advance`:
 
     sync   every SYNC is one period (0x1006), however long it took to come: the same frames in give the same frames
            out, bit for bit. A gap in the SYNC counter is as many lost periods. Between SYNCs the arm waits, and

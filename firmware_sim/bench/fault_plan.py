@@ -45,7 +45,7 @@ class FaultEdge(NamedTuple):
 
 
 class ActionKind(Enum):
-    """Actions on a node. `NodeAction.value` is in brackets."""
+    """Actions on a node. The comment says what `NodeAction.value` is."""
 
     POWER_OFF = "power off"
     POWER_ON = "power on"
@@ -110,7 +110,7 @@ class FaultPlan:
 
     @property
     def wait_ns(self) -> int:
-        """Time from the last `advance` to the next beginning or end of a row, or the next EMCY of a storm, at most."""
+        """Longest time from the last `advance` to the next one, ns: until a row begins, ends or sends an EMCY."""
         wait_ns = NEVER_NS
         for now_ns, next_ns in (
             (self._scenario_ns, self._next_scenario_ns),
@@ -154,7 +154,7 @@ class FaultPlan:
         return taken
 
     def transmit(self, node: int, can_id: int, data: bytes) -> list[tuple[int, int, bytes]]:
-        """Return the frames that faults make of one that a node sends: delay in ns, identifier, data; [] if lost."""
+        """Return the frames that faults make of a node's frame: delay in ns, identifier, data; [] if it is not sent."""
         if node in self._silent:
             return []
         rows = self._sending.get((node, can_id)) or self._sending.get((node, ANY_FRAME))
@@ -188,11 +188,15 @@ class FaultPlan:
         return (position1, position2), (velocity1, velocity2), (torque1, torque2)
 
     def sync_delay_ns(self) -> int:
-        """Draw the delay with which this SYNC reaches the devices, ns; call once per SYNC."""
+        """Return a random delay with which this SYNC reaches the devices, ns; 0 without one. Call once per SYNC."""
         return sum(row.late_ns() for row in self._slowing if row.hit())
 
     def babble(self, period_ns: int) -> list[tuple[int, int, bytes]]:
-        """Return the flood's frames within `period_ns` from the last `advance` on: offset in ns, identifier, data."""
+        """Return the flood's frames within `period_ns` from the last `advance` on: offset in ns, identifier, data.
+
+        Each frame is counted and returned once, also by overlapping calls. While all nodes of a row are off the bus,
+        its frames are only counted.
+        """
         frames = []
         for row in self._babbling:
             settings = row.settings

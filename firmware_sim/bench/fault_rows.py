@@ -87,7 +87,7 @@ class FaultRow:
         return True
 
     def late_ns(self) -> int:
-        """Draw the delay of a frame, ns: the row's delay plus random jitter."""
+        """Return the delay of a frame, ns: the row's delay plus random jitter."""
         settings = self.settings
         jitter_us = settings.jitter_us * self.draws.random() if settings.jitter_us else 0.0
         return round(((settings.delay_us or 0.0) + jitter_us) * 1e3)
@@ -166,7 +166,7 @@ def name_streams(rows: Sequence[FaultSettings], seed: int) -> list[tuple[FaultSe
 
 
 def find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Place]:
-    """Return node and identifier of the frames that a row is about.
+    """Return node and identifier of the frames that a row is about; no frame if it is about none.
 
     Raises ConfigError if the contract lacks a frame, or if a frame has no counter to freeze.
     """

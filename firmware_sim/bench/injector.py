@@ -52,7 +52,7 @@ class Outbox:
 
     @property
     def due_ns(self) -> int:
-        """When the next held frame is released."""
+        """Time at which the next held frame or function is due, ns; NEVER_NS without one."""
         return self._held[0].due_ns if self._held else NEVER_NS
 
     def put(self, can_id: int, data: bytes) -> None:
@@ -232,7 +232,7 @@ class Injector:
                 self._outbox.mark(MarkKind.LIT if self._is_acknowledged else MarkKind.DARK)
 
     def late_ns(self, period_ns: int) -> int:
-        """Draw how late this SYNC reaches the devices, ns; less than a period."""
+        """Return, at random, how late this SYNC reaches the devices, ns; less than a period."""
         return 0 if self.plan.is_quiet else min(self.plan.sync_delay_ns(), period_ns - 1)
 
     def flood(self, period_ns: int) -> None:

@@ -3,9 +3,9 @@
 Object dictionary, NMT and CiA 402 states, heartbeats, status frames, EMCY and watchdogs are those of `Bench`, so any
 host can boot and command the devices. Torque has no effect: the arm repeats its recorded motion.
 
-The bench reads the recording as the host asks for it. An attempt begins with the first SYNC after an NMT reset, so a
-run that recovered from a fault has several. In each the cycles count from its first SYNC by the SYNC counter, as the
-bench counts them; SYNCs that were lost leave a gap.
+The bench reads the recording as the host asks for it. An attempt begins with the first SYNC of the recording, and with
+the first after an NMT reset, so a run that recovered from a fault has several. In each the cycles count from its first
+SYNC by the SYNC counter, as the bench counts them; SYNCs that were lost leave a gap.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -58,7 +58,7 @@ class RecordedCycles:
 
     @property
     def problem(self) -> str:
-        """Missing part of the recording, one line."""
+        """Missing part of the recording, one line; empty if nothing is missing."""
         return self._source.problem
 
     def begin(self) -> None:
@@ -139,7 +139,7 @@ class RecordedBody:
 
     @property
     def drive_velocity_rad_s(self) -> tuple[float, float]:
-        """Velocity in the latest feedback of each drive."""
+        """Velocity in the latest feedback of each drive, rad/s."""
         return self._dq_rad_s[0], self._dq_rad_s[1]
 
     def show(self, answers: Sequence[Answer]) -> None:

@@ -87,7 +87,10 @@ class EncoderNoise:
         self._drawn = 0  # ticks
 
     def draw(self, last_tick: int) -> None:
-        """Fill `table` with the noise of the ticks up to `last_tick`, at most NOISE_TICKS new ones per call."""
+        """Fill `table` with the noise of the ticks up to `last_tick`.
+
+        Call it every NOISE_TICKS ticks at least: the table keeps the noise of twice as many.
+        """
         while self._drawn <= last_tick:
             first = self._drawn % (2 * NOISE_TICKS)
             rows = self.table[first : first + NOISE_TICKS]
@@ -114,7 +117,7 @@ TRANSDUCER_NUMBERS: Final = float_fields(
         "clock_phase": PAIR,  # sample periods
         "lsb_Nm": PAIR,  # of the converter, Nm
         "count_Nm": PAIR,  # of the wire, Nm
-        "highest": PAIR,  # code of the converter; the lowest is −1 − HIGHEST
+        "highest": PAIR,  # code of the converter; the lowest is −1 − highest
         "has_memory": (),  # whether the course within a tick matters: hysteresis, filter, own clock
     }
 )

@@ -188,7 +188,7 @@ def _compare_lengths(length: int, expected: int) -> None:
 
 @cache
 def read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
-    """Read an EDS or a DCF, whatever its encoding; `node_id` replaces $NODEID. Cached: don't change the result."""
+    """Return the objects of an EDS or DCF in any encoding; `node_id` replaces $NODEID. Cached: don't change it."""
     stream = io.StringIO(readable_eds(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff")))
     stream.name = "object dictionary.eds"
     return canopen.import_od(stream, node_id)
@@ -218,7 +218,10 @@ class DeviceDescription:
 
 
 def _read_objects(node_id: int, description: DeviceDescription) -> canopen.ObjectDictionary:
-    """Read the objects of a device with their values at power-on; a number without one is 0."""
+    """Return the objects of a device with their values at power-on.
+
+    If the description adds to the EDS, a number without a value is 0.
+    """
     objects = read_eds(description.eds, node_id)
     if not (description.defaults or description.fallbacks or description.made_up):
         return objects
@@ -340,7 +343,7 @@ class ObjectDictionary:
         return default if value is None else int(value)
 
     def take_over(self, index: int, subindex: int, value: int) -> bool:
-        """Write an object with the checks of an SDO request; return False if it is refused."""
+        """Write an object with the checks of an SDO request except `is_locked`; return False if it is refused."""
         try:
             data = self._node._find_object(index, subindex).encode_raw(value)
             self._node.set_data(index, subindex, data, check_writable=True)

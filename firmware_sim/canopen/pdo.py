@@ -343,7 +343,7 @@ class Pdos:
 
     @property
     def deadline_ns(self) -> int:
-        """When the next deadline of an RPDO ends."""
+        """When the next deadline of an RPDO ends, by the device's clock, ns; NEVER_NS without one."""
         ends = [pdo.acted_ns + pdo.timer_ns for pdo in self._receiving if pdo.timer_ns and pdo.acted_ns is not None]
         return min(ends, default=NEVER_NS)
 

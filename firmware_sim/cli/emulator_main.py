@@ -343,7 +343,7 @@ def _make_folder(path: Path) -> None:
 def _report(
     bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: TruthLog | None, as_json: bool
 ) -> EmulatorExit:
-    """Close the truth log, print counts and drive states of the run, and return the exit status."""
+    """Close the truth log, removed if it is empty; as_json: print counts and drive states. Return the exit status."""
     described: dict[str, Any] = {
         "scenario": scenario.name,
         "profile": scenario.arm.name,

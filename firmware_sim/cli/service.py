@@ -145,7 +145,7 @@ class Service:
         return self._has_been_operational and (is_silent or not self._bench.is_operational)
 
     def _is_settled(self) -> bool:
-        """Whether the arm of a host that has gone is at rest, or has been given the time for it."""
+        """Return whether the arm of a host that has gone is at rest, or has been given the time for it."""
         self._bench.outlive_host()
         self._departure.go()
         now_ns = self._clock.now_ns()
@@ -172,7 +172,7 @@ def stop_by_signal() -> Iterator[StopRequest]:
 
 
 def open_devices_end(interface: str, channel: str, clock: Clock, codec: Codec) -> Bus:
-    """Open the devices' end of a bus; CAN FD only where the contract has such frames. Raises BusMissingError."""
+    """Return the devices' end of a bus, open; CAN FD only if the contract has such frames. Raises BusMissingError."""
     heard = {message.can_id for message in codec.messages.values() if "HOST" in message.senders} | LISTENED_IDS
     heard.add(HOST_MARK)
     options: dict[str, Any] = {"is_fd": True} if is_fd(codec) else {}

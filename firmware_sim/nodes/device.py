@@ -28,11 +28,11 @@ _CLEAR_HISTORY = (0x1003, 0)
 
 
 class NmtState(IntEnum):
-    """NMT states, CiA 301 figure 46. Every state but the first ends by an NMT command."""
+    """NMT states, CiA 301 figure 46. Every state but the first ends by an NMT command or without power."""
 
     INITIALISING = 0  # by itself: boot-up message, then Pre-operational
     STOPPED = 4
-    OPERATIONAL = 5
+    OPERATIONAL = 5  # also to Pre-operational, without the master's heartbeat or off the bus
     PRE_OPERATIONAL = 127
 
 
@@ -270,7 +270,7 @@ class EmulatedDevice(ObjectDictionary):
         return min(self._producer.send_due(t_ns), self._consumer.find_silence(t_ns), self._errors.send_waiting(t_ns))
 
     def _is_locked_at_work(self, index: int, subindex: int) -> bool:
-        """Whether SDO may not write an object now: while the device is at work, only objects in `open_at_work`."""
+        """Return whether SDO may not write an object now: while the device is at work, only those in `open_at_work`."""
         return self._application.is_at_work and (index, subindex) not in self.open_at_work
 
     def _check_period(self, period_us: int) -> None:
@@ -345,7 +345,7 @@ class NodeClock:
         return self._own_since_ns + (t_ns - self._since_ns) * self._rate // _BILLION
 
     def bench_ns(self, own_ns: int) -> int:
-        """Return the first time of the bench at which the device's is `own_ns`."""
+        """Return the first time of the bench at which the device's is at least `own_ns`; NEVER_NS stays."""
         if self.is_true or own_ns >= NEVER_NS:
             return own_ns
         return self._since_ns - (own_ns - self._own_since_ns) * _BILLION // -self._rate

@@ -7,8 +7,9 @@ brake, and so do shutdown and disable operation by 0x605B and 0x605C; everywhere
 Units on the wire: position in encoder counts, velocity in the LSB of the contract, torque in per mille of rated torque
 0x6076, rated torque in mNm of the joint, or in the count of an arm of one's own, behind the gear.
 
-While the motor is powered, SDO writes only the controlword and clears the error history. While an RPDO brings
-the controlword, SDO writes only those that take the power away: Disable voltage and Quick stop.
+While the motor is powered, SDO writes only the controlword and, with an unprotected command frame, the target torque,
+and clears the error history. While an RPDO brings the controlword, SDO writes only those that take the power away:
+Disable voltage and Quick stop.
 
 Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statusword 0x6041.
 """
@@ -462,7 +463,7 @@ class DriveNode(Application):
             self.has_news = True
 
     def _is_cause_present(self, t_ns: int) -> bool:
-        """Whether the drive fails, the motor is too hot, or a watchdog that stops it is tripped or would be at once."""
+        """Return whether the drive fails, its motor calls for a fault, or a watchdog stops it, or would at once."""
         if self._failure or self._tripped - WARNINGS or self._motor.error_code():
             return True
         return self._cause is Watchdog.COMMAND and self._is_command_missing(t_ns)

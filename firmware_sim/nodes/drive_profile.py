@@ -28,7 +28,7 @@ _VOLTAGE_ENABLED = 1 << 4  # of the statusword: the power stage has its supply
 
 
 class DriveState(Enum):
-    """States of CiA 402. Each says how to get out of it."""
+    """States of CiA 402. The comment says how to leave each; a fault also ends all but START and the last two."""
 
     START = "start"  # by itself, at power-on or reset
     NOT_READY_TO_SWITCH_ON = "not ready to switch on"  # by itself, when initialised
@@ -36,7 +36,7 @@ class DriveState(Enum):
     READY_TO_SWITCH_ON = "ready to switch on"  # switch on; back: disable voltage, quick stop
     SWITCHED_ON = "switched on"  # enable operation; back: shutdown, disable voltage, quick stop
     OPERATION_ENABLED = "operation enabled"  # disable operation, shutdown, disable voltage, quick stop
-    QUICK_STOP_ACTIVE = "quick stop active"  # by itself at standstill; disable voltage
+    QUICK_STOP_ACTIVE = "quick stop active"  # at standstill, or as 0x605A says enable operation; disable voltage
     FAULT_REACTION_ACTIVE = "fault reaction active"  # by itself at standstill
     FAULT = "fault"  # fault reset, once the cause is gone
 
@@ -252,7 +252,7 @@ class Motor(NamedTuple):
 
 
 class DriveScale(NamedTuple):
-    """How a drive counts: position in the body's counts, velocity in those that the contract says.
+    """Counts of a drive: position per count of the body, velocity per count of the contract.
 
     rated_count_Nm: one count of 0x6076, behind the gear.
     """

@@ -1,7 +1,7 @@
 """Faults of a scenario: one timed row each; its kind determines its keys.
 
 A row acts from `at_s` for `duration_s`, or until it has acted `count` times, or, with neither, to the end. `fault_plan`
-has the row's effect on frames, values and nodes. A row without length, such as a reboot, is active for one period.
+has the row's effect on frames, values and nodes. A reboot or drive fault with neither is active for one period.
 
 Nodes are named drive1, drive2, sensor1, sensor2; frames by their content, as in the contract's DBC.
 """

@@ -180,7 +180,7 @@ def _times(values: Pair, factors: Pair) -> Pair:
 
 
 def _by_place(truth: ArmTruth, what: str, by_joint: Pair) -> Pair:
-    """Order values of joints by the places of the devices that are at them."""
+    """Return values of joints in the order of the devices that are at them."""
     return (by_joint[1], by_joint[0]) if truth.wiring.swapped in (what, "joints") else by_joint
 
 
@@ -397,7 +397,7 @@ _LENGTHS: Final = ("x_m", "y_m", "radius_m", "room_m")
 
 
 def _fit(table: dict[str, Any], settings: Settings, links: _Links, rated: Pair, assumed: list[str]) -> None:
-    """Scale a scenario's table that was made for profile P to the arm, in place: places, forces, payloads."""
+    """Fit a scenario's table that was made for profile P to the arm, in place: start pose, places, forces, payloads."""
     length_m = links.length_m
     longer = length_m[0] / _MODEL.link_length_m[0], length_m[1] / _MODEL.link_length_m[1]
     alpha, _, gamma = _MODEL.inertia()

@@ -302,7 +302,7 @@ def builtin_scenarios() -> list[str]:
 
 
 def load_scenario(name_or_file: str, profile: str | None = None, seed: int | None = None) -> Scenario:
-    """Read a scenario: a built-in name or a TOML file. `profile` and `seed` outweigh the file's. Raises ConfigError."""
+    """Return a scenario: a built-in name or a TOML file. `profile`, `seed` outweigh the file's. Raises ConfigError."""
     return resolve_scenario(name_or_file, read_table(name_or_file), profile, seed)
 
 
@@ -324,7 +324,7 @@ def resolve_scenario(
 
 
 def read_table(name_or_file: str) -> dict[str, Any]:
-    """Read a scenario's TOML, unchecked but for its syntax. Raises ConfigError."""
+    """Return a scenario's TOML table, unchecked but for its syntax, with a `name`. Raises ConfigError."""
     return _read("scenario", name_or_file)
 
 
@@ -427,7 +427,7 @@ def truth_names() -> list[str]:
 
 
 def load_truth(name_or_file: str) -> tuple[ArmTruth, dict[str, Any]]:
-    """Read a truth, a built-in name or a TOML file; return it and its sections of a scenario, these unchecked.
+    """Return a truth, a built-in name or a TOML file, and its sections of a scenario, these unchecked.
 
     Raises ConfigError.
     """

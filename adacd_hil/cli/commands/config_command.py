@@ -54,7 +54,7 @@ def show_settings(
 
 
 def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tuple[str, ...]) -> list[dict[str, str]]:
-    """Return a row per setting: key, effective value and default as TOML, and origin.
+    """Return a row per setting: key, effective value and default as of `in_words`, and origin.
 
     given: changes as KEY=VALUE, which override the configuration. keys: keys or groups of the settings to return; ():
     all. Raises ConfigError, CommandError.

@@ -154,7 +154,7 @@ def _replay_one(
 def _open(
     given: Path, configured: tuple[str | None, str | None, Path | None], against: Path | None
 ) -> "tuple[ReplaySource, bool]":
-    """Open a log or a recording; the second value tells whether it is a recording without a log."""
+    """Return a log or a recording, and whether it is a recording without log. Raises CommandError without settings."""
     from adacd_hil.device.contract import load_contract
     from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone
     from adacd_hil.replay.log_source import LogSource
