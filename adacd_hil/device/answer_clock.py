@@ -41,7 +41,7 @@ class AnswerClock:
     """The answers of one device.
 
     answered: the ordinal of the last SYNC that was answered; None before the first. earliest_ns: least time from a SYNC
-    to its answer among the first USUAL_ANSWERS that came in time, the very first apart; 0 before them.
+    to its answer, of USUAL_ANSWERS answers in time, from the second on; 0 before them.
     """
 
     def __init__(self) -> None:

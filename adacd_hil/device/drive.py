@@ -195,7 +195,7 @@ class Drive(CyclicDevice):
     def position_error(self, data: bytes, periods: int) -> float:
         """Return the error of a frame's position, rad, if so many periods lie between it and the last frame.
 
-        The error is a size. 0 before the first frame, for a protected drive, and for a frame of another length.
+        The error has no sign. 0 before the first frame, for a protected drive, and for a frame of another length.
         """
         if self._received is None or len(data) != self.cyclic_length:
             return 0.0
@@ -217,10 +217,10 @@ class Drive(CyclicDevice):
             self.error_code = int(values[at.error_code])
 
     def command(self, torque_permille: int, enable: bool, quick_stop: bool) -> bytes:
-        """Return one command frame: a state nearer to Operation enabled if `enable`, else disable voltage.
+        """Return the next command frame: one state nearer to Operation enabled if `enable`, else disable voltage.
 
         `quick_stop` has precedence over both. Torque is zero unless the drive is enabled in cyclic synchronous torque,
-        `enable` is set and `quick_stop` is not.
+        `enable` is set and `quick_stop` is not. Each call advances the frame's alive counter.
         """
         is_wanted = enable and not quick_stop
         controlword = self._next_controlword() if is_wanted else Controlword.DISABLE_VOLTAGE

@@ -136,7 +136,7 @@ class RecordedArm:
 
 
 def _unpack(frames: NDArray[Any]) -> Iterator[tuple[bool, Frame]]:
-    """Yield recorded frames as those of a bus, each behind whether it was sent."""
+    """Yield (is_sent, frame) for each recorded frame, the frame as a bus has it."""
     data = frames["data"].tobytes()
     starts = range(0, len(data), frames["data"].shape[1])
     columns = (frames[name].tolist() for name in ("is_tx", "can_id", "length", "t_ns", "is_error"))

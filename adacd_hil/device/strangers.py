@@ -24,9 +24,9 @@ from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, NMT_ID, SDO_REQUEST_ID
 
 HOSTS_LISTEN_S = 0.3
-"""How long a host listens before it resets an arm: 30 SYNCs of the longest period, 3 heartbeats."""
+"""How long a host listens before it resets an arm: 30 SYNCs of the longest period, 3 heartbeats of 100 ms."""
 HOLD_S = 1.0
-"""How long after such a frame the arm counts as another host's, too: ten heartbeats of a host."""
+"""How long after another sender's frame the arm counts as another host's, too: ten heartbeats of 100 ms."""
 CONTRADICTIONS = 2
 """Number of second frames of a device that is no accident, if they come within CONTRADICTION_WINDOW_S."""
 CONTRADICTION_WINDOW_S = 0.1
@@ -53,7 +53,7 @@ def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
 
 
 def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> None:
-    """Listen for HOSTS_LISTEN_S; raise DeviceError if another host sends to the arm, since a reset would take it away.
+    """Listen for HOSTS_LISTEN_S; raise DeviceError if another host runs the arm, which a reset would take from it.
 
     Not for lockstep, where time passes only by this host's own frames. Requests that only read objects, and NMT
     commands to nodes of other arms, are ignored. Raises BusError, too.

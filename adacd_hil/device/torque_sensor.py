@@ -40,8 +40,8 @@ class TorqueSensor(CyclicDevice):
     ) -> None:
         """`torque_rate_Nm_s`: the largest change of torque between unprotected frames.
 
-        `torque_range_Nm`: torque from which a sensor counts as overloaded and not valid, if its torque frame carries no
-        status; 0: none.
+        `torque_range_Nm`: torque in either direction from which a sensor counts as overloaded and not valid, if its
+        torque frame carries no status; 0: none.
 
         Raises CodecError when the contract lacks a message or signal.
         """

@@ -129,7 +129,7 @@ class MessageCodec(MessageTable):
         return tuple(values)
 
     def decode_values(self, data: bytes) -> tuple[float, ...]:
-        """Return the physical values behind the end-to-end header, in the order of `values`; the length must fit."""
+        """Return physical values of the signals in `values`, in this order; the length must be right."""
         if self._body is None:
             return self.decode(data)[len(self.signals) - len(self.values) :]
         raw = self._body.unpack_from(data, self._body_offset)
@@ -381,7 +381,7 @@ def parse_codec(text: bytes, path: Path) -> Codec:
 def parse_database(text: bytes, path: Path) -> Database:
     """Return the messages of any DBC that cantools accepts, in UTF-8 or a Windows code page. Raises CodecError.
 
-    `path`: as in `parse_codec`. Raises CodecError, too, for a signal of more bits than the longest frame has.
+    A signal of more bits than the longest frame has is an error, too. `path`: as in `parse_codec`.
     """
     for found in _SIGNAL_PLACE.finditer(text):  # cantools allocates a character for each bit
         if len(found["bits"]) > len(_MOST_BITS) or int(found["bits"]) > int(_MOST_BITS):

@@ -46,8 +46,8 @@ def move_contract(codec: Codec, node_offset: int, host_node: int | None = None) 
     """Return the contract with all devices' node ids moved and the host at `host_node` (default: unchanged).
 
     Its path is the file's name alone, since it has no file yet. Without a change the same object is returned. Raises
-    CodecError without the host's heartbeat, and for a device's node id outside 1 to 126 or equal to the host's, or its
-    29-bit identifier.
+    CodecError without the host's heartbeat, for a device's 29-bit identifier, and for a device's node id outside 1 to
+    126 or equal to the host's.
     """
     host_id = codec.message(HOST_HEARTBEAT).can_id
     if host_node is None:

@@ -100,9 +100,9 @@ class Tolerance:
     (MaxDeltaCounterInit): plus one, and plus one for each cycle since the last frame in sequence. Profile 5
     (MaxDeltaCounter): as it stands."""
     max_missing: int
-    """Cycles in a row without a new frame, after which the sequence counts as lost [MaxNoNewOrRepeatedData]."""
+    """Most cycles in a row without a new frame; after more, the sequence counts as lost [MaxNoNewOrRepeatedData]."""
     sync_frames: int
-    """Frames in sequence needed after a lost sequence before values are used again [SyncCounterInit]."""
+    """Frames in sequence after the frame that shows a lost sequence, before values are used again [SyncCounterInit]."""
 
 
 # A run ends when a value is older than `bus.max_age_cycles`, 3 unless set otherwise. So a frame after 3 lost ones must

@@ -55,7 +55,10 @@ _SEND_PATIENCE_S = 0.05
 
 
 class SocketCanBus(Bus):
-    """A SocketCAN interface. Received frames are fetched in batches; each carries the kernel's reception stamp."""
+    """A SocketCAN interface. Received frames are fetched in batches; each carries the kernel's reception stamp.
+
+    With a clock other than MonotonicClock each carries that clock's time instead.
+    """
 
     def __init__(
         self,
