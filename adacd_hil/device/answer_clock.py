@@ -40,8 +40,8 @@ CLEAR_RAD = 2e-4
 class AnswerClock:
     """The answers of one device.
 
-    answered: the ordinal of the last SYNC that was answered; None before the first. earliest_ns: how soon after a SYNC
-    it has answered, 0 before the first.
+    answered: the ordinal of the last SYNC that was answered; None before the first. earliest_ns: least time from a SYNC
+    to its answer, of USUAL_ANSWERS answers in time, from the second on; 0 before them.
     """
 
     def __init__(self) -> None:
@@ -61,6 +61,8 @@ class AnswerClock:
         soonest_ns: int | None = None,
     ) -> int | None:
         """Return the ordinal of the SYNC that a frame answers; None when every SYNC has its answer already.
+
+        If the last answer was a guess that the frame corrects, `newest` is returned again.
 
         newest: ordinal of the last SYNC before the frame, which came `offset_ns` after it. step: advance of its alive
         counter since the last frame; None without a counter, and at the beginning. position_error: returns, for a
@@ -109,16 +111,19 @@ class AnswerClock:
         return is_missing
 
     def keep(self, ordinal: int, values: tuple[float, ...]) -> None:
-        """Keep the values of one SYNC."""
+        """Keep the values that the device sampled on one SYNC, in place of those of KEPT SYNCs before."""
         self._kept[ordinal % KEPT] = ordinal, values
 
     def values_of(self, ordinal: int) -> tuple[float, ...] | None:
-        """Return the values of one SYNC; None if they did not come, or no longer kept."""
+        """Return the values of one SYNC; None if they did not come or are no longer kept."""
         answered, values = self._kept[ordinal % KEPT]
         return values if answered == ordinal else None
 
     def note(self, ordinal: int, newest: int, offset_ns: int, is_counted: bool) -> None:
-        """Note that a frame answers the SYNC `ordinal`, as `find` returned it. `is_counted`: it has a counter."""
+        """Set `ordinal` as the last answered SYNC; learn the device's usual time to an answer from one that is in time.
+
+        newest, offset_ns: as of `find`. is_counted: whether the frame has a counter.
+        """
         before, self.answered = self.answered, ordinal
         if before is not None and ordinal > before:
             passed = ordinal - before
@@ -142,7 +147,7 @@ class AnswerClock:
 def newest_sample(clocks: Sequence[AnswerClock], last: int, after: int) -> tuple[int, list[tuple[float, ...]]] | None:
     """Return the newest SYNC that all devices have answered, and the values of each device; None without one.
 
-    Only SYNCs later than `after`, up to `last`, count, of which the devices' values are kept.
+    Only SYNCs after `after` and up to `last` count, of these the last KEPT.
     """
     for ordinal in range(last, max(after, last - KEPT), -1):
         values = [found for clock in clocks if (found := clock.values_of(ordinal)) is not None]

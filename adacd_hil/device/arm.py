@@ -33,7 +33,7 @@ _Command = tuple[list[float], bool, bool]
 _COMPLETE = 0xF  # one bit per cyclic frame: feedback 1, 2, torque 1, 2
 _EMERGENCY_BYTES = 8
 REMEMBERED_GAPS = 0xFF
-"""Bits of as many cycles: which of them a device left without a usable frame."""
+"""Mask of a device's bits in `Arm.gaps`: one for each of the last eight cycles."""
 
 
 class Arm:
@@ -83,7 +83,7 @@ class Arm:
         self._sync_cycles, self._sync_ns = [-1] * KEPT, [0] * KEPT  # of the last SYNCs, by ordinal
         self._clocks = tuple(AnswerClock() for _ in self.devices)
         self._sampled_ordinal = self._sampled_cycle = -1  # of the last complete sample
-        self.gaps = [0] * len(self.devices)  # bit k: no usable frame k cycles ago
+        self.gaps = [0] * len(self.devices)  # bit k: no usable frame k + 1 cycles before the present one
         self._has_gaps = False
         self._last_data = [b""] * len(self.devices)
         self.repeats = [0] * len(self.devices)
@@ -130,7 +130,7 @@ class Arm:
         self._bus.send_all(frames)
 
     def _miss(self) -> None:
-        """Let every device note that its frame of the cycle that ends now did not come."""
+        """Count a miss of each device whose frame did not come in the cycle that ends now."""
         for bit, device in enumerate(self.devices):
             if not self._seen & (1 << bit):
                 device.miss()
@@ -141,9 +141,10 @@ class Arm:
         self._has_gaps = any(self.gaps)
 
     def accept(self, frame: Frame, is_late: bool = False) -> bool:
-        """Take one frame; return False when it is not one of the arm's. A frame that fails a check is ignored.
+        """Take one frame; return True for a cyclic or status frame, and for one that only this host may send.
 
-        `is_late`: it arrived before SYNC, so it answers an earlier one.
+        All others return False, EMCY, heartbeats and SDO answers of the arm included. A frame that fails a check is
+        ignored. `is_late`: it arrived before SYNC, so it answers an earlier one.
         """
         if frame.is_error:
             return False
@@ -160,7 +161,7 @@ class Arm:
 
     @property
     def open_answers(self) -> int:
-        """Count the cyclic frames that this cycle lacks, at least 1."""
+        """Number of cyclic frames that this cycle lacks, at least 1."""
         return max(len(self.devices) - self._seen.bit_count(), 1)
 
     def _answer(self, frame: Frame, place: int, newest: int) -> None:
@@ -195,14 +196,14 @@ class Arm:
             clock.note(ordinal, newest, offset_ns, device.is_protected)
 
     def _find(self, place: int, newest: int, offset_ns: int, step: int | None, data: bytes) -> int | None:
-        """Return the SYNC that a frame answers where earlier ones lack an answer; a drive's motion helps to decide."""
+        """Return the ordinal of the SYNC that a frame answers, None without one; a drive's motion helps to decide."""
         if place >= JOINTS:
             return self._clocks[place].find(newest, offset_ns, step)
         error = partial(self.drives[place].position_error, data)
         return self._clocks[place].find(newest, offset_ns, step, error, self._soonest_ns(place))
 
     def _soonest_ns(self, place: int) -> int:
-        """Return how soon a device can answer this SYNC: as the first of those whose frames are not in."""
+        """Return how soon after SYNC a device can answer, ns: the least of its own and of those still awaited."""
         places = (bit for bit in range(len(self._clocks)) if bit == place or not self._seen >> bit & 1)
         return min(self._clocks[bit].earliest_ns for bit in places)
 
@@ -210,7 +211,7 @@ class Arm:
         """Judge a frame that answers no SYNC; its values are not used.
 
         A repeated frame or a counter that stands still carries no new value. A different frame that passes its check
-        and follows the answer to the same SYNC (`is_second`) comes from another sender.
+        and follows the answer to the same SYNC (`is_second`) comes from another sender, unless it is a straggler.
         """
         device, data = self.devices[place], frame.data
         is_right = len(data) == device.cyclic_length and device.end_to_end.is_signed(data)
@@ -224,7 +225,10 @@ class Arm:
                 self.strangers.hear_device(frame, device.name, self._cycle)
 
     def _hear_emergency(self, frame: Frame) -> None:
-        """Take note of an EMCY of the arm's; whoever describes it gets it, too. Source: CiA 301, clause 7.2.7."""
+        """Keep the error code of a device's EMCY, unless it is tolerated, until the device resets its errors.
+
+        Source: CiA 301, clause 7.2.7.
+        """
         device = self._emergency_ids.get(frame.can_id)
         if device is None or len(frame.data) != _EMERGENCY_BYTES:
             return
@@ -241,16 +245,19 @@ class Arm:
 
     @property
     def missing_frames(self) -> int:
-        """Count the cyclic frames of this cycle that are not in or failed their checks."""
+        """Number of cyclic frames of this cycle that are not in or failed their checks."""
         return (_COMPLETE & ~self.received).bit_count()
 
     def missing_names(self) -> list[str]:
-        """Name the devices whose cyclic frame of this cycle is not in or failed its checks."""
+        """Return the names of the devices whose cyclic frame of this cycle is not in or failed its checks."""
         names = [drive.name for drive in self.drives] + [sensor.name for sensor in self.sensors]
         return [name for bit, name in enumerate(names) if not self.received & (1 << bit)]
 
     def state(self) -> ArmState:
-        """Return the state of this cycle from the newest complete sample, else from the newest value of each device."""
+        """Return the state of this cycle; call it once per cycle, since a sample is new in one state only.
+
+        Its values are of the newest complete sample after the last one used, else the newest of each device.
+        """
         cycle = self._cycle
         if self.received == _COMPLETE:
             return self._state_of(self._ordinal, [device.values for device in self.devices], (cycle,) * 4)
@@ -359,7 +366,7 @@ def _make_sensor(codec: Codec, device: PlacedDevice, period_s: float) -> TorqueS
 
 
 def _status_age_limit(device: PlacedDevice, period_s: float) -> float:
-    """Return the greatest age of a drive's status in cycles: 2.5 periods of the status frame; infinite without one."""
+    """Return the greatest age of a drive's status in cycles: 2.5 periods of its status frame; infinite without them."""
     status = device.pdo("Status")
     if status is None or not status.event_timer_ms:
         return math.inf

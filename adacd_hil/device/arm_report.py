@@ -35,8 +35,9 @@ class DataShares:
     """Shares of a run's cycles with enabled drives, 0…1.
 
     incomplete: some cyclic frame was missing, late or wrong. late: the scheme's sample was older than the cycle.
-    no_new_data, repeated: by device; its frame was not in time, or came again. excesses: quantities that exceeded
-    their limit in some second, one line each with the worst value.
+    no_new_data, repeated: by device; its frame was not in time, or came again; every repeated frame counts, so that
+    `repeated` may exceed 1. excesses: quantities that exceeded their limit in some second, one line each with the
+    worst value.
     """
 
     cycles: int
@@ -70,7 +71,10 @@ class DataWatch(EventSource):
         self._has_rows = False
 
     def note(self, state: ArmState) -> None:
-        """Count missing frames and cycles without a sample; call it once the cycle's frames are in."""
+        """Count a cycle's missing frames, and the cycle if it has no sample; judge the window if it is full.
+
+        Call it once per cycle, after the cycle's last frame. A cycle without enabled drives is not counted.
+        """
         if not state.is_enabled:
             return
         if self._cycles == 0:
@@ -156,7 +160,10 @@ def describe_gaps(arm: Arm) -> list[str]:
 
 
 def describe_checks(arm: Arm) -> list[str]:
-    """Count the cyclic frames of each device that passed and failed their checks, in words, one line each."""
+    """Return a line per device with the number of its cyclic frames by status of their end-to-end check.
+
+    The line of an unprotected device has the implausible and the missing frames.
+    """
     lines = []
     for device in arm.devices:
         tally = dict(device.end_to_end.tally())
@@ -169,9 +176,10 @@ def describe_checks(arm: Arm) -> list[str]:
 
 
 def describe_faults(arm: Arm) -> list[str]:
-    """Describe the fault of each device, one line each; empty without a fault.
+    """Return the arm's faults, one line each; empty without a fault.
 
-    Lines name a drive's fault with its error's name, a sensor's status, and signals older than their limit.
+    Lines name a drive's fault or error code, a drive that dropped out, other senders, a sensor's status unless it is 0,
+    and signals older than their limit.
     """
     lines = []
     for drive in arm.drives:
@@ -200,12 +208,12 @@ def describe_faults(arm: Arm) -> list[str]:
 
 
 def describe_disabled(arm: Arm) -> list[str]:
-    """Name each drive that is not enabled, with its state and mode, one line each; empty when both are enabled."""
+    """Return a line per drive that is not enabled, with its state and mode; empty when both are enabled."""
     return [line for drive in arm.drives for line in _describe_disabled(drive)]
 
 
 def describe_excess(arm: Arm) -> list[str]:
-    """Name each joint that exceeds a limit of the arm, and the limit, one line each; empty without an excess."""
+    """Return a line per limit of the arm that a joint exceeds, with the joint's value; empty without an excess."""
     lines = []
     for joint, (drive, sign) in enumerate(zip(arm.drives, arm.sign, strict=True)):
         position, velocity = drive.values

@@ -24,14 +24,14 @@ from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 
 
 class Recurrence:
-    """Recurs every so many cycles; if its cycle is skipped, in the next cycle."""
+    """Recurs every so many cycles, from the first cycle on; if its cycle is skipped, in the next cycle."""
 
     def __init__(self, interval_s: float, period_s: float) -> None:
         self._cycles = max(1, round(interval_s / period_s))
         self._due_cycle = 0
 
     def is_due(self, cycle: int) -> bool:
-        """Return whether it is due in this cycle; call once per cycle."""
+        """Return whether it is due in this cycle; if so, set the next due cycle: a second call returns False."""
         if cycle < self._due_cycle:
             return False
         self._due_cycle = cycle - cycle % self._cycles + self._cycles
@@ -43,7 +43,7 @@ REPEAT_NS = 1_000_000_000
 
 
 class EventSource:
-    """Collects events in `events`; `take_events` gives those since the last call."""
+    """Collects events in `events`; `take_events` returns those since the last call."""
 
     def __init__(self) -> None:
         self.events: list[Event] = []
@@ -64,7 +64,10 @@ class RateLimitedEvents(EventSource):
         self._unsaid: dict[Hashable, int] = {}
 
     def say(self, t_ns: int, kind: Hashable, event: Event, count: int = 1) -> None:
-        """Take an event of a kind at a time. `count`: how many it stands for."""
+        """Report an event, or only count it if one of its kind was reported within the last second.
+
+        The next reported event of the kind names the number of counted ones. `count`: how many the event stands for.
+        """
         if not self.is_due(kind, t_ns):
             self._unsaid[kind] = self._unsaid.get(kind, 0) + count
             return
@@ -79,7 +82,7 @@ class RateLimitedEvents(EventSource):
 
 
 _LOOKS = 0.1
-"""How often heartbeats are looked at, in their periods."""
+"""Interval between two looks at the heartbeats, in heartbeat periods."""
 
 
 class ArmWatch:
@@ -163,7 +166,10 @@ class HeartbeatWatch:
             node.left_to = node.state
 
     def watch(self, t_ns: int) -> list[str]:
-        """Describe nodes that fail now, one line each; empty if all are well or the watch is stopped."""
+        """Return a line per node that fails now; empty if all are well or the watch is stopped.
+
+        Report an event for each node whose failure is new, another than before, or over.
+        """
         if not self._is_watching:
             return []
         if self._since_ns is None:
@@ -203,7 +209,7 @@ class HeartbeatWatch:
 
 
 def follow_devices(devices: Iterable[PlacedDevice], period_ms: int, report: Callable[[Event], None]) -> HeartbeatWatch:
-    """Make the watch over those devices that send heartbeats."""
+    """Return a watch over the heartbeats of the devices whose EDS lists 0x1017."""
     return HeartbeatWatch(
         [(device.name, device.node_id) for device in devices if device.has(0x1017)], period_ms, report
     )
@@ -223,7 +229,7 @@ class DeadlineWatch:
         self._verdict = ""
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Take in one cycle; return its state, marked late or faulted if the host has missed too many periods."""
+        """Count a cycle's misses; return its state, marked late or faulted if the host has missed too many periods."""
         misses = self._misses
         if arm.periods > 1:
             misses.append((arm.cycle, arm.periods - 1))

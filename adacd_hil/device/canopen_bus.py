@@ -149,7 +149,7 @@ def _check_eds(text: str) -> None:
 
 
 def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
-    """Describe an object of an object dictionary, None when it isn't listed."""
+    """Return an object of an object dictionary; None when it isn't listed."""
     entry = objects.get(index)
     if entry is None:
         return None
@@ -202,7 +202,7 @@ class CanopenBus:
         answer_s: float = ANSWER_TIMEOUT_S,
         pause_s: float = 0.0,
     ) -> Any:
-        """Return canopen's node with the objects of `read_eds`.
+        """Add a node with the objects of `read_eds`; return canopen's object of the node.
 
         With None it has no objects, and SDO goes by index through `node.sdo.upload`. `answer_s`: longest wait for an
         answer. `pause_s`: wait before each request, for a device that loses a request soon after its answer.
@@ -229,7 +229,11 @@ class CanopenBus:
             self.pump(lambda frame: frame.can_id == can_id - 0x80, answer_s)
 
     def pump(self, is_answer: Callable[[Frame], bool], timeout_s: float) -> bool:
-        """Read the bus until an answer is in; False after a silence of `timeout_s`, or as much of other traffic."""
+        """Read the bus until an answer is in; return whether it came.
+
+        False after a silence of `timeout_s`, `timeout_s` after the first of other frames, or after 10,000 of them.
+        Raises BusError.
+        """
         remaining_s = timeout_s
         first_ns: int | None = None
         for _ in range(_MAX_UNRELATED_FRAMES):
@@ -258,7 +262,10 @@ class CanopenBus:
 
 @contextmanager
 def explained(name: str, node_id: int, what: str, answer_s: float = ANSWER_TIMEOUT_S) -> Iterator[None]:
-    """Turn whatever canopen raises into a DeviceError of one line; a BusError passes."""
+    """Turn exceptions of canopen into a DeviceError of one line, an abort into RefusedError.
+
+    BusError and DeviceError pass.
+    """
     try:
         yield
     except (BusError, DeviceError):
@@ -302,14 +309,14 @@ WATCHDOGS = {
 
 
 def name_error(code: int) -> str:
-    """Name an error code; an unlisted one gets the name of its class."""
+    """Return the name of an error code: of its class if it isn't listed, "unknown" without a class."""
     names = _emergency_names()
     codes, classes = names["codes"], names["classes"]
     return codes.get(code) or classes.get(code >> 8) or classes.get((code >> 8) & 0xF0, "unknown")
 
 
 def describe_emergency(code: int, manufacturer: bytes, has_watchdog: bool) -> str:
-    """Describe an EMCY message in one line. `manufacturer`: its bytes 3 to 7.
+    """Return an EMCY message in words, in one line. `manufacturer`: its bytes 3 to 7.
 
     `has_watchdog`: these bytes are the watchdog's number and the device's time.
     """

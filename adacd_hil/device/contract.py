@@ -77,8 +77,8 @@ _HEARTBEAT = (_DbcSignal("state", 8),)
 def load_contract(settings: Settings) -> Codec:
     """Return the codec of the configured devices: from the DBC that `devices.contract` names, or composed.
 
-    The DBC's node ids are moved as a whole to the configured ones. Raises ConfigError when a profile can't be used or
-    says otherwise than the DBC, CodecError for a DBC that can't serve.
+    The DBC's node ids are moved as a whole to the configured ones. Raises ConfigError for an unknown contract, and for
+    a profile that can't be used or differs from the DBC; CodecError for a DBC that can't serve.
     """
     devices = place_devices(settings)
     composed = compose(settings, devices)
@@ -91,13 +91,16 @@ def load_contract(settings: Settings) -> Codec:
 
 
 def compose(settings: Settings, devices: list[PlacedDevice]) -> Codec:
-    """Compose the contract of these devices. Raises ConfigError, CodecError."""
+    """Return the contract composed from the profiles of these devices. Raises ConfigError, CodecError."""
     text = _write_dbc(settings, _messages(settings, devices))
     return parse_codec(text.encode(), Path(COMPOSED_NAME))
 
 
 def find_contract(name: str) -> Path:
-    """Find the DBC that a name (`arm`) or a path stands for. Raises ConfigError with the nearest name."""
+    """Return the file of the DBC that a name (`arm`) or a path stands for; a path with a suffix need not exist.
+
+    Raises ConfigError, with the nearest name if there is one.
+    """
     folder = contract_folder()
     if (folder / f"{name}.dbc").is_file():
         return folder / f"{name}.dbc"
@@ -111,7 +114,10 @@ def find_contract(name: str) -> Path:
 
 
 def _move(codec: Codec, settings: Settings, devices: list[PlacedDevice]) -> Codec:
-    """Move a DBC to the configured node ids, if they all lie equally far from its own; else leave them."""
+    """Return a DBC with the host, and the devices if all lie equally far from its own, at the configured node ids.
+
+    A DBC without the host's heartbeat is returned unchanged.
+    """
     offsets = {
         device.node_id - (codec.messages[name].can_id & NODE_MASK)
         for device in devices

@@ -9,13 +9,12 @@ from adacd_hil.wire.codec import Codec, MessageCodec
 class CyclicDevice(ABC):
     """A device that answers every SYNC with one frame, and may send its status in another.
 
-    is_protected: whether the cyclic frame carries an end-to-end header; else it is checked by plausibility. values: in
-    use, the main one first.
-    sample_cycle: of the values in use; -1 before the first.
+    is_protected: whether the cyclic frame carries an end-to-end header; else it is checked by plausibility. values:
+    those in use, the main one first. sample_cycle: cycle of the values in use; -1 before the first.
     """
 
     def __init__(self, codec: Codec, name: str, message: MessageCodec, main: str, period_s: float) -> None:
-        """Take `main` for the signal by which a frame of `message` without end-to-end header is judged.
+        """Judge a frame of `message` without end-to-end header by its signal `main`.
 
         Raises CodecError when the contract lacks a signal.
         """

@@ -45,33 +45,33 @@ class Slave:
         self._answer_s = device.settings.patience.answer_s
 
     def has(self, index: int, sub: int = 0) -> bool:
-        """Whether the EDS lists an object."""
+        """Return whether the EDS lists an object."""
         return find_variable(self._node.object_dictionary, index, sub) is not None
 
     def can_write(self, index: int, sub: int = 0) -> bool:
-        """Whether the EDS lists an object that SDO may write."""
+        """Return whether the EDS lists an object that SDO may write."""
         variable = find_variable(self._node.object_dictionary, index, sub)
         return variable is not None and variable.is_writable
 
     def default(self, index: int, sub: int = 0) -> int | None:
-        """Return the default that the EDS gives, None without one."""
+        """Return an object's default by the EDS; None without an integer default."""
         variable = find_variable(self._node.object_dictionary, index, sub)
         return None if variable is None else variable.default
 
     def read(self, index: int, sub: int = 0) -> int:
-        """Read a number. Raises DeviceError."""
+        """Read an object and return its number. Raises DeviceError, BusError."""
         with explained(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self._answer_s):
             return int(self._entry(index, sub).raw)
 
     def write_object(self, index: int, sub: int, value: int) -> None:
-        """Write a number. Raises DeviceError."""
+        """Write a number to an object, and note it in `known`. Raises DeviceError, BusError."""
         what = f"writing {self.name_object(index, sub)} = {_number(value)}"
         with explained(self.name, self.node_id, what, self._answer_s):
             self._entry(index, sub).raw = value
         self.known[index, sub] = value
 
     def write_checked(self, index: int, sub: int, value: int, unit: str = "") -> None:
-        """Write a number and read it back. Raises DeviceError."""
+        """Write a number to an object and read it back. Raises DeviceError, also if the two differ, and BusError."""
         self.write_object(index, sub, value)
         found = self.read(index, sub)
         if found != value:
@@ -83,7 +83,10 @@ class Slave:
     def difference(
         self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False
     ) -> str:
-        """Describe the difference between an object and its expected value, "" if equal. Raises DeviceError."""
+        """Return an object's difference from its expected value in words, "" if equal; note the value in `known`.
+
+        Raises DeviceError, BusError.
+        """
         found = self.read(index, sub)
         self.known[index, sub] = expected
         if found == expected:
@@ -92,12 +95,12 @@ class Slave:
         return f"{quantity} {ObjectName(index, sub)} = {values[0]}, {values[1]} expected"
 
     def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", remedy: str = "") -> None:
-        """Compare an object with its expected value. Raises DeviceError, also for a difference."""
+        """Compare an object with its expected value. Raises DeviceError, also for a difference, and BusError."""
         if text := self.difference(index, sub, expected, quantity, unit):
             self.fail(text, remedy)
 
     def name_object(self, index: int, sub: int) -> str:
-        """Name an object as the EDS does."""
+        """Return an object's index and sub-index, with its name if the EDS lists it."""
         variable = find_variable(self._node.object_dictionary, index, sub)
         return str(ObjectName(index, sub)) + ("" if variable is None else f" {variable.name}")
 
@@ -126,7 +129,7 @@ _MODE_READS = 20
 
 
 def command_deadline_ms(settings: Settings) -> int:
-    """Return the deadline of commands in ms, for drives that count time instead of SYNCs."""
+    """Return the deadline of commands in ms, rounded up, for drives that count time instead of SYNCs."""
     return max(1, math.ceil(settings.bus.command_patience_cycles * settings.bus.period_us / 1000))
 
 
@@ -206,7 +209,7 @@ def _check_rated_torque(slave: Slave, settings: Settings) -> None:
 
 
 def torque_unit(scale: ScaleSettings) -> str:
-    """Name a count of 0x6076."""
+    """Return the unit of one count of 0x6076: Nm, mNm, µNm, else as `x 0.002 Nm`."""
     return _TORQUE_UNITS.get(scale.rated_torque_count_Nm, f"x {scale.rated_torque_count_Nm:g} Nm")
 
 
@@ -262,7 +265,7 @@ _MODE_POLL_S = 0.02
 def _enter_mode(slave: Slave, codec: Codec) -> None:
     """Request cyclic synchronous torque. 0x6061 may show it later, once the drive is enabled: the cycle compares it.
 
-    If no frame shows the mode, 0x6061 must show it now. Raises DeviceError.
+    If no frame shows the mode, 0x6061 must show it within `patience.mode_s`. Raises DeviceError.
     """
     if not slave.can_write(0x6060):
         return
@@ -300,9 +303,9 @@ PREFIX_SHIFT = 24  # of 0x6131: power of ten, signed
 
 
 def set_up_sensor(slave: Slave, codec: Codec) -> str:
-    """Compare unit and decimal digits with the contract; return the status in words, empty for a good one.
+    """Compare unit and decimal digits with the contract; return the status as text, empty for 0 and without 0x6150.
 
-    Raises DeviceError.
+    Objects that the EDS doesn't list are not compared. Raises DeviceError.
     """
     torque = codec.message(f"{slave.name}Torque")
     scale = torque.values[torque.place("torque")].scale
@@ -338,7 +341,7 @@ def _channel(slave: Slave) -> int:
 
 _UPLOAD = 0x40
 _ANSWER_S = 0.5
-"""Longest wait for an answer, as in the set-up."""
+"""Longest wait for an answer, the default of `patience.answer_s`."""
 
 
 class _KnownObject(NamedTuple):
@@ -388,7 +391,7 @@ class ParameterWatch(RateLimitedEvents):
         }
 
     def step(self, cycle: int, t_ns: int) -> None:
-        """Ask for the next object when it is due. Raises BusError."""
+        """Send the request for the next object when it is due; warn of one that was not answered. Raises BusError."""
         asked = self._asked
         if asked is not None and cycle - self._asked_cycle > self._answer_cycles:
             text = f"{asked.name} is not answered"
@@ -438,9 +441,10 @@ _RECORDS = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 
 
 def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
-    """Bring all PDOs of a device into the form of its profile; write those that differ. Raises DeviceError.
+    """Bring all PDOs of a device into the form of its profile; write those that differ, or all if it says `rewritten`.
 
-    `command_deadline_ms`: event timer of the command PDO where the profile has the deadline there.
+    PDOs that the profile doesn't name are switched off. Raises DeviceError. `command_deadline_ms`: event timer of the
+    command PDO where the profile has the deadline there.
     """
     profile = slave.device.settings
     for pdo in profile.pdo:
@@ -482,7 +486,10 @@ def _switch_off_others(slave: Slave) -> None:
 
 
 def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
-    """Write the objects of a PDO that differ, or all: invalid first, the mapping emptied, valid last."""
+    """Write the objects of a PDO that can be written: invalid first, valid last.
+
+    The mapping is emptied and written only if it differs, always if `rewritten`, never if `fixed`.
+    """
     index, mapping_index = pdo.communication_index, pdo.mapping_index
     kept = slave.read(index, _COB_ID) & RTR_NOT_ALLOWED
     cob_id = slave.device.can_id(pdo) | kept
@@ -517,7 +524,7 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
 
 
 def pdo_differences(slave: Slave, command_deadline_ms: int) -> list[str]:
-    """Read the PDOs of a device again and describe how they differ from its profile, a line each. Raises DeviceError.
+    """Read the PDOs of a device again; return how they differ from its profile, a line each. Raises DeviceError.
 
     `command_deadline_ms`: as of `set_up_pdos`.
     """
@@ -529,7 +536,7 @@ def pdo_differences(slave: Slave, command_deadline_ms: int) -> list[str]:
 
 
 def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
-    """Describe the difference between a PDO and its profile; empty without one."""
+    """Return the first difference between a PDO and its profile in words; empty without one."""
     index = pdo.communication_index
     identifier = slave.read(index, _COB_ID)
     found, expected = identifier & ~RTR_NOT_ALLOWED, slave.device.can_id(pdo)
@@ -548,7 +555,7 @@ def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
 
 
 def _mapping_difference(slave: Slave, pdo: PdoSettings) -> str:
-    """Describe the difference between the mapping of a PDO and its profile; empty without one."""
+    """Return the first difference between the mapping of a PDO and its profile in words; empty without one."""
     mapping_index, entries = pdo.mapping_index, slave.device.mapping(pdo)
     text = slave.difference(mapping_index, 0, len(entries), "number of mapped objects")
     for sub, entry in enumerate(entries, 1):

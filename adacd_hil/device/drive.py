@@ -101,19 +101,19 @@ def option_codes(settings: Settings, profile: ProfileSettings) -> tuple[int | No
 
 
 def torque_limit_permille(settings: Settings, joint: int) -> int:
-    """Return the largest commanded torque of joint 0 or 1 as per mille of rated torque, for 0x6072."""
+    """Return the largest commanded torque of joint 0 or 1 as per mille of rated torque, at most 0xFFFF, for 0x6072."""
     arm = settings.arm
     return min(0xFFFF, round(1000 * arm.torque_limit_Nm[joint] / arm.rated_torque_Nm[joint]))
 
 
 def shows_mode(codec: Codec, name: str) -> bool:
-    """Whether some frame of a drive carries the mode, 0x6061."""
+    """Return whether some frame of a drive carries the mode, 0x6061."""
     frames = (codec.messages.get(f"{name}{message}") for message in ("Feedback", "Status"))
     return any(signal.name == "mode_display" for frame in frames if frame is not None for signal in frame.values)
 
 
 def decode_statusword(statusword: int) -> Cia402State:
-    """Read the state from 0x6041; a pattern the standard doesn't list counts as not ready."""
+    """Return the state by 0x6041; a pattern that the standard doesn't list counts as NOT_READY_TO_SWITCH_ON."""
     for mask, value, state in _STATUSWORD:
         if statusword & mask == value:
             return state
@@ -134,7 +134,7 @@ class Drive(CyclicDevice):
     ) -> None:
         """`quick_stop_option`: 0x605A, None when unknown. `max_torque_permille`: for commands that carry 0x6072.
 
-        Raises CodecError when the contract lacks a message or signal.
+        Raises CodecError when the contract lacks a message or signal, or a command has one that the host can't fill.
         """
         name = f"Drive{joint}"
         feedback = codec.message(f"{name}Feedback")
@@ -193,7 +193,10 @@ class Drive(CyclicDevice):
         return bool(self.statusword & _INTERNAL_LIMIT)
 
     def position_error(self, data: bytes, periods: int) -> float:
-        """Return the error of a frame's position, rad, if so many periods lie between it and the last frame."""
+        """Return the error of a frame's position, rad, if so many periods lie between it and the last frame.
+
+        The error has no sign. 0 before the first frame, for a protected drive, and for a frame of another length.
+        """
         if self._received is None or len(data) != self.cyclic_length:
             return 0.0
         values = self._message.decode_values(data)
@@ -214,9 +217,10 @@ class Drive(CyclicDevice):
             self.error_code = int(values[at.error_code])
 
     def command(self, torque_permille: int, enable: bool, quick_stop: bool) -> bytes:
-        """Encode one command frame: one state nearer to Operation enabled, or disable voltage, or quick stop.
+        """Return the next command frame: one state nearer to Operation enabled if `enable`, else disable voltage.
 
-        Torque is zero unless the drive is wanted, and enabled in cyclic synchronous torque.
+        `quick_stop` has precedence over both. Torque is zero unless the drive is enabled in cyclic synchronous torque,
+        `enable` is set and `quick_stop` is not. Each call advances the frame's alive counter.
         """
         is_wanted = enable and not quick_stop
         controlword = self._next_controlword() if is_wanted else Controlword.DISABLE_VOLTAGE

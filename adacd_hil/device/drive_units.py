@@ -1,7 +1,7 @@
 """Units of a drive's counts at the joint, by its objects: position, velocity, and the torque of its motor.
 
-    position   0x6064 in increments: 0x608F per motor revolution, times the gear 0x6091; if 0x6092 is there, in its
-               units per revolution of the driven shaft; else, if 0x60A8 is an angle, in that angle of the motor
+    position   0x6064 in increments: 0x608F per motor revolution, times the gear 0x6091; if 0x6092 has 360 units or
+               more per revolution of the driven shaft, in these; else, if 0x60A8 is an angle, in that of the motor
     velocity   0x606C in increments per second, or in the unit of 0x60A9, as rpm, of the motor
     torque     0x6071, 0x6077 in per mille of 0x6076, the motor's rated torque
 
@@ -37,11 +37,11 @@ _TIME_NAMES = {0x03: "s", 0x47: "min", 0x48: "h"}
 
 
 class DriveUnits(NamedTuple):
-    """Units by the objects of a drive; None if they are missing.
+    """Units by the objects of a drive; None, "" or 0 if they are missing.
 
     gear_ratio: 0x6091, motor revolutions per revolution of the joint. increments_per_joint_rev: counts of 0x6064;
     increments_text: the objects behind it, with their values. velocity_rad_s: one count of 0x606C at the joint, None if
-    0x60A9 is missing or no velocity; velocity_unit: its code.
+    0x60A9 is missing or no velocity, or counts increments of unknown size; velocity_unit: the code in 0x60A9.
     """
 
     gear_ratio: float | None = None
@@ -57,7 +57,7 @@ class DriveUnits(NamedTuple):
 
 
 def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
-    """Read the units of a drive. `gear_ratio`: the gear of a drive without 0x6091."""
+    """Return the units of a drive by its objects. `gear_ratio`: the gear of a drive without 0x6091."""
     encoder, motor_revs = number(0x608F, 1), number(0x608F, 2)
     gear_in, gear_out = number(0x6091, 1), number(0x6091, 2)
     feed, shaft_revs = number(0x6092, 1), number(0x6092, 2)
@@ -100,7 +100,7 @@ def _prefix(unit: int) -> int:
 
 
 def name_velocity_unit(unit: int) -> str:
-    """Name the unit of 0x60A9: `rpm`, `10^-3 rpm`, `increment/s`; the code of an unknown one."""
+    """Return the name of a unit of 0x60A9: `rpm`, `10^-3 rpm`, `increment/s`; the code of an unknown one."""
     numerator, denominator = unit >> 16 & 0xFF, unit >> 8 & 0xFF
     if numerator not in _NAMES or denominator not in _TIME_NAMES:
         return f"0x{unit:08X}"

@@ -125,7 +125,7 @@ class Master(EventSource):
             raise DeviceError(f"no boot-up from {missing} on {self._bus.channel} within {timeout_s:g} s", _UNPOWERED)
 
     def identify(self) -> list[Identity]:
-        """Read who is there and compare it with EDS, profile and DBC. Raises DeviceError, BusError."""
+        """Return each device's identity, compared with EDS, profile and DBC. Raises DeviceError, BusError."""
         return [self._identify(slave) for slave in self.slaves]
 
     def _identify(self, slave: Slave) -> Identity:
@@ -255,7 +255,10 @@ class Master(EventSource):
             self._canopen.command(START, slave.node_id)
 
     def stop(self) -> None:
-        """Put all nodes back to pre-operational; drives drop out if they are still enabled. Raises BusError."""
+        """Put all nodes back to pre-operational, and stop watching their heartbeats. Raises BusError.
+
+        Drives drop out if they are still enabled.
+        """
         self._heartbeats.stop()
         self._command(ENTER_PRE_OPERATIONAL)
 
@@ -269,9 +272,10 @@ class Master(EventSource):
             self._canopen.command(nmt_command, node_id)
 
     def watch(self, t_ns: int) -> list[str]:
-        """Describe failures of the nodes' heartbeats now, one line per node; empty without a failure.
+        """Return the failures of the nodes' heartbeats now, one line per node; empty without a failure.
 
-        Between `start` and `stop` only: a node that is silent for 2.5 heartbeat periods, or that isn't OPERATIONAL.
+        A node fails if it is silent for 2.5 heartbeat periods or isn't OPERATIONAL, only between `start` and `stop`.
+        Nodes whose EDS doesn't list 0x1017 are not watched.
         """
         return self._heartbeats.watch(t_ns)
 

@@ -56,7 +56,7 @@ class ObjectName:
 
 
 def parse_object(text: str) -> ObjectName:
-    """Read `0x9130:1` or `0x6064`. Raises ValueError."""
+    """Return the object that a text like `0x9130:1` or `0x6064` names. Raises ValueError."""
     index, _, sub = text.partition(":")
     try:
         name = ObjectName(int(index, 16), int(sub or "0"))
@@ -124,12 +124,12 @@ class PdoSettings:
 
     @property
     def communication_index(self) -> int:
-        """Index of the communication parameters, 0x14xx or 0x18xx."""
+        """Index of the communication parameters, 0x1400 to 0x15FF or 0x1800 to 0x19FF."""
         return (0x1400 if self.is_received else 0x1800) + self.number - 1
 
     @property
     def mapping_index(self) -> int:
-        """Index of the mapping parameters, 0x16xx or 0x1Axx."""
+        """Index of the mapping parameters, 0x1600 to 0x17FF or 0x1A00 to 0x1BFF."""
         return self.communication_index + 0x200
 
 
@@ -160,7 +160,7 @@ class ScaleSettings:
 
     @property
     def joint_torque_Nm(self) -> float:
-        """One count of 0x6076 at the joint, Nm: per mille of 0x6076 are per mille of this much of it."""
+        """One count of 0x6076 at the joint, Nm: behind the gear, with its efficiency."""
         return self.rated_torque_count_Nm * self.gear_ratio * self.gear_efficiency
 
 
@@ -340,7 +340,7 @@ def _builtin_folder() -> Traversable:
 
 
 def profile_names() -> list[str]:
-    """Name the device profiles that come with the package."""
+    """Return the names of the device profiles that come with the package."""
     return toml_names(_builtin_folder())
 
 
@@ -409,11 +409,11 @@ class PlacedDevice:
         return _objects(self.profile.eds, self.node_id)
 
     def has(self, index: int, sub: int = 0) -> bool:
-        """Whether the EDS lists an object."""
+        """Return whether the EDS lists an object. Raises ConfigError when the EDS can't be read."""
         return find_variable(self.objects, index, sub) is not None
 
     def can(self, feature: str) -> bool:
-        """Whether the profile names a feature."""
+        """Return whether the profile names a feature."""
         return feature in self.settings.features
 
     def pdo(self, message: str) -> PdoSettings | None:
@@ -425,7 +425,7 @@ class PlacedDevice:
         return pdo.cob_id + self.node_id
 
     def variable(self, name: ObjectName) -> EdsVariable:
-        """Describe an object of the EDS. Raises ConfigError when it lists none or one that fits no PDO."""
+        """Return an object of the EDS. Raises ConfigError when it isn't listed, is a float, or fits no PDO."""
         found = find_variable(self.objects, name.index, name.sub)
         if found is None:
             raise ConfigError(f"device profile {self.profile.name}: object {name} is not in {self.profile.eds.name}")
@@ -444,7 +444,7 @@ class PlacedDevice:
         return [name.index << 16 | name.sub << 8 | self.variable(name).bits for name in names]
 
     def header(self, pdo: PdoSettings) -> list[SignalSettings]:
-        """Return the header objects of a PDO; () for an unprotected one."""
+        """Return the header objects of a PDO; [] for an unprotected one."""
         if not pdo.data_ids:
             return []
         return [SignalSettings(object=text, signal="e2e") for text in self.settings.header]
@@ -456,7 +456,7 @@ def _objects(path: Path, node_id: int) -> Any:
 
 
 def place_devices(settings: Settings) -> list[PlacedDevice]:
-    """Load the profiles of all devices: Drive1, Drive2, Sensor1, Sensor2, in this order. Raises ConfigError."""
+    """Return all devices with their profiles: Drive1, Drive2, Sensor1, Sensor2, in this order. Raises ConfigError."""
     chosen = settings.devices
     devices = []
     for kind, names, nodes in (
@@ -470,9 +470,9 @@ def place_devices(settings: Settings) -> list[PlacedDevice]:
 
 
 def enable_timeout_s(settings: Settings) -> float:
-    """Return how long ENABLE may take: the configuration's value, else the longest of the drives' profiles.
+    """Return how long ENABLE may take, s: the configuration's value, else by the drives' profiles.
 
-    Raises ConfigError.
+    By the profiles: the larger `enable_s` + `mode_s`, but at least `safety.phase_timeout_s`. Raises ConfigError.
     """
     if settings.safety.enable_timeout_s is not None:
         return settings.safety.enable_timeout_s

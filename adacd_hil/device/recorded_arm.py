@@ -112,7 +112,7 @@ class RecordedArm:
         return self._watch.judge(arm.state())
 
     def _pass(self, passed: _Passed) -> None:
-        """Take frames that came before a SYNC."""
+        """Take frames that passed before a SYNC, and the host's NMT commands among them."""
         for is_sent, frame in passed:
             if not is_sent:
                 self._accept(frame)
@@ -136,7 +136,7 @@ class RecordedArm:
 
 
 def _unpack(frames: NDArray[Any]) -> Iterator[tuple[bool, Frame]]:
-    """Turn recorded frames into those of a bus."""
+    """Yield (is_sent, frame) for each recorded frame, the frame as a bus has it."""
     data = frames["data"].tobytes()
     starts = range(0, len(data), frames["data"].shape[1])
     columns = (frames[name].tolist() for name in ("is_tx", "can_id", "length", "t_ns", "is_error"))
@@ -156,7 +156,7 @@ _PAIRS = ("q", "dq", "tau_J", "age_q", "age_tau_J")
 
 
 def _batch_of(states: list[ArmState]) -> ArmBatch:
-    """Lay the states of n cycles out as columns."""
+    """Return the states of n cycles as columns."""
     columns = list(zip(*states, strict=True)) if states else [()] * len(ArmBatch._fields)
     return ArmBatch(
         *(

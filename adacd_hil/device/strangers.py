@@ -5,8 +5,8 @@ A CAN frame doesn't name its sender. A frame that only one node may send reveals
 - Commands, SYNC, NMT, the host's heartbeat and SDO requests to the arm's devices come from this host alone. If the host
   receives one, it has another sender. A sender that only reads objects, as a survey of the bus does, is reported but
   doesn't stop the arm.
-- A device answers each SYNC with one cyclic frame. A second, different frame with correct length and CRC has another
-  sender: a second device with that node id, or an attack.
+- A device answers each SYNC with one cyclic frame. A second, different frame with correct length and CRC is reported.
+  Two of them within 0.1 s have another sender: a second device with that node id, or an attack.
 
 CRC and alive counter find errors; they don't protect against intent. See `docs/threat-model.md`.
 """
@@ -24,13 +24,13 @@ from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, NMT_ID, SDO_REQUEST_ID
 
 HOSTS_LISTEN_S = 0.3
-"""How long a host listens before it resets an arm: 30 SYNCs of the longest period, 3 heartbeats."""
+"""How long a host listens before it resets an arm: 30 SYNCs of the longest period, 3 heartbeats of 100 ms."""
 HOLD_S = 1.0
-"""How long after such a frame the arm counts as another host's, too: ten heartbeats of a host."""
+"""How long after another sender's frame the arm counts as another host's, too: ten heartbeats of 100 ms."""
 CONTRADICTIONS = 2
-"""Second frames of a device that are no accident."""
+"""Number of second frames of a device that is no accident, if they come within CONTRADICTION_WINDOW_S."""
 CONTRADICTION_WINDOW_S = 0.1
-"""In which they are counted."""
+"""Time within which a device's second frames are counted together."""
 _NMT_WORDS = {1: "start", 2: "stop", 128: "pre-operational", 129: "reset node", 130: "reset communication"}
 _READING = (2, 3, 5)
 """SDO client commands that only read: upload initiate, segment, block. Source: CiA 301 (4.2), clause 7.2.4.3."""
@@ -53,10 +53,10 @@ def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
 
 
 def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> None:
-    """Raise DeviceError when another host runs the arm: a reset would take it from that host. Raises BusError.
+    """Listen for HOSTS_LISTEN_S; raise DeviceError if another host runs the arm, which a reset would take from it.
 
-    Only where time passes by itself: in lockstep it does by this host's own frames. Requests that only read objects,
-    and commands to nodes of other arms, are ignored.
+    Not for lockstep, where time passes only by this host's own frames. Requests that only read objects, and NMT
+    commands to nodes of other arms, are ignored. Raises BusError, too.
     """
     strangers = Strangers(settings, codec)
     end_ns = clock.now_ns() + round(HOSTS_LISTEN_S * 1e9)
@@ -69,7 +69,7 @@ def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> 
 
 
 def _plain(name: str) -> str:
-    """Turn a device's name in the contract into words: Drive1 into drive 1."""
+    """Return a device's name in the contract as words: drive 1 for Drive1."""
     return f"{name[:-1].lower()} {name[-1]}"
 
 
@@ -109,7 +109,10 @@ class Strangers(RateLimitedEvents):
         return True
 
     def hear_device(self, frame: Frame, name: str, cycle: int) -> None:
-        """Take a frame with a device's identifier that is right, new, and answers no SYNC."""
+        """Report a second, different frame of a device on one SYNC: as a warning if it is a single one.
+
+        CONTRADICTIONS of them within CONTRADICTION_WINDOW_S are an error, and count as another sender's action.
+        """
         seen = self._contradictions.setdefault(name, deque(maxlen=CONTRADICTIONS))
         seen.append(cycle)
         if len(seen) == CONTRADICTIONS and cycle - seen[0] <= self._window_cycles:
@@ -125,9 +128,9 @@ class Strangers(RateLimitedEvents):
         self.say(frame.t_ns, text, Event("error", "bus", text))
 
     def are_heard(self, cycle: int) -> bool:
-        """Return whether another sender has acted on the arm of late."""
+        """Return whether another sender has acted on the arm within HOLD_S before a cycle; reading is no action."""
         return cycle <= self._until_cycle
 
     def describe_senders(self, cycle: int) -> list[str]:
-        """Describe the actions of other senders on the arm of late, one line each."""
+        """Return the actions of other senders on the arm within HOLD_S before a cycle, one line each."""
         return [text for text, heard in self._complaints.items() if cycle <= heard + self._hold_cycles]

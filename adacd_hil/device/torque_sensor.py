@@ -38,7 +38,10 @@ class TorqueSensor(CyclicDevice):
         torque_rate_Nm_s: float = math.inf,
         torque_range_Nm: float = 0.0,
     ) -> None:
-        """`torque_rate_Nm_s` bounds the torque of unprotected frames; at `torque_range_Nm`, if not 0, is overload.
+        """`torque_rate_Nm_s`: the largest change of torque between unprotected frames.
+
+        `torque_range_Nm`: torque in either direction from which a sensor counts as overloaded and not valid, if its
+        torque frame carries no status; 0: none.
 
         Raises CodecError when the contract lacks a message or signal.
         """
@@ -54,10 +57,11 @@ class TorqueSensor(CyclicDevice):
         self.values = (0.0,)
         """Torque, Nm, as the device gives it: its sign, its own auto-zero, not tared."""
         self.status = SensorStatus(0)
-        """Status by both of its frames: a sensor whose frames contradict each other isn't trusted.
+        """Bits of both of its frames together: a sensor whose frames contradict each other isn't trusted.
 
-        A status frame counts until the next one. It doesn't count if another status frame withdraws it before the
-        second torque frame after it: a sensor may start so.
+        The bits of a status frame count until the next one. If the torque frame tells a status, too, bits that are new
+        in a status frame don't count from the first to the second torque frame after it: a sensor may start with a
+        status frame that it withdraws at once.
         """
         self._cyclic_bits = 0
         self._slow_bits = 0

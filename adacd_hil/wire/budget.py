@@ -57,7 +57,7 @@ class Stream(NamedTuple):
     interval_ns: int
 
     def arrivals(self, window_ns: int) -> int:
-        """Most frames that can be queued within a window: ceil(window / T)."""
+        """Return the most frames that can be queued within a window: ceil(window / T)."""
         return -(-window_ns // self.interval_ns)
 
 
@@ -74,7 +74,8 @@ def response_time(
     """Return the worst-case response time of a message.
 
     higher: messages of higher priority; blocking_ns: the longest frame of lower priority; bit_ns: one bit at the
-    nominal rate. If the bus is overloaded, a time beyond `deadline_ns` (or the horizon) is returned.
+    nominal rate. If the bus is overloaded, or busy for longer than the horizon, the result is unbounded: see
+    `_exceeded`, with `deadline_ns` (default: the horizon) as the limit.
     """
     if is_overloaded((*higher, stream)):
         return _exceeded(stream, higher, blocking_ns, bit_ns, HORIZON_NS if deadline_ns is None else deadline_ns)
@@ -108,13 +109,16 @@ def is_overloaded(streams: Sequence[Stream]) -> bool:
 def _waiting(
     stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns: int, instance: int, waiting_ns: int
 ) -> int:
-    """Return the next iteration of eq. (9): the time of all frames sent before instance q, while it waits."""
+    """Return the next iteration of eq. (9): the time of all frames sent before `instance`, while it waits."""
     before_ns = sum(s.arrivals(waiting_ns + bit_ns) * s.duration_ns for s in higher)
     return blocking_ns + instance * stream.duration_ns + before_ns
 
 
 def _exceeded(stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns: int, limit_ns: int) -> ResponseTime:
-    """Return a time beyond `limit_ns`, if given, that some frame of an endless busy period takes at least."""
+    """Return a time that some frame of an endless busy period takes at least.
+
+    It is beyond `limit_ns`, unless all frames that are queued within the horizon take less.
+    """
     worst_ns = 0
     waiting_ns = blocking_ns
     instance = 0
@@ -161,7 +165,7 @@ class FrameBudget:
     """Smallest interval between two of them that the budget assumes."""
     deadline_ns: int | None
     has_interval: bool
-    """Whether an inhibit or cycle time bounds its rate; heartbeats always have one."""
+    """Whether its rate is bounded, by its trigger or an inhibit time; a heartbeat's always is."""
     responses: dict[LoadCase, ResponseTime] = field(default_factory=dict)
 
     @property
@@ -181,7 +185,7 @@ class FrameBudget:
         return is_emcy_id and self.trigger is Trigger.EVENT
 
     def late_ns(self, traffic: LoadCase = LoadCase.OPERATION) -> int:
-        """Time by which the frame's response misses the deadline, ns (at least, if unbounded); 0: in time."""
+        """Return the time by which the frame's response misses its deadline, ns (at least, if unbounded), 0 in time."""
         response = self.responses[traffic]
         if self.deadline_ns is None:
             return 0
@@ -240,7 +244,7 @@ class Budget:
 
     @property
     def longest_event_ns(self) -> int:
-        """Duration of the longest event frame, which can delay SYNC, feedback and commands."""
+        """Duration of the longest event frame other than EMCY, which can delay SYNC, feedback and commands."""
         events = [e.duration_ns for e in self.frames if e.trigger is Trigger.EVENT and not e.is_emergency]
         return max(events, default=0)
 
@@ -308,7 +312,7 @@ class Budget:
 
 
 def us(time_ns: int) -> str:
-    """Format a time in µs, with one decimal unless it is whole."""
+    """Return a time as a text in µs, with one decimal unless it is whole."""
     return f"{time_ns / 1000:.0f}" if time_ns % 1000 == 0 else f"{time_ns / 1000:.1f}"
 
 
@@ -320,9 +324,9 @@ def _describe_late(entry: FrameBudget, traffic: LoadCase) -> str:
 
 
 def describe_excess(codec: Codec, settings: Settings) -> str:
-    """Describe how the frames of a contract miss their deadlines in the configured period; "" if they meet them.
+    """Return how the frames of a contract miss their deadlines in the configured period; "" if they meet them.
 
-    A DBC without attribute Trigger can't be judged.
+    "" also for a DBC without attribute Trigger, which can't be judged. Raises CodecError as `check_budget`.
     """
     if b'"Trigger"' not in codec.text:
         return ""
@@ -337,7 +341,7 @@ def check_budget(
     data_bitrate: int | None = None,
     arms: int = 1,
 ) -> Budget:
-    """Compute loads and response times of a contract's frames; arms: number of such arms on the bus.
+    """Return the loads and response times of a contract's frames; arms: number of such arms on the bus.
 
     Period in µs and rates in bit/s default to the DBC's own. A missed deadline raises no error. Raises CodecError if
     the DBC lacks these, or its attribute Trigger.
@@ -403,8 +407,8 @@ def _function(can_id: int, is_extended: bool) -> int:
 def _share_bus(frames: list[FrameBudget], contract: str, arms: int) -> list[FrameBudget]:
     """Return the frames of several arms of one contract on a bus, for any order of the arms.
 
-    The devices' node ids follow each other from 1, the hosts' go down from the contract's. Raises CodecError for an
-    identifier without node id.
+    The devices' node ids follow each other from 1, the hosts' go down from the contract's. Raises CodecError for a
+    29-bit identifier and for a node id beyond 126.
     """
     if arms == 1:
         return frames

@@ -15,7 +15,7 @@ class BusError(OSError):
 
 
 class BusMissingError(BusError):
-    """The bus can't be opened; the message is one line with the interfaces that are present."""
+    """The bus can't be opened; the message is one line."""
 
 
 class TransmitQueueError(BusError):
@@ -163,7 +163,7 @@ class Tap(Bus):
         self._bus.send_all(frames)
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Receive and record a frame. Raises BusError."""
+        """Return the next frame, or None after `timeout_s`, and record it unless it was put back. Raises BusError."""
         if self._unread is not None:
             unread, self._unread = self._unread, None
             return unread
@@ -177,7 +177,7 @@ class Tap(Bus):
         return frame
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Receive and record the frames that are received together. Raises BusError."""
+        """Return and record the frames that are received together; a frame that was put back alone. Raises BusError."""
         if self._unread is not None or most == 1:
             frame = self.receive(timeout_s)
             return [] if frame is None else [frame]
@@ -199,7 +199,7 @@ class Tap(Bus):
         return passed
 
     def recover(self) -> None:
-        """Drop all queued frames of the wrapped bus; recorded ones stay. Raises BusError."""
+        """Drop all queued frames of the wrapped bus and the one put back; recorded ones stay. Raises BusError."""
         self._unread = None
         self._bus.recover()
 

@@ -66,7 +66,7 @@ class CanInterface:
             return 0
 
     def problem(self, is_fd: bool) -> str:
-        """Return the reason why it can't be used, with the remedy, in one line; "" if it can."""
+        """Return the reason why the interface can't be used, with the remedy, in one line; "" if it can be used."""
         present = can_interfaces()
         if self.name not in present:
             known = f"present: {', '.join(present)}" if present else "no CAN interface is present"
@@ -87,7 +87,8 @@ class CanInterface:
     def take_down_and_up(self) -> None:
         """Take the interface down and up, which drops every frame in its queue and in its controller.
 
-        Raises InterfaceDownError when it doesn't come up again, BusError with the command when it isn't permitted.
+        Raises InterfaceDownError when it can't be taken down or doesn't come up again, BusError with the command when
+        taking it down isn't permitted.
         """
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as control:
             try:
@@ -117,7 +118,7 @@ class CanInterface:
         """Return the number of frames in the queueing discipline, of all processes; needs no permission.
 
         Frames that the controller has already fetched are not counted. Raises InterfaceDownError if the interface is
-        absent.
+        absent, BusError if the kernel refuses.
         """
         try:
             index = socket.if_nametoindex(self.name)
@@ -177,8 +178,8 @@ def can_interfaces() -> list[str]:
 def is_virtual(interface: str, channel: str) -> bool:
     """Return whether a channel certainly has no wire: vcan, vxcan, python-can's own virtual bus.
 
-    False for a serial adapter (slcan), although it has no device of its own. If the kernel doesn't report the kind of
-    an interface, its name decides.
+    False for a serial adapter (slcan), although it has no device of its own. Without iproute2, the interface's name
+    decides.
     """
     if interface != "socketcan":
         return interface == "virtual"
@@ -220,7 +221,7 @@ class InterfaceState:
 
 
 def read_link(name: str) -> InterfaceState | None:
-    """Read the state of a CAN interface; None if there is no such interface or it is not CAN."""
+    """Return the state of a CAN interface; None if there is no such interface or it is not CAN."""
     ip = shutil.which("ip", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
     if ip is not None:
         with contextlib.suppress(OSError, subprocess.SubprocessError, ValueError, LookupError):
@@ -231,7 +232,7 @@ def read_link(name: str) -> InterfaceState | None:
 
 
 def parse_ip_link(link: dict[str, Any]) -> InterfaceState | None:
-    """Parse one entry of `ip -details -json link`; None if it is not CAN."""
+    """Return the state in one entry of `ip -details -json link`; None if it is not CAN."""
     if link.get("link_type") != "can":
         return None
     info = link.get("linkinfo", {})
@@ -257,7 +258,7 @@ def parse_ip_link(link: dict[str, Any]) -> InterfaceState | None:
 
 
 def read_sysfs_link(folder: Path) -> InterfaceState | None:
-    """Read the state of an interface from sysfs, without bit timing; None if it is absent or not CAN."""
+    """Return the state of an interface by sysfs, without bit timing; None if it is absent or not CAN."""
     try:
         if (folder / "type").read_text().strip() != _ARPHRD_CAN:
             return None
@@ -273,7 +274,7 @@ def read_sysfs_link(folder: Path) -> InterfaceState | None:
 
 
 def _kind_of(folder: Path) -> str:
-    """Guess the kind of an interface without a device from its name, since sysfs doesn't report it; "" if unknown."""
+    """Return the kind of an interface without a device by its name, since sysfs doesn't report it; "" if unknown."""
     if (folder / "device").exists():
         return ""
     return next((kind for kind in ("vcan", "vxcan", "slcan") if folder.name.startswith(kind)), "")

@@ -1,8 +1,8 @@
 """The cyclic codec: bytes to physical values and back, generated at start from the DBC.
 
-Accepted are only layouts that the hot path decodes fast: little-endian integers of 8, 16, 32 or 64 bits on byte
+The codec accepts only layouts that the hot path decodes fast: little-endian integers of 8, 16, 32 or 64 bits on byte
 borders, and bit fields within one byte. Any other layout is refused with the signal's name. A frame is decoded all or
-nothing: `adacd_hil.wire.e2e` first checks its length, then (for protected messages) counter and CRC.
+nothing: `adacd_hil.wire.e2e` first checks its length, then (for protected messages) CRC and counter.
 
 A message of more than 8 bytes is a CAN FD frame, marked in the DBC by VFrameFormat; its length must have a data length
 code in ISO 11898-1.
@@ -81,15 +81,15 @@ class MessageCodec(MessageTable):
         raise CodecError(f"{self.name} has no signal {name}")
 
     def sender(self) -> E2eSender:
-        """Make the end-to-end sender of this message; without protection it leaves frames unchanged."""
+        """Return a new end-to-end sender of this message; without protection it leaves frames unchanged."""
         return E2eSender() if self.profile is None else self.profile.sender(self.data_ids)
 
     def receiver(self) -> E2eReceiver:
-        """Make the end-to-end receiver of this message; without protection it accepts every frame as OK."""
+        """Return a new end-to-end receiver of this message; without protection it accepts every frame as OK."""
         return E2eReceiver() if self.profile is None else self.profile.receiver(self.data_ids, self.length)
 
     def encode(self, *values: float) -> bytearray:
-        """Encode physical values in the order of `values`; the end-to-end header is left zero.
+        """Return a frame of finite physical values in the order of `values`; the end-to-end header is left zero.
 
         Raises CodecError when a value doesn't fit or the number of values is wrong.
         """
@@ -102,7 +102,7 @@ class MessageCodec(MessageTable):
         return bytearray(self.containers.pack(*containers))
 
     def decode(self, data: bytes) -> tuple[float, ...]:
-        """Decode all signals to physical values, in the order of `signals`.
+        """Return the physical values of all signals, in the order of `signals`.
 
         Raises CodecError when the length is wrong.
         """
@@ -111,7 +111,7 @@ class MessageCodec(MessageTable):
         return super().decode(data)
 
     def decode_values(self, data: bytes) -> tuple[float, ...]:
-        """Decode the signals behind the end-to-end header, in the order of `values`; the length must be right."""
+        """Return physical values of the signals in `values`, in this order; the length must be right."""
         if self._body is None:
             return self.decode(data)[len(self.signals) - len(self.values) :]
         raw = self._body.unpack_from(data, self._body_offset)
@@ -129,14 +129,17 @@ class MessageCodec(MessageTable):
         return length == self.length
 
     def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
-        """Decode the signals behind the end-to-end header to (name, value, unit)."""
+        """Return (name, value, unit) of each signal behind the end-to-end header; the length must be right."""
         return tuple(
             (signal.name, value, signal.unit)
             for signal, value in zip(self.values, self.decode_values(data), strict=True)
         )
 
     def encode_raw(self, *raw: int) -> bytearray:
-        """Encode raw integers in the order of `values`, each of which must fill its container; for the hot path."""
+        """Return a frame of raw integers in the order of `values`, the end-to-end header left zero; for the hot path.
+
+        Raises CodecError if the message has bit fields. The integers must fit.
+        """
         if self._body is None:
             raise CodecError(f"{self.name} has bit fields: encode physical values instead")
         frame = bytearray(self.length)
@@ -165,7 +168,10 @@ def _check_length(message: Message) -> None:
 
 
 def _protection(message: Message) -> tuple[Protection, bytes]:
-    """Read E2EProfile and the data ids, E2EDataIdList or E2EDataId; a list alone means Profile 2."""
+    """Return the protection by E2EProfile, and the data ids by E2EDataIdList or E2EDataId. Raises CodecError.
+
+    A list alone means Profile 2.
+    """
     attributes = message.dbc.attributes if message.dbc else {}
     values = {name: attribute.value for name, attribute in attributes.items()}
     id_list = str(values.get("E2EDataIdList", ""))
@@ -223,7 +229,7 @@ def _in_order(message: Message) -> list[Signal]:
 
 
 def _lay_out(message: Message) -> tuple[SignalCodec, ...]:
-    """Place the signals in containers on byte borders that cover the frame without gaps."""
+    """Return the signals, placed in containers on byte borders that cover the frame without gaps. Raises CodecError."""
     end_bit = 0
     containers = 0
     codecs = []
@@ -284,7 +290,9 @@ class Codec:
         """Whether any message needs CAN FD."""
         self.wire_version = int(attributes[WIRE_VERSION].value)
         self.layout_digest = zlib.crc32(_describe(self.messages).encode())
-        """CRC-32 of every identifier, length, protection, signal place, scale and data id; of no other property."""
+        """CRC-32 of every message's name, identifier, length, protection and data ids, and every signal's name, place,
+        sign, scale and offset; of no other property. Of a signal that fills its container, the place is the container's
+        index: of unsigned ones the digest doesn't tell the sizes."""
 
     def message(self, name: str) -> MessageCodec:
         """Return a message by name. Raises CodecError when the DBC lacks it."""
@@ -294,7 +302,7 @@ class Codec:
             raise CodecError(f"message {name} is missing in the DBC") from None
 
     def node_id(self, message_name: str) -> int:
-        """Return the node id of a CANopen message: the low seven bits of its identifier."""
+        """Return the node id of a CANopen message: the low seven bits of its identifier. Raises CodecError."""
         return self.message(message_name).can_id & 0x7F
 
 
@@ -323,7 +331,7 @@ _MOST_BITS = "512"
 
 
 def read_dbc(path: Path | None = None) -> tuple[bytes, Path]:
-    """Read a DBC (default: the package's); return its text and path. Raises CodecError."""
+    """Return the text and the path of a DBC (default: the package's). Raises CodecError when it can't be read."""
     path = path or contract_folder() / "arm.dbc"
     try:
         return read_input(path), path
@@ -332,12 +340,12 @@ def read_dbc(path: Path | None = None) -> tuple[bytes, Path]:
 
 
 def load_codec(path: Path | None = None) -> Codec:
-    """Generate the codec from a DBC (default: the package's). Raises CodecError."""
+    """Return the codec of a DBC (default: the package's). Raises CodecError."""
     return parse_codec(*read_dbc(path))
 
 
 def parse_codec(text: bytes, path: Path) -> Codec:
-    """Generate the codec from the text of a DBC; `path`: its file, existing or not. Raises CodecError."""
+    """Return the codec of the text of a DBC; `path`: its file, existing or not. Raises CodecError."""
     database = parse_database(text, path)
     try:
         _check_messages(database)
@@ -347,7 +355,10 @@ def parse_codec(text: bytes, path: Path) -> Codec:
 
 
 def parse_database(text: bytes, path: Path) -> Database:
-    """Parse the text of any DBC that cantools accepts, in UTF-8 or a Windows code page. Raises CodecError."""
+    """Return the messages of any DBC that cantools accepts, in UTF-8 or a Windows code page. Raises CodecError.
+
+    A signal of more bits than the longest frame has is an error, too. `path`: as in `parse_codec`.
+    """
     for found in _SIGNAL_PLACE.finditer(text):  # cantools allocates a character for each bit
         if len(found["bits"]) > len(_MOST_BITS) or int(found["bits"]) > int(_MOST_BITS):
             raise CodecError(f"DBC {path}: a signal has {found['bits'].decode()[:20]} bits, more than {_MOST_BITS}")
@@ -362,7 +373,7 @@ def parse_database(text: bytes, path: Path) -> Database:
 
 
 def decode_dbc(text: bytes) -> str:
-    """Decode the text of a DBC: UTF-8, else the code page of vendors' tools, as cantools assumes."""
+    """Return the text of a DBC, decoded as UTF-8, else by the code page of vendors' tools, as cantools assumes."""
     try:
         return text.decode("utf-8-sig")
     except UnicodeDecodeError:

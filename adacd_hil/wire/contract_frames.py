@@ -46,7 +46,8 @@ def move_contract(codec: Codec, node_offset: int, host_node: int | None = None) 
     """Return the contract with all devices' node ids moved and the host at `host_node` (default: unchanged).
 
     Its path is the file's name alone, since it has no file yet. Without a change the same object is returned. Raises
-    CodecError for a node id beyond 126, a node id equal to the host's, and a device's identifier without a node id.
+    CodecError without the host's heartbeat, for a device's 29-bit identifier, and for a device's node id outside 1 to
+    126 or equal to the host's.
     """
     host_id = codec.message(HOST_HEARTBEAT).can_id
     if host_node is None:
@@ -67,7 +68,10 @@ def move_contract(codec: Codec, node_offset: int, host_node: int | None = None) 
 
 
 def move_id(can_id: int, node_offset: int, host_node: int, name: str) -> int:
-    """Move an identifier of a device; one without a node id stays. Raises CodecError that begins with `name`."""
+    """Return a device's identifier with its node id moved; one without a node id stays.
+
+    Raises CodecError, which begins with `name`, for a 29-bit identifier, a node id outside 1 to 126, and the host's.
+    """
     node_id = can_id & NODE_MASK
     if can_id > MAX_STANDARD_ID:
         raise CodecError(f"{name}: identifier 0x{can_id:X} has no node id that could be moved")
@@ -81,7 +85,7 @@ def move_id(can_id: int, node_offset: int, host_node: int, name: str) -> int:
 
 
 def read_bitrates(codec: "Codec | DbcDecoder") -> tuple[int, int]:
-    """Return the nominal and the data bit rate; the data bit rate of a classic bus is 0."""
+    """Return the nominal (default: 1 Mbit/s) and the data bit rate, bit/s; the data bit rate of a classic bus is 0."""
     nominal, data = (str(read_attribute(codec.database, name)) for name in ("Baudrate", "BaudrateCANFD"))
     return int(nominal) if nominal.strip("0").isdecimal() else DEFAULT_BITRATE, int(data) if data.isdecimal() else 0
 

@@ -34,11 +34,11 @@ class MessageDecoder:
         self._plain = plain, create_encode_decode_formats(plain, message.length)
 
     def takes(self, length: int) -> bool:
-        """Return whether a frame of so many bytes is decoded; short frames only if the DBC isn't a contract."""
+        """Return whether a frame of so many bytes is decoded; of another length only if the DBC isn't a contract."""
         return length == self._message.length or not self._is_exact
 
     def decode(self, data: bytes) -> dict[str, float]:
-        """Decode the signals that a frame holds; a short or multiplexed frame doesn't hold all.
+        """Return the values of the signals that a frame holds, by name; a short or multiplexed frame doesn't hold all.
 
         If the DBC doesn't list the multiplexer's value, only the signals outside the multiplexer are decoded.
         """
@@ -50,7 +50,7 @@ class MessageDecoder:
         return {name: float(value) for name, value in values.items()}  # type: ignore[arg-type]
 
     def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
-        """Decode a frame to its signals' (name, value, unit)."""
+        """Return (name, value, unit) of each signal that a frame holds."""
         return tuple((name, value, self.units[name]) for name, value in self.decode(data).items())
 
 
@@ -72,5 +72,5 @@ class DbcDecoder:
 
 
 def load_decoder(path: Path | None = None) -> DbcDecoder:
-    """Read a DBC (default: the package's). Raises CodecError."""
+    """Return the decoder of a DBC (default: the package's). Raises CodecError."""
     return DbcDecoder(*read_dbc(path))

@@ -35,7 +35,7 @@ _TABLE_8 = _crc8_table()
 
 
 def crc8(data: bytes | bytearray, data_id: int) -> int:
-    """Compute the Profile 2 CRC of a frame whose bytes 1… are `data[1:]`."""
+    """Return the Profile 2 CRC of a frame whose bytes 1… are `data[1:]`; `data_id`: the one of its counter."""
     table = _TABLE_8
     crc = 0xFF
     for byte in data[1:]:
@@ -44,7 +44,7 @@ def crc8(data: bytes | bytearray, data_id: int) -> int:
 
 
 def crc16(data: bytes | bytearray, data_id: bytes) -> int:
-    """Compute the Profile 5 CRC of a frame whose bytes 2… are `data[2:]`; `data_id`: two bytes, the low one first."""
+    """Return the Profile 5 CRC of a frame whose bytes 2… are `data[2:]`; `data_id`: two bytes, the low one first."""
     return crc_hqx(data_id, crc_hqx(data[2:], 0xFFFF))
 
 
@@ -100,9 +100,9 @@ class Tolerance:
     (MaxDeltaCounterInit): plus one, and plus one for each cycle since the last frame in sequence. Profile 5
     (MaxDeltaCounter): as it stands."""
     max_missing: int
-    """Cycles in a row without a new frame, after which the sequence counts as lost [MaxNoNewOrRepeatedData]."""
+    """Most cycles in a row without a new frame; after more, the sequence counts as lost [MaxNoNewOrRepeatedData]."""
     sync_frames: int
-    """Frames in sequence needed after a lost sequence before values are used again [SyncCounterInit]."""
+    """Frames in sequence after the frame that shows a lost sequence, before values are used again [SyncCounterInit]."""
 
 
 # A run ends when a value is older than `bus.max_age_cycles`, 3 unless set otherwise. So a frame after 3 lost ones must
@@ -115,10 +115,10 @@ PROFILE_5_TOLERANCE = Tolerance(max_delta=5, max_missing=4, sync_frames=1)
 
 
 class E2eSender:
-    """Sends frames unchanged; the sender of a profile adds counter and CRC."""
+    """Leaves the frames of one message unchanged; the sender of a profile adds counter and CRC."""
 
     def protect(self, frame: bytearray) -> bytes:
-        """Fill in counter and CRC of `frame` and return it as bytes; the sender's status stays."""
+        """Return `frame` as bytes; with a profile, fill in its counter and CRC. The sender's status stays."""
         return bytes(frame)
 
 
@@ -159,7 +159,7 @@ class E2eReceiver:
 
     def __init__(self) -> None:
         self.counts = [0] * len(E2eStatus)
-        """Number of frames by status; the index is the status."""
+        """Number of frames by status, in NO_NEW_DATA of cycles without a frame; the index is the status."""
         self.status = E2eStatus.NO_NEW_DATA
         """Status of the last frame."""
 
@@ -175,7 +175,10 @@ class E2eReceiver:
         return status
 
     def step_of(self, frame: bytes) -> int | None:  # noqa: ARG002
-        """Return the step of a frame's counter from the last one's, unchecked; None before the first, or no counter."""
+        """Return the step of a frame's counter from the last one's, unchecked.
+
+        None before the first frame, for a frame of another length, and without a counter.
+        """
         return None
 
     def is_signed(self, frame: bytes) -> bool:  # noqa: ARG002
@@ -183,13 +186,13 @@ class E2eReceiver:
         return True
 
     def miss(self) -> E2eStatus:
-        """Count a cycle without a frame."""
+        """Count a cycle without a frame and return NO_NEW_DATA; the status of the last frame stays."""
         self._note_silence()
         self.counts[E2eStatus.NO_NEW_DATA] += 1
         return E2eStatus.NO_NEW_DATA
 
     def tally(self) -> list[tuple[E2eStatus, int]]:
-        """Return the number of frames by status."""
+        """Return the number of frames by status, in NO_NEW_DATA of cycles without a frame."""
         return list(zip(E2eStatus, self.counts, strict=True))
 
     def restart_sequence(self) -> None:
@@ -232,7 +235,7 @@ class _SequenceReceiver(E2eReceiver):
         return E2eStatus.WRONG_SEQUENCE
 
     def _accept(self, delta: int) -> E2eStatus:
-        """Return the status of a frame in sequence: OK, OK_SOME_LOST, or SYNC after a silence."""
+        """Return the status of a frame in sequence: OK, OK_SOME_LOST, or SYNC after a silence or a wrong sequence."""
         missing, self._missing = self._missing, 0
         if missing > self._tolerance.max_missing:
             self._to_sync = self._tolerance.sync_frames
@@ -265,7 +268,7 @@ class Profile2Receiver(_SequenceReceiver):
         return _COUNTER_MASK_2 + 1
 
     def step_of(self, frame: bytes) -> int | None:
-        """Return the step of a frame's counter from the last one's, unchecked; None before the first."""
+        """Return the step of a frame's counter from the last one's, unchecked; None as in the base class."""
         if self._last is None or len(frame) != self._length:
             return None
         return (frame[1] - self._last) & _COUNTER_MASK_2
@@ -315,7 +318,7 @@ class Profile5Receiver(_SequenceReceiver):
         return _COUNTER_MASK_5 + 1
 
     def step_of(self, frame: bytes) -> int | None:
-        """Return the step of a frame's counter from the last one's, unchecked; None before the first."""
+        """Return the step of a frame's counter from the last one's, unchecked; None as in the base class."""
         if self._last is None or len(frame) != self._length:
             return None
         return (frame[2] - self._last) & _COUNTER_MASK_5
@@ -359,7 +362,7 @@ class E2eProfile:
 
     @property
     def header_bytes(self) -> int:
-        """Length of the header."""
+        """Length of the header in bytes."""
         return (self.crc_bits + self.counter_bits + self.status_bits) // 8
 
     @property

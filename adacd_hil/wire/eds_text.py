@@ -13,7 +13,10 @@ _DUMMIES = range(1, 8)
 
 
 def readable_eds(text: str) -> str:
-    """Return the text without comments and empty device numbers, and with all announced dummies."""
+    """Return the text without `[Comments]` and unreadable numbers of `[DeviceInfo]`.
+
+    `[DummyUsage]`, if present, lists each of the dummies 1 to 7.
+    """
     return "\n".join(_readable(text.splitlines()))
 
 

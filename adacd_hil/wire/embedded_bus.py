@@ -29,7 +29,7 @@ class EmbeddedBus(Bus):
         self._received.append(Frame(can_id, data, self._clock.now_ns(), is_error))
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a frame to the device, which has handled it when this returns."""
+        """Send a frame to the device, which has handled it when this returns; drop it without a device."""
         if self._device is not None:
             self._device(Frame(can_id, data, self._clock.now_ns()))
 
@@ -38,7 +38,7 @@ class EmbeddedBus(Bus):
         return self._received.popleft() if self._received else None
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:  # noqa: ARG002 (the protocol's signature)
-        """Return up to `most` frames."""
+        """Return the next frames, up to `most`, an error frame alone; doesn't wait."""
         return take_first(self._received, most)
 
     def recover(self) -> None:

@@ -94,7 +94,7 @@ def is_bus_off(frame: Frame) -> bool:
 
 
 def decode_error(frame: Frame) -> tuple[TroubleKind, str]:
-    """Decode an error frame to its gravest kind and a text; missing data bytes count as zero.
+    """Return the gravest kind in an error frame, and a text with all; missing data bytes count as zero.
 
     Raises ValueError for other frames.
     """

@@ -114,7 +114,10 @@ class FrameReceiver:
         self._last_ns = 0
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until a frame can be received; False after `timeout_s`; a signal restarts the wait. Raises OSError."""
+        """Wait until a frame can be received; return False after `timeout_s`. Raises OSError.
+
+        A signal restarts the wait.
+        """
         if self._held:
             return True
         whole_s = int(timeout_s)
@@ -127,7 +130,7 @@ class FrameReceiver:
         return bool(found)
 
     def take_frames(self) -> list[Frame]:
-        """Receive up to 64 frames without waiting. Raises OSError, BlockingIOError if there is no frame."""
+        """Return up to 64 received frames without waiting. Raises OSError, BlockingIOError if there is no frame."""
         if self._held:
             return self._take_held()
         count = _receive(self._descriptor, self._place, _FRAMES, _MSG_DONTWAIT, None)
@@ -161,7 +164,7 @@ class FrameReceiver:
         return frames
 
     def _to_clock(self, wall_ns: int) -> int:
-        """Convert a kernel stamp to the clock of the frames."""
+        """Return a kernel stamp in CLOCK_MONOTONIC; the present time of any other clock of the frames instead."""
         if self._clock is not None:
             return self._clock.now_ns()
         if not (wall_ns < self._trusted_ns and 0 <= wall_ns - self._last_ns < _STEP_NS):
@@ -183,7 +186,7 @@ class FrameSender:
         self._lengths = [0] * _FRAMES
 
     def send(self, frames: Sequence[bytes]) -> int:
-        """Send packed frames in one system call; return how many the kernel accepted, 0 on any error."""
+        """Send packed frames, the first 64, in one system call; return how many the kernel accepted, 0 on any error."""
         count = 0
         for count, packed in enumerate(frames[:_FRAMES], 1):
             slot, length = count - 1, len(packed)
@@ -195,7 +198,7 @@ class FrameSender:
 
 
 def _lay_out(memory: int, slot_bytes: int, length: int) -> tuple[Any, Any]:
-    """Lay out the messages of a batch, each with a vector of `length` bytes at the beginning of its slot."""
+    """Return the messages of a batch and their vectors, each of `length` bytes at the beginning of its slot."""
     vectors = (_Vector * _FRAMES)()
     messages = (_MessageHead * _FRAMES)()
     for index in range(_FRAMES):

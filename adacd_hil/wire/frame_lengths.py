@@ -15,7 +15,7 @@ delimiter as data. The CRC field of CAN FD has stuff bits at fixed places, so it
 from typing import NamedTuple
 
 CLASSIC_BYTES = 8
-"""A frame with more data is CAN FD with bit rate switch; one with less is classic, on an FD bus too."""
+"""A frame with more data is CAN FD with bit rate switch; all others are classic, on an FD bus too."""
 MAX_STANDARD_ID = 0x7FF
 """Larger identifiers are 29-bit ones."""
 FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
@@ -39,12 +39,12 @@ class FrameBits(NamedTuple):
         return self.nominal + self.data
 
     def duration_ns(self, bitrate: int, data_bitrate: int = 0) -> int:
-        """Time on the bus at rates in bit/s, rounded up to whole ns."""
+        """Return the time on the bus at rates in bit/s, rounded up to whole ns per rate."""
         data_ns = -(-self.data * 1_000_000_000 // data_bitrate) if self.data else 0
         return -(-self.nominal * 1_000_000_000 // bitrate) + data_ns
 
     def duration_s(self, bitrate: int, data_bitrate: int = 0) -> float:
-        """Time on the bus in s, at rates in bit/s."""
+        """Return the time on the bus in s, at rates in bit/s."""
         return self.nominal / bitrate + (self.data / data_bitrate if self.data else 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Exact durations of frames on the bus.
+"""Durations of frames on the bus, exact and at worst.
 
 Compiled, a byte at a time by table: a cycle has seven frames. Source: ISO 11898-1, frame formats and frame coding; for
 the counted bits, and CAN FD, see `adacd_hil.wire.frame_lengths`.
@@ -167,7 +167,10 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
 
 
 def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
-    """Return a function for the longest duration of frames of a length, whatever their content, in ns."""
+    """Return a function for the longest duration of frames of a length, in ns, whatever their content; rates in bit/s.
+
+    That function raises ValueError for a length that no frame has.
+    """
     by_length: dict[tuple[int, bool], int] = {}
 
     def time_ns(can_id: int, data: bytes) -> int:

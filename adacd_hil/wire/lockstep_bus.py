@@ -44,7 +44,7 @@ _CYCLIC_PERIODS: Final = 2
 
 
 Offer = tuple[int, int, int, bytes]
-"""A frame that waits for the bus; the smaller one wins: identifier, order among all, when it was handed over, data."""
+"""A frame that waits for the bus; the smaller one wins: identifier, order among all, from when on it waits, data."""
 
 
 class LockstepBus(Bus):
@@ -105,7 +105,11 @@ class LockstepBus(Bus):
         return tuple([offer[0] for offer in self._queue])
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Queue a frame at the clock's present time. Raises TransmitQueueError while no node acknowledges."""
+        """Queue a frame at the clock's present time.
+
+        Raises TransmitQueueError when the queue is full and no node acknowledges; SilenceError and BusError as
+        `receive`.
+        """
         now_ns = self._clock.now_ns()
         if not self._is_attached:
             self._attach()
@@ -153,9 +157,9 @@ class LockstepBus(Bus):
         return None
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return the next frame and the answers to SYNC that follow it without another frame, the clock at their end.
+        """Return the next frame; while the last one taken is an answer to SYNC, also the one behind it, up to `most`.
 
-        Raises as `receive`.
+        The clock is then at the end of the last frame. [] after `timeout_s`. Raises as `receive`.
         """
         limit_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         frame = self.receive(timeout_s)
@@ -193,7 +197,7 @@ class LockstepBus(Bus):
             pass
 
     def _transmit_next(self, limit_ns: int) -> bool:
-        """Let the next frame win the bus, if one starts before `limit_ns`."""
+        """Let the next frame win the bus, if one starts before `limit_ns`; else return False."""
         queue = self._queue
         if not self._offered:
             return bool(queue) and self._transmit_own(limit_ns)
@@ -221,7 +225,10 @@ class LockstepBus(Bus):
         return True
 
     def _transmit_own(self, limit_ns: int) -> bool:
-        """Let a frame of the host's, without a competing frame, win the bus, if it starts before `limit_ns`."""
+        """Let a frame of the host's, without a competing frame, win the bus, if it starts before `limit_ns`.
+
+        Return False if none starts before; True also if the devices had to be asked first.
+        """
         queue = self._queue
         t_ns = queue[0][2]  # the earliest: the queue is in the order in which frames were handed over
         start_ns = t_ns if t_ns > self._free_ns else self._free_ns
@@ -330,7 +337,7 @@ class LockstepBus(Bus):
         self._offered.append((frame.can_id, self._count, t_ns, frame.data))
 
     def _is_cyclic(self, t_ns: int) -> bool:
-        """Whether the devices live by SYNC at a time."""
+        """Return whether the devices live by SYNC at a time."""
         return t_ns - self.sync_ns < _CYCLIC_PERIODS * self._period_ns
 
     def _let_pass(self, limit_ns: int) -> bool:
@@ -393,7 +400,7 @@ class LockstepBus(Bus):
 
 
 def make_lockstep_bus(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> LockstepBus:
-    """Model the bus of a contract at the rates that its DBC gives, as `settings.lockstep` says. Raises CodecError.
+    """Return a modelled bus of a contract, as `settings.lockstep` says, at the rates of its DBC. Raises CodecError.
 
     A DBC without rates means 1 and 5 Mbit/s.
     """

@@ -117,7 +117,7 @@ class PythonCanBus(Bus):
 
 
 def _in_words(error: Exception) -> str:
-    """Describe an error of an interface in one line."""
+    """Return an error of an interface in words, in one line."""
     text = " ".join(str(error).split())
     if missing := _MISSING.search(text):
         return f"it also needs {missing[1]}, which python-can takes from ~/.canrc"
@@ -127,7 +127,7 @@ def _in_words(error: Exception) -> str:
 
 
 def _remedy(interface: str, error: Exception) -> str:
-    """Return the remedy for an interface that can't be opened."""
+    """Return remedies for an interface that can't be opened, each behind a semicolon; "" without one."""
     remedies = []
     extra = _EXTRAS.get(interface, interface.replace("_", "-"))
     is_here = isinstance(error, ImportError | can.CanInterfaceNotImplementedError) and "Windows" not in str(error)

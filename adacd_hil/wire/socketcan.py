@@ -55,7 +55,10 @@ _SEND_PATIENCE_S = 0.05
 
 
 class SocketCanBus(Bus):
-    """A SocketCAN interface. Received frames are fetched in batches; each carries the kernel's reception stamp."""
+    """A SocketCAN interface. Received frames are fetched in batches; each carries the kernel's reception stamp.
+
+    With a clock other than MonotonicClock each carries that clock's time instead.
+    """
 
     def __init__(
         self,
@@ -67,7 +70,7 @@ class SocketCanBus(Bus):
     ) -> None:
         """Open `channel`, receiving only `can_ids` if given; `is_shared`: see `recover`. Raises BusMissingError.
 
-        Without `can_ids` the receive buffer is as large as the system allows.
+        Without `can_ids` the receive buffer is a listener's, or as large as the system allows an unprivileged user.
         """
         self._is_shared = is_shared
         self.channel = channel
@@ -119,7 +122,7 @@ class SocketCanBus(Bus):
             self._send_patiently(packed)
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Queue several frames in one system call. Raises as `send`."""
+        """Queue several frames in this order, in one system call if there is room for all. Raises as `send`."""
         packed = [self._pack(can_id, data) for can_id, data in frames]
         sent = 0 if self._socket.fileno() < 0 else self._sender.send(packed)
         for can_id, data in frames[sent:]:  # no room for all, or an error, which `send` raises
@@ -176,7 +179,7 @@ class SocketCanBus(Bus):
         return frame
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return frames that are received together; [] after `timeout_s`. Raises as `receive`."""
+        """Return frames that are received together, up to `most`; [] after `timeout_s`. Raises as `receive`."""
         received = self._received
         if not received or received[0].is_error:
             frame = self.receive(timeout_s)
@@ -227,7 +230,8 @@ class SocketCanBus(Bus):
         since this end last sent. Other sockets of the interface see it go down. A shared interface is not taken down
         while the bus carries frames: then the queue empties by itself.
 
-        Raises InterfaceDownError while the interface is down, BusError with the command if it isn't permitted.
+        Raises InterfaceDownError while the interface is down, BusError with the command if it isn't permitted, and
+        after `close`.
         """
         if self._is_closed:
             raise BusError(f"recovering {self.channel}: closed")
@@ -272,7 +276,7 @@ def _widen(opened: socket.socket) -> None:
 
 
 def _pack_filters(can_ids: Iterable[int] | None) -> bytes:
-    """Pack the kernel's receive filters; without `can_ids` for everything but remote and ambiguous frames.
+    """Return the kernel's receive filters; without `can_ids` for everything but remote and ambiguous frames.
 
     The kernel looks a filter up by table if it asks for identifier, 11 bits and no remote frame.
     """

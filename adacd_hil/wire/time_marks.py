@@ -14,7 +14,7 @@ together. Both have 29-bit identifiers that no CANopen service has; on an arm th
 | LIT | devices | a device is powered |
 
 Every SYNC lets one period pass. RELEASE and END are sent only when not all cyclic frames follow a SYNC at once, or when
-other frames follow it too; an undisturbed arm doesn't send them. The first ADVANCE of a host gives its clock's time and
+other frames follow it too; an undisturbed arm doesn't send them. The first ADVANCE of a host has its clock's time and
 lets no time pass.
 """
 
@@ -43,12 +43,12 @@ class MarkKind(IntEnum):
 
 
 def pack_mark(kind: MarkKind, t_ns: int = 0) -> bytes:
-    """Pack the data of a mark; the time wraps at 2.3 years."""
+    """Return the data of a mark; the time wraps at 2.3 years."""
     return _PACKING.pack((t_ns << 8 | kind) & 0xFFFFFFFFFFFFFFFF)
 
 
 def unpack_mark(data: bytes) -> tuple[MarkKind, int] | None:
-    """Unpack the data of a mark; return None for other data."""
+    """Return the kind of a mark and its time in ns; None for other data."""
     if len(data) != _PACKING.size:
         return None
     (packed,) = _PACKING.unpack(data)
@@ -59,6 +59,6 @@ def unpack_mark(data: bytes) -> tuple[MarkKind, int] | None:
 
 
 def answers_to_sync(codec: Codec) -> frozenset[int]:
-    """Name the identifiers that the devices of a contract send on every SYNC. Raises CodecError."""
+    """Return the identifiers of the frames that the devices send on every SYNC. Raises CodecError without them."""
     names = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
     return frozenset(codec.message(name).can_id for name in names)
