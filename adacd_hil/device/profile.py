@@ -428,7 +428,7 @@ class PlacedDevice:
         """Return an object of the EDS. Raises ConfigError when it isn't listed, is a float, or fits no PDO."""
         found = find_variable(self.objects, name.index, name.sub)
         if found is None:
-            raise ConfigError(f"device profile {self.profile.name}: object {name} is not in {self.profile.eds.name}")
+            raise ConfigError(f"device profile {self.profile.name}: object {name} is not in {self.profile.eds}")
         if found.is_float:
             raise ConfigError(
                 f"device profile {self.profile.name}: object {name} ({found.name}) is a float, REAL{found.bits}; the "

@@ -141,5 +141,5 @@ def test_an_object_that_the_eds_lacks_cant_be_mapped(tmp_path: Path) -> None:
     path = tmp_path / "wide.toml"
     path.write_text(text.replace("0x603F", "0x603E"))
     settings = parse(Settings, {"devices": {"drive": [str(path), "adacd-drive"], "contract": ""}})
-    with pytest.raises(ConfigError, match=r"object 0x603E is not in drive\.eds"):
+    with pytest.raises(ConfigError, match=r"object 0x603E is not in /.*/drive\.eds"):
         load_contract(settings)

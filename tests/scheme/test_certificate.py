@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from excited_arm import NAMES, SETTINGS, Kernel, kernel_of
+from planar_arm import THETA
 
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.scheme.identify import termination
@@ -16,6 +17,7 @@ def fitted_arm(**changes):
     """Return the memory of an arm whose evidence is just complete, with some fields changed."""
     _, m = kernel_of()
     m.motion.samples = round(FIT[0] * 1e3)
+    m.models.belief[: len(THETA["P"])] = THETA["P"]
     m.models.P_belief[:] = np.diag(np.array(K.enough_std) ** 2 * 0.999)
     m.fit.excitation, m.fit.condition = K.excitation_Nm2s, K.condition
     m.motion.q_low[:], m.motion.q_high[:] = -0.5001 * TRAVEL, 0.5001 * TRAVEL
@@ -35,6 +37,12 @@ def uncertain(name, times):
     P = np.array(fitted_arm().models.P_belief)
     P[j, j] = (times * K.enough_std[j]) ** 2
     return P
+
+
+def with_a3(value):
+    belief = np.array(fitted_arm().models.belief)
+    belief[NAMES.index("a3")] = value
+    return belief
 
 
 def test_an_arm_with_all_the_evidence_is_fitted():
@@ -58,6 +66,8 @@ def test_an_arm_with_all_the_evidence_is_fitted():
         {"P_belief": uncertain("a2", 1.01)},
         {"P_belief": uncertain("stribeck2", 1.01)},
         {"P_belief": uncertain("offset1", np.nan)},
+        {"belief": with_a3(0.0)},
+        {"belief": with_a3(np.nan)},
     ],
     ids=str,
 )
@@ -70,6 +80,13 @@ def test_motion_that_excites_too_little_or_leaves_parameters_alike_is_named_with
     first, second = missing(fitted_arm(excitation=1e-5, condition=9.4e5))
     assert first.startswith("the motion excites the parameters by 1e-05 Nm² s, certified.excitation_Nm2s = 5e-05")
     assert second.startswith("the parameters can't be told apart: condition 9.4e+05, certified.condition = 1e+05")
+
+
+def test_a_mass_matrix_that_is_not_positive_definite_is_named_with_a_payload_too():
+    for is_payload in (0.0, 1.0):
+        m = fitted_arm(belief=with_a3(-0.01), is_payload=is_payload, samples=10_000)
+        assert not termination.is_complete(K, m)
+        assert missing(m) == ["the estimated mass matrix is not positive definite: accelerate both joints harder"]
 
 
 def test_a_payload_needs_neither_travel_nor_excitation_but_certain_parameters():

@@ -34,6 +34,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme.memory import Constants, Memory, Motion
+from adacd_hil.scheme.model.regressor import is_positive_definite
 
 EXCITATION_EVERY = 64
 """Samples between two looks at the smallest eigenvalue: it takes 4 µs, the rest of a step less than 1 µs."""
@@ -210,13 +211,13 @@ TEST_SHARE = 6.0
 
 @compiled
 def is_complete(k: Constants, m: Memory) -> bool:
-    """Return whether a fit can be frozen: enough samples, each parameter known, enough excitation and motion.
+    """Return whether a fit can be frozen: enough samples, inertia, each parameter known, enough excitation and motion.
 
-    With a payload the first two are enough.
+    Inertia: the mass matrix is positive definite. With a payload the first three are enough.
     """
     own = m.motion
     is_payload = m.models.is_payload != 0.0
-    if own.samples < k.fit_cycles[1 if is_payload else 0]:
+    if own.samples < k.fit_cycles[1 if is_payload else 0] or not is_positive_definite(m.models.belief):
         return False
     for j in range(m.models.belief.shape[0]):
         if not (m.models.P_belief[j, j] <= k.enough_std[j] ** 2):
@@ -272,6 +273,8 @@ def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dic
                     f"joint {i + 1} has moved at {min(slowest, 0.0):.1f} to {max(fastest, 0.0):.1f} deg/s, "
                     f"{speed:g} both ways needed: move it back and forth"
                 )
+    if not is_positive_definite(m.models.belief):
+        lines.append("the estimated mass matrix is not positive definite: accelerate both joints harder")
     for j, name in enumerate(names):
         std, enough = float(np.sqrt(m.models.P_belief[j, j])), float(k.enough_std[j])
         if not std <= enough:

@@ -252,7 +252,7 @@ def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode
     if is_free and belief.learn_and_use(k, m):
         fit_check.follow(k, m, W_f, tau_f)
     is_complete = is_free and termination.follow(k, m, out.q, out.dq, W_f)
-    if not (is_complete and regressor.is_positive_definite(m.models.belief)):
+    if not is_complete:
         return 0
     certificate.withhold(m, certificate.contradicted_by(k, m))
     return FITTED if m.certificate.withheld_by == certificate.NOTHING else WITHHELD
