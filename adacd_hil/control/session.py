@@ -17,9 +17,10 @@ from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.pacing import Pacer, make_pacer, prepare_spin
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import describe_checks
+from adacd_hil.device.attached_devices import device_attachments
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
-from adacd_hil.device.profile import enable_timeout_s, place_devices
+from adacd_hil.device.profile import enable_timeout_s
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import place_file
 from adacd_hil.log.log_files import LAYOUT_NAME, LOG_NAME, arithmetic
@@ -271,10 +272,7 @@ class Session:
     def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
-        attachments = {}
-        for device in place_devices(self.settings):
-            attachments[device.profile.eds.name] = device.profile.eds.read_bytes()
-            attachments[f"{device.name}.toml"] = to_toml(device.settings).encode()
+        attachments = device_attachments(self.settings)
         attachments["arm.dbc"] = self.codec.text
         attachments["config.toml"] = to_toml(self.settings).encode()
         for file in self.files:

@@ -251,6 +251,10 @@ class RecordingAlone:
         recording = self._recording
         return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
 
+    def with_own_devices(self, settings: Settings, _folder: Path) -> Settings:
+        """Return `settings`: a recording has no device profiles attached."""
+        return settings
+
     def parts(self, with_frames: bool) -> Iterator[Part]:  # noqa: ARG002 (there are only frames)
         """Yield the whole recording as one part; with_frames has no effect, since it has only frames."""
         yield Part(list(self._stretches()), {}, (), frozenset())

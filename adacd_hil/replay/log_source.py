@@ -13,6 +13,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.device.attached_devices import with_attached_devices
 from adacd_hil.device.network import RESET_COMMUNICATION
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError
@@ -22,6 +23,7 @@ from adacd_hil.log.types.record_arrays import FRAME_TOPICS, joined_frames
 from adacd_hil.log.types.topics import ARM
 from adacd_hil.records import CERTIFICATE_EVENTS, ArmBatch, ContactReport, SchemeState
 from adacd_hil.replay.logged_arms import has_arms, logged_arms
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.codec import Codec, parse_codec
 from adacd_hil.wire.contract_frames import NMT_ID, SYNC_ID, SYNC_OVERFLOW
@@ -285,6 +287,15 @@ class LogSource:
     def _open(self, with_frames: bool) -> LogStream:
         topics = (*_TOPICS, self._partner, *(FRAME_TOPICS if with_frames else ()))
         return LogStream(self._path, topics, self._cycles_per_piece, is_ahead=False)  # replay reads in a thread
+
+    def with_own_devices(self, settings: Settings, folder: Path) -> Settings:
+        """Return `settings`, if they name the run's devices, with the profiles attached to the log, put into `folder`.
+
+        Raises OSError.
+        """
+        if settings.devices != self.settings.devices:
+            return settings
+        return with_attached_devices(settings, self._stream.attachments, folder)
 
     def parts(self, with_frames: bool) -> Iterator[Part]:
         """Yield the content of the log in parts, in order.

@@ -16,6 +16,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -257,19 +258,20 @@ def replay_source(
 
 def _decoded(source: ReplaySource, reader: "_ArmReader", end_ns: int) -> Generator[_DecodedPart]:
     """Yield the parts of a source with the arm's states, up to the stretch in which the reported part ends."""
-    for part in source.parts(reader.needs_frames):
-        stretches: list[CycleStretch] = []
-        arms: list[list[ArmBatch]] = []
-        is_over = False
-        for stretch in part.stretches:
-            stretches.append(stretch)
-            arms.append(reader.read(stretch))
-            is_over = bool(stretch.ticks.t_ns[-1] >= end_ns)
+    with TemporaryDirectory(prefix="adacd-hil-") as folder:  # of the devices' profiles
+        for part in source.parts(reader.needs_frames):
+            stretches: list[CycleStretch] = []
+            arms: list[list[ArmBatch]] = []
+            is_over = False
+            for stretch in part.stretches:
+                stretches.append(stretch)
+                arms.append(reader.read(stretch, Path(folder)))
+                is_over = bool(stretch.ticks.t_ns[-1] >= end_ns)
+                if is_over:
+                    break
+            yield part._replace(stretches=stretches), arms
             if is_over:
-                break
-        yield part._replace(stretches=stretches), arms
-        if is_over:
-            return
+                return
 
 
 def _one_ahead(parts: Generator[_DecodedPart]) -> Iterator[_DecodedPart]:
@@ -346,7 +348,7 @@ class _ArmReader:
     """
 
     def __init__(self, source: ReplaySource, variants: Sequence[Settings], by_frames: bool) -> None:
-        self._codec = source.codec
+        self._source = source
         self._keys = [_decoding_key(settings) for settings in variants]
         self._settings = dict(zip(self._keys, variants, strict=True))
         self._logged_key: Any = None
@@ -356,10 +358,11 @@ class _ArmReader:
         self.needs_frames = bool(self._settings)
         self._arms: dict[Any, RecordedArm] = {}
 
-    def read(self, stretch: CycleStretch) -> list[ArmBatch]:
-        """Return the arm's states in a stretch, for each of the variants."""
+    def read(self, stretch: CycleStretch, folder: Path) -> list[ArmBatch]:
+        """Return the arm's states in a stretch, for each of the variants; folder: for the devices' profiles."""
         if stretch.is_begin:
-            self._arms = {key: RecordedArm(settings, self._codec) for key, settings in self._settings.items()}
+            own = {key: self._source.with_own_devices(each, folder) for key, each in self._settings.items()}
+            self._arms = {key: RecordedArm(settings, self._source.codec) for key, settings in own.items()}
         batches = {key: arm.read(stretch.ticks, stretch.frames) for key, arm in self._arms.items()}
         if self._logged_key is not None and stretch.arms is not None:
             batches[self._logged_key] = stretch.arms

@@ -143,25 +143,16 @@ def _write_section(section: Any, prefix: str, lines: list[str], is_short: bool =
         if dataclasses.is_dataclass(value):
             nested.append((field.name, value))
         elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
-            rows = ["{" + _inline(item, is_short) + "}" for item in value]
             if is_short:
-                lines.extend((f"{field.name} = [", *(f"    {row}," for row in rows), "]"))
+                rows = (f"    {toml_value(item, is_short)}," for item in value)
+                lines.extend((f"{field.name} = [", *rows, "]"))
             else:
-                lines.append(f"{field.name} = [{', '.join(rows)}]")
+                lines.append(f"{field.name} = {toml_value(value)}")
         elif value is not None:
             lines.append(f"{field.name} = {toml_value(value)}")
     for name, value in nested:
         lines.extend(("", f"[{prefix}{name}]"))
         _write_section(value, f"{prefix}{name}.", lines, is_short)
-
-
-def _inline(section: Any, is_short: bool) -> str:
-    values = [
-        (field.name, value)
-        for field in dataclasses.fields(section)
-        if (value := getattr(section, field.name)) is not None and not (is_short and is_default(field, value))
-    ]
-    return ", ".join(f"{name} = {toml_value(value)}" for name, value in values)
 
 
 _TOML_ESCAPES = {code: f"\\u{code:04X}" for code in (*range(0x20), 0x7F)} | {
@@ -170,12 +161,22 @@ _TOML_ESCAPES = {code: f"\\u{code:04X}" for code in (*range(0x20), 0x7F)} | {
 }
 
 
-def toml_value(value: Any) -> str:
-    """Return a number, a text or a tuple of such values as TOML that reads back to the same value."""
+def toml_value(value: Any, is_short: bool = False) -> str:
+    """Return a number, a text, settings, or a tuple of such values as TOML in one line that reads back to the same.
+
+    is_short: leave out defaults of settings.
+    """
+    if dataclasses.is_dataclass(value):
+        entries = [
+            f"{field.name} = {toml_value(one, is_short)}"
+            for field in dataclasses.fields(value)
+            if (one := getattr(value, field.name)) is not None and not (is_short and is_default(field, one))
+        ]
+        return "{" + ", ".join(entries) + "}"
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
         return '"' + value.translate(_TOML_ESCAPES) + '"'
     if isinstance(value, tuple):
-        return "[" + ", ".join(toml_value(item) for item in value) + "]"
+        return "[" + ", ".join(toml_value(item, is_short) for item in value) + "]"
     return repr(value)

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analysis.replay_rig import ChangedLog, flip, settings_of_run, with_records, without_cycles, writable
+from analysis.replay_rig import ChangedLog, flip, record, settings_of_run, with_records, without_cycles, writable
 from log.recorded_run import make_run
 from log.recorded_run import record as record_log
 
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.device.profile import enable_timeout_s
+from adacd_hil.device.profile import enable_timeout_s, load_profile
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.log_files import LogError, TimeWindow
@@ -22,6 +22,7 @@ from adacd_hil.replay.replayed_outcome import Replay, side_by_side
 from adacd_hil.score.emulator_truth import contacts_beside
 from adacd_hil.score.judge import Score
 from adacd_hil.settings.setting_keys import apply_settings
+from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.bench.bench_time import TruthLog
 
 pytestmark = pytest.mark.slow
@@ -64,6 +65,22 @@ def test_a_replay_that_must_decode_the_frames_says_why(log):
     assert why.startswith("a setting is another by which the arm takes its frames")
     (why,) = said_of(ChangedLog(log, lambda piece: piece, is_old=True), **{"detector.threshold_Nm": "0.3"})
     assert why.startswith("the log has no /arm")
+
+
+def test_the_frames_are_read_by_the_devices_of_the_run_whatever_became_of_their_files(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text(to_toml(load_profile("stock-drive", "drive").settings))
+    settings = settings_of_run("stock")
+    path = record(tmp_path / "run", replace(settings, devices=replace(settings.devices, drive=(str(file),) * 2)))
+    for text in (
+        file.read_text().replace("increments_per_joint_rev = 1048576", "increments_per_joint_rev = 524288"),
+        "",
+    ):
+        file.write_text(text)
+        source = LogSource(path)
+        (found,) = replay_source(source, [source.settings], script_of=ScriptedOperator, by_frames=True)
+        assert (found.mismatch_count, found.arms_compared) == (0, found.cycles)
+        assert found.cycles > 1000
 
 
 def test_without_the_states_of_the_arm_a_proof_by_frames_is_not_whole(log, whole):

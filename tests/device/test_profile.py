@@ -12,6 +12,7 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import ProfileSettings, load_profile, profile_names
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.toml_files import parse_toml, to_short_toml, to_toml
 from adacd_hil.wire.codec import contract_folder
 
 SENSOR = """
@@ -31,6 +32,13 @@ def profile_file(folder: Path, text: str) -> str:
     path = folder / "mine.toml"
     path.write_text(text)
     return str(path)
+
+
+@pytest.mark.parametrize("name", profile_names())
+def test_a_profile_written_as_toml_reads_back_to_the_same(name: str) -> None:
+    profile = load_profile(name, "sensor" if "sensor" in name else "drive").settings
+    for write in (to_toml, to_short_toml):
+        assert parse(ProfileSettings, parse_toml(write(profile))) == profile
 
 
 def test_profiles_for_each_contract_are_built_in() -> None:
