@@ -52,9 +52,8 @@ class MessageCodec(MessageTable):
         self.senders: tuple[str, ...] = tuple(message.senders)
         self.values = self.signals[0 if self.profile is None else len(self.profile.signals) :]
         """The signals behind the end-to-end header."""
-        # The hot path: values that each fill a container of their own need no shifting.
+        # `encode_raw` packs values that each fill a container of their own.
         is_plain = all(signal.mask == 0 for signal in self.values)
-        self._scales = tuple((signal.scale, signal.offset) for signal in self.values)
         self._body = container_struct(self.values) if is_plain else None
         self._body_offset = self.header_bytes
 
@@ -112,17 +111,7 @@ class MessageCodec(MessageTable):
 
     def decode_values(self, data: bytes) -> tuple[float, ...]:
         """Return physical values of the signals in `values`, in this order; the length must be right."""
-        if self._body is None:
-            return self.decode(data)[len(self.signals) - len(self.values) :]
-        raw = self._body.unpack_from(data, self._body_offset)
-        # For the one or two values of a classic frame a comprehension would cost more than the arithmetic.
-        if len(raw) == 1:
-            ((scale, offset),) = self._scales
-            return (raw[0] * scale + offset,)
-        if len(raw) == 2:
-            (scale1, offset1), (scale2, offset2) = self._scales
-            return raw[0] * scale1 + offset1, raw[1] * scale2 + offset2
-        return tuple([r * scale + offset for r, (scale, offset) in zip(raw, self._scales, strict=True)])
+        return self.decode(data)[len(self.signals) - len(self.values) :]
 
     def takes(self, length: int) -> bool:
         """Return whether a frame of so many bytes can be decoded."""
