@@ -178,6 +178,15 @@ def test_a_chunk_ends_behind_the_packet_that_fills_it_and_is_written_with_the_co
     assert [chunk.message_end_time for chunk in rig.chunks()] == [100, 201, 249]
 
 
+def test_a_packet_without_content_counts_with_the_next_chunk():
+    rig = Rig()
+    assert rig.write(pack_cycle(1, 0, [], [])) == [True]
+    rig.file.flush()
+    assert rig.write(pack_cycle(2, 0, CYCLE, [])) == [True]
+    rig.file.flush()
+    assert [packets for packets in rig.sink.packets if packets] == [2]
+
+
 def test_a_cycle_may_be_larger_than_a_chunk():
     rig = Rig()
     frames = [(False, Frame(0x181, number.to_bytes(8, "little"), number)) for number in range(9000)]

@@ -49,12 +49,12 @@ class ChunkedFile:
         self._writer.add_attachment(
             attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
         )
-        self._pass_on(0)
+        self._pass_on()
 
     def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
         """Write a metadata record."""
         self._writer.add_metadata(name, metadata)
-        self._pass_on(0)
+        self._pass_on()
 
     def define_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Define a schema, in the chunk in progress; return its number in the file."""
@@ -80,20 +80,22 @@ class ChunkedFile:
     def flush(self) -> None:
         """Write the chunk in progress, if it holds a message."""
         self._writer.flush()  # type: ignore[no-untyped-call]
-        self._pass_on(self._packets)
-        self._packets = 0
+        if self._pass_on(self._packets):
+            self._packets = 0
         self._chunk_full = self.record_bytes + CHUNK_BYTES
 
     def complete(self) -> None:
         """Write the chunk in progress, the summary and the footer, with which the file ends."""
         self.flush()
         self._writer.finish()  # type: ignore[no-untyped-call]
-        self._pass_on(0)
+        self._pass_on()
 
-    def _pass_on(self, packets: int) -> None:
-        """Hand over everything that mcap's writer has written since the last call."""
-        if data := self._stream.take():
+    def _pass_on(self, packets: int = 0) -> bool:
+        """Hand over everything that mcap's writer has written since the last call; return whether that is anything."""
+        data = self._stream.take()
+        if data:
             self._target.write(data, packets)
+        return bool(data)
 
 
 class _Stream:
