@@ -113,7 +113,7 @@ def is_disk_full(error: BaseException | None) -> bool:
     return False
 
 
-def in_words(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """Return the text of an error; of an OSError file and reason, without its number."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adacd_hil.clock import wall_ns
-from adacd_hil.file_access import in_words, is_disk_full
+from adacd_hil.file_access import error_text, is_disk_full
 from adacd_hil.file_replacement import Replacement, replace_file, tidied
 from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.plain_values import json_text
@@ -135,7 +135,7 @@ def complain(error: BaseException) -> ExitCode:
     code = next((code for kind, code in _expected() if isinstance(error, kind)), None)
     if code is None:
         raise error
-    line = f"{in_words(error) or type(error).__name__}{_REMEDY if _is_forbidden(error) else ''}"
+    line = f"{error_text(error) or type(error).__name__}{_REMEDY if _is_forbidden(error) else ''}"
     print(f"adacd-hil: {one_line(line)}", file=sys.stderr)
     if is_disk_full(error):
         return ExitCode.PARTIAL
