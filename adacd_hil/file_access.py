@@ -120,7 +120,7 @@ def error_text(error: BaseException) -> str:
     return str(error)
 
 
-def place_file(path: Path, content: bytes) -> None:
+def write_new_file(path: Path, content: bytes) -> None:
     """Write a file unless it exists with the same content. Raises FileExistsError for other content, OSError."""
     try:
         descriptor = os.open(path, NEW, 0o666)
