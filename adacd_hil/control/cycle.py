@@ -268,7 +268,7 @@ class Cycle:
             (ChannelId.CONTROL, pack_control(arm.cycle, self._block, flags, command.enable, command.quick_stop)),
             (ChannelId.CYCLE, pack_cycle(record)),
         ]
-        if self._frame_checks.is_due(arm.cycle):
+        if self._frame_checks.take_turn(arm.cycle):
             messages.append((ChannelId.FRAME_CHECKS, pack_frame_checks(self._arm.frame_checks())))
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))

@@ -30,7 +30,7 @@ class Recurrence:
         self._cycles = max(1, round(interval_s / period_s))
         self._due_cycle = 0
 
-    def is_due(self, cycle: int) -> bool:
+    def take_turn(self, cycle: int) -> bool:
         """Return whether it is due in this cycle; if so, set the next due cycle: a second call returns False."""
         if cycle < self._due_cycle:
             return False
@@ -63,7 +63,7 @@ class RateLimitedEvents(EventSource):
         self._said_ns: dict[Hashable, int] = {}
         self._unsaid: dict[Hashable, int] = {}
 
-    def say(self, t_ns: int, kind: Hashable, event: Event, count: int = 1) -> None:
+    def report(self, t_ns: int, kind: Hashable, event: Event, count: int = 1) -> None:
         """Report an event, or only count it if one of its kind was reported within the last second.
 
         The next reported event of the kind names the number of counted ones. `count`: how many the event stands for.
@@ -103,7 +103,7 @@ class ArmWatch:
 
         Update `lost` when a look at the heartbeats is due. A fault that is set already stays.
         """
-        if self._looks.is_due(arm.cycle):
+        if self._looks.take_turn(arm.cycle):
             self.lost = self._watch(arm.t_ns)
         if self.lost and arm.fault is FaultReason.NONE:
             arm = arm._replace(fault=FaultReason.HEARTBEAT)

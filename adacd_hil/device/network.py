@@ -12,10 +12,10 @@ from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, describe_emerg
 from adacd_hil.device.device_setup import (
     ParameterWatch,
     Slave,
+    check_sensor,
     command_deadline_ms,
     set_up_drive,
     set_up_pdos,
-    set_up_sensor,
 )
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, place_devices
 from adacd_hil.records import Event
@@ -195,7 +195,7 @@ class Master(EventSource):
                 for remark in set_up_drive(slave, self._settings, self._codec):
                     self.events.append(Event("warning", slave.name, remark))
             else:
-                status = set_up_sensor(slave, self._codec)
+                status = check_sensor(slave, self._codec)
                 if status:
                     self.events.append(Event("info", slave.name, status))
             for extra in slave.device.settings.setup:

@@ -103,7 +103,7 @@ class Strangers(RateLimitedEvents):
             doing = f"sends NMT {word} to {f'node {node_id}' if node_id else 'all nodes'}"
         elif frame.can_id & 0x780 == SDO_REQUEST_ID and frame.data and frame.data[0] >> 5 in _READING:
             text = f"somebody else {doing.replace('writes', 'reads')} (0x{frame.can_id:03X})"
-            self.say(frame.t_ns, (frame.can_id, "reads"), Event("warning", "bus", text))
+            self.report(frame.t_ns, (frame.can_id, "reads"), Event("warning", "bus", text))
             return True
         self._complain(frame, doing, cycle)
         return True
@@ -119,13 +119,13 @@ class Strangers(RateLimitedEvents):
             self._complain(frame, f"sends as {_plain(name)}", cycle)
             return
         text = f"a second frame of {_plain(name)} (0x{frame.can_id:03X}) on one SYNC, with other content"
-        self.say(frame.t_ns, (frame.can_id, "once"), Event("warning", "bus", text))
+        self.report(frame.t_ns, (frame.can_id, "once"), Event("warning", "bus", text))
 
     def _complain(self, frame: Frame, doing: str, cycle: int) -> None:
         text = f"somebody else {doing} (0x{frame.can_id:03X})"
         self._until_cycle = cycle + self._hold_cycles
         self._complaints[text] = cycle
-        self.say(frame.t_ns, text, Event("error", "bus", text))
+        self.report(frame.t_ns, text, Event("error", "bus", text))
 
     def are_heard(self, cycle: int) -> bool:
         """Return whether another sender has acted on the arm within HOLD_S before a cycle; reading is no action."""
