@@ -190,7 +190,12 @@ class Cycle:
             self._progress(text)
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(
-            self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0, self._data.shares()
+            self._arm.cycle + 1,
+            self._pacer.overruns,
+            self._state,
+            fault,
+            self._interrupts > 0,
+            self._data.finish_shares(),
         )
 
     @property

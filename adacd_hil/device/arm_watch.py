@@ -165,7 +165,7 @@ class HeartbeatWatch:
         elif node.has_run:
             node.left_to = node.state
 
-    def watch(self, t_ns: int) -> list[str]:
+    def judge_nodes(self, t_ns: int) -> list[str]:
         """Return a line per node that fails now; empty if all are well or the watch is stopped.
 
         Report an event for each node whose failure is new, another than before, or over.
@@ -208,7 +208,9 @@ class HeartbeatWatch:
         return f"{node.name} (node {node.node_id}): {text}"
 
 
-def follow_devices(devices: Iterable[PlacedDevice], period_ms: int, report: Callable[[Event], None]) -> HeartbeatWatch:
+def watch_heartbeats(
+    devices: Iterable[PlacedDevice], period_ms: int, report: Callable[[Event], None]
+) -> HeartbeatWatch:
     """Return a watch over the heartbeats of the devices whose EDS lists 0x1017."""
     return HeartbeatWatch(
         [(device.name, device.node_id) for device in devices if device.has(0x1017)], period_ms, report
