@@ -17,7 +17,7 @@ from adacd_hil.device.canopen_bus import (
     SDO_ABORT,
     DeviceError,
     RefusedError,
-    explained,
+    as_device_error,
     find_variable,
 )
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, shows_mode, torque_limit_permille
@@ -60,13 +60,13 @@ class Slave:
 
     def read(self, index: int, sub: int = 0) -> int:
         """Read an object and return its number. Raises DeviceError, BusError."""
-        with explained(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self._answer_s):
+        with as_device_error(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self._answer_s):
             return int(self._entry(index, sub).raw)
 
     def write_object(self, index: int, sub: int, value: int) -> None:
         """Write a number to an object, and note it in `known`. Raises DeviceError, BusError."""
         what = f"writing {self.name_object(index, sub)} = {_number(value)}"
-        with explained(self.name, self.node_id, what, self._answer_s):
+        with as_device_error(self.name, self.node_id, what, self._answer_s):
             self._entry(index, sub).raw = value
         self.known[index, sub] = value
 
