@@ -1,6 +1,6 @@
 """Progress of compiling: how many functions are compiled, and the listeners that show it.
 
-Compiling takes the better part of a minute, once per version of the program. Listeners register with `telling`; they
+Compiling takes the better part of a minute, once per version of the program. Listeners register with `listening`; they
 don't import numba, which takes long, too.
 """
 
@@ -19,7 +19,7 @@ _listeners: list[Listener] = []
 
 
 @contextmanager
-def telling(listener: Listener) -> Iterator[None]:
+def listening(listener: Listener) -> Iterator[None]:
     """Call `listener` with the progress of compiling while the block lasts, in the thread that compiles."""
     _listeners.append(listener)
     try:

@@ -113,14 +113,14 @@ def is_disk_full(error: BaseException | None) -> bool:
     return False
 
 
-def in_words(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """Return the text of an error; of an OSError file and reason, without its number."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     return str(error)
 
 
-def place_file(path: Path, content: bytes) -> None:
+def write_new_file(path: Path, content: bytes) -> None:
     """Write a file unless it exists with the same content. Raises FileExistsError for other content, OSError."""
     try:
         descriptor = os.open(path, NEW, 0o666)

@@ -77,7 +77,7 @@ def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Pa
     return tuple(folder / name for name in contents)
 
 
-def is_anothers(path: Path, head: bytes) -> bool:
+def has_other_head(path: Path, head: bytes) -> bool:
     """Return whether the file exists, isn't empty, and doesn't begin with `head`: then it may not be replaced.
 
     Raises OSError.
@@ -123,7 +123,7 @@ def dangling_link(path: Path) -> Path | None:
 
 
 @contextmanager
-def tidied(path: Path) -> Iterator[None]:
+def removing_empty_folders(path: Path) -> Iterator[None]:
     """When the block ends, remove a folder and its parents as far as they are empty and didn't exist before."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:

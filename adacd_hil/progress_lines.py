@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from typing import Self
 
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.compile_progress import telling
+from adacd_hil.compile_progress import listening
 from adacd_hil.printable import in_line
 from adacd_hil.terminal import moves_cursor, write_line
 
@@ -35,7 +35,7 @@ class Progress:
         self._thread = threading.Thread(target=self._print, name="progress", daemon=True)
         self._thread.start()
         self._listening = ExitStack()
-        self._listening.enter_context(telling(self.count))
+        self._listening.enter_context(listening(self.count))
 
     def __call__(self, line: str) -> None:
         """Queue a line to be printed."""

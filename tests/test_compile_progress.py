@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from adacd_hil.compile_progress import functions_below, telling
+from adacd_hil.compile_progress import functions_below, listening
 from adacd_hil.compiled import compiled, compiling
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.model import regressor
@@ -43,12 +43,12 @@ def test_whoever_listens_is_told_how_far_compiling_is(monkeypatch: pytest.Monkey
         monkeypatch.setattr(function._cache, "load_overload", lambda *_: None)  # an empty cache
     said: list[str] = []
     begun: list[int] = []
-    with telling(lambda line: said.append(line())), compiling([quarter], lambda: begun.append(len(said))):
+    with listening(lambda line: said.append(line())), compiling([quarter], lambda: begun.append(len(said))):
         assert quarter(4.0) == 1.0
     assert said[0] == "compiling 0 of 2 functions, once per version"
     assert said[-1] == "compiling 2 of 2 functions, once per version"
     assert begun == [0]
-    with telling(lambda line: said.append(line())), compiling([quarter], lambda: begun.append(len(said))):
+    with listening(lambda line: said.append(line())), compiling([quarter], lambda: begun.append(len(said))):
         assert quarter(np.float64(8.0)) == 2.0
     assert begun == [0]  # it was compiled
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.file_access import InUseError, check_unused, create_file, exists, open_input, place_file, read_input
-from adacd_hil.file_replacement import Replacement, replace_file, replacing, tidied
+from adacd_hil.file_access import InUseError, check_unused, create_file, exists, open_input, read_input, write_new_file
+from adacd_hil.file_replacement import Replacement, removing_empty_folders, replace_file, replacing
 from adacd_hil.log.mcap.record_layout import MAGIC
 
 
@@ -105,7 +105,7 @@ def test_a_new_file_takes_the_place_of_nothing(name: str, tmp_path: Path) -> Non
     with pytest.raises(FileExistsError):
         create_file(path)
     with pytest.raises(FileExistsError):
-        place_file(path, b"new")
+        write_new_file(path, b"new")
     assert (tmp_path / "target").read_text() == (tmp_path / "file").read_text() == "kept"
     assert not (tmp_path / "nowhere").exists()
 
@@ -178,10 +178,10 @@ def test_a_file_in_use_names_the_process_that_writes_it(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_there_already_with_the_same_contents_is_fine(tmp_path: Path) -> None:
-    place_file(tmp_path / "file", b"content")
-    place_file(tmp_path / "file", b"content")
+    write_new_file(tmp_path / "file", b"content")
+    write_new_file(tmp_path / "file", b"content")
     with pytest.raises(FileExistsError, match="another one is there already"):
-        place_file(tmp_path / "file", b"content.")
+        write_new_file(tmp_path / "file", b"content.")
     assert (tmp_path / "file").read_bytes() == b"content"
 
 
@@ -189,7 +189,7 @@ def test_only_folders_that_were_made_and_are_empty_go(tmp_path: Path) -> None:
     (tmp_path / "old").mkdir()
     for used, kept in ((False, []), (True, ["file"])):
         path = tmp_path / "old" / "new" / "newer"
-        with tidied(path):
+        with removing_empty_folders(path):
             path.mkdir(parents=True)
             if used:
                 (path / "file").touch()

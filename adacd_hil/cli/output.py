@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from adacd_hil.clock import wall_ns
-from adacd_hil.file_access import in_words, is_disk_full
-from adacd_hil.file_replacement import Replacement, replace_file, tidied
+from adacd_hil.file_access import error_text, is_disk_full
+from adacd_hil.file_replacement import Replacement, removing_empty_folders, replace_file
 from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line, one_line
@@ -135,7 +135,7 @@ def complain(error: BaseException) -> ExitCode:
     code = next((code for kind, code in _expected() if isinstance(error, kind)), None)
     if code is None:
         raise error
-    line = f"{in_words(error) or type(error).__name__}{_REMEDY if _is_forbidden(error) else ''}"
+    line = f"{error_text(error) or type(error).__name__}{_REMEDY if _is_forbidden(error) else ''}"
     print(f"adacd-hil: {one_line(line)}", file=sys.stderr)
     if is_disk_full(error):
         return ExitCode.PARTIAL
@@ -209,7 +209,7 @@ def writable_folder(out: Path | None) -> Iterator[None]:
     if out is None:
         yield
         return
-    with tidied(out.parent):
+    with removing_empty_folders(out.parent):
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
             Replacement(out).discard()
@@ -273,10 +273,10 @@ def run_folder(out: Path | None, log_names: tuple[str, ...], name: str) -> Itera
     if out is not None:
         for log_name in log_names:
             check_free(out / log_name)
-        with tidied(out):
+        with removing_empty_folders(out):
             yield RunFolder(out)
         return
-    with tidied(RUNS):
+    with removing_empty_folders(RUNS):
         path = _make_dated()
         try:
             yield RunFolder(path, (RUNS / LATEST, RUNS / name))

@@ -190,7 +190,12 @@ class Cycle:
             self._progress(text)
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(
-            self._arm.cycle + 1, self._pacer.overruns, self._state, fault, self._interrupts > 0, self._data.shares()
+            self._arm.cycle + 1,
+            self._pacer.overruns,
+            self._state,
+            fault,
+            self._interrupts > 0,
+            self._data.finish_shares(),
         )
 
     @property
@@ -268,7 +273,7 @@ class Cycle:
             (ChannelId.CONTROL, pack_control(arm.cycle, self._block, flags, command.enable, command.quick_stop)),
             (ChannelId.CYCLE, pack_cycle(record)),
         ]
-        if self._frame_checks.is_due(arm.cycle):
+        if self._frame_checks.take_turn(arm.cycle):
             messages.append((ChannelId.FRAME_CHECKS, pack_frame_checks(self._arm.frame_checks())))
         if output.contact is not None:
             messages.append((ChannelId.CONTACT, pack_contact(output.contact)))

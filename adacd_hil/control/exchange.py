@@ -67,7 +67,7 @@ class Exchange:
         if self._commands_late:
             self._say_late(tick.cycle)
         arm.synchronise(tick.cycle, tick.t_ns, tick.periods)
-        if self._looks_at_queues.is_due(tick.cycle):
+        if self._looks_at_queues.take_turn(tick.cycle):
             self.queues = bus.queue_bytes()
         for early in tick.ahead:
             self._accept(early)
@@ -83,7 +83,7 @@ class Exchange:
         count, from_cycle = self._commands_late, cycle - self._acts_after
         what = f"1 command of cycle {from_cycle}" if count == 1 else f"{count} commands of cycle {from_cycle}"
         text = f"{what} missed SYNC {cycle}, so acting one later"
-        self.events.say(self.sync_ns, "late", Event("warning", "late commands", text), count)
+        self.events.report(self.sync_ns, "late", Event("warning", "late commands", text), count)
 
     def _await_feedback(self, last_ns: int) -> int:
         """Take frames until all of this cycle are in or the time for them is over; return that moment, ns.
@@ -142,7 +142,7 @@ class Exchange:
         """
         self._arm.send_command(command)
         record = self._record(tick, arm, log_queue_bytes)
-        if self._heartbeats.is_due(record.cycle):
+        if self._heartbeats.take_turn(record.cycle):
             self._master.send_heartbeat()
         return record
 
@@ -153,7 +153,7 @@ class Exchange:
             count, self._said_lost = frames_lost - self._said_lost, frames_lost
             what = "1 received frame" if count == 1 else f"{count} received frames"
             text = f"{what} dropped by the kernel: this host reads too late"
-            self.events.say(command_ns, "lost", Event("warning", "bus", text))
+            self.events.report(command_ns, "lost", Event("warning", "bus", text))
         # If SYNC is followed, it is the grid point itself, however late this host woke up for it.
         late_ns = 0 if self._is_following else tick.lateness_ns
         return CycleRecord(
@@ -181,4 +181,4 @@ def say_trouble(events: RateLimitedEvents, frame: Frame) -> None:
     """
     kind, text = decode_error(frame)
     level = "info" if kind is TroubleKind.ERROR_ACTIVE else "warning"
-    events.say(frame.t_ns, kind, Event(level, "bus", text))
+    events.report(frame.t_ns, kind, Event(level, "bus", text))

@@ -65,8 +65,8 @@ class SelfChecks:
         """
         if not arm.is_enabled:
             return Request.NONE
-        if self._parameters.difference:
-            return self._fail(FaultReason.TAMPERED, Request.FAULT_TAMPERED, self._parameters.difference)
+        if self._parameters.first_difference:
+            return self._fail(FaultReason.TAMPERED, Request.FAULT_TAMPERED, self._parameters.first_difference)
         line = self._judge_torque(arm.cycle)
         if line:
             return self._fail(FaultReason.TORQUE, Request.FAULT_TORQUE, line)
@@ -339,4 +339,4 @@ class StopEscalation(RateLimitedEvents):
                 self._due = cycles + PATIENCE_CYCLES
                 self._master.leave_operational(drive.node_id)
                 text = f"{drive.name} is in Operation enabled {cycles} cycles after FAULT: NMT pre-operational"
-                self.say(t_ns, drive.name, Event("error", "stop", text))
+                self.report(t_ns, drive.name, Event("error", "stop", text))

@@ -22,7 +22,7 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.profile import enable_timeout_s
 from adacd_hil.device.strangers import refuse_company
-from adacd_hil.file_access import place_file
+from adacd_hil.file_access import write_new_file
 from adacd_hil.log.log_files import LAYOUT_NAME, LOG_NAME, arithmetic
 from adacd_hil.log.recording.processes import LiveService
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
@@ -298,7 +298,7 @@ class Session:
     def _write_beside(self, recorder: Recorder) -> None:
         """Write the viewers' files and the contract beside the log; the log contains them, too."""
         writes: list[Callable[[], object]] = [
-            partial(place_file, self.out / name, content) for name, content in self.viewer_files.items()
+            partial(write_new_file, self.out / name, content) for name, content in self.viewer_files.items()
         ]
         writes.append(partial(write_contract, self.codec, self.out))
         for write in writes:
@@ -344,7 +344,7 @@ def write_contract(codec: Codec, folder: Path) -> Path:
     if codec.path.is_file() and codec.path.read_bytes() == codec.text:
         return codec.path
     path = folder / codec.path.name
-    place_file(path, codec.text)
+    write_new_file(path, codec.text)
     return path
 
 

@@ -98,7 +98,7 @@ class AnswerClock:
             return advantage_rad > 0.0
         return self._is_usual(offset_ns)
 
-    def is_straggler(self, behind: int) -> bool:
+    def take_straggler(self, behind: int) -> bool:
         """Return whether a frame that answers no new SYNC is a delayed answer; note it, so that a second call is False.
 
         `behind`: how far its counter is behind the last answer's, 0 without a counter.
@@ -119,7 +119,7 @@ class AnswerClock:
         answered, values = self._kept[ordinal % KEPT]
         return values if answered == ordinal else None
 
-    def note(self, ordinal: int, newest: int, offset_ns: int, is_counted: bool) -> None:
+    def set_answered(self, ordinal: int, newest: int, offset_ns: int, is_counted: bool) -> None:
         """Set `ordinal` as the last answered SYNC; learn the device's usual time to an answer from one that is in time.
 
         newest, offset_ns: as of `find`. is_counted: whether the frame has a counter.

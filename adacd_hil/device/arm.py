@@ -157,7 +157,7 @@ class Arm:
             take_status(frame.data, self._cycle - self._periods if is_late else self._cycle)
             return True
         self._hear_emergency(frame)
-        return self.strangers.accept(frame, self._cycle)
+        return self.strangers.judge_host_frame(frame, self._cycle)
 
     @property
     def open_answers(self) -> int:
@@ -185,7 +185,7 @@ class Arm:
         if is_revised:
             clock.keep(ordinal - 1, device.values)
         if device.accept_cyclic(data, self._sync_cycles[ordinal % KEPT]):
-            clock.note(ordinal, newest, offset_ns, device.is_protected)
+            clock.set_answered(ordinal, newest, offset_ns, device.is_protected)
             clock.keep(ordinal, device.values)
             self._last_data[place] = data
             if is_present:
@@ -193,7 +193,7 @@ class Arm:
         elif device.end_to_end.status is E2eStatus.WRONG_SEQUENCE:
             clock.begin_anew(newest)  # the device restarted its counter
         elif device.end_to_end.status is E2eStatus.SYNC or (not device.is_protected and is_present):
-            clock.note(ordinal, newest, offset_ns, device.is_protected)
+            clock.set_answered(ordinal, newest, offset_ns, device.is_protected)
 
     def _find(self, place: int, newest: int, offset_ns: int, step: int | None, data: bytes) -> int | None:
         """Return the ordinal of the SYNC that a frame answers, None without one; a drive's motion helps to decide."""
@@ -221,8 +221,8 @@ class Arm:
             device.accept_cyclic(data, self._cycle)  # the check counts it
         if is_second and is_right and not is_same:
             behind = 0 if not step else device.end_to_end.counter_range - step
-            if not self._clocks[place].is_straggler(behind):
-                self.strangers.hear_device(frame, device.name, self._cycle)
+            if not self._clocks[place].take_straggler(behind):
+                self.strangers.report_second_frame(frame, device.name, self._cycle)
 
     def _hear_emergency(self, frame: Frame) -> None:
         """Keep the error code of a device's EMCY, unless it is tolerated, until the device resets its errors.
@@ -319,7 +319,7 @@ class Arm:
         if self._emergencies:
             is_drive = any(drive.name in self._emergencies for drive in self.drives)
             return FaultReason.DRIVE if is_drive else FaultReason.SENSOR
-        return FaultReason.FOREIGN_FRAMES if self.strangers.are_heard(self._cycle) else FaultReason.NONE
+        return FaultReason.FOREIGN_FRAMES if self.strangers.have_acted(self._cycle) else FaultReason.NONE
 
     def send_command(self, command: ArmCommand) -> None:
         """Send the commands of this cycle, to act at the next SYNC; if pipelined, keep them until then.

@@ -123,7 +123,7 @@ class DataWatch(EventSource):
         self._cycles = self._incomplete = self._late = 0
         self._missing = [0] * len(self._names)
 
-    def shares(self) -> DataShares:
+    def finish_shares(self) -> DataShares:
         """End a last window that is long enough; return the shares of missing and late data over ended windows."""
         if self._cycles >= SHORTEST_DATA_WINDOW * self._window_cycles:
             self._end_window()

@@ -30,7 +30,7 @@ class Recurrence:
         self._cycles = max(1, round(interval_s / period_s))
         self._due_cycle = 0
 
-    def is_due(self, cycle: int) -> bool:
+    def take_turn(self, cycle: int) -> bool:
         """Return whether it is due in this cycle; if so, set the next due cycle: a second call returns False."""
         if cycle < self._due_cycle:
             return False
@@ -63,7 +63,7 @@ class RateLimitedEvents(EventSource):
         self._said_ns: dict[Hashable, int] = {}
         self._unsaid: dict[Hashable, int] = {}
 
-    def say(self, t_ns: int, kind: Hashable, event: Event, count: int = 1) -> None:
+    def report(self, t_ns: int, kind: Hashable, event: Event, count: int = 1) -> None:
         """Report an event, or only count it if one of its kind was reported within the last second.
 
         The next reported event of the kind names the number of counted ones. `count`: how many the event stands for.
@@ -103,7 +103,7 @@ class ArmWatch:
 
         Update `lost` when a look at the heartbeats is due. A fault that is set already stays.
         """
-        if self._looks.is_due(arm.cycle):
+        if self._looks.take_turn(arm.cycle):
             self.lost = self._watch(arm.t_ns)
         if self.lost and arm.fault is FaultReason.NONE:
             arm = arm._replace(fault=FaultReason.HEARTBEAT)
@@ -165,7 +165,7 @@ class HeartbeatWatch:
         elif node.has_run:
             node.left_to = node.state
 
-    def watch(self, t_ns: int) -> list[str]:
+    def judge_nodes(self, t_ns: int) -> list[str]:
         """Return a line per node that fails now; empty if all are well or the watch is stopped.
 
         Report an event for each node whose failure is new, another than before, or over.
@@ -208,7 +208,9 @@ class HeartbeatWatch:
         return f"{node.name} (node {node.node_id}): {text}"
 
 
-def follow_devices(devices: Iterable[PlacedDevice], period_ms: int, report: Callable[[Event], None]) -> HeartbeatWatch:
+def watch_heartbeats(
+    devices: Iterable[PlacedDevice], period_ms: int, report: Callable[[Event], None]
+) -> HeartbeatWatch:
     """Return a watch over the heartbeats of the devices whose EDS lists 0x1017."""
     return HeartbeatWatch(
         [(device.name, device.node_id) for device in devices if device.has(0x1017)], period_ms, report

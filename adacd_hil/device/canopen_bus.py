@@ -261,7 +261,7 @@ class CanopenBus:
 
 
 @contextmanager
-def explained(name: str, node_id: int, what: str, answer_s: float = ANSWER_TIMEOUT_S) -> Iterator[None]:
+def as_device_error(name: str, node_id: int, what: str, answer_s: float = ANSWER_TIMEOUT_S) -> Iterator[None]:
     """Turn exceptions of canopen into a DeviceError of one line, an abort into RefusedError.
 
     BusError and DeviceError pass.
@@ -280,7 +280,7 @@ def explained(name: str, node_id: int, what: str, answer_s: float = ANSWER_TIMEO
 
 def read_object(node: Any, index: int, subindex: int = 0) -> bytes | None:
     """Read an object as the node sends it; None when the node has no such object. Raises DeviceError, BusError."""
-    with explained("node", node.id, f"object 0x{index:04X}:{subindex}"):
+    with as_device_error("node", node.id, f"object 0x{index:04X}:{subindex}"):
         try:
             return bytes(node.sdo.upload(index, subindex))
         except SdoAbortedError as error:

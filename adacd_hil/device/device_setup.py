@@ -17,7 +17,7 @@ from adacd_hil.device.canopen_bus import (
     SDO_ABORT,
     DeviceError,
     RefusedError,
-    explained,
+    as_device_error,
     find_variable,
 )
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, shows_mode, torque_limit_permille
@@ -60,13 +60,13 @@ class Slave:
 
     def read(self, index: int, sub: int = 0) -> int:
         """Read an object and return its number. Raises DeviceError, BusError."""
-        with explained(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self._answer_s):
+        with as_device_error(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self._answer_s):
             return int(self._entry(index, sub).raw)
 
     def write_object(self, index: int, sub: int, value: int) -> None:
         """Write a number to an object, and note it in `known`. Raises DeviceError, BusError."""
         what = f"writing {self.name_object(index, sub)} = {_number(value)}"
-        with explained(self.name, self.node_id, what, self._answer_s):
+        with as_device_error(self.name, self.node_id, what, self._answer_s):
             self._entry(index, sub).raw = value
         self.known[index, sub] = value
 
@@ -80,9 +80,7 @@ class Slave:
                 f"the device limits or rounds it: see {ObjectName(index, sub)} in its manual",
             )
 
-    def difference(
-        self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False
-    ) -> str:
+    def compare(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False) -> str:
         """Return an object's difference from its expected value in words, "" if equal; note the value in `known`.
 
         Raises DeviceError, BusError.
@@ -96,7 +94,7 @@ class Slave:
 
     def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", remedy: str = "") -> None:
         """Compare an object with its expected value. Raises DeviceError, also for a difference, and BusError."""
-        if text := self.difference(index, sub, expected, quantity, unit):
+        if text := self.compare(index, sub, expected, quantity, unit):
             self.fail(text, remedy)
 
     def name_object(self, index: int, sub: int) -> str:
@@ -302,7 +300,7 @@ NEWTON_METRE = 0x00560100
 PREFIX_SHIFT = 24  # of 0x6131: power of ten, signed
 
 
-def set_up_sensor(slave: Slave, codec: Codec) -> str:
+def check_sensor(slave: Slave, codec: Codec) -> str:
     """Compare unit and decimal digits with the contract; return the status as text, empty for 0 and without 0x6150.
 
     Objects that the EDS doesn't list are not compared. Raises DeviceError.
@@ -376,7 +374,7 @@ class ParameterWatch(RateLimitedEvents):
         self._answer_cycles = round(_ANSWER_S / settings.bus.period_s)
         self._due = Recurrence(settings.devices.reread_ms * 1e-3, settings.bus.period_s)
         self._is_on = settings.devices.reread_ms > 0
-        self.difference = ""
+        self.first_difference = ""
         """The first object whose value differs from the set-up, in one line; empty without a difference."""
 
     def follow(self, slaves: Iterable[Slave]) -> None:
@@ -395,9 +393,9 @@ class ParameterWatch(RateLimitedEvents):
         asked = self._asked
         if asked is not None and cycle - self._asked_cycle > self._answer_cycles:
             text = f"{asked.name} is not answered"
-            self.say(t_ns, asked.slave.name, Event("warning", "parameters", text))
+            self.report(t_ns, asked.slave.name, Event("warning", "parameters", text))
             self._asked = asked = None
-        if asked is not None or not (self._is_on and self._objects and self._due.is_due(cycle)):
+        if asked is not None or not (self._is_on and self._objects and self._due.take_turn(cycle)):
             return
         chosen = self._objects[self._next]
         node_id = chosen.slave.node_id
@@ -421,7 +419,7 @@ class ParameterWatch(RateLimitedEvents):
         if data[0] == SDO_ABORT:
             code = int.from_bytes(data[4:], "little")
             text = f"{asked.name} can't be read again: 0x{code:08X}"
-            self.say(frame.t_ns, asked.name, Event("warning", "parameters", text))
+            self.report(frame.t_ns, asked.name, Event("warning", "parameters", text))
             self._objects = tuple(one for one in self._objects if one is not asked)
             self._next = self._next % max(len(self._objects), 1)
         elif data[0] & 0xE2 == 0x42:  # expedited, with or without its size
@@ -431,8 +429,8 @@ class ParameterWatch(RateLimitedEvents):
 
     def _compare(self, asked: _KnownObject, found: int, size: int) -> None:
         expected = asked.expected & (1 << 8 * size) - 1
-        if found != expected and not self.difference:
-            self.difference = f"{asked.name} is 0x{found:X}, 0x{expected:X} was set up"
+        if found != expected and not self.first_difference:
+            self.first_difference = f"{asked.name} is 0x{found:X}, 0x{expected:X} was set up"
 
 
 RTR_NOT_ALLOWED = 1 << 30
@@ -549,7 +547,7 @@ def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
         (_EVENT_TIMER, event_timer_ms, "event timer", "ms"),
     )
     for sub, value, quantity, unit in parameters:
-        if slave.has(index, sub) and (text := slave.difference(index, sub, value, quantity, unit)):
+        if slave.has(index, sub) and (text := slave.compare(index, sub, value, quantity, unit)):
             return text
     return _mapping_difference(slave, pdo)
 
@@ -557,7 +555,7 @@ def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
 def _mapping_difference(slave: Slave, pdo: PdoSettings) -> str:
     """Return the first difference between the mapping of a PDO and its profile in words; empty without one."""
     mapping_index, entries = pdo.mapping_index, slave.device.mapping(pdo)
-    text = slave.difference(mapping_index, 0, len(entries), "number of mapped objects")
+    text = slave.compare(mapping_index, 0, len(entries), "number of mapped objects")
     for sub, entry in enumerate(entries, 1):
-        text = text or slave.difference(mapping_index, sub, entry, "mapped object", is_hex=True)
+        text = text or slave.compare(mapping_index, sub, entry, "mapped object", is_hex=True)
     return text

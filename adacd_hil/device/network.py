@@ -7,15 +7,15 @@ Source: CiA 301 (4.2), clauses 7.2.8 (NMT) and 7.5.2 (communication objects); Ci
 import functools
 from typing import Any, NamedTuple
 
-from adacd_hil.device.arm_watch import OPERATIONAL, PATIENCE_PERIODS, EventSource, follow_devices
+from adacd_hil.device.arm_watch import OPERATIONAL, PATIENCE_PERIODS, EventSource, watch_heartbeats
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, describe_emergency
 from adacd_hil.device.device_setup import (
     ParameterWatch,
     Slave,
+    check_sensor,
     command_deadline_ms,
     set_up_drive,
     set_up_pdos,
-    set_up_sensor,
 )
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, place_devices
 from adacd_hil.records import Event
@@ -72,7 +72,7 @@ class Master(EventSource):
             )
             self.nodes[device.name] = node
             self.slaves.append(Slave(device, node, self._let_pass))
-        self._heartbeats = follow_devices(devices, settings.bus.heartbeat_ms, self.events.append)
+        self._heartbeats = watch_heartbeats(devices, settings.bus.heartbeat_ms, self.events.append)
         self.parameters = ParameterWatch(settings, bus)
         self._canopen.bystander = self._heartbeats.accept
 
@@ -195,7 +195,7 @@ class Master(EventSource):
                 for remark in set_up_drive(slave, self._settings, self._codec):
                     self.events.append(Event("warning", slave.name, remark))
             else:
-                status = set_up_sensor(slave, self._codec)
+                status = check_sensor(slave, self._codec)
                 if status:
                     self.events.append(Event("info", slave.name, status))
             for extra in slave.device.settings.setup:
@@ -277,7 +277,7 @@ class Master(EventSource):
         A node fails if it is silent for 2.5 heartbeat periods or isn't OPERATIONAL, only between `start` and `stop`.
         Nodes whose EDS doesn't list 0x1017 are not watched.
         """
-        return self._heartbeats.watch(t_ns)
+        return self._heartbeats.judge_nodes(t_ns)
 
     def send_heartbeat(self) -> None:
         """Send the host's heartbeat, 0x700 + its node id. Raises BusError."""

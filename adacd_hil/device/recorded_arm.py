@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_watch import ArmWatch, follow_devices
+from adacd_hil.device.arm_watch import ArmWatch, watch_heartbeats
 from adacd_hil.device.network import RESET_COMMUNICATION, START
 from adacd_hil.device.profile import place_devices
 from adacd_hil.records import JOINTS, ArmBatch, ArmState
@@ -65,8 +65,8 @@ class RecordedArm:
         """Make a new arm and heartbeat watch, as at the start of an attempt."""
         settings = self._settings
         self._arm = Arm(settings, self._codec, EmbeddedBus(VirtualClock()))  # with nobody on it
-        self._heartbeats = follow_devices(self._devices, settings.bus.heartbeat_ms, lambda _: None)
-        self._watch = ArmWatch(settings, self._heartbeats.watch)
+        self._heartbeats = watch_heartbeats(self._devices, settings.bus.heartbeat_ms, lambda _: None)
+        self._watch = ArmWatch(settings, self._heartbeats.judge_nodes)
         self._is_running = False
 
     def read(self, ticks: Ticks, frames: NDArray[Any]) -> ArmBatch:

@@ -63,7 +63,7 @@ def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> 
     while (remaining_ns := end_ns - clock.now_ns()) > 0:
         frame = bus.receive(remaining_ns * 1e-9)
         if frame is not None and not frame.is_error:
-            strangers.accept(frame, 0)
+            strangers.judge_host_frame(frame, 0)
     if heard := strangers.describe_senders(0):
         raise DeviceError(f"{'; '.join(heard)} on {bus.channel}: end the other program; an arm has one host")
 
@@ -86,7 +86,7 @@ class Strangers(RateLimitedEvents):
         self._complaints: dict[str, int] = {}
         self._contradictions: dict[str, deque[int]] = {}
 
-    def accept(self, frame: Frame, cycle: int) -> bool:
+    def judge_host_frame(self, frame: Frame, cycle: int) -> bool:
         """Judge a frame received in a cycle; return True if only this host may send its identifier.
 
         Append an event, at a limited rate: a warning for an SDO request that only reads, else an error. NMT to nodes of
@@ -103,12 +103,12 @@ class Strangers(RateLimitedEvents):
             doing = f"sends NMT {word} to {f'node {node_id}' if node_id else 'all nodes'}"
         elif frame.can_id & 0x780 == SDO_REQUEST_ID and frame.data and frame.data[0] >> 5 in _READING:
             text = f"somebody else {doing.replace('writes', 'reads')} (0x{frame.can_id:03X})"
-            self.say(frame.t_ns, (frame.can_id, "reads"), Event("warning", "bus", text))
+            self.report(frame.t_ns, (frame.can_id, "reads"), Event("warning", "bus", text))
             return True
         self._complain(frame, doing, cycle)
         return True
 
-    def hear_device(self, frame: Frame, name: str, cycle: int) -> None:
+    def report_second_frame(self, frame: Frame, name: str, cycle: int) -> None:
         """Report a second, different frame of a device on one SYNC: as a warning if it is a single one.
 
         CONTRADICTIONS of them within CONTRADICTION_WINDOW_S are an error, and count as another sender's action.
@@ -119,15 +119,15 @@ class Strangers(RateLimitedEvents):
             self._complain(frame, f"sends as {_plain(name)}", cycle)
             return
         text = f"a second frame of {_plain(name)} (0x{frame.can_id:03X}) on one SYNC, with other content"
-        self.say(frame.t_ns, (frame.can_id, "once"), Event("warning", "bus", text))
+        self.report(frame.t_ns, (frame.can_id, "once"), Event("warning", "bus", text))
 
     def _complain(self, frame: Frame, doing: str, cycle: int) -> None:
         text = f"somebody else {doing} (0x{frame.can_id:03X})"
         self._until_cycle = cycle + self._hold_cycles
         self._complaints[text] = cycle
-        self.say(frame.t_ns, text, Event("error", "bus", text))
+        self.report(frame.t_ns, text, Event("error", "bus", text))
 
-    def are_heard(self, cycle: int) -> bool:
+    def have_acted(self, cycle: int) -> bool:
         """Return whether another sender has acted on the arm within HOLD_S before a cycle; reading is no action."""
         return cycle <= self._until_cycle
 

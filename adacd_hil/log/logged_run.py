@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.configuration_files import renewed
+from adacd_hil.settings.configuration_files import with_todays_keys
 from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
@@ -132,7 +132,7 @@ def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
     if "config.toml" not in attachments:
         raise LogError(f"log {path} has no attachment config.toml: its settings are not known")
     try:
-        return parse(Settings, renewed(parse_toml(attachments["config.toml"])))
+        return parse(Settings, with_todays_keys(parse_toml(attachments["config.toml"])))
     except ValueError as error:  # errors of the text, the TOML and a setting are ValueErrors
         raise LogError(f"log {path}, attachment config.toml: {error}") from None
 

@@ -14,7 +14,7 @@ _LONGEST_CHAIN = 8
 """Most configurations that one configuration may extend, directly and by those that it extends."""
 
 
-def renewed(table: dict[str, Any]) -> dict[str, Any]:
+def with_todays_keys(table: dict[str, Any]) -> dict[str, Any]:
     """Return a log's configuration, some of its old keys changed to today's; `parse` refuses the other removed keys.
 
     `safety.commission_cycles` becomes `safety.commission_s`. Withdrawn keys of `detector` are dropped. If

@@ -141,7 +141,7 @@ def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
     return parse(Settings, table)
 
 
-def refuse_facts(changes: Mapping[str, str]) -> None:
+def refuse_log_settings(changes: Mapping[str, str]) -> None:
     """Raise ConfigError if one of the changed keys determined the numbers of a log, such as a sign or a device."""
     facts = {f"arm.{name}" for name in _FACTS} | {"bus.period_us", "realtime.sample_period"}
     for key in changes:
@@ -170,7 +170,7 @@ def _spread(value: Any, kind: Any, present: Any) -> Any:
     return value
 
 
-def keep_facts(own: Settings, other: Settings) -> Settings:
+def keep_log_settings(own: Settings, other: Settings) -> Settings:
     """Return `other` with those settings of `own`, a log's, that determined the numbers of the log.
 
     These are bus, devices, sample period, and of the arm profile, signs, torque offsets and rated torques: no

@@ -275,10 +275,13 @@ class Budget:
         """The verdict in one line."""
         where = f"{self.name} at {self.period_us} µs"
         if self.is_fit:
-            return f"{where} fits: {us(self.cyclic_ns)} µs of cyclic frames, {us(self.host_ns)} µs left for the host"
+            left = f"{format_us(self.host_ns)} µs left for the host"
+            return f"{where} fits: {format_us(self.cyclic_ns)} µs of cyclic frames, {left}"
         reasons = []
         if self.host_ns < 0:
-            reasons.append(f"the cyclic frames need {us(self.cyclic_ns)} µs, {us(-self.host_ns)} µs too many")
+            reasons.append(
+                f"the cyclic frames need {format_us(self.cyclic_ns)} µs, {format_us(-self.host_ns)} µs too many"
+            )
         first, *more = sorted(self.late, key=lambda entry: (not entry.is_cyclic, -entry.late_ns()))
         reasons.append(_describe_late(first, LoadCase.OPERATION) + (f", {len(more)} more miss theirs" if more else ""))
         return f"{where} doesn't fit: {'; '.join(reasons)}"
@@ -288,7 +291,9 @@ class Budget:
         """Remarks on event frames, requests and EMCY, one line each."""
         notes = []
         if self.longest_event_ns:
-            notes.append(f"each event frame in the way takes up to {us(self.longest_event_ns)} µs of the host's time")
+            notes.append(
+                f"each event frame in the way takes up to {format_us(self.longest_event_ns)} µs of the host's time"
+            )
         if any(entry.trigger is Trigger.REQUEST for entry in self.frames):
             whose = "one SDO" if self.arms == 1 else "one SDO of each host"
             notes.append(f"{whose} in every cycle: {self._describe_traffic(LoadCase.REQUESTS)}")
@@ -308,10 +313,10 @@ class Budget:
         last = max(self.cyclic, key=lambda entry: entry.responses[traffic].time_ns)
         if last.late_ns(traffic):
             return _describe_late(last, traffic)
-        return f"in time, {last.name} within {us(last.responses[traffic].time_ns)} µs"
+        return f"in time, {last.name} within {format_us(last.responses[traffic].time_ns)} µs"
 
 
-def us(time_ns: int) -> str:
+def format_us(time_ns: int) -> str:
     """Return a time as a text in µs, with one decimal unless it is whole."""
     return f"{time_ns / 1000:.0f}" if time_ns % 1000 == 0 else f"{time_ns / 1000:.1f}"
 
@@ -320,21 +325,22 @@ def _describe_late(entry: FrameBudget, traffic: LoadCase) -> str:
     response = entry.responses[traffic]
     about = "" if response.is_bounded else "at least "
     deadline_ns = entry.deadline_ns or 0
-    return f"{entry.name} misses its deadline of {us(deadline_ns)} µs by {about}{us(entry.late_ns(traffic))} µs"
+    late = f"{about}{format_us(entry.late_ns(traffic))} µs"
+    return f"{entry.name} misses its deadline of {format_us(deadline_ns)} µs by {late}"
 
 
 def describe_excess(codec: Codec, settings: Settings) -> str:
     """Return how the frames of a contract miss their deadlines in the configured period; "" if they meet them.
 
-    "" also for a DBC without attribute Trigger, which can't be judged. Raises CodecError as `check_budget`.
+    "" also for a DBC without attribute Trigger, which can't be judged. Raises CodecError as `compute_budget`.
     """
     if b'"Trigger"' not in codec.text:
         return ""
-    budget = check_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
+    budget = compute_budget(codec, settings.bus.period_us, arms=settings.bus.arms)
     return "" if budget.is_fit else f"contract {codec.path.stem}: {budget.line}"
 
 
-def check_budget(
+def compute_budget(
     codec: Codec,
     period_us: int | None = None,
     bitrate: int | None = None,

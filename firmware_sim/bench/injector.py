@@ -276,7 +276,7 @@ class Injector:
             case ActionKind.RETURN_TO_BUS:
                 device.return_to_bus(t_ns)
             case ActionKind.EMERGENCY:
-                device.cry(int(value), t_ns)
+                device.send_emergency(int(value), t_ns)
             case ActionKind.FAIL:
                 self._drives[place].fail(int(value), t_ns)
             case ActionKind.MEND:

@@ -14,8 +14,8 @@ import click
 
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.compiled import compiling
-from adacd_hil.file_access import in_words
-from adacd_hil.file_replacement import tidied
+from adacd_hil.file_access import error_text
+from adacd_hil.file_replacement import removing_empty_folders
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.log.log_files import TRUTH_NAME, LogError, LogExistsError
 from adacd_hil.log.log_walk import run_metadata
@@ -176,7 +176,7 @@ def run(
     with ExitStack() as stack:
         if out is not None:
             check_free(out / TRUTH_NAME)
-            stack.enter_context(tidied(out))
+            stack.enter_context(removing_empty_folders(out))
         bus = open_devices_end(interface, channel, clock, codec)
         stack.callback(bus.close)
         stop = stack.enter_context(stop_by_signal())
@@ -426,7 +426,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except (click.Abort, KeyboardInterrupt):
         code = EmulatorExit.OK
     except tuple(kind for kind, _ in _CODES) as error:
-        _complain(error.format_message() if isinstance(error, click.ClickException) else in_words(error))
+        _complain(error.format_message() if isinstance(error, click.ClickException) else error_text(error))
         code = next(code for kind, code in _CODES if isinstance(error, kind))
     sys.exit(code)
 

@@ -176,7 +176,7 @@ class EmulatedDevice(ObjectDictionary):
         if self.is_on_bus:
             self._errors.report_error(_RECOVERED_FROM_BUS_OFF, self.clock.own_ns(t_ns))
 
-    def cry(self, code: int, t_ns: int) -> None:
+    def send_emergency(self, code: int, t_ns: int) -> None:
         """Send an EMCY at once, whatever its inhibit time, as a device out of control does."""
         self._errors.report_at_once(code, self.clock.own_ns(t_ns))
 

@@ -10,7 +10,7 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import (
     apply_settings,
     changed_keys,
-    keep_facts,
+    keep_log_settings,
     parse_changes,
     parse_variations,
     split_list,
@@ -85,7 +85,7 @@ def test_a_change_without_key_or_value_is_refused(given):
 def test_another_configuration_keeps_what_made_the_numbers_of_the_log():
     tared = replace(PAPER.arm, torque_offset_Nm=(0.3, -0.2), torque_offset_std_Nm=(0.01, 0.01), sign=(-1, 1))
     own = apply_settings(replace(PAPER, arm=tared), {"bus.heartbeat_ms": "200", "realtime.sample_period": "nominal"})
-    kept = keep_facts(own, load_settings("certified"))
+    kept = keep_log_settings(own, load_settings("certified"))
     assert (kept.scheme, kept.bus, kept.realtime.sample_period) == ("certified", own.bus, "nominal")
     for name in ("torque_offset_Nm", "torque_offset_std_Nm", "sign"):
         assert getattr(kept.arm, name) == getattr(tared, name)
@@ -100,8 +100,8 @@ def test_what_is_known_of_an_arm_is_another_configurations_to_say_only_where_the
         return replace(settings, arm=replace(settings.arm, **{key: value}))
 
     theirs = saying(load_settings("certified"), other)
-    assert getattr(keep_facts(saying(PAPER, own), theirs).arm, key) == own
-    assert getattr(keep_facts(PAPER, theirs).arm, key) == other
+    assert getattr(keep_log_settings(saying(PAPER, own), theirs).arm, key) == own
+    assert getattr(keep_log_settings(PAPER, theirs).arm, key) == other
 
 
 def test_changed_settings_are_listed_by_key_with_both_values():

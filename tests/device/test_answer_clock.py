@@ -12,7 +12,7 @@ def settled(is_counted: bool = False) -> AnswerClock:
     clock = AnswerClock()
     for ordinal in range(USUAL_ANSWERS + 1):
         assert clock.find(ordinal, USUAL_NS, 1 if is_counted and ordinal else None) == ordinal
-        clock.note(ordinal, ordinal, USUAL_NS, is_counted)
+        clock.set_answered(ordinal, ordinal, USUAL_NS, is_counted)
     return clock
 
 
@@ -34,7 +34,7 @@ def test_frames_that_are_late_all_the_time_stay_late_until_two_come_on_one_sync(
     clock = settled(is_counted=True)
     for newest in range(LAST + 2, LAST + 30):
         assert clock.find(newest, 50_000, 1) == newest - 1
-        clock.note(newest - 1, newest, 50_000, True)
+        clock.set_answered(newest - 1, newest, 50_000, True)
     assert clock.find(LAST + 29, USUAL_NS, 1) == LAST + 29
 
 
@@ -71,31 +71,31 @@ def test_where_the_frame_before_it_is_lost_an_answer_comes_as_soon_as_that_one_w
 def test_a_second_frame_on_a_sync_answers_nothing() -> None:
     clock = settled(is_counted=True)
     assert clock.find(LAST, 2 * USUAL_NS, 1) is None
-    assert not clock.is_straggler(0)
+    assert not clock.take_straggler(0)
 
 
 def test_a_second_frame_shows_that_the_first_was_a_late_one_and_not_behind_a_lost_one() -> None:
     clock = settled()
     assert clock.find(LAST + 2, USUAL_NS, None) == LAST + 2  # a guess: a period late, as it turns out
-    clock.note(LAST + 2, LAST + 2, USUAL_NS, False)
+    clock.set_answered(LAST + 2, LAST + 2, USUAL_NS, False)
     assert clock.find(LAST + 2, USUAL_NS + 20_000, None) == LAST + 2
-    clock.note(LAST + 2, LAST + 2, USUAL_NS + 20_000, False)
+    clock.set_answered(LAST + 2, LAST + 2, USUAL_NS + 20_000, False)
     assert clock.find(LAST + 2, USUAL_NS + 40_000, None) is None  # nobody guesses twice
 
 
 def test_an_overtaken_frame_without_counter_is_no_stranger_s() -> None:
     clock = settled()
-    clock.note(LAST + 2, LAST + 2, USUAL_NS, False)
+    clock.set_answered(LAST + 2, LAST + 2, USUAL_NS, False)
     assert clock.find(LAST + 2, USUAL_NS + 200_000, None) is None
-    assert clock.is_straggler(0)
-    assert not clock.is_straggler(0)
+    assert clock.take_straggler(0)
+    assert not clock.take_straggler(0)
 
 
 def test_an_overtaken_frame_is_known_by_its_counter_once() -> None:
     clock = settled(is_counted=True)
-    clock.note(LAST + 3, LAST + 3, USUAL_NS, True)
-    assert not clock.is_straggler(3)  # that one was answered
-    assert [clock.is_straggler(behind) for behind in (2, 1, 2, 1)] == [True, True, False, False]
+    clock.set_answered(LAST + 3, LAST + 3, USUAL_NS, True)
+    assert not clock.take_straggler(3)  # that one was answered
+    assert [clock.take_straggler(behind) for behind in (2, 1, 2, 1)] == [True, True, False, False]
 
 
 def test_a_device_that_begins_anew_owes_no_answer_from_before() -> None:

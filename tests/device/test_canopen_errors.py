@@ -6,12 +6,12 @@ import canopen
 import pytest
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from adacd_hil.device.canopen_bus import DeviceError, explained, read_object
+from adacd_hil.device.canopen_bus import DeviceError, as_device_error, read_object
 from adacd_hil.wire.bus import SilenceError
 
 
 def fail_with(error: Exception) -> None:
-    with explained("Drive1", 1, "reading 0x6041:0 Statusword"):
+    with as_device_error("Drive1", 1, "reading 0x6041:0 Statusword"):
         raise error
 
 

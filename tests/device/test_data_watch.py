@@ -73,5 +73,5 @@ def test_the_share_of_late_cycles_is_of_the_same_cycles_as_the_others(cycles):
     cycles.arm.missing_frames = 1
     for _ in range(50 + 20):  # the last 20 begin a second that is too short to be judged
         cycles.watch.note(late)
-    shares = cycles.watch.shares()
+    shares = cycles.watch.finish_shares()
     assert (shares.cycles, shares.late, shares.incomplete) == (1000, 0.05, 0.05)

@@ -22,7 +22,7 @@ class Watched:
             self.watch.accept(Frame(0x700 + node, bytes((state,)), t_ms * MS))
 
     def at(self, t_ms: int) -> list[str]:
-        return self.watch.watch(t_ms * MS)
+        return self.watch.judge_nodes(t_ms * MS)
 
     def run(self) -> "Watched":
         self.watch.start()

@@ -16,4 +16,4 @@ from adacd_hil.device.arm_watch import Recurrence
 )
 def test_a_recurrence_is_due_every_so_many_cycles(interval_s: float, cycles: list[int], due: list[int]) -> None:
     recurrence = Recurrence(interval_s, 0.001)
-    assert [cycle for cycle in cycles if recurrence.is_due(cycle)] == due
+    assert [cycle for cycle in cycles if recurrence.take_turn(cycle)] == due

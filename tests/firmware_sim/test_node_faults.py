@@ -55,7 +55,7 @@ def test_a_device_without_power_or_bus_says_and_hears_nothing(node, loss, state,
     host.nmt(Nmt.START, node)
     host.put(0x600 + node, bytes([0x2B, 0x17, 0x10, 0, 77, 0, 0, 0]))
     if loss == "leave_bus":
-        device.cry(0x1000, host.bench.now_ns)
+        device.send_emergency(0x1000, host.bench.now_ns)
     pass_ms(host, 50)
     assert [can_id for can_id, _ in host.take() if can_id & 0x7F == node] == []
     assert (device.state, device.value(0x1017)) == (state, heartbeat_ms)
@@ -224,7 +224,7 @@ def test_an_overload_is_added_to_the_error_of_a_sensor(bits, counts):
 def test_a_device_out_of_control_sends_emergencies_whatever_their_inhibit_time():
     host = enabled_host({(1, 0x1015, 0): 10_000})
     for _ in range(5):
-        host.bench.devices[0].cry(0x1000, host.bench.now_ns)
+        host.bench.devices[0].send_emergency(0x1000, host.bench.now_ns)
     assert errors(host, 1) == [0x1000] * 5
 
 

@@ -9,7 +9,7 @@ from documents import ROOT
 from adacd_hil.lab.detectors import detector_registry
 from adacd_hil.lab.detectors.detectors import DetectorBankSettings
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.configuration_files import load_settings, renewed
+from adacd_hil.settings.configuration_files import load_settings, with_todays_keys
 from adacd_hil.settings.schema import ConfigError, DetectorError, parse
 from adacd_hil.settings.setting_keys import apply_settings
 
@@ -97,4 +97,4 @@ def test_a_configuration_with_a_detector_in_the_loop_names_the_command_that_comp
 
 
 def test_an_older_log_with_a_detector_in_its_loop_is_read_without_it():
-    assert renewed(OLD) == {"detector": {"threshold_Nm": [0.2, 0.2]}}
+    assert with_todays_keys(OLD) == {"detector": {"threshold_Nm": [0.2, 0.2]}}

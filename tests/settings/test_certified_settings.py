@@ -5,7 +5,7 @@ import pytest
 from adacd_hil.records import PARAMETER_NAMES, PARAMETER_UNITS, SchemeState, certified_layout, scheme_layout
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.configuration_files import load_settings, merge, renewed
+from adacd_hil.settings.configuration_files import load_settings, merge, with_todays_keys
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.scheme_settings import FRICTION_TERMS
 from adacd_hil.settings.toml_files import parse_toml, to_toml
@@ -94,9 +94,9 @@ def test_settings_read_back_from_a_log_are_the_same():
 
 def test_a_log_from_before_cross_talk_was_identified_has_none_in_its_model():
     table = parse_toml(to_toml(load_settings("certified", "P")))
-    assert parse(Settings, renewed(table)) == load_settings("certified", "P")
+    assert parse(Settings, with_todays_keys(table)) == load_settings("certified", "P")
     del table["certified"]["cross_talk_std"]
-    old = parse(Settings, renewed(table))
+    old = parse(Settings, with_todays_keys(table))
     assert old.certified.cross_talk_std == 0.0
     assert old.further_names[-1] == "dahl_long2"
 

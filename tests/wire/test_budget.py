@@ -6,7 +6,7 @@ from pathlib import Path
 import cantools
 import pytest
 
-from adacd_hil.wire.budget import Budget, LoadCase, ResponseTime, Trigger, check_budget, us
+from adacd_hil.wire.budget import Budget, LoadCase, ResponseTime, Trigger, compute_budget, format_us
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec, parse_codec
 from adacd_hil.wire.contract_frames import move_contract
 
@@ -16,7 +16,7 @@ SYNCHRONOUS = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torq
 
 
 def budget_of(name: str, period_us: int | None = None) -> Budget:
-    return check_budget(load_codec(CONTRACTS / f"{name}.dbc"), period_us)
+    return compute_budget(load_codec(CONTRACTS / f"{name}.dbc"), period_us)
 
 
 def contract(text: bytes) -> Codec:
@@ -54,7 +54,7 @@ def test_sets_of_frames(
     budget = budget_of(name, period_us)
     if unstuffed is not None:
         assert (budget.unstuffed_bits, budget.worst_bits) == (unstuffed, worst)
-    assert (us(budget.cyclic_ns).removesuffix(".0"), budget.is_fit) == (cyclic_us.removesuffix(".0"), is_fit)
+    assert (format_us(budget.cyclic_ns).removesuffix(".0"), budget.is_fit) == (cyclic_us.removesuffix(".0"), is_fit)
 
 
 @pytest.mark.parametrize(
@@ -71,11 +71,11 @@ def test_sets_of_frames(
 )
 def test_a_contract_that_does_not_say_when_is_refused(edits: list[tuple[str, str]], reason: str) -> None:
     with pytest.raises(CodecError, match=reason):
-        check_budget(contract(edited(*edits)))
+        compute_budget(contract(edited(*edits)))
 
 
 def test_the_arm_fits_1_ms_and_leaves_205_us_for_the_host() -> None:
-    budget = check_budget(ARM)
+    budget = compute_budget(ARM)
     assert (budget.unstuffed_bits, budget.worst_bits) == (657, 795)
     assert (budget.feedback_ns, budget.command_ns, budget.host_ns) == (565_000, 230_000, 205_000)
     assert budget.is_fit
@@ -83,14 +83,14 @@ def test_the_arm_fits_1_ms_and_leaves_205_us_for_the_host() -> None:
 
 
 def test_the_arm_does_not_fit_half_a_millisecond() -> None:
-    budget = check_budget(ARM, 500)
+    budget = compute_budget(ARM, 500)
     assert not budget.is_fit
     assert "arm.dbc at 500 µs doesn't fit: the cyclic frames need 795 µs, 295 µs too many" in budget.line
     assert "Drive2Command misses its deadline of 500 µs by at least 420 µs, 12 more miss theirs" in budget.line
 
 
 def test_a_contract_can_miss_deadlines_though_its_cyclic_frames_have_room() -> None:
-    budget = check_budget(ARM, 900)
+    budget = compute_budget(ARM, 900)
     assert budget.host_ns == 105_000
     # 795 µs, and a drive status of 125 µs that has just begun
     assert [entry.name for entry in budget.late if entry.is_cyclic] == ["Drive2Command"]
@@ -98,12 +98,12 @@ def test_a_contract_can_miss_deadlines_though_its_cyclic_frames_have_room() -> N
 
 
 def test_half_the_bit_rate_takes_twice_the_time() -> None:
-    assert check_budget(ARM, 2000, bitrate=500_000).cyclic_ns == 2 * 795_000
-    assert not check_budget(ARM, 1000, bitrate=500_000).is_fit
+    assert compute_budget(ARM, 2000, bitrate=500_000).cyclic_ns == 2 * 795_000
+    assert not compute_budget(ARM, 1000, bitrate=500_000).is_fit
 
 
 def test_response_times_of_the_arm_by_hand() -> None:
-    budget = check_budget(ARM)
+    budget = compute_budget(ARM)
     # SYNC waits for one 8-byte frame; the last command for a status and all six others
     assert response_us(budget, "Sync") == 135 + 65
     assert response_us(budget, "Drive1Feedback") == 135 + 65 + 135
@@ -114,13 +114,13 @@ def test_response_times_of_the_arm_by_hand() -> None:
 
 
 def test_one_sdo_frame_per_cycle_blocks_the_last_command_for_135_us() -> None:
-    budget = check_budget(ARM)
+    budget = compute_budget(ARM)
     assert response_us(budget, "Drive2Command", LoadCase.REQUESTS) == 135 + 795
     assert "one SDO in every cycle: in time, Drive2Command within 930 µs" in budget.notes
 
 
 def test_requests_of_several_nodes_are_one_per_cycle() -> None:
-    budget = check_budget(ARM)
+    budget = compute_budget(ARM)
     heartbeat = budget.frames[-1]
     assert heartbeat.name == "HostHeartbeat"
     # Eight SDO messages of 135 µs lie above it. Were all of them sent in every cycle, nothing would be left.
@@ -140,13 +140,13 @@ def test_a_single_request_gets_through_where_one_per_cycle_would_not() -> None:
 
 
 def test_a_frame_without_bound_is_late_whatever_was_found() -> None:
-    entry = check_budget(ARM).frames[1]
+    entry = compute_budget(ARM).frames[1]
     endless = dataclasses.replace(entry, responses={LoadCase.OPERATION: ResponseTime(10_000, is_bounded=False)})
     assert (entry.late_ns(), endless.late_ns()) == (0, 1)
 
 
 def test_an_emcy_of_every_device_makes_commands_late_and_is_said() -> None:
-    budget = check_budget(ARM)
+    budget = compute_budget(ARM)
     # B 135, four EMCY 540: SYNC and feedback of the next two cycles overtake the second command as well
     assert response_us(budget, "Drive2Command", LoadCase.EMERGENCIES) == 135 + 540 + 3 * 680 + 115
     assert "and every EMCY at once: Drive2Command misses its deadline of 1000 µs by 1830 µs" in budget.notes
@@ -154,17 +154,17 @@ def test_an_emcy_of_every_device_makes_commands_late_and_is_said() -> None:
 
 
 def test_an_inhibit_time_counts_as_the_interval() -> None:
-    budget = check_budget(contract(edited(('BA_DEF_DEF_ "GenMsgDelayTime" 0;', 'BA_DEF_DEF_ "GenMsgDelayTime" 20;'))))
+    budget = compute_budget(contract(edited(('BA_DEF_DEF_ "GenMsgDelayTime" 0;', 'BA_DEF_DEF_ "GenMsgDelayTime" 20;'))))
     intervals = {entry.name: entry.interval_ns for entry in budget.frames}
     assert (intervals["Drive1Status"], intervals["Sync"]) == (20_000_000, 1_000_000)
     assert not [note for note in budget.notes if "inhibit" in note]
     # four EMCY, four status; a heartbeat keeps its time
-    (note,) = [note for note in check_budget(ARM).notes if "inhibit" in note]
+    (note,) = [note for note in compute_budget(ARM).notes if "inhibit" in note]
     assert "event frames without inhibit time (GenMsgDelayTime): 4." in note
 
 
 def test_event_frames_that_come_too_often_miss_their_deadlines() -> None:
-    budget = check_budget(contract(edited(('BA_DEF_DEF_ "GenMsgDelayTime" 0;', 'BA_DEF_DEF_ "GenMsgDelayTime" 1;'))))
+    budget = compute_budget(contract(edited(('BA_DEF_DEF_ "GenMsgDelayTime" 0;', 'BA_DEF_DEF_ "GenMsgDelayTime" 1;'))))
     assert budget.load > 1.0
     late = [entry.name for entry in budget.late]
     assert late[-1] == "HostHeartbeat"
@@ -182,12 +182,12 @@ def test_a_smaller_can_fd_set_at_1m_8m_fits_half_a_millisecond() -> None:
 def test_a_can_fd_contract_needs_a_data_bit_rate() -> None:
     text = (CONTRACTS / "fd_1ms.dbc").read_bytes().replace(b'BA_ "BaudrateCANFD" 5000000;', b"")
     with pytest.raises(CodecError, match=r"DBC x has no BaudrateCANFD, and none is given"):
-        check_budget(contract(text))
-    assert check_budget(contract(text), data_bitrate=5_000_000).is_fit
+        compute_budget(contract(text))
+    assert compute_budget(contract(text), data_bitrate=5_000_000).is_fit
 
 
 def test_every_message_of_the_arm_says_when_it_is_sent() -> None:
-    triggers = {frame.name: frame.trigger for frame in check_budget(ARM).frames}
+    triggers = {frame.name: frame.trigger for frame in compute_budget(ARM).frames}
     assert {name for name, trigger in triggers.items() if trigger is Trigger.COMMAND} == {
         "Drive1Command",
         "Drive2Command",
@@ -203,13 +203,13 @@ def test_arbitration_is_by_the_bits_on_the_wire() -> None:
     text = edited(("BO_ 1919 HostHeartbeat", f"BO_ {0x80000000 | 0x081 << 18} HostHeartbeat"))
     text = text.replace(b" BO_ 1919 ", f" BO_ {0x80000000 | 0x081 << 18} ".encode())
     text = text.replace(b"VAL_ 1919 ", f"VAL_ {0x80000000 | 0x081 << 18} ".encode())
-    names = [frame.name for frame in check_budget(contract(text)).frames]
+    names = [frame.name for frame in compute_budget(contract(text)).frames]
     # An extended frame loses to the base frame with the same first 11 bits and wins over the next one.
     assert names[:5] == ["Nmt", "Sync", "Drive1Emcy", "HostHeartbeat", "Drive2Emcy"]
 
 
 def test_frames_of_two_arms_compete_by_their_identifiers() -> None:
-    shared = check_budget(ARM, 2000, arms=2)
+    shared = compute_budget(ARM, 2000, arms=2)
     order = [f"{entry.can_id:03X} {entry.name}" for entry in shared.frames if entry.is_cyclic]
     assert order == [
         "080 Sync",
@@ -221,15 +221,15 @@ def test_frames_of_two_arms_compete_by_their_identifiers() -> None:
 
 def test_which_arm_of_a_shared_bus_asks_makes_no_difference() -> None:
     def times(node_offset: int) -> list[tuple[int, str]]:
-        budget = check_budget(move_contract(ARM, node_offset), 2000, arms=3)
+        budget = compute_budget(move_contract(ARM, node_offset), 2000, arms=3)
         return [(entry.responses[LoadCase.EMERGENCIES].time_ns, entry.name) for entry in budget.frames]
 
     assert times(0) == times(8)
 
 
 def test_each_host_of_a_shared_bus_may_ask_once_per_period() -> None:
-    heartbeat = check_budget(ARM, 4000, arms=2).frames[-1]
-    alone = check_budget(ARM, 4000).frames[-1]
+    heartbeat = compute_budget(ARM, 4000, arms=2).frames[-1]
+    alone = compute_budget(ARM, 4000).frames[-1]
     assert heartbeat.name == "Arm1.HostHeartbeat"
     waits = [
         entry.responses[LoadCase.REQUESTS].time_ns - entry.responses[LoadCase.OPERATION].time_ns

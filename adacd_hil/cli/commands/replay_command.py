@@ -124,10 +124,10 @@ def _replay_one(
     from adacd_hil.settings.configuration_files import load_settings
     from adacd_hil.settings.setting_keys import (
         apply_settings,
-        keep_facts,
+        keep_log_settings,
         parse_changes,
         parse_variations,
-        refuse_facts,
+        refuse_log_settings,
     )
 
     source, is_alone = _open(given, configured, against)
@@ -135,9 +135,9 @@ def _replay_one(
     base = own
     config, profile, _ = configured
     if config is not None and not is_alone:
-        base = keep_facts(own, load_settings(config, profile or own.arm.profile))
+        base = keep_log_settings(own, load_settings(config, profile or own.arm.profile))
     for asked in (parse_changes(changes), *(parse_variations(vary) if vary else ())):
-        refuse_facts(asked)
+        refuse_log_settings(asked)
     base = apply_settings(base, parse_changes(changes))
     variants = {_name(choice): apply_settings(base, choice) for choice in parse_variations(vary)} if vary else {}
     if not variants and base != own:

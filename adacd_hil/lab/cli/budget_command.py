@@ -8,7 +8,7 @@ from adacd_hil.printable import in_line
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import fold, terminal_columns
-from adacd_hil.wire.budget import Budget, FrameBudget, LoadCase, ResponseTime, check_budget, us
+from adacd_hil.wire.budget import Budget, FrameBudget, LoadCase, ResponseTime, compute_budget, format_us
 from adacd_hil.wire.codec import Codec, load_codec
 from adacd_hil.wire.contract_frames import read_attribute
 
@@ -37,7 +37,7 @@ def judge(
     settings = load_settings(config)
     codec = load_contract(settings) if dbc is None else load_codec(find_contract(dbc))
     declared_us = int(read_attribute(codec.database, "BusPeriod_us"))
-    budget = check_budget(
+    budget = compute_budget(
         codec, period_us or declared_us or settings.bus.period_us, bitrate, data_bitrate, arms or settings.bus.arms
     )
     notes = list(budget.notes)
@@ -54,13 +54,14 @@ def as_text(codec: Codec, budget: Budget, notes: Sequence[str]) -> str:
     findings = [
         (
             "per cycle",
-            f"{budget.unstuffed_bits} bits without stuffing, {budget.worst_bits} at worst, {us(budget.cyclic_ns)} µs",
+            f"{budget.unstuffed_bits} bits without stuffing, {budget.worst_bits} at worst, "
+            f"{format_us(budget.cyclic_ns)} µs",
         ),
         ("utilisation", f"{budget.cyclic_load:.1%} cyclic, {budget.load:.1%} with event frames"),
         (
             "phases",
-            f"feedback in after {us(budget.feedback_ns)} µs, commands need {us(budget.command_ns)} µs, "
-            f"left for the host {us(budget.host_ns)} µs",
+            f"feedback in after {format_us(budget.feedback_ns)} µs, commands need {format_us(budget.command_ns)} µs, "
+            f"left for the host {format_us(budget.host_ns)} µs",
         ),
         ("0x2000", f"wire version {codec.wire_version}, layout digest 0x{codec.layout_digest:08X}"),
         *(("note", note) for note in notes),
@@ -81,15 +82,15 @@ def _row(entry: FrameBudget) -> tuple[str, ...]:
         entry.trigger.value,
         f"{entry.interval_ns / 1e6:g}",
         f"{entry.worst.nominal}+{entry.worst.data}" if entry.worst.data else str(entry.worst.nominal),
-        us(entry.duration_ns),
+        format_us(entry.duration_ns),
         _response(entry.responses[LoadCase.OPERATION]),
         _response(entry.responses[LoadCase.EMERGENCIES]),
-        "-" if entry.deadline_ns is None else us(entry.deadline_ns),
+        "-" if entry.deadline_ns is None else format_us(entry.deadline_ns),
     )
 
 
 def _response(response: ResponseTime) -> str:
-    return ("" if response.is_bounded else "> ") + us(response.time_ns)
+    return ("" if response.is_bounded else "> ") + format_us(response.time_ns)
 
 
 def as_json(codec: Codec, budget: Budget, notes: Sequence[str]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from adacd_hil.cli.embedded_run import SCENARIO, resolve, run_embedded
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
 from adacd_hil.control.session import LiveView, SessionSummary
-from adacd_hil.file_access import in_words
+from adacd_hil.file_access import error_text
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.progress_lines import Progress
 from adacd_hil.records import FaultReason, SchemeState
@@ -56,7 +56,7 @@ def play(
             status = exit_code(summary)
             if status is ExitCode.OK:
                 raise
-            what = f"{_ending(summary)}; nor can the report be written: {in_words(error)}"
+            what = f"{_ending(summary)}; nor can the report be written: {error_text(error)}"
             raise CommandError(what, status) from None
         progress(f"report: {folder.path / 'report.html'}")
     if summary.error:

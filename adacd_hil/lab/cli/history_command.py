@@ -7,7 +7,7 @@ import click
 
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained, format_table
-from adacd_hil.file_replacement import is_anothers, replace_file
+from adacd_hil.file_replacement import has_other_head, replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.printable import in_line
 
@@ -35,7 +35,7 @@ def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:
     if plot is not None:
         if plot.exists() and plot.samefile(file):
             raise CommandError(f"--plot {plot} is the history itself; give another name", ExitCode.USAGE)
-        if is_anothers(plot, _PNG):
+        if has_other_head(plot, _PNG):
             raise CommandError(f"--plot {plot} is there already and no PNG; give another name", ExitCode.USAGE)
         replace_file(plot, _as_png(found))
     answer(as_json, found, _as_text(found))

@@ -8,7 +8,7 @@ import click
 
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table, quoted, show
-from adacd_hil.file_access import place_file
+from adacd_hil.file_access import write_new_file
 from adacd_hil.file_replacement import replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.plain_values import json_text
@@ -99,7 +99,7 @@ def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
     target = map_path or recording.parent / "map.toml"
     draft = draft_map(recording, urdfs[0], target)
     try:
-        place_file(target, draft.text().encode())
+        write_new_file(target, draft.text().encode())
     except FileExistsError:
         line = f"{target} is another map already; --map names a file for this one"
         raise CommandError(line, ExitCode.USAGE) from None

@@ -15,7 +15,7 @@ from adacd_hil.clock import Clock, format_date, wall_ns
 from adacd_hil.control.session import git_commit
 from adacd_hil.control.tare_file import TARE_FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, explained
+from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, as_device_error
 from adacd_hil.device.network import ENTER_PRE_OPERATIONAL, START, Identity, Master
 from adacd_hil.lab.commission.communication_test import ZeroTorqueLoop
 from adacd_hil.lab.commission.tare import (
@@ -102,7 +102,7 @@ class TareSession:
         if sensor.vendor != _OWN_VENDOR:
             return None
         try:
-            with explained(sensor.name, sensor.node_id, "temperature"):
+            with as_device_error(sensor.name, sensor.node_id, "temperature"):
                 data: bytes = node.sdo.upload(*_TEMPERATURE)
         except DeviceError:
             return None
@@ -232,7 +232,7 @@ class TareSession:
         for node, sensor in zip(nodes, sensors, strict=True):
             # adacd-sensors refuse it in Operational, where their values are in use.
             self._canopen.command(ENTER_PRE_OPERATIONAL, sensor.node_id)
-            with explained(sensor.name, sensor.node_id, "auto-zero"):
+            with as_device_error(sensor.name, sensor.node_id, "auto-zero"):
                 node.sdo.download(*AUTO_ZERO, AUTO_ZERO_SIGNATURE)
             self._canopen.command(START, sensor.node_id)
         for _ in range(_AUTO_ZERO_WAIT_CYCLES):

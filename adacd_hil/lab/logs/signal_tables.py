@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.file_replacement import is_anothers, replacing
+from adacd_hil.file_replacement import has_other_head, replacing
 from adacd_hil.lab.logs.joint_states import joint_state_columns
 from adacd_hil.log.frames.frame_log import open_frames
 from adacd_hil.log.log_files import LogError, failing_as
@@ -113,7 +113,7 @@ class Tables:
         path = self._paths.get(topic) or self._path(topic)
         with failing_as(f"{path} can't be written"):
             if topic not in self._tables:
-                if is_anothers(path, _HEADS[self._kind]):  # as a recording may be, which is CSV, too
+                if has_other_head(path, _HEADS[self._kind]):  # as a recording may be, which is CSV, too
                     raise FileExistsError(errno.EEXIST, "what is there is no table of this command", str(path))
                 beside = self._files.enter_context(replacing(path))
                 is_csv = self._kind == "csv"

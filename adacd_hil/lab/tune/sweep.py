@@ -37,7 +37,7 @@ from adacd_hil.replay.replayed_outcome import Replay
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.setting_keys import apply_settings, keep_facts
+from adacd_hil.settings.setting_keys import apply_settings, keep_log_settings
 from adacd_hil.wire.codec import CodecError
 
 Changes = tuple[tuple[str, str], ...]
@@ -172,7 +172,9 @@ def replay_task(task: Task) -> list[Values]:
     variants: dict[str, Settings] = {}
     try:
         own = LogSource(path).settings
-        base = keep_facts(own, load_settings(task.config, task.profile or own.arm.profile)) if task.config else own
+        base = own
+        if task.config:
+            base = keep_log_settings(own, load_settings(task.config, task.profile or own.arm.profile))
     except REFUSALS as refusal:
         return [failed(subject, row, str(refusal)) for row in task.rows]
     for row in task.rows:

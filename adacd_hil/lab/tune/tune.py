@@ -57,7 +57,7 @@ from adacd_hil.score.wording import number_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.setting_keys import apply_settings, changed_keys, keep_facts
+from adacd_hil.settings.setting_keys import apply_settings, changed_keys, keep_log_settings
 from adacd_hil.settings.toml_files import builtin_names
 
 FARTHEST: Final = 100.0
@@ -216,7 +216,7 @@ def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settin
     base_name, base: of the configuration that it extends, as from `base_of`.
     """
     own = tuning.logs[0].settings
-    differing = [key for key in changed_keys(keep_facts(own, base), own) if key != "name"]
+    differing = [key for key in changed_keys(keep_log_settings(own, base), own) if key != "name"]
     lines = [*_provenance(tuning, best)]
     if differing:
         lines.append(f"the logs' settings differ from {base_name} in {', '.join(differing)}")

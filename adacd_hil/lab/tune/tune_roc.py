@@ -42,7 +42,7 @@ from adacd_hil.score.emulator_truth import HostCycles, contacts_beside, placed_c
 from adacd_hil.score.judge import Times, TrueContact, explained_until
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.setting_keys import changed_keys, keep_facts
+from adacd_hil.settings.setting_keys import changed_keys, keep_log_settings
 
 Changes = dict[str, str]
 
@@ -309,7 +309,7 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeW
         motion = dataclasses.replace(motion, is_free=is_free)
     with open_input(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    settings = own if config is None else keep_facts(own, load_settings(config, own.arm.profile))
+    settings = own if config is None else keep_log_settings(own, load_settings(config, own.arm.profile))
     return TunedLog(path, digest, settings, motion, index.t_ns, windows, is_chosen_on, stretch)
 
 
