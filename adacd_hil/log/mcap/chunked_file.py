@@ -11,14 +11,13 @@ from mcap.writer import LIBRARY_IDENTIFIER, Writer
 
 from adacd_hil import __version__
 from adacd_hil.log.log_files import PRODUCT
+from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD
 
 LIBRARY = f"{PRODUCT} {__version__}; {LIBRARY_IDENTIFIER}"
 CHUNK_BYTES = 240 * 1024
 """A chunk ends behind the packet that fills it."""
 FLUSH_PERIOD_NS = 250_000_000
 """A chunk spans at most so much time, so that little is lost with a killed process."""
-_MESSAGE_HEAD = 31
-"""Bytes of a message record before its payload."""
 _UNLIMITED = 1 << 62
 """Chunk size for mcap's writer, whose own limit would end a chunk within a packet."""
 
@@ -69,7 +68,7 @@ class ChunkedFile:
         """Add a message to the chunk in progress."""
         self._writer.add_message(channel, log_ns, payload, publish_ns, sequence)
         self.messages += 1
-        self.record_bytes += _MESSAGE_HEAD + len(payload)
+        self.record_bytes += MESSAGE_HEAD + len(payload)
 
     def end_packet(self) -> None:
         """Count a packet as complete, and write the chunk in progress if it is full."""
