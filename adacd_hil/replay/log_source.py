@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from adacd_hil.device.attached_devices import with_attached_devices
 from adacd_hil.device.network import RESET_COMMUNICATION
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.logged_run import SHOWN, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS, joined_frames
@@ -291,11 +291,12 @@ class LogSource:
     def with_own_devices(self, settings: Settings, folder: Path) -> Settings:
         """Return `settings`, if they name the run's devices, with the profiles attached to the log, put into `folder`.
 
-        Raises OSError.
+        Raises LogError when they can't be written.
         """
         if settings.devices != self.settings.devices:
             return settings
-        return with_attached_devices(settings, self._stream.attachments, folder)
+        with failing_as("the log's device profiles can't be put into a temporary folder"):
+            return with_attached_devices(settings, self._stream.attachments, folder)
 
     def parts(self, with_frames: bool) -> Iterator[Part]:
         """Yield the content of the log in parts, in order.

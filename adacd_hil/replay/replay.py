@@ -14,7 +14,7 @@ ends with the stretch, and compares and reports only the cycles in it.
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
-from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow, failing_as
 from adacd_hil.log.logged_run import SHOWN, Milestones, Mismatch, Progress
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
 from adacd_hil.replay.can_recording import RecordingAlone
@@ -258,20 +258,29 @@ def replay_source(
 
 def _decoded(source: ReplaySource, reader: "_ArmReader", end_ns: int) -> Generator[_DecodedPart]:
     """Yield the parts of a source with the arm's states, up to the stretch in which the reported part ends."""
-    with TemporaryDirectory(prefix="adacd-hil-") as folder:  # of the devices' profiles
+    with _device_folder() if reader.needs_frames else nullcontext(Path()) as folder:
         for part in source.parts(reader.needs_frames):
             stretches: list[CycleStretch] = []
             arms: list[list[ArmBatch]] = []
             is_over = False
             for stretch in part.stretches:
                 stretches.append(stretch)
-                arms.append(reader.read(stretch, Path(folder)))
+                arms.append(reader.read(stretch, folder))
                 is_over = bool(stretch.ticks.t_ns[-1] >= end_ns)
                 if is_over:
                     break
             yield part._replace(stretches=stretches), arms
             if is_over:
                 return
+
+
+@contextmanager
+def _device_folder() -> Iterator[Path]:
+    """Yield a temporary folder for the device profiles of a log. Raises LogError when it can't be made."""
+    with failing_as("no temporary folder for the log's device profiles"):
+        folder = TemporaryDirectory(prefix="adacd-hil-")
+    with folder as name:
+        yield Path(name)
 
 
 def _one_ahead(parts: Generator[_DecodedPart]) -> Iterator[_DecodedPart]:

@@ -2,6 +2,9 @@
 
 A damaged file needs small chunks, and CRCs of chunks and of the whole data section. A chunk ends behind a packet, so a
 target that counts packets knows which of them are on the disk.
+
+mcap's writer keeps 1.5 KB a chunk in memory until the file ends: 3 MB for a part of 512 MiB, some 60 MB for an hour of
+a run at 1 kHz whose parts have no limit.
 """
 
 from typing import Protocol

@@ -29,8 +29,7 @@ from adacd_hil.log.recording.run_folder import is_there
 from adacd_hil.printable import in_line
 
 POLL_PERIOD_US = 25_000
-"""Polling interval of the ring in real time. A wake-up would cost the control process more than the packet; a poll
-costs the writer as much as writing two cycles."""
+"""Polling interval of the ring in real time. A wake-up would cost the control process more than the packet."""
 RETRY_PERIOD_NS = 5_000_000_000
 """Time before a disk that failed is tried again."""
 TAKEN_BYTES = 64 * 1024
