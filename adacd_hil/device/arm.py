@@ -3,18 +3,16 @@
 The only place of sign, zeros and torque ratio. Every value carries its age in cycles.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 
 from adacd_hil.device.answer_clock import KEPT, AnswerClock, newest_sample
-from adacd_hil.device.arm_watch import PATIENCE_PERIODS
 from adacd_hil.device.drive import Drive, option_codes, torque_limit_permille
 from adacd_hil.device.profile import PlacedDevice, place_devices
 from adacd_hil.device.strangers import Strangers
-from adacd_hil.device.torque_sensor import USABLE, TorqueSensor
+from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason, FrameChecks
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
@@ -49,6 +47,8 @@ class Arm:
         self.drives = tuple(_make_drive(settings, codec, device) for device in devices[:JOINTS])
         self.sensors = tuple(_make_sensor(codec, device, period_s) for device in devices[JOINTS:])
         self.devices: tuple[Drive | TorqueSensor, ...] = (*self.drives, *self.sensors)
+        for device, placed in zip(self.devices, devices, strict=True):
+            device.set_bounds(placed)
         self._bus = bus
         self.sync_id = codec.message("Sync").can_id
         self._is_following = settings.bus.follows
@@ -64,8 +64,6 @@ class Arm:
         )
         self.max_age_cycles = settings.bus.max_age_cycles
         self.gear_ratios = tuple(device.settings.scale.gear_ratio for device in devices[:JOINTS])
-        self.status_age_limits = tuple(_status_age_limit(device, period_s) for device in devices[:JOINTS])
-        """Greatest permitted age of each drive's status, in cycles; infinite for a drive that has no status period."""
         self._places = {device.can_id: place for place, device in enumerate(self.devices)}  # of cyclic frames
         self._status_takers: dict[int, _Take] = {
             device.status_message.can_id: device.accept_status
@@ -310,12 +308,9 @@ class Arm:
         self.was_enabled |= is_enabled
         if has_dropped_out:
             return FaultReason.DRIVE
-        sensor1, sensor2 = self.sensors
-        if not (sensor1.status in USABLE and sensor2.status in USABLE):
-            return FaultReason.SENSOR
-        (drive1, drive2), (limit1, limit2) = self.drives, self.status_age_limits
-        if is_enabled and (self._cycle - drive1.status_cycle > limit1 or self._cycle - drive2.status_cycle > limit2):
-            return FaultReason.DATA_AGE
+        for device in (*self.sensors, *self.drives):
+            if (fault := device.fault(self._cycle, is_enabled)) is not FaultReason.NONE:
+                return fault
         if self._emergencies:
             is_drive = any(drive.name in self._emergencies for drive in self.drives)
             return FaultReason.DRIVE if is_drive else FaultReason.SENSOR
@@ -363,11 +358,3 @@ def _make_drive(settings: Settings, codec: Codec, device: PlacedDevice) -> Drive
 def _make_sensor(codec: Codec, device: PlacedDevice, period_s: float) -> TorqueSensor:
     bounds = device.settings.plausibility
     return TorqueSensor(codec, device.joint + 1, period_s, bounds.torque_rate_Nm_s, bounds.torque_range_Nm)
-
-
-def _status_age_limit(device: PlacedDevice, period_s: float) -> float:
-    """Return the greatest age of a drive's status in cycles: 2.5 periods of its status frame; infinite without them."""
-    status = device.pdo("Status")
-    if status is None or not status.event_timer_ms:
-        return math.inf
-    return math.ceil(PATIENCE_PERIODS * status.event_timer_ms * 1e-3 / period_s)

@@ -179,7 +179,7 @@ def describe_faults(arm: Arm) -> list[str]:
     """Return the arm's faults, one line each; empty without a fault.
 
     Lines name a drive's fault or error code, a drive that dropped out, other senders, a sensor's status unless it is 0,
-    and signals older than their limit.
+    bounded values outside their bounds, and signals older than their limit.
     """
     lines = []
     for drive in arm.drives:
@@ -193,11 +193,13 @@ def describe_faults(arm: Arm) -> list[str]:
         if sensor.status:
             words = ", ".join(text for bit, text in _STATUS_WORDS if sensor.status & bit)
             lines.append(f"{sensor.name}: status 0x{int(sensor.status):02X}: {words}")
+    for device in arm.devices:
+        lines += device.describe_excess(arm.cycle)
     ages: list[tuple[str, int, float]] = []
-    for drive, status_limit in zip(arm.drives, arm.status_age_limits, strict=True):
+    for drive in arm.drives:
         ages.append((f"{drive.name}: position, velocity", drive.sample_cycle, arm.max_age_cycles))
         if drive.has_status_frame:
-            ages.append((f"{drive.name}: statusword", drive.status_cycle, status_limit))
+            ages.append((f"{drive.name}: statusword", drive.status_cycle, drive.status_age_limit))
     ages += ((f"{sensor.name}: torque", sensor.sample_cycle, arm.max_age_cycles) for sensor in arm.sensors)
     lines += (
         f"{signals} {arm.cycle - cycle} cycles old, {limit:g} allowed"

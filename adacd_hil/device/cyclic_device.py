@@ -1,8 +1,13 @@
 """A device with one frame per SYNC: its checks, and the parts that drives and sensors share."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+from adacd_hil.device.arm_watch import PATIENCE_PERIODS
+from adacd_hil.device.profile import PlacedDevice
+from adacd_hil.device.value_bounds import ValueBound, bounds_of
+from adacd_hil.records import FaultReason
 from adacd_hil.wire.codec import Codec, MessageCodec
 
 
@@ -12,6 +17,9 @@ class CyclicDevice(ABC):
     is_protected: whether the cyclic frame carries an end-to-end header; else it is checked by plausibility. values:
     those in use, the main one first. sample_cycle: cycle of the values in use; -1 before the first.
     """
+
+    own_fault = FaultReason.NONE
+    """Fault of the arm when a bounded value of such a device is outside."""
 
     def __init__(self, codec: Codec, name: str, message: MessageCodec, main: str, period_s: float) -> None:
         """Judge a frame of `message` without end-to-end header by its signal `main`.
@@ -35,6 +43,24 @@ class CyclicDevice(ABC):
         self._main_at = message.place(main)
         self._received: float | None = None  # main value of the last frame that came
         self._received_cycle = 0
+        self.status_age_limit = math.inf
+        """Greatest permitted age of its status, in cycles; infinite without a status period."""
+        self._cyclic_bounds: tuple[ValueBound, ...] = ()
+        self._status_bounds: tuple[ValueBound, ...] = ()
+        self._cyclic_values: Sequence[float] = ()
+        self._status_values: Sequence[float] = ()
+        self._status_came: float = -math.inf  # cycle of the last status frame
+
+    def set_bounds(self, placed: PlacedDevice) -> None:
+        """Take over the bounds of values and the period of the status from the device's profile.
+
+        The status may be 2.5 periods old. Raises CodecError when the contract lacks a signal.
+        """
+        status, cyclic = placed.pdo("Status"), self._message.name.removeprefix(self.name)
+        if status is not None and status.event_timer_ms:
+            self.status_age_limit = math.ceil(PATIENCE_PERIODS * status.event_timer_ms * 1e-3 / self._period_s)
+        self._cyclic_bounds = bounds_of(placed.pdo(cyclic), self._message)
+        self._status_bounds = bounds_of(status, self.status_message)
 
     def accept_cyclic(self, data: bytes, cycle: int) -> bool:
         """Take one cyclic frame of `cycle`; return False when a check fails: the frame is ignored."""
@@ -52,6 +78,7 @@ class CyclicDevice(ABC):
             if last is not None and not self._is_plausible(values, last, cycles):
                 self.implausible_frames += 1
                 return False
+        self._cyclic_values = values
         self._use(data, values, cycle)
         return True
 
@@ -62,8 +89,23 @@ class CyclicDevice(ABC):
             return False
         is_valid = receiver.check(data).is_valid
         if is_valid:
-            self._use_status(message.decode_values(data), cycle)
+            self._status_values, self._status_came = message.decode_values(data), cycle
+            self._use_status(self._status_values, cycle)
         return is_valid
+
+    def fault(self, cycle: int, is_enabled: bool) -> FaultReason:  # noqa: ARG002 (drives have use for it)
+        """Return the device's fault in a cycle, NONE without one; `is_enabled`: whether all drives are."""
+        if (self._cyclic_bounds or self._status_bounds) and self.describe_excess(cycle):
+            return self.own_fault
+        return FaultReason.NONE
+
+    def describe_excess(self, cycle: int) -> list[str]:
+        """Return a line per bounded value that is outside its bounds, and one if such values are missing or old."""
+        frames = (self._cyclic_bounds, self._cyclic_values), (self._status_bounds, self._status_values)
+        lines = [bound.describe_excess(values) for bounds, values in frames if values for bound in bounds]
+        if self._status_bounds and cycle - self._status_came > self.status_age_limit:
+            lines.append(f"no status for more than {self.status_age_limit:g} cycles")
+        return [f"{self.name}: {line}" for line in lines if line]
 
     @abstractmethod
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from adacd_hil.device.cyclic_device import CyclicDevice
 from adacd_hil.device.profile import PlausibilitySettings, ProfileSettings
+from adacd_hil.records import FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
 
@@ -123,6 +124,8 @@ def decode_statusword(statusword: int) -> Cia402State:
 class Drive(CyclicDevice):
     """One drive of the arm, joint 1 or 2. Its status may be in a frame of its own or in the feedback."""
 
+    own_fault = FaultReason.DRIVE
+
     def __init__(
         self,
         codec: Codec,
@@ -168,6 +171,12 @@ class Drive(CyclicDevice):
         """Whether the drive produces the commanded torque."""
         self.torque_actual_permille = 0
         self.error_code = 0
+
+    def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
+        """Return DATA_AGE for a status that is too old for an enabled drive, DRIVE for a bounded value outside."""
+        if is_enabled and cycle - self.status_cycle > self.status_age_limit:
+            return FaultReason.DATA_AGE
+        return super().fault(cycle, is_enabled)
 
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
         travel = values[self._velocity_at] * (cycles * self._period_s)

@@ -87,11 +87,23 @@ class SignalSettings:
     signal: str = setting(meaning="name in the contract")
     unit: str = setting("", meaning="unit of the signal's value")
     scale: float = setting(1.0, low=1e-12, high=1e12, meaning="value of one count, where [scale] doesn't say it")
+    low: float | None = setting(None, low=-1e12, high=1e12, meaning="least value, else the arm stops")
+    high: float | None = setting(None, low=-1e12, high=1e12, meaning="greatest value, else the arm stops")
+    of: str = setting("", meaning="signal of the same frame: `low` and `high` bound the difference to it")
 
     def __post_init__(self) -> None:
         parse_object(self.object)
         if not self.signal.isidentifier():
             raise ValueError(f"signal {self.signal!r} must be a name of letters, digits and _")
+        if self.of and not self.is_bounded:
+            raise ValueError(f"signal {self.signal!r}: `of` needs `low` or `high`")
+        if self.low is not None and self.high is not None and self.low > self.high:
+            raise ValueError(f"signal {self.signal!r}: low = {self.low:g} is above high = {self.high:g}")
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether the arm stops at some values."""
+        return self.low is not None or self.high is not None
 
     @property
     def name(self) -> ObjectName:
@@ -275,6 +287,7 @@ class ProfileSettings:
         for pdo in self.pdo:
             if pdo.message in ("Feedback", "Torque") and pdo.transmission != 1:
                 raise ValueError(f"pdo {pdo.message}: transmission = {pdo.transmission} must be 1, on every SYNC")
+            _check_bounds(pdo)
 
     def _check_protection(self) -> None:
         profile = PROFILES_BY_CODE.get(self.protection)
@@ -321,6 +334,19 @@ class ProfileSettings:
         if self.kind == "sensor" and signal.signal in ("torque", "gross_torque"):
             return self.scale.torque_Nm, "Nm"
         return signal.scale, signal.unit
+
+
+def _check_bounds(pdo: PdoSettings) -> None:
+    """Raise ValueError for bounds of values that the host doesn't get, or wouldn't miss."""
+    names = [signal.signal for signal in pdo.signals]
+    for signal in pdo.signals:
+        place = f"pdo {pdo.message}: signal {signal.signal!r}"
+        if signal.of and (signal.of not in names or signal.of == signal.signal):
+            raise ValueError(f"{place}: of = {signal.of!r} must be another signal of the frame: {', '.join(names)}")
+        if signal.is_bounded and pdo.is_received:
+            raise ValueError(f"{place} is the host's own, and can't have `low` or `high`")
+        if signal.is_bounded and pdo.message == "Status" and not pdo.event_timer_ms:
+            raise ValueError(f"{place}: `low` and `high` need event_timer_ms: without it a silent device isn't noticed")
 
 
 def _is_hex(text: str, digits: int) -> bool:

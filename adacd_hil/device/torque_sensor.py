@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from enum import IntFlag
 
 from adacd_hil.device.cyclic_device import CyclicDevice
+from adacd_hil.records import FaultReason
 from adacd_hil.wire.codec import Codec
 
 
@@ -29,6 +30,8 @@ USABLE = tuple(status for status in _STATUSES if not status & SensorStatus.NOT_V
 
 class TorqueSensor(CyclicDevice):
     """The torque sensor of joint 1 or 2."""
+
+    own_fault = FaultReason.SENSOR
 
     def __init__(
         self,
@@ -66,6 +69,10 @@ class TorqueSensor(CyclicDevice):
         self._cyclic_bits = 0
         self._slow_bits = 0
         self._heard_bits = 0  # of the last status frame
+
+    def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
+        """Return SENSOR for a torque that isn't valid or a bounded value outside; NONE without a fault."""
+        return super().fault(cycle, is_enabled) if self.status in USABLE else FaultReason.SENSOR
 
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
         # Two frames of one cycle, late and present, may lie a period apart.

@@ -84,10 +84,10 @@ class BenchNodes:
         )
         self.sensors = tuple(self._make_sensor(i, codec, scenario) for i in range(JOINTS))
         for device, description in zip(self.devices, described, strict=True):
-            for alias, place in description.aliases.items():
-                if alias != place:
-                    device.serve(*alias, device.reader(*place))
-                    device.pdos.accept_values(*alias, device.pdos.writer(*place))
+            for alias, (key, ratio) in description.aliases.items():
+                if alias != key:
+                    device.serve(*alias, _scaled(device.reader(*key), ratio))
+                    device.pdos.accept_values(*alias, device.pdos.writer(*key))
         injector.attach(self.devices, self.drives, self.sensors)
         self.latch_motors()
         self.period_ns = contract.period_us * 1000 or _UNTOLD_PERIOD_NS
@@ -178,6 +178,10 @@ def _scale_of(own: EmulatedArm | None, place: int) -> DriveScale:
         return DriveScale()
     increments = own.increments_per_joint_rev[place] or ENCODER_COUNTS
     return DriveScale(increments / ENCODER_COUNTS, own.velocity_factor[place], own.rated_count_Nm[place])
+
+
+def _scaled(read: Callable[[], int], ratio: float) -> Callable[[], int]:
+    return read if ratio == 1.0 else lambda: round(read() * ratio)
 
 
 def _check_period(period_us: int) -> None:

@@ -30,7 +30,7 @@ _BEFORE_NS = -1  # scenario time before the drives are enabled
 _NOT_VALID = 0x01  # of 0x6150
 _FRAME_KINDS = ("lose", "duplicate", "delay", "reorder", "corrupt", "freeze_counter")
 _VALUE_KINDS = ("stick", "jump", "saturate")
-_NODES_OWN = ("wrong_node_id", "duplicate_node_id", "drive_fault", "sensor_error", "clock_drift")
+_NODES_OWN = ("wrong_node_id", "duplicate_node_id", "drive_fault", "sensor_error", "clock_drift", "object_value")
 """Kinds whose effect the node keeps by itself, from power-on or since a `NodeAction`."""
 
 Pair = tuple[int, int]
@@ -56,14 +56,17 @@ class ActionKind(Enum):
     MEND = "mend"
     SENSOR_STATUS = "sensor status"  # bits of 0x6150, 0: no error
     DRIFT = "drift"  # ppm, 0: no drift
+    REPLACE_VALUE = "replace value"  # the object's, in counts
+    OWN_VALUE = "own value"
 
 
 class NodeAction(NamedTuple):
-    """Something that happens to a node now."""
+    """Something that happens to a node now; `key`: of the object whose value changes."""
 
     kind: ActionKind
     node: int
     value: float = 0
+    key: tuple[int, int] = (0, 0)
 
 
 class FaultPlan:
@@ -106,6 +109,7 @@ class FaultPlan:
         self._off_bus: frozenset[int] = frozenset()
         self._bits: dict[int, int] = {}
         self._drifts: dict[int, float] = {}
+        self._replaced: dict[tuple[int, tuple[int, int]], int] = {}
         self._plan_next()
 
     @property
@@ -265,7 +269,7 @@ class FaultPlan:
                 self._sending[node, can_id] = tuple(sorted(both, key=lambda row: row.index))
 
     def _switch(self, active: list[FaultRow]) -> None:
-        """Queue the actions for changes of power, bus, failures, sensor status, clocks."""
+        """Queue the actions for changes of power, bus, failures, sensor status, clocks, objects."""
         lasting = [row for row in active if row.settings.kind == "power_loss" or row.settings.duration_ns]
         off = _nodes_of(_of(lasting, "power_loss", "reboot"))
         off_bus = _nodes_of(_of(active, "bus_off"))
@@ -284,6 +288,15 @@ class FaultPlan:
         self._act_by_value(ActionKind.SENSOR_STATUS, self._bits, bits)
         self._act_by_value(ActionKind.DRIFT, self._drifts, drifts)
         self._bits, self._drifts = bits, drifts
+        replaced = {
+            (node, row.settings.object_key): row.settings.raw or 0
+            for node, row in _each_node(_of(active, "object_value"))
+        }
+        for node, key in sorted(self._replaced.keys() - replaced.keys()):
+            self._actions.append(NodeAction(ActionKind.OWN_VALUE, node, key=key))
+        for (node, key), raw in sorted(replaced.items() - self._replaced.items()):
+            self._actions.append(NodeAction(ActionKind.REPLACE_VALUE, node, raw, key))
+        self._replaced = replaced
 
     def _switch_failures(self, failing: tuple[FaultRow, ...]) -> None:
         for row in self._rows:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from adacd_hil.records import JOINTS
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import DEVICE_MARK, NEVER_NS, MarkKind, pack_mark
@@ -141,6 +142,7 @@ class Injector:
         """Begin before power-on. Raises ConfigError when a fault is about a frame that the contract hasn't."""
         first, second = (count_Nm(scenario.sensors, joint) for joint in scenario.wiring.sensor_joint)
         self.plan = FaultPlan(scenario.faults, seed, period_ns, codec, (first, second))
+        self._rows = scenario.faults
         self.has_faults = bool(scenario.faults)
         self.now_ns = 0
         self.on_event = on_event
@@ -156,8 +158,12 @@ class Injector:
     def attach(
         self, devices: Sequence[EmulatedDevice], drives: Sequence[DriveNode], sensors: Sequence[SensorNode]
     ) -> None:
-        """Set the nodes on which faults act."""
+        """Set the nodes on which faults act. Raises ConfigError for an object that a node lacks or that can't be so."""
         self._devices, self._drives, self._sensors = devices, drives, sensors
+        for index, row in enumerate(self._rows):
+            for place in row.nodes if row.kind == "object_value" else ():
+                if problem := devices[place].describe_misfit(*row.object_key, row.raw or 0):
+                    raise ConfigError(f"faults[{index}]: {row.node}: {problem}")
 
     def power_on(self, t_ns: int) -> None:
         """Set `t_ns` as the time of power-on, from which some faults count."""
@@ -264,7 +270,7 @@ class Injector:
                 sensor.on_sync(torque[joint])
 
     def _do(self, action: NodeAction, t_ns: int) -> None:
-        kind, place, value = action
+        kind, place, value, key = action
         device = self._devices[place]
         match kind:
             case ActionKind.POWER_OFF:
@@ -285,3 +291,7 @@ class Injector:
                 self._sensors[place - JOINTS].set_error(int(value))
             case ActionKind.DRIFT:
                 device.clock.set_drift(value, t_ns)
+            case ActionKind.REPLACE_VALUE:
+                device.replace_value(*key, int(value))
+            case ActionKind.OWN_VALUE:
+                device.replace_value(*key, None)

@@ -194,6 +194,13 @@ def read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
     return canopen.import_od(stream, node_id)
 
 
+class LiveValue(NamedTuple):
+    """The value of another object, times `ratio`."""
+
+    key: tuple[int, int]
+    ratio: float = 1.0
+
+
 class MadeUp(NamedTuple):
     """An object that a real device has and its EDS omits: its name, its type, and its value at power-on."""
 
@@ -214,7 +221,7 @@ class DeviceDescription:
     defaults: Values = field(default_factory=dict)
     fallbacks: Values = field(default_factory=dict)
     made_up: Mapping[int, MadeUp] = field(default_factory=dict)
-    aliases: Mapping[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
+    aliases: Mapping[tuple[int, int], LiveValue] = field(default_factory=dict)
 
 
 def _read_objects(node_id: int, description: DeviceDescription) -> canopen.ObjectDictionary:
@@ -267,6 +274,7 @@ class ObjectDictionary:
         """Read the EDS. Raises OSError when it can't be read."""
         self.node_id = node_id
         self._readers: dict[tuple[int, int], Callable[[], int]] = {}
+        self._replaced: dict[tuple[int, int], Callable[[], int]] = {}
         self._checks: dict[tuple[int, int], list[Callable[[int], None]]] = {}
         self._appliers: dict[tuple[int, int], list[Callable[[int], None]]] = {}
         self.is_locked: Callable[[int, int], bool] = lambda _index, _subindex: False
@@ -306,7 +314,27 @@ class ObjectDictionary:
 
     def reader(self, index: int, subindex: int) -> Callable[[], int]:
         """Return a function that returns the present value of a numeric object, by `serve` or as written."""
-        return self._readers.get((index, subindex)) or (lambda: self.value(index, subindex))
+        key = index, subindex
+        return self._replaced.get(key) or self._readers.get(key) or (lambda: self.value(index, subindex))
+
+    def replace_value(self, index: int, subindex: int, value: int | None) -> None:
+        """Give a numeric object a value in place of its own, for all who read it from now on; None: its own again."""
+        if value is None:
+            self._replaced.pop((index, subindex), None)
+        else:
+            self._replaced[index, subindex] = lambda: value
+
+    def describe_misfit(self, index: int, subindex: int, value: int) -> str:
+        """Return why a value can't be a numeric object's, in a line; empty if it can."""
+        name = f"object 0x{index:04X}:{subindex}"
+        if not self.has(index, subindex):
+            return f"has no {name}"
+        variable = self.find(index, subindex)
+        if variable.data_type not in datatypes.INTEGER_TYPES:
+            return f"{name} is no integer"
+        bits, is_signed = len(variable), variable.data_type in datatypes.SIGNED_TYPES
+        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if is_signed else (0, (1 << bits) - 1)
+        return "" if low <= value <= high else f"{name} can't be {value}, {low} to {high} allowed"
 
     def watch(
         self,
@@ -368,7 +396,7 @@ class ObjectDictionary:
                 _call_all(appliers, self.default_or(0, index, subindex))
 
     def _read(self, index: int, subindex: int, od: object) -> int | None:  # noqa: ARG002 (canopen passes it by name)
-        read = self._readers.get((index, subindex))
+        read = self._replaced.get((index, subindex)) or self._readers.get((index, subindex))
         return None if read is None else read()
 
     def _write(self, index: int, subindex: int, od: ODVariable, data: bytes) -> None:

@@ -13,7 +13,7 @@ from importlib import resources
 from typing import NamedTuple
 
 from adacd_hil.device.contract import load_contract
-from adacd_hil.device.profile import ObjectName, PlacedDevice, place_devices
+from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, SignalSettings, place_devices
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
@@ -25,6 +25,7 @@ from firmware_sim.canopen.object_dictionary import (
     CONTRACTS,
     DeviceDescription,
     EmulatedContract,
+    LiveValue,
     MadeUp,
     contract_of,
 )
@@ -44,19 +45,23 @@ _DEVICE_TYPES = {"drive": 0x00020192, "sensor": 0x00020194}
 _NEWTON_METRE = 0x00560100
 _RECORDS = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 _OBJECTS = {
-    "position": (0x6064, 0),
-    "velocity": (0x606C, 0),
-    "torque_actual": (0x6077, 0),
-    "torque_demand": (0x6074, 0),
-    "error_code": (0x603F, 0),
-    "statusword": (0x6041, 0),
-    "controlword": (0x6040, 0),
-    "target_torque": (0x6071, 0),
-    "torque_offset": (0x60B2, 0),
-    "torque": (0x9130, 1),
-    "gross_torque": (0x2110, 1),
-    "status": (0x6150, 1),
-    "temperature": (0x2111, 0),
+    "drive": {
+        "position": (0x6064, 0),
+        "velocity": (0x606C, 0),
+        "torque_actual": (0x6077, 0),
+        "torque_demand": (0x6074, 0),
+        "error_code": (0x603F, 0),
+        "statusword": (0x6041, 0),
+        "controlword": (0x6040, 0),
+        "target_torque": (0x6071, 0),
+        "torque_offset": (0x60B2, 0),
+    },
+    "sensor": {
+        "torque": (0x9130, 1),
+        "gross_torque": (0x2110, 1),
+        "status": (0x6150, 1),
+        "temperature": (0x2111, 0),
+    },
 }
 """Objects of the emulated devices for the signals that a profile maps from objects of its own."""
 _OWN_EDS = {eds for contract in CONTRACTS.values() for eds in (contract.drive_eds, contract.sensor_eds)}
@@ -203,6 +208,21 @@ def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
     }
 
 
+def _live_value(device: PlacedDevice, pdo: PdoSettings, signal: SignalSettings) -> LiveValue | None:
+    """Return the live value that a mapped object has: that of its name, else of the signal with which it is compared.
+
+    None: the object has a value of its own.
+    """
+    objects = _OBJECTS[device.settings.kind]
+    if signal.signal in objects:
+        return LiveValue(objects[signal.signal])
+    twin = next((other for other in pdo.signals if other.signal == signal.of), None)
+    if twin is None or twin.signal not in objects:
+        return None
+    (count, _), (twin_count, _) = device.settings.unit_of(signal), device.settings.unit_of(twin)
+    return LiveValue(objects[twin.signal], twin_count / count)
+
+
 def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
     """Return a device's description: its EDS, and the values at power-on that the profile adds or replaces."""
     kind, scale = device.settings.kind, device.settings.scale
@@ -211,10 +231,10 @@ def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
     if device.settings.serial:
         defaults[0x1018, 4] = device.settings.serial[device.joint]
     aliases = {
-        (signal.name.index, signal.name.sub): _OBJECTS[signal.signal]
+        (signal.name.index, signal.name.sub): live
         for pdo in device.settings.pdo
         for signal in pdo.signals
-        if signal.signal in _OBJECTS
+        if (live := _live_value(device, pdo, signal)) is not None
     }
     if device.profile.eds.name in _OWN_EDS and device.profile.eds.parent == contract_folder():
         return DeviceDescription(device.profile.eds, defaults, {}, made_up, aliases)

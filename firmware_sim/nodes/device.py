@@ -146,6 +146,11 @@ class EmulatedDevice(ObjectDictionary):
         self._application = application
         self.pdos.act, self.pdos.mind_length = application.act, application.mind_length
 
+    def replace_value(self, index: int, subindex: int, value: int | None) -> None:
+        """Give an object a value in place of its own, in PDOs and by SDO; None: its own value again."""
+        super().replace_value(index, subindex, value)
+        self.pdos.refresh()
+
     def power_on(self, t_ns: int) -> None:
         """Switch the power on: begin the device's time, send the boot-up message, and enter Pre-operational."""
         self.is_powered = True

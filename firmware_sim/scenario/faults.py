@@ -86,6 +86,7 @@ KINDS: Mapping[str, _Kind] = {
     "silence": _Kind(("node",), ("duration_s",), (*NODES, ALL)),
     "drive_fault": _Kind(("node", "code"), ("duration_s",), DRIVES),
     "sensor_error": _Kind(("node",), ("status", "duration_s"), SENSORS),
+    "object_value": _Kind(("node", "index", "raw"), ("sub", "duration_s")),
 }
 """By the value of the key `kind`."""
 
@@ -118,6 +119,9 @@ class FaultSettings:
     data: str | None = setting(None, meaning="hex bytes of the flood's frames; absent: eight zero bytes")
     code: int | None = setting(None, low=1, high=0xFFFF, meaning="error code of EMCY and 0x603F")
     status: int | None = setting(None, low=1, high=7, meaning="bits of 0x6150; absent: 1, not valid")
+    index: int | None = setting(None, low=0x2000, high=0xFFFF, meaning="object whose value is another")
+    sub: int | None = setting(None, low=0, high=0xFF, meaning="its sub-index; absent: 0")
+    raw: int | None = setting(None, low=-(2**63), high=2**64 - 1, meaning="value of the object, in its counts")
     node_id: int | None = setting(None, low=1, high=126, meaning="the node id that the node has from power-on")
     same_as: str | None = setting(None, choices=NODES, meaning="whose node id the node has from power-on")
     drift_ppm: float | None = setting(None, unit="ppm", low=-5e5, high=5e5, meaning="how much its clock runs fast")
@@ -175,6 +179,11 @@ class FaultSettings:
         return 1.0 if self.probability is None else self.probability
 
     @property
+    def object_key(self) -> tuple[int, int]:
+        """Index and sub-index of the object whose value the fault replaces."""
+        return self.index or 0, self.sub or 0
+
+    @property
     def nodes(self) -> tuple[int, ...]:
         """Places in `NODES` of the devices that the fault affects; () for the host."""
         if self.node == HOST:
@@ -219,7 +228,9 @@ _IN_TEXT = ("kind", "node", "frame", "signal", "at_s", "since")
 
 
 def _show(key: str, value: object) -> str:
-    return f"0x{value:X}" if key in ("can_id", "code") else f"{value:g}" if isinstance(value, float) else str(value)
+    if key in ("can_id", "code", "index"):
+        return f"0x{value:X}"
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _check_keys(name: str, kind: _Kind, given: Iterable[str]) -> None:

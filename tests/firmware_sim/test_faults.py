@@ -33,6 +33,7 @@ EXAMPLES = {
     "silence": {"node": "sensor2"},
     "drive_fault": {"node": "drive1", "code": 0x2310},
     "sensor_error": {"node": "sensor1", "status": 1},
+    "object_value": {"node": "sensor1", "index": 0x2111, "raw": -2000},
 }
 UNTIMED = ("wrong_node_id", "duplicate_node_id")
 

@@ -1,0 +1,50 @@
+"""Bounds that a profile sets to values of a device, such as a temperature or the second torque of a sensor.
+
+A value may be bounded by itself or by its difference to another value of the same frame.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from adacd_hil.device.profile import PdoSettings
+from adacd_hil.wire.codec import MessageCodec
+
+
+class ValueBound(NamedTuple):
+    """The bounds of one value: its places among a message's values, and `low` and `high` in `unit`."""
+
+    text: str
+    unit: str
+    place: int
+    place_of: int | None
+    """Of the value that is subtracted; None: the value itself is bounded."""
+    low: float
+    high: float
+
+    def describe_excess(self, values: Sequence[float]) -> str:
+        """Return a line if the value of a decoded frame is outside, NaN included; empty within."""
+        value = values[self.place] - (0.0 if self.place_of is None else values[self.place_of])
+        if self.low <= value <= self.high:
+            return ""
+        bounds = [f"at least {self.low:g}"] if self.low > -math.inf else []
+        bounds += [f"at most {self.high:g}"] if self.high < math.inf else []
+        return f"{self.text} {value:g} {self.unit}, {' and '.join(bounds)} allowed"
+
+
+def bounds_of(pdo: PdoSettings | None, message: MessageCodec | None) -> tuple[ValueBound, ...]:
+    """Return the bounds that a profile sets to values of a frame; empty without such a frame. Raises CodecError."""
+    if pdo is None or message is None:
+        return ()
+    return tuple(
+        ValueBound(
+            f"{signal.signal} - {signal.of}" if signal.of else signal.signal,
+            message.values[message.place(signal.signal)].unit,
+            message.place(signal.signal),
+            message.place(signal.of) if signal.of else None,
+            -math.inf if signal.low is None else signal.low,
+            math.inf if signal.high is None else signal.high,
+        )
+        for signal in pdo.signals
+        if signal.is_bounded
+    )

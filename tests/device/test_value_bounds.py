@@ -1,0 +1,203 @@
+"""Bounds that a profile sets to further values: the arm stops outside them, and where the values stay away."""
+
+import contextlib
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from adacd_hil.cli.main import cli
+from adacd_hil.device.profile import ProfileSettings
+from adacd_hil.log.reader import read_log
+from adacd_hil.records import FaultReason, SchemeState
+from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.wire.codec import contract_folder
+
+ARM = """
+extends = "certified"
+[arm]
+link_length_m = [0.4, 0.25]
+rated_torque_Nm = [20.0, 8.0]
+torque_limit_Nm = [18.0, 7.0]
+position_limit_deg = [80.0, 110.0]
+cad_theta = []
+[devices]
+drive = ["drive.toml", "drive.toml"]
+sensor = ["sensor.toml", "sensor.toml"]
+drive_node = [11, 12]
+sensor_node = [21, 22]
+contract = ""
+"""
+TEMPERATURE = {"object": "0x2031", "signal": "temperature", "unit": "degC", "scale": 0.1, "high": 85.0}
+SECOND_TORQUE = {"object": "0x9130:2", "signal": "torque_2", "unit": "Nm", "scale": 2e-5, "of": "torque"}
+SECOND_TORQUE |= {"low": -0.2, "high": 0.2}
+COLD = {"object": "0x2111", "signal": "temperature", "unit": "degC", "scale": 0.01, "low": -10.0}
+HOT_WINDING = 'kind = "object_value", node = "drive2", index = 0x2031, raw = 912'
+TWIN = 'kind = "object_value", node = "sensor1", index = 0x9130, sub = 2, raw = 300000'
+COLD_SENSOR = 'kind = "object_value", node = "sensor2", index = 0x2111, raw = -2000'
+MUTE_STATUS = 'kind = "lose", node = "sensor1", frame = "status"'
+ONSET_S = 0.1
+
+
+def table_of(name: str) -> dict[str, Any]:
+    return tomllib.loads((resources.files("adacd_hil") / "device_profiles" / f"{name}.toml").read_text())
+
+
+def add_signal(profile: dict[str, Any], message: str, row: dict[str, object]) -> None:
+    (pdo,) = (pdo for pdo in profile["pdo"] if pdo["message"] == message)
+    pdo["signals"].append(row)
+
+
+def drive_with_a_temperature() -> tuple[dict[str, Any], str]:
+    profile = table_of("stock-drive") | {"eds": "drive.eds"}
+    add_signal(profile, "Status", TEMPERATURE)
+    profile["pdo"][1]["signals"] = [row for row in profile["pdo"][1]["signals"] if row["signal"] != "torque_actual"]
+    eds = (contract_folder() / "stock_drive.eds").read_text()
+    eds = eds.replace("SupportedObjects=2\n1=0x2211\n2=0x2212", "SupportedObjects=3\n1=0x2211\n2=0x2212\n3=0x2031")
+    return (
+        profile,
+        f"{eds}\n\n[2031]\nParameterName=Winding\nObjectType=0x7\nDataType=0x0003\nAccessType=ro\nPDOMapping=1\n",
+    )
+
+
+def sensor_with_two_channels() -> tuple[dict[str, Any], str]:
+    profile = table_of("int32-sensor") | {"eds": "sensor.eds", "mapping": "writable"}
+    add_signal(profile, "Torque", SECOND_TORQUE)
+    eds = (contract_folder() / "int32_sensor.eds").read_text().rstrip() + "\n\n"
+    for index, old, new in (("9130", "PV 1", "PV 2"), ("1A00", "0x91300120", "0x91300220")):
+        begin = eds.index(f"[{index}sub1]")
+        end = eds.index("\n\n", begin)
+        row = eds[begin:end]
+        eds = f"{eds[:end]}\n\n{row.replace('sub1', 'sub2').replace(old, new)}{eds[end:]}"
+        head = eds.index(f"[{index}]")
+        eds = eds[:head] + eds[head:].replace("SubNumber=2", "SubNumber=3", 1).replace(
+            "DefaultValue=1", "DefaultValue=2", 1
+        )
+    return profile, eds
+
+
+def sensor_with_a_temperature() -> tuple[dict[str, Any], str]:
+    profile = table_of("adacd-sensor") | {"eds": "sensor.eds"}
+    add_signal(profile, "Status", COLD)
+    return profile, (contract_folder() / "torque_sensor.eds").read_text()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("bounds")
+    for name, (profile, eds) in {"drive": drive_with_a_temperature(), "sensor": sensor_with_two_channels()}.items():
+        (folder / f"{name}.eds").write_text(eds)
+        (folder / f"{name}.toml").write_text(to_toml(parse(ProfileSettings, profile)))
+    profile, eds = sensor_with_a_temperature()
+    (folder / "warm").mkdir()
+    (folder / "warm" / "sensor.eds").write_text(eds)
+    (folder / "warm" / "sensor.toml").write_text(to_toml(parse(ProfileSettings, profile)))
+    (folder / "arm.toml").write_text(ARM)
+    (folder / "warm-arm.toml").write_text(ARM.replace('"sensor.toml"', '"warm/sensor.toml"'))
+    return folder
+
+
+def play(folder: Path, name: str, *faults: str, arm: str = "arm") -> tuple[FaultReason, int | None, str]:
+    """Play half a second of the arm with faults; return the fault, the ms from onset to it, and the text on stderr."""
+    rows = "".join(f"[[faults]]\n{fault}\n".replace(", ", "\n") for fault in faults)
+    (folder / f"{name}-scenario.toml").write_text(f"lasts_s = 0.5\nstart_deg = [-30.0, -60.0]\n{rows}")
+    command = ["demo", "--config", f"{arm}.toml", "--scenario", f"{name}-scenario.toml", "--out", name]
+    with contextlib.chdir(folder):
+        ran = CliRunner().invoke(cli, command)
+    scheme = read_log(folder / name / "run.mcap").scheme
+    fault = FaultReason(int(scheme["fault"].max()))
+    began = scheme["cycle"][np.flatnonzero(scheme["state"] == SchemeState.ADAPT)]
+    ended = scheme["cycle"][np.flatnonzero(scheme["state"] == SchemeState.FAULT)]
+    cycles = int(ended[0] - began[0]) - round(ONSET_S * 1000) if len(began) and len(ended) else None
+    return fault, cycles, ran.stderr
+
+
+def test_values_within_their_bounds_stop_no_arm(folder: Path) -> None:
+    assert play(folder, "well")[0] is FaultReason.NONE
+    assert play(folder, "warm-well", arm="warm-arm")[0] is FaultReason.NONE
+
+
+@pytest.mark.parametrize(
+    ("name", "fault", "reason", "latest", "line"),
+    [
+        ("hot", HOT_WINDING, FaultReason.DRIVE, 100, "Drive2: temperature 91.2 degC, at most 85 allowed"),
+        ("twin", TWIN, FaultReason.SENSOR, 1, "Sensor1: torque_2 - torque"),
+        ("cold", COLD_SENSOR, FaultReason.SENSOR, 100, "Sensor2: temperature -20 degC, at least -10 allowed"),
+        ("mute", MUTE_STATUS, FaultReason.SENSOR, 260, "Sensor1: no status for more than 250 cycles"),
+    ],
+)
+def test_a_value_outside_its_bounds_or_one_that_stays_away_stops_the_arm(
+    folder: Path, name: str, fault: str, reason: FaultReason, latest: int, line: str
+) -> None:
+    arm = "warm-arm" if name in ("cold", "mute") else "arm"
+    found, cycles, said = play(folder, name, f"{fault}, at_s = {ONSET_S}", arm=arm)
+    assert found is reason
+    assert cycles is not None
+    assert -2 <= cycles <= latest  # the drives are enabled two cycles before the host moves
+    assert line in said
+    with contextlib.chdir(folder / name):  # the frames are decoded and judged again, by the profiles in the log
+        replayed = CliRunner().invoke(cli, ["replay", "--frames", "run.mcap"])
+    assert replayed.exit_code == 0, replayed.output
+
+
+def test_no_arm_is_enabled_before_a_bounded_value_has_come(folder: Path) -> None:
+    fault, cycles, said = play(folder, "never", f'{MUTE_STATUS}, since = "power_on", at_s = 0.0', arm="warm-arm")
+    assert (fault, cycles) == (FaultReason.COMMISSION_TIMEOUT, None)
+    assert "Sensor1: no status for more than 250 cycles" in said
+
+
+def test_a_replaced_value_ends_with_its_fault(folder: Path) -> None:
+    rows = f'{HOT_WINDING}, since = "power_on", at_s = 0.0, duration_s = 0.1'
+    assert play(folder, "cooled", rows)[0] is FaultReason.NONE
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ('node = "sensor1", index = 0x2031, raw = 1', "faults[0]: sensor1: has no object 0x2031:0"),
+        ('node = "drive1", index = 0x2031, raw = 40000', "object 0x2031:0 can't be 40000, -32768 to 32767 allowed"),
+    ],
+)
+def test_an_object_that_no_device_can_have_is_refused(folder: Path, changes: str, line: str) -> None:
+    (folder / "wrong-scenario.toml").write_text(
+        f'lasts_s = 0.5\n[[faults]]\nkind = "object_value"\nat_s = 0.1\n{changes}\n'.replace(", ", "\n")
+    )
+    with contextlib.chdir(folder):
+        ran = CliRunner().invoke(
+            cli, ["demo", "--config", "arm.toml", "--scenario", "wrong-scenario.toml", "--out", "w"]
+        )
+    assert ran.exit_code == 2
+    assert line in ran.stderr
+    assert not (folder / "w").exists()
+
+
+@pytest.mark.parametrize(
+    ("message", "changes", "line"),
+    [
+        ("Status", {"of": "torque_2"}, "of = 'torque_2' must be another signal of the frame: statusword, "),
+        ("Status", {"of": "temperature"}, "of = 'temperature' must be another signal of the frame"),
+        ("Status", {"low": 90.0}, "low = 90 is above high = 85"),
+        ("Command", {}, "is the host's own, and can't have `low` or `high`"),
+        ("Feedback", {"high": None, "of": "position"}, "`of` needs `low` or `high`"),
+    ],
+)
+def test_bounds_that_cant_be_are_one_line(message: str, changes: dict[str, object], line: str) -> None:
+    profile = table_of("stock-drive")
+    row = {key: value for key, value in (TEMPERATURE | changes).items() if value is not None}
+    add_signal(profile, message, row)
+    with pytest.raises(ConfigError) as raised:
+        parse(ProfileSettings, profile)
+    assert line in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_bounded_value_of_a_frame_without_a_period_is_refused() -> None:
+    profile = table_of("maxon-epos4")
+    add_signal(profile, "Status", TEMPERATURE)
+    with pytest.raises(ConfigError, match="'temperature': `low` and `high` need event_timer_ms"):
+        parse(ProfileSettings, profile)
