@@ -10,6 +10,7 @@ The reader refuses a log of another run, as far as both logs name their scenario
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -28,7 +29,7 @@ from adacd_hil.log.logged_run import (
 )
 from adacd_hil.log.reader import LogStream, Series
 from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
-from adacd_hil.score.judge import TrueContact, true_contacts
+from adacd_hil.score.judge import TrueContact, forgotten_after_s, true_contacts
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml
@@ -272,26 +273,35 @@ def placed_contacts(contacts: Sequence[TrueContact], host: HostCycles, settings:
     contacts = [contact for contact in contacts if len(host.cycle) and contact.onset <= host.cycle[-1]]
     if not contacts:
         return []
-    is_certified = settings.scheme == "certified"
-    a_rad_s = settings.certified.cutoffs_rad_s[0] if is_certified else settings.filter.a_rad_s
     instants = [(contact.onset, contact.end) for contact in contacts]
     since_ns = np.rint(np.interp(instants, host.cycle, host.t_ns - host.t_ns[0])).astype(np.int64)
     rows = np.searchsorted(host.cycle, [contact.onset for contact in contacts]).tolist()
-    placed = []
-    for contact, row, (onset_ns, end_ns) in zip(contacts, rows, (since_ns + host.t_ns[0]).tolist(), strict=True):
-        threshold = np.where(np.isfinite(host.threshold[row]), host.threshold[row], settings.detector.threshold_Nm)
-        before = host.before[row]
-        placed.append(
-            contact.placed(
-                (onset_ns, end_ns),
-                settings,
-                a_rad_s,
-                threshold,
-                is_armed=bool(before == SchemeState.MONITOR),
-                is_reacting=bool(is_interrupted(before)),
-            )
-        )
-    return placed
+    is_certified = settings.scheme == "certified"
+    a_rad_s = settings.certified.cutoffs_rad_s[0] if is_certified else settings.filter.a_rad_s
+    times_ns = (since_ns + host.t_ns[0]).tolist()
+    return [
+        placed_contact(contact, (onset_ns, end_ns), host, row, settings, a_rad_s)
+        for contact, row, (onset_ns, end_ns) in zip(contacts, rows, times_ns, strict=True)
+    ]
+
+
+def placed_contact(
+    contact: TrueContact, times_ns: tuple[int, int], host: HostCycles, row: int, settings: Settings, a_rad_s: float
+) -> TrueContact:
+    """Return a contact on the clock of a run, with the times in which it explains alarms.
+
+    times_ns: of onset and end. row: of the first of the host's cycles at the onset or after it. a_rad_s: cut-off of the
+    scheme's slowest filter.
+    """
+    threshold = np.where(np.isfinite(host.threshold[row]), host.threshold[row], settings.detector.threshold_Nm)
+    after_s = forgotten_after_s(contact.tau_ext, contact.cycle, settings.bus.period_s, a_rad_s, threshold)
+    return replace(
+        contact,
+        onset_ns=times_ns[0],
+        forgotten_ns=times_ns[1] + round(after_s * 1e9),
+        is_armed=bool(host.before[row] == SchemeState.MONITOR),
+        is_reacting=bool(is_interrupted(host.before[row])),
+    )
 
 
 KnownContacts = tuple[tuple[TrueContact, ...], EmulatorSpan]

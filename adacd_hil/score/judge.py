@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.logged_run import Truth, cycle_offsets
 from adacd_hil.records import JOINTS, ContactReport, Vector
-from adacd_hil.settings.configuration import Settings
 
 Times = NDArray[np.int64]
 
@@ -107,29 +106,6 @@ class TrueContact:
     def counted_from(self, first_cycle: int) -> "TrueContact":
         """Return the contact with cycles counted by the host, whose attempt begins with `first_cycle`."""
         return replace(self, cycle=self.cycle + int(cycle_offsets(np.array(first_cycle))))
-
-    def placed(
-        self,
-        times_ns: tuple[int, int],
-        settings: Settings,
-        a_rad_s: float,
-        threshold: Vector,
-        is_armed: bool,
-        is_reacting: bool = False,
-    ) -> "TrueContact":
-        """Return the contact on the clock of a run, with the times in which it explains alarms.
-
-        times_ns: of onset and end. a_rad_s, threshold (2,): cut-off of the filter and threshold of each joint.
-        """
-        after_s = forgotten_after_s(self.tau_ext, self.cycle, settings.bus.period_s, a_rad_s, threshold)
-        onset_ns, end_ns = times_ns
-        return replace(
-            self,
-            onset_ns=onset_ns,
-            forgotten_ns=end_ns + round(after_s * 1e9),
-            is_armed=is_armed,
-            is_reacting=is_reacting,
-        )
 
 
 @dataclass(frozen=True)

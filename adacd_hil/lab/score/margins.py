@@ -96,17 +96,15 @@ class BesideGatherer:
                 values = stream.tau_ext_hat[rows][free[rows] & armed[rows]]
                 self._largest[section.label] = larger(self._largest.get(section.label), values)
 
-    def _contacts(self, run: Run, sections: Sequence[Section], since_s: float = -np.inf) -> list[TrueContact]:
+    def _contacts(self, run: Run, sections: Sequence[Section], since_s: float = -np.inf) -> Sequence[TrueContact]:
         """Return the true contacts that end at `since_s` or later, on a run's clock, for the paper's scheme."""
         assert run.beside is not None
         time_s = run.time_s()
         armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
-        threshold = np.array(run.settings.detector.threshold_Nm)
-        return [
-            placed_in(run, contact, self._a_rad_s, threshold, armed)
-            for contact in timed_contacts(run)
-            if contact.time_s is not None and contact.time_s[-1] >= since_s
-        ]
+        state = np.where(armed, np.uint8(SchemeState.MONITOR), np.uint8(SchemeState.ADAPT))
+        threshold = np.full((len(time_s), JOINTS), np.nan)  # the configured one
+        contacts = (each for each in timed_contacts(run) if each.time_s is not None and each.time_s[-1] >= since_s)
+        return placed_in(run, contacts, state, threshold, self._a_rad_s)
 
     def beside(self, run: Run, sections: Sequence[Section]) -> Beside:
         """Return the results of all cycles; run: the outline of all of them."""

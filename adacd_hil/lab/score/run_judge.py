@@ -5,15 +5,17 @@ Shapes and units as in `adacd_hil.lab.score.run_arrays`.
 
 import math
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adacd_hil.lab.score.run_arrays import Run
-from adacd_hil.log.logged_run import Cycles, Mask, enters_react
+from adacd_hil.log.logged_run import Cycles, enters_react
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
+from adacd_hil.score.emulator_truth import HostCycles, placed_contact
 from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge, true_contacts
 
 
@@ -47,20 +49,24 @@ def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
 
 def contacts_of(run: Run) -> tuple[TrueContact, ...]:
     """Return the true contacts of a run, on its clock, with the thresholds and the filter of its own scheme."""
-    armed = run.state == SchemeState.MONITOR
-    return tuple(placed_in(run, contact, run.a_rad_s, None, armed) for contact in timed_contacts(run))
+    return placed_in(run, timed_contacts(run), run.state, run.threshold, run.a_rad_s)
 
 
-def placed_in(run: Run, contact: TrueContact, a_rad_s: float, threshold: Vector | None, armed: Mask) -> TrueContact:
-    """Return a contact on the clock of a run, with the times in which it explains alarms.
+def placed_in(
+    run: Run, contacts: Iterable[TrueContact], state: NDArray[np.uint8], threshold: Vector, a_rad_s: float
+) -> tuple[TrueContact, ...]:
+    """Return timed contacts on the clock of a run, with the times in which they explain alarms of a scheme.
 
-    a_rad_s, threshold (2,): filter and thresholds that do; None: those in force. armed (n,): where detection is armed.
+    state (n,), threshold (n, 2), a_rad_s: of that scheme, in the run's cycles; cut-off of its slowest filter.
     """
-    assert contact.time_s is not None
-    ends_ns = [run.zero_ns + round(float(at_s) * 1e9) for at_s in contact.time_s[[0, -1]]]
-    row = row_at(run, float(contact.time_s[0]))
-    threshold = threshold_in(run, row) if threshold is None else threshold
-    return contact.placed((ends_ns[0], ends_ns[1]), run.settings, a_rad_s, threshold, bool(row > 0 and armed[row - 1]))
+    host = HostCycles(run.cycle, run.t_ns, np.concatenate(([SchemeState.INIT], state[:-1])), threshold)
+    placed = []
+    for contact in contacts:
+        assert contact.time_s is not None
+        onset_ns, end_ns = (run.zero_ns + round(float(at_s) * 1e9) for at_s in contact.time_s[[0, -1]])
+        row = row_at(run, float(contact.time_s[0]))
+        placed.append(placed_contact(contact, (onset_ns, end_ns), host, row, run.settings, a_rad_s))
+    return tuple(placed)
 
 
 def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
