@@ -62,6 +62,19 @@ def write_sensor_eds(folder: Path) -> Path:
     return path
 
 
+def eds_of_two_channels() -> str:
+    """Give the EDS of a sensor with two torques in its frame, whose mapping is fixed."""
+    eds = (contract_folder() / "int32_sensor.eds").read_text().rstrip() + "\n\n"
+    for index, old, new in (("9130", "PV 1", "PV 2"), ("1A00", "0x91300120", "0x91300220")):
+        begin = eds.index(f"[{index}sub1]")
+        end = eds.index("\n\n", begin)
+        row = eds[begin:end].replace("sub1", "sub2").replace(old, new)
+        head = eds.index(f"[{index}]")
+        counts = eds[head:begin].replace("SubNumber=2", "SubNumber=3").replace("DefaultValue=1", "DefaultValue=2")
+        eds = f"{eds[:head]}{counts}{eds[begin:end]}\n\n{row}{eds[end:]}"
+    return eds
+
+
 def describe_arm(folder: Path) -> list[str]:
     """Write the devices' files; give the words after `init` that write the arm's, `my-arm.toml` in `folder`."""
     values: dict[str, tuple[object, object]] = {

@@ -135,6 +135,8 @@ def test_a_fault_on_a_bus_leads_to_the_doctor_of_that_arm_and_to_nothing_else_on
 def test_a_fault_of_an_emulated_arm_is_played_again():
     run = faulted(interface="embedded", config="certified", scenario="idle")
     assert steps_of(run)[0].command == "adacd-hil demo --config certified --scenario idle"
+    own = faulted(interface="embedded", config="certified", scenario="my-hit")
+    assert steps_of(own)[0].command == "adacd-hil demo --config certified --scenario my-hit.toml"
 
 
 def test_a_run_without_a_cycle_is_not_told_to_be_replayed():

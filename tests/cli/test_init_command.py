@@ -12,7 +12,7 @@ import pytest
 from called import called, complaints
 from click.testing import Result
 from eds_variants import EdsVariant
-from own_arm import write_sensor_eds
+from own_arm import eds_of_two_channels, write_sensor_eds
 from rig import Rig, SessionRig
 
 from adacd_hil.control.configuration_check import examine_configuration
@@ -336,6 +336,16 @@ def test_the_guessed_worth_of_a_count_lets_16_bits_carry_a_joint_s_torque(tmp_pa
     assert not any("carries" in line for line in warned)
     (signal,) = load_contract(written(out)).message("Sensor1Torque").values
     assert (signal.bits, signal.scale) == (16, 2e-3)
+
+
+def test_a_given_count_of_torque_is_no_guess(tmp_path, out):
+    (tmp_path / "twin.eds").write_text(eds_of_two_channels())
+    given = init(out, *NO_BUS, "--eds", str(tmp_path / "twin.eds"), "--torque-count-nm", "1e-5", "2e-5")
+    assert given.exit_code == 0, given.stderr
+    assert "devices.sensor" not in written(out).assumed
+    contract = load_contract(written(out))
+    scales = [[signal.scale for signal in contract.message(f"Sensor{joint}Torque").values] for joint in (1, 2)]
+    assert scales == [[1e-5, 1.0], [2e-5, 1.0]]  # the second channel is in counts: nobody told their worth
 
 
 def test_what_the_device_says_outweighs_the_eds():

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from own_arm import eds_of_two_channels
 
 from adacd_hil.cli.main import cli
 from adacd_hil.device.profile import ProfileSettings
@@ -66,19 +67,9 @@ def drive_with_a_temperature() -> tuple[dict[str, Any], str]:
 
 
 def sensor_with_two_channels() -> tuple[dict[str, Any], str]:
-    profile = table_of("int32-sensor") | {"eds": "sensor.eds", "mapping": "writable"}
+    profile = table_of("int32-sensor") | {"eds": "sensor.eds"}
     add_signal(profile, "Torque", SECOND_TORQUE)
-    eds = (contract_folder() / "int32_sensor.eds").read_text().rstrip() + "\n\n"
-    for index, old, new in (("9130", "PV 1", "PV 2"), ("1A00", "0x91300120", "0x91300220")):
-        begin = eds.index(f"[{index}sub1]")
-        end = eds.index("\n\n", begin)
-        row = eds[begin:end]
-        eds = f"{eds[:end]}\n\n{row.replace('sub1', 'sub2').replace(old, new)}{eds[end:]}"
-        head = eds.index(f"[{index}]")
-        eds = eds[:head] + eds[head:].replace("SubNumber=2", "SubNumber=3", 1).replace(
-            "DefaultValue=1", "DefaultValue=2", 1
-        )
-    return profile, eds
+    return profile, eds_of_two_channels()
 
 
 def sensor_with_a_temperature() -> tuple[dict[str, Any], str]:

@@ -440,7 +440,7 @@ class _ProfileWriter(ABC):
         index, sub = place
         if place in _TORQUE_OBJECTS:
             return 'signal = "torque"'
-        name = next((name for name, known in _SIGNAL_OBJECTS.items() if known == index), "")
+        name = next((name for name, known in _SIGNAL_OBJECTS.items() if known == index and sub <= 1), "")
         unit = ', unit = "permille"' if name in _PERMILLE else ""
         return f'signal = "{name or f"object_{index:04X}_{sub}"}"{unit}'
 
@@ -654,7 +654,7 @@ class _SensorWriter(_ProfileWriter):
     kind = SENSOR
 
     def scale(self) -> list[str]:
-        torque_Nm = self.ratings.torque_Nm
+        torque_Nm = self.answers.get("torque_Nm", self.ratings.torque_Nm)
         if torque_Nm is None:
             torque_Nm = self._by_eds()
         if torque_Nm is not None:

@@ -5,6 +5,7 @@ wherever it lies. Texts of a log are quoted for the shell.
 """
 
 import shlex
+from importlib import resources
 from typing import NamedTuple
 
 from adacd_hil.lab.report.page import STEPS, went_wrong
@@ -12,7 +13,7 @@ from adacd_hil.lab.score.metrics import Metrics, ReportSource
 from adacd_hil.lab.score.run_arrays import EMBEDDED, Run
 from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked
 from adacd_hil.printable import in_line
-from adacd_hil.settings.toml_files import builtin_names
+from adacd_hil.settings.toml_files import builtin_names, toml_names
 
 
 class NextStep(NamedTuple):
@@ -77,7 +78,7 @@ def _checked(run: Run, text: str) -> NextStep:
     """Return a next step: `text`, and the check of host, bus and arm; for an emulated arm, a demo to play again."""
     interface, channel = run.metadata.get("interface", ""), run.metadata.get("channel", "")
     if interface in ("", EMBEDDED):
-        played = f" --scenario {_quoted(run.metadata['scenario'])}" if run.metadata.get("scenario") else ""
+        played = f" --scenario {_scenario(run)}" if run.metadata.get("scenario") else ""
         return NextStep(f"{text} Play it again.", f"adacd-hil demo --config {_configuration(run)}{played}")
     bus = f"-i {_quoted(interface)} -c {_quoted(channel or 'can0')}"
     return NextStep(
@@ -89,6 +90,13 @@ def _configuration(run: Run) -> str:
     """Return a run's configuration, quoted, as a command takes it: a built-in name, or `<arm's name>.toml`."""
     name = run.metadata.get("config", "")
     return _quoted(name) if name in builtin_names() else _quoted(f"{name or 'my-arm'}.toml")
+
+
+def _scenario(run: Run) -> str:
+    """Return a run's scenario, quoted, as `demo` takes it: a built-in name, or `<its name>.toml`."""
+    name = run.metadata["scenario"]
+    is_builtin = name in toml_names(resources.files("firmware_sim") / "scenarios")
+    return _quoted(name if is_builtin else f"{name}.toml")
 
 
 def _quoted(text: str) -> str:
