@@ -26,6 +26,7 @@ from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LogStream, Piece, Series
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS, receivable_frames
+from adacd_hil.log.types.topics import CYCLE, SCHEME
 from adacd_hil.replay.log_source import CycleStretch, LogSource, Part, Places, find_resets
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
@@ -168,7 +169,7 @@ class RecordingAgainstLog(LogSource):
         is_there = np.isin(number, recording.number)
         self._missing += int((~is_there).sum())
         series = dict(piece.series)
-        for name in (self._partner, "/scheme"):
+        for name in (self._partner, SCHEME.name):
             records = series[name].records
             is_known = np.isin(records["publish_time"], cycles.records["publish_time"][is_there])
             series[name] = Series(records[is_known], self._stream.epoch_ns)
@@ -204,8 +205,8 @@ def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
     """
     wanted = _answers(recording.frames[recording.owner == recording.number[0]], codec)
     first = int(recording.number[0])
-    for piece in LogStream(against, (*FRAME_TOPICS, "/cycle")):
-        cycles = piece.series["/cycle"]
+    for piece in LogStream(against, (*FRAME_TOPICS, CYCLE.name)):
+        cycles = piece.series[CYCLE.name]
         number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
         for row in np.flatnonzero((number - first) % SYNC_OVERFLOW == 0).tolist():
             ends = np.searchsorted(piece.frames["cycle_t_ns"], (t_ns[row], t_ns[row] + 1))

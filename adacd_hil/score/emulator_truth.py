@@ -27,6 +27,7 @@ from adacd_hil.log.logged_run import (
     is_interrupted,
 )
 from adacd_hil.log.reader import LogStream, Series
+from adacd_hil.log.types.topics import TRUTH
 from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
 from adacd_hil.score.judge import TrueContact, true_contacts
 from adacd_hil.settings.configuration import Settings
@@ -87,10 +88,10 @@ def read_truth(path: Path) -> TruthTable:
 
     Raises LogError.
     """
-    stream = LogStream(path, ("/truth",))
+    stream = LogStream(path, (TRUTH.name,))
     rows = _TruthRows()
     for piece in stream:
-        rows.add_records(piece.series["/truth"])
+        rows.add_records(piece.series[TRUTH.name])
     return rows.table(stream)
 
 

@@ -27,6 +27,7 @@ from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.types.topics import TRUTH
 from adacd_hil.records import SchemeState
 
 VICTIMS = ("host", "logger", "emulator", "host and logger", "host and emulator")
@@ -189,7 +190,7 @@ def _judge(result: VcanKill, folder: Path, killed_ns: int) -> None:
     result.violations += [f"{text}; it says {result.said or 'nothing'}" for text in told]
     if "emulator" not in result.victim:
         result.violations += drive_violations(result.drives)
-        truth = read_log(folder / TRUTH_NAME, ("/truth",)).truth
+        truth = read_log(folder / TRUTH_NAME, (TRUTH.name,)).truth
         result.rest_s = rest_s(truth.t_ns, truth["dq"], killed_ns)
         if result.victim.startswith("host") and (result.rest_s is None or result.rest_s > REST_S):
             result.violations.append("the truth does not show the arm at rest")

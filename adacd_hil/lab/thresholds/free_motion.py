@@ -20,6 +20,7 @@ from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
+from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
 
 APART_S: Final = 0.6
@@ -28,7 +29,7 @@ MOST_SAMPLES: Final = 1_000_000
 """Most samples that are processed together; of more motion, windows are taken."""
 WINDOW: Final = 10_000
 """Samples of such a window."""
-TOPICS: Final = ("/scheme",)
+TOPICS: Final = (SCHEME.name,)
 _NEAR: Final = (0.5, 1.5)  # shares of the period: the shortest and longest interval of samples that follow each other
 _PERIODS: Final = 1_000_000
 """Number of intervals whose median is the period."""
@@ -89,7 +90,7 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
     """Yield /scheme of a log, or its part between two times, in pieces that are not empty. Raises LogError."""
     stream = LogStream(path, TOPICS)
     for piece in stream:
-        scheme = piece.series["/scheme"]
+        scheme = piece.series[SCHEME.name]
         if bounds_ns is not None and len(scheme):
             if scheme.t_ns[0] >= bounds_ns[1]:
                 return
