@@ -20,7 +20,7 @@ from typing import Any
 
 from long_log import LongLog, write
 
-from adacd_hil.log.log_files import find_parts
+from adacd_hil.log.log_files import LOG_NAME, find_parts
 from adacd_hil.log.reader import LogStream
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, SCHEME
@@ -71,7 +71,7 @@ def play(folder: Path, seconds: float) -> Path:
         check=True,
         stdout=subprocess.DEVNULL,
     )
-    return out / "run.mcap"
+    return out / LOG_NAME
 
 
 def measure(command: list[str]) -> dict[str, float]:

@@ -20,6 +20,7 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.file_access import read_input
 from adacd_hil.file_replacement import dangling_link, replacing
+from adacd_hil.log.log_files import HISTORY_NAME
 from adacd_hil.records import Event
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.settings.configuration import Settings
@@ -27,7 +28,6 @@ from adacd_hil.settings.run_settings import HistorySettings
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import parse_toml, to_toml
 
-HISTORY_NAME = "history.toml"
 HISTORY_FORMAT = 1
 _LARGEST = 1000.0
 _FUTURE_NS = 360_000_000_000

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from adacd_hil.device.attached_devices import with_attached_devices
 from adacd_hil.device.network import RESET_COMMUNICATION
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.log_files import LogError, failing_as
+from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LogError, failing_as
 from adacd_hil.log.logged_run import SHOWN, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS, joined_frames
@@ -345,14 +345,14 @@ class LogSource:
 
 def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:
     """Return the codec of a run's DBC, from the attachment arm.dbc of its log `path`. Raises LogError, CodecError."""
-    if "arm.dbc" not in attachments:
-        raise LogError(f"log {path} has no arm.dbc attached: its frames can't be decoded")
-    return parse_codec(attachments["arm.dbc"], path.with_name("arm.dbc"))
+    if DBC_NAME not in attachments:
+        raise LogError(f"log {path} has no {DBC_NAME} attached: its frames can't be decoded")
+    return parse_codec(attachments[DBC_NAME], path.with_name(DBC_NAME))
 
 
 def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
     """Return whether the version that made the log knew anchors, by a setting that came with them."""
-    tare = parse_toml(attachments["config.toml"]).get("tare")
+    tare = parse_toml(attachments[CONFIG_NAME]).get("tare")
     return isinstance(tare, dict) and "drift_Nm_sqrt_s" in tare
 
 

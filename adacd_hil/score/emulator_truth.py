@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, CONFIG_NAME, SCENARIO_NAME, TRUTH_NAME
 from adacd_hil.log.log_walk import attachment, run_metadata
 from adacd_hil.log.logged_run import (
     Cycles,
@@ -220,7 +220,7 @@ def foreign_truth(log: Path, truth: Path) -> str:
     for key in _PLAYED:
         if key in ours and key in theirs and ours[key] != theirs[key]:
             return f"{truth} is of another run: its {key} is {theirs[key]}, the log's {ours[key]}"
-    config = attachment(log, "config.toml")
+    config = attachment(log, CONFIG_NAME)
     if CONFIG_DIGEST_KEY in theirs and config is not None and theirs[CONFIG_DIGEST_KEY] != _digest(config):
         return f"{truth} is of another run: its host had another configuration"
     return ""
@@ -249,7 +249,7 @@ def _played(truth: Path) -> dict[str, str]:
     """Return scenario and seed of a truth by name; old ones have them in an attachment alone."""
     said = run_metadata(truth)
     try:
-        table = parse_toml(attachment(truth, "scenario.toml") or b"")
+        table = parse_toml(attachment(truth, SCENARIO_NAME) or b"")
     except ConfigError:
         return said
     attached = {"scenario": table.get("name"), "seed": table.get("seed")}

@@ -5,11 +5,14 @@ from pathlib import Path
 
 import pytest
 
+from adacd_hil.log.log_files import CONFIG_NAME, HISTORY_NAME, LOG_NAME, SCENARIO_NAME, TARE_NAME, TRUTH_NAME
 from adacd_hil.log.types.topics import RUN_TOPICS, TRUTH
 
 ROOT = Path(__file__).parents[2]
 OWN_RULES = {"straightforward.py", "mutations.py"}
 """Tools that write a log of their own, or damage one."""
+PRODUCT = ("adacd_hil", "firmware_sim")
+FILES = (LOG_NAME, TRUTH_NAME, CONFIG_NAME, TARE_NAME, HISTORY_NAME, SCENARIO_NAME)
 TOPICS = tuple(topic.name for topic in (*RUN_TOPICS, TRUTH))
 
 
@@ -24,12 +27,13 @@ def spelled_out(path: Path, names: tuple[str, ...]) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("names", "homes"),
+    ("names", "rooms", "homes"),
     [
         # joint_state_bags.py: the topic of other programs' bags, which ROS names
-        pytest.param(TOPICS, {"topics.py", "joint_state_bags.py"}, id="topics"),
+        pytest.param(TOPICS, (*PRODUCT, "tools"), {"topics.py", "joint_state_bags.py"}, id="topics"),
+        pytest.param(FILES, PRODUCT, {"log_files.py"}, id="files"),
     ],
 )
-def test_names_of_a_log_stand_in_one_file(names: tuple[str, ...], homes: set[str]) -> None:
-    files = [path for room in ("adacd_hil", "firmware_sim", "tools") for path in sorted((ROOT / room).rglob("*.py"))]
+def test_names_of_a_log_stand_in_one_file(names: tuple[str, ...], rooms: tuple[str, ...], homes: set[str]) -> None:
+    files = [path for room in rooms for path in sorted((ROOT / room).rglob("*.py"))]
     assert [each for path in files if path.name not in homes | OWN_RULES for each in spelled_out(path, names)] == []

@@ -19,7 +19,7 @@ from damage_trials import messages_of
 
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.recover import recover
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.topics import CONTROL, CYCLE, JOINT_STATES, SCHEME
 
@@ -67,7 +67,7 @@ def _attempt(seed: int, folder: Path) -> KillResult:
     command = [sys.executable, "-c", _DEMO, "demo", "--clock", "realtime", "--out", str(folder)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        path = folder / "run.mcap"
+        path = folder / LOG_NAME
         try:
             writer = _wait_for_cycles(process, path)
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -78,7 +78,7 @@ def _attempt(seed: int, folder: Path) -> KillResult:
             _wait_for_end(writer)
         finally:
             process.kill()
-    return _judge(seed, victim, path, _last_cycle_ns(folder / "truth.mcap", killed_ns))
+    return _judge(seed, victim, path, _last_cycle_ns(folder / TRUTH_NAME, killed_ns))
 
 
 def _kill(victim: str, control: int, writer: int) -> None:

@@ -51,7 +51,15 @@ from adacd_hil.lab.score.run_arrays import (
     truth_rows,
 )
 from adacd_hil.lab.score.run_judge import find_detections, timed_contacts
-from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_files import (
+    CONFIG_DIGEST_KEY,
+    DBC_NAME,
+    ENDING_KEY,
+    PLANNED_ENDINGS,
+    WHOLE,
+    LogError,
+    TimeWindow,
+)
 from adacd_hil.log.logged_run import Cycles, Mask, Milestones, Progress, host_cycles, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series, check_states, contacts_of, start_of_log
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, FRAME_CHECKS, SCHEME
@@ -132,8 +140,8 @@ def read_run(
 def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
     """Return a run without a cycle, with metadata and settings of the log."""
     metadata = dict(stream.metadata)
-    if "arm.dbc" in stream.attachments:
-        metadata["dbc_sha256"] = hashlib.sha256(stream.attachments["arm.dbc"]).hexdigest()
+    if DBC_NAME in stream.attachments:
+        metadata["dbc_sha256"] = hashlib.sha256(stream.attachments[DBC_NAME]).hexdigest()
     if truth is not None:
         told = {key: value for key, value in truth.metadata.items() if key not in (*metadata, CONFIG_DIGEST_KEY)}
         metadata |= {f"emulator_{key}": value for key, value in told.items()}

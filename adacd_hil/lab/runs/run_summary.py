@@ -24,7 +24,7 @@ from typing import Any, Final, NamedTuple
 from adacd_hil.file_access import InUseError, check_unused, read_input
 from adacd_hil.lab.logs.log_info import LogInfo, read_info
 from adacd_hil.lab.report.report_json import JSON_NAME, SCHEMA
-from adacd_hil.log.log_files import EPOCH_KEY, LOG_NAME, PLANNED_ENDINGS, TRUTH_NAME, LogError, parts_of
+from adacd_hil.log.log_files import CONFIG_NAME, EPOCH_KEY, LOG_NAME, PLANNED_ENDINGS, TRUTH_NAME, LogError, parts_of
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.printable import one_line
@@ -195,9 +195,9 @@ def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:
 
 
 def _settings(log: Path) -> Settings | None:
-    text = attachment(log, "config.toml")
+    text = attachment(log, CONFIG_NAME)
     try:
-        return None if text is None else settings_of(log, {"config.toml": text})
+        return None if text is None else settings_of(log, {CONFIG_NAME: text})
     except LogError:  # of a version that has other settings
         return None
 

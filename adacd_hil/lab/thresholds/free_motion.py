@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from adacd_hil.lab.detectors import detectors
-from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_files import CONFIG_NAME, WHOLE, LogError, TimeWindow
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
@@ -135,8 +135,8 @@ def read_motion(
 
 
 def _level_rad(path: Path) -> float:
-    text = attachment(path, "config.toml")
-    return 0.0 if text is None else settings_of(path, {"config.toml": text}).level_rad
+    text = attachment(path, CONFIG_NAME)
+    return 0.0 if text is None else settings_of(path, {CONFIG_NAME: text}).level_rad
 
 
 def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:
