@@ -32,6 +32,11 @@ GRAVITY_PARAMETER_NAMES = ("a4", "a5")
 """Appended where the joint axes are not vertical; Nm."""
 POSITION_TERMS = ("sin_q", "cos_q", "sin_2q", "cos_2q", "sin_sum", "cos_sum")
 """Torque that depends on the joint position, one parameter per joint each, of `arm.position_torque_Nm`."""
+FRICTION_SPEEDS_RAD_S = (0.2, 0.6, 1.2)
+"""Speeds at which friction is compared: in the sum, errors of viscous and Coulomb friction can't hide each other."""
+FRICTION_AT = slice(1, None, len(FRICTION_SPEEDS_RAD_S))
+"""Of friction at these speeds, joint by joint: that at the one speed for which people are shown it."""
+FRICTION_AT_RAD_S = FRICTION_SPEEDS_RAD_S[FRICTION_AT][0]
 _JOINT_UNITS = {
     "F_v": "Nm s/rad",
     "F_c": "Nm",

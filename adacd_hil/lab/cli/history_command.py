@@ -10,13 +10,12 @@ from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explain
 from adacd_hil.file_replacement import has_other_head, replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.printable import in_line
+from adacd_hil.records import FRICTION_AT, FRICTION_AT_RAD_S
 
 if TYPE_CHECKING:
     from adacd_hil.control.history_file import History
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_MIDDLE = slice(1, None, 3)
-"""Index of the friction at 0.6 rad/s among that at 0.2, 0.6, 1.2 rad/s, joint by joint."""
 
 
 @click.command(epilog=EPILOG)
@@ -54,9 +53,9 @@ def _as_png(found: "History") -> bytes:
         found, deviations = (np.array([getattr(each, name) for each in shown]) for name in (values, std))
         return HistoryPanel(title, names, found, deviations)
 
-    friction = panel("Friction at 0.6 rad/s, Nm", joints, "friction_Nm", "friction_std_Nm")
+    friction = panel(f"Friction at {FRICTION_AT_RAD_S:g} rad/s, Nm", joints, "friction_Nm", "friction_std_Nm")
     panels = (
-        friction._replace(values=friction.values[:, _MIDDLE], std=friction.std[:, _MIDDLE]),
+        friction._replace(values=friction.values[:, FRICTION_AT], std=friction.std[:, FRICTION_AT]),
         panel("Inertia, kg m²", ("a1", "a2", "a3"), "inertia_kgm2", "inertia_std_kgm2"),
         panel("Torque offset, Nm", joints, "offset_Nm", "offset_std_Nm"),
     )
@@ -71,7 +70,7 @@ def _as_text(found: "History") -> str:
         rows.append(
             [
                 certificate.date_utc,
-                *(f"{value:.3f}" for value in certificate.friction_Nm[_MIDDLE]),
+                *(f"{value:.3f}" for value in certificate.friction_Nm[FRICTION_AT]),
                 *(f"{value:.4f}" for value in certificate.inertia_kgm2),
                 ", ".join(f"{value:.3f}" for value in certificate.offset_Nm),
                 "yes" if certificate.is_payload else "",
@@ -79,4 +78,4 @@ def _as_text(found: "History") -> str:
             ]
         )
     table = format_table(head, rows, right=(1, 2, 3, 4, 5))
-    return f"{in_line(f'devices by serial number: {devices}')}\nfriction F at 0.6 rad/s\n{table}"
+    return f"{in_line(f'devices by serial number: {devices}')}\nfriction F at {FRICTION_AT_RAD_S:g} rad/s\n{table}"
