@@ -23,7 +23,7 @@ from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, placed_contacts
 from adacd_hil.score.judge import Detection, Score, TrueContact, judge
-from adacd_hil.score.smallest_push import PushGatherer
+from adacd_hil.score.smallest_push import PUSH_WITHIN, PushGatherer
 from adacd_hil.score.wording import NONE, found_text, why_not_found
 from adacd_hil.settings.configuration import Settings
 
@@ -199,7 +199,7 @@ class Replay:
     stretch, None where the truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0
     without one. ending: the last change of state, which may be before the stretch. threshold_Nm: median in MONITOR of
     each joint's lowest threshold of all channels, nan where it never monitored; push_Nm: of the smallest push found
-    within 100 ms, an estimate, () of the paper's scheme. attempts, threshold_Nm, push_Nm: from the log's
+    within `PUSH_WITHIN`, an estimate, () of the paper's scheme. attempts, threshold_Nm, push_Nm: from the log's
     beginning.
     """
 
@@ -267,7 +267,7 @@ def side_by_side(replays: Sequence[Replay]) -> list[Row]:
     ]
     rows.append(("threshold, Nm", *(_by_joint(each.threshold_Nm) for each in replays)))
     if any(each.push_Nm for each in replays):
-        rows.append(("smallest push in 100 ms, Nm", *(_by_joint(each.push_Nm) for each in replays)))
+        rows.append((f"smallest push in {PUSH_WITHIN}, Nm", *(_by_joint(each.push_Nm) for each in replays)))
     for index in range(max(len(each.adaptation_s) for each in replays)):
         rows.append((f"adaptation {index + 1}, s", *(_adaptation(each, index) for each in replays)))
     for name in dict.fromkeys(itertools.chain.from_iterable(each.parameters for each in replays)):

@@ -14,6 +14,7 @@ from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_replacement import replace_files
 from adacd_hil.lab.commission.communication_test import (
+    GOOD_SHARE,
     CommunicationReport,
     CommunicationTest,
     Verdict,
@@ -286,5 +287,7 @@ def _findings(described: dict[str, Any]) -> list[str]:
         lines.append(f"log: {described['log']}" + (f" ({described['log_error']})" if described["log_error"] else ""))
     lines += [f"pictures: {path}" for path in described.get("pictures", ())[:1]]
     verdict, share = described["verdict"], 100.0 * described["share"]
-    lines.append(f"{verdict}: {share:.2f} % of the periods brought complete fresh data (good from 95 %)")
+    lines.append(
+        f"{verdict}: {share:.2f} % of the periods brought complete fresh data (good from {100.0 * GOOD_SHARE:g} %)"
+    )
     return lines
