@@ -10,7 +10,6 @@ from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explain
 from adacd_hil.file_replacement import has_other_head, replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.printable import in_line
-from adacd_hil.records import FRICTION_AT, FRICTION_AT_RAD_S
 
 if TYPE_CHECKING:
     from adacd_hil.control.history_file import History
@@ -45,6 +44,7 @@ def _as_png(found: "History") -> bytes:
     import numpy as np
 
     from adacd_hil.lab.drawing import HistoryPanel, history_figure
+    from adacd_hil.records import FRICTION_AT, FRICTION_AT_RAD_S
 
     shown = found.certificates
     joints = tuple(f"joint {number}" for number in range(1, len(found.last.offset_Nm) + 1))
@@ -63,6 +63,8 @@ def _as_png(found: "History") -> bytes:
 
 
 def _as_text(found: "History") -> str:
+    from adacd_hil.records import FRICTION_AT, FRICTION_AT_RAD_S
+
     devices = ", ".join(f"{device.name} {device.serial}" for device in found.devices)
     head = ("certified", "F1 Nm", "F2 Nm", "a1 kg m²", "a2 kg m²", "a3 kg m²", "offset Nm", "payload", "known by")
     rows = []

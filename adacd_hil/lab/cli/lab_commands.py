@@ -89,8 +89,8 @@ def demo(
 
 @click.command(epilog=EPILOG)
 @on_bus
-@click.option("--poses", type=click.IntRange(1, 50), help="Poses to measure in; default: tare.poses.")
-@click.option("--seconds", type=click.FloatRange(0.1, 600.0), help="Measured time per pose; default: tare.window_s.")
+@click.option("--poses", type=int, help="Poses to measure in; default: tare.poses.")
+@click.option("--seconds", type=float, help="Measured time per pose; default: tare.window_s.")
 @click.option("--auto-zero", is_flag=True, help="Let the sensors set their own zero (0x6125) before.")
 @click.option("--out", type=WrittenPath(dir_okay=False), default=Path(TARE_NAME), show_default=True)
 @clock_option(default="realtime")
