@@ -31,10 +31,10 @@ from adacd_hil.replay.log_source import CycleStretch, LogSource, Part, Places, f
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
+from adacd_hil.wire.time_marks import ANSWERS
 
 _REALTIME: Final = (0.9, 1.1)
 """Median interval of SYNC over the period, of a bus that runs in real time; in lockstep it runs as fast as it can."""
-_CYCLIC: Final = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
 _NOWHERE: Final = np.int64(2**62)
 
 
@@ -95,7 +95,7 @@ def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording
     before = np.searchsorted(sync, places, side="right") - 1
     since = np.maximum(before, 0)
     offset_ns = frames["t_ns"] - t_ns[since]
-    is_after = places > _complete(frames, sync, [codec.message(name).can_id for name in _CYCLIC])[since]
+    is_after = places > _complete(frames, sync, [codec.message(name).can_id for name in ANSWERS])[since]
     if is_realtime:
         is_after |= offset_ns > FEEDBACK_SHARE * period_ns
     resets = np.searchsorted(find_resets(frames), places, side="right")
@@ -218,7 +218,7 @@ def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
 def _answers(frames: NDArray[Any], codec: Codec) -> dict[int, bytes]:
     """Return the data of the first cyclic frame of each device, by identifier."""
     answers: dict[int, bytes] = {}
-    for can_id in (codec.message(name).can_id for name in _CYCLIC):
+    for can_id in (codec.message(name).can_id for name in ANSWERS):
         mine = frames[(frames["can_id"] == can_id) & ~frames["is_error"]]
         if len(mine):
             answers[can_id] = mine["data"][0, : int(mine["length"][0])].tobytes()

@@ -23,6 +23,7 @@ import numpy as np
 from kill_trials import LOSS_BOUND_S
 from side_by_side import BIN, CHANNEL, TimingError, host_run, patient_config, running, wait_for
 
+from adacd_hil.cli.output import ExitCode
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
@@ -49,8 +50,6 @@ WATCHED_S = 2.0
 REST_S = 1.0
 """A drive brakes for a second at the most."""
 STILL_RAD_S = 0.02
-STOPPED_BY_FAULT = 4
-NOT_COMPLETE = 3
 ATTEMPTS = 3
 
 
@@ -199,11 +198,11 @@ def _judge(result: VcanKill, folder: Path, killed_ns: int) -> None:
 def status_violations(victim: str, status: int | None, messages: Sequence[str]) -> list[str]:
     """Say what is wrong with the end of a host that was not the victim itself."""
     if victim == "emulator":
-        if status != STOPPED_BY_FAULT:
-            return [f"the arm has gone, and the host ended with status {status}, {STOPPED_BY_FAULT} expected"]
+        if status != ExitCode.SAFETY_STOP:
+            return [f"the arm has gone, and the host ended with status {status}, {ExitCode.SAFETY_STOP} expected"]
         return [] if any("FAULT" in text or "Drive1" in text for text in messages) else ["nobody says what has gone"]
-    if victim == "logger" and status != NOT_COMPLETE:
-        return [f"the log was cut, and the host ended with status {status}, {NOT_COMPLETE} expected"]
+    if victim == "logger" and status != ExitCode.PARTIAL:
+        return [f"the log was cut, and the host ended with status {status}, {ExitCode.PARTIAL} expected"]
     return []
 
 

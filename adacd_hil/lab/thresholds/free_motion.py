@@ -22,6 +22,7 @@ from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
 from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
+from adacd_hil.scheme.kernel.kernel_samples import LONGEST_SHARE, SHORTEST_SHARE
 
 APART_S: Final = 0.6
 """Distance from contacts and gaps: six time constants of the slowest filter."""
@@ -30,7 +31,6 @@ MOST_SAMPLES: Final = 1_000_000
 WINDOW: Final = 10_000
 """Samples of such a window."""
 TOPICS: Final = (SCHEME.name,)
-_NEAR: Final = (0.5, 1.5)  # shares of the period: the shortest and longest interval of samples that follow each other
 _PERIODS: Final = 1_000_000
 """Number of intervals whose median is the period."""
 
@@ -159,7 +159,7 @@ def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:
 def _intervals(scheme: Any, cycle: NDArray[np.int64], before: int | None, period_s: float) -> Vector:
     """Return the time since the previous sample (n,), s; 0 if that is not of the previous cycle."""
     interval_s: Vector = scheme["period_s"].reshape(-1).copy()
-    is_near = (interval_s >= _NEAR[0] * period_s) & (interval_s <= _NEAR[1] * period_s)
+    is_near = (interval_s >= SHORTEST_SHARE * period_s) & (interval_s <= LONGEST_SHARE * period_s)
     interval_s[~is_near | (np.diff(cycle, prepend=cycle[0] - 2 if before is None else before) != 1)] = 0.0
     return interval_s
 
