@@ -122,6 +122,11 @@ class Truth:
         return max(int(np.searchsorted(cycles, cycle, side="right")) - 1, 0) if cycles.size else None
 
 
+def is_armed_in(state: NDArray[np.uint8]) -> Mask:
+    """Return for each state (n,) whether detection is armed in it: what judges call armed."""
+    return np.asarray(state == SchemeState.MONITOR)
+
+
 def is_interrupted(state: NDArray[np.uint8]) -> Mask:
     """Return for each cycle (n,) whether its state is REACT or STOPPED."""
     return np.isin(state, (SchemeState.REACT, SchemeState.STOPPED))

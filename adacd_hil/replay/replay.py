@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow, failing_as
-from adacd_hil.log.logged_run import SHOWN, Milestones, Mismatch, Progress
+from adacd_hil.log.logged_run import SHOWN, Milestones, Mismatch, Progress, is_armed_in
 from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
 from adacd_hil.replay.can_recording import RecordingAlone
@@ -135,7 +135,7 @@ class _Player:
             asked = self._asking.requests(ticks, batch)
         if is_told:
             self.cycles += len(ticks.cycle)
-            self.monitored += int(np.count_nonzero(batch.state == SchemeState.MONITOR))
+            self.monitored += int(np.count_nonzero(is_armed_in(batch.state)))
             self._compare(stretch, arms, batch, asked, part, events)
         return batch
 

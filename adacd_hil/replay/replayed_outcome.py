@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.logged_run import Mismatch, enters_react, host_span
+from adacd_hil.log.logged_run import Mismatch, enters_react, host_span, is_armed_in
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.supervisor import LEARNING
@@ -85,7 +85,7 @@ class OutcomeGatherer:
         self._crossings += ticks.t_ns[rises].tolist()
         over[batch.contact_places] |= np.array([r.cycle for r in batch.contacts]) == ticks.cycle[batch.contact_places]
         for row in np.flatnonzero(enters_react(batch.previous_state, batch.state) & over).tolist():
-            is_armed = bool(batch.previous_state[row] == SchemeState.MONITOR)
+            is_armed = bool(is_armed_in(batch.previous_state[row]))
             self._alarms.append((int(ticks.cycle[row]), Detection(int(ticks.t_ns[row]), is_armed)))
         for row in np.flatnonzero(batch.state != batch.previous_state).tolist():
             self._enter(
@@ -115,7 +115,7 @@ class OutcomeGatherer:
 
     def _watch(self, batch: SchemeBatch, is_quiet: NDArray[np.bool_]) -> None:
         """Gather residuals and thresholds of the cycles in MONITOR in which no joint is over its threshold."""
-        monitors = (batch.state == SchemeState.MONITOR) & (batch.previous_state == SchemeState.MONITOR)
+        monitors = is_armed_in(batch.state) & is_armed_in(batch.previous_state)
         block = batch.block[monitors & is_quiet]
         if not len(block):
             return

@@ -19,16 +19,10 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, CONFIG_NAME, SCENARIO_NAME, TRUTH_NAME
 from adacd_hil.log.log_walk import attachment, run_metadata
-from adacd_hil.log.logged_run import (
-    Cycles,
-    EmulatorSpan,
-    Progress,
-    Truth,
-    is_interrupted,
-)
+from adacd_hil.log.logged_run import Cycles, EmulatorSpan, Progress, Truth, is_armed_in, is_interrupted
 from adacd_hil.log.reader import LogStream, Series
 from adacd_hil.log.types.topics import TRUTH
-from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
+from adacd_hil.records import PARAMETER_NAMES, Vector
 from adacd_hil.score.judge import TrueContact, true_contacts
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
@@ -288,7 +282,7 @@ def placed_contacts(contacts: Sequence[TrueContact], host: HostCycles, settings:
                 settings,
                 a_rad_s,
                 threshold,
-                is_armed=bool(before == SchemeState.MONITOR),
+                is_armed=bool(is_armed_in(before)),
                 is_reacting=bool(is_interrupted(before)),
             )
         )

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from adacd_hil.lab.score.run_arrays import Run
-from adacd_hil.log.logged_run import Cycles, Mask, enters_react
+from adacd_hil.log.logged_run import Cycles, Mask, enters_react, is_armed_in
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge, true_contacts
@@ -29,7 +29,7 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
         first = alarms.get(cycle, final)
         if first is None and run.contact_joints is not None and not run.contact_joints[row]:
             continue
-        is_armed = bool(run.state[row - 1] == SchemeState.MONITOR)
+        is_armed = bool(is_armed_in(run.state[row - 1]))
         is_known = run.truth is None or run.truth.covers(cycle)
         detections.append(Detection(int(run.t_ns[row]), is_armed, is_known, row, first, final or first))
     return tuple(detections)
@@ -47,7 +47,7 @@ def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
 
 def contacts_of(run: Run) -> tuple[TrueContact, ...]:
     """Return the true contacts of a run, on its clock, with the thresholds and the filter of its own scheme."""
-    armed = run.state == SchemeState.MONITOR
+    armed = is_armed_in(run.state)
     return tuple(placed_in(run, contact, run.a_rad_s, None, armed) for contact in timed_contacts(run))
 
 
@@ -150,7 +150,7 @@ def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[De
 
 def is_payload_alarm(run: Run, row: int) -> bool:
     """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet."""
-    truth, armed = run.truth, np.flatnonzero(run.state[:row] == SchemeState.MONITOR)
+    truth, armed = run.truth, np.flatnonzero(is_armed_in(run.state[:row]))
     if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:
         return False
     known, now = (truth.model_row(int(run.cycle[place])) for place in (armed[-1] if len(armed) else row, row))

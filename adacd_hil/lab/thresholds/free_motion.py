@@ -18,10 +18,10 @@ from scipy.ndimage import maximum_filter1d
 from adacd_hil.lab.detectors import detectors
 from adacd_hil.log.log_files import CONFIG_NAME, WHOLE, LogError, TimeWindow
 from adacd_hil.log.log_walk import attachment
-from adacd_hil.log.logged_run import Milestones, Progress, settings_of
+from adacd_hil.log.logged_run import Milestones, Progress, is_armed_in, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
 from adacd_hil.log.types.topics import SCHEME
-from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
+from adacd_hil.records import PARAMETER_NAMES, Vector
 from adacd_hil.scheme.kernel.kernel_samples import LONGEST_SHARE, SHORTEST_SHARE
 
 APART_S: Final = 0.6
@@ -120,7 +120,7 @@ def read_motion(
     for scheme in schemes(path, bounds_ns):
         watch(scheme)
         cycle = scheme["cycle"].astype(np.int64).reshape(-1)
-        is_good = (scheme["state"].reshape(-1) == SchemeState.MONITOR) & (scheme["contact_joints"].reshape(-1) == 0)
+        is_good = is_armed_in(scheme["state"].reshape(-1)) & (scheme["contact_joints"].reshape(-1) == 0)
         is_good &= _intervals(scheme, cycle, before, period_s) > 0.0
         for name in ("q", "tau_J", "dq", "theta_hat"):
             is_good &= np.isfinite(scheme[name]).all(axis=1)

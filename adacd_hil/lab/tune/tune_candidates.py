@@ -22,8 +22,8 @@ from adacd_hil.lab.thresholds.detector_comparison import WARM_UP_S
 from adacd_hil.lab.thresholds.free_motion import torque_streams
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, run_detectors
 from adacd_hil.lab.tune.tune_roc import Changes, Observed, Trial, TunedLog, Window, rising
-from adacd_hil.log.logged_run import Progress
-from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.log.logged_run import Progress, is_armed_in
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.replay.replay import Watch, replay_many
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.settings.configuration import Settings
@@ -164,7 +164,7 @@ class ShownLog:
         if known.size == 0:
             return
         rows, statistic = rows[known], self._statistic_of(batch.block[known])
-        is_armed = batch.previous_state[known] == SchemeState.MONITOR
+        is_armed = is_armed_in(batch.previous_state[known])
         counted = np.flatnonzero(is_armed & self._log.motion.is_free[rows])
         if counted.size:
             blocks = rows[counted] // self._log.block
