@@ -32,6 +32,12 @@ GRAVITY_PARAMETER_NAMES = ("a4", "a5")
 """Appended where the joint axes are not vertical; Nm."""
 POSITION_TERMS = ("sin_q", "cos_q", "sin_2q", "cos_2q", "sin_sum", "cos_sum")
 """Torque that depends on the joint position, one parameter per joint each, of `arm.position_torque_Nm`."""
+FRICTION_SPEEDS_RAD_S = (0.2, 0.6, 1.2)
+"""Speeds at which friction is compared: in the sum, errors of viscous and Coulomb friction can't hide each other."""
+FRICTION_AT_RAD_S = FRICTION_SPEEDS_RAD_S[1]
+"""The one of these speeds for which people are shown friction."""
+FRICTION_AT = slice(FRICTION_SPEEDS_RAD_S.index(FRICTION_AT_RAD_S), None, len(FRICTION_SPEEDS_RAD_S))
+"""Its places in friction at these speeds, joint by joint."""
 _JOINT_UNITS = {
     "F_v": "Nm s/rad",
     "F_c": "Nm",

@@ -33,9 +33,10 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.pacing import GridPacer, Tick
 from adacd_hil.control.session import Session
+from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.types.topics import ChannelId, pack_scheme
+from adacd_hil.log.types.topics import CYCLE, ChannelId, pack_scheme
 from adacd_hil.records import ArmState, FaultReason, Request
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration_files import load_settings
@@ -264,7 +265,7 @@ def bench_lockstep() -> int:
         if done.returncode:
             print(done.stderr, file=sys.stderr)
             return done.returncode
-        count = len(read_log(folder / "run.mcap", ("/cycle",)).cycle)
+        count = len(read_log(folder / LOG_NAME, (CYCLE.name,)).cycle)
         print(f"vcan, lockstep: {count} cycles in {elapsed_s:.1f} s with start-up", flush=True)
         return 0
 

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.types.topics import SCHEME, TRUTH
 from adacd_hil.records import SchemeState
 
 EVERY = 2  # cycles of 1 ms
@@ -28,8 +30,8 @@ def main() -> None:
     parser.add_argument("--from", dest="start_s", type=float, default=0.0, help="since the arm first moved, s")
     parser.add_argument("--until", dest="end_s", type=float, default=np.inf, help="since the arm first moved, s")
     arguments = parser.parse_args()
-    scheme = read_log(arguments.run / "run.mcap", ("/scheme",)).scheme
-    truth = read_log(arguments.run / "truth.mcap", ("/truth",)).truth
+    scheme = read_log(arguments.run / LOG_NAME, (SCHEME.name,)).scheme
+    truth = read_log(arguments.run / TRUTH_NAME, (TRUTH.name,)).truth
     moving = np.isin(scheme["state"], [int(state) for state in MOVING])
     time_s = (scheme.t_ns - scheme.t_ns[int(np.argmax(moving))]) * 1e-9
     rows = np.flatnonzero((time_s >= arguments.start_s) & (time_s < arguments.end_s))

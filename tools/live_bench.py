@@ -25,6 +25,7 @@ from side_by_side import patient_config
 from adacd_hil.cli.embedded_run import Cast, resolve, run_embedded
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.log.reader import Series, read_log
+from adacd_hil.log.types.topics import CYCLE, SCHEME
 from adacd_hil.settings.run_settings import RequestSettings
 
 FIELDS = ("lateness_ns", "compute_ns")
@@ -74,7 +75,7 @@ def run(blocks: int, block_s: float, folder: Path) -> dict[str, Any]:
     if summary.error or summary.result is None or not viewers or viewers[0].returncode:
         ended = "" if summary.result is None else f" after {summary.result.cycles} cycles, {summary.result.fault.name}"
         raise BenchError(summary.error or f"the run ended before the viewer was done{ended}")
-    log = read_log(summary.log.path, ("/cycle",))
+    log = read_log(summary.log.path, (CYCLE.name,))
     blocks_of = json.loads(viewed)
     return {
         "scheduler": summary.grant.scheduler,
@@ -137,8 +138,9 @@ def _rates(received: list[dict[str, Any]]) -> dict[str, str]:
 def _ages(received: list[dict[str, Any]]) -> dict[str, float]:
     """Return the ages of /scheme when it arrived, ms: medians over the blocks."""
     names = {"p50": "age_p50_ms", "p99": "age_p99_ms"}
+    schemes = [block[SCHEME.name] for block in received]
     return {
-        short: round(float(np.median([block["/scheme"][name] for block in received if name in block["/scheme"]])), 1)
+        short: round(float(np.median([each[name] for each in schemes if name in each])), 1)
         for short, name in names.items()
     }
 

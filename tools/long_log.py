@@ -28,8 +28,10 @@ from adacd_hil.log.log_files import (
     DROPPED_KEY,
     ENDING_KEY,
     FIELDS_KEY,
+    LOG_NAME,
     PART_KEY,
     RUN_METADATA,
+    TRUTH_NAME,
     LogError,
     part_path,
 )
@@ -47,7 +49,7 @@ PART_BYTES: Final = 512 << 20
 PART_S: Final = 1800.0
 LOG_TIME, PUBLISH_TIME, STAMP = 15, 23, 35
 """Where a message record has its times."""
-LOGS: Final = ("run.mcap", "truth.mcap")
+LOGS: Final = (LOG_NAME, TRUTH_NAME)
 
 
 class Block(NamedTuple):

@@ -23,6 +23,7 @@ import sys
 from pathlib import Path
 
 from adacd_hil.clock import MonotonicClock
+from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.wire.socketcan import SocketCanBus
 
@@ -121,7 +122,7 @@ def main() -> None:
             stdout, _ = run.communicate(timeout=LIMIT_S)
             played.terminate()
         arm.terminate()
-    ours = decisions(read_log(options.folder / "run.mcap"))
+    ours = decisions(read_log(options.folder / LOG_NAME))
     result = {
         "player": options.player,
         "run": json.loads(stdout),

@@ -20,13 +20,15 @@ from typing import Any
 
 from long_log import LongLog, write
 
-from adacd_hil.log.log_files import find_parts
+from adacd_hil.log.log_files import LOG_NAME, find_parts
 from adacd_hil.log.reader import LogStream
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS
+from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, SCHEME
 
 ROOT = Path(__file__).resolve().parent.parent
 SECONDS = (60, 300, 900, 3600)
-REPLAYED = ("/scheme", "/control", "/cycle", "/contact", "/events")
-FRAMES = ("/to_can_bus", "/from_can_bus", "/to_can_bus_fd", "/from_can_bus_fd")
+REPLAYED = (SCHEME.name, CONTROL.name, CYCLE.name, CONTACT.name, EVENTS.name)
+FRAMES = tuple(FRAME_TOPICS)
 HOUR_S = 3600.0
 CLI = "from adacd_hil.cli.main import main; main()"
 LAUNCH = """
@@ -52,7 +54,7 @@ def read(path: str) -> dict[str, Any]:
     stream = LogStream(Path(path), (*REPLAYED, *FRAMES))
     cycles = frames = 0
     for piece in stream:
-        cycles += len(piece.series["/cycle"])
+        cycles += len(piece.series[CYCLE.name])
         frames += len(piece.frames)
     return {"cycles": cycles, "frames": frames, "problem": stream.problem}
 
@@ -69,7 +71,7 @@ def play(folder: Path, seconds: float) -> Path:
         check=True,
         stdout=subprocess.DEVNULL,
     )
-    return out / "run.mcap"
+    return out / LOG_NAME
 
 
 def measure(command: list[str]) -> dict[str, float]:

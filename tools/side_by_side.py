@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 import adacd_hil
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.log.types.topics import CYCLE
 from adacd_hil.wire.codec import contract_folder, load_codec
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -375,7 +376,7 @@ def host_run(channel: str, folder: Path, config: Path, *options: str) -> Run:
 
     def read(said: str) -> tuple[NDArray[np.int64], dict[str, NDArray[np.int64]], dict[str, Any]]:
         described = json.loads(said) if said.strip() else {}
-        due_ns, times_ns, rest = read_cycles(read_log(out / LOG_NAME, ("/cycle",)))
+        due_ns, times_ns, rest = read_cycles(read_log(out / LOG_NAME, (CYCLE.name,)))
         times_ns["stamp"], times_ns["answer"] = times_ns.pop("feedback"), times_ns.pop("compute")
         kept = ("dropped", "fault", "recoveries", "log_error")
         return due_ns, times_ns, rest | {name: described[name] for name in kept if name in described}

@@ -20,16 +20,15 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.file_access import read_input
 from adacd_hil.file_replacement import dangling_link, replacing
+from adacd_hil.log.log_files import HISTORY_NAME
 from adacd_hil.records import Event
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.run_settings import HistorySettings
+from adacd_hil.settings.run_settings import HISTORY_LARGEST, HistorySettings
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import parse_toml, to_toml
 
-HISTORY_NAME = "history.toml"
 HISTORY_FORMAT = 1
-_LARGEST = 1000.0
 _FUTURE_NS = 360_000_000_000
 """Most by which a certificate's date may be ahead of this machine's clock."""
 
@@ -44,15 +43,25 @@ class CertificateRecord:
     version: str = setting(meaning="of adacd-hil")
     parameters: tuple[float, ...] = setting(meaning="a1 … F_c2, and those of gravity")
     friction_Nm: tuple[float, ...] = setting(
-        unit="Nm", low=-_LARGEST, high=_LARGEST, meaning="of joint 1 at 0.2, 0.6, 1.2 rad/s, then of joint 2"
+        unit="Nm",
+        low=-HISTORY_LARGEST,
+        high=HISTORY_LARGEST,
+        meaning="of joint 1 at each speed, then of joint 2",
     )
-    friction_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, high=_LARGEST, meaning="their deviations")
-    inertia_kgm2: tuple[float, ...] = setting(unit="kg m²", low=-_LARGEST, high=_LARGEST, meaning="a1, a2, a3")
-    inertia_std_kgm2: tuple[float, ...] = setting(unit="kg m²", low=0.0, high=_LARGEST, meaning="their deviations")
+    friction_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, high=HISTORY_LARGEST, meaning="their deviations")
+    inertia_kgm2: tuple[float, ...] = setting(
+        unit="kg m²", low=-HISTORY_LARGEST, high=HISTORY_LARGEST, meaning="a1, a2, a3"
+    )
+    inertia_std_kgm2: tuple[float, ...] = setting(
+        unit="kg m²", low=0.0, high=HISTORY_LARGEST, meaning="their deviations"
+    )
     offset_Nm: tuple[float, ...] = setting(
-        unit="Nm", low=-_LARGEST, high=_LARGEST, meaning="of the torque sensors, the configuration's included"
+        unit="Nm",
+        low=-HISTORY_LARGEST,
+        high=HISTORY_LARGEST,
+        meaning="of the torque sensors, the configuration's included",
     )
-    offset_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, high=_LARGEST, meaning="their deviations")
+    offset_std_Nm: tuple[float, ...] = setting(unit="Nm", low=0.0, high=HISTORY_LARGEST, meaning="their deviations")
     is_payload: bool = setting(meaning="with a payload that was announced in the run")
     text: str = setting(meaning="the anchor of its offsets, and the sources of friction and inertia")
     digest: str = setting("", meaning="SHA-256 of the digest before (of the devices at first) and of all above")

@@ -184,7 +184,7 @@ class Admittance:
             ddq_d[i] = (new - speed) / self._period_s
 
 
-_TOLERANCE = 1e-3
+TOLERANCE = 1e-3
 """Relative excess over a limit that an excitation may have: the search for it ends a little outside."""
 
 
@@ -213,5 +213,5 @@ def motion_problems(settings: Settings) -> list[str]:
         for name, peaks in needed.items()
         for peak, (key, limit, unit) in zip(peaks, limits, strict=True)
         for i in range(JOINTS)
-        if peak[i] > (1.0 + _TOLERANCE) * limit[i]
+        if peak[i] > (1.0 + TOLERANCE) * limit[i]
     ]

@@ -23,7 +23,7 @@ from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.profile import enable_timeout_s
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import write_new_file
-from adacd_hil.log.log_files import LAYOUT_NAME, LOG_NAME, arithmetic
+from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, LOG_NAME, arithmetic
 from adacd_hil.log.recording.processes import LiveService
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
 from adacd_hil.log.types.topics import CERTIFIED_MODEL
@@ -273,8 +273,8 @@ class Session:
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
         attachments = device_attachments(self.settings)
-        attachments["arm.dbc"] = self.codec.text
-        attachments["config.toml"] = to_toml(self.settings).encode()
+        attachments[DBC_NAME] = self.codec.text
+        attachments[CONFIG_NAME] = to_toml(self.settings).encode()
         for file in self.files:
             attachments |= file.attachments()
         attachments |= self.viewer_files

@@ -17,13 +17,13 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.file_access import read_input
 from adacd_hil.file_replacement import replacing
+from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.records import JOINTS, Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.run_settings import TareSettings
 from adacd_hil.settings.schema import ConfigError, parse, setting
 from adacd_hil.settings.toml_files import read_toml, to_toml
 
-TARE_NAME = "tare.toml"
 TARE_FORMAT = 1
 SMALLEST_STD_NM = 0.001
 """Smallest standard deviation of a sensor's zero that is used, however long it was measured."""

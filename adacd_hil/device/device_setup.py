@@ -42,7 +42,7 @@ class Slave:
         self.known: dict[tuple[int, int], int] = {}
         """Values that the set-up has written or compared, by index and sub-index."""
         self._node = node
-        self._answer_s = device.settings.patience.answer_s
+        self.answer_s = device.settings.patience.answer_s
 
     def has(self, index: int, sub: int = 0) -> bool:
         """Return whether the EDS lists an object."""
@@ -60,13 +60,13 @@ class Slave:
 
     def read(self, index: int, sub: int = 0) -> int:
         """Read an object and return its number. Raises DeviceError, BusError."""
-        with as_device_error(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self._answer_s):
+        with as_device_error(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self.answer_s):
             return int(self._entry(index, sub).raw)
 
     def write_object(self, index: int, sub: int, value: int) -> None:
         """Write a number to an object, and note it in `known`. Raises DeviceError, BusError."""
         what = f"writing {self.name_object(index, sub)} = {_number(value)}"
-        with as_device_error(self.name, self.node_id, what, self._answer_s):
+        with as_device_error(self.name, self.node_id, what, self.answer_s):
             self._entry(index, sub).raw = value
         self.known[index, sub] = value
 
@@ -338,8 +338,6 @@ def _channel(slave: Slave) -> int:
 
 
 _UPLOAD = 0x40
-_ANSWER_S = 0.5
-"""Longest wait for an answer, the default of `patience.answer_s`."""
 
 
 class _KnownObject(NamedTuple):
@@ -371,7 +369,6 @@ class ParameterWatch(RateLimitedEvents):
         self._last_cycle: dict[int, int] = {}
         """By node id: least pause between requests, and cycle of the last request."""
         self._period_s = settings.bus.period_s
-        self._answer_cycles = round(_ANSWER_S / settings.bus.period_s)
         self._due = Recurrence(settings.devices.reread_ms * 1e-3, settings.bus.period_s)
         self._is_on = settings.devices.reread_ms > 0
         self.first_difference = ""
@@ -391,7 +388,7 @@ class ParameterWatch(RateLimitedEvents):
     def step(self, cycle: int, t_ns: int) -> None:
         """Send the request for the next object when it is due; warn of one that was not answered. Raises BusError."""
         asked = self._asked
-        if asked is not None and cycle - self._asked_cycle > self._answer_cycles:
+        if asked is not None and cycle - self._asked_cycle > round(asked.slave.answer_s / self._period_s):
             text = f"{asked.name} is not answered"
             self.report(t_ns, asked.slave.name, Event("warning", "parameters", text))
             self._asked = asked = None

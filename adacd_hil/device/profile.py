@@ -16,7 +16,7 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adacd_hil.device.canopen_bus import EdsVariable, find_variable, read_eds
+from adacd_hil.device.canopen_bus import ANSWER_TIMEOUT_S, EdsVariable, find_variable, read_eds
 from adacd_hil.device.drive_units import LEAST_INCREMENTS
 from adacd_hil.records import JOINTS
 from adacd_hil.remedies import nearest_name
@@ -193,7 +193,7 @@ class PlausibilitySettings:
 class PatienceSettings:
     """How long the host waits for a device, and how soon it asks again."""
 
-    answer_s: float = setting(0.5, unit="s", low=0.01, high=60.0, meaning="longest wait for an SDO answer")
+    answer_s: float = setting(ANSWER_TIMEOUT_S, unit="s", low=0.01, high=60.0, meaning="longest wait for an SDO answer")
     pause_ms: float = setting(
         0.0, unit="ms", low=0.0, high=1000.0, meaning="from an SDO answer to the next request, 15 for an EPOS"
     )

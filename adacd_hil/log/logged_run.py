@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import CONFIG_NAME, LogError
 from adacd_hil.records import SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import with_todays_keys
@@ -122,6 +122,11 @@ class Truth:
         return max(int(np.searchsorted(cycles, cycle, side="right")) - 1, 0) if cycles.size else None
 
 
+def is_armed_in(state: NDArray[np.uint8]) -> Mask:
+    """Return for each state (n,) whether detection is armed in it: what judges call armed."""
+    return np.asarray(state == SchemeState.MONITOR)
+
+
 def is_interrupted(state: NDArray[np.uint8]) -> Mask:
     """Return for each cycle (n,) whether its state is REACT or STOPPED."""
     return np.isin(state, (SchemeState.REACT, SchemeState.STOPPED))
@@ -129,12 +134,12 @@ def is_interrupted(state: NDArray[np.uint8]) -> Mask:
 
 def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
     """Return the settings of a run from the attachment config.toml of its log `path`. Raises LogError."""
-    if "config.toml" not in attachments:
-        raise LogError(f"log {path} has no attachment config.toml: its settings are not known")
+    if CONFIG_NAME not in attachments:
+        raise LogError(f"log {path} has no attachment {CONFIG_NAME}: its settings are not known")
     try:
-        return parse(Settings, with_todays_keys(parse_toml(attachments["config.toml"])))
+        return parse(Settings, with_todays_keys(parse_toml(attachments[CONFIG_NAME])))
     except ValueError as error:  # errors of the text, the TOML and a setting are ValueErrors
-        raise LogError(f"log {path}, attachment config.toml: {error}") from None
+        raise LogError(f"log {path}, attachment {CONFIG_NAME}: {error}") from None
 
 
 def enters_react(previous: NDArray[np.uint8], state: NDArray[np.uint8]) -> NDArray[np.bool_]:

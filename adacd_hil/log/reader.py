@@ -32,7 +32,18 @@ from adacd_hil.log.types.message_types import (
     unpack_log,
 )
 from adacd_hil.log.types.record_arrays import FRAME_DTYPE, FRAME_TOPICS, LONG_FRAME_DTYPE, Topic
-from adacd_hil.log.types.topics import DECODED, contact_report, run_channels, truth_channels
+from adacd_hil.log.types.topics import (
+    CONTACT,
+    CONTROL,
+    CYCLE,
+    DECODED,
+    EVENTS,
+    SCHEME,
+    TRUTH,
+    contact_report,
+    run_channels,
+    truth_channels,
+)
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactReport,
@@ -144,22 +155,22 @@ class RunLog:
     @property
     def scheme(self) -> Series:
         """Decisions of the scheme, records.scheme_layout."""
-        return self.topics["/scheme"]
+        return self.topics[SCHEME.name]
 
     @property
     def control(self) -> Series:
         """Desired motion and commanded torque, records.CONTROL_LAYOUT."""
-        return self.topics["/control"]
+        return self.topics[CONTROL.name]
 
     @property
     def cycle(self) -> Series:
         """Times and counts of each cycle, records.CycleRecord."""
-        return self.topics["/cycle"]
+        return self.topics[CYCLE.name]
 
     @property
     def truth(self) -> Series:
         """The emulator's truth, records.TRUTH_LAYOUT."""
-        return self.topics["/truth"]
+        return self.topics[TRUTH.name]
 
 
 def _is_complete(problem: str, summary: Mapping[str, str]) -> bool:
@@ -186,7 +197,7 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
         decoded={name.removeprefix(DECODED): values for name, values in series.items() if name.startswith(DECODED)},
         frames=piece.frames,
         events=stream.events(piece),
-        contacts=contacts_of(series["/contact"]),
+        contacts=contacts_of(series[CONTACT.name]),
         parts=stream.parts,
     )
 
@@ -260,7 +271,7 @@ def check_states(scheme: Series) -> None:
             odd = np.flatnonzero(~np.isin(scheme.records[name], [int(member) for member in kind]))
             if odd.size:
                 value, cycle = scheme.records[name][odd[0]], scheme.records["cycle"][odd[0]]
-                raise LogError(f"/scheme has {name} {value} in cycle {cycle}, which this version does not know")
+                raise LogError(f"{SCHEME.name} has {name} {value} in cycle {cycle}, which this version does not know")
 
 
 def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
@@ -273,7 +284,7 @@ def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
         try:
             report = contact_report(record)
         except (ValueError, OverflowError) as error:  # "77 is not a valid ContactLevel"
-            raise LogError(f"/contact has a report that this version does not know: {error}") from None
+            raise LogError(f"{CONTACT.name} has a report that this version does not know: {error}") from None
         contacts.append((t_ns, report))
     return contacts
 
@@ -352,10 +363,10 @@ class LogStream(LogWalk):
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
         """Return the events of a piece; [] for a log without events."""
-        topic = self.topics.get("/events")
+        topic = self.topics.get(EVENTS.name)
         if topic is None or topic.type_name != LOG.name:
             return []
-        payloads = piece.payloads.get("/events", ())
+        payloads = piece.payloads.get(EVENTS.name, ())
         return [LoggedEvent(log_time_ns(payload) - self.epoch_ns, unpack_log(payload)) for payload in payloads]
 
     def joint_states(self, piece: Piece) -> dict[str, list[bytes]]:

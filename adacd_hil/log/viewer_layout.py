@@ -6,6 +6,7 @@ from typing import Any
 
 from adacd_hil.log.log_files import LAYOUT_NAME, ROBOT_NAME
 from adacd_hil.log.robot_description import WORLD, robot_description
+from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, JOINT_STATES, SCHEME, OwnTopic
 from adacd_hil.settings.configuration import Settings
 
 SCENE_TOPIC = "/scene"
@@ -32,8 +33,8 @@ def _plot(title: str, *paths: str) -> dict[str, Any]:
     return _titled(title, panel)
 
 
-def _both_joints(field: str) -> tuple[str, str]:
-    return f"{field}[0]", f"{field}[1]"
+def _both_joints(topic: OwnTopic, field: str) -> tuple[str, str]:
+    return f"{topic.name}.{field}[0]", f"{topic.name}.{field}[1]"
 
 
 def _scene(robot: bytes) -> dict[str, Any]:
@@ -46,7 +47,7 @@ def _scene(robot: bytes) -> dict[str, Any]:
         "sourceType": "url",
         "url": "data:text/xml;base64," + base64.b64encode(robot).decode(),
         "controlMode": "jointStates",
-        "jointStatesTopic": "/joint_states",
+        "jointStatesTopic": JOINT_STATES.name,
         "displayMode": "visual",
         "framePrefix": "",
     }
@@ -55,7 +56,7 @@ def _scene(robot: bytes) -> dict[str, Any]:
         "cameraState": {"distance": 1.8, "phi": 25, "thetaOffset": 0, "targetOffset": [0.3, 0, 0], "perspective": True},
         "followTf": WORLD,
         "layers": {"arm": arm, "grid": {**grid, "divisions": 20}},
-        "topics": {SCENE_TOPIC: {"visible": True}, "/joint_states": {"visible": True}},
+        "topics": {SCENE_TOPIC: {"visible": True}, JOINT_STATES.name: {"visible": True}},
     }
     return _titled("Arm", panel)
 
@@ -73,29 +74,29 @@ def viewer_layout(robot: bytes = b"") -> bytes:
     """
     panels = {
         "Plot!contact": _plot(
-            "External torque, Nm", *_both_joints("/scheme.tau_ext_hat"), *_both_joints("/scheme.threshold")
+            "External torque, Nm", *_both_joints(SCHEME, "tau_ext_hat"), *_both_joints(SCHEME, "threshold")
         ),
-        "Plot!torque": _plot("Joint torque, Nm", *_both_joints("/scheme.tau_j"), *_both_joints("/control.tau_c")),
-        "Plot!motion": _plot("Position, rad", *_both_joints("/scheme.q"), *_both_joints("/control.q_d")),
-        "Plot!theta": _plot("Parameters", "/scheme.theta_hat[:]"),
+        "Plot!torque": _plot("Joint torque, Nm", *_both_joints(SCHEME, "tau_j"), *_both_joints(CONTROL, "tau_c")),
+        "Plot!motion": _plot("Position, rad", *_both_joints(SCHEME, "q"), *_both_joints(CONTROL, "q_d")),
+        "Plot!theta": _plot("Parameters", f"{SCHEME.name}.theta_hat[:]"),
         "Plot!cycle": _plot(
-            "Cycle, ns", *(f"/cycle.{name}_ns" for name in ("lateness", "feedback", "command", "slack"))
+            "Cycle, ns", *(f"{CYCLE.name}.{name}_ns" for name in ("lateness", "feedback", "command", "slack"))
         ),
         "Plot!queues": _plot(
-            "Queues, bytes", *(f"/cycle.{name}_queue_bytes" for name in ("receive", "transmit", "log"))
+            "Queues, bytes", *(f"{CYCLE.name}.{name}_queue_bytes" for name in ("receive", "transmit", "log"))
         ),
         "StateTransitions!state": _titled(
             "State and fault",
             {
                 "paths": [
-                    {"value": f"/scheme.{field}", "label": field, "enabled": True, "timestampMethod": "receiveTime"}
-                    for field in ("state", "fault")
+                    {"value": f"{SCHEME.name}.{name}", "label": name, "enabled": True, "timestampMethod": "receiveTime"}
+                    for name in ("state", "fault")
                 ],
                 "isSynced": True,
             },
         ),
-        "RawMessages!contact": _titled("Last contact", {"topicPath": "/contact", "diffEnabled": False}),
-        "RosOut!events": _titled("Events", {"searchTerms": [], "minLogLevel": 1, "topicToRender": "/events"}),
+        "RawMessages!contact": _titled("Last contact", {"topicPath": CONTACT.name, "diffEnabled": False}),
+        "RosOut!events": _titled("Events", {"searchTerms": [], "minLogLevel": 1, "topicToRender": EVENTS.name}),
     }
     left: list[str] = ["Plot!contact", "Plot!torque", "Plot!motion", "Plot!theta"]
     right = ["StateTransitions!state", "RosOut!events", "RawMessages!contact", "Plot!cycle", "Plot!queues"]

@@ -26,14 +26,15 @@ from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LogStream, Piece, Series
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS, receivable_frames
+from adacd_hil.log.types.topics import CYCLE, SCHEME
 from adacd_hil.replay.log_source import CycleStretch, LogSource, Part, Places, find_resets
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
+from adacd_hil.wire.time_marks import ANSWERS
 
 _REALTIME: Final = (0.9, 1.1)
 """Median interval of SYNC over the period, of a bus that runs in real time; in lockstep it runs as fast as it can."""
-_CYCLIC: Final = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
 _NOWHERE: Final = np.int64(2**62)
 
 
@@ -94,7 +95,7 @@ def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording
     before = np.searchsorted(sync, places, side="right") - 1
     since = np.maximum(before, 0)
     offset_ns = frames["t_ns"] - t_ns[since]
-    is_after = places > _complete(frames, sync, [codec.message(name).can_id for name in _CYCLIC])[since]
+    is_after = places > _complete(frames, sync, [codec.message(name).can_id for name in ANSWERS])[since]
     if is_realtime:
         is_after |= offset_ns > FEEDBACK_SHARE * period_ns
     resets = np.searchsorted(find_resets(frames), places, side="right")
@@ -168,7 +169,7 @@ class RecordingAgainstLog(LogSource):
         is_there = np.isin(number, recording.number)
         self._missing += int((~is_there).sum())
         series = dict(piece.series)
-        for name in (self._partner, "/scheme"):
+        for name in (self._partner, SCHEME.name):
             records = series[name].records
             is_known = np.isin(records["publish_time"], cycles.records["publish_time"][is_there])
             series[name] = Series(records[is_known], self._stream.epoch_ns)
@@ -204,8 +205,8 @@ def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
     """
     wanted = _answers(recording.frames[recording.owner == recording.number[0]], codec)
     first = int(recording.number[0])
-    for piece in LogStream(against, (*FRAME_TOPICS, "/cycle")):
-        cycles = piece.series["/cycle"]
+    for piece in LogStream(against, (*FRAME_TOPICS, CYCLE.name)):
+        cycles = piece.series[CYCLE.name]
         number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
         for row in np.flatnonzero((number - first) % SYNC_OVERFLOW == 0).tolist():
             ends = np.searchsorted(piece.frames["cycle_t_ns"], (t_ns[row], t_ns[row] + 1))
@@ -217,7 +218,7 @@ def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
 def _answers(frames: NDArray[Any], codec: Codec) -> dict[int, bytes]:
     """Return the data of the first cyclic frame of each device, by identifier."""
     answers: dict[int, bytes] = {}
-    for can_id in (codec.message(name).can_id for name in _CYCLIC):
+    for can_id in (codec.message(name).can_id for name in ANSWERS):
         mine = frames[(frames["can_id"] == can_id) & ~frames["is_error"]]
         if len(mine):
             answers[can_id] = mine["data"][0, : int(mine["length"][0])].tobytes()

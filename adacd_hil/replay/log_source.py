@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from adacd_hil.device.attached_devices import with_attached_devices
 from adacd_hil.device.network import RESET_COMMUNICATION
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.log_files import LogError, failing_as
+from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LogError, failing_as
 from adacd_hil.log.logged_run import SHOWN, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS, joined_frames
-from adacd_hil.log.types.topics import ARM
+from adacd_hil.log.types.topics import ARM, CONTACT, CYCLE, EVENTS, SCHEME
 from adacd_hil.records import CERTIFICATE_EVENTS, ArmBatch, ContactReport, SchemeState
 from adacd_hil.replay.logged_arms import has_arms, logged_arms
 from adacd_hil.settings.configuration import Settings
@@ -95,8 +95,8 @@ class AttemptSplitter:
     def _pair(self, piece: Piece) -> tuple[NDArray[Any], NDArray[Any]]:
         """Return the records of /scheme and /arm, or of an older log /cycle, of the same cycles; count the others."""
         self._has_arms = ARM.name in piece.series
-        scheme = piece.series["/scheme"].records
-        other = piece.series[ARM.name if self._has_arms else "/cycle"].records
+        scheme = piece.series[SCHEME.name].records
+        other = piece.series[ARM.name if self._has_arms else CYCLE.name].records
         theirs, own = scheme["publish_time"], other["publish_time"]
         if not np.array_equal(theirs, own):
             _, first, second = np.intersect1d(theirs, own, return_indices=True)
@@ -250,7 +250,7 @@ def find_resets(frames: NDArray[Any]) -> Places:
     return np.asarray(places[frames["data"][places, 0] == RESET_COMMUNICATION])
 
 
-_TOPICS: Final = ("/scheme", "/contact", "/events")
+_TOPICS: Final = (SCHEME.name, CONTACT.name, EVENTS.name)
 CYCLES_PER_PIECE: Final = 8_000
 _SAID_BEFORE_ANCHORS: Final = frozenset({"margin"})
 _SAID: Final = _SAID_BEFORE_ANCHORS | CERTIFICATE_EVENTS
@@ -274,7 +274,7 @@ class LogSource:
     def __init__(self, path: Path, cycles_per_piece: int = CYCLES_PER_PIECE) -> None:
         """Open the log, to be read in pieces of `cycles_per_piece` cycles. Raises LogError, ConfigError, CodecError."""
         self.has_arms = has_arms(path)
-        self._partner = ARM.name if self.has_arms else "/cycle"
+        self._partner = ARM.name if self.has_arms else CYCLE.name
         self._path = path
         self._cycles_per_piece = cycles_per_piece
         self._stream = self._open(with_frames=False)
@@ -307,7 +307,7 @@ class LogSource:
         for read in self._stream:
             piece = self._piece(read)
             events = [logged for logged in self._stream.events(piece) if logged.event.name in self._said]
-            yield Part(self._splitter.split(piece), contact_records(piece.series["/contact"]), events, self._said)
+            yield Part(self._splitter.split(piece), contact_records(piece.series[CONTACT.name]), events, self._said)
 
     @property
     def start_ns(self) -> int:
@@ -337,20 +337,22 @@ class LogSource:
         if len(splitter.gaps) > SHOWN:
             notes.append(f"and {len(splitter.gaps) - SHOWN} more gaps")
         if splitter.unpaired:
-            notes.append(f"{splitter.unpaired} records of /scheme or {self._partner} lack the other one of their cycle")
+            notes.append(
+                f"{splitter.unpaired} records of {SCHEME.name} or {self._partner} lack the other one of their cycle"
+            )
         return notes
 
 
 def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:
     """Return the codec of a run's DBC, from the attachment arm.dbc of its log `path`. Raises LogError, CodecError."""
-    if "arm.dbc" not in attachments:
-        raise LogError(f"log {path} has no arm.dbc attached: its frames can't be decoded")
-    return parse_codec(attachments["arm.dbc"], path.with_name("arm.dbc"))
+    if DBC_NAME not in attachments:
+        raise LogError(f"log {path} has no {DBC_NAME} attached: its frames can't be decoded")
+    return parse_codec(attachments[DBC_NAME], path.with_name(DBC_NAME))
 
 
 def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
     """Return whether the version that made the log knew anchors, by a setting that came with them."""
-    tare = parse_toml(attachments["config.toml"]).get("tare")
+    tare = parse_toml(attachments[CONFIG_NAME]).get("tare")
     return isinstance(tare, dict) and "drift_Nm_sqrt_s" in tare
 
 

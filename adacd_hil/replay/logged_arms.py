@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LogStream
-from adacd_hil.log.types.topics import ARM
+from adacd_hil.log.types.topics import ARM, SCHEME
 from adacd_hil.records import ArmBatch, FaultReason
 
 _FIELDS: Final = frozenset(member.name for member in ARM.head)
@@ -17,8 +17,8 @@ _FIELDS: Final = frozenset(member.name for member in ARM.head)
 
 def has_arms(path: Path) -> bool:
     """Return whether a log has the arm's states. Logs of earlier versions lack them. Raises LogError."""
-    for piece in LogStream(path, (ARM.name, "/scheme"), cycles_per_piece=1, is_ahead=False):
-        if len(piece.series["/scheme"]):
+    for piece in LogStream(path, (ARM.name, SCHEME.name), cycles_per_piece=1, is_ahead=False):
+        if len(piece.series[SCHEME.name]):
             arms = piece.series[ARM.name]
             return len(arms) > 0 and set(arms.fields) >= _FIELDS
     return False
@@ -32,7 +32,7 @@ def logged_arms(scheme: NDArray[Any], arm: NDArray[Any], ticks: Ticks) -> ArmBat
     odd = np.flatnonzero(~np.isin(arm["fault"], [int(fault) for fault in FaultReason]))
     if odd.size:
         fault, cycle = arm["fault"][odd[0]], arm["cycle"][odd[0]]
-        raise LogError(f"/arm has fault {fault} in cycle {cycle}, which this version does not know")
+        raise LogError(f"{ARM.name} has fault {fault} in cycle {cycle}, which this version does not know")
     return ArmBatch(
         cycle=ticks.cycle,
         t_ns=ticks.t_ns,

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow, failing_as
-from adacd_hil.log.logged_run import SHOWN, Milestones, Mismatch, Progress
+from adacd_hil.log.logged_run import SHOWN, Milestones, Mismatch, Progress, is_armed_in
+from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
 from adacd_hil.replay.can_recording import RecordingAlone
 from adacd_hil.replay.log_source import CycleStretch, LogSource, Part
@@ -134,7 +135,7 @@ class _Player:
             asked = self._asking.requests(ticks, batch)
         if is_told:
             self.cycles += len(ticks.cycle)
-            self.monitored += int(np.count_nonzero(batch.state == SchemeState.MONITOR))
+            self.monitored += int(np.count_nonzero(is_armed_in(batch.state)))
             self._compare(stretch, arms, batch, asked, part, events)
         return batch
 
@@ -411,9 +412,9 @@ def _result(
         notes.append(unjudged)
     if comparison is not None:
         for cycle, t_ns, logged, asked in player.requests.unexplained:
-            comparison.add_mismatch(Mismatch("/scheme", "request", "", cycle, t_ns, str(logged), str(asked)))
+            comparison.add_mismatch(Mismatch(SCHEME.name, "request", "", cycle, t_ns, str(logged), str(asked)))
         if comparison.missing_fields:
-            notes.append(f"/scheme lacks {', '.join(comparison.missing_fields)}, an older format")
+            notes.append(f"{SCHEME.name} lacks {', '.join(comparison.missing_fields)}, an older format")
     threshold_Nm, push_Nm = gatherer.sensitivity_Nm()
     return Replay(
         settings=player.settings,

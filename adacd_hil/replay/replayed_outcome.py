@@ -16,14 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.logged_run import Mismatch, enters_react, host_span
+from adacd_hil.log.logged_run import Mismatch, enters_react, host_span, is_armed_in
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, placed_contacts
 from adacd_hil.score.judge import Detection, Score, TrueContact, judge
-from adacd_hil.score.smallest_push import PushGatherer
+from adacd_hil.score.smallest_push import PUSH_WITHIN, PushGatherer
 from adacd_hil.score.wording import NONE, found_text, why_not_found
 from adacd_hil.settings.configuration import Settings
 
@@ -85,7 +85,7 @@ class OutcomeGatherer:
         self._crossings += ticks.t_ns[rises].tolist()
         over[batch.contact_places] |= np.array([r.cycle for r in batch.contacts]) == ticks.cycle[batch.contact_places]
         for row in np.flatnonzero(enters_react(batch.previous_state, batch.state) & over).tolist():
-            is_armed = bool(batch.previous_state[row] == SchemeState.MONITOR)
+            is_armed = bool(is_armed_in(batch.previous_state[row]))
             self._alarms.append((int(ticks.cycle[row]), Detection(int(ticks.t_ns[row]), is_armed)))
         for row in np.flatnonzero(batch.state != batch.previous_state).tolist():
             self._enter(
@@ -115,7 +115,7 @@ class OutcomeGatherer:
 
     def _watch(self, batch: SchemeBatch, is_quiet: NDArray[np.bool_]) -> None:
         """Gather residuals and thresholds of the cycles in MONITOR in which no joint is over its threshold."""
-        monitors = (batch.state == SchemeState.MONITOR) & (batch.previous_state == SchemeState.MONITOR)
+        monitors = is_armed_in(batch.state) & is_armed_in(batch.previous_state)
         block = batch.block[monitors & is_quiet]
         if not len(block):
             return
@@ -199,7 +199,7 @@ class Replay:
     stretch, None where the truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0
     without one. ending: the last change of state, which may be before the stretch. threshold_Nm: median in MONITOR of
     each joint's lowest threshold of all channels, nan where it never monitored; push_Nm: of the smallest push found
-    within 100 ms, an estimate, () of the paper's scheme. attempts, threshold_Nm, push_Nm: from the log's
+    within `PUSH_WITHIN`, an estimate, () of the paper's scheme. attempts, threshold_Nm, push_Nm: from the log's
     beginning.
     """
 
@@ -267,7 +267,7 @@ def side_by_side(replays: Sequence[Replay]) -> list[Row]:
     ]
     rows.append(("threshold, Nm", *(_by_joint(each.threshold_Nm) for each in replays)))
     if any(each.push_Nm for each in replays):
-        rows.append(("smallest push in 100 ms, Nm", *(_by_joint(each.push_Nm) for each in replays)))
+        rows.append((f"smallest push in {PUSH_WITHIN}, Nm", *(_by_joint(each.push_Nm) for each in replays)))
     for index in range(max(len(each.adaptation_s) for each in replays)):
         rows.append((f"adaptation {index + 1}, s", *(_adaptation(each, index) for each in replays)))
     for name in dict.fromkeys(itertools.chain.from_iterable(each.parameters for each in replays)):

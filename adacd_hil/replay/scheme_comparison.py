@@ -24,6 +24,7 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError, arithmetic
 from adacd_hil.log.logged_run import SHOWN, Mismatch
 from adacd_hil.log.reader import LoggedEvent, Series
+from adacd_hil.log.types.topics import ARM, CONTACT, EVENTS, SCHEME
 from adacd_hil.records import JOINTS, ArmBatch, ContactReport, Event, Layout, Request, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.supervisor import KeptRequest
@@ -87,7 +88,7 @@ class SchemeComparison:
     def _compare_whole(self, name: str, logged: NDArray[Any], replayed: NDArray[Any], ticks: Ticks) -> None:
         is_other = np.asarray(logged != replayed)
         if is_other.any():
-            self._note("/scheme", name, is_other, logged, replayed, ticks)
+            self._note(SCHEME.name, name, is_other, logged, replayed, ticks)
 
     def _compare_reals(self, name: str, logged: Vector, replayed: Vector, ticks: Ticks) -> None:
         """Compare a float field, logged and replayed (n, k) each, and note the cycles in which it differs.
@@ -95,12 +96,12 @@ class SchemeComparison:
         Without a tolerance, every bit counts. Raises LogError if the field has another number of values.
         """
         if logged.shape != replayed.shape:
-            raise LogError(f"/scheme.{name} has {logged.shape[1]} values in the log, {replayed.shape[1]} here")
+            raise LogError(f"{SCHEME.name}.{name} has {logged.shape[1]} values in the log, {replayed.shape[1]} here")
         is_other = np.asarray(logged.view(np.uint64) != replayed.view(np.uint64))
         if self._tolerance:
             is_other &= ~self._is_near(name, logged, replayed)
         if is_other.any():
-            self._note("/scheme", name, is_other, logged, replayed, ticks)
+            self._note(SCHEME.name, name, is_other, logged, replayed, ticks)
 
     def _is_near(self, name: str, logged: Vector, replayed: Vector) -> NDArray[np.bool_]:
         finite = np.where(np.isfinite(logged), np.abs(logged), 0.0)
@@ -119,7 +120,7 @@ class SchemeComparison:
             bits = np.uint64 if theirs.dtype == np.float64 else theirs.dtype
             is_other = np.asarray(theirs.view(bits) != ours.view(bits))
             if is_other.any():
-                self._note("/arm", name, is_other, theirs, ours, ticks)
+                self._note(ARM.name, name, is_other, theirs, ours, ticks)
 
     def _note(
         self,
@@ -169,11 +170,11 @@ class SchemeComparison:
             theirs, ours = logged.get(t_ns), replayed.get(t_ns)
             if theirs is None or ours is None:
                 said = [("no report" if side is None else "a report") for side in (theirs, ours)]
-                self.add_mismatch(Mismatch("/contact", "report", "", *where, *said))
+                self.add_mismatch(Mismatch(CONTACT.name, "report", "", *where, *said))
                 continue
             for field, place, there, here in _contact_values(theirs, ours):
                 if not self._is_same(there, here):
-                    self.add_mismatch(Mismatch("/contact", field, place, *where, _text(there), _text(here)))
+                    self.add_mismatch(Mismatch(CONTACT.name, field, place, *where, _text(there), _text(here)))
 
     def _is_same(self, logged: float, replayed: float) -> bool:
         if struct.pack("<d", logged) == struct.pack("<d", replayed):
@@ -192,7 +193,7 @@ class SchemeComparison:
             name = ours.name if theirs is None else theirs.event.name
             t_ns = 0 if theirs is None else theirs.t_ns
             logged_text, replayed_text = _event_text(theirs and theirs.event), _event_text(ours)
-            self.add_mismatch(Mismatch("/events", name, "", cycle, t_ns, logged_text, replayed_text))
+            self.add_mismatch(Mismatch(EVENTS.name, name, "", cycle, t_ns, logged_text, replayed_text))
 
 
 def _event_text(event: Event | None) -> str:

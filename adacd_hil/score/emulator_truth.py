@@ -18,15 +18,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, CONFIG_NAME, SCENARIO_NAME, TRUTH_NAME
 from adacd_hil.log.log_walk import attachment, run_metadata
-from adacd_hil.log.logged_run import (
-    Cycles,
-    EmulatorSpan,
-    Progress,
-    Truth,
-    is_interrupted,
-)
+from adacd_hil.log.logged_run import Cycles, EmulatorSpan, Progress, Truth, is_armed_in, is_interrupted
 from adacd_hil.log.reader import LogStream, Series
 from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
 from adacd_hil.score.judge import TrueContact, forgotten_after_s, true_contacts
@@ -88,10 +82,10 @@ def read_truth(path: Path) -> TruthTable:
 
     Raises LogError.
     """
-    stream = LogStream(path, ("/truth",))
+    stream = LogStream(path, (TRUTH.name,))
     rows = _TruthRows()
     for piece in stream:
-        rows.add_records(piece.series["/truth"])
+        rows.add_records(piece.series[TRUTH.name])
     return rows.table(stream)
 
 
@@ -220,7 +214,7 @@ def foreign_truth(log: Path, truth: Path) -> str:
     for key in _PLAYED:
         if key in ours and key in theirs and ours[key] != theirs[key]:
             return f"{truth} is of another run: its {key} is {theirs[key]}, the log's {ours[key]}"
-    config = attachment(log, "config.toml")
+    config = attachment(log, CONFIG_NAME)
     if CONFIG_DIGEST_KEY in theirs and config is not None and theirs[CONFIG_DIGEST_KEY] != _digest(config):
         return f"{truth} is of another run: its host had another configuration"
     return ""
@@ -249,7 +243,7 @@ def _played(truth: Path) -> dict[str, str]:
     """Return scenario and seed of a truth by name; old ones have them in an attachment alone."""
     said = run_metadata(truth)
     try:
-        table = parse_toml(attachment(truth, "scenario.toml") or b"")
+        table = parse_toml(attachment(truth, SCENARIO_NAME) or b"")
     except ConfigError:
         return said
     attached = {"scenario": table.get("name"), "seed": table.get("seed")}

@@ -14,6 +14,9 @@ from adacd_hil.scheme.detect import margin as detect_margin
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.settings.configuration import Settings
 
+PUSH_WITHIN = f"{1e3 * detect_margin.WITHIN_S:g} ms"
+"""In how much time it is found, as text."""
+
 
 @dataclass(frozen=True)
 class SmallestPush:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from adacd_hil.records import JOINTS, Reaction
+from adacd_hil.records import FRICTION_SPEEDS_RAD_S, JOINTS, Reaction
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU
 from adacd_hil.settings.schema import ConfigError, setting
 
@@ -304,22 +304,37 @@ class TareSettings:
         return (self.drift_Nm_K * self.temperature_K) ** 2 + self.drift_Nm_sqrt_s**2 * age_s
 
 
+HISTORY_LARGEST = 1000.0
+"""Bound of each of its values, Nm or kg m²."""
+_FRICTION_AT = f"joint 1 at {', '.join(f'{speed:g}' for speed in FRICTION_SPEEDS_RAD_S)} rad/s, then of joint 2"
+
+
 @dataclass(frozen=True)
 class HistorySettings:
     """The arm's last certificate, of an earlier run; `run --history` reads it from the arm's file."""
 
     date_utc: str = setting("", meaning="time of the last certificate, ISO 8601, UTC; empty: none")
     friction_Nm: tuple[float, ...] = setting(
-        (), unit="Nm", low=-1000.0, high=1000.0, meaning="friction of joint 1 at 0.2, 0.6, 1.2 rad/s, then of joint 2"
+        (), unit="Nm", low=-HISTORY_LARGEST, high=HISTORY_LARGEST, meaning=f"friction of {_FRICTION_AT}"
     )
-    friction_std_Nm: tuple[float, ...] = setting((), unit="Nm", low=0.0, high=1000.0, meaning="their deviations")
-    inertia_kgm2: tuple[float, ...] = setting((), unit="kg m²", low=-1000.0, high=1000.0, meaning="inertias a1, a2, a3")
-    inertia_std_kgm2: tuple[float, ...] = setting((), unit="kg m²", low=0.0, high=1000.0, meaning="their deviations")
+    friction_std_Nm: tuple[float, ...] = setting(
+        (), unit="Nm", low=0.0, high=HISTORY_LARGEST, meaning="their deviations"
+    )
+    inertia_kgm2: tuple[float, ...] = setting(
+        (), unit="kg m²", low=-HISTORY_LARGEST, high=HISTORY_LARGEST, meaning="inertias a1, a2, a3"
+    )
+    inertia_std_kgm2: tuple[float, ...] = setting(
+        (), unit="kg m²", low=0.0, high=HISTORY_LARGEST, meaning="their deviations"
+    )
     offset_Nm: tuple[float, ...] = setting(
-        (), unit="Nm", low=-1000.0, high=1000.0, meaning="zero of each torque sensor, `arm.torque_offset_Nm` included"
+        (),
+        unit="Nm",
+        low=-HISTORY_LARGEST,
+        high=HISTORY_LARGEST,
+        meaning="zero of each torque sensor, `arm.torque_offset_Nm` included",
     )
     offset_std_Nm: tuple[float, ...] = setting(
-        (), unit="Nm", low=0.0, high=1000.0, meaning="their deviations, drift since the certificate included"
+        (), unit="Nm", low=0.0, high=HISTORY_LARGEST, meaning="their deviations, drift since the certificate included"
     )
     friction_share: float = setting(
         0.2, low=0.0, high=10.0, meaning="standard deviation of friction from run to run, as a share of it"
@@ -327,9 +342,10 @@ class HistorySettings:
     inertia_share: float = setting(0.02, low=0.0, high=10.0, meaning="the same of an inertia")
 
     def __post_init__(self) -> None:
+        frictions = len(FRICTION_SPEEDS_RAD_S) * JOINTS
         for name, values, count in (
-            ("friction_Nm", self.friction_Nm, 3 * JOINTS),
-            ("friction_std_Nm", self.friction_std_Nm, 3 * JOINTS),
+            ("friction_Nm", self.friction_Nm, frictions),
+            ("friction_std_Nm", self.friction_std_Nm, frictions),
             ("inertia_kgm2", self.inertia_kgm2, 3),
             ("inertia_std_kgm2", self.inertia_std_kgm2, 3),
             ("offset_Nm", self.offset_Nm, JOINTS),

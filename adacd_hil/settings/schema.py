@@ -56,6 +56,12 @@ def setting(
     return dataclasses.field(default=default, metadata=metadata)
 
 
+def bounds_of(section: type, name: str) -> tuple[float, float]:
+    """Return the lowest and the highest value that a setting may have."""
+    (metadata,) = (field.metadata for field in dataclasses.fields(section) if field.name == name)
+    return metadata["low"], metadata["high"]
+
+
 Section = TypeVar("Section")
 
 

@@ -26,6 +26,8 @@ from adacd_hil.wire.codec import Codec
 
 HOST_MARK: Final = 0x1ADACD00
 DEVICE_MARK: Final = 0x1ADACD01
+ANSWERS: Final = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
+"""The messages that the devices send on every SYNC."""
 NEVER_NS: Final = 1 << 62
 """A time after all others: no frame is due."""
 _PACKING: Final = struct.Struct("<Q")
@@ -60,5 +62,4 @@ def unpack_mark(data: bytes) -> tuple[MarkKind, int] | None:
 
 def answers_to_sync(codec: Codec) -> frozenset[int]:
     """Return the identifiers of the frames that the devices send on every SYNC. Raises CodecError without them."""
-    names = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
-    return frozenset(codec.message(name).can_id for name in names)
+    return frozenset(codec.message(name).can_id for name in ANSWERS)

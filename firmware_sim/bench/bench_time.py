@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from adacd_hil.log.log_files import find_parts
+from adacd_hil.log.log_files import SCENARIO_NAME, find_parts
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_truth
 from adacd_hil.records import TRUTH_LAYOUT, Event, Vector
@@ -61,10 +61,6 @@ class TruthFeed:
         if self.on_truth is not None:
             self._fill(self._block)
             self.on_truth(self.cycle, self._sync_stamp_ns + periods * period_ns, self._block)
-
-
-SCENARIO_NAME = "scenario.toml"
-"""The attachment."""
 
 
 class TruthLog(Recorder):

@@ -384,7 +384,7 @@ def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list
         mechanics["holding_brake_Nm"] = list(pair)
         assumed.append(
             f"brakes that hold {pair[0]:.3g} and {pair[1]:.3g} Nm without power, since arm.holding_torque_Nm is "
-            "unset: 1.5 times gravity's"
+            f"unset: {_HOLDING_SHARE:g} times gravity's"
         )
     if holding is not None and any(holding) and "holding_brake_Nm" not in mechanics:
         mechanics["holding_brake_Nm"] = list(holding)

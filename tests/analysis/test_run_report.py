@@ -15,6 +15,7 @@ import pytest
 from hand_made_run import A, M, like_an_old_log, make_run, record, record_truth, touched_run, without_cycles
 from parsed_page import Page
 
+from adacd_hil.lab.report import run_page
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.report_files import write_report, write_run_report
 from adacd_hil.lab.report.report_json import report_json
@@ -240,6 +241,12 @@ def test_the_heading_does_not_part_a_number_from_its_unit(html):
 def test_a_run_with_a_missed_contact_looks_bad_and_one_without_fault_good(html, tmp_path):
     good = write_run_report(make_run(), tmp_path, SOURCE).html_path.read_text(encoding="utf-8")
     assert ('<header class="bad">' in html, '<header class="good">' in good) == (True, True)
+
+
+def test_the_page_defines_free_of_contact_by_the_time_that_the_residuals_leave_out(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_page, "SETTLING_TIME_CONSTANTS", 20.0)
+    page = write_run_report(touched_run(), tmp_path, SOURCE).html_path.read_text(encoding="utf-8")
+    assert f"{20.0 / touched_run().a_rad_s:g} s (20/a)" in page
 
 
 def test_every_curve_of_the_plan_has_its_place_on_the_page(html):

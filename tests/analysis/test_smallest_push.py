@@ -85,7 +85,8 @@ def test_what_was_never_armed_says_nothing():
 def told(metrics):
     """Give what the page says of it."""
     push = push_table(metrics.evidence)
-    html = render("margins.html.j2", metrics=metrics, margins=None, push=push, counted=counted_sentence(metrics))
+    counted = counted_sentence(metrics)
+    html = render("margins.html.j2", metrics=metrics, margins=None, push=push, push_within="1 s", counted=counted)
     return " ".join(html.split())
 
 

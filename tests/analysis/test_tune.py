@@ -16,7 +16,7 @@ from called import called
 from adacd_hil.cli.embedded_run import Cast, run_embedded
 from adacd_hil.lab.score.rates import least_rate_per_h, rate_bound_per_h, share_bounds
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
-from adacd_hil.lab.tune import tune_roc
+from adacd_hil.lab.tune import tune_candidates, tune_roc
 from adacd_hil.lab.tune.tune import base_of, best_of, problems_of, suggested_toml, write_tuning
 from adacd_hil.lab.tune.tune_candidates import (
     ShownLog,
@@ -166,7 +166,7 @@ def test_candidates_change_filter_and_gain_within_what_a_configuration_can_have(
     assert {"certified.residual_Nm": "0.03651"} in certified, "a third of the gain"
 
 
-def test_thresholds_become_settings_that_are_never_lower():
+def test_thresholds_become_settings_that_are_never_lower(monkeypatch):
     def changed(name, *thresholds):
         return thresholds_as_changes(load_settings(name), np.array([thresholds]))
 
@@ -175,6 +175,8 @@ def test_thresholds_become_settings_that_are_never_lower():
     assert changed("certified", 2.0) == {"certified.noise_sigmas": "13.01", "certified.model_sigmas": "6.503"}
     assert set(changed("certified", 1e-3).values()) == {"1.0"}
     assert set(changed("certified", 1e3).values()) == {"50.0"}
+    monkeypatch.setattr(tune_candidates, "bounds_of", lambda section, name: (2.0, 30.0))
+    assert set(changed("certified", 1e3).values()) == {"30.0"}
 
 
 def hand_made_log(count=400):

@@ -5,9 +5,13 @@ import re
 
 from rig import Rig
 
-from adacd_hil.lab.cli.commtest_command import as_text, describe, write_page
+from adacd_hil.cli.connection import Connection
+from adacd_hil.lab.cli.commtest_command import as_text, describe, open_log, write_page
+from adacd_hil.lab.cli.log_command import find_dbc
 from adacd_hil.lab.commission.communication_test import CommunicationReport, CommunicationTest, ZeroTorqueLoop
 from adacd_hil.lab.score.report_wording import number_text
+from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.wire.codec import contract_folder, load_codec
 
 
 def played(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:
@@ -65,3 +69,9 @@ def test_a_test_without_a_cycle_has_no_pictures(tmp_path):
     rig = Rig(is_wall=True)
     report = CommunicationTest(rig.settings, rig.arm, 1_000_000).report()
     assert write_page(tmp_path, report, {}) == []
+
+
+def test_a_log_of_another_contract_is_decoded_by_that_contract(tmp_path):
+    codec = load_codec(contract_folder() / "arm_fd.dbc")
+    recorder = open_log(tmp_path, load_settings("fd", "P"), codec, Connection("", "", None, "fd", None, None), {})
+    assert find_dbc(recorder.close().path, None)[0] == codec.text

@@ -90,7 +90,7 @@ def test_options_that_are_missing_or_wrong_are_named_and_nothing_is_written(tmp_
 
 
 def test_guesses_are_listed_and_doctor_asks_for_each(out):
-    assert init(out, *NO_BUS, "--mass-kg", "1", "0.5", "--length-m", "0.4", "0.25").exit_code == 0
+    assert init(out, *NO_BUS, "--mass-kg", "1", "0.0005", "--length-m", "0.4", "0.25").exit_code == 0
     settings = written(out)
     assert settings.scheme == "certified"
     assert settings.arm.link_length_m == (0.4, 0.25)

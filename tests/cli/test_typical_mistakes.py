@@ -64,6 +64,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("run -i slcan -c tty1 --clock lockstep", USAGE, ("lockstep is for emulated arms", "it needs --clock realtime")),
     ("commtest -i udp_multicast -c 239.0.0.1", BUS_MISSING, ("echoes own frames",)),
     ("commtest -i virtual -c empty --seconds 0.1", BUS_MISSING, ("no boot-up from Drive1 (node 1)",)),
+    ("tare -i virtual -c empty --poses 51", USAGE, ("`tare.poses` = 51 is above 50",)),
     ("tare -i virtual -c empty --out new.toml", BUS_MISSING, ("no boot-up from Drive1 (node 1)",)),
     (f"{RUN} -b 1M", USAGE, ("'1M' is not a valid integer", "run --help")),
     ("init new.toml -i virtual -c x --yes", BUS_MISSING, ("drives that answer: none", "Check power, wiring and node")),

@@ -9,7 +9,7 @@ from excited_arm import FREE, NAMES, OFFSETS, PERIOD_S, TouchedLoop, added, kern
 from long_cases import long_but
 from planar_arm import THETA
 
-from adacd_hil.records import FaultReason, Request, SchemeState
+from adacd_hil.records import FRICTION_SPEEDS_RAD_S, FaultReason, Request, SchemeState
 from adacd_hil.scheme.identify import anchor, certificate, earlier, evidence, fit_check
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD, CertificateWatch
@@ -352,7 +352,7 @@ def test_what_is_kept_is_from_before_the_contact():
     said = m.evidence.value[evidence.KEPT : evidence.KEPT + kept + 1]
     a1 = of_steps[earlier.YOUNG_STEPS : steps, NAMES.index("a1")]
     np.testing.assert_array_equal(said[:kept, evidence.FRICTIONS], a1)
-    friction = said[-1, 0] - (THETA["P"][5] + evidence.SPEEDS_RAD_S[0] * THETA["P"][3])
+    friction = said[-1, 0] - (THETA["P"][5] + FRICTION_SPEEDS_RAD_S[0] * THETA["P"][3])
     assert abs(friction) < 0.02  # what it had come to at the contact, with nothing of the lean
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from excited_arm import NAMES, kernel_of
 
+from adacd_hil.records import FRICTION_AT, FRICTION_AT_RAD_S, FRICTION_SPEEDS_RAD_S, JOINTS
 from adacd_hil.scheme.identify import evidence
 from adacd_hil.scheme.identify.evidence import FRICTIONS, KEPT, LAST, OFFSETS, QUANTITIES, REFUSED, VISCOUS
 
@@ -75,7 +76,7 @@ def test_each_quantity_is_a_column_of_the_parameters():
     k, _ = kernel_of()
     theta = np.arange(1.0, len(NAMES) + 1.0)
     of = dict(zip(NAMES, theta, strict=True))
-    friction = [of[f"F_c{i}"] + v * of[f"F_v{i}"] for i in (1, 2) for v in evidence.SPEEDS_RAD_S]
+    friction = [of[f"F_c{i}"] + v * of[f"F_v{i}"] for i in (1, 2) for v in FRICTION_SPEEDS_RAD_S]
     others = ("a1", "a2", "a3", "offset1", "offset2", "F_v1", "F_v2")
     np.testing.assert_allclose(k.evidence.columns @ theta, [*friction, *(of[name] for name in others)])
     assert k.evidence.columns.shape[0] == QUANTITIES
@@ -85,3 +86,8 @@ def test_the_prior_s_part_of_a_variance_is_not_scaled():
     assert evidence.split(0.25, 0.25, 0.1) == pytest.approx(0.25)
     assert evidence.split(0.01, 1e9, 0.1) == pytest.approx(0.001)
     assert 0.001 < evidence.split(0.01, 0.02, 0.1) < 0.01
+
+
+def test_the_friction_that_people_are_shown_is_that_at_the_named_speed():
+    assert FRICTION_AT_RAD_S in FRICTION_SPEEDS_RAD_S
+    assert (FRICTION_SPEEDS_RAD_S * JOINTS)[FRICTION_AT] == (FRICTION_AT_RAD_S,) * JOINTS

@@ -9,7 +9,7 @@ from excited_arm import FREE, NAMES, TouchedLoop, added, kernel_of, learnt_s, st
 from long_cases import long_but
 from planar_arm import PAYLOAD_1KG, THETA
 
-from adacd_hil.records import Request, SchemeState
+from adacd_hil.records import FRICTION_SPEEDS_RAD_S, Request, SchemeState
 from adacd_hil.scheme.identify import certificate, evidence, fit_check
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD, THIS_RUN_ONLY
 
@@ -17,7 +17,7 @@ DATE = "2026-11-22T10:00:00Z"
 
 
 def friction_of(theta):
-    return [theta[5 + i] + v * theta[3 + i] for i in range(2) for v in evidence.SPEEDS_RAD_S]
+    return [theta[5 + i] + v * theta[3 + i] for i in range(2) for v in FRICTION_SPEEDS_RAD_S]
 
 
 def known(theta, settings=FREE):

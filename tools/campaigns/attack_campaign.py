@@ -34,11 +34,10 @@ from attacked_run import Finding, play_attack
 from attacks import ATTACKS, find_attack
 from campaign_loop import add_jobs, play_trials
 
-from adacd_hil.cli.output import format_table
+from adacd_hil.cli.output import ExitCode, format_table
 
 NOTHING = "nothing"
 """The run without an attacker, for comparison."""
-BUS_MISSING = 5
 HEAD = ("attack", "forged", "noticed ms", "rest after ms", "deg", "deg/s", "verdict", "end", "first line")
 
 
@@ -106,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("no attack has such a name")
     if chosen.vcan and not Path("/sys/class/net", chosen.vcan).exists():
         print(f"attack_campaign: there is no interface {chosen.vcan}; run it by tools/with-vcan", file=sys.stderr)
-        return BUS_MISSING
+        return ExitCode.BUS_MISSING
     if chosen.vcan:
         findings = list(play_vcan(names, chosen.vcan, chosen.period_us, chosen.keep))
     else:

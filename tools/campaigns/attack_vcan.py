@@ -21,7 +21,9 @@ from attacked_run import ATTACK_S, STOPS, Finding, expected_lines, finding, firs
 from attacks import ATTACKS, MS, AttackCase, Forger, Repeated, find_attack
 from side_by_side import BIN, ROOT, TimingError, emulator
 
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.types.topics import EVENTS, SCHEME, TRUTH
 from adacd_hil.settings.toml_files import to_toml
 
 START_S = 600.0
@@ -306,10 +308,10 @@ def _judge(
     case: AttackCase, folder: Path, begin_ns: int, forged: int, ended: str, status: int | None, second: str
 ) -> Finding:
     """Read host's log and emulator's truth, both by the wall clock."""
-    log = read_log(folder / "run.mcap", ("/scheme", "/events"))
+    log = read_log(folder / LOG_NAME, (SCHEME.name, EVENTS.name))
     events = [entry._replace(t_ns=entry.t_ns + log.epoch_ns) for entry in log.events]
     stops_ns = log.scheme.t_ns[np.isin(log.scheme["state"], STOPS)] + log.epoch_ns
-    truth = read_log(folder / "truth.mcap", ("/truth",)).truth
+    truth = read_log(folder / TRUTH_NAME, (TRUTH.name,)).truth
     if not len(truth):
         raise VoidError("the emulator has left no truth")
     noticed_ns, line = first_notice(events, begin_ns, expected_lines(case))

@@ -21,6 +21,7 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.reader import LoggedEvent, RunLog, read_log
+from adacd_hil.log.types.topics import EVENTS, SCHEME
 from adacd_hil.records import TRUTH_LAYOUT, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
@@ -258,7 +259,7 @@ def play_attack(case: AttackCase | None, folder: Path) -> tuple[Finding, RunLog]
     summary = session.run()
     wire.close()
     clock.sleep_until_ns(clock.now_ns() + round(AFTER_S * 1e9))
-    log = read_log(summary.log.path, ("/scheme", "/events"))
+    log = read_log(summary.log.path, (SCHEME.name, EVENTS.name))
     return judge(case, wire, bench, log, summary), log
 
 

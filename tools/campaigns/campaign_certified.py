@@ -9,12 +9,11 @@ from played_record import play_record
 
 from adacd_hil.control.motions import Excitation
 from adacd_hil.records import JOINTS, SchemeState
+from adacd_hil.scheme.detect.external_torque import WIDE_SAMPLES
+from adacd_hil.scheme.model.filter_bank import WIDE
 from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
 from adacd_hil.settings.configuration import Settings
 
-WIDE_FILTER = 1
-"""Filter of the bank that is undone for the external torque, as in contact reports."""
-WIDE_SAMPLES = 5
 _PHASES = {int(SchemeState.CERTIFY): TESTING, int(SchemeState.MONITOR): ARMED}
 
 
@@ -54,7 +53,7 @@ class CertifiedScheme:
             cycles = np.flatnonzero(phase[begin:end] == ARMED)
             armed.append(begin + int(cycles[0]) if cycles.size else -1)
         over = played.observation.astype(np.int64) >> CONTACT_SHIFT
-        wide = self._undo(y[:, WIDE_FILTER], settings.certified.cutoffs_rad_s[WIDE_FILTER])
+        wide = self._undo(y[:, WIDE], settings.certified.cutoffs_rad_s[WIDE])
         most = np.argmax(np.abs(y) / h, axis=1)[:, np.newaxis]
         direction = np.sign(np.take_along_axis(y, most, axis=1)[:, 0])
         return Outcome(phase, over, y[:, 0], wide, h[:, 0], direction, tuple(armed), played.theta[np.maximum(armed, 0)])

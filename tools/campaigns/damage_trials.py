@@ -21,7 +21,7 @@ import recorded_run
 
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.recover import recover
-from adacd_hil.log.log_files import PART_KEY, LogError
+from adacd_hil.log.log_files import LOG_NAME, PART_KEY, LogError
 
 KINDS = ("cut", "flip", "flips", "zeros", "cut and flip")
 CYCLES = 400
@@ -142,7 +142,7 @@ def run_trial(whole: Undamaged, seed: int, folder: Path) -> DamageResult:
     """Damage a log, check it, recover it, judge the result."""
     data, kind, places = damage(whole, seed)
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "run.mcap"
+    path = folder / LOG_NAME
     path.write_bytes(data)
     violations: list[str] = []
     has_found = check_log(path).errors > 0

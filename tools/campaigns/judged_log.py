@@ -9,7 +9,9 @@ import numpy as np
 from wire_record import Passed, WireRecord
 from witnessed_run import Played, Truth
 
+from adacd_hil.log.log_files import DBC_NAME
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.types.topics import TRUTH
 from adacd_hil.settings.configuration import Settings
 from firmware_sim.scenario.scenario import Scenario
 
@@ -29,8 +31,8 @@ def judged_log(log_path: Path, truth_path: Path, settings: Settings, scenario: S
             frames["data"][is_frame], frames["length"][is_frame], strict=True,
         )
     ]  # fmt: skip
-    wire = WireRecord(log.attachments["arm.dbc"], passed)
-    truth = read_log(truth_path, ("/truth",)).truth
+    wire = WireRecord(log.attachments[DBC_NAME], passed)
+    truth = read_log(truth_path, (TRUTH.name,)).truth
     sync_wall_ns = wire.sync_t_ns + log.epoch_ns
     sync = np.searchsorted(sync_wall_ns, truth.t_ns + settings.bus.period_ns // 4, side="right") - 1
     return Played(

@@ -19,8 +19,9 @@ from damage_trials import messages_of
 
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.recover import recover
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.types.topics import CONTROL, CYCLE, JOINT_STATES, SCHEME
 
 VICTIMS = ("writer", "control", "both")
 LOSS_BOUND_S = 0.3
@@ -66,7 +67,7 @@ def _attempt(seed: int, folder: Path) -> KillResult:
     command = [sys.executable, "-c", _DEMO, "demo", "--clock", "realtime", "--out", str(folder)]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        path = folder / "run.mcap"
+        path = folder / LOG_NAME
         try:
             writer = _wait_for_cycles(process, path)
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -77,7 +78,7 @@ def _attempt(seed: int, folder: Path) -> KillResult:
             _wait_for_end(writer)
         finally:
             process.kill()
-    return _judge(seed, victim, path, _last_cycle_ns(folder / "truth.mcap", killed_ns))
+    return _judge(seed, victim, path, _last_cycle_ns(folder / TRUTH_NAME, killed_ns))
 
 
 def _kill(victim: str, control: int, writer: int) -> None:
@@ -107,7 +108,7 @@ def _wait_for_cycles(process: "subprocess.Popen[bytes]", path: Path) -> int:
         if process.poll() is not None:
             raise RunEndedError(f"the run ended by itself, exit status {process.returncode}")
         time.sleep(0.1)  # another process writes the file: there is nothing else to wait on
-        if path.exists() and len(read_log(path, ("/cycle",)).cycle):
+        if path.exists() and len(read_log(path, (CYCLE.name,)).cycle):
             return _writer_of(process.pid, path)
     raise RunEndedError(f"no cycle within {START_S:g} s")
 
@@ -153,7 +154,7 @@ def _judge(seed: int, victim: str, path: Path, last_ns: int) -> KillResult:
     skipped = int(log.cycle["overruns"][-1] - log.cycle["overruns"][0])  # by a host that was late
     if missing != skipped:
         violations.append(f"{missing} cycles are missing in between, of which the host skipped {skipped}")
-    topics = {name: len(log.topics[name]) for name in ("/scheme", "/control", "/joint_states")}
+    topics = {name: len(log.topics[name]) for name in (SCHEME.name, CONTROL.name, JOINT_STATES.name)}
     if any(abs(count - len(cycle)) > 1 for count in topics.values()):
         violations.append(f"{len(cycle)} cycles, but {topics}")
     lost_s = max(0, last_ns - int(log.cycle.t_ns[-1])) * 1e-9

@@ -13,6 +13,7 @@ from adacd_hil.control.history_file import HISTORY_FORMAT, CertificateRecord, Hi
 from adacd_hil.lab.logs.cut import TimeWindow, cut
 from adacd_hil.lab.logs.python_can_files import to_messages
 from adacd_hil.log.frames.frame_log import read_frames
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.toml_files import to_toml
@@ -148,14 +149,14 @@ def make_seeds(folder: Path, is_light: bool) -> Seeds:
     )
     run_embedded(resolve("certified", str(played), None, 1), "lockstep", folder / "run")
     short = folder / "short.mcap"
-    cut(folder / "run" / "run.mcap", short, TimeWindow(0.0, 0.5), ())
+    cut(folder / "run" / LOG_NAME, short, TimeWindow(0.0, 0.5), ())
     files = {
         "toml": _texts(folder, "config", MY_ARM, to_toml(load_settings("certified")), to_toml(load_settings("paper"))),
         "scenario": [scenario, *_scenarios()],
         "profile": sorted(PROFILES.glob("*drive*.toml")),
         "dbc": sorted(contract_folder().glob("*.dbc")),
         "eds": [contract_folder() / "drive.eds"],
-        "mcap": [short] if is_light else [short, short, folder / "run" / "run.mcap", folder / "run" / "truth.mcap"],
+        "mcap": [short] if is_light else [short, short, folder / "run" / LOG_NAME, folder / "run" / TRUTH_NAME],
         "csv": [_foreign_csv(folder / "foreign.csv")],
         "map": [EXAMPLE / "map.toml"],
         "urdf": [EXAMPLE / "planar-arm.urdf"],

@@ -12,7 +12,7 @@ from typing import Any
 
 from witnessed_run import User
 
-from adacd_hil.records import Request
+from adacd_hil.records import QUINTIC_PEAK_SPEED, Request
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
@@ -193,7 +193,7 @@ def _draw_start(draws: random.Random, settings: Settings) -> list[float]:
 def _approach_s(settings: Settings, start_deg: list[float]) -> float:
     """Estimate how long the arm takes to the start corner: a quintic with the approach's peak speed."""
     way_deg = max(abs(a + b) for a, b in zip(start_deg, settings.trajectory.amplitude_deg, strict=True))
-    return 1.875 * way_deg / settings.trajectory.approach_deg_s
+    return QUINTIC_PEAK_SPEED * way_deg / settings.trajectory.approach_deg_s
 
 
 def _draw_touches(

@@ -31,6 +31,7 @@ from witness import Seen, read_witness, times_after, witness
 
 from adacd_hil.log.log_files import LOG_NAME, LogError
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.types.topics import CYCLE
 
 SYNC_ID, FEEDBACK_ID, LAST_COMMAND_ID, STATUS_ID = 0x080, 0x181, 0x202, 0x281
 POSITION_RAD = 2.0 * np.pi / 2**20
@@ -186,7 +187,7 @@ def run_disk_case(case: str, chosen: argparse.Namespace, folder: Path) -> dict[s
 def log_problem(path: Path) -> str:
     """Say what is wrong with a log; empty for a whole one."""
     try:
-        log = read_log(path, ("/cycle",))
+        log = read_log(path, (CYCLE.name,))
     except LogError as error:
         return str(error)
     return log.problem

@@ -31,6 +31,7 @@ from timing_hour import write_contacts
 
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME
 from adacd_hil.log.reader import Series, read_log
+from adacd_hil.log.types.topics import CYCLE
 from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration_files import load_settings
 from firmware_sim.scenario.scenario import load_scenario
@@ -110,7 +111,7 @@ def describe(folder: Path, config: Path, scenario_path: Path) -> dict[str, Any]:
     case = Case(played)
     if case.log is None:
         raise TimingError("the host's log has no cycle")
-    cycle = read_log(log_path, ("/cycle",)).cycle
+    cycle = read_log(log_path, (CYCLE.name,)).cycle
     violations = judge(played)
     if not case.log.is_complete:  # where packets are missing, so are frames
         known = outside_gaps(

@@ -27,6 +27,7 @@ from witness import Seen, read_witness, witness
 
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.types.topics import CYCLE, EVENTS
 
 FIRST_COMMAND_ID = 0x201
 MEMORY_EVERY_S = 10.0
@@ -112,7 +113,7 @@ def reaction_times(path: Path, seen: Seen) -> dict[str, Any]:
     compute: feedback read to commands handed over, by the host's clock, in the cycles that decide to react. wire:
     feedback read to the kernel's stamp of the first command after it. Raises LogError, TimingError.
     """
-    log = read_log(path, ("/cycle", "/events"))
+    log = read_log(path, (CYCLE.name, EVENTS.name))
     _, times_ns, rest = read_cycles(log)
     t_ns = log.cycle.t_ns
     compute_ns, wire_ns = [], []

@@ -23,10 +23,12 @@ import numpy as np
 from kill_trials import LOSS_BOUND_S
 from side_by_side import BIN, CHANNEL, TimingError, host_run, patient_config, running, wait_for
 
+from adacd_hil.cli.output import ExitCode
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.log.reader import read_log
+from adacd_hil.log.types.topics import TRUTH
 from adacd_hil.records import SchemeState
 
 VICTIMS = ("host", "logger", "emulator", "host and logger", "host and emulator")
@@ -48,8 +50,6 @@ WATCHED_S = 2.0
 REST_S = 1.0
 """A drive brakes for a second at the most."""
 STILL_RAD_S = 0.02
-STOPPED_BY_FAULT = 4
-NOT_COMPLETE = 3
 ATTEMPTS = 3
 
 
@@ -189,7 +189,7 @@ def _judge(result: VcanKill, folder: Path, killed_ns: int) -> None:
     result.violations += [f"{text}; it says {result.said or 'nothing'}" for text in told]
     if "emulator" not in result.victim:
         result.violations += drive_violations(result.drives)
-        truth = read_log(folder / TRUTH_NAME, ("/truth",)).truth
+        truth = read_log(folder / TRUTH_NAME, (TRUTH.name,)).truth
         result.rest_s = rest_s(truth.t_ns, truth["dq"], killed_ns)
         if result.victim.startswith("host") and (result.rest_s is None or result.rest_s > REST_S):
             result.violations.append("the truth does not show the arm at rest")
@@ -198,11 +198,11 @@ def _judge(result: VcanKill, folder: Path, killed_ns: int) -> None:
 def status_violations(victim: str, status: int | None, messages: Sequence[str]) -> list[str]:
     """Say what is wrong with the end of a host that was not the victim itself."""
     if victim == "emulator":
-        if status != STOPPED_BY_FAULT:
-            return [f"the arm has gone, and the host ended with status {status}, {STOPPED_BY_FAULT} expected"]
+        if status != ExitCode.SAFETY_STOP:
+            return [f"the arm has gone, and the host ended with status {status}, {ExitCode.SAFETY_STOP} expected"]
         return [] if any("FAULT" in text or "Drive1" in text for text in messages) else ["nobody says what has gone"]
-    if victim == "logger" and status != NOT_COMPLETE:
-        return [f"the log was cut, and the host ended with status {status}, {NOT_COMPLETE} expected"]
+    if victim == "logger" and status != ExitCode.PARTIAL:
+        return [f"the log was cut, and the host ended with status {status}, {ExitCode.PARTIAL} expected"]
     return []
 
 

@@ -23,6 +23,7 @@ from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
+from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, SCHEME
 from adacd_hil.records import TRUTH_LAYOUT, Request, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.embedded_bus import EmbeddedBus
@@ -243,7 +244,9 @@ def play_witnessed(settings: Settings, scenario: Scenario, folder: Path, user: U
         scenario=scenario,
         wire=WireRecord(codec.text, bus.passed),
         truth=Truth(np.array(syncs, np.int64), np.array(blocks).reshape(len(blocks), TRUTH_LAYOUT.size)),
-        log=read_log(path, ("/scheme", "/control", "/contact", "/events", "/cycle")) if path.exists() else None,
+        log=read_log(path, [topic.name for topic in (SCHEME, CONTROL, CONTACT, EVENTS, CYCLE)])
+        if path.exists()
+        else None,
         summary=summary,
         crash=crash,
         overdue=overdue,

@@ -46,7 +46,7 @@ from adacd_hil.lab.serial_arm.urdf import UrdfError
 from adacd_hil.log.recording.run_folder import is_there
 from adacd_hil.printable import in_line
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.schema import ConfigError, bounds_of, parse
 from adacd_hil.settings.setting_keys import known_keys
 from adacd_hil.wire.can_interface import can_interfaces, read_link
 from adacd_hil.wire.open_bus import open_bus
@@ -728,9 +728,10 @@ def _masses(value: Any) -> Pair | None:
     if value == "-":
         return None
     masses = _numbers(value, float, "--mass-kg")
+    low, high = bounds_of(ArmSettings, "mass_kg")
     for mass in masses:
-        if not 0.001 <= mass <= 1000.0:
-            raise ConfigError(f"--mass-kg: {mass:g} kg must be within 0.001 kg to 1000 kg")
+        if not low <= mass <= high:
+            raise ConfigError(f"--mass-kg: {mass:g} kg must be within {low:g} kg to {high:g} kg")
     return masses
 
 

@@ -14,6 +14,7 @@ from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_replacement import replace_files
 from adacd_hil.lab.commission.communication_test import (
+    GOOD_SHARE,
     CommunicationReport,
     CommunicationTest,
     Verdict,
@@ -24,7 +25,7 @@ from adacd_hil.lab.score.evaluation import collect_evidence
 from adacd_hil.lab.score.histogram import bar_chart, doubling_bins
 from adacd_hil.lab.score.metrics import TimingEvidence
 from adacd_hil.lab.score.run_arrays import QUANTITIES
-from adacd_hil.log.log_files import LAYOUT_NAME, failing_as
+from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, failing_as
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.log.types.topics import ChannelId, pack_cycle
@@ -77,7 +78,7 @@ def run_commtest(
         loop = ZeroTorqueLoop(settings, tap, clock, arm, master, is_enabling)
         achieved = {**grant.describe(), **prepare_spin(loop.pacer, settings, clock, grant)}
         with grant.unpinned():
-            recorder = None if out is None else _open_log(out, settings, codec, connection, achieved)
+            recorder = None if out is None else open_log(out, settings, codec, connection, achieved)
         log_error = ""
         try:
             if recorder is not None:
@@ -132,16 +133,15 @@ def _exit_code(report: CommunicationReport, fault: FaultReason, is_interrupted: 
     return ExitCode.PARTIAL if code is ExitCode.OK and has_lost_log else code
 
 
-def _open_log(
-    out: Path, settings: Settings, codec: Codec, connection: Connection, achieved: dict[str, str]
-) -> Recorder:
+def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection, achieved: dict[str, str]) -> Recorder:
+    """Open the log of a test in the folder `out`, with the contract and the settings attached. Raises LogError."""
     out.mkdir(parents=True, exist_ok=True)
     return Recorder(
         out / LOG_NAME,
         messages=codec.messages.values(),
         attachments={
-            codec.path.name: codec.text,
-            "config.toml": to_toml(settings).encode(),
+            DBC_NAME: codec.text,
+            CONFIG_NAME: to_toml(settings).encode(),
             LAYOUT_NAME: viewer_layout(),
         },
         metadata={
@@ -287,5 +287,7 @@ def _findings(described: dict[str, Any]) -> list[str]:
         lines.append(f"log: {described['log']}" + (f" ({described['log_error']})" if described["log_error"] else ""))
     lines += [f"pictures: {path}" for path in described.get("pictures", ())[:1]]
     verdict, share = described["verdict"], 100.0 * described["share"]
-    lines.append(f"{verdict}: {share:.2f} % of the periods brought complete fresh data (good from 95 %)")
+    lines.append(
+        f"{verdict}: {share:.2f} % of the periods brought complete fresh data (good from {100.0 * GOOD_SHARE:g} %)"
+    )
     return lines

@@ -58,7 +58,7 @@ def play(
                 raise
             what = f"{_ending(summary)}; nor can the report be written: {error_text(error)}"
             raise CommandError(what, status) from None
-        progress(f"report: {folder.path / 'report.html'}")
+        progress(f"report: {report.html_path}")
     if summary.error:
         raise CommandError(summary.error, exit_code(summary))
     return report, exit_code(summary)

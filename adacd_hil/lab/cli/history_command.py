@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from adacd_hil.control.history_file import History
 
 _PNG = b"\x89PNG\r\n\x1a\n"
-_MIDDLE = slice(1, None, 3)
-"""Index of the friction at 0.6 rad/s among that at 0.2, 0.6, 1.2 rad/s, joint by joint."""
 
 
 @click.command(epilog=EPILOG)
@@ -46,6 +44,7 @@ def _as_png(found: "History") -> bytes:
     import numpy as np
 
     from adacd_hil.lab.drawing import HistoryPanel, history_figure
+    from adacd_hil.records import FRICTION_AT, FRICTION_AT_RAD_S
 
     shown = found.certificates
     joints = tuple(f"joint {number}" for number in range(1, len(found.last.offset_Nm) + 1))
@@ -54,9 +53,9 @@ def _as_png(found: "History") -> bytes:
         found, deviations = (np.array([getattr(each, name) for each in shown]) for name in (values, std))
         return HistoryPanel(title, names, found, deviations)
 
-    friction = panel("Friction at 0.6 rad/s, Nm", joints, "friction_Nm", "friction_std_Nm")
+    friction = panel(f"Friction at {FRICTION_AT_RAD_S:g} rad/s, Nm", joints, "friction_Nm", "friction_std_Nm")
     panels = (
-        friction._replace(values=friction.values[:, _MIDDLE], std=friction.std[:, _MIDDLE]),
+        friction._replace(values=friction.values[:, FRICTION_AT], std=friction.std[:, FRICTION_AT]),
         panel("Inertia, kg m²", ("a1", "a2", "a3"), "inertia_kgm2", "inertia_std_kgm2"),
         panel("Torque offset, Nm", joints, "offset_Nm", "offset_std_Nm"),
     )
@@ -64,6 +63,8 @@ def _as_png(found: "History") -> bytes:
 
 
 def _as_text(found: "History") -> str:
+    from adacd_hil.records import FRICTION_AT, FRICTION_AT_RAD_S
+
     devices = ", ".join(f"{device.name} {device.serial}" for device in found.devices)
     head = ("certified", "F1 Nm", "F2 Nm", "a1 kg m²", "a2 kg m²", "a3 kg m²", "offset Nm", "payload", "known by")
     rows = []
@@ -71,7 +72,7 @@ def _as_text(found: "History") -> str:
         rows.append(
             [
                 certificate.date_utc,
-                *(f"{value:.3f}" for value in certificate.friction_Nm[_MIDDLE]),
+                *(f"{value:.3f}" for value in certificate.friction_Nm[FRICTION_AT]),
                 *(f"{value:.4f}" for value in certificate.inertia_kgm2),
                 ", ".join(f"{value:.3f}" for value in certificate.offset_Nm),
                 "yes" if certificate.is_payload else "",
@@ -79,4 +80,4 @@ def _as_text(found: "History") -> str:
             ]
         )
     table = format_table(head, rows, right=(1, 2, 3, 4, 5))
-    return f"{in_line(f'devices by serial number: {devices}')}\nfriction F at 0.6 rad/s\n{table}"
+    return f"{in_line(f'devices by serial number: {devices}')}\nfriction F at {FRICTION_AT_RAD_S:g} rad/s\n{table}"

@@ -11,6 +11,7 @@ from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quoted, show, suggest
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.lab.cli.interview import Interview
+from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line
 
@@ -130,7 +131,7 @@ def next_of_init(file: str, bus: dict[str, Any] | None) -> tuple[str, ...]:
 
     bus = bus or {"interface": "socketcan", "channel": "can0", "bitrate": None}
     arm = Connection(bus["interface"], bus["channel"], bus["bitrate"], file, None, None).arguments
-    tare = quoted(Path(file).with_name("tare.toml"))
+    tare = quoted(Path(file).with_name(TARE_NAME))
     return (
         f"adacd-hil demo --config {quoted(Path(file))}   # rehearse",
         f"adacd-hil doctor {arm}",

@@ -30,6 +30,7 @@ from adacd_hil.lab.cli.play_command import play
 from adacd_hil.lab.cli.runs_command import runs, trend
 from adacd_hil.lab.cli.sweep_command import sweep
 from adacd_hil.lab.cli.tune_command import tune
+from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.settings.toml_files import to_toml
 
 if TYPE_CHECKING:
@@ -88,10 +89,10 @@ def demo(
 
 @click.command(epilog=EPILOG)
 @on_bus
-@click.option("--poses", type=click.IntRange(1, 50), help="Poses to measure in; default: tare.poses.")
-@click.option("--seconds", type=click.FloatRange(0.1, 600.0), help="Measured time per pose; default: tare.window_s.")
+@click.option("--poses", type=int, help="Poses to measure in; default: tare.poses.")
+@click.option("--seconds", type=float, help="Measured time per pose; default: tare.window_s.")
 @click.option("--auto-zero", is_flag=True, help="Let the sensors set their own zero (0x6125) before.")
-@click.option("--out", type=WrittenPath(dir_okay=False), default=Path("tare.toml"), show_default=True)
+@click.option("--out", type=WrittenPath(dir_okay=False), default=Path(TARE_NAME), show_default=True)
 @clock_option(default="realtime")
 @json_option
 def tare(

@@ -17,6 +17,7 @@ from adacd_hil.lab.cli.monitor_command import Screen
 from adacd_hil.lab.live.client import LiveClient, LiveMessage, live_client
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.message_types import unpack_log
+from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, SCHEME
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import one_line
 from adacd_hil.records import (
@@ -32,7 +33,7 @@ from adacd_hil.records import (
 )
 from adacd_hil.terminal import fold, moves_cursor, terminal_columns, write_screen
 
-TOPICS = ("/scheme", "/cycle", "/contact", "/events")
+TOPICS = (SCHEME.name, CYCLE.name, CONTACT.name, EVENTS.name)
 _BAR_WIDTH = 40
 _EVENTS, _CONTACTS = 8, 5
 
@@ -61,12 +62,12 @@ class LiveMonitor:
         self._log_ns = max(self._log_ns, message.log_ns)
         self._begin_ns = message.log_ns if self._begin_ns is None else self._begin_ns
         t_s = round((message.log_ns - self._begin_ns) * 1e-9, 3)
-        if message.topic == "/events":
+        if message.topic == EVENTS.name:
             event = unpack_log(message.payload)
             self._events.append({"t_s": t_s, **event._asdict()})
-        elif message.topic == "/contact":
+        elif message.topic == CONTACT.name:
             self._contacts.append({"t_s": t_s, **_describe_contact(self._client.decode(message))})
-        elif message.topic == "/scheme":
+        elif message.topic == SCHEME.name:
             self._scheme = self._client.decode(message)
         else:
             self._cycle = self._client.decode(message)
@@ -181,7 +182,7 @@ def _decoding() -> Iterator[None]:
 def as_text(described: dict[str, Any], is_cut: bool = False) -> str:
     """Return the values of `describe` as text for people; is_cut: a line for each event, cut to the terminal."""
     if "state" not in described:
-        return f"{described['messages']} messages, none of /scheme"
+        return f"{described['messages']} messages, none of {SCHEME.name}"
     fault = "" if described["fault"] == FaultReason.NONE.name else f" by {described['fault']}"
     head = f"{described['state']}{fault}, cycle {described['cycle']}, {described['t_s']:.1f} s watched"
     if timing := described.get("timing"):

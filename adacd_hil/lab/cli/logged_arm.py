@@ -11,7 +11,7 @@ from adacd_hil.file_access import exists
 from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
 from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.lab.commission.arm_draft import ArmDraft, Entry, draft_as_toml
-from adacd_hil.log.log_files import log_in
+from adacd_hil.log.log_files import CONFIG_NAME, log_in
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.settings.configuration import Settings
@@ -46,8 +46,8 @@ def draft_from_log(
         option = f"--{further[0].removeprefix('is_').replace('_', '-')}"
         raise CommandError(f"--from takes the arm from the log: leave out {option}", ExitCode.USAGE)
     path = log_in(log)
-    text = attachment(path, "config.toml")
-    settings = settings_of(path, {} if text is None else {"config.toml": text})
+    text = attachment(path, CONFIG_NAME)
+    settings = settings_of(path, {} if text is None else {CONFIG_NAME: text})
     base = "certified" if settings.scheme == "certified" else "paper"
     warnings: list[str] = []
     entries = _differences(settings, base, path, warnings)

@@ -222,10 +222,12 @@ def _run(
 
 def _as_text(described: dict[str, Any]) -> str:
     """Format the result for people."""
+    from adacd_hil.lab.logs.playback import LATE_NS
+
     late = described["lateness_us"]
     lines = [
         f"{described['frames']} frames sent, late by p50 {late['p50']} µs, p99 {late['p99']} µs, max {late['max']} µs; "
-        f"{described['late_by_1_ms']} by more than 1 ms"
+        f"{described['late_by_1_ms']} by more than {1e-6 * LATE_NS:g} ms"
     ]
     if described["withheld"]:
         lines.append(

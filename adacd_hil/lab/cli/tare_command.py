@@ -1,6 +1,5 @@
 """A tare on a bus: opens it, runs a tare session, stores its result."""
 
-import dataclasses
 import signal
 from contextlib import closing
 from pathlib import Path
@@ -17,6 +16,7 @@ from adacd_hil.lab.commission.tare_session import TareSession
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.setting_keys import apply_settings
 
 
 def as_text(tare: Tare, path: Path, backup: Path | None) -> str:
@@ -81,7 +81,6 @@ def tare_on_bus(
 
 
 def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:
-    """Return the settings with number of poses and time per pose replaced, unless None."""
-    tare = settings.tare
-    tare = dataclasses.replace(tare, poses=poses or tare.poses, window_s=seconds or tare.window_s)
-    return dataclasses.replace(settings, tare=tare)
+    """Return the settings with number of poses and time per pose replaced, unless None. Raises ConfigError."""
+    given = {"tare.poses": poses, "tare.window_s": seconds}
+    return apply_settings(settings, {key: repr(value) for key, value in given.items() if value is not None})

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from adacd_hil.cli.output import format_table
+from adacd_hil.lab.score.rates import CONFIDENCE_TEXT
 from adacd_hil.lab.thresholds.detector_comparison import Comparison, compare_detectors
 from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
 from adacd_hil.log.log_files import WHOLE, TimeWindow, log_in
@@ -66,7 +67,7 @@ def as_text(thresholds: Thresholds, comparison: Comparison | None) -> str:
         )
         for row in thresholds.detectors
     ]
-    head = ("detector", "95 % bound, 1/h", "to be sure", "held out: predicted, 1/h", "measured, 1/h")
+    head = ("detector", f"{CONFIDENCE_TEXT} bound, 1/h", "to be sure", "held out: predicted, 1/h", "measured, 1/h")
     lines += ["", format_table(head, checks, (1, 2, 3, 4))]
     if thresholds.missing:
         lines += ["", f"Too little motion for: {', '.join(thresholds.missing)}"]

@@ -99,13 +99,15 @@ def _next(log_path: Path, found: "Tuning", out: Path | None) -> tuple[str, ...]:
 
 
 def _as_text(found: "Tuning") -> str:
+    from adacd_hil.lab.score.rates import CONFIDENCE_TEXT
     from adacd_hil.lab.tune.tune import in_words
     from adacd_hil.lab.tune.tune_roc import LIMITS, free_hours
 
     hours = sum(map(free_hours, found.logs))
     lines = [f"{found.rate_per_h:g} false alarms per hour wanted; {hours:.4f} h of contact-free motion", ""]
     if found.detectors:
-        head = ("detector", "found", "95 %", "median ms", "p90 ms", "max ms", "alarms", "95 % bound, 1/h", "thresholds")
+        rate = f"{CONFIDENCE_TEXT} bound, 1/h"
+        head = ("detector", "found", CONFIDENCE_TEXT, "median ms", "p90 ms", "max ms", "alarms", rate, "thresholds")
         rows = [
             (choice.name, *_cells(choice.checked), "largest seen" if choice.calibration is None else choice.method)
             for choice in found.detectors

@@ -27,7 +27,8 @@ from adacd_hil.printable import one_line
 from adacd_hil.records import GRAVITY_M_S2, JOINTS, Vector
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.run_settings import SafetySettings, TrajectorySettings
+from adacd_hil.settings.schema import ConfigError, bounds_of, parse
 from adacd_hil.settings.setting_keys import known_keys
 from adacd_hil.settings.toml_files import toml_value
 
@@ -295,14 +296,15 @@ def _short(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-_MODEL_INERTIA = (0.1786065, 0.0189645)
-"""a1 and a3 of P's CAD model, kg m², for which the gains below were measured."""
-_KP, _KD = (250.0, 20.0), (12.5, 0.75)
-_MODEL_TORQUE_NM = (12.0, 6.0)
-_RATE_PER_NM = 1000.0 / 6.0
+_MODEL = load_settings("certified", "P")
+_MODEL_INERTIA = _MODEL.arm.cad_theta[0], _MODEL.arm.cad_theta[2]
+"""a1 and a3 of P's CAD model, kg m², for which its gains were measured."""
+_KP, _KD = _MODEL.controller.Kp, _MODEL.controller.Kd
+_MODEL_TORQUE_NM = _MODEL.arm.rated_torque_Nm
+_RATE_PER_NM = _MODEL.arm.torque_rate_limit_Nm_s[1] / _MODEL_TORQUE_NM[1]
 """Torque rate limit per rated torque, 1/s."""
-_AMPLITUDE_DEG, _HALF_PERIOD_S, _EXCITATION_S = (30.0, 60.0), (1.125, 4.5), 2.4
-_MOST_HALF_PERIOD_S = 60.0
+_AMPLITUDE_DEG, _HALF_PERIOD_S = _MODEL.trajectory.amplitude_deg, _MODEL.trajectory.half_period_s
+_MOST_HALF_PERIOD_S = bounds_of(TrajectorySettings, "half_period_s")[1]
 _MOST_SLOWER = _MOST_HALF_PERIOD_S / max(_HALF_PERIOD_S)
 """Largest slowdown of the motion; beyond it the amplitude shrinks, by steps of this factor."""
 _SHORTER = 0.95
@@ -310,7 +312,7 @@ _UPRIGHT_DEG, _LEAST_UPRIGHT_DEG = (60.0, 60.0), 45.0
 """For an arm that is level at q1 = 0: amplitude, and joint 1's amplitude below which gravity looks like an offset."""
 _LEVEL = math.sin(math.radians(45.0))
 """|sin| of the q1 at which link 1 hangs, from which gravity hardly changes about q1 = 0, as an offset does not."""
-_PEAK_DEG_S = (100.0, 120.0)
+_PEAK_DEG_S = _MODEL.reaction.velocity_limit_deg_s
 """Peak speed of the certified scheme's excitation at those amplitudes and that period, and of a withdrawal."""
 _FULL_ACCELERATION = 1.02
 """Factor on its peak acceleration for a withdrawal's limit; two percent allow for rounding."""
@@ -324,8 +326,7 @@ _HEAVY_INERTIA = 20.0
 """Inertia, against P, up to which a fit is as well conditioned; measured on 8 kg links."""
 _OFFSET, _LAG = 4, 5
 """Index of torque offsets, and of lags (not torques), among the kinds of parameters."""
-_MOST_REST_NM = 100.0
-"""Bound of `safety.rest_torque_Nm`."""
+_MOST_REST_NM = bounds_of(SafetySettings, "rest_torque_Nm")[1]
 _LEAST_TORQUE_SHARE = 0.3
 """Share of the torque that gravity must leave."""
 
@@ -468,7 +469,7 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
     half_period = tuple(_round(slower * period_s) for period_s in _HALF_PERIOD_S)
     reason = "as of the emulated arm" if slower == 1.0 else f"{slower:.2f} times slower than the emulated arm"
     yield Entry("trajectory.half_period_s", half_period, reason)
-    yield Entry("excitation.period_s", _round(slower * _EXCITATION_S), reason)
+    yield Entry("excitation.period_s", _round(slower * _MODEL.excitation.period_s), reason)
     withdrawal = tuple(_round(min(_PEAK_DEG_S[i], max(_SPEED_SHARE * speed[i], 1.0))) for i in range(JOINTS))
     if withdrawal != _PEAK_DEG_S:
         yield Entry("reaction.velocity_limit_deg_s", withdrawal, f"{_SPEED_SHARE:.0%} of the velocity limit")

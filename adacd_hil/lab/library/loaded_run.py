@@ -14,6 +14,7 @@ from adacd_hil.lab.score.metrics import certificates_in
 from adacd_hil.log.log_files import LogError, log_in
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.log.reader import RunLog, each_once, read_log
+from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, SCHEME
 from adacd_hil.records import ContactReport, SchemeState, Vector
 from adacd_hil.remedies import install_command, nearest_name
 from adacd_hil.score.wording import number_of
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
 
     from adacd_hil.scheme.identify.certificate import Certificate
 
-_TOPICS: Final = ("/scheme", "/control", "/cycle")
+_TOPICS: Final = (SCHEME.name, CONTROL.name, CYCLE.name)
 """Topics with a record per cycle."""
-_READ: Final = (*_TOPICS, "/contact", "/events")
+_READ: Final = (*_TOPICS, CONTACT.name, EVENTS.name)
 
 
 class RunEvent(NamedTuple):

@@ -15,6 +15,7 @@ from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import CUT, RUN_METADATA, LogError, TimeWindow
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.reader import begin_of_log, each_once, read_log
+from adacd_hil.log.types.topics import CONTACT
 
 
 def default_out(path: Path) -> Path:
@@ -27,7 +28,7 @@ def find_contact(path: Path, contact: int, around_s: float) -> TimeWindow:
 
     contact: its number, from 1.
     """
-    log = read_log(path, ("/contact",))
+    log = read_log(path, (CONTACT.name,))
     begun = each_once(log.contacts)
     if not 1 <= contact <= len(begun):
         raise LogError(f"log {path} has {len(begun)} contacts: there is no contact {contact}")

@@ -15,7 +15,7 @@ from adacd_hil.log.log_files import (
     RUN_METADATA,
     SUMMARY_METADATA,
 )
-from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS, LIBRARY
+from adacd_hil.log.mcap.chunked_file import CHUNK_BYTES, FLUSH_PERIOD_NS, LIBRARY
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
     END_OF_TIME_NS,
@@ -23,9 +23,6 @@ from adacd_hil.log.types.message_types import (
     pack_can_frame,
     pack_fd_frame,
 )
-
-_CHUNK_BYTES = 240 * 1024
-
 
 _STAMP = struct.Struct("<II")
 
@@ -37,7 +34,7 @@ class FrameWriter:
         self._messages = 0
         self._frames = 0  # of the first CAN channel, which has the topics of our logs
         self._stream = stream
-        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, enable_data_crcs=True)
+        self._writer = Writer(stream, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         self._writer.start(ROS_PROFILE, LIBRARY)
         self._writer.add_metadata(RUN_METADATA, {EPOCH_KEY: "0"})
         self._schemas: dict[bool, int] = {}

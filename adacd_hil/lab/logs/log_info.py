@@ -37,7 +37,7 @@ from adacd_hil.log.mcap.record_layout import MAGIC, MESSAGE_HEAD
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.types.message_types import LOG, log_time_ns, payload_dtype, unpack_log
 from adacd_hil.log.types.record_arrays import count_frames
-from adacd_hil.log.types.topics import CONTACT, EVENTS
+from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS
 from adacd_hil.records import ContactLevel, Event
 
 _READ = (EVENTS.name, CONTACT.name)
@@ -257,7 +257,7 @@ class _InfoView:
         if self._end_ns:
             info.start_ns, info.end_ns = self._start_ns, self._end_ns
         info.messages = self._counts.total()
-        info.cycles = self._counts["/cycle"]
+        info.cycles = self._counts[CYCLE.name]
         topics = dict(enumerate(self._counts))
         info.frames = count_frames(topics, {place: self._counts[topic] for place, topic in topics.items()})
         info.contacts = len(self._contact_cycles)

@@ -30,6 +30,7 @@ from adacd_hil.lab.score.report_wording import number_text, pair_text, percent_t
 from adacd_hil.lab.score.run_arrays import QUANTITIES, Quantity, Run
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.score.distribution import LOW_PERCENTILE_NAMES, PERCENTILE_NAMES
+from adacd_hil.score.smallest_push import PUSH_WITHIN
 from adacd_hil.score.wording import NONE, number_of
 
 
@@ -58,7 +59,7 @@ def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def push_table(evidence: CertifiedEvidence | None) -> Table | None:
-    """Return the table of the smallest push found within 100 ms and the threshold in force; None if unknown."""
+    """Return the table of the smallest push found in time and the threshold in force; None if unknown."""
     push = None if evidence is None else evidence.smallest_push
     if push is None:
         return None
@@ -66,7 +67,7 @@ def push_table(evidence: CertifiedEvidence | None) -> Table | None:
     rows = [
         (what, *(pair_text([joint[name] for joint in joints], 3) for name in names))
         for what, joints in (
-            ("smallest push found within 100 ms, estimated", push.push_Nm),
+            (f"smallest push found within {PUSH_WITHIN}, estimated", push.push_Nm),
             ("threshold in force", push.threshold_Nm),
         )
     ]

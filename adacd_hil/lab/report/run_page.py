@@ -40,6 +40,7 @@ from adacd_hil.lab.report.timeline import (
     timeline_of,
     traces_of,
 )
+from adacd_hil.lab.score.margins import SETTLING_TIME_CONSTANTS
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.lab.score.report_wording import (
     number_text,
@@ -54,6 +55,7 @@ from adacd_hil.lab.score.run_arrays import Run
 from adacd_hil.lab.score.run_judge import row_at
 from adacd_hil.lab.score.verdict import LISTED, headlines
 from adacd_hil.records import Location, Vector
+from adacd_hil.score.smallest_push import PUSH_WITHIN
 from adacd_hil.score.wording import NONE, why_not_found
 
 _Point = tuple[float, float]
@@ -344,7 +346,9 @@ def report_page(metrics: Metrics, run: Run, source: ReportSource) -> str:
         data=data_table(metrics.data),
         timing=timing_tables(metrics.timing),
         origin=origin_table(metrics, run, source),
-        settling_s=f"{10.0 / run.a_rad_s:g}",
+        settling_constants=f"{SETTLING_TIME_CONSTANTS:g}",
+        settling_s=f"{SETTLING_TIME_CONSTANTS / run.a_rad_s:g}",
+        push_within=PUSH_WITHIN,
         motion_start_s=None if since_ns is None else since_ns * 1e-9,
     )
 

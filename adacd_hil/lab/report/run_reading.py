@@ -51,9 +51,18 @@ from adacd_hil.lab.score.run_arrays import (
     truth_rows,
 )
 from adacd_hil.lab.score.run_judge import find_detections, timed_contacts
-from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, ENDING_KEY, PLANNED_ENDINGS, WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_files import (
+    CONFIG_DIGEST_KEY,
+    DBC_NAME,
+    ENDING_KEY,
+    PLANNED_ENDINGS,
+    WHOLE,
+    LogError,
+    TimeWindow,
+)
 from adacd_hil.log.logged_run import Cycles, Mask, Milestones, Progress, host_cycles, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series, check_states, contacts_of, start_of_log
+from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, FRAME_CHECKS, SCHEME
 from adacd_hil.printable import one_line
 from adacd_hil.records import JOINTS, ContactReport, Request, SchemeState
 from adacd_hil.score.emulator_truth import Rows, TruthTable, extreme_rows, foreign_truth, read_truth
@@ -69,7 +78,7 @@ TIME_BUCKETS: Final = 4_000
 FULL_CYCLES: Final = 150_000
 """Cycles that are kept and drawn one by one: 150 s at 1 kHz, about as many as are kept of hours."""
 ADAPTATION_S: Final = 10.0
-RUN_TOPICS: Final = ("/scheme", "/cycle", "/frame_checks", "/contact", "/events")
+RUN_TOPICS: Final = (SCHEME.name, CYCLE.name, FRAME_CHECKS.name, CONTACT.name, EVENTS.name)
 """Topics that a report reads."""
 _AROUND_S: Final = (0.15, 0.6)
 _NOISE_BUCKETS: Final = 150
@@ -110,7 +119,7 @@ def read_run(
     truth = None if truth_path is None or problem else read_truth(truth_path)
     stream = LogStream(log_path, RUN_TOPICS)
     shell = _shell(stream, truth)
-    reading = RunReading(shell, stream.empty().series["/scheme"], truth, full_cycles)
+    reading = RunReading(shell, stream.empty().series[SCHEME.name], truth, full_cycles)
     if stretch.is_whole:
         _read(stream, reading, progress)
     else:
@@ -120,7 +129,7 @@ def read_run(
         _read(stream, reading, progress, until_ns=stretch.bounds_ns(start_ns)[1])
         shell, bounds_ns = _widened(reading.outline(), shell, stretch, start_ns)
         stream = LogStream(log_path, RUN_TOPICS)
-        reading = RunReading(shell, stream.empty().series["/scheme"], None, full_cycles)
+        reading = RunReading(shell, stream.empty().series[SCHEME.name], None, full_cycles)
         _read(stream, reading, progress, bounds_ns)
     run = reading.finished()
     if run.cycle.size == 0 and run.stretch is not None:
@@ -131,8 +140,8 @@ def read_run(
 def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
     """Return a run without a cycle, with metadata and settings of the log."""
     metadata = dict(stream.metadata)
-    if "arm.dbc" in stream.attachments:
-        metadata["dbc_sha256"] = hashlib.sha256(stream.attachments["arm.dbc"]).hexdigest()
+    if DBC_NAME in stream.attachments:
+        metadata["dbc_sha256"] = hashlib.sha256(stream.attachments[DBC_NAME]).hexdigest()
     if truth is not None:
         told = {key: value for key, value in truth.metadata.items() if key not in (*metadata, CONFIG_DIGEST_KEY)}
         metadata |= {f"emulator_{key}": value for key, value in told.items()}
@@ -147,7 +156,7 @@ def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
         theta_hat=nothing,
         threshold=nothing,
         reports=(),
-        timing=columns_of_series(stream.empty().series["/cycle"]),
+        timing=columns_of_series(stream.empty().series[CYCLE.name]),
         truth=None,
         settings=settings_of(stream.path, stream.attachments),
         metadata=metadata,
@@ -168,7 +177,7 @@ def _read(
     milestones = Milestones(lambda count: progress(f"{stream.path}: {count} cycles read"))
     cycles = 0
     for piece in stream:
-        scheme = piece.series["/scheme"]
+        scheme = piece.series[SCHEME.name]
         check_states(scheme)
         cycles += len(scheme)
         milestones.reach(cycles)
@@ -238,10 +247,10 @@ class RunReading:
 
     def add_piece(self, series: Mapping[str, Series], events: list[LoggedEvent]) -> None:
         """Add the next piece of the log, and sum up the cycles that have settled."""
-        self._reports += [report for _, report in contacts_of(series["/contact"])]
+        self._reports += [report for _, report in contacts_of(series[CONTACT.name])]
         self._events += events
-        self._checks += _checks_of(series["/frame_checks"])
-        scheme, columns = series["/scheme"], columns_of_series(series["/cycle"])
+        self._checks += _checks_of(series[FRAME_CHECKS.name])
+        scheme, columns = series[SCHEME.name], columns_of_series(series[CYCLE.name])
         cycle, state = scheme.records["cycle"].astype(np.int64), scheme.records["state"]
         self.sums.add_times(columns, cycle, state)
         self._times.add_columns(columns)

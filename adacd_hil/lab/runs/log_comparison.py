@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log, each_once
+from adacd_hil.log.types.topics import CONTACT, CYCLE, SCHEME
 from adacd_hil.records import ContactReport, SchemeState
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.settings.setting_keys import changed_keys
 
-_TOPICS: Final = ("/scheme", "/cycle", "/contact")
+_TOPICS: Final = (SCHEME.name, CYCLE.name, CONTACT.name)
 _TIMES: Final = ("lateness_ns", "feedback_ns", "command_ns", "compute_ns", "slack_ns")
 _NOT_METADATA: Final = ("epoch_ns",)
 
@@ -79,9 +80,9 @@ class RunReader:
         """Yield the records of /scheme, piece by piece, and gather states, parameters, contacts and times."""
         zero_ns = self.zero_ns
         for piece in self._stream:
-            if self._is_over(piece.series["/scheme"]):
+            if self._is_over(piece.series[SCHEME.name]):
                 break
-            scheme = self._wanted(piece.series["/scheme"])
+            scheme = self._wanted(piece.series[SCHEME.name])
             t_s = (scheme.t_ns - zero_ns) * 1e-9
             records = scheme.records
             self.cycles += len(records)
@@ -91,10 +92,10 @@ class RunReader:
                     self._keep_parameters(records[row])
             if len(records):
                 last = records[-1].copy()
-            contacts = self._wanted(piece.series["/contact"])
+            contacts = self._wanted(piece.series[CONTACT.name])
             times_s = ((contacts.t_ns - zero_ns) * 1e-9).tolist()
             self._contacts = each_once((*self._contacts, *zip(times_s, _reports(contacts), strict=True)))
-            cycles = self._wanted(piece.series["/cycle"])
+            cycles = self._wanted(piece.series[CYCLE.name])
             for name in _TIMES:
                 if name in cycles.fields:
                     self._times[name].add_values(cycles.records[name] / 1e3)
@@ -139,8 +140,8 @@ def _name_of(state: int) -> str:
 def _motion_start(path: Path) -> tuple[int, int]:
     """Return cycle and time of the first ADAPT, else of the first cycle. Raises LogError."""
     first: tuple[int, int] | None = None
-    for piece in LogStream(path, ("/scheme",)):
-        scheme = piece.series["/scheme"]
+    for piece in LogStream(path, (SCHEME.name,)):
+        scheme = piece.series[SCHEME.name]
         if not len(scheme):
             continue
         rows = np.flatnonzero(scheme.records["state"] == SchemeState.ADAPT)
@@ -150,7 +151,7 @@ def _motion_start(path: Path) -> tuple[int, int]:
         if rows.size:
             return here
     if first is None:
-        raise LogError(f"log {path} has no /scheme")
+        raise LogError(f"log {path} has no {SCHEME.name}")
     return first
 
 

@@ -5,7 +5,8 @@ a stretch, of another log or of another version of the file's layout is ignored.
 from the log's index and its events; `judged` reads the whole log.
 
 Friction and torque offsets are those of the first certificate that no payload was announced for, thresholds those of
-the watching after the first adaptation. Friction is at `FRICTION_AT_RAD_S`; offsets have the configuration's included.
+the watching after the first adaptation. Friction is at `records.FRICTION_AT_RAD_S`; offsets have the configuration's
+included.
 
 Torques in Nm, a value per joint.
 """
@@ -24,17 +25,15 @@ from typing import Any, Final, NamedTuple
 from adacd_hil.file_access import InUseError, check_unused, read_input
 from adacd_hil.lab.logs.log_info import LogInfo, read_info
 from adacd_hil.lab.report.report_json import JSON_NAME, SCHEMA
-from adacd_hil.log.log_files import EPOCH_KEY, LOG_NAME, PLANNED_ENDINGS, TRUTH_NAME, LogError, parts_of
+from adacd_hil.log.log_files import CONFIG_NAME, EPOCH_KEY, LOG_NAME, PLANNED_ENDINGS, TRUTH_NAME, LogError, parts_of
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.printable import one_line
+from adacd_hil.records import FRICTION_AT, FRICTION_AT_RAD_S
 from adacd_hil.settings.configuration import Settings
 
 DEEPEST: Final = 4
 """Levels below a folder in which its runs are looked for."""
-FRICTION_AT_RAD_S: Final = 0.6
-_AT: Final = slice(1, None, 3)
-"""Of a certificate's friction, at 0.2, 0.6 and 1.2 rad/s joint by joint."""
 GOOD, NOT_GOOD, NOT_JUDGED, BROKEN, RUNNING = STATUSES = ("good", "not good", "not judged", "broken", "running")
 CERTIFIED, IDENTIFIED, TAKEN_BACK, NO_CERTIFICATE = CERTIFICATES = ("certified", "identified", "taken back", "none")
 """`identified`: by the paper's scheme, which issues no certificates."""
@@ -195,9 +194,9 @@ def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:
 
 
 def _settings(log: Path) -> Settings | None:
-    text = attachment(log, "config.toml")
+    text = attachment(log, CONFIG_NAME)
     try:
-        return None if text is None else settings_of(log, {"config.toml": text})
+        return None if text is None else settings_of(log, {CONFIG_NAME: text})
     except LogError:  # of a version that has other settings
         return None
 
@@ -369,7 +368,7 @@ def _first_model(table: Mapping[str, Any]) -> dict[str, Any]:
         return {"friction_Nm": _identified_friction(table["parameters"], section)}
     own = [each for each in certified["certificates"] if not _flag(each["is_payload"])]
     names = ("friction_Nm", "friction_std_Nm", "offset_Nm", "offset_std_Nm") if own else ()
-    return {name: _pair(own[0][name][_AT if name.startswith("friction") else slice(None)]) for name in names}
+    return {name: _pair(own[0][name][FRICTION_AT if name.startswith("friction") else slice(None)]) for name in names}
 
 
 def _identified_friction(parameters: Mapping[str, Any], section: str | None) -> Pair | None:

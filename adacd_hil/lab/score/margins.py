@@ -31,7 +31,7 @@ from adacd_hil.lab.score.metrics import (
 )
 from adacd_hil.lab.score.run_arrays import CertifiedStream, Run, Section, rows_of, split_sections
 from adacd_hil.lab.score.run_judge import find_detections, placed_in, timed_contacts
-from adacd_hil.log.logged_run import Mask
+from adacd_hil.log.logged_run import Mask, is_armed_in
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of
 from adacd_hil.score.distribution import Distribution
@@ -312,7 +312,7 @@ class UntouchedGatherer:
     def _add_residual(self, piece: Run, section: Section, rows: slice, free: Mask) -> None:
         is_frozen = section.kind == "detection"
         if is_frozen:
-            free = free & (piece.state[rows] == SchemeState.MONITOR)
+            free = free & is_armed_in(piece.state[rows])
         before = self._residuals.get(section.label, Residual(None, None, 0))
         identified, cad = before.identified, before.cad
         if is_frozen:
@@ -328,7 +328,7 @@ class UntouchedGatherer:
         if chosen.any():
             margin = self._margins.setdefault(section.label, MarginGatherer(self._settings))
             margin.add_residuals(piece.certified.tau_ext[rows][chosen], threshold[chosen])
-        armed = chosen & (piece.state[rows] == SchemeState.MONITOR)
+        armed = chosen & is_armed_in(piece.state[rows])
         if armed.any():
             self._push.add_residuals(piece.certified.tau_ext[rows][armed], threshold[armed])
 

@@ -10,6 +10,7 @@ from typing import Final
 from scipy.special import betaincinv, gammaincinv
 
 CONFIDENCE: Final = 0.95
+CONFIDENCE_TEXT: Final = f"{100.0 * CONFIDENCE:g} %"
 
 
 def share_bounds(found: int, count: int) -> tuple[float, float]:

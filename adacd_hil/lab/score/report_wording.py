@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from adacd_hil.lab.score.rates import CONFIDENCE_TEXT
 from adacd_hil.records import SchemeState
 from adacd_hil.score.judge import Score
 from adacd_hil.score.wording import NONE, found_text, number_of
@@ -108,7 +109,7 @@ def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
     count = number_of(false_alarms, "false alarm") if false_alarms else "No false alarms"
     if bound_per_h > _TELLING_PER_H:
         return f"{count} in that time, which is too short to tell a rate by counting"
-    return f"{count} in that time: by counting alone, at most {bound_per_h:.3g} per hour at 95 %"
+    return f"{count} in that time: by counting alone, at most {bound_per_h:.3g} per hour at {CONFIDENCE_TEXT}"
 
 
 def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | None, float | None]:
@@ -134,7 +135,7 @@ def share_phrase(delays_ms: Sequence[float], contacts: int, bounds: tuple[float,
 
 def rate_phrase(alarms: int, hours: float, bound_per_h: float) -> str:
     """Return as text how many false alarms came in how many hours, and the upper bound of their rate."""
-    return f"{alarms} false alarms in {hours:.4f} h, 95 % bound {bound_per_h:.3g} per hour"
+    return f"{alarms} false alarms in {hours:.4f} h, {CONFIDENCE_TEXT} bound {bound_per_h:.3g} per hour"
 
 
 def percent_text(share: float) -> str:

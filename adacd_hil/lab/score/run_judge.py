@@ -31,7 +31,7 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
         first = alarms.get(cycle, final)
         if first is None and run.contact_joints is not None and not run.contact_joints[row]:
             continue
-        is_armed = bool(run.state[row - 1] == SchemeState.MONITOR)
+        is_armed = bool(is_armed_in(run.state[row - 1]))
         is_known = run.truth is None or run.truth.covers(cycle)
         detections.append(Detection(int(run.t_ns[row]), is_armed, is_known, row, first, final or first))
     return tuple(detections)
@@ -156,7 +156,7 @@ def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[De
 
 def is_payload_alarm(run: Run, row: int) -> bool:
     """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet."""
-    truth, armed = run.truth, np.flatnonzero(run.state[:row] == SchemeState.MONITOR)
+    truth, armed = run.truth, np.flatnonzero(is_armed_in(run.state[:row]))
     if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:
         return False
     known, now = (truth.model_row(int(run.cycle[place])) for place in (armed[-1] if len(armed) else row, row))

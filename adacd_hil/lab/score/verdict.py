@@ -26,6 +26,7 @@ from adacd_hil.lab.score.metrics import (
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
 from adacd_hil.lab.score.run_arrays import Run, Section
 from adacd_hil.score.judge import Score
+from adacd_hil.score.smallest_push import PUSH_WITHIN
 from adacd_hil.score.wording import NONE, found_text, number_of
 from adacd_hil.settings.arm_settings import ArmSettings
 from adacd_hil.settings.configuration_files import load_settings
@@ -278,7 +279,9 @@ def compare_with_paper(
     rows += [(quantity, paper, theirs, value) for (quantity, paper, theirs), value in zip(settled, ours, strict=True)]
     margin = evidence.smallest_margin
     rows.append(("Smallest threshold / residual", NONE, NONE, NONE if margin is None else f"{margin:.2f}"))
-    rows.append(("Smallest push found within 100 ms, estimated, joints 1 / 2", NONE, NONE, _push_text(evidence)))
+    rows.append(
+        (f"Smallest push found within {PUSH_WITHIN}, estimated, joints 1 / 2", NONE, NONE, _push_text(evidence))
+    )
     rows.append(("Control rate", "1 kHz", rate, rate))
     return _of_what_was_played(run, [PaperRow(*row) for row in rows])
 

@@ -26,6 +26,7 @@ from typing import Final
 import numpy as np
 from scipy.special import boxcox, inv_boxcox
 
+from adacd_hil.lab.score.rates import CONFIDENCE
 from adacd_hil.lab.signal_noise import low_pass
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
@@ -39,7 +40,6 @@ _SHAPES: Final = (-0.5, 0.25)
 """Bounds of xi. Encoder counts and friction are bounded, so most tails end; a heavier tail than the upper bound has not
 been seen on contact-free motion and would make every extrapolation infinite."""
 _RESAMPLES: Final = 400
-_CONFIDENCE: Final = 0.95
 _BISECTIONS: Final = 60
 _S_PER_H: Final = 3600.0
 
@@ -172,8 +172,8 @@ def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
     excesses = clusters(peaks, tail.level) - tail.level
     fits = _moments_fit(np.sort(generator.choice(excesses, (_RESAMPLES, tail.count)), axis=1))
     rates = np.maximum(generator.poisson(tail.count, _RESAMPLES) / tail.hours, 1e-9)
-    bound = tail.level + float(np.quantile(_excesses(rate_per_h, *fits, rates), _CONFIDENCE))
-    rate_bound = float(np.quantile(_rates(threshold - tail.level, *fits, rates), _CONFIDENCE))
+    bound = tail.level + float(np.quantile(_excesses(rate_per_h, *fits, rates), CONFIDENCE))
+    rate_bound = float(np.quantile(_rates(threshold - tail.level, *fits, rates), CONFIDENCE))
     return TailCalibration(
         threshold, max(bound, threshold), rate_per_h, max(rate_bound, rate_per_h), rate_per_h * tail.hours < 1.0, tail
     )

@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from adacd_hil.lab.detectors import detectors
-from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_files import CONFIG_NAME, WHOLE, LogError, TimeWindow
 from adacd_hil.log.log_walk import attachment
-from adacd_hil.log.logged_run import Milestones, Progress, settings_of
+from adacd_hil.log.logged_run import Milestones, Progress, is_armed_in, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
-from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
+from adacd_hil.log.types.topics import SCHEME
+from adacd_hil.records import PARAMETER_NAMES, Vector
+from adacd_hil.scheme.kernel.kernel_samples import LONGEST_SHARE, SHORTEST_SHARE
 
 APART_S: Final = 0.6
 """Distance from contacts and gaps: six time constants of the slowest filter."""
@@ -28,8 +30,7 @@ MOST_SAMPLES: Final = 1_000_000
 """Most samples that are processed together; of more motion, windows are taken."""
 WINDOW: Final = 10_000
 """Samples of such a window."""
-TOPICS: Final = ("/scheme",)
-_NEAR: Final = (0.5, 1.5)  # shares of the period: the shortest and longest interval of samples that follow each other
+TOPICS: Final = (SCHEME.name,)
 _PERIODS: Final = 1_000_000
 """Number of intervals whose median is the period."""
 
@@ -89,7 +90,7 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
     """Yield /scheme of a log, or its part between two times, in pieces that are not empty. Raises LogError."""
     stream = LogStream(path, TOPICS)
     for piece in stream:
-        scheme = piece.series["/scheme"]
+        scheme = piece.series[SCHEME.name]
         if bounds_ns is not None and len(scheme):
             if scheme.t_ns[0] >= bounds_ns[1]:
                 return
@@ -119,7 +120,7 @@ def read_motion(
     for scheme in schemes(path, bounds_ns):
         watch(scheme)
         cycle = scheme["cycle"].astype(np.int64).reshape(-1)
-        is_good = (scheme["state"].reshape(-1) == SchemeState.MONITOR) & (scheme["contact_joints"].reshape(-1) == 0)
+        is_good = is_armed_in(scheme["state"].reshape(-1)) & (scheme["contact_joints"].reshape(-1) == 0)
         is_good &= _intervals(scheme, cycle, before, period_s) > 0.0
         for name in ("q", "tau_J", "dq", "theta_hat"):
             is_good &= np.isfinite(scheme[name]).all(axis=1)
@@ -134,8 +135,8 @@ def read_motion(
 
 
 def _level_rad(path: Path) -> float:
-    text = attachment(path, "config.toml")
-    return 0.0 if text is None else settings_of(path, {"config.toml": text}).level_rad
+    text = attachment(path, CONFIG_NAME)
+    return 0.0 if text is None else settings_of(path, {CONFIG_NAME: text}).level_rad
 
 
 def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:
@@ -158,7 +159,7 @@ def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:
 def _intervals(scheme: Any, cycle: NDArray[np.int64], before: int | None, period_s: float) -> Vector:
     """Return the time since the previous sample (n,), s; 0 if that is not of the previous cycle."""
     interval_s: Vector = scheme["period_s"].reshape(-1).copy()
-    is_near = (interval_s >= _NEAR[0] * period_s) & (interval_s <= _NEAR[1] * period_s)
+    is_near = (interval_s >= SHORTEST_SHARE * period_s) & (interval_s <= LONGEST_SHARE * period_s)
     interval_s[~is_near | (np.diff(cycle, prepend=cycle[0] - 2 if before is None else before) != 1)] = 0.0
     return interval_s
 

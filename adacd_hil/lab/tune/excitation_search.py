@@ -25,6 +25,7 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 
 from adacd_hil.compiled import compiled
+from adacd_hil.control.motions import TOLERANCE
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.kernel.certified_memory import constants_of
 from adacd_hil.scheme.model.filter_bank import first_order_hold
@@ -37,8 +38,6 @@ PERIOD_S = 2.4
 """Period of an excitation for a configuration without one: a fit of 1.4 s covers more than half of it."""
 HARMONICS = 6
 """Harmonics of that excitation, up to 2.5 Hz. The acceleration limit keeps faster ones too small to be of use."""
-TOLERANCE = 1e-3
-"""Part by which a motion may be over a limit: a search from outside ends a little outside."""
 TORQUE_SHARE = 0.5
 """Part of the torque limit that the motion may need; the rest is for a payload, friction and the controller."""
 ITERATIONS = 150

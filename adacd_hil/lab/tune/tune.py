@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from adacd_hil import __version__
 from adacd_hil.clock import wall_ns
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
-from adacd_hil.lab.score.rates import least_rate_per_h
+from adacd_hil.lab.score.rates import CONFIDENCE_TEXT, least_rate_per_h
 from adacd_hil.lab.score.report_wording import delay_figures, delays_phrase, rate_phrase, share_phrase
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.lab.tune.tune_candidates import (
@@ -239,8 +239,8 @@ def _provenance(tuning: Tuning, best: Candidate) -> list[str]:
         f"Suggested by adacd-hil tune, version {__version__}, {date}.",
         f"From {len(tuning.logs)} logs, {sum(map(free_hours, tuning.logs)):.4f} h of motion that nobody touched:",
         *(f"  {_plain(log.path)}, SHA-256 {log.digest}, {free_hours(log):.4f} h" for log in tuning.logs),
-        f"Wanted: {tuning.rate_per_h:g} false alarms per hour. Thresholds: {choice.method}, whose upper 95 % bound is "
-        "the wanted rate.",
+        f"Wanted: {tuning.rate_per_h:g} false alarms per hour. Thresholds: {choice.method}, whose upper "
+        f"{CONFIDENCE_TEXT} bound is the wanted rate.",
     ]
     if tail is not None:
         lines.append(f"  The tail is fitted to {tail.tail.count} peaks of {tail.tail.hours:.4f} h.")
@@ -322,7 +322,7 @@ def draw_roc(tuning: Tuning) -> Drawing:
                 low, high = np.array([each.share_bounds for each in found]).T
                 axes.fill_between(bounds, 100.0 * low, 100.0 * high, color=look["color"], alpha=0.12, linewidth=0.0)
         has_truth = tuning.candidates[0].choice.chosen.contacts is not None
-        bound_label = "false alarms per hour, upper 95 % bound of what was counted"
+        bound_label = f"false alarms per hour, upper {CONFIDENCE_TEXT} bound of what was counted"
         if has_truth:
             axes.set(xscale="log", ylim=(-3.0, 103.0), xlabel=bound_label, ylabel="contacts found, %")
         else:

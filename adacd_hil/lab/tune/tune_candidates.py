@@ -22,17 +22,19 @@ from adacd_hil.lab.thresholds.detector_comparison import WARM_UP_S
 from adacd_hil.lab.thresholds.free_motion import torque_streams
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, run_detectors
 from adacd_hil.lab.tune.tune_roc import Changes, Observed, Trial, TunedLog, Window, rising
-from adacd_hil.log.logged_run import Progress
-from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.log.logged_run import Progress, is_armed_in
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.replay.replay import Watch, replay_many
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.schema import ConfigError, bounds_of
+from adacd_hil.settings.scheme_settings import CertifiedSettings, DetectorSettings
 from adacd_hil.settings.setting_keys import apply_settings
 
 _FILTER_FACTORS: Final = (1.0, 0.5, 2.0, 4.0)
 _GAIN_FACTORS: Final = (1.0, 0.3, 3.0)
-_NOTHING_EXCEEDS_Nm: Final = 100.0
+_THRESHOLDS_NM: Final = bounds_of(DetectorSettings, "threshold_Nm")
+_NOTHING_EXCEEDS_Nm: Final = _THRESHOLDS_NM[1]
 """The largest threshold that a configuration may have."""
 
 Places = NDArray[np.int64]
@@ -92,10 +94,14 @@ def thresholds_as_changes(settings: Settings, thresholds: Vector) -> Changes:
     up = 1.0005  # so that four digits are never below the chosen value
     if settings.scheme == "certified":
         factor = up * float(thresholds[0, 0])
-        own = {"noise_sigmas": settings.certified.noise_sigmas, "model_sigmas": settings.certified.model_sigmas}
-        return {f"certified.{name}": in_toml(min(max(factor * each, 1.0), 50.0)) for name, each in own.items()}
-    low, high = 1e-3, _NOTHING_EXCEEDS_Nm
-    return {"detector.threshold_Nm": in_toml([min(max(up * each, low), high) for each in thresholds[0].tolist()])}
+        own = {name: factor * getattr(settings.certified, name) for name in ("noise_sigmas", "model_sigmas")}
+        bounds = {name: bounds_of(CertifiedSettings, name) for name in own}
+        return {f"certified.{name}": in_toml(_within(value, bounds[name])) for name, value in own.items()}
+    return {"detector.threshold_Nm": in_toml([_within(up * each, _THRESHOLDS_NM) for each in thresholds[0].tolist()])}
+
+
+def _within(value: float, bounds: tuple[float, float]) -> float:
+    return min(max(value, bounds[0]), bounds[1])
 
 
 def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progress: Progress) -> list[Observed]:
@@ -158,7 +164,7 @@ class ShownLog:
         if known.size == 0:
             return
         rows, statistic = rows[known], self._statistic_of(batch.block[known])
-        is_armed = batch.previous_state[known] == SchemeState.MONITOR
+        is_armed = is_armed_in(batch.previous_state[known])
         counted = np.flatnonzero(is_armed & self._log.motion.is_free[rows])
         if counted.size:
             blocks = rows[counted] // self._log.block

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.types.message_types import CAN_FRAME, FD_FRAME, LOG, MAX_DATA, is_log
+from adacd_hil.log.types.message_types import FD_FRAME, LOG, MAX_DATA, is_log
+from adacd_hil.log.types.topics import FROM_CAN_BUS, FROM_CAN_BUS_FD, TO_CAN_BUS, TO_CAN_BUS_FD
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 
 if TYPE_CHECKING:
@@ -59,13 +60,10 @@ LONG_FRAME_DTYPE = _frame_dtype(MAX_DATA)
 """A frame of a log with FD frames, classic ones too: `data` (64,). All else is as in the other."""
 
 
-SENT = "to_can_bus"
+SENT = TO_CAN_BUS.name.removeprefix("/")
 """In the names of topics of sent frames."""
 FRAME_TOPICS = {
-    "/to_can_bus": CAN_FRAME.name,
-    "/from_can_bus": CAN_FRAME.name,
-    "/to_can_bus_fd": FD_FRAME.name,
-    "/from_can_bus_fd": FD_FRAME.name,
+    topic.name: topic.channel().type.name for topic in (TO_CAN_BUS, FROM_CAN_BUS, TO_CAN_BUS_FD, FROM_CAN_BUS_FD)
 }
 """The topics of frames and their types."""
 

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import FRICTION_SPEEDS_RAD_S, JOINTS, Vector
 from adacd_hil.scheme.identify import anchor, earlier, evidence, fit_check, missing_torque
-from adacd_hil.scheme.identify.evidence import FRICTIONS, INERTIAS, LAST, OFFSETS, SPEEDS_RAD_S, VISCOUS
+from adacd_hil.scheme.identify.evidence import FRICTIONS, INERTIAS, LAST, OFFSETS, VISCOUS
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.settings.configuration import Settings
 
@@ -35,8 +35,8 @@ class Certificate(NamedTuple):
     """A certificate's description of the arm at the time of certification.
 
     parameters: a1 … F_c2, and those of gravity where there are any (p,); friction_Nm, their deviations (6,): joint 1 at
-    `evidence.SPEEDS_RAD_S`, then joint 2; inertia_kgm2 (3,); offset_Nm (n,): of the torque sensors, the configuration's
-    included.
+    `records.FRICTION_SPEEDS_RAD_S`, then joint 2; inertia_kgm2 (3,); offset_Nm (n,): of the torque sensors, the
+    configuration's included.
     """
 
     parameters: tuple[float, ...]
@@ -64,8 +64,8 @@ def last_of(settings: Settings) -> tuple[Vector, Vector, Vector]:
     counts = (FRICTIONS, INERTIAS, JOINTS, JOINTS)
     slope = np.zeros((JOINTS, OFFSETS))
     for i, speeds in enumerate(slope):
-        speeds[[len(SPEEDS_RAD_S) * i, len(SPEEDS_RAD_S) * (i + 1) - 1]] = (-1.0, 1.0)
-    slope /= SPEEDS_RAD_S[-1] - SPEEDS_RAD_S[0]
+        speeds[[len(FRICTION_SPEEDS_RAD_S) * i, len(FRICTION_SPEEDS_RAD_S) * (i + 1) - 1]] = (-1.0, 1.0)
+    slope /= FRICTION_SPEEDS_RAD_S[-1] - FRICTION_SPEEDS_RAD_S[0]
     quantities = np.vstack((np.eye(OFFSETS), np.zeros((JOINTS, OFFSETS)), slope))
     last, variance = np.zeros(sum(counts)), np.full(sum(counts), np.inf)
     if history.is_known:

@@ -24,14 +24,12 @@ import numpy as np
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, PARAMETER_NAMES, QUINTIC_PEAK_ACCELERATION, Vector
+from adacd_hil.records import FRICTION_SPEEDS_RAD_S, JOINTS, PARAMETER_NAMES, QUINTIC_PEAK_ACCELERATION, Vector
 from adacd_hil.scheme.memory import Constants, EvidenceConstants, Memory
 from adacd_hil.settings.configuration import Settings
 
-SPEEDS_RAD_S = (0.2, 0.6, 1.2)
-"""Speeds at which friction is compared: in the sum, errors of viscous and Coulomb friction can't hide each other."""
 _INERTIAS = ("a1", "a2", "a3")
-FRICTIONS, INERTIAS = JOINTS * len(SPEEDS_RAD_S), len(_INERTIAS)
+FRICTIONS, INERTIAS = JOINTS * len(FRICTION_SPEEDS_RAD_S), len(_INERTIAS)
 OFFSETS = FRICTIONS + INERTIAS
 VISCOUS = OFFSETS + JOINTS
 QUANTITIES = VISCOUS + JOINTS
@@ -56,7 +54,7 @@ def constants_of(settings: Settings, prior_std: Vector) -> EvidenceConstants:
     unit = np.eye(prior_std.size)
     base = len(settings.estimator.parameter_names)
     viscous, coulomb = PARAMETER_NAMES.index("F_v1"), PARAMETER_NAMES.index("F_c1")
-    friction = [v * unit[viscous + i] + unit[coulomb + i] for i in range(JOINTS) for v in SPEEDS_RAD_S]
+    friction = [v * unit[viscous + i] + unit[coulomb + i] for i in range(JOINTS) for v in FRICTION_SPEEDS_RAD_S]
     inertia = [unit[PARAMETER_NAMES.index(name)] for name in _INERTIAS]
     offset = [unit[base + i] for i in range(JOINTS)]
     columns = np.array([*friction, *inertia, *offset, *(unit[viscous + i] for i in range(JOINTS))])
@@ -200,11 +198,11 @@ def named(excesses: Vector) -> list[tuple[int, str, str]]:
 
     A viscous friction is named after the others.
     """
-    speeds = len(SPEEDS_RAD_S)
+    speeds = len(FRICTION_SPEEDS_RAD_S)
     found = []
     for i in range(JOINTS):
         q = speeds * i + int(np.argmax(excesses[speeds * i : speeds * (i + 1)]))
-        found.append((q, f"friction of joint {i + 1} at {SPEEDS_RAD_S[q - speeds * i]:g} rad/s", "Nm"))
+        found.append((q, f"friction of joint {i + 1} at {FRICTION_SPEEDS_RAD_S[q - speeds * i]:g} rad/s", "Nm"))
     found += [(q, name, "kg m²") for q, name in enumerate(_INERTIAS, FRICTIONS)]
     found += [(OFFSETS + i, f"torque offset of joint {i + 1}", "Nm") for i in range(JOINTS)]
     found += [(VISCOUS + i, f"viscous friction of joint {i + 1}", "Nm s/rad") for i in range(JOINTS)]

@@ -19,7 +19,7 @@ from adacd_hil.scheme.supervisor.transitions import AT_REST, NOT_A_NUMBER, OVER_
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Structured, described
 
-_SHORTEST_SHARE, _LONGEST_SHARE = 0.5, 1.5
+SHORTEST_SHARE, LONGEST_SHARE = 0.5, 1.5
 """Shortest and longest interval of two samples that follow each other, over the nominal period."""
 
 
@@ -110,7 +110,7 @@ def is_filled(steps: int, period_s: float, nominal_s: float, most: int) -> bool:
     """
     if not 1 <= steps <= most + 1:
         return False
-    return bool(_SHORTEST_SHARE * nominal_s * steps <= period_s <= _LONGEST_SHARE * nominal_s * steps)
+    return bool(SHORTEST_SHARE * nominal_s * steps <= period_s <= LONGEST_SHARE * nominal_s * steps)
 
 
 @compiled
