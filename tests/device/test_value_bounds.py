@@ -81,6 +81,13 @@ def sensor_with_two_channels() -> tuple[dict[str, Any], str]:
     return profile, eds
 
 
+def with_16_bits(eds: str) -> str:
+    head = eds.index("[9130sub2]")
+    return (eds[:head] + eds[head:].replace("DataType=0x0004", "DataType=0x0003", 1)).replace(
+        "0x91300220", "0x91300210"
+    )
+
+
 def sensor_with_a_temperature() -> tuple[dict[str, Any], str]:
     profile = table_of("adacd-sensor") | {"eds": "sensor.eds"}
     add_signal(profile, "Status", COLD)
@@ -97,6 +104,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "warm").mkdir()
     (folder / "warm" / "sensor.eds").write_text(eds)
     (folder / "warm" / "sensor.toml").write_text(to_toml(parse(ProfileSettings, profile)))
+    profile, eds = sensor_with_two_channels()
+    (folder / "narrow").mkdir()
+    (folder / "narrow" / "sensor.eds").write_text(with_16_bits(eds))
+    (folder / "narrow" / "sensor.toml").write_text(to_toml(parse(ProfileSettings, profile)))
+    (folder / "narrow-arm.toml").write_text(ARM.replace('"sensor.toml"', '"narrow/sensor.toml"'))
     (folder / "arm.toml").write_text(ARM)
     (folder / "warm-arm.toml").write_text(ARM.replace('"sensor.toml"', '"warm/sensor.toml"'))
     return folder
@@ -154,6 +166,10 @@ def test_no_arm_is_enabled_before_a_bounded_value_has_come(folder: Path) -> None
 def test_a_replaced_value_ends_with_its_fault(folder: Path) -> None:
     rows = f'{HOT_WINDING}, since = "power_on", at_s = 0.0, duration_s = 0.1'
     assert play(folder, "cooled", rows)[0] is FaultReason.NONE
+
+
+def test_an_emulated_second_torque_ends_at_the_range_of_its_object(folder: Path) -> None:
+    assert play(folder, "narrow", arm="narrow-arm")[0] is FaultReason.SENSOR  # 16 bits are 0.66 Nm
 
 
 @pytest.mark.parametrize(
