@@ -1,6 +1,8 @@
 """Bounds that a profile sets to further values: the arm stops outside them, and where the values stay away."""
 
 import contextlib
+import math
+import shutil
 import tomllib
 from importlib import resources
 from pathlib import Path
@@ -12,6 +14,7 @@ from click.testing import CliRunner
 
 from adacd_hil.cli.main import cli
 from adacd_hil.device.profile import ProfileSettings
+from adacd_hil.device.value_bounds import ValueBound
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.schema import ConfigError, parse
@@ -200,6 +203,10 @@ def test_an_object_that_no_device_can_have_is_refused(folder: Path, changes: str
         ("Status", {"low": 90.0}, "low = 90 is above high = 85"),
         ("Command", {}, "is the host's own, and can't have `low` or `high`"),
         ("Feedback", {"high": None, "of": "position"}, "`of` needs `low` or `high`"),
+        ("Status", {"of": "torque_actual"}, "unit = 'degC' must be that of 'torque_actual', 'permille'"),
+        ("Feedback", {"unit": 'a"b'}, "unit = 'a\"b' can't have"),
+        ("Feedback", {"signal": "wärme"}, "signal 'wärme' must be a name"),
+        ("Feedback", {"signal": "SG_"}, "signal 'SG_' must be a name"),
     ],
 )
 def test_bounds_that_cant_be_are_one_line(message: str, changes: dict[str, object], line: str) -> None:
@@ -217,3 +224,27 @@ def test_a_bounded_value_of_a_frame_without_a_period_is_refused() -> None:
     add_signal(profile, "Status", TEMPERATURE)
     with pytest.raises(ConfigError, match="'temperature': `low` and `high` need event_timer_ms"):
         parse(ProfileSettings, profile)
+
+
+@pytest.mark.parametrize(
+    ("key", "row", "bound"),
+    [("high", TEMPERATURE, 3277.0), ("low", TEMPERATURE, -3277.0), ("high", SECOND_TORQUE, 9e4)],
+)
+def test_a_bound_that_no_value_can_reach_is_refused(
+    folder: Path, tmp_path: Path, key: str, row: dict[str, object], bound: float
+) -> None:
+    file, make, at = (
+        ("drive", drive_with_a_temperature, 1) if row is TEMPERATURE else ("sensor", sensor_with_two_channels, 0)
+    )
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    profile, _ = make()
+    profile["pdo"][at]["signals"][-1] = row | {key: bound}
+    (tmp_path / f"{file}.toml").write_text(to_toml(parse(ProfileSettings, profile)))
+    with contextlib.chdir(tmp_path):
+        checked = CliRunner().invoke(cli, ["config", "check", "arm.toml"])
+    assert checked.exit_code == 2
+    assert f"{key} = {bound:g} is outside its range" in checked.output
+
+
+def test_a_value_without_a_unit_has_no_gap_in_its_line() -> None:
+    assert ValueBound("errors", "", 0, None, -math.inf, 3.0).describe_excess([5.0]).startswith("errors 5, ")
