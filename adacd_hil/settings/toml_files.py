@@ -17,6 +17,7 @@ _MOST_TOML_BYTES = 1 << 20
 _DEEPEST = 16
 _LONGEST_KEY = 80
 _TOO_DEEP = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){64}""")
+_DECIMAL_COMMA = re.compile(r"[\w-]++[ \t]*=[ \t]*[-+]?\d++,\d++")
 _MOST_NAMES = 12
 """Most built-in names that an error message lists."""
 
@@ -61,7 +62,9 @@ def parse_toml(text: bytes | str) -> dict[str, Any]:
     except UnicodeDecodeError as error:
         raise ConfigError(f"byte {error.start} is not UTF-8; save the file as UTF-8") from None
     except ValueError as error:  # TOML syntax, or an integer that is too long to be parsed
-        raise ConfigError(one_line(error)) from None
+        comma = _DECIMAL_COMMA.search(text)
+        hint = f"; `{comma[0]}`: a decimal point, not a comma?" if comma else ""
+        raise ConfigError(f"{one_line(error)}{hint}") from None
     _check_extent(table)
     return table
 
