@@ -329,6 +329,9 @@ class ProfileSettings:
             digits = 2 * profile.data_id_bytes
             if len(pdo.data_ids) != 2 or any(not _is_hex(text, digits) for text in pdo.data_ids):
                 raise ValueError(f"pdo {pdo.message}: data_ids must be two of {digits} hexadecimal digits")
+            header = [name for name, _ in profile.signals]
+            if taken := [signal.signal for signal in pdo.signals if signal.signal in header]:
+                raise ValueError(f"pdo {pdo.message}: signal {taken[0]!r} has the name of a part of the header")
 
     def _check_scale(self) -> None:
         if self.kind == "drive" and not (self.scale.increments_per_joint_rev and self.scale.velocity_rad_s):
