@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 
 from adacd_hil.cli.main import cli
 from adacd_hil.device.profile import ProfileSettings
@@ -175,6 +175,23 @@ def test_an_emulated_second_torque_ends_at_the_range_of_its_object(folder: Path)
     assert play(folder, "narrow", arm="narrow-arm")[0] is FaultReason.SENSOR  # 16 bits are 0.66 Nm
 
 
+def play_object(folder: Path, name: str, changes: str) -> Result:
+    (folder / f"{name}-scenario.toml").write_text(
+        f'lasts_s = 0.5\n[[faults]]\nkind = "object_value"\n{changes}\n'.replace(", ", "\n")
+    )
+    with contextlib.chdir(folder):
+        return CliRunner().invoke(
+            cli, ["demo", "--config", "arm.toml", "--scenario", f"{name}-scenario.toml", "--out", name]
+        )
+
+
+def test_an_object_of_the_communication_that_reads_back_another_value_ends_the_set_up(folder: Path) -> None:
+    changes = 'node = "drive1", index = 0x1A00, sub = 1, raw = 0x60770010, since = "power_on", at_s = 0.0'
+    ran = play_object(folder, "mapped", changes)
+    assert ran.exit_code == 5
+    assert "0x1A00:1 = 0x60770010, 0x60640020 expected" in ran.stderr
+
+
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
@@ -183,16 +200,10 @@ def test_an_emulated_second_torque_ends_at_the_range_of_its_object(folder: Path)
     ],
 )
 def test_an_object_that_no_device_can_have_is_refused(folder: Path, changes: str, line: str) -> None:
-    (folder / "wrong-scenario.toml").write_text(
-        f'lasts_s = 0.5\n[[faults]]\nkind = "object_value"\nat_s = 0.1\n{changes}\n'.replace(", ", "\n")
-    )
-    with contextlib.chdir(folder):
-        ran = CliRunner().invoke(
-            cli, ["demo", "--config", "arm.toml", "--scenario", "wrong-scenario.toml", "--out", "w"]
-        )
+    ran = play_object(folder, "wrong", f"at_s = 0.1, {changes}")
     assert ran.exit_code == 2
     assert line in ran.stderr
-    assert not (folder / "w").exists()
+    assert not (folder / "wrong").exists()
 
 
 @pytest.mark.parametrize(
