@@ -41,6 +41,12 @@ class _DbcSignal(NamedTuple):
     scale: float = 1.0
     unit: str = ""
 
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Least and greatest value, in `unit`."""
+        low, high = (-(1 << self.bits - 1), (1 << self.bits - 1) - 1) if self.is_signed else (0, (1 << self.bits) - 1)
+        return low * self.scale, high * self.scale
+
 
 @dataclass
 class _DbcMessage:
@@ -216,6 +222,7 @@ def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
         variable = device.variable(signal.name)
         scale, unit = profile.unit_of(signal)
         signals.append(_DbcSignal(signal.signal, variable.bits, variable.is_signed, scale, unit))
+    _check_bounds(device, pdo, signals)
     sender, receiver = ("HOST", name) if pdo.is_received else (name, "HOST")
     message = _DbcMessage(
         device.can_id(pdo),
@@ -236,6 +243,23 @@ def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
             f"a frame has 0 to 8, {', '.join(map(str, FD_LENGTHS))}"
         )
     return message
+
+
+def _check_bounds(device: PlacedDevice, pdo: PdoSettings, signals: list[_DbcSignal]) -> None:
+    """Raise ConfigError for a bound that the value can't have, so that it never acts, or always."""
+    found = {signal.name: signal for signal in signals}
+    for signal in pdo.signals:
+        low, high = found[signal.signal].limits
+        if signal.of:
+            other_low, other_high = found[signal.of].limits
+            low, high = low - other_high, high - other_low
+        for key, bound in ("low", signal.low), ("high", signal.high):
+            if bound is not None and not low <= bound <= high:
+                what = f"{signal.signal} - {signal.of}" if signal.of else signal.signal
+                raise ConfigError(
+                    f"device profile {device.profile.name}: {what}: {key} = {bound:g} is outside its range, "
+                    f"{low:g} to {high:g}"
+                )
 
 
 def _check_identifiers(messages: list[_DbcMessage]) -> None:
@@ -307,11 +331,9 @@ def _signal_lines(message: _DbcMessage) -> Iterable[str]:
     start = 0
     receivers = ",".join(message.receivers)
     for signal in message.signals:
-        low, high = (
-            (-(1 << signal.bits - 1), (1 << signal.bits - 1) - 1) if signal.is_signed else (0, (1 << signal.bits) - 1)
-        )
+        low, high = signal.limits
         sign = "-" if signal.is_signed else "+"
-        bounds = f"[{_number(low * signal.scale)}|{_number(high * signal.scale)}]"
+        bounds = f"[{_number(low)}|{_number(high)}]"
         place = f"{start}|{signal.bits}@1{sign} ({_number(signal.scale)},0)"
         yield f' SG_ {signal.name} : {place} {bounds} "{signal.unit}" {receivers}'
         start += signal.bits

@@ -78,6 +78,9 @@ _TOGETHER = {
 HOST_SIGNALS = ("controlword", "target_torque", "torque_offset", "max_torque", "mode")
 """Signals that the host can fill in a command frame."""
 
+_DBC_MARKS = '"', "\\"
+"""What the text of a unit can't have in a DBC."""
+
 
 @dataclass(frozen=True)
 class SignalSettings:
@@ -93,8 +96,12 @@ class SignalSettings:
 
     def __post_init__(self) -> None:
         parse_object(self.object)
-        if not self.signal.isidentifier():
-            raise ValueError(f"signal {self.signal!r} must be a name of letters, digits and _")
+        if not (self.signal.isascii() and self.signal.isidentifier()) or self.signal.endswith("_"):  # DBC: `SG_`
+            raise ValueError(f"signal {self.signal!r} must be a name of letters a to z, digits and _, not at its end")
+        if not self.unit.isprintable() or any(mark in self.unit for mark in _DBC_MARKS):
+            raise ValueError(
+                f"signal {self.signal!r}: unit = {self.unit!r} can't have {' '.join(_DBC_MARKS)} or a line end"
+            )
         if self.of and not self.is_bounded:
             raise ValueError(f"signal {self.signal!r}: `of` needs `low` or `high`")
         if self.low is not None and self.high is not None and self.low > self.high:
@@ -287,7 +294,27 @@ class ProfileSettings:
         for pdo in self.pdo:
             if pdo.message in ("Feedback", "Torque") and pdo.transmission != 1:
                 raise ValueError(f"pdo {pdo.message}: transmission = {pdo.transmission} must be 1, on every SYNC")
-            _check_bounds(pdo)
+            self._check_bounds(pdo)
+
+    def _check_bounds(self, pdo: PdoSettings) -> None:
+        """Raise ValueError for bounds of values that the host doesn't get, or wouldn't miss, or can't compare."""
+        signals = {signal.signal: signal for signal in pdo.signals}
+        for name, signal in signals.items():
+            place = f"pdo {pdo.message}: signal {name!r}"
+            if signal.of and (signal.of not in signals or signal.of == name):
+                others = ", ".join(signals)
+                raise ValueError(f"{place}: of = {signal.of!r} must be another signal of the frame: {others}")
+            if signal.is_bounded and pdo.is_received:
+                raise ValueError(f"{place} is the host's own, and can't have `low` or `high`")
+            if signal.is_bounded and pdo.message == "Status" and not pdo.event_timer_ms:
+                raise ValueError(
+                    f"{place}: `low` and `high` need event_timer_ms: without it a silent device isn't noticed"
+                )
+            if not signal.of:
+                continue
+            (_, unit), (_, other) = self.unit_of(signal), self.unit_of(signals[signal.of])
+            if unit != other:
+                raise ValueError(f"{place}: unit = {unit!r} must be that of {signal.of!r}, {other!r}")
 
     def _check_protection(self) -> None:
         profile = PROFILES_BY_CODE.get(self.protection)
@@ -302,6 +329,9 @@ class ProfileSettings:
             digits = 2 * profile.data_id_bytes
             if len(pdo.data_ids) != 2 or any(not _is_hex(text, digits) for text in pdo.data_ids):
                 raise ValueError(f"pdo {pdo.message}: data_ids must be two of {digits} hexadecimal digits")
+            header = [name for name, _ in profile.signals]
+            if taken := [signal.signal for signal in pdo.signals if signal.signal in header]:
+                raise ValueError(f"pdo {pdo.message}: signal {taken[0]!r} has the name of a part of the header")
 
     def _check_scale(self) -> None:
         if self.kind == "drive" and not (self.scale.increments_per_joint_rev and self.scale.velocity_rad_s):
@@ -334,19 +364,6 @@ class ProfileSettings:
         if self.kind == "sensor" and signal.signal in ("torque", "gross_torque"):
             return self.scale.torque_Nm, "Nm"
         return signal.scale, signal.unit
-
-
-def _check_bounds(pdo: PdoSettings) -> None:
-    """Raise ValueError for bounds of values that the host doesn't get, or wouldn't miss."""
-    names = [signal.signal for signal in pdo.signals]
-    for signal in pdo.signals:
-        place = f"pdo {pdo.message}: signal {signal.signal!r}"
-        if signal.of and (signal.of not in names or signal.of == signal.signal):
-            raise ValueError(f"{place}: of = {signal.of!r} must be another signal of the frame: {', '.join(names)}")
-        if signal.is_bounded and pdo.is_received:
-            raise ValueError(f"{place} is the host's own, and can't have `low` or `high`")
-        if signal.is_bounded and pdo.message == "Status" and not pdo.event_timer_ms:
-            raise ValueError(f"{place}: `low` and `high` need event_timer_ms: without it a silent device isn't noticed")
 
 
 def _is_hex(text: str, digits: int) -> bool:

@@ -29,7 +29,7 @@ class ValueBound(NamedTuple):
             return ""
         bounds = [f"at least {self.low:g}"] if self.low > -math.inf else []
         bounds += [f"at most {self.high:g}"] if self.high < math.inf else []
-        return f"{self.text} {value:g} {self.unit}, {' and '.join(bounds)} allowed"
+        return f"{self.text} {f'{value:g} {self.unit}'.rstrip()}, {' and '.join(bounds)} allowed"
 
 
 def bounds_of(pdo: PdoSettings | None, message: MessageCodec | None) -> tuple[ValueBound, ...]:

@@ -22,7 +22,8 @@ from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, CONFIG_NAME, SCENARIO_NAM
 from adacd_hil.log.log_walk import attachment, run_metadata
 from adacd_hil.log.logged_run import Cycles, EmulatorSpan, Progress, Truth, is_armed_in, is_interrupted
 from adacd_hil.log.reader import LogStream, Series
-from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
+from adacd_hil.log.types.topics import TRUTH
+from adacd_hil.records import PARAMETER_NAMES, Vector
 from adacd_hil.score.judge import TrueContact, forgotten_after_s, true_contacts
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
@@ -293,7 +294,7 @@ def placed_contact(
         contact,
         onset_ns=times_ns[0],
         forgotten_ns=times_ns[1] + round(after_s * 1e9),
-        is_armed=bool(host.before[row] == SchemeState.MONITOR),
+        is_armed=bool(is_armed_in(host.before[row])),
         is_reacting=bool(is_interrupted(host.before[row])),
     )
 

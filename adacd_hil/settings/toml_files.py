@@ -17,6 +17,7 @@ _MOST_TOML_BYTES = 1 << 20
 _DEEPEST = 16
 _LONGEST_KEY = 80
 _TOO_DEEP = re.compile(r"""(?<![\w-])(?:(?:[\w-]++|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*){64}""")
+_DECIMAL_COMMA = re.compile(r"[\w-]++[ \t]*=[ \t]*[-+]?\d++,\d++")
 _MOST_NAMES = 12
 """Most built-in names that an error message lists."""
 
@@ -52,16 +53,19 @@ def parse_toml(text: bytes | str) -> dict[str, Any]:
     A byte order mark at the beginning, as editors on Windows write it, is ignored.
     """
     try:
-        text = (text if isinstance(text, str) else text.decode("utf-8")).removeprefix("\ufeff")
-        if _TOO_DEEP.search(text):  # tomllib takes quadratic time for such a key
-            raise RecursionError
-        table = tomllib.loads(text)
-    except RecursionError:
-        raise ConfigError(f"more than {_DEEPEST} tables or lists within each other") from None
+        decoded = (text if isinstance(text, str) else text.decode("utf-8")).removeprefix("\ufeff")
     except UnicodeDecodeError as error:
         raise ConfigError(f"byte {error.start} is not UTF-8; save the file as UTF-8") from None
+    try:
+        if _TOO_DEEP.search(decoded):  # tomllib takes quadratic time for such a key
+            raise RecursionError
+        table = tomllib.loads(decoded)
+    except RecursionError:
+        raise ConfigError(f"more than {_DEEPEST} tables or lists within each other") from None
     except ValueError as error:  # TOML syntax, or an integer that is too long to be parsed
-        raise ConfigError(one_line(error)) from None
+        comma = _DECIMAL_COMMA.search(decoded)
+        hint = f"; `{comma[0]}`: a decimal point, not a comma?" if comma else ""
+        raise ConfigError(f"{one_line(error)}{hint}") from None
     _check_extent(table)
     return table
 

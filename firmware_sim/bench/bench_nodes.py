@@ -86,7 +86,7 @@ class BenchNodes:
         for device, description in zip(self.devices, described, strict=True):
             for alias, (key, ratio) in description.aliases.items():
                 if alias != key:
-                    device.serve(*alias, _scaled(device.reader(*key), ratio))
+                    device.serve(*alias, _scaled(device.reader(*key), ratio, *device.range_of(*alias)))
                     device.pdos.accept_values(*alias, device.pdos.writer(*key))
         injector.attach(self.devices, self.drives, self.sensors)
         self.latch_motors()
@@ -180,8 +180,9 @@ def _scale_of(own: EmulatedArm | None, place: int) -> DriveScale:
     return DriveScale(increments / ENCODER_COUNTS, own.velocity_factor[place], own.rated_count_Nm[place])
 
 
-def _scaled(read: Callable[[], int], ratio: float) -> Callable[[], int]:
-    return read if ratio == 1.0 else lambda: round(read() * ratio)
+def _scaled(read: Callable[[], int], ratio: float, low: int, high: int) -> Callable[[], int]:
+    """Return a reader of the value times `ratio`, which ends at the range of the object that has it."""
+    return read if ratio == 1.0 else lambda: min(max(round(read() * ratio), low), high)
 
 
 def _check_period(period_us: int) -> None:

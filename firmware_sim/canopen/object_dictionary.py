@@ -324,16 +324,20 @@ class ObjectDictionary:
         else:
             self._replaced[index, subindex] = lambda: value
 
+    def range_of(self, index: int, subindex: int) -> tuple[int, int]:
+        """Return the least and the greatest value of an integer that the EDS lists; raise `Refusal` if it doesn't."""
+        variable = self.find(index, subindex)
+        bits, is_signed = len(variable), variable.data_type in datatypes.SIGNED_TYPES
+        return (-(1 << bits - 1), (1 << bits - 1) - 1) if is_signed else (0, (1 << bits) - 1)
+
     def describe_misfit(self, index: int, subindex: int, value: int) -> str:
         """Return why a value can't be a numeric object's, in a line; empty if it can."""
         name = f"object 0x{index:04X}:{subindex}"
         if not self.has(index, subindex):
             return f"has no {name}"
-        variable = self.find(index, subindex)
-        if variable.data_type not in datatypes.INTEGER_TYPES:
+        if self.find(index, subindex).data_type not in datatypes.INTEGER_TYPES:
             return f"{name} is no integer"
-        bits, is_signed = len(variable), variable.data_type in datatypes.SIGNED_TYPES
-        low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if is_signed else (0, (1 << bits) - 1)
+        low, high = self.range_of(index, subindex)
         return "" if low <= value <= high else f"{name} can't be {value}, {low} to {high} allowed"
 
     def watch(

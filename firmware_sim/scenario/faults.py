@@ -119,7 +119,7 @@ class FaultSettings:
     data: str | None = setting(None, meaning="hex bytes of the flood's frames; absent: eight zero bytes")
     code: int | None = setting(None, low=1, high=0xFFFF, meaning="error code of EMCY and 0x603F")
     status: int | None = setting(None, low=1, high=7, meaning="bits of 0x6150; absent: 1, not valid")
-    index: int | None = setting(None, low=0x2000, high=0xFFFF, meaning="object whose value is another")
+    index: int | None = setting(None, low=0x1000, high=0xFFFF, meaning="object whose value is another")
     sub: int | None = setting(None, low=0, high=0xFF, meaning="its sub-index; absent: 0")
     raw: int | None = setting(None, low=-(2**63), high=2**64 - 1, meaning="value of the object, in its counts")
     node_id: int | None = setting(None, low=1, high=126, meaning="the node id that the node has from power-on")

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from importlib import resources
 from typing import Any
 
 import pytest
@@ -153,6 +154,16 @@ def test_devices_of_one_s_own_pass(tmp_path, describe):
     if describe is describe_geared_arm:
         text = "Drive1: 0x6076 = 400000 µNm x gear 50, 20 Nm at the joint, 0.1 % of it a count"
         assert text in findings["torque scale"].reason
+
+
+def test_a_value_outside_the_bounds_of_its_profile_fails(tmp_path):
+    text = (resources.files("adacd_hil") / "device_profiles" / "adacd-sensor.toml").read_text()
+    (tmp_path / "sensor.toml").write_text(text.replace('"error_register" }', '"error_register", low = 1 }'))
+    sensor = str(tmp_path / "sensor.toml")
+    settings = apply_settings(load_settings("paper"), {"devices.sensor": f'["adacd-sensor", "{sensor}"]'})
+    finding = doctor(Rig(settings, is_wall=True))["devices"]
+    assert finding.status is Status.FAILED
+    assert finding.reason == "Sensor2: error_register 0, at least 1 allowed"
 
 
 def change_torque(rig: Rig, change: Callable[[int, float], float]) -> None:

@@ -45,6 +45,9 @@ URDF = """<robot name="lab">
 </robot>"""
 
 
+INT32 = ("--sensor", "int32-sensor", "int32-sensor")
+
+
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
     return tmp_path / "lab" / "my-arm.toml"
@@ -77,6 +80,8 @@ def urdf(folder: Path, axis: str = "0 0 1", wrist: str = "fixed") -> Path:
         ((*NO_BUS, "--mounting", "flor"), "'flor' must be flat, floor"),
         ((*NO_BUS, "--mounting", "100"), "0 to 90 deg"),
         ((*NO_BUS, "--eds", "float.eds"), "its 0x6130:1 is a float, which no frame of a cycle can hold"),
+        ((*NO_BUS, "--gear", "3", "3"), "--gear: profile adacd-drive has its own `scale.gear_ratio`"),
+        ((*NO_BUS, *INT32, "--torque-count-nm", "1e-3", "1e-3"), "profile int32-sensor has its own `scale.torque_Nm`"),
         (("--from", ".", "--length-m", "1", "1"), "leave out --length-m"),
     ],
 )

@@ -27,6 +27,11 @@ cob_id = 0x180
 signals = [{ object = "0x9130:1", signal = "torque" }]
 """
 
+HEADED = SENSOR.replace(
+    "[scale]", 'protection = "P05"\nheader = ["0x2100:1", "0x2100:2", "0x2100:3"]\n[scale]'
+).replace('signal = "torque" }', 'signal = "torque" }, { object = "0x2111", signal = "e2e_counter" }')
+HEADED += 'data_ids = ["0001", "0002"]\n'
+
 
 def profile_file(folder: Path, text: str) -> str:
     path = folder / "mine.toml"
@@ -81,6 +86,7 @@ def test_a_users_file_is_a_profile_and_an_eds_beside_it_comes_first(tmp_path: Pa
         (("torque_Nm = 1e-6", ""), "a sensor needs torque_Nm"),
         (("[scale]", 'protection = "P02"\n[scale]'), "header has 0 objects, P02 takes 2"),
         (("cob_id", 'data_ids = ["00", "11"]\ncob_id'), "data_ids need protection P02 or P05"),
+        ((SENSOR, HEADED), "signal 'e2e_counter' has the name of a part of the header"),
         (("[scale]", "features = ['sync_conter']\n[scale]"), "did you mean 'sync_counter'?"),
         (("[scale]", "serial = [1]\n[scale]"), "serial has 1 numbers, 2 expected"),
     ],

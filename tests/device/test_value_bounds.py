@@ -1,6 +1,8 @@
 """Bounds that a profile sets to further values: the arm stops outside them, and where the values stay away."""
 
 import contextlib
+import math
+import shutil
 import tomllib
 from importlib import resources
 from pathlib import Path
@@ -8,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from click.testing import CliRunner, Result
 from own_arm import eds_of_two_channels
 
 from adacd_hil.cli.main import cli
 from adacd_hil.device.profile import ProfileSettings
+from adacd_hil.device.value_bounds import ValueBound
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.schema import ConfigError, parse
@@ -72,6 +75,13 @@ def sensor_with_two_channels() -> tuple[dict[str, Any], str]:
     return profile, eds_of_two_channels()
 
 
+def with_16_bits(eds: str) -> str:
+    head = eds.index("[9130sub2]")
+    return (eds[:head] + eds[head:].replace("DataType=0x0004", "DataType=0x0003", 1)).replace(
+        "0x91300220", "0x91300210"
+    )
+
+
 def sensor_with_a_temperature() -> tuple[dict[str, Any], str]:
     profile = table_of("adacd-sensor") | {"eds": "sensor.eds"}
     add_signal(profile, "Status", COLD)
@@ -88,6 +98,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "warm").mkdir()
     (folder / "warm" / "sensor.eds").write_text(eds)
     (folder / "warm" / "sensor.toml").write_text(to_toml(parse(ProfileSettings, profile)))
+    profile, eds = sensor_with_two_channels()
+    (folder / "narrow").mkdir()
+    (folder / "narrow" / "sensor.eds").write_text(with_16_bits(eds))
+    (folder / "narrow" / "sensor.toml").write_text(to_toml(parse(ProfileSettings, profile)))
+    (folder / "narrow-arm.toml").write_text(ARM.replace('"sensor.toml"', '"narrow/sensor.toml"'))
     (folder / "arm.toml").write_text(ARM)
     (folder / "warm-arm.toml").write_text(ARM.replace('"sensor.toml"', '"warm/sensor.toml"'))
     return folder
@@ -147,6 +162,27 @@ def test_a_replaced_value_ends_with_its_fault(folder: Path) -> None:
     assert play(folder, "cooled", rows)[0] is FaultReason.NONE
 
 
+def test_an_emulated_second_torque_ends_at_the_range_of_its_object(folder: Path) -> None:
+    assert play(folder, "narrow", arm="narrow-arm")[0] is FaultReason.SENSOR  # 16 bits are 0.66 Nm
+
+
+def play_object(folder: Path, name: str, changes: str) -> Result:
+    (folder / f"{name}-scenario.toml").write_text(
+        f'lasts_s = 0.5\n[[faults]]\nkind = "object_value"\n{changes}\n'.replace(", ", "\n")
+    )
+    with contextlib.chdir(folder):
+        return CliRunner().invoke(
+            cli, ["demo", "--config", "arm.toml", "--scenario", f"{name}-scenario.toml", "--out", name]
+        )
+
+
+def test_an_object_of_the_communication_that_reads_back_another_value_ends_the_set_up(folder: Path) -> None:
+    changes = 'node = "drive1", index = 0x1A00, sub = 1, raw = 0x60770010, since = "power_on", at_s = 0.0'
+    ran = play_object(folder, "mapped", changes)
+    assert ran.exit_code == 5
+    assert "0x1A00:1 = 0x60770010, 0x60640020 expected" in ran.stderr
+
+
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
@@ -155,16 +191,10 @@ def test_a_replaced_value_ends_with_its_fault(folder: Path) -> None:
     ],
 )
 def test_an_object_that_no_device_can_have_is_refused(folder: Path, changes: str, line: str) -> None:
-    (folder / "wrong-scenario.toml").write_text(
-        f'lasts_s = 0.5\n[[faults]]\nkind = "object_value"\nat_s = 0.1\n{changes}\n'.replace(", ", "\n")
-    )
-    with contextlib.chdir(folder):
-        ran = CliRunner().invoke(
-            cli, ["demo", "--config", "arm.toml", "--scenario", "wrong-scenario.toml", "--out", "w"]
-        )
+    ran = play_object(folder, "wrong", f"at_s = 0.1, {changes}")
     assert ran.exit_code == 2
     assert line in ran.stderr
-    assert not (folder / "w").exists()
+    assert not (folder / "wrong").exists()
 
 
 @pytest.mark.parametrize(
@@ -175,6 +205,10 @@ def test_an_object_that_no_device_can_have_is_refused(folder: Path, changes: str
         ("Status", {"low": 90.0}, "low = 90 is above high = 85"),
         ("Command", {}, "is the host's own, and can't have `low` or `high`"),
         ("Feedback", {"high": None, "of": "position"}, "`of` needs `low` or `high`"),
+        ("Status", {"of": "torque_actual"}, "unit = 'degC' must be that of 'torque_actual', 'permille'"),
+        ("Feedback", {"unit": 'a"b'}, "unit = 'a\"b' can't have"),
+        ("Feedback", {"signal": "wärme"}, "signal 'wärme' must be a name"),
+        ("Feedback", {"signal": "SG_"}, "signal 'SG_' must be a name"),
     ],
 )
 def test_bounds_that_cant_be_are_one_line(message: str, changes: dict[str, object], line: str) -> None:
@@ -192,3 +226,27 @@ def test_a_bounded_value_of_a_frame_without_a_period_is_refused() -> None:
     add_signal(profile, "Status", TEMPERATURE)
     with pytest.raises(ConfigError, match="'temperature': `low` and `high` need event_timer_ms"):
         parse(ProfileSettings, profile)
+
+
+@pytest.mark.parametrize(
+    ("key", "row", "bound"),
+    [("high", TEMPERATURE, 3277.0), ("low", TEMPERATURE, -3277.0), ("high", SECOND_TORQUE, 9e4)],
+)
+def test_a_bound_that_no_value_can_reach_is_refused(
+    folder: Path, tmp_path: Path, key: str, row: dict[str, object], bound: float
+) -> None:
+    file, make, at = (
+        ("drive", drive_with_a_temperature, 1) if row is TEMPERATURE else ("sensor", sensor_with_two_channels, 0)
+    )
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    profile, _ = make()
+    profile["pdo"][at]["signals"][-1] = row | {key: bound}
+    (tmp_path / f"{file}.toml").write_text(to_toml(parse(ProfileSettings, profile)))
+    with contextlib.chdir(tmp_path):
+        checked = CliRunner().invoke(cli, ["config", "check", "arm.toml"])
+    assert checked.exit_code == 2
+    assert f"{key} = {bound:g} is outside its range" in checked.output
+
+
+def test_a_value_without_a_unit_has_no_gap_in_its_line() -> None:
+    assert ValueBound("errors", "", 0, None, -math.inf, 3.0).describe_excess([5.0]).startswith("errors 5, ")

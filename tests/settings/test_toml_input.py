@@ -2,6 +2,7 @@
 
 import datetime
 import os
+import re
 import time
 import tracemalloc
 from pathlib import Path
@@ -72,6 +73,16 @@ def test_what_is_within_the_bounds_is_read_as_it_is():
 def test_bytes_that_are_no_text_are_named_by_their_place():
     with pytest.raises(ConfigError, match="byte 4 is not UTF-8"):
         parse_toml(b"x = \xff")
+
+
+@pytest.mark.parametrize(
+    ("text", "hint"),
+    [("a = 0,5", "`a = 0,5`"), ("a = { b = 1, high = -8,5 }", "`high = -8,5`"), ("a = [1,2]\nb", "")],
+)
+def test_a_decimal_comma_is_named(text, hint):
+    with pytest.raises(ConfigError) as raised:
+        parse_toml(text)
+    assert re.findall(r"; (`.*`): a decimal point", str(raised.value)) == [hint][: bool(hint)]
 
 
 CONFIGURATIONS = {

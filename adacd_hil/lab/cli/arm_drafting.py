@@ -181,6 +181,7 @@ class Drafting:
         options = self.options
         drives, sensors = self._find_devices()
         drive, sensor = self._profiles(drives, sensors)
+        self._check_used({DRIVE: drive.value, SENSOR: sensor.value})
         profiles = [self._drive_profile(drive.value[joint], joint) for joint in range(2)]
         scales = [profile.scale for profile in profiles]
         geometry, length_source, mass_source, gravity_source = self._ask_geometry()
@@ -222,6 +223,17 @@ class Drafting:
             8_000_000 if is_half else None,
             self.bitrate,
         )
+
+    def _check_used(self, names: dict[str, Any]) -> None:
+        """Raise CommandError for a given value of a scale that no profile leaves open; names: profiles by kind."""
+        for question in _QUESTIONS:
+            if question.given(self.options) is not None and question.option not in self._answers:
+                option, profiles = question.option.split()[0], " and ".join(dict.fromkeys(names[question.kind]))
+                raise CommandError(
+                    f"{option}: profile {profiles} has its own `{question.key}`; correct it in a profile that "
+                    f"`extends` that one, or give the EDS, --{question.kind}-eds FILE",
+                    ExitCode.USAGE,
+                )
 
     def _drive_profile(self, name: str, joint: int) -> ProfileSettings:
         draft = self._drafts.get((DRIVE, joint))

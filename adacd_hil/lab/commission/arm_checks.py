@@ -293,11 +293,14 @@ def check_heartbeats(patient: ArmExamination) -> Finding:
 
 
 def check_devices(patient: ArmExamination) -> Finding:
-    """Check that no drive is in fault and no device reports an error."""
+    """Check that no drive is in fault, no device reports an error, and bounded values are within their bounds."""
     lines = [line for line in describe_faults(patient.arm) if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
-    if lines or events:
-        return warning("; ".join([*lines, *events]), "a run resets the fault if its cause has gone")
+    text = "; ".join([*lines, *events])
+    if any(device.describe_excess(patient.arm.cycle) for device in patient.arm.devices):
+        return failed(text, "no run enables the arm outside `low` and `high` of a device's profile, or without a value")
+    if text:
+        return warning(text, "a run resets the fault if its cause has gone")
     return ok("no fault, no EMCY")
 
 

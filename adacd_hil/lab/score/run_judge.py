@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.lab.score.run_arrays import Run
-from adacd_hil.log.logged_run import Cycles, enters_react
+from adacd_hil.log.logged_run import Cycles, enters_react, is_armed_in
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.score.emulator_truth import HostCycles, placed_contact
