@@ -66,25 +66,36 @@ class ConsoleOperator:
         In FAULT, typed requests stay for `answer_fault`. elapsed_s: since the drives were enabled, None before.
         """
         if state is not self._state:
-            self._state = state
-            if state in _AWAITED and not self._asked:
-                self._tell(_AWAITED[state])
+            self._enter(state)
         if self._asked and state is not SchemeState.FAULT:
             return self._asked.popleft()
         return self._script.request(elapsed_s, state)
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Return RECOVER if the user typed `ack`, END for `finish`, else WAIT; drop the requests typed before.
+        """Return RECOVER if the user has typed `ack` since the fault, END for `finish`, else WAIT; drop other requests.
 
         After the terminal's end, if neither was typed, return the script's answer. elapsed_s: since the fault.
         """
+        if self._state is not SchemeState.FAULT:  # the bus or the boot failed, without a cycle in FAULT
+            self._enter(SchemeState.FAULT)
         while self._asked:
             request = self._asked.popleft()
             if request is Request.ACKNOWLEDGE:
+                self._state = SchemeState.INIT
                 return FaultAnswer.RECOVER
             if request is Request.FINISH:
                 return FaultAnswer.END
         return FaultAnswer.WAIT if self._thread.is_alive() else self._script.answer_fault(elapsed_s)
+
+    def _enter(self, state: SchemeState) -> None:
+        """Store a new state. A fault drops what was typed before it, which can't acknowledge it, except for FINISH."""
+        self._state = state
+        if state is SchemeState.FAULT:
+            for request in [self._asked.popleft() for _ in range(len(self._asked))]:
+                if request is Request.FINISH:
+                    self._asked.append(request)
+        elif state in _AWAITED and not self._asked:
+            self._tell(_AWAITED[state])
 
 
 def _unknown(word: str) -> str:
