@@ -11,6 +11,7 @@ from typing import TextIO
 from adacd_hil.control.operator import FaultAnswer, ScriptedOperator
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.remedies import nearest_name
+from adacd_hil.scheme.supervisor.supervisor import KEPT_IN, REACTING
 
 CONSOLE_WORDS = {
     "ack": Request.ACKNOWLEDGE,
@@ -63,12 +64,15 @@ class ConsoleOperator:
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
         """Return the next request that the user typed, else the script's; print which word a new state waits for.
 
-        In FAULT, typed requests stay for `answer_fault`. elapsed_s: since the drives were enabled, None before.
+        Print that the state drops the request, if it does. In FAULT, typed requests stay for `answer_fault`.
+        elapsed_s: since the drives were enabled, None before.
         """
         if state is not self._state:
             self._enter(state)
         if self._asked and state is not SchemeState.FAULT:
-            return self._asked.popleft()
+            request = self._asked.popleft()
+            self._tell_if_dropped(request)
+            return request
         return self._script.request(elapsed_s, state)
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
@@ -85,6 +89,7 @@ class ConsoleOperator:
                 return FaultAnswer.RECOVER
             if request is Request.FINISH:
                 return FaultAnswer.END
+            self._tell_if_dropped(request)
         return FaultAnswer.WAIT if self._thread.is_alive() else self._script.answer_fault(elapsed_s)
 
     def _enter(self, state: SchemeState) -> None:
@@ -96,6 +101,15 @@ class ConsoleOperator:
                     self._asked.append(request)
         elif state in _AWAITED and not self._asked:
             self._tell(_AWAITED[state])
+
+    def _tell_if_dropped(self, request: Request) -> None:
+        """Print that the present state drops a request; of a reaction that is known in one case to the scheme only."""
+        is_open = request is Request.PAYLOAD_CHANGED and self._state in REACTING
+        if request not in KEPT_IN or self._state in KEPT_IN[request] or is_open:
+            return
+        word = next(word for word, meant in CONSOLE_WORDS.items() if meant is request)
+        works_in = ", ".join(state.name for state in sorted(KEPT_IN[request]))
+        self._tell(f"`{word}` is dropped in {self._state.name}; it works in {works_in}")
 
 
 def _unknown(word: str) -> str:

@@ -91,6 +91,21 @@ def test_a_stop_that_is_already_acknowledged_waits_for_nothing() -> None:
     assert told("ack\n", SchemeState.STOPPED) == []
 
 
+@pytest.mark.parametrize(
+    ("typed_words", "state", "dropped"),
+    [
+        ("changed\nack\n", SchemeState.MONITOR, ["`changed`", "`ack`"]),
+        ("payload\nrelearn\n", SchemeState.PAYLOAD, ["`payload`", "`relearn`"]),
+        ("payload\nfinish\naccept\n", SchemeState.ADAPT, []),
+        ("ack\nchanged\n", SchemeState.STOPPED, []),  # in doubt, `changed` works in STOPPED
+    ],
+)
+def test_a_word_that_the_state_drops_is_answered(typed_words: str, state: SchemeState, dropped: list[str]) -> None:
+    lines = [line for line in told(typed_words, *[state] * 3) if "waiting" not in line]
+    assert [line.split()[0] for line in lines] == dropped
+    assert all(state.name in line for line in lines)
+
+
 def test_a_script_acknowledges_so_many_faults_each_after_its_time() -> None:
     operator = ScriptedOperator(OperatorSettings(acknowledge_faults=2, acknowledge_fault_after_s=0.5))
     for _ in range(2):
