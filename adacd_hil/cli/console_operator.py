@@ -11,6 +11,7 @@ from typing import TextIO
 from adacd_hil.control.operator import FaultAnswer, ScriptedOperator
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.remedies import nearest_name
+from adacd_hil.scheme.supervisor.supervisor import KEPT_IN, REACTING
 
 CONSOLE_WORDS = {
     "ack": Request.ACKNOWLEDGE,
@@ -63,28 +64,52 @@ class ConsoleOperator:
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
         """Return the next request that the user typed, else the script's; print which word a new state waits for.
 
-        In FAULT, typed requests stay for `answer_fault`. elapsed_s: since the drives were enabled, None before.
+        Print that the state drops the request, if it does. In FAULT, typed requests stay for `answer_fault`.
+        elapsed_s: since the drives were enabled, None before.
         """
         if state is not self._state:
-            self._state = state
-            if state in _AWAITED and not self._asked:
-                self._tell(_AWAITED[state])
+            self._enter(state)
         if self._asked and state is not SchemeState.FAULT:
-            return self._asked.popleft()
+            request = self._asked.popleft()
+            self._tell_if_dropped(request)
+            return request
         return self._script.request(elapsed_s, state)
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Return RECOVER if the user typed `ack`, END for `finish`, else WAIT; drop the requests typed before.
+        """Return RECOVER if the user has typed `ack` since the fault, END for `finish`, else WAIT; drop other requests.
 
         After the terminal's end, if neither was typed, return the script's answer. elapsed_s: since the fault.
         """
+        if self._state is not SchemeState.FAULT:  # the bus or the boot failed, without a cycle in FAULT
+            self._enter(SchemeState.FAULT)
         while self._asked:
             request = self._asked.popleft()
             if request is Request.ACKNOWLEDGE:
+                self._state = SchemeState.INIT
                 return FaultAnswer.RECOVER
             if request is Request.FINISH:
                 return FaultAnswer.END
+            self._tell_if_dropped(request)
         return FaultAnswer.WAIT if self._thread.is_alive() else self._script.answer_fault(elapsed_s)
+
+    def _enter(self, state: SchemeState) -> None:
+        """Store a new state. A fault drops what was typed before it, which can't acknowledge it, except for FINISH."""
+        self._state = state
+        if state is SchemeState.FAULT:
+            for request in [self._asked.popleft() for _ in range(len(self._asked))]:
+                if request is Request.FINISH:
+                    self._asked.append(request)
+        elif state in _AWAITED and not self._asked:
+            self._tell(_AWAITED[state])
+
+    def _tell_if_dropped(self, request: Request) -> None:
+        """Print that the present state drops a request; of a reaction that is known in one case to the scheme only."""
+        is_open = request is Request.PAYLOAD_CHANGED and self._state in REACTING
+        if request not in KEPT_IN or self._state in KEPT_IN[request] or is_open:
+            return
+        word = next(word for word, meant in CONSOLE_WORDS.items() if meant is request)
+        works_in = ", ".join(state.name for state in sorted(KEPT_IN[request]))
+        self._tell(f"`{word}` is dropped in {self._state.name}; it works in {works_in}")
 
 
 def _unknown(word: str) -> str:

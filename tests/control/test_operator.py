@@ -2,8 +2,10 @@
 
 import io
 import os
+import time
 
 import pytest
+from hang import HANG_S
 
 from adacd_hil.cli.console_operator import CONSOLE_WORDS, ConsoleOperator
 from adacd_hil.control.operator import FaultAnswer, ScriptedOperator
@@ -89,11 +91,19 @@ def test_a_stop_that_is_already_acknowledged_waits_for_nothing() -> None:
     assert told("ack\n", SchemeState.STOPPED) == []
 
 
-def test_what_the_user_types_while_the_arm_is_faulted_answers_the_fault() -> None:
-    operator = ConsoleOperator(script(), io.StringIO("finish\n"))
-    operator.join(1.0)
-    asked = operator.request(1.0, SchemeState.FAULT)
-    assert (asked, operator.answer_fault(0.5)) == (Request.NONE, FaultAnswer.END)
+@pytest.mark.parametrize(
+    ("typed_words", "state", "dropped"),
+    [
+        ("changed\nack\n", SchemeState.MONITOR, ["`changed`", "`ack`"]),
+        ("payload\nrelearn\n", SchemeState.PAYLOAD, ["`payload`", "`relearn`"]),
+        ("payload\nfinish\naccept\n", SchemeState.ADAPT, []),
+        ("ack\nchanged\n", SchemeState.STOPPED, []),  # in doubt, `changed` works in STOPPED
+    ],
+)
+def test_a_word_that_the_state_drops_is_answered(typed_words: str, state: SchemeState, dropped: list[str]) -> None:
+    lines = [line for line in told(typed_words, *[state] * 3) if "waiting" not in line]
+    assert [line.split()[0] for line in lines] == dropped
+    assert all(state.name in line for line in lines)
 
 
 def test_a_script_acknowledges_so_many_faults_each_after_its_time() -> None:
@@ -105,19 +115,43 @@ def test_a_script_acknowledges_so_many_faults_each_after_its_time() -> None:
     assert script().answer_fault(1000.0) is FaultAnswer.END  # by default nobody does
 
 
+def answers(before: bytes, after: bytes, *states: SchemeState) -> list[FaultAnswer]:
+    """Return the answers to a fault and to a failed boot behind it: typed before it, and once it has been told."""
+    read_end, write_end = os.pipe()
+    with os.fdopen(read_end) as stream, os.fdopen(write_end, "wb", buffering=0) as keys:
+        operator = ConsoleOperator(script(), stream)
+        keys.write(before)
+        wait_for_words(operator, before)
+        assert [operator.request(1.0, state) for state in states] == [Request.NONE] * len(states)
+        first = operator.answer_fault(0.0)
+        keys.write(after)
+        keys.close()
+        operator.join(1.0)
+        return [first, operator.answer_fault(0.5), operator.answer_fault(0.0)]
+
+
+def wait_for_words(operator: ConsoleOperator, words: bytes) -> None:
+    deadline_s = time.monotonic() + HANG_S
+    while len(operator._asked) < words.count(b"\n"):
+        assert time.monotonic() < deadline_s
+
+
+@pytest.mark.parametrize("states", [(), (SchemeState.FAULT,)], ids=["bus fails", "fault"])
 @pytest.mark.parametrize(
-    ("typed", "answer"),
+    ("before", "after", "expected"),
     [
-        ("ack\n", FaultAnswer.RECOVER),
-        ("finish\n", FaultAnswer.END),
-        ("payload\nack\n", FaultAnswer.RECOVER),
-        ("payload\n", FaultAnswer.END),  # the stream has ended: nobody is there to ask
+        (b"", b"ack\n", [FaultAnswer.WAIT, FaultAnswer.RECOVER, FaultAnswer.END]),
+        (b"", b"payload\nack\n", [FaultAnswer.WAIT, FaultAnswer.RECOVER, FaultAnswer.END]),
+        (b"finish\n", b"", [FaultAnswer.END, FaultAnswer.END, FaultAnswer.END]),
+        (b"", b"payload\n", [FaultAnswer.WAIT, FaultAnswer.END, FaultAnswer.END]),  # the stream has ended: nobody
+        (b"ack\nack\n", b"", [FaultAnswer.WAIT, FaultAnswer.END, FaultAnswer.END]),  # meant something else
+        (b"", b"ack\nack\n", [FaultAnswer.WAIT, FaultAnswer.RECOVER, FaultAnswer.END]),  # one for each fault
     ],
 )
-def test_the_console_answers_a_fault(typed: str, answer: FaultAnswer) -> None:
-    operator = ConsoleOperator(script(), io.StringIO(typed))
-    operator.join(1.0)
-    assert operator.answer_fault(0.0) is answer
+def test_a_fault_is_answered_by_what_is_typed_after_it(
+    before: bytes, after: bytes, expected: list[FaultAnswer], states: tuple[SchemeState, ...]
+) -> None:
+    assert answers(before, after, *states) == expected
 
 
 def test_a_fault_waits_while_somebody_may_still_type() -> None:
@@ -141,7 +175,7 @@ def typed(data: bytes) -> ConsoleOperator:
 
 def test_a_key_that_is_no_letter_does_not_end_the_console() -> None:
     assert typed(b"\xff\xfe\nfinish\n").answer_fault(0.0) is FaultAnswer.END
-    assert typed(b"\xff\xfe\nack\n").answer_fault(0.0) is FaultAnswer.RECOVER
+    assert typed(b"\xff\xfe\nack\n").request(1.0, SchemeState.STOPPED) is Request.ACKNOWLEDGE
 
 
 def test_a_terminal_that_hangs_up_ends_the_console_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -301,6 +301,8 @@ def test_a_touch_is_reacted_to_wherever_it_is_found_and_the_arm_goes_on_where_it
 def test_a_host_that_is_late_holds_the_arm_or_faults(state, expected):
     run = run_in(SchemeState[state]).play(f"late = {expected}")
     assert (run.fault is FaultReason.DEADLINE) == (expected == "FAULT")
+    if expected == "FAULT":  # it outranks its own effect
+        assert run_in(SchemeState[state]).play("late+q1-too-old = FAULT").fault is FaultReason.DEADLINE
 
 
 # A sentence about the arm, the state in which it begins, and what happens.

@@ -451,6 +451,8 @@ def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
         fault = arm.fault
     elif observation & NOT_A_NUMBER:
         fault = FaultReason.NOT_A_NUMBER
+    elif arm.is_late != 0 and not _IS_HELD_FROM[state]:
+        fault = FaultReason.DEADLINE  # outranks its effects: old data, drives that drop out
     elif arm.age > k.max_age_cycles or m.stale_cycles > k.blind_limit:
         fault = FaultReason.DATA_AGE
     elif m.blind_cycles >= k.blind_limit:
@@ -459,8 +461,6 @@ def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
         fault = FaultReason.LIMIT
     elif _IS_POWERED[state] and arm.is_enabled == 0:
         fault = FaultReason.DRIVE
-    elif arm.is_late != 0 and not _IS_HELD_FROM[state]:
-        fault = FaultReason.DEADLINE
     return fault
 
 
