@@ -3,10 +3,12 @@
 import contextlib
 import dataclasses
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from eds_variants import EdsVariant
 from own_arm import LINKS, describe_arm, describe_geared_arm, touches
 
 from adacd_hil.cli.embedded_run import resolve
@@ -217,3 +219,24 @@ number = 1
 cob_id = 0x180
 signals = [{ object = "0x9130:1", signal = "torque" }]
 """
+
+
+@pytest.mark.parametrize(
+    ("variant", "said"),
+    [
+        (EdsVariant().without("1A00"), "0x1A00 of [[pdo]] Feedback is not in"),
+        (EdsVariant().with_value("0x0003", "6064", key="DataType"), "0x6064 has 16 bits in"),
+        (EdsVariant().with_value("0x0005", "6041", key="DataType"), "0x6041 has 8 bits in"),
+        (EdsVariant().with_value("0x0007", "6040", key="DataType"), "0x6040 has 32 bits in"),
+    ],
+)
+def test_a_drive_that_its_eds_lets_nobody_play_is_named(tmp_path: Path, variant: EdsVariant, said: str) -> None:
+    variant.write(tmp_path / "odd.eds")
+    stock = resources.files("adacd_hil").joinpath("device_profiles", "stock-drive.toml").read_text()
+    (tmp_path / "odd.toml").write_text(stock.replace("stock_drive.eds", "odd.eds"))
+    devices = 'drive = ["odd.toml", "odd.toml"]\nsensor = ["int32-sensor", "int32-sensor"]\n'
+    (tmp_path / "my-arm.toml").write_text(OWN_ARM.replace("[devices]\n", f"[devices]\n{devices}"))
+    (tmp_path / "short.toml").write_text(SHORT)
+    status, error = rehearse(tmp_path, "played")
+    assert status == 2
+    assert said in error

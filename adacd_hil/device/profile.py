@@ -449,7 +449,7 @@ class PlacedDevice:
     @property
     def objects(self) -> Any:
         """The object dictionary of its EDS. Raises ConfigError when it can't be read."""
-        return _objects(self.profile.eds, self.node_id)
+        return _objects(self.profile.eds.absolute(), self.node_id)
 
     def has(self, index: int, sub: int = 0) -> bool:
         """Return whether the EDS lists an object. Raises ConfigError when the EDS can't be read."""

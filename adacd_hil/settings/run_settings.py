@@ -243,6 +243,13 @@ class SafetySettings:
         "or a SYNC of the wrong length",
     )
 
+    def __post_init__(self) -> None:
+        if self.phase_timeout_s <= self.commission_s:
+            raise ConfigError(
+                f"`safety.phase_timeout_s` = {self.phase_timeout_s:g} s must be longer than `safety.commission_s` = "
+                f"{self.commission_s:g} s, else COMMISSION never ends well"
+            )
+
 
 @dataclass(frozen=True)
 class TareSettings:

@@ -223,8 +223,28 @@ def _live_value(device: PlacedDevice, pdo: PdoSettings, signal: SignalSettings) 
     return LiveValue(objects[twin.signal], twin_count / count)
 
 
+_STANDARD_BITS = {0x603F: 16, 0x6040: 16, 0x6041: 16, 0x6060: 8, 0x6061: 8, 0x6064: 32, 0x606C: 32, 0x6071: 16}
+"""Size of the objects that a drive lives by. Source: CiA 402-2."""
+
+
+def _check_objects(device: PlacedDevice) -> None:
+    """Raise ConfigError for a device that can't be played: it lacks a PDO's objects, or one has another size."""
+    place = f"device profile {device.profile.name}"
+    for pdo in device.settings.pdo:
+        for index in (pdo.communication_index, pdo.mapping_index):
+            if not device.has(index):
+                raise ConfigError(f"{place}: 0x{index:04X} of [[pdo]] {pdo.message} is not in {device.profile.eds}")
+    for index, bits in _STANDARD_BITS.items():
+        if device.has(index) and (found := device.variable(ObjectName(index)).bits) != bits:
+            raise ConfigError(f"{place}: 0x{index:04X} has {found} bits in {device.profile.eds}, {bits} by CiA 402")
+
+
 def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
-    """Return a device's description: its EDS, and the values at power-on that the profile adds or replaces."""
+    """Return a device's description: its EDS, and the values at power-on that the profile adds or replaces.
+
+    Raises ConfigError for an EDS by which no device can be played.
+    """
+    _check_objects(device)
     kind, scale = device.settings.kind, device.settings.scale
     made_up = {index: made for index, made in _made_up(kind, settings).items() if not device.has(index)}
     defaults: dict[tuple[int, int], int] = {}
