@@ -34,6 +34,7 @@ def test_an_identical_log_ends_with_status_0_and_says_so(log):
     assert done.exit_code == OK
     assert "identical, bit for bit" in done.stdout
     assert "in 2 attempts" in done.stdout
+    assert "--set filter.a_rad_s=20" in done.stderr  # a setting that its scheme has
 
 
 def test_a_flipped_bit_in_the_file_ends_with_status_1_and_the_field_is_named(log, flipped):
