@@ -429,6 +429,12 @@ def test_the_unit_of_one_joint_alone_is_its_scale(tmp_path, upright, spoil, said
     assert verdict.remedy == f"if the {remedy}"
 
 
+def test_torques_of_an_unknown_unit_are_not_said_to_be_what_the_map_has(tmp_path, upright):
+    verdict = judged(tmp_path, times(tau=1e6)(upright), more='[units]\ntau_J = "mNm"\n', has_masses=False).verdict
+    assert "reaches" in verdict.reasons[0]
+    assert "mNm" not in verdict.remedy
+
+
 def test_what_is_named_makes_the_recording_explained(tmp_path, upright):
     turned = replace(upright, q=upright.q * TURNED, dq=upright.dq * TURNED, tau=1e3 * upright.tau * TURNED)
     keys = '[units]\ntau_J = "mNm"\n[scale]\nq = [1, -1]\ntau_J = [1, -1]\n'
