@@ -48,6 +48,11 @@ class CycleStretch(NamedTuple):
     requests: NDArray[np.uint8] | None
     scheme: Series | None
 
+    @property
+    def follows_gap(self) -> bool:
+        """Whether the log lacks cycles of the attempt before it."""
+        return self.scheme is not None and not self.is_exact
+
 
 class AttemptSplitter:
     """Splits the pieces of a log, in order, into stretches of its attempts.

@@ -41,7 +41,7 @@ from adacd_hil.replay.scheme_comparison import (
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, arm_at
 from adacd_hil.score.emulator_truth import KnownContacts, contacts_beside
-from adacd_hil.score.wording import unjudged_sentence
+from adacd_hil.score.wording import number_of, unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 
 SCRIPTED: Final = "script"
@@ -129,7 +129,7 @@ class _Player:
             self.gatherer.begin_attempt(stretch.attempt, int(ticks.cycle[0]))
         batch = self._run(stretch, arms)
         events = self._pipeline.take_events()
-        self.gatherer.add_stretch(ticks, batch)
+        self.gatherer.add_stretch(ticks, batch, stretch.follows_gap)
         asked = None
         if self._asking is not None and stretch.requests is not None and stretch.is_exact:
             asked = self._asking.requests(ticks, batch)
@@ -408,8 +408,12 @@ def _result(
     score = None if score is None else score.since(first_ns)
     if in_loop := source.metadata.get("detectors", ""):
         notes.append(f"the run had detectors in its loop, which a replay leaves out: {in_loop}")
-    if unjudged := unjudged_sentence(0 if score is None else len(score.unjudged)):
-        notes.append(unjudged)
+    unjudged = () if score is None else score.unjudged
+    behind_gap = sum(alarm.t_ns in gatherer.behind_gap_ns for alarm in unjudged)
+    if untold := unjudged_sentence(len(unjudged) - behind_gap):
+        notes.append(untold)
+    if behind_gap:
+        notes.append(f"{number_of(behind_gap, 'detection')} behind missing cycles may stem from them, not judged")
     if comparison is not None:
         for cycle, t_ns, logged, asked in player.requests.unexplained:
             comparison.add_mismatch(Mismatch(SCHEME.name, "request", "", cycle, t_ns, str(logged), str(asked)))

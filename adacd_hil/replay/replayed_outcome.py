@@ -61,6 +61,8 @@ class OutcomeGatherer:
         self._kept: list[HostCycles] = []  # of this attempt
         self._placed: list[TrueContact] = []  # on the host's clock
         self._alarms: list[tuple[int, Detection]] = []  # with the cycle of each
+        self.behind_gap_ns: set[int] = set()
+        """Times of the alarms before which the log lacks cycles of their attempt."""
         self._begins: list[int] = []  # first cycle of each attempt
         slices = layout_of(settings).slices
         self._theta = slices["theta_hat"]
@@ -72,8 +74,11 @@ class OutcomeGatherer:
         self._crossings: list[int] = []  # times at which some joint crosses its threshold
         self._was_over = False
 
-    def add_stretch(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Gather states, contacts and alarms of the next cycles, from the scheme's decisions in them."""
+    def add_stretch(self, ticks: Ticks, batch: SchemeBatch, follows_gap: bool = False) -> None:
+        """Gather states, contacts and alarms of the next cycles, from the scheme's decisions in them.
+
+        follows_gap: the log lacks cycles before them, so that an alarm may stem from the jump.
+        """
         count = len(batch.cycle)
         if count == 0:
             return
@@ -87,6 +92,8 @@ class OutcomeGatherer:
         for row in np.flatnonzero(enters_react(batch.previous_state, batch.state) & over).tolist():
             is_armed = bool(is_armed_in(batch.previous_state[row]))
             self._alarms.append((int(ticks.cycle[row]), Detection(int(ticks.t_ns[row]), is_armed)))
+            if follows_gap:
+                self.behind_gap_ns.add(int(ticks.t_ns[row]))
         for row in np.flatnonzero(batch.state != batch.previous_state).tolist():
             self._enter(
                 StateChange(
@@ -184,7 +191,10 @@ class OutcomeGatherer:
             return None
         span = host_span(self._truth[1], np.array(self._begins or [0]))
         is_known = span.covers(np.array([cycle for cycle, _ in self._alarms], np.int64)).tolist()
-        alarms = [replace(alarm, is_known=known) for (_, alarm), known in zip(self._alarms, is_known, strict=True)]
+        alarms = [
+            replace(alarm, is_known=known and alarm.t_ns not in self.behind_gap_ns)
+            for (_, alarm), known in zip(self._alarms, is_known, strict=True)
+        ]
         return judge(self._placed, alarms, self._crossings)
 
 
@@ -256,12 +266,13 @@ Row = tuple[str, ...]
 
 def side_by_side(replays: Sequence[Replay]) -> list[Row]:
     """Return a row per quantity: its name, then its value in each replay."""
-    rows = [("contacts detected", *map(_detected, replays))]
+    rows = [("watched, s", *(f"{each.monitored_s:.2f}" for each in replays))]
+    rows.append(("contacts detected", *map(_detected, replays)))
     if any(each.score is None for each in replays):
         rows.append(("detections at", *(_times(each, each.detections_ns) for each in replays)))
     rows += _contact_rows(replays)
     rows += [
-        ("missed", *(NONE if each.score is None else str(each.score.missed) for each in replays)),
+        ("missed", *map(_missed, replays)),
         ("false alarms", *map(_false_alarms, replays)),
         ("median delay, ms", *map(_median_delay, replays)),
     ]
@@ -306,8 +317,12 @@ def _times(found: Replay, times_ns: Sequence[int]) -> str:
     return ", ".join(f"{found.time_s(t_ns):.2f} s" for t_ns in times_ns) or NONE
 
 
+def _missed(found: Replay) -> str:
+    return NONE if found.score is None or not found.monitored_s else str(found.score.missed)
+
+
 def _false_alarms(found: Replay) -> str:
-    if found.score is None:
+    if found.score is None or not (found.monitored_s or found.score.false_alarms):
         return NONE
     times_ns = [alarm.t_ns for alarm in found.score.false_alarms]
     count = len(times_ns)
@@ -348,6 +363,7 @@ def as_json(found: Replay) -> dict[str, Any]:
     return {
         "cycles": found.cycles,
         "attempts": found.attempts,
+        "monitored_s": found.monitored_s,
         "contacts": None
         if found.score is None
         else [

@@ -262,3 +262,6 @@ def test_a_span_that_ends_before_it_begins_is_usage(free):
     played = called("identify", free, "--map", EXAMPLE / "map.toml", "--from", "5", "--until", "4")
     assert (played.exit_code, played.stdout) == (2, "")
     assert "--from 5 s is not before --until 4 s" in played.stderr
+    beyond = called("identify", free, "--map", EXAMPLE / "map.toml", "--from", "1000")
+    assert (beyond.exit_code, beyond.stdout) == (1, "")
+    assert "no 50 samples in a row" in beyond.stderr

@@ -1,6 +1,7 @@
 """A truth of another run is left out; what a truth doesn't cover isn't judged."""
 
 import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -74,14 +75,22 @@ def with_truth_of(run: Run, rows: slice) -> Run:
 @pytest.mark.slow
 @pytest.mark.parametrize("full_cycles", [500_000, 100], ids=["short", "long"])
 @pytest.mark.parametrize(
-    ("rows", "false_alarms", "unjudged"),
-    [(slice(None), 1, ""), (slice(3000), 0, "2 detections"), (slice(3000, None), 1, "1 detection")],
+    ("rows", "false_alarms", "unjudged", "judged_s"),
+    [
+        (slice(None), 1, "", []),
+        (slice(3000), 0, "2 detections", [("1.00", "2.95")]),
+        (slice(3000, None), 1, "1 detection", [("2.95", "9.30")]),
+    ],
 )
-def test_what_comes_before_or_after_the_truth_is_not_judged(rows, false_alarms, unjudged, full_cycles, tmp_path):
+def test_what_comes_before_or_after_the_truth_is_not_judged(
+    rows, false_alarms, unjudged, judged_s, full_cycles, tmp_path
+):
     run, gathered, source = read_run(*recorded(tmp_path, with_truth_of(touched_run(), rows)), full_cycles=full_cycles)
-    assert evaluate(run, gathered).false_alarms == false_alarms
+    metrics = evaluate(run, gathered)
+    assert metrics.false_alarms == false_alarms
+    assert re.findall(r"from (\S+) to (\S+) s", metrics.findings[0].text) == judged_s
     said = f"the truth doesn't cover {unjudged}, not judged" if unjudged else ""
-    assert (source.problem, source.is_complete) == (said, not unjudged)
+    assert (source.log_problem, source.truth_problem, source.is_complete) == ("", said, not unjudged)
 
 
 @pytest.mark.slow

@@ -209,7 +209,7 @@ def test_a_long_stretch_comes_to_the_same_as_one_that_is_kept_whole(few_kept, pa
 
 
 def test_a_stretch_beside_the_log_is_a_log_error(certified):
-    with pytest.raises(LogError, match=r"run\.mcap has no cycle from 100 to 200 s"):
+    with pytest.raises(LogError, match=r"run\.mcap has no cycle from 100 s until 200 s"):
         stretched(certified, 100.0, 200.0)
 
 

@@ -389,6 +389,15 @@ def test_a_common_mistake_is_named_with_its_key(tmp_path, upright, mistake):
     assert remedy in verdict.remedy
 
 
+@pytest.mark.parametrize("mistake", ["torques exchanged", "positions exchanged", "joints exchanged"])
+def test_exchanged_columns_leave_the_scale_to_the_joint(tmp_path, upright, mistake):
+    spoil, said, remedy = MISTAKES[mistake]
+    other = times(q=TURNED, dq=TURNED, tau=np.array([1.0, -2.0]))(upright)
+    verdict = judged(tmp_path, spoil(other), more="[scale]\nq = [1.0, -1.0]\ntau_J = [1.0, -0.5]\n").verdict
+    assert said in verdict.reasons[0]
+    assert verdict.remedy == f"in the map: exchange them in {remedy}"
+
+
 @pytest.mark.parametrize(
     ("keys", "said", "remedy"),
     [
@@ -418,6 +427,12 @@ def test_the_unit_of_one_joint_alone_is_its_scale(tmp_path, upright, spoil, said
     assert not verdict.is_explained
     assert verdict.reasons[0].startswith(said)
     assert verdict.remedy == f"if the {remedy}"
+
+
+def test_torques_of_an_unknown_unit_are_not_said_to_be_what_the_map_has(tmp_path, upright):
+    verdict = judged(tmp_path, times(tau=1e6)(upright), more='[units]\ntau_J = "mNm"\n', has_masses=False).verdict
+    assert "reaches" in verdict.reasons[0]
+    assert "mNm" not in verdict.remedy
 
 
 def test_what_is_named_makes_the_recording_explained(tmp_path, upright):

@@ -357,6 +357,20 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(log, whole):
     assert replay_source(LogSource(log), [source.settings], (contacts, span))[0].notes == ()
 
 
+def test_an_alarm_behind_missing_cycles_is_not_called_false(log):
+    source = ChangedLog(log, without_cycles(2050, 2150))
+    found = replay_source(source, [source.settings], contacts_beside(log))[0]
+    assert ([alarm.t_ns for alarm in found.score.unjudged], found.score.false_alarms) == ([found.detections_ns[0]], ())
+    assert any(note.startswith("1 detection behind missing cycles") for note in found.notes)
+
+
+def test_where_nothing_was_watched_no_alarm_is_counted(log):
+    source = LogSource(log)
+    learning = replay_source(source, [source.settings], contacts_beside(log), stretch=TimeWindow(end_s=0.3))[0]
+    rows = dict(side_by_side([learning]))
+    assert (rows["watched, s"], rows["missed"], rows["false alarms"]) == ("0.00", "–", "–")
+
+
 def test_a_truth_without_a_cycle_knows_nothing(log, tmp_path):
     (tmp_path / "run.mcap").write_bytes(log.read_bytes())
     TruthLog(tmp_path / "truth.mcap", blocking=True).close()

@@ -2,12 +2,14 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from analysis.flipped_log import flip_in_file
 from analysis.replay_rig import write_candump
 from called import called, complaints
 
+from adacd_hil.lab.runs.log_comparison import LogComparison
 from adacd_hil.log.reader import begin_of_log, read_log
 
 pytestmark = pytest.mark.slow
@@ -32,6 +34,7 @@ def test_an_identical_log_ends_with_status_0_and_says_so(log):
     assert done.exit_code == OK
     assert "identical, bit for bit" in done.stdout
     assert "in 2 attempts" in done.stdout
+    assert "--set filter.a_rad_s=20" in done.stderr  # a setting that its scheme has
 
 
 def test_a_flipped_bit_in_the_file_ends_with_status_1_and_the_field_is_named(log, flipped):
@@ -127,11 +130,21 @@ def test_a_recording_alone_needs_a_configuration(log, tmp_path):
     assert "--against the log of its run, or --config" in done.stderr
 
 
-def test_two_logs_that_are_the_same_compare_with_status_0_and_others_with_1(log, tmp_path):
+def test_two_logs_compare_with_status_0_if_the_same_3_as_far_as_whole_else_1(log, flipped, tmp_path):
     assert called("compare", log, log.parent).exit_code == OK
     content = log.read_bytes()
     (tmp_path / "run.mcap").write_bytes(content[: len(content) * 3 // 4])
     many = called("compare", log, log.parent, tmp_path, "--json")
     same, cut = json.loads(many.stdout)
-    assert (many.exit_code, same["is_same"], cut["is_same"], cut["fields"]) == (FAILURE, True, False, [])
+    assert (many.exit_code, same["is_same"], cut["is_same"], cut["fields"]) == (PARTIAL, True, False, [])
     assert cut["only"][0] > 0
+    assert called("compare", tmp_path, log).exit_code == PARTIAL
+    assert called("compare", log, tmp_path, flipped).exit_code == FAILURE
+    one, two = {"problem": ""}, {"problem": "cut after 9 bytes"}
+    for first, second, only, is_same in (
+        (one, two, (4, 0), True),
+        (one, two, (0, 4), False),
+        (one, one, (4, 0), False),
+    ):
+        sides = SimpleNamespace(**first), SimpleNamespace(**second)
+        assert LogComparison(*sides, {}, {}, (), (), 9, only, ()).is_same_where_whole == is_same

@@ -91,15 +91,18 @@ def replay(
         ]
     described = [_as_json(*result, shown, stretch) for result in results]
     text = "\n\n".join(_as_text(*result, shown, stretch) for result in results)
-    answer(as_json, described, text, _next(logs[0], has_changes=bool(changes or vary or config)))
+    answer(as_json, described, text, *_next(logs[0], results[0][1][0], has_changes=bool(changes or vary or config)))
     codes = [_code(replays) for _, replays, _ in results]
     return max(codes, key=[ExitCode.OK, ExitCode.PARTIAL, ExitCode.FAILURE].index)
 
 
-def _next(given: Path, has_changes: bool) -> str:
+def _next(given: Path, own: "Replay", has_changes: bool) -> tuple[str, ...]:
+    if not own.cycles:
+        return ()
     if has_changes:
-        return f"adacd-hil sweep {quoted(given)} --vary KEY=A,B,C   # many values at once"
-    return f"adacd-hil replay {quoted(given)} --set certified.noise_sigmas=8   # and with another setting?"
+        return (f"adacd-hil sweep {quoted(given)} --vary KEY=A,B,C   # many values at once",)
+    key = "certified.noise_sigmas=8" if own.settings.scheme == "certified" else "filter.a_rad_s=20"
+    return (f"adacd-hil replay {quoted(given)} --set {key}   # and with another setting?",)
 
 
 _Result = tuple[Path, "list[Replay]", list[str]]

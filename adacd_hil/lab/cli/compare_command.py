@@ -42,9 +42,9 @@ def compare(first: Path, others: tuple[Path, ...], as_json: bool, stretch: "Time
         found = [compare_logs(log_in(first), log_in(other), progress, stretch) for other in others]
     tables = [each.by_key() for each in found]
     answer(as_json, tables[0] if len(tables) == 1 else tables, "\n\n".join(map(_as_text, found)))
-    if not all(each.is_same for each in found):
+    if not all(each.is_same_where_whole for each in found):
         return ExitCode.FAILURE
-    return ExitCode.PARTIAL if any(each.notes for each in found) else ExitCode.OK
+    return ExitCode.OK if all(each.is_same and not each.notes for each in found) else ExitCode.PARTIAL
 
 
 def _as_text(found: "LogComparison") -> str:
@@ -55,7 +55,8 @@ def _as_text(found: "LogComparison") -> str:
     if found.is_same:
         lines.append(f"the same in all {found.cycles} cycles")
     else:
-        lines.append(f"{found.cycles} cycles compared, {found.only[0]} and {found.only[1]} only in one")
+        same = ", all the same" if found.is_same_where_whole else ""
+        lines.append(f"{found.cycles} cycles compared{same}, {found.only[0]} and {found.only[1]} only in one")
     if found.settings:
         lines += ["", format_table(("setting", "1", "2"), [(key, *pair) for key, pair in found.settings.items()])]
     if found.metadata:

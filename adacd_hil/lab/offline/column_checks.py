@@ -51,6 +51,7 @@ _BEYOND_LIMITS: Final = 3.0
 _BEYOND_EFFORT: Final = 30.0
 """Factor on the effort of the URDF: mNm read as Nm are 1000 times too large."""
 
+CORRECT_UNITS: Final = "correct `units` and `scale` of positions and torques"
 CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 
 
@@ -162,7 +163,9 @@ def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[Reco
     yield RecordingFinding(
         f"the torque of {column_name(described, 'tau_J', joint)} reaches {largest[joint]:.3g} Nm, the URDF allows "
         f"{effort[joint]:g} Nm",
-        f"if the torques are mNm: {_unit_or_scale(described, 'tau_J', 'mNm', 1e-3, is_over | np.isinf(effort))}",
+        CORRECT_UNITS
+        if described.units.tau_J == "mNm"
+        else f"if the torques are mNm: {_unit_or_scale(described, 'tau_J', 'mNm', 1e-3, is_over | np.isinf(effort))}",
         is_dead=not np.any(described.urdf.theta_full),  # else its masses say more
     )
 

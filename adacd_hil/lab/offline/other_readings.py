@@ -67,12 +67,16 @@ class _Motion(NamedTuple):
 
 
 class _Torques(NamedTuple):
-    """A reading of torques: joint i has `signs[i]` times the column of joint `places[i]`."""
+    """A reading of torques: joint i has `factors[i]` times the column of joint `places[i]`.
 
-    signs: tuple[float, ...]
+    turned: the joints whose sign is not the map's.
+    """
+
+    factors: Vector
     places: tuple[int, ...]
     text: str = ""
     remedy: str = ""
+    turned: tuple[int, ...] = ()
 
 
 class _Equations(NamedTuple):
@@ -184,18 +188,20 @@ def _judge(
     fitted: list[Record],
 ) -> Reading:
     """Fit the arm for a reading of motion and torques; return the reading, with its unexplained share in the test."""
-    signs, places, joints = np.array(torques.signs), list(torques.places), range(motion.model.joints)
-    weight = 1.0 / fit.spread[places]
+    factors, places, joints = torques.factors, list(torques.places), range(motion.model.joints)
+    weight = 1.0 / (factors**2 * fit.spread[places])
     A = np.tensordot(weight, fit.A, axes=1)
-    b = np.sum([weight[i] * signs[i] * fit.b[i, places[i]] for i in joints], axis=0)
+    b = np.sum([weight[i] * factors[i] * fit.b[i, places[i]] for i in joints], axis=0)
     scale = np.sqrt(np.maximum(np.diag(A), 1e-30))
     theta = np.linalg.solve(A / np.outer(scale, scale) + _RIDGE * np.eye(len(scale)), b / scale) / scale
     left = [
-        test.S[places[i], places[i]] - 2.0 * signs[i] * theta @ test.b[i, places[i]] + theta @ test.A[i] @ theta
+        factors[i] ** 2 * test.S[places[i], places[i]]
+        - 2.0 * factors[i] * theta @ test.b[i, places[i]]
+        + theta @ test.A[i] @ theta
         for i in joints
     ]
-    unexplained = float(np.max(np.maximum(left, 0.0) / test.spread[places]))
-    turned = np.flatnonzero(signs < 0.0).tolist()
+    unexplained = float(np.max(np.maximum(left, 0.0) / (factors**2 * test.spread[places])))
+    turned = list(torques.turned)
     differences = bool(motion.text) + min(len(turned), 2) + (places != list(joints))
     texts, remedies = [motion.text, torques.text], [motion.remedy, torques.remedy]
     if turned == [motion.turned]:
@@ -214,22 +220,23 @@ def _torques(described: RecordingMap, most_turned: int) -> Iterator[_Torques]:
     most_turned: most torques that have the other sign, unless all have.
     """
     n, names = described.joints, described.urdf.joint_names
-    straight, ones = tuple(range(n)), (1.0,) * n
+    straight, ones = tuple(range(n)), np.ones(n)
+    Nm = np.array(described.tau_J_Nm)
     for choice in itertools.product((1.0, -1.0), repeat=min(n, _MOST_SIGNS)):
-        turned = [i for i, sign in enumerate(choice) if sign < 0.0]
-        signs = choice + ones[len(choice) :]
+        turned = tuple(i for i, sign in enumerate(choice) if sign < 0.0)
+        signs = np.concatenate((choice, ones[len(choice) :]))
         if not turned:
             yield _Torques(ones, straight)
         elif len(turned) in (*range(most_turned + 1), n):
             some = "all torques have" if len(turned) == n > 1 else f"the torque of {_both(names, turned)} has"
-            remedy = described.scaled("tau_J", np.array(signs))
-            yield _Torques(signs, straight, f"{some} the other sign", remedy)
+            yield _Torques(signs, straight, f"{some} the other sign", described.scaled("tau_J", signs), turned)
     for pair in itertools.combinations(range(n), 2):
         text = f"the torques of {_both(names, pair)} are exchanged"
-        yield _Torques(ones, tuple(_exchanged(n, *pair)), text, "exchange them in `columns.tau_J`")
+        places = _exchanged(n, *pair)
+        yield _Torques(Nm / Nm[places], tuple(places), text, "exchange them in `columns.tau_J`")
     if n > 3:
         text, remedy = "the torques begin with the outermost joint", "turn the order round in `columns.tau_J`"
-        yield _Torques(ones, straight[::-1], text, remedy)
+        yield _Torques(Nm / Nm[::-1], straight[::-1], text, remedy)
 
 
 def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
@@ -248,13 +255,15 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
         yield _Motion(text, described.scaled("q", signs), model, np.diag(signs), turned=i)
     both_columns = "`columns.q`, `columns.tau_J`"
     for pair in itertools.combinations(range(n), 2):
-        swap, both = straight[_exchanged(n, *pair)], _both(names, pair)
+        places, both = _exchanged(n, *pair), _both(names, pair)
+        swap, swap_torques = (_moved(units, places) for units in (described.q_rad, described.tau_J_Nm))
         yield _Motion(f"the positions of {both} are exchanged", "exchange them in `columns.q`", model, swap)
         text = f"{both} are exchanged, positions and torques"
-        yield _Motion(text, f"exchange them in {both_columns}", model, swap, swap)
+        yield _Motion(text, f"exchange them in {both_columns}", model, swap, swap_torques)
     if n > 3:
         text, remedy = "the columns begin with the outermost joint", f"turn the order round in {both_columns}"
-        yield _Motion(text, remedy, model, straight[::-1], straight[::-1])
+        turned, turned_torques = (_moved(units, range(n)[::-1]) for units in (described.q_rad, described.tau_J_Nm))
+        yield _Motion(text, remedy, model, turned, turned_torques)
     # A column may count from the base, or with the joint before, as behind belts: then torques do the same power.
     for i, (sign, what) in itertools.product(range(1, n), ((-1.0, "sum"), (1.0, "difference"))):
         T = straight.copy()
@@ -287,6 +296,15 @@ def _coupled(text: str, model: ArmModel, T: Vector) -> Iterator[_Motion]:
     remedy = "record the joints' own positions and torques, or write them into new columns"
     yield _Motion(text, remedy, model, T)
     yield _Motion(f"{text}, and so do the torques", remedy, model, T, np.linalg.inv(T).T.astype(np.float64))
+
+
+def _moved(units: Sequence[float], places: Sequence[int]) -> Vector:
+    """Return M (n, n) that gives joint i the column of joint places[i], in the unit that the map gives joint i.
+
+    units (n,): of the map, to which `scale` belongs; the columns have been read in their old places' units.
+    """
+    sizes = np.array(units)
+    return np.asarray(np.eye(len(sizes))[list(places)] * np.divide.outer(sizes, sizes))
 
 
 def _exchanged(n: int, i: int, j: int) -> list[int]:

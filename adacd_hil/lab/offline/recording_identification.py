@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, plot, style
+from adacd_hil.lab.offline.recorded_columns import SHORTEST_SAMPLES
 from adacd_hil.lab.offline.recording_import import ForeignRecording, RecordingStretch
 from adacd_hil.lab.offline.recording_map import RecordingMap
 from adacd_hil.lab.offline.recording_verdict import Fitted, Verdict, judge_fit
@@ -141,6 +142,9 @@ def identify(
     tested: None: of the last recording the first `FIT_SHARE` of its time is fitted, and the rest tested. Samples during
     a known touch are neither fitted nor tested. Raises ConfigError, LogError.
     """
+    for recording in fitted:
+        if not recording.stretches:
+            raise LogError(f"{recording.path}: no {SHORTEST_SAMPLES} samples in a row lie in the part to fit")
     recordings = [recording.free for recording in fitted]
     if tested is None:
         last = recordings[-1]
@@ -152,7 +156,10 @@ def identify(
         recordings[-1], tested = last.between(-np.inf, split_s), last.between(split_s, np.inf)
     tested = tested.free
     if not tested.stretches or not any(recording.stretches for recording in recordings):
-        raise LogError("too little free motion to fit or to test")
+        raise LogError(
+            f"too little free motion to fit or to test: both need {SHORTEST_SAMPLES} samples in a row, "
+            f"{SHORTEST_SAMPLES * tested.period_s:g} s at {tested.period_s * 1e3:g} ms"
+        )
     source = recordings[-1]
     settings = described.settings(source.noise_Nm, source.period_s, source.velocity_noise_rad_s)
     model = offline.model_of(described.urdf.chain, described.arm.has_rotors)

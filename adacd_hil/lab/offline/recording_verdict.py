@@ -24,6 +24,7 @@ import numpy as np
 
 from adacd_hil.lab.offline.column_checks import (
     CLIPPED_REMEDY,
+    CORRECT_UNITS,
     RecordingFinding,
     clipped_torque,
     find_faults,
@@ -334,7 +335,7 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFi
     if mass_kg is not None and least >= HALF and not _LIGHTEST_KG <= mass_kg <= _HEAVIEST_KG:
         yield RecordingFinding(
             f"the inertia about {joints[0].name} is that of {mass_kg:.2g} kg at the arm's reach",
-            "correct `units` and `scale` of positions and torques",
+            CORRECT_UNITS,
         )
 
 

@@ -26,7 +26,9 @@ class NextStep(NamedTuple):
 def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[NextStep], list[NextStep]]:
     """Return the next steps, the gravest first, STEPS at most, and further ones."""
     log = _quoted(source.log_name)
-    steps = [NextStep("The log is not whole: see what it lacks.", f"adacd-hil log check {log}")] * bool(source.problem)
+    steps = [NextStep("The log is not whole: see what it lacks.", f"adacd-hil log check {log}")] * bool(
+        source.log_problem
+    )
     if run.cycle.size == 0:
         return [*steps, _checked(run, "The arm was not moved. Mend the cause above.")], []
     steps += _repairs(metrics, run, log)
@@ -38,7 +40,7 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
     if run.truth is None and metrics.contacts:
         more.insert(0, NextStep("Compare the detections with what you did: the log has no record of the touches."))
     if not steps:
-        steps = [NextStep("Nothing: all went well.")] * metrics.is_clean + more[:1]
+        steps = [NextStep("Nothing: all went well.")] * (metrics.is_clean and not source.truth_problem) + more[:1]
         more = more[1:]
     return steps[:STEPS], steps[STEPS:] + more
 

@@ -60,7 +60,7 @@ class Report:
         """Return the result of the run, the next steps and the path of the report, as text for a terminal."""
         first, *further = headlines(self.metrics)
         lines = [in_line(f"{'Good' if self.metrics.is_clean else 'NOT GOOD'}: {first}")]
-        lines += [in_line(f"The log is not whole: {self.source.problem}")] if self.source.problem else []
+        lines += [in_line(self.source.notice)] if self.source.notice else []
         lines += [in_line(f"- {line}") for line in further]
         wrong = [contact for contact in self.metrics.contacts if went_wrong(contact)]
         if wrong:

@@ -362,7 +362,7 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> dict[str, Any]
     words = origin_words(run)
     if run.stretch is not None:
         words.append(stretch_text(run.stretch))
-    problems = [f"The log is not whole: {source.problem}"] if source.problem else []
+    problems = [source.notice] if source.notice else []
     if not problems and metrics.dropped:
         problems = [f"{metrics.dropped} packets are not in the log."]
     first, *further = headlines(metrics)

@@ -56,6 +56,7 @@ from adacd_hil.log.log_files import (
     DBC_NAME,
     ENDING_KEY,
     PLANNED_ENDINGS,
+    TRUTH_NAME,
     WHOLE,
     LogError,
     TimeWindow,
@@ -133,7 +134,7 @@ def read_run(
         _read(stream, reading, progress, bounds_ns)
     run = reading.finished()
     if run.cycle.size == 0 and run.stretch is not None:
-        raise LogError(f"log {log_path} has no cycle from {stretch.start_s:g} to {stretch.end_s:g} s")
+        raise LogError(f"log {log_path} has no cycle {stretch.text}")
     return _with_ending(run, reading.sums, stream, truth, problem)
 
 
@@ -199,10 +200,10 @@ def _with_ending(
     if ending and ending not in PLANNED_ENDINGS:
         run = replace(run, broken_off=one_line(ending))
     unjudged = unjudged_sentence(sum(not detection.is_known for detection in find_detections(run)))
-    of_truth = truth_problem or unjudged
-    problems = [stream.problem, "" if truth is None else truth.problem, of_truth]
-    is_complete = stream.is_complete and not of_truth and (truth is None or truth.is_complete)
-    source = ReportSource(stream.path.name, "; ".join(filter(None, problems)), is_complete)
+    cut = f"{TRUTH_NAME} is not whole: {truth.problem}" if truth is not None and truth.problem else ""
+    is_complete = stream.is_complete and not (truth_problem or unjudged) and (truth is None or truth.is_complete)
+    of_truth = "; ".join(filter(None, (truth_problem, cut, unjudged)))
+    source = ReportSource(stream.path.name, stream.problem, is_complete, of_truth)
     if run.stretch is None:
         run = replace(run, frames=_count(stream.summary, "frames"), dropped=_count(stream.summary, "dropped"))
     return ReadRun(run, gathered, source)

@@ -199,6 +199,13 @@ class LogComparison:
         """Whether both runs decided the same in the same cycles."""
         return not self.fields and self.only == (0, 0)
 
+    @property
+    def is_same_where_whole(self) -> bool:
+        """Whether cycles were compared, all of them the same, and none is missing but in a damaged log."""
+        damages = self.second.problem, self.first.problem
+        lacks = any(count and not damage for count, damage in zip(self.only, damages, strict=True))
+        return self.cycles > 0 and not self.fields and not lacks
+
     def by_key(self) -> dict[str, Any]:
         """Return the comparison by the keys of `compare --json`."""
         runs = [

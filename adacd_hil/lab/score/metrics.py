@@ -242,11 +242,27 @@ class PaperRow(NamedTuple):
 
 
 class ReportSource(NamedTuple):
-    """The log that a run was read from; `is_complete`: it is whole and no record was dropped on the way to it."""
+    """The log that a run was read from; `is_complete`: it and its truth are whole, no record was dropped before.
+
+    log_problem: the parts that the log lacks, one line. truth_problem: why the truth says nothing of all or some of it.
+    """
 
     log_name: str
-    problem: str = ""  # the missing parts, one line
+    log_problem: str = ""
     is_complete: bool = True
+    truth_problem: str = ""
+
+    @property
+    def problem(self) -> str:
+        """Both problems, one line; "" without any."""
+        return "; ".join(filter(None, (self.log_problem, self.truth_problem)))
+
+    @property
+    def notice(self) -> str:
+        """A line on both problems; "" without any."""
+        log = f"The log is not whole: {self.log_problem}" if self.log_problem else ""
+        truth = f"Not all could be judged: {self.truth_problem}" if self.truth_problem else ""
+        return "; ".join(filter(None, (log, truth)))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,6 +25,7 @@ from adacd_hil.lab.score.metrics import (
 )
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
 from adacd_hil.lab.score.run_arrays import Run, Section
+from adacd_hil.records import SchemeState
 from adacd_hil.score.judge import Score
 from adacd_hil.score.smallest_push import PUSH_WITHIN
 from adacd_hil.score.wording import NONE, found_text, number_of
@@ -61,6 +62,8 @@ def list_findings(
         found = f"{number_of(len(score.false_alarms), 'detection')}, whose truth is not recorded"
     elif not has_wrong and not score.contacts and all(section.kind != "detection" for section in sections):
         found = "the arm was not watched for contacts"
+    else:
+        found = _judged_text(run, found)
     if evidence is not None and not evidence.is_anchored:
         identified += ", with torque offsets that nothing anchors"
     beside = ""
@@ -79,6 +82,20 @@ def list_findings(
         findings.append(Finding(identified, not adaptation_s or None in adaptation_s.values()))
     findings += [Finding(beside), Finding(data_text(data), bool(data.excesses))]
     return tuple(finding for finding in findings if finding.text)
+
+
+def _judged_text(run: Run, found: str) -> str:
+    """Return `found`, with the time that the truth covers where it doesn't cover all of MONITOR."""
+    watched = run.state == SchemeState.MONITOR
+    if run.truth is None or run.truth.span is None or not watched.any():
+        return found
+    is_told = run.truth.span.covers(run.cycle[watched])
+    if is_told.all():
+        return found
+    if not is_told.any():
+        return "the arm was watched, but the truth of that time is not recorded"
+    first_s, last_s = run.time_s()[watched][is_told][[0, -1]]
+    return f"{found}, from {first_s:.2f} to {last_s:.2f} s: the truth covers no more"
 
 
 _HEADLINE_LETTERS: Final = 110
