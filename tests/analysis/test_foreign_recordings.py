@@ -114,6 +114,16 @@ def test_parameters_torque_and_touches_are_found(free, touched, example):
     assert contact.start_s == pytest.approx(TOUCH_S[0] - 4.5, abs=0.02)
 
 
+@pytest.mark.parametrize("spoiled", [0.0, 500.0])
+def test_contacts_in_a_recording_whose_torque_is_dead_or_noise_are_not_judged(free, tmp_path, spoiled):
+    rows = table(3.0, 4.5)
+    rows[:, 3] = spoiled * np.random.default_rng(1).standard_normal(len(rows))
+    watched = write(tmp_path / "spoiled.csv", rows)
+    done = called("identify", free, "--map", EXAMPLE / "map.toml", "--watch", watched, "--json")
+    (found,) = json.loads(done.stdout)["watched"]
+    assert (done.exit_code, len(found["faults"])) == (3, 1)
+
+
 def test_what_is_touched_is_not_learnt(touched, example):
     recording = read_recording(touched, example)
     before, after = recording.free.stretches

@@ -83,7 +83,8 @@ def identify(
             _write(found, out)
             progress(f"pictures in {out}")
     answer(as_json, found.by_key(), _as_text(found), *_next(found, map_path, recordings[0]))
-    return ExitCode.OK if found.is_explained else ExitCode.PARTIAL
+    is_judged = found.is_explained and not any(watched.faults for watched in found.watched)
+    return ExitCode.OK if is_judged else ExitCode.PARTIAL
 
 
 def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
@@ -169,6 +170,8 @@ def _as_text(found: "Identified") -> str:
 
 def _describe(watched: "Watched") -> str:
     name = in_line(str(watched.recording.path))
+    if watched.faults:
+        return "\n".join(["", f"{name}: not judged", *(f"  because {fault}" for fault in map(in_line, watched.faults))])
     lines = ["", f"{name}: {len(watched.contacts)} contacts in {watched.recording.duration_s:.1f} s"]
     if watched.touches is not None:
         found = watched.touches - (watched.missed or 0)

@@ -69,6 +69,11 @@ class RecordingFinding(NamedTuple):
     is_dead: bool = False
     is_wrong: bool = False
 
+    @property
+    def is_harmless(self) -> bool:
+        """Whether contacts can be told in spite of it."""
+        return not (self.is_dead or self.is_wrong)
+
 
 class _Columns(NamedTuple):
     """All samples of some recordings, (k, n), their times in the recording (k,), and the period."""
@@ -85,18 +90,25 @@ def find_faults(
 ) -> tuple[RecordingFinding, ...]:
     """Return the defects of the columns of the fitted and the tested recordings."""
     recordings = [*fitted, tested]
-    stretches = [stretch for recording in recordings for stretch in recording.stretches]
-    period_s = recordings[0].period_s
-    times = [stretch.start_s + period_s * np.arange(len(stretch.record.q)) for stretch in stretches]
-    q, dq, tau_J = (samples(recordings, name) for name in ("q", "dq", "tau_J"))
-    columns = _Columns(np.concatenate(times), q, dq, tau_J, period_s)
-    found = [*_of_torques(described, columns), *_of_positions(described, columns), *_of_spikes(described, columns)]
-    still = np.ptp(q, axis=0) < STILL_RAD
+    found = list(column_faults(described, recordings))
+    still = np.ptp(samples(recordings, "q"), axis=0) < STILL_RAD
     for part, records in (("fit", fitted), ("test", [tested])):
         found += _of_rest(described, part, records, still)
     if all(recording.has_velocities for recording in recordings):
         found += _of_velocities(described, recordings)
     return tuple(found)
+
+
+def column_faults(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
+    """Yield the defects of torques and positions over some recordings."""
+    stretches = [stretch for recording in recordings for stretch in recording.stretches]
+    period_s = recordings[0].period_s
+    times = [stretch.start_s + period_s * np.arange(len(stretch.record.q)) for stretch in stretches]
+    q, dq, tau_J = (samples(recordings, name) for name in ("q", "dq", "tau_J"))
+    columns = _Columns(np.concatenate(times), q, dq, tau_J, period_s)
+    yield from _of_torques(described, columns)
+    yield from _of_positions(described, columns)
+    yield from _of_spikes(described, columns)
 
 
 def joined_names(names: list[str], count: int) -> str:

@@ -7,15 +7,16 @@ error that the test shows.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, plot, style
+from adacd_hil.lab.offline.column_checks import column_faults
 from adacd_hil.lab.offline.recorded_columns import SHORTEST_SAMPLES
 from adacd_hil.lab.offline.recording_import import ForeignRecording, RecordingStretch
 from adacd_hil.lab.offline.recording_map import RecordingMap
@@ -50,6 +51,8 @@ class Watched:
     touches: int | None  # None if unknown
     missed: int | None
     delays_s: tuple[float, ...]  # of the detected touches
+    faults: tuple[str, ...] = ()
+    """Defects of its columns with which contacts can't be told, a line each."""
 
     @property
     def false_contacts(self) -> int | None:
@@ -125,6 +128,7 @@ class Identified(Fitted):
                     "missed": watched.missed,
                     "false_contacts": watched.false_contacts,
                     "delays_s": watched.delays_s,
+                    "faults": watched.faults,
                 }
                 for watched in self.watched
             ],
@@ -174,8 +178,25 @@ def identify(
         **vars(fit),
         verdict=judge_fit(fit),
         test=watch(model, settings, estimate, np.zeros(model.joints), tested),
-        watched=tuple(watch(model, settings, estimate, certificate.lack_Nm, recording) for recording in watched),
+        watched=tuple(
+            _examined(described, watch(model, settings, estimate, certificate.lack_Nm, recording))
+            for recording in watched
+        ),
     )
+
+
+_MOST_OVER: Final = 0.5
+"""Share of the time over a threshold from which on the model, not a touch, is taken for the cause."""
+
+
+def _examined(described: RecordingMap, watched: Watched) -> Watched:
+    """Return a watched recording with the defects for which its contacts can't be told."""
+    faults = [fault.text for fault in column_faults(described, [watched.recording]) if not fault.is_harmless]
+    pairs = zip(watched.tau_ext_hat, watched.threshold, strict=True)
+    is_over = np.concatenate([(np.abs(tau) > threshold).any(axis=1) for tau, threshold in pairs])
+    if not faults and is_over.mean() > _MOST_OVER:
+        faults.append(f"the torque is over a threshold for {is_over.mean():.0%} of the time: is it of this arm?")
+    return replace(watched, faults=tuple(faults))
 
 
 def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> OfflineCertificate:
