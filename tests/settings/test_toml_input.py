@@ -12,8 +12,9 @@ import pytest
 from adacd_hil.control.tare_file import read_tare
 from adacd_hil.device.profile import load_profile
 from adacd_hil.lab.offline.recording_map import read_map
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import parse_toml, read_toml
 from firmware_sim.scenario.scenario import load_scenario
 
@@ -157,3 +158,8 @@ def test_a_byte_order_mark_is_left_out(tmp_path):
     (tmp_path / "x.toml").write_bytes(b"\xef\xbb\xbf[filter]\r\na_rad_s = 12.5\r\n")
     assert load_settings(str(tmp_path / "x.toml")).filter.a_rad_s == 12.5
     assert parse_toml("\ufeffa = 1") == {"a": 1}
+
+
+def test_a_phase_can_last_as_long_as_the_rest_that_it_needs():
+    with pytest.raises(ConfigError, match=r"phase_timeout_s` = 0.2 s must be longer than .*commission_s` = 0.2 s"):
+        parse(Settings, {"safety": {"phase_timeout_s": 0.2, "commission_s": 0.2}})
