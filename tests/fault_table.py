@@ -467,6 +467,11 @@ NODES = [
         wire=(Wire(0x283, 1, 1),),
     ),
     Case(
+        "a drive reports that it is no longer enabled",
+        'kind = "object_value", node = "drive2", index = 0x6041, raw = 0x0233',
+        Expected(("DRIVE",), 100, says="Drive2: SWITCHED_ON"),
+    ),
+    Case(
         "a sensor reports an overload that it calls valid",
         'kind = "sensor_error", node = "sensor2", status = 2, duration_s = 0.2',
     ),
