@@ -19,7 +19,7 @@ class GateFlag(IntFlag):
 
 
 KEPT_CYCLES = 5
-"""Age of the feedback, in cycles, up to which the torque is kept: as long as the model may be blind. A command from
+"""Age of the feedback, in cycles, up to which the torque is kept, the default of `data.blind_cycles`. A command from
 older feedback doesn't fit the present motion."""
 FADING = 0.8
 """Factor on the torque in each further cycle: 1 % is left after 20."""

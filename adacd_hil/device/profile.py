@@ -265,6 +265,8 @@ class ProfileSettings:
         self._check_frames()
         self._check_protection()
         self._check_scale()
+        for pdo in self.pdo:
+            self._check_bounds(pdo)
         self._check_assumed()
 
     def _check_frames(self) -> None:
@@ -294,7 +296,6 @@ class ProfileSettings:
         for pdo in self.pdo:
             if pdo.message in ("Feedback", "Torque") and pdo.transmission != 1:
                 raise ValueError(f"pdo {pdo.message}: transmission = {pdo.transmission} must be 1, on every SYNC")
-            self._check_bounds(pdo)
 
     def _check_bounds(self, pdo: PdoSettings) -> None:
         """Raise ValueError for bounds of values that the host doesn't get, or wouldn't miss, or can't compare."""

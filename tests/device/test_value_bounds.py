@@ -205,6 +205,7 @@ def test_an_object_that_no_device_can_have_is_refused(folder: Path, changes: str
         ("Status", {"low": 90.0}, "low = 90 is above high = 85"),
         ("Command", {}, "is the host's own, and can't have `low` or `high`"),
         ("Feedback", {"high": None, "of": "position"}, "`of` needs `low` or `high`"),
+        ("Feedback", {"of": "position", "unit": "deg"}, "unit = 'deg' must be that of 'position', 'rad'"),
         ("Status", {"of": "torque_actual"}, "unit = 'degC' must be that of 'torque_actual', 'permille'"),
         ("Feedback", {"unit": 'a"b'}, "unit = 'a\"b' can't have"),
         ("Feedback", {"signal": "wärme"}, "signal 'wärme' must be a name"),
@@ -250,3 +251,10 @@ def test_a_bound_that_no_value_can_reach_is_refused(
 
 def test_a_value_without_a_unit_has_no_gap_in_its_line() -> None:
     assert ValueBound("errors", "", 0, None, -math.inf, 3.0).describe_excess([5.0]).startswith("errors 5, ")
+
+
+def test_a_drive_without_a_scale_is_named_before_its_bounds_are_compared() -> None:
+    profile = table_of("stock-drive") | {"scale": {}}
+    add_signal(profile, "Feedback", TEMPERATURE | {"of": "position"})
+    with pytest.raises(ConfigError, match="a drive needs increments_per_joint_rev"):
+        parse(ProfileSettings, profile)
