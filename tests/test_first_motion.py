@@ -71,7 +71,7 @@ class Feed:
         before = SchemeState.INIT
         for row, state in enumerate(self.state.tolist()):
             values = {"q": self.q[row], "dq": self.dq[row], "tau_J": self.tau_J[row]}
-            judge.note(BLANK._replace(**values), before, self.tau_c[row])
+            judge.add_cycle(BLANK._replace(**values), before, self.tau_c[row])
             before = SchemeState(state)
             if judge.line:
                 break
@@ -115,10 +115,10 @@ def test_a_joint_that_is_not_known_in_time_is_named_and_judged_no_more(
     drives = (SimpleNamespace(is_limited=is_limited),)
     judge = FirstMotion(load_settings("certified"), SimpleNamespace(drives=drives, gear_ratios=(1.0, 1.0)))  # type: ignore[arg-type]
     for k in range(399 * len(periods) // sum(periods)):
-        judge.note(BLANK._replace(periods=periods[k % len(periods)]), SchemeState.ADAPT, np.zeros(2))
+        judge.add_cycle(BLANK._replace(periods=periods[k % len(periods)]), SchemeState.ADAPT, np.zeros(2))
     assert (judge.is_on, judge.take_events()) == (True, [])
     for _ in range(2):
-        judge.note(BLANK, SchemeState.ADAPT, np.zeros(2))
+        judge.add_cycle(BLANK, SchemeState.ADAPT, np.zeros(2))
     events = judge.take_events()
     assert [(event.level, event.message[:7]) for event in events] == [("warning", "joint 1"), ("warning", "joint 2")]
     assert "is not known after 0.4 s, since it moves too little" in events[0].message

@@ -97,7 +97,7 @@ class Cycle:
         self._bus, self._arm, self._master = bus, arm, master
         self._pacer, self._operator = pacer, operator
         self._exchange = Exchange(settings, bus, arm, master, pacer, clock)
-        self._watch = ArmWatch(settings, master.watch)
+        self._watch = ArmWatch(settings, master.failed_heartbeats)
         self._data = DataWatch(settings, arm)
         self._stale_ns = settings.bus.max_age_cycles * settings.bus.period_ns
         self._pipeline = new_pipeline(settings)
@@ -173,9 +173,9 @@ class Cycle:
             self._follow(arm, output)
             command, flags = self._limit(arm, output, self._exchange.leave())
             record = self._exchange.end(tick, arm, command, recorder.waiting_bytes)
-            self._data.note(arm)
-            self._faults.note(self._state, arm)
-            self._first_motion.note(arm, self._state, self._tau_c)
+            self._data.count_cycle(arm)
+            self._faults.count_cycle(self._state, arm)
+            self._first_motion.add_cycle(arm, self._state, self._tau_c)
             self._look_after_devices(arm, output)
             self._log(recorder, record, arm, request, output, command, flags)
         fault = output.fault if output is not None else FaultReason.NONE

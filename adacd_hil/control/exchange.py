@@ -132,7 +132,7 @@ class Exchange:
 
     def leave(self) -> int:
         """Return the time at which this cycle's commands leave, ns; in lockstep, move the clock by modelled work."""
-        self._bus.held_ns = leaving_ns = self._pacer.spend(self.feedback_ns)
+        self._bus.held_ns = leaving_ns = self._pacer.command_time(self.feedback_ns)
         return leaving_ns
 
     def end(self, tick: Tick, arm: ArmState, command: ArmCommand, log_queue_bytes: int = 0) -> CycleRecord:

@@ -161,7 +161,7 @@ class FaultReport:
             FaultReason.ADAPT_TIMEOUT: (pipeline.describe_missing,),
         }
 
-    def note(self, state: SchemeState, arm: ArmState) -> None:
+    def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
         """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
         self._commission.count_cycle(state, arm)
 

@@ -112,11 +112,11 @@ class FirstMotion(EventSource):
         return bool(self._open or self._readings) and not self.line
 
     def compile_readings(self) -> None:
-        """Compile the functions of the device readings that `note` calls."""
+        """Compile the functions of the device readings that `add_cycle` calls."""
         if self._readings is not None:
             self._readings.compile_readings()
 
-    def note(self, arm: ArmState, state: SchemeState, tau_c: Vector) -> None:
+    def add_cycle(self, arm: ArmState, state: SchemeState, tau_c: Vector) -> None:
         """Add a cycle to the blocks, and judge the joints; put a contradiction in `line`, remarks in `events`.
 
         `tau_c` (2,): its commanded torque, Nm. `state`: of the scheme after the cycle before. Stop judging after 60 s

@@ -112,7 +112,7 @@ class Pacer(Protocol):
     def next(self) -> Tick:
         """Wait until the next cycle begins; return its number, time and lateness."""
 
-    def spend(self, feedback_ns: int) -> int:
+    def command_time(self, feedback_ns: int) -> int:
         """Return the time at which the cycle's commands leave, ns; in lockstep, first move the clock by modelled work.
 
         feedback_ns: time of the last feedback.
@@ -160,7 +160,7 @@ class GridPacer:
             due_ns += skipped * self._period_ns
         return Tick(self._cycle, now_ns, self._cycle - previous, now_ns - due_ns)
 
-    def spend(self, feedback_ns: int) -> int:
+    def command_time(self, feedback_ns: int) -> int:
         """Move a virtual clock to feedback_ns plus the modelled latency; return the clock's time."""
         if self._latency is not None:
             self._clock.sleep_until_ns(feedback_ns + self._latency.draw_ns())
@@ -205,7 +205,7 @@ class FollowingPacer:
         lateness_ns = self._clock.now_ns() - sync.t_ns
         return Tick(self._cycle, sync.t_ns, 1 + skipped, lateness_ns, tuple(frames[:place]), tuple(frames[place + 1 :]))
 
-    def spend(self, feedback_ns: int) -> int:  # noqa: ARG002 (the protocol's signature)
+    def command_time(self, feedback_ns: int) -> int:  # noqa: ARG002 (the protocol's signature)
         """Return the clock's time, ns."""
         return self._clock.now_ns()
 

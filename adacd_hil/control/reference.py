@@ -297,10 +297,10 @@ class Reference(EventSource):
 
     def _warn_beyond(self, withdrawal: Withdrawal) -> None:
         """Add an event for each joint that can't stop within its position limit, once per state."""
-        for joint in withdrawal.beyond:
+        for joint in withdrawal.beyond_limits:
             if joint not in self._beyond:
                 self.events.append(Event("warning", MOTION, withdrawal.describe_beyond(joint)))
-        self._beyond.update(withdrawal.beyond)
+        self._beyond.update(withdrawal.beyond_limits)
 
     def _stop_from(self, q: Vector, dq: Vector) -> Withdrawal:
         return Withdrawal(self._settings, q, dq, np.zeros(JOINTS))

@@ -70,7 +70,7 @@ class DataWatch(EventSource):
         self._in_a_row = self._rows = 0  # cycles without a sample; rows of them in the present window
         self._has_rows = False
 
-    def note(self, state: ArmState) -> None:
+    def count_cycle(self, state: ArmState) -> None:
         """Count a cycle's missing frames, and the cycle if it has no sample; judge the window if it is full.
 
         Call it once per cycle, after the cycle's last frame. A cycle without enabled drives is not counted.

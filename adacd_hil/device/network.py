@@ -271,7 +271,7 @@ class Master(EventSource):
         for node_id in [slave.node_id for slave in self.slaves] if self._settings.bus.is_shared else [0]:
             self._canopen.command(nmt_command, node_id)
 
-    def watch(self, t_ns: int) -> list[str]:
+    def failed_heartbeats(self, t_ns: int) -> list[str]:
         """Return the failures of the nodes' heartbeats now, one line per node; empty without a failure.
 
         A node fails if it is silent for 2.5 heartbeat periods or isn't OPERATIONAL, only between `start` and `stop`.

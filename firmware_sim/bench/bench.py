@@ -237,7 +237,7 @@ class Bench:
         takers: 1 for each device that takes SYNCs of this length, else 0.
         """
         listeners, is_quiet = self._nodes.listeners, self.injector.is_quiet
-        heard = listeners.everybody if is_quiet else self.injector.hear(self._sync_id, data)
+        heard = listeners.everybody if is_quiet else self.injector.count_heard(self._sync_id, data)
         listeners.ignore(heard, takers, self._order.kind, self.time.now_ns)
         self.time.poll(self.time.now_ns)
 
@@ -297,15 +297,15 @@ class Bench:
         heard: Sequence[int] = listeners.everybody
         if self._plan.is_quiet and takers == heard:
             if listeners.is_remembering or lost or order.kind is not SyncKind.RIGHT:
-                listeners.tell(heard, takers, order.kind, lost, now_ns)
+                listeners.report_sync(heard, takers, order.kind, lost, now_ns)
             (position1, position2), (velocity1, velocity2), (torque1, torque2) = measured
             drive1.on_sync(position1, velocity1, now_ns)
             drive2.on_sync(position2, velocity2, now_ns)
             sensor1.on_sync(torque1)
             sensor2.on_sync(torque2)
         else:
-            heard = self.injector.hear(self._sync_id, data)
-            listeners.tell(heard, takers, order.kind, lost, now_ns)
+            heard = self.injector.count_heard(self._sync_id, data)
+            listeners.report_sync(heard, takers, order.kind, lost, now_ns)
             heard = [times * is_taken for times, is_taken in zip(heard, takers, strict=True)]
             self.injector.sync(heard, measured, now_ns)
             if not self._is_wall:  # by the clock, a drive that hears no SYNC has no period to count

@@ -111,17 +111,17 @@ class Outbox:
 
 
 class Departure:
-    """Gathers frames until they are let go."""
+    """Gathers frames until `send_waiting`."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
         self._frames: list[tuple[int, bytes]] = []
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Add a frame to those that `go` sends."""
+        """Add a frame to those that `send_waiting` sends."""
         self._frames.append((can_id, data))
 
-    def go(self) -> None:
+    def send_waiting(self) -> None:
         """Send the waiting frames. Raises BusError; unsent frames are dropped, as by a controller's reset."""
         if self._frames:
             frames, self._frames = self._frames, []
@@ -248,7 +248,7 @@ class Injector:
             for offset_ns, can_id, data in self.plan.babble(period_ns):
                 self._outbox.put_later(self.now_ns + offset_ns, can_id, data)
 
-    def hear(self, sync_id: int, data: bytes) -> tuple[int, ...]:
+    def count_heard(self, sync_id: int, data: bytes) -> tuple[int, ...]:
         """Return how often each device hears a SYNC that is sent once: 0 off the bus or if it is lost."""
         plan = self.plan
         return tuple(
@@ -258,7 +258,7 @@ class Injector:
     def sync(self, heard: Sequence[int], measured: Measurement, now_ns: int) -> None:
         """Call `on_sync` of the nodes that hear a SYNC, with measured values that faults have changed.
 
-        heard: how often each device hears it, as from `hear`.
+        heard: how often each device hears it, as from `count_heard`.
         """
         position, velocity, torque = self.plan.distort(*measured)
         for joint, drive in enumerate(self._drives):

@@ -190,7 +190,12 @@ def run(
         departure = Departure(bus)
         with Progress(), compiling(Body.compiled_functions):
             bench = Bench(
-                resolved, codec, departure.send, clock_mode=clock_mode, contract=played, on_answer=departure.go
+                resolved,
+                codec,
+                departure.send,
+                clock_mode=clock_mode,
+                contract=played,
+                on_answer=departure.send_waiting,
             )
         if log is not None:
             _log_truth(log, bench, wall_ns() - clock.now_ns())
@@ -244,7 +249,7 @@ def play(
             cycles,
             clock_mode=clock_mode,
             contract=chosen,
-            on_answer=departure.go,
+            on_answer=departure.send_waiting,
         )
         _serve(Service(bench, bus, departure, clock, clock_mode, stop, is_once))
         return _report_played(bench, cycles, as_json)

@@ -69,7 +69,7 @@ class Service:
             pass
         self._time_ns = self._heard_ns = self._clock.now_ns()
         self._bench.boot(self._time_ns)
-        self._departure.go()
+        self._departure.send_waiting()
 
     def run(self) -> None:
         """Carry frames and time until a stop is requested, with `is_once` until the host has gone.
@@ -101,7 +101,7 @@ class Service:
             self._time_ns = self._heard_ns
         else:
             self._pass_time(self._clock.now_ns() if frame is None else frame.t_ns, frame is None)
-        self._departure.go()
+        self._departure.send_waiting()
         return frame
 
     def _await_interface(self) -> None:
@@ -147,7 +147,7 @@ class Service:
     def _is_settled(self) -> bool:
         """Return whether the arm of a host that has gone is at rest, or has been given the time for it."""
         self._bench.outlive_host()
-        self._departure.go()
+        self._departure.send_waiting()
         now_ns = self._clock.now_ns()
         self._gone_ns = min(self._gone_ns, now_ns)
         return not self._is_wall or self._bench.is_at_rest or now_ns - self._gone_ns > LONGEST_ORPHANAGE_NS

@@ -382,7 +382,7 @@ class SyncListeners:
         """Return 1 for each device that takes SYNCs of this length, by its 0x1019; else 0."""
         return self._takers.get(len(data), self._nobody)
 
-    def tell(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, lost: int, t_ns: int) -> None:
+    def report_sync(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, lost: int, t_ns: int) -> None:
         """Report the kind of a SYNC to the devices that hear it, with the number of SYNCs lost before it.
 
         heard: how often each device hears it. takers: 1 for each device that takes its length, else 0. lost: SYNCs
@@ -400,7 +400,7 @@ class SyncListeners:
         self._remember()
 
     def ignore(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, t_ns: int) -> None:
-        """Report the kind of a SYNC that no device answers to the devices; `heard`, `takers` as in `tell`."""
+        """Report the kind of a SYNC that no device answers to the devices; `heard`, `takers` as in `report_sync`."""
         for place, device in enumerate(self._devices):
             for _ in range(heard[place]):
                 device.note_sync(kind if takers[place] else SyncKind.WRONG_LENGTH, 0, t_ns)

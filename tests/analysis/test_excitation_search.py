@@ -44,7 +44,7 @@ def found(search: Search) -> ExcitationSettings:
 def test_the_motion_is_the_one_that_the_arm_makes():
     settings = load_settings("certified")
     search, played = Search(settings), Excitation(settings)
-    motion = search.move(np.array(settings.excitation.cosine), np.array(settings.excitation.sine))
+    motion = search.motion_of(np.array(settings.excitation.cosine), np.array(settings.excitation.sine))
     for n in (0, 1, 100, 599):
         q, dq, ddq = np.zeros((3, 2))
         played.evaluate(n * 0.004, q, dq, ddq)

@@ -127,19 +127,19 @@ def paced(**lockstep: Any) -> tuple[VirtualClock, Pacer]:
 def test_in_lockstep_the_hosts_work_takes_its_modelled_time() -> None:
     clock, pacer = paced(latency_us=80.0)
     clock.sleep_until_ns(500_000)
-    assert (pacer.spend(500_000), clock.now_ns()) == (580_000, 580_000)
+    assert (pacer.command_time(500_000), clock.now_ns()) == (580_000, 580_000)
 
 
 def test_in_real_time_the_work_takes_what_it_takes() -> None:
     clock = MonotonicClock()
     pacer = make_pacer(load_settings(), clock, Tap(EmbeddedBus(clock), clock), 0x080)
     before_ns = clock.now_ns()
-    leaving_ns = pacer.spend(500_000)
+    leaving_ns = pacer.command_time(500_000)
     assert before_ns <= leaving_ns <= clock.now_ns()
 
 
 def test_a_modelled_host_that_is_slower_than_a_period_skips_periods() -> None:
     _, pacer = paced(latency_us=1_700.0)
     pacer.next()
-    pacer.spend(500_000)
+    pacer.command_time(500_000)
     assert (pacer.next(), pacer.overruns) == (Tick(2, 2_200_000, 2, 200_000), 1)

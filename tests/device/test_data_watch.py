@@ -23,7 +23,7 @@ class Cycles:
         for is_complete in are_complete:
             self.arm.missing_frames = 0 if is_complete else 1
             self.arm.received = 0b11 if is_complete else 0b10
-            self.watch.note(SimpleNamespace(is_enabled=is_enabled, is_complete=is_complete))
+            self.watch.count_cycle(SimpleNamespace(is_enabled=is_enabled, is_complete=is_complete))
         return [(event.level, event.message) for event in self.watch.take_events()]
 
 
@@ -72,6 +72,6 @@ def test_the_share_of_late_cycles_is_of_the_same_cycles_as_the_others(cycles):
     cycles.play(*[True] * 950)
     cycles.arm.missing_frames = 1
     for _ in range(50 + 20):  # the last 20 begin a second that is too short to be judged
-        cycles.watch.note(late)
+        cycles.watch.count_cycle(late)
     shares = cycles.watch.finish_shares()
     assert (shares.cycles, shares.late, shares.incomplete) == (1000, 0.05, 0.05)

@@ -72,7 +72,7 @@ def test_the_emulated_devices_of_every_contract_are_set_up_enabled_and_moved(con
     assert (state.is_enabled, state.is_complete, state.fault) == (True, True, FaultReason.NONE)
     assert state.dq.min() > 0.1
     np.testing.assert_allclose(state.tau_J, [0.3, 0.1], atol=0.1)
-    assert describe_faults(rig.arm) == rig.master.watch(rig.cycle * rig.period_ns) == []
+    assert describe_faults(rig.arm) == rig.master.failed_heartbeats(rig.cycle * rig.period_ns) == []
 
 
 def test_devices_watch_the_host_for_two_and_a_half_periods() -> None:

@@ -69,7 +69,12 @@ def serve(
         bus.send_all = send_all
     departure = Departure(bus)
     bench = Bench(
-        quiet_scenario(), CODEC, departure.send, clock_mode=clock_mode, on_answer=departure.go, on_truth=on_truth
+        quiet_scenario(),
+        CODEC,
+        departure.send,
+        clock_mode=clock_mode,
+        on_answer=departure.send_waiting,
+        on_truth=on_truth,
     )
     service = Service(bench, bus, departure, clock, clock_mode, stop, is_once)
     bus.script.extend((t_ms * MS, can_id, data) for t_ms, can_id, data in waiting)

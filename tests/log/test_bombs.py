@@ -90,10 +90,10 @@ def test_an_unknown_compression_is_named():
 def test_a_file_may_open_to_so_many_times_its_size():
     opening = Opening()
     for _ in range(FREE_BYTES // MOST_BYTES):
-        opening.allow(0, MOST_BYTES)
-    opening.allow(1000, 1000 * MOST_RATIO)
+        opening.add_chunk(0, MOST_BYTES)
+    opening.add_chunk(1000, 1000 * MOST_RATIO)
     with pytest.raises(ChunkError, match=f"opens to more than {MOST_RATIO} times the file before it"):
-        opening.allow(0, 1)
+        opening.add_chunk(0, 1)
 
 
 def many_small_bombs():

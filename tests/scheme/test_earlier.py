@@ -232,7 +232,7 @@ def test_a_fit_that_has_come_further_than_its_variance_allows_has_changed(share,
     added_variance = (1.0 + fit_check.REGULAR) * 0.02**2 - 0.01**2
     m.models.belief[INERTIA] += share * np.sqrt(fit_check.STEADY * fit_check.SMALLEST_SQUARE * added_variance)
     assert (fit_check.last_unsteady_step(m) == fit_check.NONE) is is_steady
-    earlier.keep(compared.k, m)
+    earlier.keep_fit(compared.k, m)
     assert m.earlier.kept_count == (2.0 if is_steady else 1.0)
     assert m.evidence.value[evidence.KEPT, evidence.FRICTIONS] == 0.1
 
@@ -433,7 +433,7 @@ def test_what_was_kept_lapses_where_two_fits_agree_that_exceed_it_by_little(firs
 def test_a_contact_between_two_fits_keeps_what_was_kept():
     compared = Compared(std=1e-5)
     assert not compared.agrees_with("F_c1", 0.04)
-    earlier.keep(compared.k, compared.m)
+    earlier.keep_fit(compared.k, compared.m)
     assert not compared.agrees_with("F_c1", 0.04)
     assert compared.agrees_with("F_c1", 0.04)
 

@@ -69,7 +69,7 @@ def test_of_several_sources_the_one_that_contradicts_most_is_named():
     evidence.put_fitted(table.m, DRAG, 1.3, 0.0)
     for s in range(KEPT, KEPT + 3):
         evidence.weigh(table.k, table.m, s, DRAG)
-    assert evidence.foremost(table.m, KEPT, KEPT + 3, DRAG) == KEPT + 1
+    assert evidence.largest_excess(table.m, KEPT, KEPT + 3, DRAG) == KEPT + 1
 
 
 def test_each_quantity_is_a_column_of_the_parameters():

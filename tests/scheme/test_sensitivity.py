@@ -231,7 +231,7 @@ def test_a_contact_doubles_the_strain_of_the_joints_that_are_over_up_to_the_larg
     m.filters.y[3, 1] = -1.1
     strains = []
     for largest in (8.0, 8.0, 8.0, 8.0, 4.0):
-        sensitivity.strain(m, largest)
+        sensitivity.raise_strain(m, largest)
         strains.append(m.sensitivity.strain.tolist())
     assert strains == [[1.0, 2.0], [1.0, 4.0], [1.0, 8.0], [1.0, 8.0], [1.0, 8.0]]
 
@@ -286,7 +286,7 @@ def relaxed(share, count, strain=8.0):
     m.sensitivity.h[:] = 0.5
     m.filters.y[2] = 0.5 * share
     for _ in range(count):
-        sensitivity.relax(K, m)
+        sensitivity.decay_strain(K, m)
     return m
 
 
@@ -301,10 +301,10 @@ def test_a_peak_of_the_residual_holds_the_strain_for_a_while():
     m.filters.y[:] = 0.0
     count = round(np.log(0.9 / sensitivity.RELAXED) * sensitivity.STRAIN_S / T)
     for _ in range(count - 2):
-        sensitivity.relax(K, m)
+        sensitivity.decay_strain(K, m)
     assert m.sensitivity.strain.tolist() == [8.0, 8.0]
     for _ in range(4):
-        sensitivity.relax(K, m)
+        sensitivity.decay_strain(K, m)
     assert np.all(m.sensitivity.strain < 8.0)
 
 

@@ -448,20 +448,22 @@ def test_heartbeats_are_watched() -> None:
     rig.enable()
     for _ in range(300):
         rig.step()
-    assert rig.master.watch(rig.wire.now_ns) == []
+    assert rig.master.failed_heartbeats(rig.wire.now_ns) == []
     rig.sensors[0].node.nmt.stop_heartbeat()
     for _ in range(300):
         rig.step()
-    (line,) = rig.master.watch(rig.wire.now_ns)
+    (line,) = rig.master.failed_heartbeats(rig.wire.now_ns)
     assert line.startswith("Sensor1 (node 3): no heartbeat for")
     rig.sensors[0].node.nmt.start_heartbeat(100)
     for _ in range(150):
         rig.step()
-    assert rig.master.watch(rig.wire.now_ns) == []
+    assert rig.master.failed_heartbeats(rig.wire.now_ns) == []
     rig.drives[0].node.nmt.state = "PRE-OPERATIONAL"
     for _ in range(150):
         rig.step()
-    assert rig.master.watch(rig.wire.now_ns) == ["Drive1 (node 1): is PRE-OPERATIONAL, OPERATIONAL expected"]
+    assert rig.master.failed_heartbeats(rig.wire.now_ns) == [
+        "Drive1 (node 1): is PRE-OPERATIONAL, OPERATIONAL expected"
+    ]
 
 
 RATED, NO_MAPPING, WRONG_STATE = (0x6076, 0), 0x06040041, 0x08000022

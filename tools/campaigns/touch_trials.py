@@ -219,7 +219,7 @@ def rule_shares(constants: Structured, memory: Structured) -> tuple[float, ...]:
     explained = max((abs(fit_check.residual(m, *place)) for place in places), default=0.0) / fit_check.limit_Nm(m)
     later = max((fit_check.later_share(k, m, s) for s in steps), default=0.0)
     earlier.forget(m)
-    earlier.keep(k, m)
+    earlier.keep_fit(k, m)
     earlier.is_no_more(k, m)
     more = np.max(m.evidence.difference[evidence.KEPT :] / m.evidence.limit[evidence.KEPT :])
     return float(changed), float(explained), float(later), float(more)

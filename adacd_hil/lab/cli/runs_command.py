@@ -216,24 +216,24 @@ def _page(found: list["RunSummary"], path: Path) -> str:
 
 
 def _as_text(found: list["RunSummary"]) -> str:
-    from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, cells, count_text
+    from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, count_text, row_texts
 
     if not found:
         return "no run is as asked for"
-    lines = [format_table(HEAD, [cells(run) for run in found], right=NUMBERS), "", f"{count_text(found)}"]
+    lines = [format_table(HEAD, [row_texts(run) for run in found], right=NUMBERS), "", f"{count_text(found)}"]
     lines += [in_line(f"{run.name}: {run.status}: {run.verdict}") for run in found if run.verdict and not run.is_clean]
     return "\n".join(lines)
 
 
 def _trend_text(made: "Trend") -> str:
-    from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, cells
+    from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, row_texts
 
     left = f", {len(made.left_out)} left out" if made.left_out else ""
     lines = [in_line(line) for line in (f"{made.arm}: {counted(len(made.runs), 'run')}{left}", made.sentence)]
     lines += [in_line(line) for line in made.further]
     lines += [in_line(f"left out: {run.name}: {run.status}: {run.verdict}") for run in made.left_out]
     if made.runs:
-        lines += ["", format_table(HEAD[:6], [cells(run)[:6] for run in made.runs], right=NUMBERS[:1])]
+        lines += ["", format_table(HEAD[:6], [row_texts(run)[:6] for run in made.runs], right=NUMBERS[:1])]
     return "\n".join(lines)
 
 

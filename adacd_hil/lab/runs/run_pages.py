@@ -11,7 +11,7 @@ import numpy as np
 from adacd_hil.lab.report.page import Table, make_table, render_page
 from adacd_hil.lab.report.traces import Trace, TracePanel, Track, pack_tracks
 from adacd_hil.lab.runs.run_summary import BROKEN, RunSummary
-from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, cells, count_text
+from adacd_hil.lab.runs.run_table import HEAD, NUMBERS, count_text, row_texts
 from adacd_hil.lab.runs.run_trend import Trend
 from adacd_hil.records import JOINTS
 
@@ -48,7 +48,7 @@ def runs_page(folder: Path, listed: Sequence[ListedRun]) -> str:
         over="adacd-hil runs",
         headline=f"{count[0].upper()}{count[1:]}.",
         is_good=all(run.is_clean for run in runs),
-        rows=[(each, _place(folder, each.report), cells(each.run)[1:]) for each in listed],
+        rows=[(each, _place(folder, each.report), row_texts(each.run)[1:]) for each in listed],
         head=HEAD[1:],
         right=[place - 1 for place in NUMBERS],
     )
@@ -109,4 +109,4 @@ def _changes_table(trend: Trend) -> Table:
 def _runs_table(trend: Trend) -> Table:
     runs = (*trend.runs, *trend.left_out)
     left = [place for place in range(len(HEAD)) if place not in NUMBERS]
-    return make_table(HEAD, [cells(run) for run in runs], left=left)
+    return make_table(HEAD, [row_texts(run) for run in runs], left=left)

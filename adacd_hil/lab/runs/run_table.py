@@ -125,7 +125,7 @@ def count_text(runs: Sequence[RunSummary]) -> str:
     return f"{text}, {', '.join(parts) or 'all good'}" if runs else "no run"
 
 
-def cells(run: RunSummary) -> tuple[str, ...]:
+def row_texts(run: RunSummary) -> tuple[str, ...]:
     """Return the texts of a run's row in the table of runs, in the order of HEAD."""
     return (
         run.name,

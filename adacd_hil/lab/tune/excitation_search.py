@@ -141,7 +141,7 @@ class Search:
 
     def figures(self, excitation: ExcitationSettings) -> Figures:
         """Return the figures of a motion. excitation: of the period and number of harmonics of this search."""
-        motion = self.move(np.array(excitation.cosine), np.array(excitation.sine))
+        motion = self.motion_of(np.array(excitation.cosine), np.array(excitation.sine))
         W = self._regressors(motion)
         smallest, largest, inertia = self._shown(W)
         travel, velocity, acceleration = np.degrees(np.abs(motion).max(axis=1))
@@ -157,7 +157,7 @@ class Search:
 
     def overshoot(self, excitation: ExcitationSettings) -> float:
         """Return by which share of a limit a motion exceeds it, at worst; 0 or less: the motion keeps all limits."""
-        motion = self.move(np.array(excitation.cosine), np.array(excitation.sine))
+        motion = self.motion_of(np.array(excitation.cosine), np.array(excitation.sine))
         return max(float(used.max()) for used in self._used(motion, self._regressors(motion))) - 1.0
 
     def run(
@@ -214,7 +214,7 @@ class Search:
             np.column_stack((-sine @ order, sine)),
         )
 
-    def move(self, cosine: Vector, sine: Vector) -> Vector:
+    def motion_of(self, cosine: Vector, sine: Vector) -> Vector:
         """Compute q, dq and ddq (3, N, 2) of an excitation at all samples of the search.
 
         cosine, sine (2, K): coefficients, in amplitudes of the trajectory, as in `ExcitationSettings`.
@@ -263,7 +263,7 @@ class Search:
         return np.asarray(np.linalg.eigvalsh(self._step_s * rows.T @ rows), dtype=np.float64)
 
     def _cost(self, free: Vector, penalty: float) -> float:
-        motion = self.move(*self._complete(free))
+        motion = self.motion_of(*self._complete(free))
         W = self._regressors(motion)
         over = sum(float(np.mean(np.maximum(used - 1.0, 0.0) ** 2)) for used in self._used(motion, W))
         for joint, column in enumerate((F_C1, F_C2)):

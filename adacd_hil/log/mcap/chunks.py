@@ -48,7 +48,7 @@ class Opening:
     def __init__(self) -> None:
         self._packed = self._opened = 0
 
-    def allow(self, packed: int, size: int) -> None:
+    def add_chunk(self, packed: int, size: int) -> None:
         """Add a chunk to the file's counts: its `packed` bytes in the file, and its `size` in bytes when decompressed.
 
         Raises ChunkError if the chunk is too large, or if the file grows to too many times its size.
@@ -66,7 +66,7 @@ class Opening:
         Raises ChunkError for too many bytes, another size or another CRC.
         """
         data = decompress(chunk.compression, chunk.data)
-        self.allow(len(chunk.data), len(data))
+        self.add_chunk(len(chunk.data), len(data))
         return _checked(chunk, data, is_size_certain=bool(chunk.uncompressed_crc))
 
 
@@ -367,7 +367,7 @@ def _packed(record: RawRecord, opening: Opening) -> _Packed | Problem:
         return _Packed(whole, len(whole), position, [])
     try:
         chunk: Chunk = parse(record.opcode, record.body)
-        opening.allow(len(chunk.data), chunk.uncompressed_size)
+        opening.add_chunk(len(chunk.data), chunk.uncompressed_size)
     except (LogError, ChunkError):
         return Problem(f"damaged at byte {position}", is_damage=True)
     return _Packed(chunk, chunk.uncompressed_size, position, [])

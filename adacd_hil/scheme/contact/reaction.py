@@ -113,7 +113,7 @@ class Withdrawal:
             q_d[i], dq_d[i], ddq_d[i] = profile.at(elapsed_s)
 
     @property
-    def beyond(self) -> list[int]:
+    def beyond_limits(self) -> list[int]:
         """Indices, from 0, of the joints that can't stop within their position limit.
 
         They brake at the acceleration limit from their position and velocity at the start of the withdrawal.

@@ -14,7 +14,7 @@
   the positive residuals and that of the negative ones are followed apart, and the smaller one counts: a push has one
   sign, an error of the model has both. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
 - R: the velocity's noise over that of the settings, squared, measured in its second difference.
-- e: 1, or more of a joint that has shown contacts while the arm learnt, or right after going on (`strain`).
+- e: 1, or more of a joint that has shown contacts while the arm learnt, or right after going on (`raise_strain`).
 - G: uncertainty after lost samples, see below. tail: floor by the largest residual seen (`margin`).
 - s, s': shares of standstill, and of low speed, in the filter's memory. At standstill friction may hold any torque
   up to F_s: F_c, static friction and friction by load where they are in the model, and as much more as the first two
@@ -204,7 +204,7 @@ def keep_velocity_noise(k: Constants, m: Memory) -> None:
 
 
 @compiled
-def strain(m: Memory, largest: float) -> None:
+def raise_strain(m: Memory, largest: float) -> None:
     """Double the strain, up to `largest`, of each joint that is over a threshold in any channel.
 
     A contact while learning may be the model's failure. One contact may be a hand; repeated ones come from an error
@@ -219,7 +219,7 @@ def strain(m: Memory, largest: float) -> None:
 
 
 @compiled
-def relax(k: Constants, m: Memory) -> None:
+def decay_strain(k: Constants, m: Memory) -> None:
     """Update `strain` and `peak_share` (n,) by one sample without contact.
 
     The strain decays towards 1 while the residual has stayed below RELAXED of its threshold; `peak_share` is the

@@ -189,7 +189,7 @@ def learn(k: Constants, m: Memory) -> bool:
     else:
         m.ring.used += 1.0
     m.ring.W[place] = W
-    missing_torque.keep(m, place)
+    missing_torque.keep_columns(m, place)
     for i in range(still.shape[0]):
         m.ring.still[place, i] = still[i] if abs(m.sensitivity.dq_old[i]) > regressor.SLOW_RAD_S else 1.0
     m.ring.tau[place] = tau_J

@@ -214,7 +214,7 @@ class Doubt:
         if not is_touched:
             clear(self._m)
         elif self._waited_s < AT_REST_S:
-            sensitivity.strain(self._m, MOST_STRAIN)
+            sensitivity.raise_strain(self._m, MOST_STRAIN)
 
     def end_contact(self, cycle: int) -> CommonCause | None:
         """Store the contact that ends in this cycle; return the common cause of the last contacts, or None.

@@ -75,7 +75,7 @@ def is_keeping(m: Memory) -> bool:
 
 
 @compiled
-def keep(k: Constants, m: Memory) -> None:
+def keep_fit(k: Constants, m: Memory) -> None:
     """Keep the fit's present belief and its steps, as a touch may have begun; not if beliefs are kept already.
 
     If the fit has changed since a step, keep only the steps up to that one. Keep nothing before the second step. Set
@@ -195,7 +195,7 @@ def _lapses(k: Constants, m: Memory) -> bool:
     own = m.earlier
     is_little, is_less, is_same, friction_Nm, else_Nm = True, True, True, 0.0, 0.0
     for q in range(VISCOUS):
-        s = evidence.foremost(m, KEPT, KEPT + int(own.kept_count), q)
+        s = evidence.largest_excess(m, KEPT, KEPT + int(own.kept_count), q)
         excess = evidence.excess(m, s, q)
         is_little = is_little and abs(excess) <= (LITTLE if excess > 0.0 or q >= FRICTIONS else 1.0)
         is_less = is_less and excess <= 1.0 and (q < OFFSETS or excess >= -1.0)

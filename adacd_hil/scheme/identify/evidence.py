@@ -184,7 +184,7 @@ def excess(m: Memory, s: int, q: int) -> float:
 
 
 @compiled
-def foremost(m: Memory, first: int, last: int, q: int) -> int:
+def largest_excess(m: Memory, first: int, last: int, q: int) -> int:
     """Return the source among first .. last - 1 whose last weighed excess of quantity `q` is largest in size."""
     worst = first
     for s in range(first, last):

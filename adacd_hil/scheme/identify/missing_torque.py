@@ -94,7 +94,7 @@ def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
 
 
 @compiled
-def keep(m: Memory, slot: int) -> None:
+def keep_columns(m: Memory, slot: int) -> None:
     """Put the columns of this sample into a slot of the ring, where they wait with the row of the regressor."""
     m.missing_torque.ring_X[slot] = m.missing_torque.X_learnt
 

@@ -239,8 +239,8 @@ def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode
     was_free = m.models.recovering_cycles == 0.0
     is_free = belief.is_free(k, m, is_touched)
     if is_touched and was_free and mode & (LEARN | TEST):
-        sensitivity.strain(m, sensitivity.LARGEST_STRAIN)
-        earlier.keep(k, m)
+        sensitivity.raise_strain(m, sensitivity.LARGEST_STRAIN)
+        earlier.keep_fit(k, m)
     if is_touched and mode & REFINE:
         doubt.begin(k, m)
     _follow_noise(k, m, is_free, mode)
@@ -279,7 +279,7 @@ def _test(k: Constants, m: Memory, dq: Vector) -> int:
     if result >= 0:
         return CERTIFIED if result > 0 else 0
     if m.models.is_payload == 0.0:  # a new payload: hands have been on the arm, and friction may depend on it
-        earlier.keep(k, m)
+        earlier.keep_fit(k, m)
     is_by_place = missing_torque.is_found(k, m)
     certificate.withhold(m, certificate.BY_PLACE if is_by_place else certificate.NOTHING)
     return REFUTED | WITHHELD if is_by_place else REFUTED
@@ -292,7 +292,7 @@ def _refine(k: Constants, m: Memory) -> int:
     Return WITHHELD if something contradicts the certificate, with the cause in `withheld_by`, else 0.
     """
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_share, True)
-    sensitivity.relax(k, m)
+    sensitivity.decay_strain(k, m)
     cause = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
     if belief.learn(k, m):
         belief.wander(k.drift_std, m.filters.W_learnt, k.period_s * k.learn_every, m.models.P_belief)

@@ -82,7 +82,7 @@ class CertifiedPipeline(Pipeline):
         anchor.accept(m, np.zeros(JOINTS), np.ones(JOINTS))
         anchor.tightest(k, m, 0)
         doubt.begin(k, m)
-        sensitivity.strain(m, doubt.MOST_STRAIN)
+        sensitivity.raise_strain(m, doubt.MOST_STRAIN)
         compile_recalled(self._settings)
         paper_kernel.begin_adaptation(*(array.copy() for array in self._paper))
         super().compile_cycle()
