@@ -47,6 +47,7 @@ class Arm:
         self.drives = tuple(_make_drive(settings, codec, device) for device in devices[:JOINTS])
         self.sensors = tuple(_make_sensor(codec, device, period_s) for device in devices[JOINTS:])
         self.devices: tuple[Drive | TorqueSensor, ...] = (*self.drives, *self.sensors)
+        self._judged: tuple[Drive | TorqueSensor, ...] = (*self.sensors, *self.drives)  # in the order of their faults
         for device, placed in zip(self.devices, devices, strict=True):
             device.set_bounds(placed)
         self._bus = bus
@@ -308,7 +309,7 @@ class Arm:
         self.was_enabled |= is_enabled
         if has_dropped_out:
             return FaultReason.DRIVE
-        for device in (*self.sensors, *self.drives):
+        for device in self._judged:
             if (fault := device.fault(self._cycle, is_enabled)) is not FaultReason.NONE:
                 return fault
         if self._emergencies:

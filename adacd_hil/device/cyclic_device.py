@@ -18,9 +18,6 @@ class CyclicDevice(ABC):
     those in use, the main one first. sample_cycle: cycle of the values in use; -1 before the first.
     """
 
-    own_fault = FaultReason.NONE
-    """Fault of the arm when a bounded value of such a device is outside."""
-
     def __init__(self, codec: Codec, name: str, message: MessageCodec, main: str, period_s: float) -> None:
         """Judge a frame of `message` without end-to-end header by its signal `main`.
 
@@ -45,6 +42,8 @@ class CyclicDevice(ABC):
         self._received_cycle = 0
         self.status_age_limit = math.inf
         """Greatest permitted age of its status, in cycles; infinite without a status period."""
+        self.has_bounds = False
+        """Whether its profile bounds a value."""
         self._cyclic_bounds: tuple[ValueBound, ...] = ()
         self._status_bounds: tuple[ValueBound, ...] = ()
         self._cyclic_values: Sequence[float] = ()
@@ -61,6 +60,7 @@ class CyclicDevice(ABC):
             self.status_age_limit = math.ceil(PATIENCE_PERIODS * status.event_timer_ms * 1e-3 / self._period_s)
         self._cyclic_bounds = bounds_of(placed.pdo(cyclic), self._message)
         self._status_bounds = bounds_of(status, self.status_message)
+        self.has_bounds = bool(self._cyclic_bounds or self._status_bounds)
 
     def accept_cyclic(self, data: bytes, cycle: int) -> bool:
         """Take one cyclic frame of `cycle`; return False when a check fails: the frame is ignored."""
@@ -93,11 +93,9 @@ class CyclicDevice(ABC):
             self._use_status(self._status_values, cycle)
         return is_valid
 
-    def fault(self, cycle: int, is_enabled: bool) -> FaultReason:  # noqa: ARG002 (drives have use for it)
+    @abstractmethod
+    def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
         """Return the device's fault in a cycle, NONE without one; `is_enabled`: whether all drives are."""
-        if (self._cyclic_bounds or self._status_bounds) and self.describe_excess(cycle):
-            return self.own_fault
-        return FaultReason.NONE
 
     def describe_excess(self, cycle: int) -> list[str]:
         """Return a line per bounded value that is outside its bounds, and one if such values are missing or old."""

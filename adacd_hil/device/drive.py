@@ -124,8 +124,6 @@ def decode_statusword(statusword: int) -> Cia402State:
 class Drive(CyclicDevice):
     """One drive of the arm, joint 1 or 2. Its status may be in a frame of its own or in the feedback."""
 
-    own_fault = FaultReason.DRIVE
-
     def __init__(
         self,
         codec: Codec,
@@ -176,7 +174,7 @@ class Drive(CyclicDevice):
         """Return DATA_AGE for a status that is too old for an enabled drive, DRIVE for a bounded value outside."""
         if is_enabled and cycle - self.status_cycle > self.status_age_limit:
             return FaultReason.DATA_AGE
-        return super().fault(cycle, is_enabled)
+        return FaultReason.DRIVE if self.has_bounds and self.describe_excess(cycle) else FaultReason.NONE
 
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
         travel = values[self._velocity_at] * (cycles * self._period_s)

@@ -31,8 +31,6 @@ USABLE = tuple(status for status in _STATUSES if not status & SensorStatus.NOT_V
 class TorqueSensor(CyclicDevice):
     """The torque sensor of joint 1 or 2."""
 
-    own_fault = FaultReason.SENSOR
-
     def __init__(
         self,
         codec: Codec,
@@ -70,9 +68,11 @@ class TorqueSensor(CyclicDevice):
         self._slow_bits = 0
         self._heard_bits = 0  # of the last status frame
 
-    def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
+    def fault(self, cycle: int, is_enabled: bool) -> FaultReason:  # noqa: ARG002 (as of all devices)
         """Return SENSOR for a torque that isn't valid or a bounded value outside; NONE without a fault."""
-        return super().fault(cycle, is_enabled) if self.status in USABLE else FaultReason.SENSOR
+        if self.status not in USABLE or (self.has_bounds and self.describe_excess(cycle)):
+            return FaultReason.SENSOR
+        return FaultReason.NONE
 
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
         # Two frames of one cycle, late and present, may lie a period apart.
