@@ -5,6 +5,22 @@ from pathlib import Path
 
 from adacd_hil.wire.codec import contract_folder
 
+OWN_ARM = """
+extends = "certified"
+
+[arm]
+link_length_m = [0.4, 0.25]
+rated_torque_Nm = [20.0, 8.0]
+torque_limit_Nm = [18.0, 7.0]
+position_limit_deg = [80.0, 110.0]
+cad_theta = []
+
+[devices]
+drive_node = [11, 12]
+sensor_node = [21, 22]
+contract = ""
+"""
+
 OTHER_LAYOUT = """
 [[pdo]]
 message = "Feedback"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from eds_variants import EdsVariant
-from own_arm import LINKS, describe_arm, describe_geared_arm, touches
+from own_arm import LINKS, OWN_ARM, describe_arm, describe_geared_arm, touches
 
 from adacd_hil.cli.embedded_run import resolve
 from adacd_hil.cli.main import cli
@@ -23,21 +23,6 @@ from adacd_hil.settings.schema import ConfigError
 from firmware_sim.cli.own_devices import rehearse as rehearse_file
 from firmware_sim.scenario.scenario import Scenario
 
-OWN_ARM = """
-extends = "certified"
-
-[arm]
-link_length_m = [0.4, 0.25]
-rated_torque_Nm = [20.0, 8.0]
-torque_limit_Nm = [18.0, 7.0]
-position_limit_deg = [80.0, 110.0]
-cad_theta = []
-
-[devices]
-drive_node = [11, 12]
-sensor_node = [21, 22]
-contract = ""
-"""
 SHORT = "lasts_s = 0.4\n"
 
 

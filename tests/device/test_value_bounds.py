@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
-from own_arm import eds_of_two_channels
+from own_arm import OWN_ARM, eds_of_two_channels
 
 from adacd_hil.cli.main import cli
 from adacd_hil.device.profile import ProfileSettings
@@ -22,21 +22,8 @@ from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.codec import contract_folder
 
-ARM = """
-extends = "certified"
-[arm]
-link_length_m = [0.4, 0.25]
-rated_torque_Nm = [20.0, 8.0]
-torque_limit_Nm = [18.0, 7.0]
-position_limit_deg = [80.0, 110.0]
-cad_theta = []
-[devices]
-drive = ["drive.toml", "drive.toml"]
-sensor = ["sensor.toml", "sensor.toml"]
-drive_node = [11, 12]
-sensor_node = [21, 22]
-contract = ""
-"""
+DEVICES = '[devices]\ndrive = ["drive.toml", "drive.toml"]\nsensor = ["sensor.toml", "sensor.toml"]\n'
+ARM = OWN_ARM.replace("[devices]\n", DEVICES)
 TEMPERATURE = {"object": "0x2031", "signal": "temperature", "unit": "degC", "scale": 0.1, "high": 85.0}
 SECOND_TORQUE = {"object": "0x9130:2", "signal": "torque_2", "unit": "Nm", "scale": 2e-5, "of": "torque"}
 SECOND_TORQUE |= {"low": -0.2, "high": 0.2}
