@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from adacd_hil.device.arm_watch import PATIENCE_PERIODS
 from adacd_hil.device.profile import PlacedDevice
@@ -97,13 +97,29 @@ class CyclicDevice(ABC):
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
         """Return the device's fault in a cycle, NONE without one; `is_enabled`: whether all drives are."""
 
+    def has_excess(self, cycle: int) -> bool:
+        """Return whether a bounded value is outside its bounds, or missing or old, in a cycle."""
+        return self.has_bounds and (self._is_status_old(cycle) or any(self._excesses()))
+
     def describe_excess(self, cycle: int) -> list[str]:
         """Return a line per bounded value that is outside its bounds, and one if such values are missing or old."""
-        frames = (self._cyclic_bounds, self._cyclic_values), (self._status_bounds, self._status_values)
-        lines = [bound.describe_excess(values) for bounds, values in frames if values for bound in bounds]
-        if self._status_bounds and cycle - self._status_came > self.status_age_limit:
+        lines = [bound.describe(values) for bound, values in self._excesses()]
+        if self._is_status_old(cycle):
             lines.append(f"no status for more than {self.status_age_limit:g} cycles")
-        return [f"{self.name}: {line}" for line in lines if line]
+        return [f"{self.name}: {line}" for line in lines]
+
+    def _is_status_old(self, cycle: int) -> bool:
+        return bool(self._status_bounds) and cycle - self._status_came > self.status_age_limit
+
+    def _excesses(self) -> Iterator[tuple[ValueBound, Sequence[float]]]:
+        """Yield the bounds that the newest values exceed, with these values."""
+        for bounds, values in (
+            (self._cyclic_bounds, self._cyclic_values),
+            (self._status_bounds, self._status_values),
+        ):
+            for bound in bounds if values else ():
+                if not bound.is_within(values):
+                    yield bound, values
 
     @abstractmethod
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:

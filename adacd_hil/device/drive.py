@@ -174,7 +174,7 @@ class Drive(CyclicDevice):
         """Return DATA_AGE for a status that is too old for an enabled drive, DRIVE for a bounded value outside."""
         if is_enabled and cycle - self.status_cycle > self.status_age_limit:
             return FaultReason.DATA_AGE
-        return FaultReason.DRIVE if self.has_bounds and self.describe_excess(cycle) else FaultReason.NONE
+        return FaultReason.DRIVE if self.has_excess(cycle) else FaultReason.NONE
 
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
         travel = values[self._velocity_at] * (cycles * self._period_s)

@@ -70,7 +70,7 @@ class TorqueSensor(CyclicDevice):
 
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:  # noqa: ARG002 (as of all devices)
         """Return SENSOR for a torque that isn't valid or a bounded value outside; NONE without a fault."""
-        if self.status not in USABLE or (self.has_bounds and self.describe_excess(cycle)):
+        if self.status not in USABLE or self.has_excess(cycle):
             return FaultReason.SENSOR
         return FaultReason.NONE
 

@@ -22,14 +22,19 @@ class ValueBound(NamedTuple):
     low: float
     high: float
 
-    def describe_excess(self, values: Sequence[float]) -> str:
-        """Return a line if the value of a decoded frame is outside, NaN included; empty within."""
-        value = values[self.place] - (0.0 if self.place_of is None else values[self.place_of])
-        if self.low <= value <= self.high:
-            return ""
+    def value_in(self, values: Sequence[float]) -> float:
+        """Return the bounded value of a decoded frame, or its difference to the other one."""
+        return values[self.place] - (0.0 if self.place_of is None else values[self.place_of])
+
+    def is_within(self, values: Sequence[float]) -> bool:
+        """Return whether the value of a decoded frame is within its bounds; NaN isn't."""
+        return self.low <= self.value_in(values) <= self.high
+
+    def describe(self, values: Sequence[float]) -> str:
+        """Return the value of a decoded frame and its bounds in words."""
         bounds = [f"at least {self.low:g}"] if self.low > -math.inf else []
         bounds += [f"at most {self.high:g}"] if self.high < math.inf else []
-        return f"{self.text} {f'{value:g} {self.unit}'.rstrip()}, {' and '.join(bounds)} allowed"
+        return f"{self.text} {f'{self.value_in(values):g} {self.unit}'.rstrip()}, {' and '.join(bounds)} allowed"
 
 
 def bounds_of(pdo: PdoSettings | None, message: MessageCodec | None) -> tuple[ValueBound, ...]:

@@ -237,7 +237,7 @@ def test_a_bound_that_no_value_can_reach_is_refused(
 
 
 def test_a_value_without_a_unit_has_no_gap_in_its_line() -> None:
-    assert ValueBound("errors", "", 0, None, -math.inf, 3.0).describe_excess([5.0]).startswith("errors 5, ")
+    assert ValueBound("errors", "", 0, None, -math.inf, 3.0).describe([5.0]).startswith("errors 5, ")
 
 
 def test_a_drive_without_a_scale_is_named_before_its_bounds_are_compared() -> None:

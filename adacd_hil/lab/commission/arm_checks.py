@@ -297,7 +297,7 @@ def check_devices(patient: ArmExamination) -> Finding:
     lines = [line for line in describe_faults(patient.arm) if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
     text = "; ".join([*lines, *events])
-    if any(device.describe_excess(patient.arm.cycle) for device in patient.arm.devices):
+    if any(device.has_excess(patient.arm.cycle) for device in patient.arm.devices):
         return failed(text, "no run enables the arm outside `low` and `high` of a device's profile, or without a value")
     if text:
         return warning(text, "a run resets the fault if its cause has gone")
