@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from adacd_hil.device.arm_watch import PATIENCE_PERIODS
 from adacd_hil.device.profile import PlacedDevice
-from adacd_hil.device.value_bounds import ValueBound, bounds_of
+from adacd_hil.device.value_bounds import ValueBound, value_bounds
 from adacd_hil.records import FaultReason
 from adacd_hil.wire.codec import Codec, MessageCodec
 
@@ -58,8 +58,8 @@ class CyclicDevice(ABC):
         status, cyclic = placed.pdo("Status"), self._message.name.removeprefix(self.name)
         if status is not None and status.event_timer_ms:
             self.status_age_limit = math.ceil(PATIENCE_PERIODS * status.event_timer_ms * 1e-3 / self._period_s)
-        self._cyclic_bounds = bounds_of(placed.pdo(cyclic), self._message)
-        self._status_bounds = bounds_of(status, self.status_message)
+        self._cyclic_bounds = value_bounds(placed.pdo(cyclic), self._message)
+        self._status_bounds = value_bounds(status, self.status_message)
         self.has_bounds = bool(self._cyclic_bounds or self._status_bounds)
 
     def accept_cyclic(self, data: bytes, cycle: int) -> bool:

@@ -37,7 +37,7 @@ class ValueBound(NamedTuple):
         return f"{self.text} {f'{self.value_in(values):g} {self.unit}'.rstrip()}, {' and '.join(bounds)} allowed"
 
 
-def bounds_of(pdo: PdoSettings | None, message: MessageCodec | None) -> tuple[ValueBound, ...]:
+def value_bounds(pdo: PdoSettings | None, message: MessageCodec | None) -> tuple[ValueBound, ...]:
     """Return the bounds that a profile sets to values of a frame; empty without such a frame. Raises CodecError."""
     if pdo is None or message is None:
         return ()

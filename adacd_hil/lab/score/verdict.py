@@ -25,7 +25,7 @@ from adacd_hil.lab.score.metrics import (
 )
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
 from adacd_hil.lab.score.run_arrays import Run, Section
-from adacd_hil.records import SchemeState
+from adacd_hil.log.logged_run import is_armed_in
 from adacd_hil.score.judge import Score
 from adacd_hil.score.smallest_push import PUSH_WITHIN
 from adacd_hil.score.wording import NONE, found_text, number_of
@@ -86,7 +86,7 @@ def list_findings(
 
 def _judged_text(run: Run, found: str) -> str:
     """Return `found`, with the time that the truth covers where it doesn't cover all of MONITOR."""
-    watched = run.state == SchemeState.MONITOR
+    watched = is_armed_in(run.state)
     if run.truth is None or run.truth.span is None or not watched.any():
         return found
     is_told = run.truth.span.covers(run.cycle[watched])
