@@ -7,14 +7,12 @@ history, names of folders.
 import ctypes
 import os
 import time
-from datetime import UTC, datetime
 from typing import Protocol
 
 _CLOCK_MONOTONIC = 1
 _TIMER_ABSTIME = 1
 _EINTR = 4
 _NS_PER_S = 1_000_000_000
-_DATE = "%Y-%m-%dT%H:%M:%SZ"
 
 
 class _Timespec(ctypes.Structure):
@@ -87,13 +85,3 @@ def wall_offset_ns() -> int:
         after_ns = time.monotonic_ns()
         offsets.append((after_ns - before_ns, now_ns - (before_ns + after_ns) // 2))
     return min(offsets)[1]
-
-
-def format_date(t_ns: int) -> str:
-    """Return wall-clock time, ns since 1970, as ISO 8601 in UTC, whole seconds."""
-    return datetime.fromtimestamp(t_ns // _NS_PER_S, tz=UTC).strftime(_DATE)
-
-
-def date_ns(date_utc: str) -> int:
-    """Return the ns since 1970 of a date as `format_date` returns it. Raises ValueError."""
-    return int(datetime.strptime(date_utc, _DATE).replace(tzinfo=UTC).timestamp()) * _NS_PER_S

@@ -1,9 +1,7 @@
-"""Remedies in error messages: the nearest known name, the command that installs an extra."""
+"""The known name that is most like a word, for error messages."""
 
-import sys
 from collections.abc import Iterable
 from difflib import SequenceMatcher
-from pathlib import Path
 
 _SHORTEST, _LONGEST = 2, 64
 """Fewest and most letters of a word that is compared with names."""
@@ -29,27 +27,3 @@ def _likeness(word: str, name: str) -> float:
     if len(parts[0]) != len(parts[1]):
         return 0.0
     return min(SequenceMatcher(None, *pair).ratio() for pair in zip(*parts, strict=True))
-
-
-_SOURCE_TREE = Path(__file__).resolve().parent.parent
-
-
-def install_command(extra: str) -> str:
-    """Return the command that installs an extra into this interpreter's environment, from the source tree if any.
-
-    This package is in no registry: without a source tree the command names the package, and the user gives its file.
-    """
-    is_source = (_SOURCE_TREE / "pyproject.toml").is_file()
-    source = "adacd-hil" if not is_source else "." if Path.cwd() == _SOURCE_TREE else str(_SOURCE_TREE)
-    return f"{pip_command()} install {'-e ' if is_source else ''}'{source}[{extra}]'"
-
-
-def pip_command() -> str:
-    """Return the shortest command that runs this interpreter's pip."""
-    executable = Path(sys.executable)
-    pip = executable.with_name("pip")
-    try:
-        name = str((pip if pip.exists() else executable).relative_to(Path.cwd()))
-    except ValueError:
-        name = str(pip if pip.exists() else executable)
-    return name if pip.exists() else f"{name} -m pip"

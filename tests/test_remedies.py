@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from adacd_hil import remedies
-from adacd_hil.remedies import install_command, nearest_name
+from adacd_hil.extras import install_command
+from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse

@@ -25,7 +25,6 @@ from mcap.records import Attachment
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import (
     CONTINUED,
-    DROPPED_KEY,
     ENDING_KEY,
     FIELDS_KEY,
     LOG_NAME,
@@ -35,6 +34,7 @@ from adacd_hil.log.log_files import (
     LogError,
     part_path,
 )
+from adacd_hil.log.log_parts import DROPPED_KEY
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD
 from adacd_hil.log.recording.log_file import McapFile, Sink

@@ -20,9 +20,9 @@ from adacd_hil.cli.options import (
     run_folder_option,
 )
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, complain
+from adacd_hil.extras import pip_command
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.printable import one_line
-from adacd_hil.remedies import pip_command
 from adacd_hil.terminal import is_interrupted, open_terminals
 
 if TYPE_CHECKING:

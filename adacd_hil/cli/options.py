@@ -14,9 +14,9 @@ import click
 
 from adacd_hil.cli.completion import complete_channel, complete_configuration, complete_interface, complete_setting
 from adacd_hil.cli.output import CommandError, ExitCode, explained
+from adacd_hil.extras import install_command
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.log.log_files import MOST_VIEWERS
-from adacd_hil.remedies import install_command
 from adacd_hil.settings.toml_files import builtin_names
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]
 
     @functools.wraps(command)
     def bounded(*args: Any, from_s: float | None, until_s: float | None, **kwargs: Any) -> ExitCode:
-        from adacd_hil.log.log_files import TimeWindow
+        from adacd_hil.log.time_window import TimeWindow
 
         for name, bound_s in (("--from", from_s), ("--until", until_s)):
             if bound_s is not None and not math.isfinite(bound_s):

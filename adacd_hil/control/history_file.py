@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.clock import date_ns
 from adacd_hil.control.device_record import DeviceRecord
+from adacd_hil.dates import date_ns
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.file_access import read_input

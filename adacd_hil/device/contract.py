@@ -23,10 +23,10 @@ from adacd_hil.wire.contract_frames import (
     SDO_REQUEST_ID,
     SDO_RESPONSE_ID,
     SYNC_ID,
-    move_contract,
 )
 from adacd_hil.wire.e2e import PROFILES_BY_CODE
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
+from adacd_hil.wire.moved_contract import move_contract
 
 COMPOSED_NAME = "contract.dbc"
 WIRE_VERSION = 1

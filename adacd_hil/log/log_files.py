@@ -1,15 +1,10 @@
-"""The files of a log: their names, the words in their headers and summaries, and their errors.
+"""The files of a log: their names, the words in their headers and summaries, and their errors."""
 
-A window of time in a log is given in s since the beginning of the log, its first message.
-"""
-
-import math
 import platform
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
 
 
 class LogError(Exception):
@@ -63,19 +58,6 @@ MOST_VIEWERS = 8
 _DIGITS, _MOST_DIGITS = 3, 5
 
 
-def log_in(given: str | Path) -> Path:
-    """Return the path of a log: the given path, or for a folder run.mcap in it.
-
-    Raises LogError for a folder without it.
-    """
-    path = Path(given)
-    if not path.is_dir():
-        return path
-    if not (path / LOG_NAME).exists():
-        raise LogError(f"folder {path} has no {LOG_NAME}; name a log, or the folder of a run")
-    return path / LOG_NAME
-
-
 def part_path(path: Path, number: int) -> Path:
     """Return the path of part `number` of the log `path`, such as run_001.mcap; part 0 is `path` itself."""
     return path.with_name(f"{path.stem}_{number:0{_DIGITS}d}{path.suffix}") if number else path
@@ -98,47 +80,6 @@ def find_parts(path: Path) -> dict[int, Path]:
     return {number: part for number, part in named.items() if part.exists()}
 
 
-RECOVERED = "recovered"
-"""The ending of a recovered log."""
-CUT = "cut"
-"""The ending of a stretch of a log."""
-MERGED = "merged"
-"""The ending of several logs in one, as earlier versions made it."""
-COPY_ENDINGS = (RECOVERED, CUT, MERGED)
-"""The endings of logs that are made of others."""
-PLANNED_ENDINGS = ("closed", "continued", *COPY_ENDINGS)
-LOST_KEY = "lost"
-"""Of the summary of a recovered log: its losses in words; missing without any."""
-DROPPED_KEY = "dropped"
-"""Of the summary: packets that are not in the log."""
-
-
-def parts_of(path: Path) -> dict[int, Path]:
-    """Return the existing parts of the log `path` by number; without any, {0: path}, which fails when it is opened."""
-    try:
-        return find_parts(path) or {0: path}
-    except OSError:
-        return {0: path}
-
-
-def missing_parts(path: Path, parts: Collection[int], ending: str = "") -> list[Path]:
-    """Return the paths of missing parts of the log `path`: in between, and behind a last one that says "continued".
-
-    parts: the numbers found. ending: of the last one, from its summary.
-    """
-    last = max(parts)
-    missing = [number for number in range(last) if number not in parts]
-    if ending == CONTINUED:
-        missing.append(last + 1)
-    return [part_path(path, number) for number in missing]
-
-
-def summary_count(texts: Mapping[str, str], key: str) -> int:
-    """Return the count under a key in a log's summary; 0 if it is missing or not a number."""
-    text = texts.get(key, "0")
-    return int(text) if text.isdecimal() else 0
-
-
 def arithmetic() -> dict[str, str]:
     """Return machine, Python and libraries by name, for a log's metadata: equal descriptions compute equal bits."""
     from importlib.metadata import version  # costs 20 ms, and most importers don't need it
@@ -149,38 +90,3 @@ def arithmetic() -> dict[str, str]:
         "numpy": version("numpy"),
         "numba": version("numba"),
     }
-
-
-_CENTURY_S = 3.2e9
-
-
-class TimeWindow(NamedTuple):
-    """A stretch of a log, [start_s, end_s), s since its beginning; infinite where it is not bounded."""
-
-    start_s: float = float("-inf")
-    end_s: float = float("inf")
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether the window has neither begin nor end, so that it is the whole log."""
-        return self == TimeWindow()
-
-    @property
-    def text(self) -> str:
-        """The window in a command's words, such as "from 3 s until 5 s"; "" for the whole log."""
-        words = (("from", self.start_s), ("until", self.end_s))
-        return " ".join(f"{word} {bound_s:g} s" for word, bound_s in words if math.isfinite(bound_s))
-
-    def bounds_ns(self, start_ns: int) -> tuple[int, int]:
-        """Return begin and end of the window, ns; start_ns: the log's first message on the same clock."""
-        first_ns, end_ns = (start_ns + round(min(max(bound_s, -_CENTURY_S), _CENTURY_S) * 1e9) for bound_s in self)
-        return first_ns, end_ns
-
-    @property
-    def named_bounds(self) -> dict[str, float]:
-        """Begin and end of the window as `from_s` and `until_s`, the names in results; infinite where not bounded."""
-        return {"from_s": self.start_s, "until_s": self.end_s}
-
-
-WHOLE = TimeWindow()
-EVER_NS = WHOLE.bounds_ns(0)

@@ -25,9 +25,8 @@ from adacd_hil.log.log_files import (
     LogError,
     failing_as,
     part_path,
-    parts_of,
-    summary_count,
 )
+from adacd_hil.log.log_parts import parts_of, summary_count
 from adacd_hil.log.mcap.chunks import Block, Item, read_blocks
 from adacd_hil.log.mcap.mcap_records import (
     CHANNEL_NUMBERS,

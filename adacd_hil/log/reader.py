@@ -16,7 +16,8 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from adacd_hil.log.log_files import DROPPED_KEY, EPOCH_KEY, FIELDS_KEY, LOST_KEY, LogError, log_in
+from adacd_hil.log.log_files import EPOCH_KEY, FIELDS_KEY, LogError
+from adacd_hil.log.log_parts import DROPPED_KEY, LOST_KEY, log_in
 from adacd_hil.log.log_walk import LogWalk
 from adacd_hil.log.mcap.record_layout import record_dtype
 from adacd_hil.log.types.message_types import (

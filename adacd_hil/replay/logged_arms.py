@@ -10,7 +10,7 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LogStream
 from adacd_hil.log.types.topics import ARM, SCHEME
-from adacd_hil.records import ArmBatch, FaultReason
+from adacd_hil.records import ArmBatch, ArmState, FaultReason
 
 _FIELDS: Final = frozenset(member.name for member in ARM.head)
 
@@ -48,4 +48,25 @@ def logged_arms(scheme: NDArray[Any], arm: NDArray[Any], ticks: Ticks) -> ArmBat
         is_late=arm["is_late"].astype(np.bool_),
         steps=arm["steps"].astype(np.int64),
         sampled_ns=ticks.t_ns - arm["sample_age_ns"],
+    )
+
+
+def arm_at(arms: ArmBatch, row: int) -> ArmState:
+    """Return one row as an ArmState; its vectors are views."""
+    age_q, age_tau_J = arms.age_q[row].tolist(), arms.age_tau_J[row].tolist()
+    return ArmState(
+        cycle=int(arms.cycle[row]),
+        t_ns=int(arms.t_ns[row]),
+        periods=int(arms.periods[row]),
+        q=arms.q[row],
+        dq=arms.dq[row],
+        tau_J=arms.tau_J[row],
+        age_q=(age_q[0], age_q[1]),
+        age_tau_J=(age_tau_J[0], age_tau_J[1]),
+        is_enabled=bool(arms.is_enabled[row]),
+        is_complete=bool(arms.is_complete[row]),
+        fault=FaultReason(arms.fault[row]),
+        is_late=bool(arms.is_late[row]),
+        steps=int(arms.steps[row]),
+        sampled_ns=int(arms.sampled_ns[row]),
     )

@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
-from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow, failing_as
+from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.logged_run import SHOWN, Milestones, Mismatch, Progress, is_armed_in
+from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
 from adacd_hil.replay.can_recording import RecordingAlone
@@ -39,7 +40,8 @@ from adacd_hil.replay.scheme_comparison import (
     different_arithmetic,
 )
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
-from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, arm_at
+from adacd_hil.scheme.pipeline.pipeline import SchemeBatch
+from adacd_hil.replay.logged_arms import arm_at
 from adacd_hil.score.emulator_truth import KnownContacts, contacts_beside
 from adacd_hil.score.wording import number_of, unjudged_sentence
 from adacd_hil.settings.configuration import Settings

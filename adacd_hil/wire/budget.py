@@ -32,17 +32,10 @@ from cantools.database.can import Message
 
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec, CodecError
-from adacd_hil.wire.contract_frames import (
-    EMERGENCY_ID,
-    HEARTBEAT_ID,
-    HOST_HEARTBEAT,
-    NMT_ID,
-    NODE_MASK,
-    SYNC_ID,
-    move_id,
-    read_attribute,
-)
-from adacd_hil.wire.frame_lengths import FrameBits, unstuffed_frame, worst_case_frame
+from adacd_hil.wire.contract_attributes import read_attribute
+from adacd_hil.wire.contract_frames import EMERGENCY_ID, HEARTBEAT_ID, HOST_HEARTBEAT, NMT_ID, NODE_MASK, SYNC_ID
+from adacd_hil.wire.frame_bits import FrameBits, unstuffed_frame, worst_case_frame
+from adacd_hil.wire.moved_contract import move_id
 
 ASSUMED_INTERVAL_MS = 100
 """Interval of an event frame without a declared one: the usual heartbeat period."""

@@ -1,18 +1,4 @@
-"""Lengths of CAN frames: bits without stuffing and at worst, allowed data lengths, identifiers.
-
-`adacd_hil.wire.frame_time` computes the exact length with the stuff bits of a frame's content.
-All counts go from start of frame to the end of the intermission (3 bits), after which the next frame can begin, and
-are those of data frames (no remote frames). Source: ISO 11898-1, frame formats and frame coding; the worst case of
-classic frames: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited
-and revised", Real-Time Systems 35 (2007), eq. (1) and (2).
-
-A frame with more than 8 bytes is CAN FD (ISO, not the first Bosch format) with bit rate switch; all others are classic.
-In CAN FD the bits from BRS to the CRC delimiter run at the data bit rate. Each of these two bits changes the rate at
-its sample point; together they last as long as one bit of either rate, so BRS is counted as nominal and the CRC
-delimiter as data. The CRC field of CAN FD has stuff bits at fixed places, so its length doesn't depend on its value.
-"""
-
-from typing import NamedTuple
+"""Data lengths of CAN frames, and their identifiers. Source: ISO 11898-1."""
 
 CLASSIC_BYTES = 8
 """A frame with more data is CAN FD with bit rate switch; all others are classic, on an FD bus too."""
@@ -22,69 +8,3 @@ FD_LENGTHS = (12, 16, 20, 24, 32, 48, 64)
 """Data lengths of FD frames beyond those of classic ones. Source: ISO 11898-1, table of DLC."""
 FRAME_LENGTHS = (*range(CLASSIC_BYTES + 1), *FD_LENGTHS)
 """Data lengths of CAN FD, by data length code."""
-TAIL_BITS = 3 + 7 + 3  # CRC delimiter, acknowledgement, its delimiter; end of frame; intermission
-_FD_TAIL_BITS = 2 + 7 + 3  # the CRC delimiter is a data bit
-_LONG_CRC_BYTES = 16  # CRC-17 up to here, CRC-21 above
-
-
-class FrameBits(NamedTuple):
-    """Bits of a frame at the nominal and at the data bit rate."""
-
-    nominal: int
-    data: int = 0
-
-    @property
-    def total(self) -> int:
-        """Sum of the bits at both rates."""
-        return self.nominal + self.data
-
-    def duration_ns(self, bitrate: int, data_bitrate: int = 0) -> int:
-        """Return the time on the bus at rates in bit/s, rounded up to whole ns per rate."""
-        data_ns = -(-self.data * 1_000_000_000 // data_bitrate) if self.data else 0
-        return -(-self.nominal * 1_000_000_000 // bitrate) + data_ns
-
-    def duration_s(self, bitrate: int, data_bitrate: int = 0) -> float:
-        """Return the time on the bus in s, at rates in bit/s."""
-        return self.nominal / bitrate + (self.data / data_bitrate if self.data else 0.0)
-
-
-def unstuffed_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the bits of a CAN FD frame, without dynamic stuff bits. Raises ValueError if no such frame exists."""
-    if length not in FRAME_LENGTHS:
-        above = next((known for known in FRAME_LENGTHS if known > length), FRAME_LENGTHS[-1])
-        raise ValueError(f"a CAN FD frame can't have {length} bytes; next possible: {above}")
-    crc, fixed_stuff = (17, 6) if length <= _LONG_CRC_BYTES else (21, 7)
-    # ESI, DLC, data; stuff count; CRC with its fixed stuff bits; CRC delimiter
-    return FrameBits(fd_head_bits(is_extended) + _FD_TAIL_BITS, 5 + 8 * length + 4 + crc + fixed_stuff + 1)
-
-
-def unstuffed_frame(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the bits of a frame, classic up to 8 bytes, without content-dependent stuff bits. Raises ValueError."""
-    if length > CLASSIC_BYTES:
-        return unstuffed_fd_bits(length, is_extended)
-    return FrameBits(_stuffable_bits(length, is_extended) + TAIL_BITS)
-
-
-def worst_case_frame(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the most bits of a frame, classic up to 8 bytes. Raises ValueError.
-
-    In CAN FD, stuff bits go from start of frame to the end of the data, as in a classic frame; as many of them as
-    possible are counted before the rate switch, where they take longest.
-    """
-    plain = unstuffed_frame(length, is_extended)
-    if length <= CLASSIC_BYTES:
-        return FrameBits(plain.nominal + (_stuffable_bits(length, is_extended) - 1) // 4)
-    head = fd_head_bits(is_extended)
-    stuff = (head + 5 + 8 * length - 1) // 4
-    nominal_stuff = (head - 1) // 4
-    return FrameBits(plain.nominal + nominal_stuff, plain.data + stuff - nominal_stuff)
-
-
-def _stuffable_bits(length: int, is_extended: bool) -> int:
-    """Return the bits of a classic frame from start of frame to CRC."""
-    return (54 if is_extended else 34) + 8 * length
-
-
-def fd_head_bits(is_extended: bool) -> int:
-    """Return the bits from start of frame to BRS."""
-    return 36 if is_extended else 17

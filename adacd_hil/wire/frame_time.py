@@ -11,16 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.wire.frame_lengths import (
-    CLASSIC_BYTES,
-    FRAME_LENGTHS,
-    MAX_STANDARD_ID,
-    TAIL_BITS,
-    FrameBits,
-    fd_head_bits,
-    unstuffed_fd_bits,
-    worst_case_frame,
-)
+from adacd_hil.wire.frame_bits import TAIL_BITS, FrameBits, fd_head_bits, unstuffed_fd_bits, worst_case_frame
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FRAME_LENGTHS, MAX_STANDARD_ID
 
 _CRC_POLYNOMIAL: Final = 0x4599
 _HEAD_BITS: Final = 19  # start of frame, identifier, RTR, IDE, r0, DLC

@@ -24,7 +24,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.contract_frames import read_bitrates
+from adacd_hil.wire.contract_attributes import read_bitrates
 from adacd_hil.wire.frame_time import FrameTime, exact_time, worst_time
 from adacd_hil.wire.time_marks import (
     DEVICE_MARK,

@@ -14,7 +14,8 @@ from typing import Any
 import can
 
 from adacd_hil.clock import Clock, MonotonicClock
-from adacd_hil.remedies import nearest_name, pip_command
+from adacd_hil.extras import pip_command
+from adacd_hil.remedies import nearest_name
 from adacd_hil.wire.bus import Bus, BusError, BusMissingError, Frame
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 

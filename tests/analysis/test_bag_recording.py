@@ -12,7 +12,8 @@ from rosbags.rosbag2 import StoragePlugin
 
 from adacd_hil.lab.offline.recording_import import ForeignRecording, read_recording
 from adacd_hil.lab.offline.recording_map import RecordingMap, read_map
-from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.settings.schema import ConfigError
 
 NAMES = ("pan", "lift", "elbow")

@@ -13,7 +13,8 @@ from adacd_hil.lab.offline.recording_identification import identify
 from adacd_hil.lab.offline.recording_import import read_recording
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.lab.serial_arm.offline import model_of
-from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.schema import ConfigError
 

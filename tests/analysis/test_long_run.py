@@ -19,9 +19,10 @@ from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.run_arrays import AttemptBegins, host_truth
 from adacd_hil.lab.score.verdict import identified_text
 from adacd_hil.log import reader
-from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.reader import Series, start_of_log
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import CycleRecord, FaultReason, SchemeState
 from adacd_hil.score import emulator_truth
 from adacd_hil.score.emulator_truth import TruthTable, read_truth

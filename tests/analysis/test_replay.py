@@ -14,8 +14,9 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.device.profile import enable_timeout_s, load_profile
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import begin_of_log, read_log
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.replay.replay import replay, replay_many, replay_source

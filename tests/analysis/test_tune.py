@@ -38,8 +38,9 @@ from adacd_hil.lab.tune.tune_roc import (
     read_logs,
     rising,
 )
-from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import begin_of_log, read_log
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import SchemeState
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.scheme.pipeline.pipeline import layout_of

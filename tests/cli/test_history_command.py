@@ -10,7 +10,7 @@ from bus_lab import BUS_MISSING, SHORT_RUN, USAGE, Lab, answered
 from called import called, complaints
 
 from adacd_hil.cli.commands.run_command import ask_first_run
-from adacd_hil.clock import date_ns, wall_ns
+from adacd_hil.clock import wall_ns
 from adacd_hil.control.history_file import (
     HISTORY_FORMAT,
     CertificateRecord,
@@ -21,6 +21,7 @@ from adacd_hil.control.history_file import (
     read_history,
     use_history,
 )
+from adacd_hil.dates import date_ns
 from adacd_hil.device.network import Identity
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.clock import format_date
 from adacd_hil.control.tare_file import (
     PoseRecord,
     SensorRecord,
@@ -15,6 +14,7 @@ from adacd_hil.control.tare_file import (
     use_tare,
     write_tare,
 )
+from adacd_hil.dates import format_date
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.settings.configuration_files import load_settings

@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adacd_hil.wire.frame_lengths import FRAME_LENGTHS, worst_case_frame
+from adacd_hil.wire.frame_bits import worst_case_frame
+from adacd_hil.wire.frame_lengths import FRAME_LENGTHS
 from adacd_hil.wire.frame_time import exact_frame, exact_time, worst_time
 
 RATE, DATA_RATE = 1_000_000, 5_000_000

@@ -15,6 +15,7 @@ from recorded_run import make_run
 
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.options import live_options
+from adacd_hil.extras import install_command
 from adacd_hil.lab.cli.live_monitor import TOPICS, LiveMonitor, as_text
 from adacd_hil.lab.live.client import LiveMessage, live_client
 from adacd_hil.lab.live.live_view import LiveView
@@ -31,7 +32,6 @@ from adacd_hil.records import (
     SchemeState,
     scheme_layout,
 )
-from adacd_hil.remedies import install_command
 
 PUSH = ContactReport(
     5,

@@ -10,7 +10,8 @@ from hang import HANG_S
 from mcap.writer import Writer
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
-from adacd_hil.log.log_files import LogError, LogExistsError, log_in, part_path
+from adacd_hil.log.log_files import LogError, LogExistsError, part_path
+from adacd_hil.log.log_parts import log_in
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free

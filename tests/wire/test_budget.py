@@ -8,7 +8,7 @@ import pytest
 
 from adacd_hil.wire.budget import Budget, LoadCase, ResponseTime, Trigger, compute_budget, format_us
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec, parse_codec
-from adacd_hil.wire.contract_frames import move_contract
+from adacd_hil.wire.moved_contract import move_contract
 
 CONTRACTS = Path(__file__).parent / "contracts"
 ARM = load_codec()

@@ -10,7 +10,7 @@ import pytest
 from hang import HANG_S
 
 from adacd_hil.wire.codec import contract_folder, load_codec, parse_codec
-from adacd_hil.wire.contract_frames import read_bitrates
+from adacd_hil.wire.contract_attributes import read_bitrates
 
 FILES = sorted(contract_folder().glob("*.dbc"))
 EVERY_FILE = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

@@ -4,12 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from adacd_hil.wire.frame_lengths import (
-    FRAME_LENGTHS,
-    FrameBits,
-    unstuffed_frame,
-    worst_case_frame,
-)
+from adacd_hil.wire.frame_bits import FrameBits, unstuffed_frame, worst_case_frame
+from adacd_hil.wire.frame_lengths import FRAME_LENGTHS
 from adacd_hil.wire.frame_time import exact_frame
 
 BASE_ID = st.integers(0, 0x7FF)

@@ -4,7 +4,7 @@ import cantools
 import pytest
 
 from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec, parse_codec
-from adacd_hil.wire.contract_frames import move_contract
+from adacd_hil.wire.moved_contract import move_contract
 
 CONTRACTS = ("arm", "arm_fd", "arm_fd_500us", "arm_stock")
 

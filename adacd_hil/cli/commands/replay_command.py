@@ -9,12 +9,12 @@ from adacd_hil.cli.completion import complete_run, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, set_option, stretch_options
 from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained, format_table, quoted
 from adacd_hil.given_path import GivenPath
-from adacd_hil.log.log_files import log_in
+from adacd_hil.log.log_parts import log_in
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 
 if TYPE_CHECKING:
-    from adacd_hil.log.log_files import TimeWindow
+    from adacd_hil.log.time_window import TimeWindow
     from adacd_hil.replay.replay import ReplaySource
     from adacd_hil.replay.replayed_outcome import Replay
     from adacd_hil.settings.configuration import Settings

@@ -24,12 +24,13 @@ from adacd_hil.cli.connection import (
 )
 from adacd_hil.cli.console_operator import ConsoleOperator
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
-from adacd_hil.clock import format_date, wall_ns
+from adacd_hil.clock import wall_ns
 from adacd_hil.control.configuration_check import guesses_in_brief
 from adacd_hil.control.history_file import Origin, UsedHistory, use_history
 from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.control.tare_file import TARED, use_tare
+from adacd_hil.dates import format_date
 from adacd_hil.device.contract import load_contract
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.viewer_layout import viewer_files

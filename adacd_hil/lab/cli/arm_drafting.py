@@ -10,8 +10,9 @@ from typing import Any
 
 from adacd_hil import __version__
 from adacd_hil.cli.output import CommandError, ExitCode, tell
-from adacd_hil.clock import MonotonicClock, format_date, wall_ns
+from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.control.configuration_check import ConfigurationFindings, examine_configuration
+from adacd_hil.dates import format_date
 from adacd_hil.device.profile import ProfileSettings, ScaleSettings, load_profile, profile_names
 from adacd_hil.file_access import read_input
 from adacd_hil.file_replacement import replace_file

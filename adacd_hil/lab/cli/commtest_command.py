@@ -37,7 +37,7 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import BusError, Tap
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.contract_frames import read_bitrates
+from adacd_hil.wire.contract_attributes import read_bitrates
 
 LOG_NAME = "commtest.mcap"
 HTML_NAME = "commtest.html"

@@ -8,13 +8,13 @@ import click
 from adacd_hil.cli.options import json_option, stretch_options
 from adacd_hil.cli.output import ExitCode, answer, explained, format_table
 from adacd_hil.given_path import GivenPath
-from adacd_hil.log.log_files import log_in
+from adacd_hil.log.log_parts import log_in
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 
 if TYPE_CHECKING:
     from adacd_hil.lab.runs.log_comparison import Contact, LogComparison
-    from adacd_hil.log.log_files import TimeWindow
+    from adacd_hil.log.time_window import TimeWindow
 
 _EPILOG = (
     "Exit status: 0 all decided the same in every cycle; 1 they differ, or a log can't be read; 2 wrong usage; 3 the "

@@ -20,7 +20,7 @@ from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import request_realtime
 from adacd_hil.wire.can_interface import InterfaceState, read_link
-from adacd_hil.wire.contract_frames import read_bitrates
+from adacd_hil.wire.contract_attributes import read_bitrates
 from adacd_hil.wire.open_bus import open_bus
 
 _MARKS = {Status.OK: "ok", Status.WARNING: "WARNING", Status.FAILED: "FAILED", Status.SKIPPED: "skipped"}

@@ -59,7 +59,7 @@ def identify(
     from adacd_hil.lab.offline.recording_identification import identify as run
     from adacd_hil.lab.offline.recording_import import read_recording
     from adacd_hil.lab.offline.recording_map import read_map
-    from adacd_hil.log.log_files import TimeWindow
+    from adacd_hil.log.time_window import TimeWindow
 
     if is_init:
         return _init(recordings, map_path)

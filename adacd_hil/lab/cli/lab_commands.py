@@ -36,7 +36,7 @@ from adacd_hil.settings.toml_files import to_toml
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
     from adacd_hil.control.session import LiveView
-    from adacd_hil.log.log_files import TimeWindow
+    from adacd_hil.log.time_window import TimeWindow
 
 
 @click.command(epilog=EPILOG)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from adacd_hil.lab.logs.check.log_check import LogCheck
     from adacd_hil.lab.logs.log_info import LogInfo
     from adacd_hil.lab.logs.recover import LogRecovery
-    from adacd_hil.log.log_files import TimeWindow
+    from adacd_hil.log.time_window import TimeWindow
 
 _TOLD_FAULTS = 5
 _log_argument = click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)

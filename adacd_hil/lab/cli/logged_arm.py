@@ -5,13 +5,15 @@ from typing import Any
 
 from adacd_hil import __version__
 from adacd_hil.cli.output import CommandError, ExitCode
-from adacd_hil.clock import format_date, wall_ns
+from adacd_hil.clock import wall_ns
+from adacd_hil.dates import format_date
 from adacd_hil.device.contract import find_contract
 from adacd_hil.file_access import exists
 from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
 from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.lab.commission.arm_draft import ArmDraft, Entry, draft_as_toml
-from adacd_hil.log.log_files import CONFIG_NAME, log_in
+from adacd_hil.log.log_files import CONFIG_NAME
+from adacd_hil.log.log_parts import log_in
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.settings.configuration import Settings

@@ -17,7 +17,7 @@ from adacd_hil.terminal import fold, moves_cursor, terminal_columns, write_scree
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.can_interface import carried_frames, read_link
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.contract_frames import read_bitrates
+from adacd_hil.wire.contract_attributes import read_bitrates
 from adacd_hil.wire.dbc_decoder import DbcDecoder
 
 REDRAW_S = 0.2

@@ -10,7 +10,9 @@ from adacd_hil.lab.report.report_files import Report, write_report
 from adacd_hil.lab.runs.run_pages import INDEX_NAME, ListedRun, runs_page
 from adacd_hil.lab.runs.run_summary import BROKEN, RunSummary, find_runs, reported
 from adacd_hil.lab.runs.run_table import count_text
-from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, TimeWindow, failing_as, log_in
+from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError, failing_as
+from adacd_hil.log.log_parts import log_in
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.printable import one_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.schema import ConfigError

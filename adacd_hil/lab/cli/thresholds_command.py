@@ -6,7 +6,8 @@ from adacd_hil.cli.output import format_table
 from adacd_hil.lab.score.rates import CONFIDENCE_TEXT
 from adacd_hil.lab.thresholds.detector_comparison import Comparison, compare_detectors
 from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
-from adacd_hil.log.log_files import WHOLE, TimeWindow, log_in
+from adacd_hil.log.log_parts import log_in
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.plain_values import json_text
 from adacd_hil.progress_lines import Progress
 

@@ -19,14 +19,14 @@ from adacd_hil.cli.output import (
     writable_folder,
 )
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.log.log_files import log_in
+from adacd_hil.log.log_parts import log_in
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 
 if TYPE_CHECKING:
     from adacd_hil.lab.tune.tune_roc import Candidate, Found, Tuning
-    from adacd_hil.log.log_files import TimeWindow
+    from adacd_hil.log.time_window import TimeWindow
 
 
 @click.command(

@@ -7,10 +7,8 @@ CAN FD, which `canbusload -e` can't count, is measured likewise, each part of a 
 from dataclasses import dataclass
 
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.frame_lengths import (
-    FRAME_LENGTHS,
-    FrameBits,
-)
+from adacd_hil.wire.frame_bits import FrameBits
+from adacd_hil.wire.frame_lengths import FRAME_LENGTHS
 from adacd_hil.wire.frame_time import exact_frame
 
 

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from adacd_hil import __version__
-from adacd_hil.clock import Clock, format_date, wall_ns
+from adacd_hil.clock import Clock, wall_ns
 from adacd_hil.control.session import git_commit
 from adacd_hil.control.tare_file import TARE_FORMAT, PoseRecord, SensorRecord, Tare, sensor_identities
+from adacd_hil.dates import format_date
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, as_device_error
 from adacd_hil.device.network import ENTER_PRE_OPERATIONAL, START, Identity, Master

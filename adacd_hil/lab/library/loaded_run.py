@@ -10,13 +10,15 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.extras import install_command
 from adacd_hil.lab.score.metrics import certificates_in
-from adacd_hil.log.log_files import LogError, log_in
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_parts import log_in
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.log.reader import RunLog, each_once, read_log
 from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, SCHEME
 from adacd_hil.records import ContactReport, SchemeState, Vector
-from adacd_hil.remedies import install_command, nearest_name
+from adacd_hil.remedies import nearest_name
 from adacd_hil.score.wording import number_of
 from adacd_hil.settings.configuration import Settings
 

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from adacd_hil.lab.logs.log_copy import LogCopy
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
-from adacd_hil.log.log_files import CUT, RUN_METADATA, LogError, TimeWindow
+from adacd_hil.log.log_files import RUN_METADATA, LogError
+from adacd_hil.log.log_parts import CUT
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.reader import begin_of_log, each_once, read_log
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.log.types.topics import CONTACT
 
 

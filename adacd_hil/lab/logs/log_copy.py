@@ -19,8 +19,6 @@ from adacd_hil.lab.logs.log_info import read_info
 from adacd_hil.lab.logs.record_scan import read_header
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import (
-    COPY_ENDINGS,
-    DROPPED_KEY,
     ENDING_KEY,
     PART_KEY,
     PRODUCT,
@@ -30,6 +28,7 @@ from adacd_hil.log.log_files import (
     failing_as,
     is_part_name,
 )
+from adacd_hil.log.log_parts import COPY_ENDINGS, DROPPED_KEY
 from adacd_hil.log.mcap.chunked_file import ChunkedFile
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end

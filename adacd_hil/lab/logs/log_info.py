@@ -18,7 +18,6 @@ from adacd_hil.file_access import open_input
 from adacd_hil.lab.logs.payload_sizes import payload_size
 from adacd_hil.lab.logs.salvage import Losses, Salvage
 from adacd_hil.log.log_files import (
-    DROPPED_KEY,
     ENDING_KEY,
     FIELDS_KEY,
     PART_KEY,
@@ -26,10 +25,8 @@ from adacd_hil.log.log_files import (
     SUMMARY_METADATA,
     LogError,
     failing_as,
-    missing_parts,
-    parts_of,
-    summary_count,
 )
+from adacd_hil.log.log_parts import DROPPED_KEY, missing_parts, parts_of, summary_count
 from adacd_hil.log.log_walk import run_metadata
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_contents
 from adacd_hil.log.mcap.mcap_records import Definitions, FileEnd, RawRecord, parse, read_end, read_record

@@ -14,7 +14,7 @@ from mcap.records import Attachment
 from adacd_hil.lab.logs.log_copy import LogCopy
 from adacd_hil.lab.logs.salvage import Losses
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
-from adacd_hil.log.log_files import LOST_KEY, RECOVERED
+from adacd_hil.log.log_parts import LOST_KEY, RECOVERED
 
 
 class LogRecovery(NamedTuple):

@@ -6,17 +6,8 @@ from pathlib import Path
 from mcap.records import Attachment, Metadata
 
 from adacd_hil.lab.logs.salvage import Losses, Salvage
-from adacd_hil.log.log_files import (
-    DROPPED_KEY,
-    ENDING_KEY,
-    PART_KEY,
-    RUN_METADATA,
-    SUMMARY_METADATA,
-    LogError,
-    missing_parts,
-    parts_of,
-    summary_count,
-)
+from adacd_hil.log.log_files import ENDING_KEY, PART_KEY, RUN_METADATA, SUMMARY_METADATA, LogError
+from adacd_hil.log.log_parts import DROPPED_KEY, missing_parts, parts_of, summary_count
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import Definitions
 

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.extras import install_command
 from adacd_hil.file_replacement import has_other_head, replacing
 from adacd_hil.lab.logs.joint_states import joint_state_columns
 from adacd_hil.log.frames.frame_log import open_frames
@@ -27,7 +28,7 @@ from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 from adacd_hil.log.types.topics import DECODED, EVENTS
-from adacd_hil.remedies import install_command, nearest_name
+from adacd_hil.remedies import nearest_name
 from adacd_hil.wire.dbc_decoder import DbcDecoder
 
 _LONGEST_STEM = 60

@@ -11,7 +11,8 @@ from adacd_hil.lab.logs.joint_state_bags import JOINT_STATES, joint_state_topics
 from adacd_hil.lab.logs.joint_states import TYPE, JointStateMessage
 from adacd_hil.lab.offline.recorded_columns import RecordedColumns, RecordedRows
 from adacd_hil.lab.offline.recording_map import RecordingMap
-from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.schema import ConfigError
 

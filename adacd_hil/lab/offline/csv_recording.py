@@ -19,7 +19,8 @@ from typing import Final, NamedTuple, TextIO
 from adacd_hil.file_access import open_input
 from adacd_hil.lab.offline.recorded_columns import RecordedColumns, RecordedRows
 from adacd_hil.lab.offline.recording_map import ISO, RecordingMap, unit_of
-from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.schema import ConfigError
 

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.lab.offline.recording_map import RecordingMap
-from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import Vector
 from adacd_hil.score.wording import number_of
 

@@ -19,7 +19,8 @@ from adacd_hil.lab.offline.recorded_columns import MOST_ROWS, SHORTEST_SAMPLES, 
 from adacd_hil.lab.offline.recording_map import RecordingMap, time_unit_of
 from adacd_hil.lab.serial_arm.offline import Record
 from adacd_hil.lab.signal_noise import resolution, white_noise
-from adacd_hil.log.log_files import LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import Vector
 from adacd_hil.score.judge import contact_bounds
 from adacd_hil.score.wording import number_of

@@ -24,8 +24,9 @@ from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.lab.score.report_wording import number_text
 from adacd_hil.lab.score.run_arrays import Run, StretchOfRun, section_at
 from adacd_hil.lab.score.verdict import headlines
-from adacd_hil.log.log_files import WHOLE, TimeWindow, failing_as
+from adacd_hil.log.log_files import failing_as
 from adacd_hil.log.logged_run import Progress
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.printable import in_line
 from adacd_hil.records import PARAMETER_UNITS
 from adacd_hil.score.wording import NONE, number_of, why_not_found

@@ -51,18 +51,11 @@ from adacd_hil.lab.score.run_arrays import (
     truth_rows,
 )
 from adacd_hil.lab.score.run_judge import find_detections, timed_contacts
-from adacd_hil.log.log_files import (
-    CONFIG_DIGEST_KEY,
-    DBC_NAME,
-    ENDING_KEY,
-    PLANNED_ENDINGS,
-    TRUTH_NAME,
-    WHOLE,
-    LogError,
-    TimeWindow,
-)
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, DBC_NAME, ENDING_KEY, TRUTH_NAME, LogError
+from adacd_hil.log.log_parts import PLANNED_ENDINGS
 from adacd_hil.log.logged_run import Cycles, Mask, Milestones, Progress, host_cycles, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series, check_states, contacts_of, start_of_log
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, FRAME_CHECKS, SCHEME
 from adacd_hil.printable import one_line
 from adacd_hil.records import JOINTS, ContactReport, Request, SchemeState

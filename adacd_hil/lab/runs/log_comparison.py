@@ -15,9 +15,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log, each_once
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import CONTACT, CYCLE, SCHEME
 from adacd_hil.records import ContactReport, SchemeState
 from adacd_hil.score.distribution import Distribution

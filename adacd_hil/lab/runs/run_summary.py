@@ -25,7 +25,8 @@ from typing import Any, Final, NamedTuple
 from adacd_hil.file_access import InUseError, check_unused, read_input
 from adacd_hil.lab.logs.log_info import LogInfo, read_info
 from adacd_hil.lab.report.report_json import JSON_NAME, SCHEMA
-from adacd_hil.log.log_files import CONFIG_NAME, EPOCH_KEY, LOG_NAME, PLANNED_ENDINGS, TRUTH_NAME, LogError, parts_of
+from adacd_hil.log.log_files import CONFIG_NAME, EPOCH_KEY, LOG_NAME, TRUTH_NAME, LogError
+from adacd_hil.log.log_parts import PLANNED_ENDINGS, parts_of
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.printable import one_line

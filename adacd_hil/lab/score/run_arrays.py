@@ -15,7 +15,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.log_files import TimeWindow
 from adacd_hil.log.logged_run import (
     Cycles,
     Mask,
@@ -25,6 +24,7 @@ from adacd_hil.log.logged_run import (
     is_interrupted,
 )
 from adacd_hil.log.reader import LoggedEvent, Series
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import ContactReport, CycleRecord, SchemeState, Vector
 from adacd_hil.score.emulator_truth import TruthTable
 from adacd_hil.settings.configuration import Settings

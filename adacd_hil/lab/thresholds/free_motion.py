@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from adacd_hil.lab.detectors import detectors
-from adacd_hil.log.log_files import CONFIG_NAME, WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_files import CONFIG_NAME, LogError
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import Milestones, Progress, is_armed_in, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import PARAMETER_NAMES, Vector
 from adacd_hil.scheme.kernel.kernel_samples import LONGEST_SHARE, SHORTEST_SHARE

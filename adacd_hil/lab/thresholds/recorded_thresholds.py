@@ -29,8 +29,9 @@ from adacd_hil.lab.thresholds.false_alarms import (
     mean_square,
 )
 from adacd_hil.lab.thresholds.free_motion import LoggedMotion, Mask, Motion, read_motion, sample_of, torque_streams
-from adacd_hil.log.log_files import WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Milestones, Progress
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.model.regressor import mass_matrix
 from adacd_hil.settings.schema import setting

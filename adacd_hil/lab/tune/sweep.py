@@ -25,12 +25,12 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from adacd_hil.clock import MonotonicClock
+from adacd_hil.extras import install_command
 from adacd_hil.file_replacement import replace_file, replacing
 from adacd_hil.lab.tune.workers import Workers
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Progress
 from adacd_hil.records import SchemeState
-from adacd_hil.remedies import install_command
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.replay.replay import replay_many
 from adacd_hil.replay.replayed_outcome import Replay

@@ -49,8 +49,8 @@ from adacd_hil.lab.tune.tune_roc import (
     read_logs,
     tuning_by_key,
 )
-from adacd_hil.log.log_files import WHOLE, TimeWindow
 from adacd_hil.log.logged_run import Progress
+from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.replay.replay import replay_many
 from adacd_hil.replay.replayed_outcome import Replay
 from adacd_hil.score.wording import number_of

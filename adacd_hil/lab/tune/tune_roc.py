@@ -33,9 +33,10 @@ from adacd_hil.lab.thresholds.false_alarms import (
     largest_ratio,
 )
 from adacd_hil.lab.thresholds.free_motion import APART_S, LoggedMotion, read_motion, schemes
-from adacd_hil.log.log_files import EVER_NS, WHOLE, LogError, TimeWindow
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Progress, host_span
 from adacd_hil.log.reader import Series
+from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.score.emulator_truth import HostCycles, contacts_beside, placed_contacts

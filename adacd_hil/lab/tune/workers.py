@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from adacd_hil.clock import MonotonicClock
+from adacd_hil.extras import install_command
 from adacd_hil.log.log_files import LogError
-from adacd_hil.remedies import install_command
 from adacd_hil.settings.schema import ConfigError
 
 TLS = "tls://"

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from adacd_hil.extras import install_command
 from adacd_hil.log.frames.mcap_frames import McapFrames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE, FrameLog
-from adacd_hil.remedies import install_command, nearest_name
+from adacd_hil.remedies import nearest_name
 
 if TYPE_CHECKING:
     from adacd_hil.log.frames.can_io import PythonCanFrames

@@ -21,13 +21,8 @@ from mcap.records import Channel, Metadata
 from numpy.typing import NDArray
 
 from adacd_hil.file_access import open_input
-from adacd_hil.log.log_files import (
-    EPOCH_KEY,
-    RUN_METADATA,
-    LogError,
-    failing_as,
-    parts_of,
-)
+from adacd_hil.log.log_files import EPOCH_KEY, RUN_METADATA, LogError, failing_as
+from adacd_hil.log.log_parts import parts_of
 from adacd_hil.log.mcap.chunks import Block, Contents, read_blocks
 from adacd_hil.log.mcap.mcap_records import DEFINITIONS, Definitions, Problem, RawRecord, parse, summary_of
 from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, MESSAGE_HEAD, record_dtype

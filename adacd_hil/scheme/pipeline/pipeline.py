@@ -74,27 +74,6 @@ def layout_of(settings: Settings) -> Layout:
     return scheme_layout(count)
 
 
-def arm_at(arms: ArmBatch, row: int) -> ArmState:
-    """Return one row as an ArmState; its vectors are views."""
-    age_q, age_tau_J = arms.age_q[row].tolist(), arms.age_tau_J[row].tolist()
-    return ArmState(
-        cycle=int(arms.cycle[row]),
-        t_ns=int(arms.t_ns[row]),
-        periods=int(arms.periods[row]),
-        q=arms.q[row],
-        dq=arms.dq[row],
-        tau_J=arms.tau_J[row],
-        age_q=(age_q[0], age_q[1]),
-        age_tau_J=(age_tau_J[0], age_tau_J[1]),
-        is_enabled=bool(arms.is_enabled[row]),
-        is_complete=bool(arms.is_complete[row]),
-        fault=FaultReason(arms.fault[row]),
-        is_late=bool(arms.is_late[row]),
-        steps=int(arms.steps[row]),
-        sampled_ns=int(arms.sampled_ns[row]),
-    )
-
-
 class Pipeline(ABC):
     """Adaptation and contact detection for one run: the compiled cycle, and a scheme's rare tasks in Python.
 

@@ -20,20 +20,16 @@ from adacd_hil.lab.logs.check.structure_checks import ChunkCheck, SummaryCheck
 from adacd_hil.lab.logs.record_scan import FileGap, scan
 from adacd_hil.log.log_files import (
     CONTINUED,
-    DROPPED_KEY,
     ENDING_KEY,
-    LOST_KEY,
     PART_KEY,
-    PLANNED_ENDINGS,
     RUN_METADATA,
     SUMMARY_METADATA,
     LogError,
     failing_as,
     find_parts,
-    missing_parts,
     part_path,
-    parts_of,
 )
+from adacd_hil.log.log_parts import DROPPED_KEY, LOST_KEY, PLANNED_ENDINGS, missing_parts, parts_of
 from adacd_hil.log.mcap.mcap_records import RawRecord, attachment_crc_fits, crc_of, name_of, parse
 from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, crc32
 from adacd_hil.log.types.record_arrays import count_frames

@@ -1,0 +1,27 @@
+"""Commands that install the package's extras, for error messages."""
+
+import sys
+from pathlib import Path
+
+_SOURCE_TREE = Path(__file__).resolve().parent.parent
+
+
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra into this interpreter's environment, from the source tree if any.
+
+    This package is in no registry: without a source tree the command names the package, and the user gives its file.
+    """
+    is_source = (_SOURCE_TREE / "pyproject.toml").is_file()
+    source = "adacd-hil" if not is_source else "." if Path.cwd() == _SOURCE_TREE else str(_SOURCE_TREE)
+    return f"{pip_command()} install {'-e ' if is_source else ''}'{source}[{extra}]'"
+
+
+def pip_command() -> str:
+    """Return the shortest command that runs this interpreter's pip."""
+    executable = Path(sys.executable)
+    pip = executable.with_name("pip")
+    try:
+        name = str((pip if pip.exists() else executable).relative_to(Path.cwd()))
+    except ValueError:
+        name = str(pip if pip.exists() else executable)
+    return name if pip.exists() else f"{name} -m pip"

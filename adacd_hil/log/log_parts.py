@@ -1,0 +1,59 @@
+"""The parts of a log to be read, and the counts in their summaries."""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+
+from adacd_hil.log.log_files import CONTINUED, LOG_NAME, LogError, find_parts, part_path
+
+RECOVERED = "recovered"
+"""The ending of a recovered log."""
+CUT = "cut"
+"""The ending of a stretch of a log."""
+MERGED = "merged"
+"""The ending of several logs in one, as earlier versions made it."""
+COPY_ENDINGS = (RECOVERED, CUT, MERGED)
+"""The endings of logs that are made of others."""
+PLANNED_ENDINGS = ("closed", "continued", *COPY_ENDINGS)
+LOST_KEY = "lost"
+"""Of the summary of a recovered log: its losses in words; missing without any."""
+DROPPED_KEY = "dropped"
+"""Of the summary: packets that are not in the log."""
+
+
+def log_in(given: str | Path) -> Path:
+    """Return the path of a log: the given path, or for a folder run.mcap in it.
+
+    Raises LogError for a folder without it.
+    """
+    path = Path(given)
+    if not path.is_dir():
+        return path
+    if not (path / LOG_NAME).exists():
+        raise LogError(f"folder {path} has no {LOG_NAME}; name a log, or the folder of a run")
+    return path / LOG_NAME
+
+
+def parts_of(path: Path) -> dict[int, Path]:
+    """Return the existing parts of the log `path` by number; without any, {0: path}, which fails when it is opened."""
+    try:
+        return find_parts(path) or {0: path}
+    except OSError:
+        return {0: path}
+
+
+def missing_parts(path: Path, parts: Collection[int], ending: str = "") -> list[Path]:
+    """Return the paths of missing parts of the log `path`: in between, and behind a last one that says "continued".
+
+    parts: the numbers found. ending: of the last one, from its summary.
+    """
+    last = max(parts)
+    missing = [number for number in range(last) if number not in parts]
+    if ending == CONTINUED:
+        missing.append(last + 1)
+    return [part_path(path, number) for number in missing]
+
+
+def summary_count(texts: Mapping[str, str], key: str) -> int:
+    """Return the count under a key in a log's summary; 0 if it is missing or not a number."""
+    text = texts.get(key, "0")
+    return int(text) if text.isdecimal() else 0
