@@ -31,7 +31,8 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.setting_keys import apply_settings, parse_changes, parse_variations
-from adacd_hil.wire.codec import CodecError, load_codec
+from adacd_hil.wire.codec import CodecError
+from adacd_hil.wire.dbc_contract import load_codec
 from firmware_sim.cli.emulator_main import cli as emulator_cli
 from firmware_sim.cli.scenario_list import check as check_scenario
 from firmware_sim.scenario.faults import FaultSettings

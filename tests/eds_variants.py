@@ -4,7 +4,7 @@ import configparser
 from pathlib import Path
 from typing import Self
 
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 UNSIGNED8, UNSIGNED32 = "0x0005", "0x0007"
 _LISTS = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")

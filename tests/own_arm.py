@@ -3,7 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 OWN_ARM = """
 extends = "certified"

@@ -24,7 +24,8 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.wire.bus import Bus, Frame, Tap
-from adacd_hil.wire.codec import Codec, load_codec
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import Scenario, load_scenario

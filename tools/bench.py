@@ -41,7 +41,7 @@ from adacd_hil.records import ArmState, FaultReason, Request
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.sensing import DriveMode

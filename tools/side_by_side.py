@@ -29,7 +29,7 @@ import adacd_hil
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.types.topics import CYCLE
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 
 ROOT = Path(__file__).resolve().parent.parent
 BIN = Path(sys.executable).parent

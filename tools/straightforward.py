@@ -29,7 +29,7 @@ from mcap.writer import CompressionType, Writer
 
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 ANSWERS = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
 PRIORITY = 80

@@ -13,7 +13,7 @@ from adacd_hil.device.profile import EMCY_INHIBIT_100US, PdoSettings, PlacedDevi
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.wire.codec import Codec, MessageCodec, contract_folder, load_codec, parse_codec
+from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import (
     EMERGENCY_ID,
     HEARTBEAT_ID,
@@ -24,6 +24,7 @@ from adacd_hil.wire.contract_frames import (
     SDO_RESPONSE_ID,
     SYNC_ID,
 )
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
 from adacd_hil.wire.e2e import PROFILES_BY_CODE
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.moved_contract import move_contract

@@ -25,8 +25,9 @@ from adacd_hil.records import CERTIFICATE_EVENTS, ArmBatch, ContactReport, Schem
 from adacd_hil.replay.logged_arms import has_arms, logged_arms
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import parse_toml
-from adacd_hil.wire.codec import Codec, parse_codec
+from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import NMT_ID, SYNC_ID, SYNC_OVERFLOW
+from adacd_hil.wire.dbc_contract import parse_codec
 
 Places = NDArray[np.int64]
 

@@ -30,6 +30,7 @@ from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState
 from adacd_hil.replay.can_recording import RecordingAlone
 from adacd_hil.replay.log_source import CycleStretch, LogSource, Part
+from adacd_hil.replay.logged_arms import arm_at
 from adacd_hil.replay.replayed_outcome import OutcomeGatherer, Replay
 from adacd_hil.replay.scheme_comparison import (
     TOLERANCE,
@@ -41,7 +42,6 @@ from adacd_hil.replay.scheme_comparison import (
 )
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch
-from adacd_hil.replay.logged_arms import arm_at
 from adacd_hil.score.emulator_truth import KnownContacts, contacts_beside
 from adacd_hil.score.wording import number_of, unjudged_sentence
 from adacd_hil.settings.configuration import Settings

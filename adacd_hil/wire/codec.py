@@ -1,38 +1,20 @@
-"""The cyclic codec: bytes to physical values and back, generated at start from the DBC.
+"""The cyclic codec: bytes to physical values and back, by the tables of a contract.
 
-The codec accepts only layouts that the hot path decodes fast: little-endian integers of 8, 16, 32 or 64 bits on byte
-borders, and bit fields within one byte. Any other layout is refused with the signal's name. A frame is decoded all or
-nothing: `adacd_hil.wire.e2e` first checks its length, then (for protected messages) CRC and counter.
-
-A message of more than 8 bytes is a CAN FD frame, marked in the DBC by VFrameFormat; its length must have a data length
-code in ISO 11898-1.
+A frame is decoded all or nothing: `adacd_hil.wire.e2e` first checks its length, then (for protected messages) CRC and
+counter. `adacd_hil.wire.dbc_contract` makes a codec from a DBC.
 """
 
-import logging
-import re
 import zlib
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import cantools
-from cantools.database.can import Database, Message, Signal
-
-from adacd_hil.file_access import read_input
-from adacd_hil.wire.e2e import (
-    PROFILES,
-    E2eProfile,
-    E2eReceiver,
-    E2eSender,
-    Protection,
-)
-from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
+from adacd_hil.wire.e2e import PROFILES, E2eReceiver, E2eSender, Protection
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 from adacd_hil.wire.message_table import MessageTable, SignalCodec, container_struct
 
-logging.getLogger("cantools").addHandler(logging.NullHandler())  # our errors replace its output on the terminal
-
-_MOST_MESSAGES = 1000
-"""Most messages of a contract: its budget takes 3 s to compute, and four times that for twice as many."""
-WIRE_VERSION = "WireVersion"
-"""The DBC attribute that marks a contract."""
+if TYPE_CHECKING:
+    from cantools.database.can import Database
 
 
 class CodecError(ValueError):
@@ -42,15 +24,25 @@ class CodecError(ValueError):
 class MessageCodec(MessageTable):
     """Encodes and decodes the frames of one message."""
 
-    def __init__(self, message: Message) -> None:
-        _check_length(message)
-        self.protection, self.data_ids = _protection(message)
-        """Protection of the frames; data ids: a byte for each counter, or a number, its low byte first."""
-        self.profile = PROFILES.get(self.protection)
+    def __init__(
+        self,
+        name: str,
+        can_id: int,
+        length: int,
+        signals: tuple[SignalCodec, ...],
+        protection: Protection,
+        data_ids: bytes,
+        senders: tuple[str, ...],
+    ) -> None:
+        """Take a message's table, and the protection of its frames.
+
+        data_ids: a byte for each counter, or a number, its low byte first. senders: names of the nodes that send it.
+        """
+        super().__init__(name, can_id, length, signals)
+        self.protection, self.data_ids, self.senders = protection, data_ids, senders
+        self.profile = PROFILES.get(protection)
         """Layout, sender and receiver of the end-to-end header; None without protection."""
-        super().__init__(message.name, message.frame_id, message.length, _lay_out(message))
-        self.senders: tuple[str, ...] = tuple(message.senders)
-        self.values = self.signals[0 if self.profile is None else len(self.profile.signals) :]
+        self.values = signals[0 if self.profile is None else len(self.profile.signals) :]
         """The signals behind the end-to-end header."""
         # `encode_raw` packs values that each fill a container of their own.
         is_plain = all(signal.mask == 0 for signal in self.values)
@@ -145,139 +137,20 @@ def _quantise(signal: SignalCodec, value: float) -> int:
     return raw
 
 
-def _check_length(message: Message) -> None:
-    """Raise CodecError for a length that no frame has, or a frame format that doesn't fit the length."""
-    if message.length > CLASSIC_BYTES and message.length not in FD_LENGTHS:
-        lengths = ", ".join(map(str, FD_LENGTHS))
-        raise CodecError(f"{message.name}: no CAN frame has {message.length} bytes; beyond 8 there are {lengths}")
-    if message.length > CLASSIC_BYTES and not message.is_fd:
-        raise CodecError(f"{message.name}: {message.length} bytes need VFrameFormat StandardCAN_FD")
-    if message.length <= CLASSIC_BYTES and message.is_fd:
-        raise CodecError(f"{message.name}: {message.length} bytes go in a classic frame; VFrameFormat says CAN FD")
-
-
-def _protection(message: Message) -> tuple[Protection, bytes]:
-    """Return the protection by E2EProfile, and the data ids by E2EDataIdList or E2EDataId. Raises CodecError.
-
-    A list alone means Profile 2.
-    """
-    attributes = message.dbc.attributes if message.dbc else {}
-    values = {name: attribute.value for name, attribute in attributes.items()}
-    id_list = str(values.get("E2EDataIdList", ""))
-    code = str(values.get("E2EProfile", "")) or (Protection.PROFILE_2.value if id_list else "")
-    try:
-        protection = Protection(code)
-    except ValueError:
-        known = ", ".join(repr(each.value) for each in Protection)
-        raise CodecError(f"{message.name}: E2EProfile = {code!r} is none of {known}") from None
-    if protection is Protection.NONE:
-        if "E2EDataId" in values:
-            raise CodecError(f"{message.name}: E2EDataId without E2EProfile")
-        return protection, b""
-    profile = PROFILES[protection]
-    if profile.is_id_list:
-        data_ids = _data_id_list(message.name, id_list, profile.data_id_bytes)
-    else:
-        data_ids = _data_id(message.name, code, values.get("E2EDataId"), profile.data_id_bytes)
-    _check_header(message, code, profile)
-    return protection, data_ids
-
-
-def _data_id_list(name: str, text: str, count: int) -> bytes:
-    try:
-        ids = bytes.fromhex(text)
-    except ValueError:
-        raise CodecError(f"{name}: E2EDataIdList = {text!r} is not hexadecimal") from None
-    if len(ids) != count:
-        raise CodecError(f"{name}: E2EDataIdList has {len(ids)} bytes, {count} expected")
-    return ids
-
-
-def _data_id(name: str, code: str, value: float | str | None, size: int) -> bytes:
-    if value is None:
-        raise CodecError(f"{name}: E2EProfile {code} without E2EDataId")
-    most = (1 << 8 * size) - 1
-    if not isinstance(value, int) or not 0 <= value <= most:
-        raise CodecError(f"{name}: E2EDataId = {value!r} is no integer of 0..{most}")
-    return value.to_bytes(size, "little")
-
-
-def _check_header(message: Message, code: str, profile: E2eProfile) -> None:
-    start, wanted = 0, []
-    for name, bits in profile.signals:
-        wanted.append((name, start, bits, False))
-        start += bits
-    first = _in_order(message)[: len(wanted)]
-    if [(signal.name, signal.start, signal.length, signal.is_signed) for signal in first] != wanted:
-        header = ", ".join(f"{name} ({bits} bits)" for name, bits in profile.signals)
-        raise CodecError(f"{message.name}: a message protected by {code} begins with unsigned {header}")
-
-
-def _in_order(message: Message) -> list[Signal]:
-    return sorted(message.signals, key=lambda signal: signal.start)
-
-
-def _lay_out(message: Message) -> tuple[SignalCodec, ...]:
-    """Return the signals, placed in containers on byte borders that cover the frame without gaps. Raises CodecError."""
-    end_bit = 0
-    containers = 0
-    codecs = []
-    for signal in _in_order(message):
-        where = f"{message.name}.{signal.name}"
-        if signal.byte_order != "little_endian" or signal.is_float or signal.is_multiplexer:
-            raise CodecError(f"{where}: only plain little-endian integers can be cyclic")
-        is_whole = signal.start % 8 == 0 and signal.length in (8, 16, 32, 64)
-        if is_whole and signal.start == end_bit:
-            container, shift, mask = containers, 0, 0
-            containers += 1
-            end_bit += signal.length
-        elif signal.start % 8 + signal.length <= 8 and signal.start // 8 * 8 in (end_bit, end_bit - 8):
-            if signal.start // 8 * 8 == end_bit:
-                containers += 1
-                end_bit += 8
-            container, shift, mask = containers - 1, signal.start % 8, (1 << signal.length) - 1
-        else:
-            raise CodecError(f"{where}: bits {signal.start}+{signal.length} overlap, leave a gap or cross a byte")
-        half = 1 << (signal.length - 1)
-        low, high = (-half, half - 1) if signal.is_signed else (0, 2 * half - 1)
-        scale, offset, unit = float(signal.scale), float(signal.offset), signal.unit or ""
-        codecs.append(SignalCodec(signal.name, unit, scale, offset, container, shift, mask, low, high))
-    if end_bit != message.length * 8:
-        raise CodecError(f"{message.name}: signals cover {end_bit} of {message.length * 8} bits")
-    return tuple(codecs)
-
-
-def _check_messages(database: Database) -> None:
-    """Raise CodecError for two messages of the same name or identifier, and for too many messages."""
-    by_name: dict[str, Message] = {}
-    by_id: dict[tuple[int, bool], Message] = {}
-    for message in database.messages:
-        first = by_id.setdefault((message.frame_id, message.is_extended_frame), message)
-        if by_name.setdefault(message.name, message) is not message:
-            raise CodecError(f"message {message.name} is defined more than once")
-        if first is not message:
-            raise CodecError(
-                f"messages {first.name} and {message.name} have the same identifier 0x{message.frame_id:X}"
-            )
-    if len(by_name) > _MOST_MESSAGES:
-        raise CodecError(f"{len(by_name)} messages are more than {_MOST_MESSAGES}")
-
-
 class Codec:
-    """All messages of one DBC."""
+    """All messages of one contract. path, text, database: of its DBC, as a file, as bytes, and as cantools reads it."""
 
-    def __init__(self, database: Database, path: Path, text: bytes) -> None:
+    def __init__(
+        self, messages: Iterable[MessageCodec], wire_version: int, database: "Database", path: Path, text: bytes
+    ) -> None:
         self.path = path
         self.text = text
         self.database = database
-        self.messages = {message.name: MessageCodec(message) for message in database.messages}
+        self.messages = {message.name: message for message in messages}
         self.by_id = {message.can_id: message for message in self.messages.values()}
-        attributes = database.dbc.attributes if database.dbc else {}
-        if WIRE_VERSION not in attributes:
-            raise CodecError("the DBC has no WireVersion attribute")
         self.is_fd = any(message.is_fd for message in self.messages.values())
         """Whether any message needs CAN FD."""
-        self.wire_version = int(attributes[WIRE_VERSION].value)
+        self.wire_version = wire_version
         self.layout_digest = zlib.crc32(_describe(self.messages).encode())
         """CRC-32 of every message's name, identifier, length, protection and data ids, and every signal's name, place,
         sign, scale and offset; of no other property. Of a signal that fills its container, the place is the container's
@@ -305,65 +178,3 @@ def _describe(messages: dict[str, MessageCodec]) -> str:
             f" {s.name} {s.container} {s.shift} {s.mask} {s.raw_low} {s.scale!r} {s.offset!r}" for s in message.signals
         )
     return "\n".join(lines)
-
-
-def contract_folder() -> Path:
-    """Return the folder of the DBC and EDS files: beside the package when installed, else in the source tree."""
-    package = Path(__file__).resolve().parent.parent
-    installed = package / "dbc"
-    return installed if installed.is_dir() else package.parent / "dbc"
-
-
-_SIGNAL_PLACE = re.compile(rb"\|\s*0*(?P<bits>\d+)\s*@")
-_MOST_BITS = "512"
-"""Bits of the longest frame, 64 bytes."""
-
-
-def read_dbc(path: Path | None = None) -> tuple[bytes, Path]:
-    """Return the text and the path of a DBC (default: the package's). Raises CodecError when it can't be read."""
-    path = path or contract_folder() / "arm.dbc"
-    try:
-        return read_input(path), path
-    except OSError as error:
-        raise CodecError(f"DBC {path}: {error.strerror}") from None
-
-
-def load_codec(path: Path | None = None) -> Codec:
-    """Return the codec of a DBC (default: the package's). Raises CodecError."""
-    return parse_codec(*read_dbc(path))
-
-
-def parse_codec(text: bytes, path: Path) -> Codec:
-    """Return the codec of the text of a DBC; `path`: its file, existing or not. Raises CodecError."""
-    database = parse_database(text, path)
-    try:
-        _check_messages(database)
-        return Codec(database, path, text)
-    except CodecError as error:
-        raise CodecError(f"DBC {path}: {error}") from None
-
-
-def parse_database(text: bytes, path: Path) -> Database:
-    """Return the messages of any DBC that cantools accepts, in UTF-8 or a Windows code page. Raises CodecError.
-
-    A signal of more bits than the longest frame has is an error, too. `path`: as in `parse_codec`.
-    """
-    for found in _SIGNAL_PLACE.finditer(text):  # cantools allocates a character for each bit
-        if len(found["bits"]) > len(_MOST_BITS) or int(found["bits"]) > int(_MOST_BITS):
-            raise CodecError(f"DBC {path}: a signal has {found['bits'].decode()[:20]} bits, more than {_MOST_BITS}")
-    try:
-        database = cantools.database.load_string(decode_dbc(text), "dbc")
-    except Exception as error:  # cantools has no common class of its errors
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise CodecError(f"DBC {path} can't be read: {reason}") from None
-    if not isinstance(database, Database):
-        raise CodecError(f"DBC {path} holds no CAN messages")
-    return database
-
-
-def decode_dbc(text: bytes) -> str:
-    """Return the text of a DBC, decoded as UTF-8, else by the code page of vendors' tools, as cantools assumes."""
-    try:
-        return text.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return text.decode("cp1252", "replace")

@@ -10,7 +10,7 @@ from cantools.database.can import Message
 from cantools.database.errors import DecodeError
 from cantools.database.utils import create_encode_decode_formats, decode_data
 
-from adacd_hil.wire.codec import WIRE_VERSION, parse_database, read_dbc
+from adacd_hil.wire.dbc_contract import WIRE_VERSION, parse_database, read_dbc
 
 
 class MessageDecoder:

@@ -8,8 +8,9 @@ data ids and names stay, too. Source: CiA 301 clause 7.3.3 (predefined connectio
 import re
 from pathlib import Path
 
-from adacd_hil.wire.codec import Codec, CodecError, decode_dbc, parse_codec
+from adacd_hil.wire.codec import Codec, CodecError
 from adacd_hil.wire.contract_frames import HEARTBEAT_ID, HOST_HEARTBEAT, NODE_MASK
+from adacd_hil.wire.dbc_contract import decode_dbc, parse_codec
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 _LAST_DEVICE = 126

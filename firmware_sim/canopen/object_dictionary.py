@@ -22,7 +22,8 @@ from canopen.sdo.server import SdoServer
 
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
+from adacd_hil.wire.codec import Codec, CodecError
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from adacd_hil.wire.eds_text import readable_eds
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS
 from adacd_hil.wire.moved_contract import move_contract

@@ -27,8 +27,9 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import open_terminals, terminal_columns, write_result
 from adacd_hil.wire.bus import BusError, BusMissingError
-from adacd_hil.wire.codec import Codec, CodecError, load_codec
+from adacd_hil.wire.codec import Codec, CodecError
 from adacd_hil.wire.contract_frames import HOST_NODE
+from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.moved_contract import move_contract
 from firmware_sim.arm.arms import ARMS
 from firmware_sim.bench.bench import Bench, ClockMode

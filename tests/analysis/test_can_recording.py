@@ -10,7 +10,7 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.log.log_files import LogError
 from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone, load_recording
 from adacd_hil.replay.replay import replay_source
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_contract import load_codec
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 CODEC = load_codec()

@@ -7,7 +7,7 @@ from called import called, complaints
 from experiment_runs import PAPER, emulator, other_contract, run_on_vcan, run_while_killing
 
 from adacd_hil.log.reader import read_log
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 pytestmark = pytest.mark.slow
 

@@ -11,7 +11,7 @@ from adacd_hil.lab.cli.log_command import find_dbc
 from adacd_hil.lab.commission.communication_test import CommunicationReport, CommunicationTest, ZeroTorqueLoop
 from adacd_hil.lab.score.report_wording import number_text
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 
 
 def played(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:

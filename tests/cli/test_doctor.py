@@ -15,7 +15,8 @@ from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination, chec
 from adacd_hil.lab.commission.host_checks import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import apply_settings
-from adacd_hil.wire.codec import Codec, load_codec
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.dbc_contract import load_codec
 from firmware_sim.cli.own_devices import rehearse
 from firmware_sim.nodes.device import NmtState
 

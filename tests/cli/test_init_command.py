@@ -24,7 +24,7 @@ from adacd_hil.lab.commission.profile_draft import DeviceRatings, draft_profile
 from adacd_hil.lab.serial_arm.urdf import UrdfError
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from firmware_sim.cli.own_devices import rehearse
 
 USAGE, BUS_MISSING = 2, 5

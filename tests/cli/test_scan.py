@@ -6,7 +6,8 @@ from rig import CODEC, Rig
 
 from adacd_hil.lab.cli.scan_command import as_text, describe
 from adacd_hil.lab.commission.survey import compare, expected_nodes, survey
-from adacd_hil.wire.codec import Codec, parse_codec
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.dbc_contract import parse_codec
 
 
 def scanned(rig: Rig, codec: Codec = CODEC) -> dict:

@@ -15,7 +15,7 @@ from foreign_arms import urdf_text
 
 from adacd_hil.cli.main import main
 from adacd_hil.log.log_files import LOG_NAME
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 FAILURE, USAGE, PARTIAL, BUS_MISSING = 1, 2, 3, 5
 

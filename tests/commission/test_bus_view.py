@@ -4,7 +4,7 @@ import pytest
 
 from adacd_hil.lab.commission.survey import BusView, MessageView, Snapshot
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_contract import load_codec
 
 CODEC = load_codec()
 TORQUE = CODEC.message("Sensor1Torque")

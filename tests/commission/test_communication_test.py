@@ -14,7 +14,7 @@ from adacd_hil.lab.commission.communication_test import (
 )
 from adacd_hil.records import FaultReason
 from adacd_hil.wire.bus import QueueBytes
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_contract import load_codec
 
 COMMAND = load_codec().message("Drive1Command")
 COMMANDS = (0x201, 0x202)

@@ -12,7 +12,7 @@ from adacd_hil.records import ArmCommand, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.e2e import E2eSender
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 

@@ -10,7 +10,7 @@ from adacd_hil.device.profile import load_profile, place_devices
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.toml_files import to_toml
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 
 def with_drives(settings: Settings, first: Path, second: Path) -> Settings:

@@ -14,7 +14,7 @@ from adacd_hil.device.profile import place_devices
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 
 DRIVE_PROFILE = Path(adacd_hil.__file__).parent / "device_profiles" / "adacd-drive.toml"
 WRITTEN = [

@@ -13,7 +13,7 @@ from adacd_hil.device.profile import ProfileSettings, load_profile, profile_name
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import parse_toml, to_short_toml, to_toml
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 SENSOR = """
 kind = "sensor"

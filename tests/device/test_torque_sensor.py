@@ -6,7 +6,7 @@ from adacd_hil.device.contract import compose
 from adacd_hil.device.profile import place_devices
 from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.e2e import E2eStatus
 
 CODEC = load_codec()

@@ -20,7 +20,7 @@ from adacd_hil.log.reader import read_log
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import to_toml
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 DEVICES = '[devices]\ndrive = ["drive.toml", "drive.toml"]\nsensor = ["sensor.toml", "sensor.toml"]\n'
 ARM = OWN_ARM.replace("[devices]\n", DEVICES)

@@ -11,7 +11,7 @@ import numpy as np
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.bench.bench import Bench
 from firmware_sim.canopen.object_dictionary import CONTRACTS

@@ -14,7 +14,7 @@ from canopen.objectdictionary.datatypes import SIGNED_TYPES
 from adacd_hil.device.contract import load_contract
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.wire.codec import contract_folder, load_codec, parse_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
 from firmware_sim.arm.sensing import TORQUE_LSB_NM
 from firmware_sim.canopen.object_dictionary import CONTRACTS, contract_of, playable_contract
 

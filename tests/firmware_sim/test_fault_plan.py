@@ -7,7 +7,7 @@ from bench_host import CODEC, quiet_scenario
 from test_faults import UNTIMED, example
 
 from adacd_hil.settings.schema import ConfigError, parse
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S

@@ -5,7 +5,7 @@ import pytest
 from bench_host import PERIOD_NS, Nmt, quiet_scenario
 
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from adacd_hil.wire.moved_contract import move_contract
 from firmware_sim.bench.bench import Bench
 from firmware_sim.canopen.object_dictionary import CONTRACTS

@@ -7,7 +7,7 @@ import struct
 import pytest
 from bench_host import CODEC, EDS, BenchHost, Nmt
 
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 from firmware_sim.canopen.error_control import Watchdog
 from firmware_sim.nodes.device import NmtState
 

@@ -8,7 +8,7 @@ import pytest
 from bench_host import CODEC, BenchHost, Nmt, quiet_scenario
 from cantools.autosar import end_to_end
 
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 ZERO = int.from_bytes(b"zero", "little")
 DATABASE = cantools.database.load_file(contract_folder() / "arm.dbc")

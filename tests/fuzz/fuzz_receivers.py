@@ -26,7 +26,8 @@ from adacd_hil.records import ArmCommand, Request, SchemeState
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import CodecError, MessageCodec, load_codec
+from adacd_hil.wire.codec import CodecError, MessageCodec
+from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.arm.sensing import DriveMode

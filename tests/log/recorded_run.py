@@ -29,7 +29,8 @@ from adacd_hil.records import (
     scheme_layout,
 )
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import Codec, load_codec, parse_codec
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.dbc_contract import load_codec, parse_codec
 from adacd_hil.wire.frame_lengths import FD_LENGTHS
 
 PERIOD_NS = 1_000_000

@@ -9,9 +9,9 @@ from planar_arm import PAYLOAD_1KG, THETA
 
 from adacd_hil.control.motions import Excitation
 from adacd_hil.records import ArmBatch, Request, SchemeState
+from adacd_hil.replay.logged_arms import arm_at
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.pipeline.pipeline import layout_of
-from adacd_hil.replay.logged_arms import arm_at
 
 REST = 60
 """Cycles at rest, the first of them without drives."""

@@ -15,7 +15,7 @@ from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import TRUTH_LAYOUT, Event, FaultReason, Request, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 from firmware_sim.scenario.scenario import Scenario
 
 PERIOD_NS = 1_000_000

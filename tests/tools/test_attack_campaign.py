@@ -15,7 +15,7 @@ from crccheck.crc import Crc8Autosar
 
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import TRUTH_LAYOUT, Event
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from adacd_hil.wire.e2e import E2eStatus
 
 FORGER = Forger((contract_folder() / "arm.dbc").read_bytes())

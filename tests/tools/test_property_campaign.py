@@ -20,7 +20,7 @@ from wire_record import Passed, WireRecord
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import parse
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 from firmware_sim.scenario.scenario import Scenario
 
 ADAPT, MONITOR, REACT, STOPPED = SchemeState.ADAPT, SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED

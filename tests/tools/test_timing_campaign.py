@@ -15,7 +15,7 @@ from mcap.writer import Writer
 
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.budget import describe_excess
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_contract import load_codec
 from firmware_sim.scenario.scenario import load_scenario
 
 MS = 1_000_000

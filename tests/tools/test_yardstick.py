@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yardstick
 
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from adacd_hil.wire.e2e import E2eStatus
 
 GOOD = ["-i", "none0", "-s", "080", "-r", "181", "-c", "201#0011"]

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from adacd_hil.log.reader import read_log, topic_bytes
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 

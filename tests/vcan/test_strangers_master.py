@@ -16,7 +16,7 @@ from canopen.profiles.p402 import BaseNode402
 from experiment_runs import emulator
 from hang import HANG_S
 
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.wallclock]
 

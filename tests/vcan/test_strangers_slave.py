@@ -25,7 +25,7 @@ from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, ArmState, FaultReason
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.bus import Bus, Frame
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 PERIOD_NS = 1_000_000
 INCREMENTS_PER_RAD = 1048576 / (2 * np.pi)

@@ -7,7 +7,8 @@ import cantools
 import pytest
 
 from adacd_hil.wire.budget import Budget, LoadCase, ResponseTime, Trigger, compute_budget, format_us
-from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec, parse_codec
+from adacd_hil.wire.codec import Codec, CodecError
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
 from adacd_hil.wire.moved_contract import move_contract
 
 CONTRACTS = Path(__file__).parent / "contracts"

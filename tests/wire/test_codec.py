@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adacd_hil.wire.codec import CodecError, MessageCodec, contract_folder, load_codec, parse_codec
+from adacd_hil.wire.codec import CodecError, MessageCodec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
 from adacd_hil.wire.e2e import E2eStatus
 
 CODEC = load_codec()

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from cantools.autosar.end_to_end import compute_profile2_crc, compute_profile5_crc
 
-from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
+from adacd_hil.wire.codec import Codec, CodecError
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from adacd_hil.wire.e2e import E2eReceiver, E2eSender, Protection
 
 FD = load_codec(contract_folder() / "arm_fd.dbc")

@@ -11,8 +11,9 @@ from adacd_hil.lab.commission.survey import BusView
 from adacd_hil.lab.logs.signal_tables import frame_columns
 from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec
+from adacd_hil.wire.codec import Codec, CodecError
 from adacd_hil.wire.contract_attributes import read_bitrates
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from adacd_hil.wire.dbc_decoder import DbcDecoder, load_decoder
 
 FOREIGN = """VERSION ""

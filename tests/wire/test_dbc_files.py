@@ -9,8 +9,8 @@ import cantools
 import pytest
 from hang import HANG_S
 
-from adacd_hil.wire.codec import contract_folder, load_codec, parse_codec
 from adacd_hil.wire.contract_attributes import read_bitrates
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
 
 FILES = sorted(contract_folder().glob("*.dbc"))
 EVERY_FILE = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from eds_utils.core.file_io.read_eds import read_eds
 
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 FILES = sorted(contract_folder().glob("*.eds"))
 EVERY_FILE = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

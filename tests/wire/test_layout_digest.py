@@ -8,7 +8,7 @@ import cantools
 import pytest
 from cantools.database.can import Message
 
-from adacd_hil.wire.codec import contract_folder, load_codec
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
 FILES = sorted(contract_folder().glob("*.dbc"))

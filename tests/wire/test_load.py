@@ -11,7 +11,7 @@ from hang import HANG_S
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.commission.load_meter import LoadMeter
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import load_codec
+from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.open_bus import open_bus
 
 SECOND_NS = 1_000_000_000

@@ -3,7 +3,8 @@
 import cantools
 import pytest
 
-from adacd_hil.wire.codec import Codec, CodecError, contract_folder, load_codec, parse_codec
+from adacd_hil.wire.codec import Codec, CodecError
+from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
 from adacd_hil.wire.moved_contract import move_contract
 
 CONTRACTS = ("arm", "arm_fd", "arm_fd_500us", "arm_stock")

@@ -22,7 +22,7 @@ sys.path.insert(0, str(ROOT))
 
 from attacks import ATTACKS, Attack, Forged, Forger, find_attack  # noqa: E402
 
-from adacd_hil.wire.codec import contract_folder  # noqa: E402
+from adacd_hil.wire.dbc_contract import contract_folder  # noqa: E402
 
 FRAME = struct.Struct("=IB3x8s")
 RECEIVE_BUFFER = 1 << 22

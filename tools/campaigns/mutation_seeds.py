@@ -17,7 +17,7 @@ from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.toml_files import to_toml
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 from firmware_sim.scenario.scenario import builtin_scenarios
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -17,7 +17,8 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError, parse
 from adacd_hil.settings.toml_files import to_toml
-from adacd_hil.wire.codec import Codec, load_codec
+from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.dbc_contract import load_codec
 from firmware_sim.arm.touch_settings import BODY_REGIONS
 from firmware_sim.bench.fault_plan import FaultPlan
 from firmware_sim.canopen.object_dictionary import CONTRACTS as DBCS

@@ -44,7 +44,7 @@ from timing_disk import DISK_CASES, STOPPED_S, run_disk, show_disk
 from timing_hogs import finish_hogs, run_hogs, show_hogs
 from timing_hour import CONTACT_S, finish_hour, run_hour, show_hour
 
-from adacd_hil.wire.codec import contract_folder
+from adacd_hil.wire.dbc_contract import contract_folder
 
 PROGRAM = "timing_campaign"
 BLOCK_S = 30.0

@@ -162,7 +162,7 @@ def _open(
     from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone
     from adacd_hil.replay.log_source import LogSource
     from adacd_hil.settings.configuration_files import load_settings
-    from adacd_hil.wire.codec import load_codec
+    from adacd_hil.wire.dbc_contract import load_codec
 
     path = log_in(given)
     if against is not None:

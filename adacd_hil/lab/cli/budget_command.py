@@ -9,8 +9,9 @@ from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import fold, terminal_columns
 from adacd_hil.wire.budget import Budget, FrameBudget, LoadCase, ResponseTime, compute_budget, format_us
-from adacd_hil.wire.codec import Codec, load_codec
+from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_attributes import read_attribute
+from adacd_hil.wire.dbc_contract import load_codec
 
 _COLUMNS = ("id", "message", "bytes", "trigger", "every ms", "bits", "µs", "response µs", "disturbed µs", "deadline µs")
 _WIDTH = 120

@@ -292,7 +292,7 @@ def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
     """Return text and path of a recording's DBC: the given one, else the one in the log, else the package's."""
     from adacd_hil.log.log_files import DBC_NAME
     from adacd_hil.log.log_walk import attachment
-    from adacd_hil.wire.codec import read_dbc
+    from adacd_hil.wire.dbc_contract import read_dbc
 
     text = attachment(log, DBC_NAME) if dbc is None and log.suffix.lower() == ".mcap" else None
     return read_dbc(dbc) if text is None else (text, log / DBC_NAME)

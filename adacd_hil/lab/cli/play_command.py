@@ -109,7 +109,7 @@ def play(
     """
     from adacd_hil.lab.logs.frame_choice import FrameChoice, sides
     from adacd_hil.log.frames.frame_log import open_frames
-    from adacd_hil.wire.codec import parse_codec
+    from adacd_hil.wire.dbc_contract import parse_codec
 
     codec = parse_codec(*find_dbc(log, dbc))
     choice = FrameChoice(

@@ -256,6 +256,6 @@ def _create(path: Path, is_truth: bool) -> int:
 
 def _own_messages() -> Iterable[MessageTable]:
     # Takes 0.2 s; callers with a codec pass its messages instead.
-    from adacd_hil.wire.codec import load_codec
+    from adacd_hil.wire.dbc_contract import load_codec
 
     return load_codec().messages.values()
