@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from adacd_hil.wire.e2e import PROFILES, E2eReceiver, E2eSender, Protection
+from adacd_hil.wire.e2e import PROFILES, E2eReceiver, E2eSender, ProtectedReceiver, Protection
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 from adacd_hil.wire.message_table import MessageTable, SignalCodec, container_struct
 
@@ -41,7 +41,7 @@ class MessageCodec(MessageTable):
         super().__init__(name, can_id, length, signals)
         self.protection, self.data_ids, self.senders = protection, data_ids, senders
         self.profile = PROFILES.get(protection)
-        """Layout, sender and receiver of the end-to-end header; None without protection."""
+        """Layout and rules of the end-to-end header; None without protection."""
         self.values = signals[0 if self.profile is None else len(self.profile.signals) :]
         """The signals behind the end-to-end header."""
         # `encode_raw` packs values that each fill a container of their own.
@@ -73,11 +73,12 @@ class MessageCodec(MessageTable):
 
     def sender(self) -> E2eSender:
         """Return a new end-to-end sender of this message; without protection it leaves frames unchanged."""
-        return E2eSender() if self.profile is None else self.profile.sender(self.data_ids)
+        return E2eSender(self.profile, self.data_ids)
 
     def receiver(self) -> E2eReceiver:
         """Return a new end-to-end receiver of this message; without protection it accepts every frame as OK."""
-        return E2eReceiver() if self.profile is None else self.profile.receiver(self.data_ids, self.length)
+        profile = self.profile
+        return E2eReceiver() if profile is None else ProtectedReceiver(profile, self.data_ids, self.length)
 
     def encode(self, *values: float) -> bytearray:
         """Return a frame of finite physical values in the order of `values`; the end-to-end header is left zero.

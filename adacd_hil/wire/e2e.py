@@ -14,11 +14,10 @@ from binascii import crc_hqx
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, IntEnum
+from functools import cached_property
 from typing import Final
 
 _POLYNOMIAL_8 = 0x2F
-_COUNTER_MASK_2 = 0x0F
-_COUNTER_MASK_5 = 0xFF
 
 
 def _crc8_table() -> bytes:
@@ -34,36 +33,24 @@ def _crc8_table() -> bytes:
 _TABLE_8 = _crc8_table()
 
 
-def crc8(data: bytes | bytearray, data_id: int) -> int:
-    """Return the Profile 2 CRC of a frame whose bytes 1… are `data[1:]`; `data_id`: the one of its counter."""
+def crc8(frame: bytes | bytearray, counter: int, data_ids: bytes) -> int:
+    """Return the Profile 2 CRC of a frame over its bytes 1… and the data id of its counter, one of 16 in `data_ids`."""
     table = _TABLE_8
     crc = 0xFF
-    for byte in data[1:]:
+    for byte in frame[1:]:
         crc = table[crc ^ byte]
-    return table[crc ^ data_id] ^ 0xFF
+    return table[crc ^ data_ids[counter]] ^ 0xFF
 
 
-def crc16(data: bytes | bytearray, data_id: bytes) -> int:
-    """Return the Profile 5 CRC of a frame whose bytes 2… are `data[2:]`; `data_id`: two bytes, the low one first."""
-    return crc_hqx(data_id, crc_hqx(data[2:], 0xFFFF))
-
-
-def sign_profile_2(frame: bytearray, counter: int, data_ids: bytes) -> None:
-    """Write Profile 2's counter 0…15 into a frame, and the CRC that goes with it; the sender's status stays."""
-    frame[1] = (frame[1] & 0xF0) | counter
-    frame[0] = crc8(frame, data_ids[counter])
-
-
-def sign_profile_5(frame: bytearray, counter: int, data_id: bytes) -> None:
-    """Write Profile 5's counter 0…255 into a frame, and the CRC that goes with it; the sender's status stays."""
-    frame[2] = counter
-    frame[:2] = crc16(frame, data_id).to_bytes(2, "little")
+def crc16(frame: bytes | bytearray, counter: int, data_id: bytes) -> int:  # noqa: ARG001 (as of all profiles)
+    """Return the Profile 5 CRC of a frame over its bytes 2… and `data_id`, two bytes, the low one first."""
+    return crc_hqx(data_id, crc_hqx(frame[2:], 0xFFFF))
 
 
 class Protection(Enum):
     """How a message's frames are protected; the values are those of the DBC attribute `E2EProfile`.
 
-    `PROFILES` has the layout, sender and receiver of each.
+    `PROFILES` has the layout, CRC and tolerance of each.
     """
 
     NONE = ""
@@ -96,9 +83,8 @@ class Tolerance:
     """Losses that a receiver tolerates. The names in brackets are the standard's."""
 
     max_delta: int
-    """Largest step of the counter that counts as loss; a larger one is a wrong sequence. Profile 2
-    (MaxDeltaCounterInit): plus one, and plus one for each cycle since the last frame in sequence. Profile 5
-    (MaxDeltaCounter): as it stands."""
+    """Largest step of the counter that counts as loss; a larger one is a wrong sequence [MaxDeltaCounter, of Profile 2
+    MaxDeltaCounterInit]."""
     max_missing: int
     """Most cycles in a row without a new frame; after more, the sequence counts as lost [MaxNoNewOrRepeatedData]."""
     sync_frames: int
@@ -114,48 +100,77 @@ PROFILE_2_TOLERANCE = Tolerance(max_delta=2, max_missing=4, sync_frames=1)
 PROFILE_5_TOLERANCE = Tolerance(max_delta=5, max_missing=4, sync_frames=1)
 
 
+@dataclass(frozen=True)
+class E2eProfile:
+    """A profile: everything that its frames, devices and contracts need to know; a new one is a row of `PROFILES`.
+
+    crc_bits, counter_bits, status_bits: the header's signals in this order, from bit 0 on. objects: of a device's
+    dictionary that carry the header. data_id_bytes: of one message; is_id_list: a list by counter, in the DBC attribute
+    `E2EDataIdList`, else a number, in `E2EDataId`. crc: returns the CRC of a frame, its counter, and the data ids.
+    is_growing: the largest tolerated step grows by one, and by one for each cycle since the last frame in sequence.
+    """
+
+    crc_bits: int
+    counter_bits: int
+    status_bits: int
+    objects: int
+    data_id_bytes: int
+    is_id_list: bool
+    crc: Callable[[bytes | bytearray, int, bytes], int]
+    tolerance: Tolerance
+    is_growing: bool
+
+    @property
+    def header_bytes(self) -> int:
+        """Length of the header in bytes."""
+        return (self.crc_bits + self.counter_bits + self.status_bits) // 8
+
+    @property
+    def signals(self) -> tuple[tuple[str, int], ...]:
+        """Names of the header's signals with their numbers of bits, in order."""
+        return ("e2e_crc", self.crc_bits), ("e2e_counter", self.counter_bits), ("e2e_status", self.status_bits)
+
+    @property
+    def status_place(self) -> tuple[int, int]:
+        """Byte and shift of the sender's status."""
+        return divmod(self.crc_bits + self.counter_bits, 8)
+
+    @cached_property
+    def counter_place(self) -> tuple[int, int]:
+        """Byte of the counter, and its mask there."""
+        return self.crc_bits // 8, (1 << self.counter_bits) - 1
+
+    def counter_of(self, frame: bytes | bytearray) -> int:
+        """Return the counter of a frame."""
+        place, mask = self.counter_place
+        return frame[place] & mask
+
+    def sign(self, frame: bytearray, counter: int, data_ids: bytes) -> None:
+        """Write a counter into a frame, and the CRC that goes with it; the sender's status stays."""
+        place, mask = self.counter_place
+        frame[place] = frame[place] & ~mask | counter
+        frame[:place] = self.crc(frame, counter, data_ids).to_bytes(place, "little")
+
+
 class E2eSender:
-    """Leaves the frames of one message unchanged; the sender of a profile adds counter and CRC."""
+    """Adds counter and CRC to the frames of one message; without a profile it leaves them unchanged."""
+
+    def __init__(self, profile: E2eProfile | None = None, data_ids: bytes = b"") -> None:
+        """`data_ids`: of the message, as the profile takes them."""
+        self._profile, self._data_ids = profile, data_ids
+        self._counter = 0
 
     def protect(self, frame: bytearray) -> bytes:
         """Return `frame` as bytes; with a profile, fill in its counter and CRC. The sender's status stays."""
-        return bytes(frame)
-
-
-class Profile2Sender(E2eSender):
-    """Adds counter and CRC of Profile 2 to the frames of one message."""
-
-    def __init__(self, data_ids: bytes) -> None:
-        """`data_ids`: 16 bytes, one for each counter."""
-        self._data_ids = data_ids
-        self._counter = 0
-
-    def protect(self, frame: bytearray) -> bytes:
-        """Fill in the header of `frame` (bytes 0 and low nibble of 1) and return it as bytes."""
-        counter = self._counter
-        self._counter = (counter + 1) & _COUNTER_MASK_2
-        sign_profile_2(frame, counter, self._data_ids)
-        return bytes(frame)
-
-
-class Profile5Sender(E2eSender):
-    """Adds counter and CRC of Profile 5 to the frames of one message."""
-
-    def __init__(self, data_id: bytes) -> None:
-        """`data_id`: two bytes, the low one first."""
-        self._data_id = data_id
-        self._counter = 0
-
-    def protect(self, frame: bytearray) -> bytes:
-        """Fill in the header of `frame` (bytes 0 to 2) and return it as bytes."""
-        counter = self._counter
-        self._counter = (counter + 1) & _COUNTER_MASK_5
-        sign_profile_5(frame, counter, self._data_id)
+        profile = self._profile
+        if profile is not None:
+            profile.sign(frame, self._counter, self._data_ids)
+            self._counter = self._counter + 1 & profile.counter_place[1]
         return bytes(frame)
 
 
 class E2eReceiver:
-    """Accepts the frames of one message unchecked, and counts them; the receiver of a profile checks them."""
+    """Accepts the frames of one message unchecked, and counts them; with a profile, `ProtectedReceiver` checks them."""
 
     def __init__(self) -> None:
         self.counts = [0] * len(E2eStatus)
@@ -205,13 +220,20 @@ class E2eReceiver:
         pass
 
 
-class _SequenceReceiver(E2eReceiver):
-    """Common part of both profiles' receivers: sequence, silence, SYNC."""
+class ProtectedReceiver(E2eReceiver):
+    """Checks the frames of one message by its profile: sequence, silence, SYNC (E2E_P02Check, E2E_P05Check).
 
-    def __init__(self, length: int, tolerance: Tolerance) -> None:
+    Profile 2: as in the standard the tolerated step grows with each cycle without a usable frame, wrong CRCs included.
+    Profile 5: the standard's check has no SYNC, it leaves that to a state machine above it. Here Profile 2's SYNC is
+    used, so that both profiles treat a silence alike.
+    """
+
+    def __init__(self, profile: E2eProfile, data_ids: bytes, length: int, tolerance: Tolerance | None = None) -> None:
+        """`data_ids`: as the profile takes them; `length`: bytes of a frame; `tolerance`: by default the profile's."""
         super().__init__()
-        self._length = length
-        self._tolerance = tolerance
+        self._profile, self._data_ids, self._length = profile, data_ids, length
+        self._tolerance = tolerance or profile.tolerance
+        self._place, self._mask = profile.counter_place
         self.restart_sequence()
 
     def restart_sequence(self) -> None:
@@ -219,13 +241,50 @@ class _SequenceReceiver(E2eReceiver):
         self._last: int | None = None
         self._missing = 0
         self._to_sync = 0
+        self._max_delta = self._tolerance.max_delta
+
+    @property
+    def counter_range(self) -> int:
+        """Number of values of the counter."""
+        return self._mask + 1
+
+    def step_of(self, frame: bytes) -> int | None:
+        """Return the step of a frame's counter from the last one's, unchecked; None as in the base class."""
+        if self._last is None or len(frame) != self._length:
+            return None
+        return frame[self._place] - self._last & self._mask
+
+    def is_signed(self, frame: bytes) -> bool:
+        """Return whether length and CRC of a frame are right; doesn't count it."""
+        if len(frame) != self._length:
+            return False
+        crc = self._profile.crc(frame, frame[self._place] & self._mask, self._data_ids)
+        return int.from_bytes(frame[: self._place], "little") == crc
 
     def _note_silence(self) -> None:
         self._missing += 1
+        self._max_delta += self._profile.is_growing
+
+    def _judge(self, frame: bytes) -> E2eStatus:
+        is_growing = self._profile.is_growing
+        self._max_delta += is_growing
+        if not self.is_signed(frame):
+            return E2eStatus.WRONG_CRC
+        counter, last = frame[self._place] & self._mask, self._last
+        if last is None:
+            return self._begin(counter)
+        delta = counter - last & self._mask
+        if delta == 0:
+            self._missing += 1
+            return E2eStatus.REPEATED
+        is_in_sequence = delta <= self._max_delta
+        if is_in_sequence or self._tolerance.sync_frames or not is_growing:  # else only a wider tolerance recovers
+            self._last, self._max_delta = counter, self._tolerance.max_delta
+        return self._accept(delta) if is_in_sequence else self._lose_sequence()
 
     def _begin(self, counter: int) -> E2eStatus:
         """Accept the first frame, the standard's INITIAL. Its values are used; silence before it is ignored."""
-        self._last = counter
+        self._last, self._max_delta = counter, self._tolerance.max_delta
         self._missing = 0
         return E2eStatus.OK
 
@@ -246,141 +305,6 @@ class _SequenceReceiver(E2eReceiver):
         return E2eStatus.OK if delta == 1 else E2eStatus.OK_SOME_LOST
 
 
-class Profile2Receiver(_SequenceReceiver):
-    """Checks the frames of one message by Profile 2 (E2E_P02Check).
-
-    As in the standard the tolerated step grows with each cycle without a usable frame, wrong CRCs included.
-    """
-
-    def __init__(self, data_ids: bytes, length: int, tolerance: Tolerance = PROFILE_2_TOLERANCE) -> None:
-        """`data_ids`: 16 bytes, one for each counter; `length`: bytes of a frame, at least 2."""
-        super().__init__(length, tolerance)
-        self._data_ids = data_ids
-
-    def restart_sequence(self) -> None:
-        """Forget the sequence: the next frame with a right CRC starts a new one. The counts stay."""
-        super().restart_sequence()
-        self._max_delta = self._tolerance.max_delta
-
-    @property
-    def counter_range(self) -> int:
-        """Number of values of the counter."""
-        return _COUNTER_MASK_2 + 1
-
-    def step_of(self, frame: bytes) -> int | None:
-        """Return the step of a frame's counter from the last one's, unchecked; None as in the base class."""
-        if self._last is None or len(frame) != self._length:
-            return None
-        return (frame[1] - self._last) & _COUNTER_MASK_2
-
-    def is_signed(self, frame: bytes) -> bool:
-        """Return whether length and CRC of a frame are right; doesn't count it."""
-        return len(frame) == self._length and frame[0] == crc8(frame, self._data_ids[frame[1] & _COUNTER_MASK_2])
-
-    def _note_silence(self) -> None:
-        self._max_delta += 1
-        self._missing += 1
-
-    def _judge(self, frame: bytes) -> E2eStatus:
-        self._max_delta += 1
-        if not self.is_signed(frame):
-            return E2eStatus.WRONG_CRC
-        counter = frame[1] & _COUNTER_MASK_2
-        if self._last is None:
-            self._max_delta = self._tolerance.max_delta
-            return self._begin(counter)
-        delta = (counter - self._last) & _COUNTER_MASK_2
-        if delta == 0:
-            self._missing += 1
-            return E2eStatus.REPEATED
-        is_in_sequence = delta <= self._max_delta
-        if is_in_sequence or self._tolerance.sync_frames:  # without SYNC only a wider tolerance recovers
-            self._last = counter
-            self._max_delta = self._tolerance.max_delta
-        return self._accept(delta) if is_in_sequence else self._lose_sequence()
-
-
-class Profile5Receiver(_SequenceReceiver):
-    """Checks the frames of one message by Profile 5 (E2E_P05Check).
-
-    The standard's check has no SYNC: it leaves that to a state machine above it. Here Profile 2's SYNC is used, so that
-    both profiles treat a silence alike.
-    """
-
-    def __init__(self, data_id: bytes, length: int, tolerance: Tolerance = PROFILE_5_TOLERANCE) -> None:
-        """`data_id`: two bytes, the low one first; `length`: bytes of a frame, at least 4."""
-        super().__init__(length, tolerance)
-        self._data_id = data_id
-
-    @property
-    def counter_range(self) -> int:
-        """Number of values of the counter."""
-        return _COUNTER_MASK_5 + 1
-
-    def step_of(self, frame: bytes) -> int | None:
-        """Return the step of a frame's counter from the last one's, unchecked; None as in the base class."""
-        if self._last is None or len(frame) != self._length:
-            return None
-        return (frame[2] - self._last) & _COUNTER_MASK_5
-
-    def is_signed(self, frame: bytes) -> bool:
-        """Return whether length and CRC of a frame are right; doesn't count it."""
-        return len(frame) == self._length and frame[0] | frame[1] << 8 == crc16(frame, self._data_id)
-
-    def _judge(self, frame: bytes) -> E2eStatus:
-        if not self.is_signed(frame):
-            return E2eStatus.WRONG_CRC
-        last, self._last = self._last, frame[2]
-        if last is None:
-            return self._begin(frame[2])
-        delta = (frame[2] - last) & _COUNTER_MASK_5
-        if delta == 0:
-            self._missing += 1
-            return E2eStatus.REPEATED
-        return self._accept(delta) if delta <= self._tolerance.max_delta else self._lose_sequence()
-
-
-@dataclass(frozen=True)
-class E2eProfile:
-    """A profile: everything that its frames, devices and contracts need to know; a new one is a row of `PROFILES`.
-
-    crc_bits, counter_bits, status_bits: the header's signals in this order, from bit 0 on. objects: of a device's
-    dictionary that carry the header. data_id_bytes: of one message; is_id_list: a list by counter, in the DBC attribute
-    `E2EDataIdList`, else a number, in `E2EDataId`. sender, receiver: made of the data ids, and the frame's length.
-    sign: writes a counter and its CRC into a frame.
-    """
-
-    crc_bits: int
-    counter_bits: int
-    status_bits: int
-    objects: int
-    data_id_bytes: int
-    is_id_list: bool
-    sender: Callable[[bytes], E2eSender]
-    receiver: Callable[[bytes, int], E2eReceiver]
-    sign: Callable[[bytearray, int, bytes], None]
-
-    @property
-    def header_bytes(self) -> int:
-        """Length of the header in bytes."""
-        return (self.crc_bits + self.counter_bits + self.status_bits) // 8
-
-    @property
-    def signals(self) -> tuple[tuple[str, int], ...]:
-        """Names of the header's signals with their numbers of bits, in order."""
-        return ("e2e_crc", self.crc_bits), ("e2e_counter", self.counter_bits), ("e2e_status", self.status_bits)
-
-    @property
-    def status_place(self) -> tuple[int, int]:
-        """Byte and shift of the sender's status."""
-        return divmod(self.crc_bits + self.counter_bits, 8)
-
-    def counter_of(self, frame: bytes) -> int:
-        """Return the counter of a frame."""
-        byte, shift = divmod(self.crc_bits, 8)
-        return frame[byte] >> shift & (1 << self.counter_bits) - 1
-
-
 PROFILES: Final = {
     Protection.PROFILE_2: E2eProfile(
         crc_bits=8,
@@ -389,9 +313,9 @@ PROFILES: Final = {
         objects=2,  # counter and status share one
         data_id_bytes=16,
         is_id_list=True,
-        sender=Profile2Sender,
-        receiver=Profile2Receiver,
-        sign=sign_profile_2,
+        crc=crc8,
+        tolerance=PROFILE_2_TOLERANCE,
+        is_growing=True,
     ),
     Protection.PROFILE_5: E2eProfile(
         crc_bits=16,
@@ -400,9 +324,9 @@ PROFILES: Final = {
         objects=3,
         data_id_bytes=2,
         is_id_list=False,
-        sender=Profile5Sender,
-        receiver=Profile5Receiver,
-        sign=sign_profile_5,
+        crc=crc16,
+        tolerance=PROFILE_5_TOLERANCE,
+        is_growing=False,
     ),
 }
 PROFILES_BY_CODE: Final = {protection.value: profile for protection, profile in PROFILES.items()}

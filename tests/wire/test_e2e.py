@@ -13,15 +13,13 @@ from adacd_hil.wire.e2e import (
     E2eReceiver,
     E2eSender,
     E2eStatus,
-    Profile2Receiver,
-    Profile2Sender,
-    Profile5Receiver,
-    Profile5Sender,
+    ProtectedReceiver,
     Protection,
     crc8,
     crc16,
 )
 
+P02, P05 = PROFILES[Protection.PROFILE_2], PROFILES[Protection.PROFILE_5]
 DATA_IDS = bytes(range(10, 26))
 OTHER_DATA_IDS = bytes(range(100, 116))
 
@@ -40,9 +38,9 @@ class Profile(NamedTuple):
 
 def profile_2(length: int) -> Profile:
     return Profile(
-        lambda: Profile2Sender(DATA_IDS),
-        lambda: Profile2Receiver(DATA_IDS, length),
-        lambda: Profile2Receiver(OTHER_DATA_IDS, length),
+        lambda: E2eSender(P02, DATA_IDS),
+        lambda: ProtectedReceiver(P02, DATA_IDS, length),
+        lambda: ProtectedReceiver(P02, OTHER_DATA_IDS, length),
         length,
         counter_byte=1,
         modulus=16,
@@ -51,9 +49,9 @@ def profile_2(length: int) -> Profile:
 
 def profile_5(length: int) -> Profile:
     return Profile(
-        lambda: Profile5Sender(b"\x34\x12"),
-        lambda: Profile5Receiver(b"\x34\x12", length),
-        lambda: Profile5Receiver(b"\x34\x13", length),
+        lambda: E2eSender(P05, b"\x34\x12"),
+        lambda: ProtectedReceiver(P05, b"\x34\x12", length),
+        lambda: ProtectedReceiver(P05, b"\x34\x13", length),
         length,
         counter_byte=2,
         modulus=256,
@@ -72,12 +70,12 @@ def frames(profile: Profile, count: int) -> list[bytes]:
 
 @given(payload=st.binary(min_size=2, max_size=8), data_id=st.integers(0, 255))
 def test_the_profile_2_crc_equals_cantools(payload: bytes, data_id: int) -> None:
-    assert crc8(payload, data_id) == compute_profile2_crc(payload, data_id)
+    assert crc8(payload, 0, bytes([data_id])) == compute_profile2_crc(payload, data_id)
 
 
 @given(payload=st.binary(min_size=4, max_size=64), data_id=st.integers(0, 0xFFFF))
 def test_the_profile_5_crc_equals_cantools(payload: bytes, data_id: int) -> None:
-    assert crc16(payload, data_id.to_bytes(2, "little")) == compute_profile5_crc(payload, data_id)
+    assert crc16(payload, 0, data_id.to_bytes(2, "little")) == compute_profile5_crc(payload, data_id)
 
 
 @pytest.mark.parametrize(
@@ -95,7 +93,7 @@ def test_the_profile_5_crc_equals_cantools(payload: bytes, data_id: int) -> None
 def test_the_profile_2_crc_is_that_of_the_standard_crc_library(covered: str, crc: int) -> None:
     # AUTOSAR SWS CRC Library, table of Crc_CalculateCRC8H2F: the last byte stands where the data id is
     data = bytes.fromhex(covered)
-    assert crc8(b"\0" + data[:-1], data[-1]) == crc
+    assert crc8(b"\0" + data[:-1], 0, data[-1:]) == crc
 
 
 @pytest.mark.parametrize(
@@ -114,20 +112,20 @@ def test_the_profile_2_crc_is_that_of_the_standard_crc_library(covered: str, crc
 def test_the_profile_5_crc_is_that_of_the_standard_crc_library(covered: str, crc: int) -> None:
     # AUTOSAR SWS CRC Library, table of Crc_CalculateCRC16: the last two bytes stand where the data id is
     data = bytes.fromhex(covered)
-    assert crc16(b"\0\0" + data[:-2], data[-2:]) == crc
+    assert crc16(b"\0\0" + data[:-2], 0, data[-2:]) == crc
 
 
 def test_the_profile_5_example_of_the_standard_comes_out() -> None:
     # AUTOSAR FO PRS E2E Protocol, Profile 5 protocol examples, "short": data id 0x1234, counter 0, 8 bytes of zero
-    assert Profile5Sender(b"\x34\x12").protect(bytearray(8)).hex() == "1cca000000000000"
+    assert E2eSender(P05, b"\x34\x12").protect(bytearray(8)).hex() == "1cca000000000000"
 
 
 @pytest.mark.parametrize(
     ("sender", "sent"),
     [
-        (Profile2Sender(DATA_IDS), ["575001020304", "2c5101020304", "1d5201020304"]),
+        (E2eSender(P02, DATA_IDS), ["575001020304", "2c5101020304", "1d5201020304"]),
         (
-            Profile5Sender(b"\x34\x12"),
+            E2eSender(P05, b"\x34\x12"),
             ["cad60050010203040506070a", "bfd50150010203040506070a", "20d00250010203040506070a"],
         ),
     ],

@@ -14,15 +14,16 @@ import pytest
 from adacd_hil.wire.e2e import (
     PROFILE_2_TOLERANCE,
     PROFILE_5_TOLERANCE,
+    PROFILES,
     E2eReceiver,
+    E2eSender,
     E2eStatus,
-    Profile2Receiver,
-    Profile2Sender,
-    Profile5Receiver,
-    Profile5Sender,
+    ProtectedReceiver,
+    Protection,
     Tolerance,
 )
 
+P02, P05 = PROFILES[Protection.PROFILE_2], PROFILES[Protection.PROFILE_5]
 DATA_IDS = bytes.fromhex("f5ddf3da0f18165dd62cbdd0acdb4f41")
 DATA_ID = b"\x86\x8e"
 LENGTH = 6
@@ -188,7 +189,7 @@ STATUS = {
 }
 
 
-def row_of_frames(sender: Profile2Sender | Profile5Sender, modulus: int) -> tuple[list[bytes], list[bytes]]:
+def row_of_frames(sender: E2eSender, modulus: int) -> tuple[list[bytes], list[bytes]]:
     """Return the frame of each counter, and the same with a CRC that is wrong."""
     good = [sender.protect(bytearray(LENGTH)) for _ in range(modulus)]
     return good, [bytes([frame[0] ^ 0xFF]) + frame[1:] for frame in good]
@@ -216,23 +217,23 @@ class Bench:
         self.found.append((status, STATUS[self.reference.check(event.is_new, counter, event.is_crc_ok)]))
 
 
-P02_FRAMES = row_of_frames(Profile2Sender(DATA_IDS), 16)
-P05_FRAMES = row_of_frames(Profile5Sender(DATA_ID), 256)
+P02_FRAMES = row_of_frames(E2eSender(P02, DATA_IDS), 16)
+P05_FRAMES = row_of_frames(E2eSender(P05, DATA_ID), 256)
 
 
 def p02(tolerance: Tolerance) -> Bench:
     reference = StandardP02(tolerance.max_delta, tolerance.max_missing, tolerance.sync_frames)
-    return Bench(Profile2Receiver(DATA_IDS, LENGTH, tolerance), reference, P02_FRAMES)
+    return Bench(ProtectedReceiver(P02, DATA_IDS, LENGTH, tolerance), reference, P02_FRAMES)
 
 
 def p05(tolerance: Tolerance) -> Bench:
     reference = SyncedP05(StandardP05(tolerance.max_delta), tolerance.max_missing, tolerance.sync_frames)
-    return Bench(Profile5Receiver(DATA_ID, LENGTH, tolerance), reference, P05_FRAMES)
+    return Bench(ProtectedReceiver(P05, DATA_ID, LENGTH, tolerance), reference, P05_FRAMES)
 
 
 def p05_without_sync(tolerance: Tolerance) -> Bench:
     endless = Tolerance(tolerance.max_delta, max_missing=1_000_000, sync_frames=0)
-    return Bench(Profile5Receiver(DATA_ID, LENGTH, endless), StandardP05(tolerance.max_delta), P05_FRAMES)
+    return Bench(ProtectedReceiver(P05, DATA_ID, LENGTH, endless), StandardP05(tolerance.max_delta), P05_FRAMES)
 
 
 BEFORE = {
