@@ -29,7 +29,8 @@ from adacd_hil.given_path import WrittenPath
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import apply_settings, parse_changes, parse_variations
 from adacd_hil.wire.codec import CodecError
 from adacd_hil.wire.dbc_contract import load_codec

@@ -10,7 +10,7 @@ from rig import CycleRig, Rig, SessionRig, scripted
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import FaultReason, SchemeState
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.bus import BusError, Frame
 from firmware_sim.scenario.scenario import Scenario
 

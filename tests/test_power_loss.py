@@ -6,8 +6,8 @@ from rig import play_lockstep
 
 from adacd_hil.log.reader import RunLog
 from adacd_hil.settings.arm_settings import LockstepSettings
+from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
-from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Frame
 from firmware_sim.scenario.scenario import Scenario
 

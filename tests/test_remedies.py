@@ -13,7 +13,8 @@ from adacd_hil.extras import install_command
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import SUCCESSORS, ConfigError, parse
+from adacd_hil.settings.parsing import SUCCESSORS, parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import apply_settings
 
 KEYS = ("a_rad_s", "b_rad_s", "threshold_Nm", "torque_limit_Nm", "torque_rate_limit_Nm_s", "Kp", "Kd", "condition")

@@ -12,7 +12,8 @@ import pytest
 from adacd_hil import scheduling
 from adacd_hil.scheduling import RealtimeRequest, isolated_cpus, request_realtime
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 
 ASKING = """
 import json, os, subprocess, sys

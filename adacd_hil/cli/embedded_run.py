@@ -18,8 +18,8 @@ from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.score.emulator_truth import config_digest
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import configuration_layers, load_settings, resolved_table
+from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import RequestSettings
-from adacd_hil.settings.schema import parse
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.embedded_bus import EmbeddedBus

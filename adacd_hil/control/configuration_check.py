@@ -10,7 +10,8 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import load_profile
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import explain_unknown, known_keys, value_of
 from adacd_hil.settings.toml_files import builtin_names
 from adacd_hil.wire.budget import describe_excess

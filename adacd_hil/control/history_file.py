@@ -24,8 +24,9 @@ from adacd_hil.log.log_files import HISTORY_NAME
 from adacd_hil.records import Event
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import HISTORY_LARGEST, HistorySettings
-from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.settings.toml_files import parse_toml, to_toml
 
 HISTORY_FORMAT = 1

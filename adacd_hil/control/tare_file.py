@@ -20,8 +20,9 @@ from adacd_hil.file_replacement import replacing
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.records import JOINTS, Event
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import TareSettings
-from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.settings.toml_files import read_toml, to_toml
 
 TARE_FORMAT = 1

@@ -10,7 +10,8 @@ from pathlib import Path
 from adacd_hil.device.profile import PlacedDevice, ProfileSettings, place_devices
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml, to_toml
 
 

@@ -21,7 +21,8 @@ from adacd_hil.device.drive_units import LEAST_INCREMENTS
 from adacd_hil.records import JOINTS
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
 from adacd_hil.wire.dbc_contract import contract_folder
 from adacd_hil.wire.e2e import PROFILES_BY_CODE

@@ -18,7 +18,7 @@ from adacd_hil.log.log_files import CONFIG_NAME, LogError
 from adacd_hil.records import SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import with_todays_keys
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 

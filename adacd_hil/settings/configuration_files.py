@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 from adacd_hil.file_access import exists
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.schema import WITHDRAWN, ConfigError, parse
+from adacd_hil.settings.parsing import WITHDRAWN, parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import builtin_folder, builtin_names, find_toml, read_toml
 
 _LONGEST_CHAIN = 8

@@ -17,7 +17,8 @@ from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, Sign
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import NOT_VALID
 from adacd_hil.wire.dbc_contract import contract_folder

@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 from typing import Any
 
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import to_short_toml, to_toml
 from adacd_hil.wire.codec import Codec
 from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS, FaultPlan

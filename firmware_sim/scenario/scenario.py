@@ -32,7 +32,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from adacd_hil.records import FaultReason, Vector
-from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
 from firmware_sim.arm.arms import ARMS, STRAIGHT, EmulatedArm, Wiring
 from firmware_sim.arm.hardware_settings import (

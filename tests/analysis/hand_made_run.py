@@ -22,7 +22,7 @@ from adacd_hil.records import (
 )
 from adacd_hil.scheme.pipeline.pipeline import layout_of
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 
 CAD_THETA = (0.1786065, 0.036855, 0.0189645, 0.0, 0.0, 0.0, 0.0)
 THETA = (0.2, 0.04, 0.02, 0.03, 0.015, 0.0375, 0.025)

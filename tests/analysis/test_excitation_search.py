@@ -14,8 +14,9 @@ from adacd_hil.scheme.kernel.certified_memory import constants_of
 from adacd_hil.scheme.model.regressor import regressor
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import ExcitationSettings, TrajectorySettings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.schema import ConfigError
 
 TWO = ((-0.04, 0.01), (-0.04, 0.01))
 NO_SINE = ((0.0, 0.0), (0.0, 0.0))

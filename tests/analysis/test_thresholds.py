@@ -26,7 +26,7 @@ from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, compute_thr
 from adacd_hil.log.log_files import LogError
 from adacd_hil.plain_values import plain_values
 from adacd_hil.records import SchemeState
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.toml_files import read_toml
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")

@@ -12,7 +12,7 @@ from rig import Rig
 
 from adacd_hil.clock import Clock
 from adacd_hil.log.reader import RunLog, read_log
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.bus import Bus
 from firmware_sim.scenario.scenario import Scenario
 

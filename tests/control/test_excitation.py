@@ -5,7 +5,7 @@ import numpy as np
 from adacd_hil.control.motions import Excitation
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 
 SETTINGS = load_settings("certified", "P")
 PERIOD_S = SETTINGS.excitation.period_s

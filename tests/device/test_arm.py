@@ -10,7 +10,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import describe_checks, describe_excess, describe_faults
 from adacd_hil.records import ArmCommand, FaultReason
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.e2e import E2eSender

@@ -13,7 +13,8 @@ from adacd_hil.device.contract import compose, load_contract
 from adacd_hil.device.profile import place_devices
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 
 DRIVE_PROFILE = Path(adacd_hil.__file__).parent / "device_profiles" / "adacd-drive.toml"

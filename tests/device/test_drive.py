@@ -20,7 +20,7 @@ from adacd_hil.device.drive import (
 from adacd_hil.device.profile import load_profile
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.codec import Codec, CodecError
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
 from adacd_hil.wire.e2e import E2eStatus

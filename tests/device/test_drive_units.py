@@ -7,7 +7,8 @@ import pytest
 from adacd_hil.device.drive_units import DriveUnits, name_velocity_unit, read_drive_units
 from adacd_hil.device.profile import ProfileSettings, ScaleSettings, enable_timeout_s
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 
 RPM, MILLI_RPM, INCREMENTS_S, DEG_S = 0x00B44700, 0xFDB44700, 0x00B50300, 0x00410300
 

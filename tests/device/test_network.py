@@ -11,7 +11,7 @@ from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.bus import Frame
 
 pytestmark = pytest.mark.slow

@@ -11,7 +11,8 @@ from adacd_hil.device.canopen_bus import read_eds
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.profile import ProfileSettings, load_profile, profile_names
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml, to_short_toml, to_toml
 from adacd_hil.wire.dbc_contract import contract_folder
 

@@ -18,7 +18,8 @@ from adacd_hil.device.profile import ProfileSettings
 from adacd_hil.device.value_bounds import ValueBound
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import FaultReason, SchemeState
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.dbc_contract import contract_folder
 

@@ -9,7 +9,7 @@ import canopen
 import numpy as np
 
 from adacd_hil.records import TRUTH_LAYOUT
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from firmware_sim.arm.sensing import DriveMode

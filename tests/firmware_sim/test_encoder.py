@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from general_arm import BRAKE, OFF, TORQUE, truth_of
 
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from firmware_sim.arm.hardware_settings import SensorSettings
 from firmware_sim.body.body import Body
 from firmware_sim.body.sensors import NOISE_TICKS, encoder_numbers, read_angle

@@ -2,7 +2,7 @@
 
 import pytest
 
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from firmware_sim.scenario.scenario import ExpectSettings, Scenario, ScenarioOutcome, deviations
 
 EXPECTED = ExpectSettings(

@@ -6,7 +6,8 @@ import pytest
 from bench_host import CODEC, quiet_scenario
 from test_faults import UNTIMED, example
 
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.time_marks import NEVER_NS

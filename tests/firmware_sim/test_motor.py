@@ -8,7 +8,7 @@ import pytest
 from bench_host import BenchHost, State, Word, quiet_scenario
 from general_arm import BRAKE, OFF, TORQUE, truth_of
 
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from firmware_sim.arm.hardware_settings import DriveSettings
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.body.body import Body

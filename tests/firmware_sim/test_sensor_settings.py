@@ -10,7 +10,7 @@ import pytest
 from general_arm import TORQUE
 
 from adacd_hil.records import TRUTH_LAYOUT
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.toml_files import to_toml
 from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,

@@ -9,7 +9,7 @@ from bench_host import BenchHost, Nmt, quiet_scenario
 from general_arm import OFF
 from scipy import signal
 
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from firmware_sim.arm.hardware_settings import SensorSettings
 from firmware_sim.arm.sensing import TORQUE_LSB_NM, TorqueNoise
 from firmware_sim.arm.touch_settings import TICK_S

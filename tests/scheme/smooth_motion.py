@@ -7,7 +7,7 @@ from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings, merge
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 
 PLACES = scheme_layout(7).slices
 

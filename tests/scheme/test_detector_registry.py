@@ -10,7 +10,8 @@ from adacd_hil.lab.detectors import detector_registry
 from adacd_hil.lab.detectors.detectors import DetectorBankSettings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings, with_todays_keys
-from adacd_hil.settings.schema import ConfigError, DetectorError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError, DetectorError
 from adacd_hil.settings.setting_keys import apply_settings
 
 EXAMPLE = ROOT / "docs/examples/detector"

@@ -6,7 +6,8 @@ from adacd_hil.records import PARAMETER_NAMES, PARAMETER_UNITS, SchemeState, cer
 from adacd_hil.scheme.kernel import certified_memory
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings, merge, with_todays_keys
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.scheme_settings import FRICTION_TERMS
 from adacd_hil.settings.toml_files import parse_toml, to_toml
 

@@ -7,7 +7,8 @@ import pytest
 
 from adacd_hil.lab.commission.arm_draft import draw_arm
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 
 WITH_GRAVITY = {"estimator": {"gravity": True}}
 

@@ -14,7 +14,8 @@ from adacd_hil.device.profile import load_profile
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml, read_toml
 from firmware_sim.scenario.scenario import load_scenario
 

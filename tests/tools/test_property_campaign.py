@@ -19,7 +19,7 @@ from wire_record import Passed, WireRecord
 
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.dbc_contract import contract_folder
 from firmware_sim.scenario.scenario import Scenario
 

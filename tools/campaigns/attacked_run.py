@@ -25,8 +25,8 @@ from adacd_hil.log.types.topics import EVENTS, SCHEME
 from adacd_hil.records import TRUTH_LAYOUT, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
-from adacd_hil.settings.schema import parse
 from adacd_hil.wire.bus import Bus, Frame
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import Scenario

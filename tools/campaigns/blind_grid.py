@@ -35,8 +35,8 @@ from adacd_hil.cli.output import format_table
 from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
-from adacd_hil.settings.schema import parse
 from firmware_sim.scenario.scenario import Scenario
 
 PLACES = (

@@ -31,7 +31,7 @@ from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, fill_sample
 from adacd_hil.scheme.supervisor import transitions
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings, merge
-from adacd_hil.settings.schema import parse
+from adacd_hil.settings.parsing import parse
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.arm.touch_settings import ticks
 from firmware_sim.body.body import Body

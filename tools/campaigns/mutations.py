@@ -16,7 +16,8 @@ from mcap.writer import CompressionType, Writer
 
 from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.control.history_file import CertificateRecord, devices_digest
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml
 
 Mutation = Callable[[bytes, random.Random], bytes]

@@ -15,7 +15,8 @@ from witnessed_run import User
 from adacd_hil.records import QUINTIC_PEAK_SPEED, Request
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import to_toml
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.dbc_contract import load_codec

@@ -62,7 +62,7 @@ def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tupl
     from adacd_hil.control.configuration_check import origins_of
     from adacd_hil.settings.configuration import Settings
     from adacd_hil.settings.configuration_files import configuration_layers, resolved_table
-    from adacd_hil.settings.schema import parse
+    from adacd_hil.settings.parsing import parse
     from adacd_hil.settings.setting_keys import apply_settings, in_words, parse_changes, value_of
 
     layers = configuration_layers(name, profile)

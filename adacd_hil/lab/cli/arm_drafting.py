@@ -47,7 +47,8 @@ from adacd_hil.lab.serial_arm.urdf import UrdfError
 from adacd_hil.log.recording.run_folder import is_there
 from adacd_hil.printable import in_line
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
-from adacd_hil.settings.schema import ConfigError, bounds_of, parse
+from adacd_hil.settings.parsing import bounds_of, parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import known_keys
 from adacd_hil.wire.can_interface import can_interfaces, read_link
 from adacd_hil.wire.open_bus import open_bus

@@ -27,8 +27,9 @@ from adacd_hil.printable import one_line
 from adacd_hil.records import GRAVITY_M_S2, JOINTS, Vector
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
 from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.settings.parsing import bounds_of, parse
 from adacd_hil.settings.run_settings import SafetySettings, TrajectorySettings
-from adacd_hil.settings.schema import ConfigError, bounds_of, parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import known_keys
 from adacd_hil.settings.toml_files import toml_value
 

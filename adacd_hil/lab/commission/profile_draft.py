@@ -28,7 +28,8 @@ from adacd_hil.device.profile import (
     load_profile,
     profile_names,
 )
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.wire.contract_frames import NOT_VALID
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES

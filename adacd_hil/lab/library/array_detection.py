@@ -32,7 +32,8 @@ from adacd_hil.records import Vector
 from adacd_hil.remedies import nearest_name
 from adacd_hil.score.wording import number_of
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.schema import ConfigError, parse
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError
 
 FIT_SHARE: Final = 0.4
 """Share of the arrays, from the beginning, that is taken for free motion by default."""

@@ -15,7 +15,8 @@ from adacd_hil.file_access import read_input
 from adacd_hil.lab.serial_arm.offline import OfflineSettings
 from adacd_hil.lab.serial_arm.urdf import STANDARD_GRAVITY_M_S2, SerialArm, UrdfError, read_urdf
 from adacd_hil.records import Vector
-from adacd_hil.settings.schema import ConfigError, parse, setting
+from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.settings.toml_files import read_toml
 
 ISO = "iso"

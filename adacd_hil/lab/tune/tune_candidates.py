@@ -27,7 +27,8 @@ from adacd_hil.records import JOINTS, Vector
 from adacd_hil.replay.replay import Watch, replay_many
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.schema import ConfigError, bounds_of
+from adacd_hil.settings.parsing import bounds_of
+from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.scheme_settings import CertifiedSettings, DetectorSettings
 from adacd_hil.settings.setting_keys import apply_settings
 
