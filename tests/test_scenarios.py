@@ -9,7 +9,7 @@ from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.lab.cli.demo_command import outcome_of
 from adacd_hil.log.reader import read_log
 from adacd_hil.settings.parsing import parse
-from adacd_hil.settings.toml_files import to_short_toml, to_toml
+from adacd_hil.settings.toml_text import to_short_toml, to_toml
 from firmware_sim.scenario.faults import KINDS
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, deviations, load_scenario
 

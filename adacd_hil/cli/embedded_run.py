@@ -20,7 +20,7 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import configuration_layers, load_settings, resolved_table
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import RequestSettings
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench

@@ -27,7 +27,8 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import HISTORY_LARGEST, HistorySettings
 from adacd_hil.settings.schema import ConfigError, setting
-from adacd_hil.settings.toml_files import parse_toml, to_toml
+from adacd_hil.settings.toml_files import parse_toml
+from adacd_hil.settings.toml_text import to_toml
 
 HISTORY_FORMAT = 1
 _FUTURE_NS = 360_000_000_000

@@ -23,7 +23,8 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import TareSettings
 from adacd_hil.settings.schema import ConfigError, setting
-from adacd_hil.settings.toml_files import read_toml, to_toml
+from adacd_hil.settings.toml_files import read_toml
+from adacd_hil.settings.toml_text import to_toml
 
 TARE_FORMAT = 1
 SMALLEST_STD_NM = 0.001

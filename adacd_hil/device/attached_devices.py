@@ -12,7 +12,8 @@ from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import parse_toml, to_toml
+from adacd_hil.settings.toml_files import parse_toml
+from adacd_hil.settings.toml_text import to_toml
 
 
 def device_attachments(settings: Settings) -> dict[str, bytes]:

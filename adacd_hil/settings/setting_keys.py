@@ -17,7 +17,8 @@ from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import describe_gone, parse
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import parse_toml, to_toml
+from adacd_hil.settings.toml_files import parse_toml
+from adacd_hil.settings.toml_text import to_toml
 
 
 class KnownKey(NamedTuple):

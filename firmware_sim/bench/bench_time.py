@@ -26,7 +26,7 @@ from adacd_hil.log.log_files import SCENARIO_NAME, find_parts
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_truth
 from adacd_hil.records import TRUTH_LAYOUT, Event, Vector
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.time_marks import NEVER_NS, MarkKind, unpack_mark
 from firmware_sim.bench.bench_nodes import TICK_NS, BenchNodes
 from firmware_sim.bench.injector import Injector, Outbox

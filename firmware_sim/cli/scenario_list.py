@@ -5,7 +5,7 @@ from typing import Any
 
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import to_short_toml, to_toml
+from adacd_hil.settings.toml_text import to_short_toml, to_toml
 from adacd_hil.wire.codec import Codec
 from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS, FaultPlan
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario, read_table

@@ -16,7 +16,7 @@ from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
 from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.score.emulator_truth import TruthTable, config_digest, contacts_beside, foreign_truth
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.scenario.scenario import load_scenario
 

@@ -15,7 +15,7 @@ from adacd_hil.log.log_files import LogError
 from adacd_hil.records import ContactReport
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import apply_settings
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 
 SETTINGS = load_settings("paper")
 

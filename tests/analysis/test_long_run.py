@@ -26,7 +26,7 @@ from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import CycleRecord, FaultReason, SchemeState
 from adacd_hil.score import emulator_truth
 from adacd_hil.score.emulator_truth import TruthTable, read_truth
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 
 
 def table_of(read):

@@ -24,7 +24,7 @@ from adacd_hil.replay.replayed_outcome import Replay, side_by_side
 from adacd_hil.score.emulator_truth import contacts_beside
 from adacd_hil.score.judge import Score
 from adacd_hil.settings.setting_keys import apply_settings
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from firmware_sim.bench.bench_time import TruthLog
 
 pytestmark = pytest.mark.slow

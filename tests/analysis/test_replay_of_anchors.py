@@ -15,7 +15,7 @@ from adacd_hil.replay.replayed_outcome import side_by_side
 from adacd_hil.scheme.identify import anchor
 from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
 from adacd_hil.settings.setting_keys import apply_settings
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 

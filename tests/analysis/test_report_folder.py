@@ -8,7 +8,7 @@ import pytest
 from called import called
 from hand_made_run import A, M, make_run, record
 
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 
 pytestmark = pytest.mark.slow
 

@@ -26,7 +26,7 @@ from adacd_hil.lab.score.verdict import headlines
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 
 pytestmark = pytest.mark.slow
 SOURCE = ReportSource("run.mcap")

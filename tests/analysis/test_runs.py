@@ -33,7 +33,7 @@ from adacd_hil.lab.runs.run_trend import trends
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 
 pytestmark = pytest.mark.slow
 

@@ -49,7 +49,7 @@ from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import apply_settings
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from firmware_sim.scenario.scenario import load_scenario
 
 M, A = SchemeState.MONITOR, SchemeState.ADAPT

@@ -25,7 +25,8 @@ from adacd_hil.dates import date_ns
 from adacd_hil.device.network import Identity
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import parse_toml, to_toml
+from adacd_hil.settings.toml_files import parse_toml
+from adacd_hil.settings.toml_text import to_toml
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,7 @@ from adacd_hil.device.attached_devices import device_attachments, with_attached_
 from adacd_hil.device.profile import load_profile, place_devices
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.dbc_contract import contract_folder
 
 

@@ -13,7 +13,8 @@ from adacd_hil.device.profile import ProfileSettings, load_profile, profile_name
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import parse_toml, to_short_toml, to_toml
+from adacd_hil.settings.toml_files import parse_toml
+from adacd_hil.settings.toml_text import to_short_toml, to_toml
 from adacd_hil.wire.dbc_contract import contract_folder
 
 SENSOR = """

@@ -20,7 +20,7 @@ from adacd_hil.log.reader import read_log
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.dbc_contract import contract_folder
 
 DEVICES = '[devices]\ndrive = ["drive.toml", "drive.toml"]\nsensor = ["sensor.toml", "sensor.toml"]\n'

@@ -6,7 +6,7 @@ import pytest
 
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.dbc_contract import load_codec
 from firmware_sim.scenario.faults import KINDS, MOST_ROWS, FaultSettings, device_ids, own_messages
 from firmware_sim.scenario.scenario import Scenario

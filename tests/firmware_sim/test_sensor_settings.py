@@ -11,7 +11,7 @@ from general_arm import TORQUE
 
 from adacd_hil.records import TRUTH_LAYOUT
 from adacd_hil.settings.parsing import parse
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     VELOCITY_LSB_RAD_S,

@@ -9,7 +9,8 @@ from adacd_hil.settings.configuration_files import load_settings, merge, with_to
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.scheme_settings import FRICTION_TERMS
-from adacd_hil.settings.toml_files import parse_toml, to_toml
+from adacd_hil.settings.toml_files import parse_toml
+from adacd_hil.settings.toml_text import to_toml
 
 SEVEN = [0.1] * 7
 AT_REST = {"period_s": 2.0, "cosine": [[0.1], [0.2]], "sine": [[0.0], [0.0]]}

@@ -16,7 +16,7 @@ from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME
 from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.dbc_contract import contract_folder
 from firmware_sim.scenario.scenario import builtin_scenarios
 

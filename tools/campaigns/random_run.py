@@ -17,7 +17,7 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.dbc_contract import load_codec
 from firmware_sim.arm.touch_settings import BODY_REGIONS

@@ -34,7 +34,7 @@ from adacd_hil.plain_values import plain_values
 from adacd_hil.records import FaultReason
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.bus import BusError, Tap
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_attributes import read_bitrates

@@ -10,7 +10,8 @@ from adacd_hil.lab.tune.excitation_search import NoExcitationError, Search
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import ExcitationSettings
-from adacd_hil.settings.toml_files import builtin_names, to_toml
+from adacd_hil.settings.toml_files import builtin_names
+from adacd_hil.settings.toml_text import to_toml
 
 _LABELS = (
     ("excitation_Nm2s", "smallest eigenvalue, Nm² s", "{:.3g}"),

@@ -14,7 +14,7 @@ from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
-from adacd_hil.settings.toml_files import toml_value
+from adacd_hil.settings.toml_text import toml_value
 
 if TYPE_CHECKING:
     from adacd_hil.lab.offline.recording_identification import Identified, Watched

@@ -31,7 +31,7 @@ from adacd_hil.lab.cli.runs_command import runs, trend
 from adacd_hil.lab.cli.sweep_command import sweep
 from adacd_hil.lab.cli.tune_command import tune
 from adacd_hil.log.log_files import TARE_NAME
-from adacd_hil.settings.toml_files import to_toml
+from adacd_hil.settings.toml_text import to_toml
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection

@@ -31,7 +31,7 @@ from adacd_hil.settings.parsing import bounds_of, parse
 from adacd_hil.settings.run_settings import SafetySettings, TrajectorySettings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import known_keys
-from adacd_hil.settings.toml_files import toml_value
+from adacd_hil.settings.toml_text import toml_value
 
 Pair = tuple[float, float]
 _PARALLEL = math.cos(math.radians(2.0))

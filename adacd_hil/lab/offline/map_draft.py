@@ -20,7 +20,7 @@ from adacd_hil.lab.serial_arm.urdf import SerialArm, UrdfError, read_urdf
 from adacd_hil.log.log_files import LogError
 from adacd_hil.records import Vector
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_files import toml_value
+from adacd_hil.settings.toml_text import toml_value
 
 _FINGERS: Final = re.compile(r"finger|gripper|claw|knuckle|jaw", re.IGNORECASE)
 _BEYOND: Final = 1.5
