@@ -47,10 +47,14 @@ def setting(
     low: float = -math.inf,
     high: float = math.inf,
     choices: tuple[str, ...] = (),
+    is_hex: bool = False,
     meaning: str,
 ) -> Any:
-    """Return the field of one setting, required if it has no default. Bounds are inclusive and hold in tuples, too."""
-    metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "meaning": meaning}
+    """Return the field of one setting, required if it has no default. Bounds are inclusive and hold in tuples, too.
+
+    is_hex: an integer that everybody writes in hexadecimal, such as an index; messages do, too.
+    """
+    metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "is_hex": is_hex, "meaning": meaning}
     if isinstance(default, type):
         return dataclasses.field(default_factory=default, metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)
@@ -180,7 +184,8 @@ def _check_bounds(value: float, key: str, metadata: Any) -> None:
         (value > metadata["high"], "above", metadata["high"]),
     ):
         if is_outside:
-            raise ConfigError(f"`{key}` = {value}{unit} is {word} {bound:g}{unit}{_other_unit(value, metadata)}")
+            shown, limit = (f"0x{value:X}", f"0x{bound:X}") if metadata["is_hex"] else (str(value), f"{bound:g}")
+            raise ConfigError(f"`{key}` = {shown}{unit} is {word} {limit}{unit}{_other_unit(value, metadata)}")
 
 
 _OTHER_UNITS = {
