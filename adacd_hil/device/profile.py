@@ -456,6 +456,12 @@ class PlacedDevice:
         """Return whether the EDS lists an object. Raises ConfigError when the EDS can't be read."""
         return find_variable(self.objects, index, sub) is not None
 
+    @property
+    def is_heartbeat_known(self) -> bool:
+        """Whether the host can set the period of its heartbeat, 0x1017, and so knows when one is overdue."""
+        variable = find_variable(self.objects, 0x1017, 0)
+        return variable is not None and variable.is_writable
+
     def can(self, feature: str) -> bool:
         """Return whether the profile names a feature."""
         return feature in self.settings.features
