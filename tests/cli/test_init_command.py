@@ -46,6 +46,7 @@ URDF = """<robot name="lab">
 
 
 INT32 = ("--sensor", "int32-sensor", "int32-sensor")
+MIXED = ("--drive", "maxon-epos4", "stock-drive")
 
 
 @pytest.fixture
@@ -80,8 +81,9 @@ def urdf(folder: Path, axis: str = "0 0 1", wrist: str = "fixed") -> Path:
         ((*NO_BUS, "--mounting", "flor"), "'flor' must be flat, floor"),
         ((*NO_BUS, "--mounting", "100"), "0 to 90 deg"),
         ((*NO_BUS, "--eds", "float.eds"), "its 0x6130:1 is a float, which no frame of a cycle can hold"),
-        ((*NO_BUS, "--gear", "3", "3"), "--gear: profile adacd-drive has its own `scale.gear_ratio`"),
-        ((*NO_BUS, *INT32, "--torque-count-nm", "1e-3", "1e-3"), "profile int32-sensor has its own `scale.torque_Nm`"),
+        ((*NO_BUS, "--gear", "3", "3"), "profile adacd-drive of joint 1 has its own `scale.gear_ratio` = 1;"),
+        ((*NO_BUS, *MIXED, "--gear", "100", "100"), "--gear: profile stock-drive of joint 2 has its own `scale.gear_r"),
+        ((*NO_BUS, *INT32, "--torque-count-nm", "1e-3", "1e-3"), "profile int32-sensor of joint 1 has its own"),
         (("--from", ".", "--length-m", "1", "1"), "leave out --length-m"),
     ],
 )

@@ -54,6 +54,8 @@ from adacd_hil.wire.open_bus import open_bus
 Pair = tuple[float, float]
 _PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
 _NO_BUS = "none"
+_SHOWN_SHARE = 1e-5
+"""Relative difference of a value as it was given and as a profile has it, by the digits that are written."""
 
 
 @dataclass(frozen=True)
@@ -181,8 +183,8 @@ class Drafting:
         options = self.options
         drives, sensors = self._find_devices()
         drive, sensor = self._profiles(drives, sensors)
+        profiles = [self._profile(DRIVE, drive.value[joint], joint) for joint in range(2)]
         self._check_used({DRIVE: drive.value, SENSOR: sensor.value})
-        profiles = [self._drive_profile(drive.value[joint], joint) for joint in range(2)]
         scales = [profile.scale for profile in profiles]
         geometry, length_source, mass_source, gravity_source = self._ask_geometry()
         ratings = [device.ratings for device in drives]
@@ -225,23 +227,38 @@ class Drafting:
         )
 
     def _check_used(self, names: dict[str, Any]) -> None:
-        """Raise CommandError for a given value of a scale that no profile leaves open; names: profiles by kind."""
+        """Raise CommandError for a given value of a scale that a joint's profile doesn't have; names: profiles by kind.
+
+        A unit is enough in one of both profiles; that of velocity counts as taken once it was asked for.
+        """
         for question in _QUESTIONS:
-            if question.given(self.options) is not None and question.option not in self._answers:
-                option, profiles = question.option.split()[0], " and ".join(dict.fromkeys(names[question.kind]))
+            if (given := question.given(self.options)) is None:
+                continue
+            key = question.key.partition(".")[2]
+            owned = [getattr(self._profile(question.kind, names[question.kind][i], i).scale, key) for i in range(2)]
+            wrong = [
+                joint
+                for joint, value in enumerate(question.read(given))
+                if not math.isclose(value, owned[joint], rel_tol=_SHOWN_SHARE)
+            ]
+            if question.answer == "velocity_unit" and question.option in self._answers:
+                wrong = []
+            if len(wrong) > (1 if question.units else 0):
+                joint = wrong[0]
                 raise CommandError(
-                    f"{option}: profile {profiles} has its own `{question.key}`; correct it in a profile that "
-                    f"`extends` that one, or give the EDS, --{question.kind}-eds FILE",
+                    f"{question.option.split()[0]}: profile {names[question.kind][joint]} of joint {joint + 1} has its "
+                    f"own `{question.key}` = {owned[joint]:g}; correct it in a profile that `extends` that one, or "
+                    f"give the EDS, --{question.kind}-eds FILE",
                     ExitCode.USAGE,
                 )
 
-    def _drive_profile(self, name: str, joint: int) -> ProfileSettings:
-        draft = self._drafts.get((DRIVE, joint))
+    def _profile(self, kind: str, name: str, joint: int) -> ProfileSettings:
+        draft = self._drafts.get((kind, joint))
         if draft is not None:
             return draft.settings
         path = Path(name)
         there = name if name in profile_names() or path.is_absolute() else str(self.writing.out.parent / path)
-        return load_profile(there, DRIVE).settings
+        return load_profile(there, kind).settings
 
     def _profile_guesses(self, facts: ArmFacts) -> list[str]:
         """Return the guessed keys of the device profiles as "PROFILE: KEY", each once."""
