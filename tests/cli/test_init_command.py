@@ -4,6 +4,7 @@ import json
 import math
 import re
 import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -334,6 +335,20 @@ def test_profiles_are_drafted_from_eds_files_beside_the_configuration(out, tmp_p
     monkeypatch.chdir(tmp_path)  # the profiles are found from anywhere
     drafted, stock = (load_contract(load_settings(name)) for name in ("lab/my-arm.toml", "stock"))
     assert drafted.layout_digest == stock.layout_digest
+
+
+def test_two_eds_of_a_kind_are_of_joint_1_and_2_and_more_or_namesakes_are_refused(out, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        shutil.copy(contract_folder() / "stock_drive.eds", tmp_path / name / f"{name}.eds")
+    (tmp_path / "b" / "a.eds").write_text((tmp_path / "a" / "a.eds").read_text() + "\n")
+    first, second, namesake = (str(tmp_path / name) for name in ("a/a.eds", "b/b.eds", "b/a.eds"))
+    assert init(out, *NO_BUS, "--eds", first, "--eds", second).exit_code == 0
+    assert [Path(name).name for name in written(out).devices.drive] == ["my-arm-a.toml", "my-arm-b.toml"]
+    for eds in ((first, namesake), (first, second, first)):
+        refused = init(tmp_path / "another" / "arm.toml", *NO_BUS, *[word for one in eds for word in ("--eds", one)])
+        assert refused.exit_code == USAGE
+    assert not (tmp_path / "another").exists()
 
 
 def test_the_guessed_worth_of_a_count_lets_16_bits_carry_a_joint_s_torque(tmp_path, out):

@@ -108,9 +108,11 @@ class DraftFiles:
     def add_file(self, path: Path, content: str | bytes) -> None:
         """Add a file to those that `write_files` writes.
 
-        Raises CommandError if it exists with other content, unless `--force` is given.
+        Raises CommandError if it has other content, in these files or, unless `--force` is given, on the disk.
         """
         data = content.encode() if isinstance(content, str) else content
+        if self.contents.get(path, data) != data:
+            raise CommandError(f"{path} would get two contents, of files with one name: rename one", ExitCode.USAGE)
         if not (path.is_file() and path.read_bytes() == data):
             self.require_free(path)
         self.contents[path] = data
@@ -437,10 +439,12 @@ class Drafting:
     def _draft_profiles(self, devices: Sequence[RecognisedDevice]) -> dict[tuple[str, int], str]:
         """Draft profiles of each EDS, beside the configuration; return their names by kind and joint (0, 1).
 
-        devices: found on the bus, [] without a bus. Raises CommandError for an EDS that fits none of them.
+        devices: found on the bus; [] without a bus: of two EDS of a kind, the first is of joint 1. Raises CommandError
+        for an EDS that fits none of them, or that fits one which has another EDS already.
         """
         names: dict[tuple[str, int], str] = {}
-        for eds, kind in self._eds_files():
+        files = self._eds_files()
+        for place, (eds, kind) in enumerate(files):
             identity = identity_of(eds)
             same = [device for device in devices if device.kind == kind]
             fitting = [
@@ -448,6 +452,14 @@ class Drafting:
                 for joint in range(2)
                 if not same or is_of(identity, (same[joint].node.vendor, same[joint].node.product))
             ]
+            alike = [other for other, (_, its) in enumerate(files) if its == kind]
+            if not same and len(alike) > 1:
+                fitting = [alike.index(place)]
+            if any(joint > 1 or (kind, joint) in names for joint in fitting):
+                raise CommandError(
+                    f"EDS {eds}: the {kind} of joint {fitting[0] % 2 + 1} has one already; give one EDS for each joint",
+                    ExitCode.USAGE,
+                )
             if not fitting:
                 vendor, product = ("?" if number is None else f"0x{number:X}" for number in identity)
                 raise CommandError(
