@@ -15,6 +15,7 @@ from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.printable import in_line
+from adacd_hil.settings.arm_settings import MOST_BLIND_CYCLES
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.terminal import hurry
@@ -23,9 +24,6 @@ from adacd_hil.wire.can_interface import can_interfaces, is_virtual
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.dbc_decoder import DbcDecoder, load_decoder
 from adacd_hil.wire.open_bus import open_bus
-
-MOST_BLIND_CYCLES = 5
-"""Most cycles without data that are allowed on a real arm: half a degree at 100 deg/s and 1 ms."""
 
 
 def make_clock(name: str) -> Clock:

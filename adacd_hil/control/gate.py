@@ -4,7 +4,7 @@ import math
 from enum import IntFlag
 
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.settings.arm_settings import ArmSettings
+from adacd_hil.settings.arm_settings import MOST_BLIND_CYCLES, ArmSettings
 
 
 class GateFlag(IntFlag):
@@ -18,9 +18,6 @@ class GateFlag(IntFlag):
     HELD = 16  # the feedback is older than a cycle: the torque may fall and not grow
 
 
-KEPT_CYCLES = 5
-"""Age of the feedback, in cycles, up to which the torque is kept, the default of `data.blind_cycles`. A command from
-older feedback doesn't fit the present motion."""
 FADING = 0.8
 """Factor on the torque in each further cycle: 1 % is left after 20."""
 
@@ -37,7 +34,7 @@ class Gate:
         """Fill `tau_c` (2,) with the commanded torque for `tau_d` (2,), Nm; return the changes that were made.
 
         Torque drops to zero at once when the gate closes, and rises from zero at the limited rate when it opens. `age`:
-        of the feedback in cycles; beyond 1 the torque can't grow, beyond `KEPT_CYCLES` it fades.
+        of the feedback in cycles; beyond 1 the torque can't grow, beyond MOST_BLIND_CYCLES it fades.
         """
         desired = tau_d.tolist()
         if not all(map(math.isfinite, desired)):
@@ -49,7 +46,7 @@ class Gate:
             last, step, bound = self._last_Nm[joint], self._step_Nm[joint], self._limit_Nm[joint]
             wanted = desired[joint]
             if age > 1:
-                most = last if age <= KEPT_CYCLES else FADING * last
+                most = last if age <= MOST_BLIND_CYCLES else FADING * last
                 kept = min(max(wanted, min(most, 0.0)), max(most, 0.0))
                 flags |= GateFlag.HELD if kept != wanted else GateFlag.NONE
                 wanted = kept

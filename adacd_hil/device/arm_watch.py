@@ -211,9 +211,9 @@ class HeartbeatWatch:
 def watch_heartbeats(
     devices: Iterable[PlacedDevice], period_ms: int, report: Callable[[Event], None]
 ) -> HeartbeatWatch:
-    """Return a watch over the heartbeats of the devices whose EDS lists 0x1017."""
+    """Return a watch over the heartbeats of the devices whose EDS lets the host set their period."""
     return HeartbeatWatch(
-        [(device.name, device.node_id) for device in devices if device.has(0x1017)], period_ms, report
+        [(device.name, device.node_id) for device in devices if device.is_heartbeat_known], period_ms, report
     )
 
 

@@ -21,8 +21,8 @@ DISABLE_CYCLES = 20
 """Cycles of disabling at the end of a run: drives need two, the rest shows in the log that they did."""
 
 IMPLAUSIBLE_JUMP_RAD = PlausibilitySettings().position_jump_rad
-"""Position against velocity, per frame. The drive's velocity lags 1.6 ms, so 100 rad/s² leave 0.3 mrad; a flipped
-high bit of the unprotected frame is at least 0.1 rad."""
+"""Position against velocity, per frame. The drive's velocity lags 1.6 ms, so 100 rad/s² leave 0.16 mrad in 1 ms; a
+flipped high bit of the unprotected frame is at least 0.1 rad."""
 
 
 class Cia402State(IntEnum):

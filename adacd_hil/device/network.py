@@ -235,10 +235,11 @@ class Master(EventSource):
 
     def _set_up_heartbeats(self, slave: Slave) -> None:
         period_ms = self._settings.bus.heartbeat_ms
-        if slave.can_write(0x1017):
+        if slave.device.is_heartbeat_known:
             slave.write_checked(0x1017, 0, period_ms, "ms")
         else:
-            self.events.append(Event("warning", slave.name, "sends no heartbeat (0x1017 is not in its EDS)"))
+            why = "read-only" if slave.has(0x1017) else "not there"
+            self.events.append(Event("warning", slave.name, f"its heartbeat isn't watched: 0x1017 is {why} in its EDS"))
         if slave.can_write(0x1016, 1) and slave.device.can("heartbeat_consumer"):
             host = self._heartbeat_id & 0x7F
             entry = host << 16 | round(PATIENCE_PERIODS * period_ms)
@@ -275,7 +276,7 @@ class Master(EventSource):
         """Return the failures of the nodes' heartbeats now, one line per node; empty without a failure.
 
         A node fails if it is silent for 2.5 heartbeat periods or isn't OPERATIONAL, only between `start` and `stop`.
-        Nodes whose EDS doesn't list 0x1017 are not watched.
+        Nodes are not watched if their EDS doesn't let the host write 0x1017.
         """
         return self._heartbeats.judge_nodes(t_ns)
 

@@ -125,7 +125,7 @@ class PdoSettings:
 
     message: str = setting(choices=("Feedback", "Status", "Command", "Torque"), meaning="name in the contract")
     number: int = setting(low=1, high=512, meaning="1 is 0x1400 or 0x1800")
-    cob_id: int = setting(low=0x180, high=0x57F, meaning="identifier without the node id")
+    cob_id: int = setting(low=0x180, high=0x57F, is_hex=True, meaning="identifier without the node id")
     signals: tuple[SignalSettings, ...] = setting(meaning="mapped objects in order, the header apart")
     transmission: int = setting(1, low=0, high=255, meaning="1 on every SYNC, 254 and 255 on events")
     inhibit_100us: int = setting(0, unit="100 µs", low=0, high=0xFFFF, meaning="smallest distance of two frames")
@@ -456,6 +456,12 @@ class PlacedDevice:
     def has(self, index: int, sub: int = 0) -> bool:
         """Return whether the EDS lists an object. Raises ConfigError when the EDS can't be read."""
         return find_variable(self.objects, index, sub) is not None
+
+    @property
+    def is_heartbeat_known(self) -> bool:
+        """Whether the host can set the period of its heartbeat, 0x1017, and so knows when one is overdue."""
+        variable = find_variable(self.objects, 0x1017, 0)
+        return variable is not None and variable.is_writable
 
     def can(self, feature: str) -> bool:
         """Return whether the profile names a feature."""

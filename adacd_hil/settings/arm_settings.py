@@ -227,12 +227,17 @@ SHORTEST_DATA_WINDOW = 0.2
 """Smallest part of that time that is judged when the attempt ends in it."""
 
 
+MOST_BLIND_CYCLES = 5
+"""Cycles without data in which an arm may go on: half a degree at 100 deg/s and 1 ms. On a real arm no setting allows
+more; on an emulated one the gate lets the torque fade beyond, whatever `data.blind_cycles` says."""
+
+
 @dataclass(frozen=True)
 class DataSettings:
     """How much of the cyclic data may be missing. Shares are of the cycles of each second with enabled drives."""
 
     blind_cycles: int = setting(
-        5,
+        MOST_BLIND_CYCLES,
         low=2,
         high=1000,
         meaning="cycles in a row without a fresh sample that fault the run; at least `bus.max_age_cycles`",

@@ -146,7 +146,8 @@ def _check_bounds(value: float, key: str, metadata: Any) -> None:
         (value > metadata["high"], "above", metadata["high"]),
     ):
         if is_outside:
-            raise ConfigError(f"`{key}` = {value}{unit} is {word} {bound:g}{unit}{_other_unit(value, metadata)}")
+            shown, limit = (f"0x{value:X}", f"0x{bound:X}") if metadata["is_hex"] else (str(value), f"{bound:g}")
+            raise ConfigError(f"`{key}` = {shown}{unit} is {word} {limit}{unit}{_other_unit(value, metadata)}")
 
 
 _OTHER_UNITS = {

@@ -30,10 +30,14 @@ def setting(
     low: float = -math.inf,
     high: float = math.inf,
     choices: tuple[str, ...] = (),
+    is_hex: bool = False,
     meaning: str,
 ) -> Any:
-    """Return the field of one setting, required if it has no default. Bounds are inclusive and hold in tuples, too."""
-    metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "meaning": meaning}
+    """Return the field of one setting, required if it has no default. Bounds are inclusive and hold in tuples, too.
+
+    is_hex: an integer that everybody writes in hexadecimal, such as an index; messages do, too.
+    """
+    metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "is_hex": is_hex, "meaning": meaning}
     if isinstance(default, type):
         return dataclasses.field(default_factory=default, metadata=metadata)
     return dataclasses.field(default=default, metadata=metadata)

@@ -4,6 +4,7 @@ A frame is decoded all or nothing: `adacd_hil.wire.e2e` first checks its length,
 counter. `adacd_hil.wire.dbc_contract` makes a codec from a DBC.
 """
 
+import math
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
@@ -130,12 +131,13 @@ class MessageCodec(MessageTable):
 
 
 def _quantise(signal: SignalCodec, value: float) -> int:
-    """Return the raw integer of a physical value. Raises CodecError when it doesn't fit."""
-    raw = round((value - signal.offset) / signal.scale)
-    if not signal.raw_low <= raw <= signal.raw_high:
-        bound = signal.raw_high if raw > signal.raw_high else signal.raw_low
-        raise CodecError(f"{signal.name} = {value:g} {signal.unit} exceeds {bound * signal.scale + signal.offset:g}")
-    return raw
+    """Return the raw integer of a physical value. Raises CodecError when it doesn't fit, as NaN and infinity."""
+    exact = (value - signal.offset) / signal.scale
+    if not (math.isfinite(exact) and signal.raw_low <= round(exact) <= signal.raw_high):
+        low, high = (bound * signal.scale + signal.offset for bound in (signal.raw_low, signal.raw_high))
+        unit = f" {signal.unit}" if signal.unit else ""
+        raise CodecError(f"{signal.name} = {value:g}{unit} must be within {low:g}{unit} to {high:g}{unit}")
+    return round(exact)
 
 
 class Codec:

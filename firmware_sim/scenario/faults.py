@@ -115,11 +115,11 @@ class FaultSettings:
     )
     step: float | None = setting(None, low=-1e6, high=1e6, meaning="added to the value, rad, rad/s or Nm")
     rate_Hz: float | None = setting(None, unit="Hz", low=1e-3, high=20_000.0, meaning="frames per second")
-    can_id: int | None = setting(None, low=0, high=0x7FF, meaning="identifier of the flood")
+    can_id: int | None = setting(None, low=0, high=0x7FF, is_hex=True, meaning="identifier of the flood")
     data: str | None = setting(None, meaning="hex bytes of the flood's frames; absent: eight zero bytes")
-    code: int | None = setting(None, low=1, high=0xFFFF, meaning="error code of EMCY and 0x603F")
+    code: int | None = setting(None, low=1, high=0xFFFF, is_hex=True, meaning="error code of EMCY and 0x603F")
     status: int | None = setting(None, low=1, high=7, meaning="bits of 0x6150; absent: 1, not valid")
-    index: int | None = setting(None, low=0x1000, high=0xFFFF, meaning="object whose value is another")
+    index: int | None = setting(None, low=0x1000, high=0xFFFF, is_hex=True, meaning="object whose value is another")
     sub: int | None = setting(None, low=0, high=0xFF, meaning="its sub-index; absent: 0")
     raw: int | None = setting(None, low=-(2**63), high=2**64 - 1, meaning="value of the object, in its counts")
     node_id: int | None = setting(None, low=1, high=126, meaning="the node id that the node has from power-on")
@@ -209,7 +209,7 @@ class FaultSettings:
         whom = self.node or ALL
         what = next((part for part in (self.frame, self.signal) if part is not None), None)
         details = [
-            f"{field.name} {_show(field.name, getattr(self, field.name))}"
+            f"{field.name} {_show(getattr(self, field.name), field.metadata['is_hex'])}"
             for field in fields(self)
             if field.name not in _IN_TEXT and getattr(self, field.name) is not None
         ]
@@ -227,8 +227,8 @@ class FaultSettings:
 _IN_TEXT = ("kind", "node", "frame", "signal", "at_s", "since")
 
 
-def _show(key: str, value: object) -> str:
-    if key in ("can_id", "code", "index"):
+def _show(value: object, is_hex: bool) -> str:
+    if is_hex:
         return f"0x{value:X}"
     return f"{value:g}" if isinstance(value, float) else str(value)
 

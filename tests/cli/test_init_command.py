@@ -4,6 +4,7 @@ import json
 import math
 import re
 import shlex
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -46,6 +47,7 @@ URDF = """<robot name="lab">
 
 
 INT32 = ("--sensor", "int32-sensor", "int32-sensor")
+MIXED = ("--drive", "maxon-epos4", "stock-drive")
 
 
 @pytest.fixture
@@ -80,8 +82,9 @@ def urdf(folder: Path, axis: str = "0 0 1", wrist: str = "fixed") -> Path:
         ((*NO_BUS, "--mounting", "flor"), "'flor' must be flat, floor"),
         ((*NO_BUS, "--mounting", "100"), "0 to 90 deg"),
         ((*NO_BUS, "--eds", "float.eds"), "its 0x6130:1 is a float, which no frame of a cycle can hold"),
-        ((*NO_BUS, "--gear", "3", "3"), "--gear: profile adacd-drive has its own `scale.gear_ratio`"),
-        ((*NO_BUS, *INT32, "--torque-count-nm", "1e-3", "1e-3"), "profile int32-sensor has its own `scale.torque_Nm`"),
+        ((*NO_BUS, "--gear", "3", "3"), "profile adacd-drive of joint 1 has its own `scale.gear_ratio` = 1;"),
+        ((*NO_BUS, *MIXED, "--gear", "100", "100"), "--gear: profile stock-drive of joint 2 has its own `scale.gear_r"),
+        ((*NO_BUS, *INT32, "--torque-count-nm", "1e-3", "1e-3"), "profile int32-sensor of joint 1 has its own"),
         (("--from", ".", "--length-m", "1", "1"), "leave out --length-m"),
     ],
 )
@@ -332,6 +335,20 @@ def test_profiles_are_drafted_from_eds_files_beside_the_configuration(out, tmp_p
     monkeypatch.chdir(tmp_path)  # the profiles are found from anywhere
     drafted, stock = (load_contract(load_settings(name)) for name in ("lab/my-arm.toml", "stock"))
     assert drafted.layout_digest == stock.layout_digest
+
+
+def test_two_eds_of_a_kind_are_of_joint_1_and_2_and_more_or_namesakes_are_refused(out, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        shutil.copy(contract_folder() / "stock_drive.eds", tmp_path / name / f"{name}.eds")
+    (tmp_path / "b" / "a.eds").write_text((tmp_path / "a" / "a.eds").read_text() + "\n")
+    first, second, namesake = (str(tmp_path / name) for name in ("a/a.eds", "b/b.eds", "b/a.eds"))
+    assert init(out, *NO_BUS, "--eds", first, "--eds", second).exit_code == 0
+    assert [Path(name).name for name in written(out).devices.drive] == ["my-arm-a.toml", "my-arm-b.toml"]
+    for eds in ((first, namesake), (first, second, first)):
+        refused = init(tmp_path / "another" / "arm.toml", *NO_BUS, *[word for one in eds for word in ("--eds", one)])
+        assert refused.exit_code == USAGE
+    assert not (tmp_path / "another").exists()
 
 
 def test_the_guessed_worth_of_a_count_lets_16_bits_carry_a_joint_s_torque(tmp_path, out):

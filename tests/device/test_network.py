@@ -1,5 +1,7 @@
 """The master against the emulated devices."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from rig import Rig
@@ -13,6 +15,7 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.bus import Frame
+from adacd_hil.wire.codec import contract_folder
 
 pytestmark = pytest.mark.slow
 
@@ -110,6 +113,23 @@ def test_a_second_boot_of_running_nodes_leaves_them_configured() -> None:
     rig.start()
     assert read(rig, "Drive1", 0x6061) == 10
     assert read(rig, "Drive1", 0x1017) == 100
+
+
+@pytest.mark.parametrize(("line", "why"), [("AccessType=ro", "read-only"), ("AccessType=rw", "")])
+def test_a_heartbeat_whose_period_the_host_cant_set_is_named_and_not_watched(
+    tmp_path: Path, line: str, why: str
+) -> None:
+    head, place, tail = (contract_folder() / "drive.eds").read_text().partition("[1017]")
+    (tmp_path / "drive.eds").write_text(head + place + tail.replace("AccessType=rw", line, 1))
+    (tmp_path / "own.toml").write_text('extends = "adacd-drive"\neds = "drive.eds"\n')
+    rig = NetworkRig({"devices": {"drive": [str(tmp_path / "own.toml"), "adacd-drive"]}})
+    rig.start()
+    warnings = [event.message for event in rig.master.take_events() if event.name == "Drive1"]
+    assert warnings == ([f"its heartbeat isn't watched: 0x1017 is {why} in its EDS"] if why else [])
+    for _ in range(400):
+        rig.step()
+        failures = rig.master.failed_heartbeats(rig.cycle * rig.period_ns)
+    assert failures == []  # an emulated drive to which nobody writes 0x1017 sends none
 
 
 def test_an_option_code_of_the_configuration_reaches_the_drives() -> None:

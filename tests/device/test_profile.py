@@ -84,7 +84,7 @@ def test_a_users_file_is_a_profile_and_an_eds_beside_it_comes_first(tmp_path: Pa
         (("0x9130:1", "0x19130:1"), "must be within 0x0001 to 0xFFFF:255"),
         (('"torque"', '"load"'), "no frame carries torque"),
         (('"Torque"', '"Feedback"'), "a sensor needs Torque"),
-        (("cob_id = 0x180", "cob_id = 0x80"), "is below 384"),
+        (("cob_id = 0x180", "cob_id = 0x80"), "= 0x80 is below 0x180"),
         (("torque_Nm = 1e-6", ""), "a sensor needs torque_Nm"),
         (("[scale]", 'protection = "P02"\n[scale]'), "header has 0 objects, P02 takes 2"),
         (("cob_id", 'data_ids = ["00", "11"]\ncob_id'), "data_ids need protection P02 or P05"),

@@ -106,6 +106,8 @@ def test_every_key_that_a_kind_has_not_is_refused(kind):
         (example("reboot", count=2), "kind 'reboot' has no key `count`; its keys: at_s, since, node, duration_s"),
         (example("delay", node_id=2), "kind 'delay' has no key `node_id`; did you mean `node`?"),
         (example("duplicate_node_id", same_as="drive2"), "same_as = 'drive2' is the node itself"),
+        (example("object_value", index=0x0FFF), "`faults[0].index` = 0xFFF is below 0x1000"),
+        (example("babble", can_id=0x800), "`faults[0].can_id` = 0x800 is above 0x7FF"),
     ],
 )
 def test_a_fault_that_cannot_be_is_refused_in_one_line(row, message):

@@ -56,6 +56,8 @@ from adacd_hil.wire.open_bus import open_bus
 Pair = tuple[float, float]
 _PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
 _NO_BUS = "none"
+_SHOWN_SHARE = 1e-5
+"""Relative difference of a value as it was given and as a profile has it, by the digits that are written."""
 
 
 @dataclass(frozen=True)
@@ -108,9 +110,11 @@ class DraftFiles:
     def add_file(self, path: Path, content: str | bytes) -> None:
         """Add a file to those that `write_files` writes.
 
-        Raises CommandError if it exists with other content, unless `--force` is given.
+        Raises CommandError if it has other content, in these files or, unless `--force` is given, on the disk.
         """
         data = content.encode() if isinstance(content, str) else content
+        if self.contents.get(path, data) != data:
+            raise CommandError(f"{path} would get two contents, of files with one name: rename one", ExitCode.USAGE)
         if not (path.is_file() and path.read_bytes() == data):
             self.require_free(path)
         self.contents[path] = data
@@ -183,8 +187,8 @@ class Drafting:
         options = self.options
         drives, sensors = self._find_devices()
         drive, sensor = self._profiles(drives, sensors)
+        profiles = [self._profile(DRIVE, drive.value[joint], joint) for joint in range(2)]
         self._check_used({DRIVE: drive.value, SENSOR: sensor.value})
-        profiles = [self._drive_profile(drive.value[joint], joint) for joint in range(2)]
         scales = [profile.scale for profile in profiles]
         geometry, length_source, mass_source, gravity_source = self._ask_geometry()
         ratings = [device.ratings for device in drives]
@@ -227,23 +231,38 @@ class Drafting:
         )
 
     def _check_used(self, names: dict[str, Any]) -> None:
-        """Raise CommandError for a given value of a scale that no profile leaves open; names: profiles by kind."""
+        """Raise CommandError for a given value of a scale that a joint's profile doesn't have; names: profiles by kind.
+
+        A unit is enough in one of both profiles; that of velocity counts as taken once it was asked for.
+        """
         for question in _QUESTIONS:
-            if question.given(self.options) is not None and question.option not in self._answers:
-                option, profiles = question.option.split()[0], " and ".join(dict.fromkeys(names[question.kind]))
+            if (given := question.given(self.options)) is None:
+                continue
+            key = question.key.partition(".")[2]
+            owned = [getattr(self._profile(question.kind, names[question.kind][i], i).scale, key) for i in range(2)]
+            wrong = [
+                joint
+                for joint, value in enumerate(question.read(given))
+                if not math.isclose(value, owned[joint], rel_tol=_SHOWN_SHARE)
+            ]
+            if question.answer == "velocity_unit" and question.option in self._answers:
+                wrong = []
+            if len(wrong) > (1 if question.units else 0):
+                joint = wrong[0]
                 raise CommandError(
-                    f"{option}: profile {profiles} has its own `{question.key}`; correct it in a profile that "
-                    f"`extends` that one, or give the EDS, --{question.kind}-eds FILE",
+                    f"{question.option.split()[0]}: profile {names[question.kind][joint]} of joint {joint + 1} has its "
+                    f"own `{question.key}` = {owned[joint]:g}; correct it in a profile that `extends` that one, or "
+                    f"give the EDS, --{question.kind}-eds FILE",
                     ExitCode.USAGE,
                 )
 
-    def _drive_profile(self, name: str, joint: int) -> ProfileSettings:
-        draft = self._drafts.get((DRIVE, joint))
+    def _profile(self, kind: str, name: str, joint: int) -> ProfileSettings:
+        draft = self._drafts.get((kind, joint))
         if draft is not None:
             return draft.settings
         path = Path(name)
         there = name if name in profile_names() or path.is_absolute() else str(self.writing.out.parent / path)
-        return load_profile(there, DRIVE).settings
+        return load_profile(there, kind).settings
 
     def _profile_guesses(self, facts: ArmFacts) -> list[str]:
         """Return the guessed keys of the device profiles as "PROFILE: KEY", each once."""
@@ -422,10 +441,12 @@ class Drafting:
     def _draft_profiles(self, devices: Sequence[RecognisedDevice]) -> dict[tuple[str, int], str]:
         """Draft profiles of each EDS, beside the configuration; return their names by kind and joint (0, 1).
 
-        devices: found on the bus, [] without a bus. Raises CommandError for an EDS that fits none of them.
+        devices: found on the bus; [] without a bus: of two EDS of a kind, the first is of joint 1. Raises CommandError
+        for an EDS that fits none of them, or that fits one which has another EDS already.
         """
         names: dict[tuple[str, int], str] = {}
-        for eds, kind in self._eds_files():
+        files = self._eds_files()
+        for place, (eds, kind) in enumerate(files):
             identity = identity_of(eds)
             same = [device for device in devices if device.kind == kind]
             fitting = [
@@ -433,6 +454,14 @@ class Drafting:
                 for joint in range(2)
                 if not same or is_of(identity, (same[joint].node.vendor, same[joint].node.product))
             ]
+            alike = [other for other, (_, its) in enumerate(files) if its == kind]
+            if not same and len(alike) > 1:
+                fitting = [alike.index(place)]
+            if any(joint > 1 or (kind, joint) in names for joint in fitting):
+                raise CommandError(
+                    f"EDS {eds}: the {kind} of joint {fitting[0] % 2 + 1} has one already; give one EDS for each joint",
+                    ExitCode.USAGE,
+                )
             if not fitting:
                 vendor, product = ("?" if number is None else f"0x{number:X}" for number in identity)
                 raise CommandError(

@@ -270,12 +270,14 @@ def check_load(patient: ArmExamination) -> Finding:
 
 
 def check_heartbeats(patient: ArmExamination) -> Finding:
-    """Check that each node sends heartbeats in state Operational, often enough."""
+    """Check that each node whose heartbeat is watched sends it in state Operational, often enough."""
     expected_Hz = 1e3 / patient.settings.bus.heartbeat_ms
-    silent, odd, slow = [], [], []
-    for name, node in patient.master.nodes.items():
-        talk = patient.traffic.talks.get(0x700 + node.id)
-        if talk is None:
+    silent, odd, slow, unwatched = [], [], [], []
+    for slave in patient.master.slaves:
+        name, talk = slave.name, patient.traffic.talks.get(0x700 + slave.node_id)
+        if not slave.device.is_heartbeat_known:
+            unwatched.append(name)
+        elif talk is None:
             silent.append(name)
         elif talk.data != b"\x05":
             odd.append(f"{name} is {NMT_STATES.get(talk.data[0] & 0x7F if talk.data else -1, 'in an unknown state')}")
@@ -288,6 +290,11 @@ def check_heartbeats(patient: ArmExamination) -> Finding:
     if slow:
         return warning(
             f"slower than {expected_Hz:g}/s: {', '.join(slow)}", "a loaded bus delays heartbeats: see `load`"
+        )
+    if unwatched:
+        return warning(
+            f"not watched: {', '.join(unwatched)}",
+            "the EDS lets no host set 0x1017; only missing cyclic frames show that such a device is silent",
         )
     return ok(f"all operational, every {patient.settings.bus.heartbeat_ms} ms")
 
