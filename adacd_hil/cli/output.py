@@ -11,13 +11,13 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from enum import IntEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from adacd_hil.clock import wall_ns
 from adacd_hil.file_access import error_text, is_disk_full
@@ -32,6 +32,10 @@ PROGRAM = "adacd-hil"
 
 if TYPE_CHECKING:
     from adacd_hil.control.session import SessionSummary  # its import compiles, which takes seconds
+
+
+Given = TypeVar("Given")
+Done = TypeVar("Done")
 
 
 class ExitCode(IntEnum):
@@ -118,6 +122,11 @@ def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
     return run
 
 
+def _code_of(error: BaseException) -> ExitCode | None:
+    """Return the exit status of an error that a command reports in one line; None for any other."""
+    return next((code for kind, code in _expected() if isinstance(error, kind)), None)
+
+
 _REMEDY = "; give another place, or let its owner change the rights"
 
 
@@ -132,7 +141,7 @@ def complain(error: BaseException) -> ExitCode:
     if isinstance(error, KeyboardInterrupt):
         print("adacd-hil: interrupted", file=sys.stderr)
         return ExitCode.INTERRUPTED
-    code = next((code for kind, code in _expected() if isinstance(error, kind)), None)
+    code = _code_of(error)
     if code is None:
         raise error
     line = f"{error_text(error) or type(error).__name__}{_REMEDY if _is_forbidden(error) else ''}"
@@ -140,6 +149,29 @@ def complain(error: BaseException) -> ExitCode:
     if is_disk_full(error):
         return ExitCode.PARTIAL
     return error.code if isinstance(error, CommandError) else code
+
+
+def one_by_one(given: Iterable[Given], work: Callable[[Given], Done]) -> tuple[list[Done], list[Exception]]:
+    """Return the results of `work` on each of the given ones, and the errors of those that it can't be done on.
+
+    One that is refused doesn't stop the others. Raises errors that no command should end with.
+    """
+    done: list[Done] = []
+    refused: list[Exception] = []
+    for each in given:
+        try:
+            done.append(work(each))
+        except Exception as error:
+            if _code_of(error) is None:
+                raise
+            refused.append(error)
+    return done, refused
+
+
+def complain_of(refused: Iterable[Exception]) -> ExitCode:
+    """Print each error of `one_by_one` in a line, equal ones once; return the exit status of the first, OK of none."""
+    codes = [complain(error) for error in {str(error): error for error in refused}.values()]
+    return codes[0] if codes else ExitCode.OK
 
 
 def format_table(

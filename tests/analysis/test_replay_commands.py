@@ -48,6 +48,12 @@ def test_a_flipped_bit_in_the_file_ends_with_status_1_and_the_field_is_named(log
     assert "theta_hat[a1]" in called("replay", flipped).stdout
 
 
+def test_a_log_that_cannot_be_read_keeps_no_other_back(log, tmp_path):
+    done = called("replay", tmp_path / "gone.mcap", log, tmp_path / "gone.mcap", "--json")
+    assert (done.exit_code, [each["log"] for each in json.loads(done.stdout)]) == (FAILURE, [str(log)])
+    assert [str(tmp_path / "gone.mcap") in line for line in complaints(done)] == [True]
+
+
 def test_a_cut_log_ends_with_status_3(log, tmp_path):
     content = log.read_bytes()
     (tmp_path / "run.mcap").write_bytes(content[: len(content) // 2])

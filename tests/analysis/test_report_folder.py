@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from called import called
+from called import called, complaints
 from hand_made_run import A, M, make_run, record
 
 from adacd_hil.settings.toml_text import to_toml
@@ -63,6 +63,12 @@ def test_a_folder_with_a_run_is_that_run_and_several_are_reported_in_folders_of_
     both = report(folder / "b" / "deep", folder / "a c#1" / "run.mcap", "--out", tmp_path / "both")
     assert both.exit_code == 0, both.output
     assert sorted(path.parent.name for path in (tmp_path / "both").rglob("report.html")) == ["a c#1", "deep"]
+
+
+def test_a_log_that_cannot_be_read_keeps_no_other_back(folder, tmp_path):
+    found = report(folder / "notes", folder / "d" / "run.mcap", folder / "b" / "deep", "--out", tmp_path, "--json")
+    assert (found.exit_code, [table["is_clean"] for table in json.loads(found.stdout)]) == (1, [True])
+    assert [str(folder / name) in line for name, line in zip("nd", complaints(found), strict=True)] == [True, True]
 
 
 def test_two_reports_in_one_folder_are_refused_before_the_first(folder, tmp_path):

@@ -1,5 +1,6 @@
 """A sweep computes every row once, tries again what failed by accident, and goes on where it was stopped."""
 
+import json
 import os
 import signal
 import subprocess
@@ -205,3 +206,15 @@ def test_a_row_of_a_log_says_what_its_replay_came_to(log, whole):
     assert deaf["set.detector.threshold_Nm"] == "9.0"
     assert wrong["status"] == "failed"
     assert "detector.threshold_Nm" in wrong["error"]
+
+
+def test_what_a_replay_says_of_a_damaged_log_a_sweep_says_too(log, tmp_path):
+    content = log.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(content[: len(content) // 2])
+    played = called("sweep", log, cut, "--out", tmp_path / "out", "--workers", "1", "--json")
+    (replayed,) = json.loads(called("replay", cut, "--json").stdout)
+    result = json.loads(played.stdout)
+    whole, damaged = parquet.read_table(result["table"]).column("notes").to_pylist()
+    assert (played.exit_code, whole, damaged) == (3, None, "; ".join(replayed["notes"]))
+    assert result["notes"] == [f"{cut}: {damaged}"]

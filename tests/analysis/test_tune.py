@@ -17,7 +17,7 @@ from adacd_hil.cli.embedded_run import Cast, run_embedded
 from adacd_hil.lab.score.rates import least_rate_per_h, rate_bound_per_h, share_bounds
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.lab.tune import tune_candidates, tune_roc
-from adacd_hil.lab.tune.tune import base_of, best_of, problems_of, suggested_toml, write_tuning
+from adacd_hil.lab.tune.tune import base_of, best_of, problems_of, slowest_adaptation, suggested_toml, write_tuning
 from adacd_hil.lab.tune.tune_candidates import (
     ShownLog,
     candidates,
@@ -278,6 +278,18 @@ def candidate(delay_ms=2.0, name="made", changes=None, problems=(), seconds=600.
 )
 def test_a_candidate_is_fit_if_it_adapts_misses_nothing_and_alarms_no_more_than_wanted(changes, problem):
     assert problems_of(candidate().choice, outcome(**changes), outcome(), 1.0) == problem
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "6.00"),
+        ({"adaptation_s": (), "unfinished": 1}, "not finished"),
+        ({"adaptation_s": ()}, "not looked at"),  # a stretch that begins after it
+    ],
+)
+def test_an_adaptation_outside_the_stretch_is_not_said_to_fail(changes, said):
+    assert slowest_adaptation(outcome(**changes)) == said
 
 
 def test_alarms_in_the_half_to_check_on_and_too_short_a_motion_are_no_fit():

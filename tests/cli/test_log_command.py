@@ -45,6 +45,17 @@ def test_check_says_whether_a_log_is_clean(tmp_path):
     assert call("check", tmp_path / "none.mcap")[0] == 1
 
 
+@pytest.mark.parametrize("command", ["info", "check"])
+def test_a_log_that_cannot_be_read_keeps_no_other_back(command, tmp_path):
+    whole, gone, empty = write(tmp_path / "a.mcap"), tmp_path / "gone.mcap", tmp_path / "empty"
+    empty.mkdir()
+    code, out, err = call(command, empty, gone, whole, "--json")
+    assert (code, [entry["path"] for entry in json.loads(out)]) == (1, [str(whole)])
+    folder, file = (line for line in err.splitlines() if line.startswith("adacd-hil: "))
+    assert (str(empty) in folder, str(gone) in file) == (True, True)
+    assert call(command, gone, "--json")[:2] == (1, "")
+
+
 def test_recover_says_what_was_lost(tmp_path):
     path = write(tmp_path / "a.mcap")
     code, out, _ = call("recover", path)

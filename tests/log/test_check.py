@@ -335,10 +335,10 @@ def test_a_folder_stands_for_its_logs_without_their_later_parts(tmp_path):
     (tmp_path / "deep").mkdir()
     path = write_parts(tmp_path, ["continued", "closed"])
     (tmp_path / "deep" / "other.mcap").write_bytes(WHOLE)
-    assert find_logs([tmp_path]) == [tmp_path / "deep" / "other.mcap", path]
+    assert find_logs(tmp_path) == [tmp_path / "deep" / "other.mcap", path]
     (tmp_path / "empty").mkdir()
     with pytest.raises(LogError, match=f"^folder {tmp_path / 'empty'} has no .mcap file$"):
-        find_logs([tmp_path / "empty"])
+        find_logs(tmp_path / "empty")
 
 
 def test_a_file_that_does_not_exist_is_an_error_of_one_line(tmp_path):

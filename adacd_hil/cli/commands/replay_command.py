@@ -7,7 +7,17 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, set_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained, format_table, quoted
+from adacd_hil.cli.output import (
+    CommandError,
+    ExitCode,
+    answer,
+    complain_of,
+    counted,
+    explained,
+    format_table,
+    one_by_one,
+    quoted,
+)
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.printable import in_line
@@ -82,18 +92,22 @@ def replay(
     With --from and --until, only that stretch is compared and printed. The replay still begins with the log, because
     filters and model depend on earlier cycles.
     """
+    configured = config, profile, dbc
     with Progress() as progress:
-        results = [
-            _replay_one(
-                path, changes, vary, (config, profile, dbc), against, by_frames, tolerance, shown, stretch, progress
-            )
-            for path in logs
-        ]
-    described = [_as_json(*result, shown, stretch) for result in results]
-    text = "\n\n".join(_as_text(*result, shown, stretch) for result in results)
-    answer(as_json, described, text, *_next(logs[0], results[0][1][0], has_changes=bool(changes or vary or config)))
+        results, refused = one_by_one(
+            logs,
+            lambda path: _replay_one(
+                path, changes, vary, configured, against, by_frames, tolerance, shown, stretch, progress
+            ),
+        )
+    if results:
+        described = [_as_json(*result, shown, stretch) for result in results]
+        text = "\n\n".join(_as_text(*result, shown, stretch) for result in results)
+        first, (own, *_), _ = results[0]
+        answer(as_json, described, text, *_next(first, own, has_changes=bool(changes or vary or config)))
     codes = [_code(replays) for _, replays, _ in results]
-    return max(codes, key=[ExitCode.OK, ExitCode.PARTIAL, ExitCode.FAILURE].index)
+    order = [ExitCode.OK, ExitCode.PARTIAL, ExitCode.FAILURE]
+    return complain_of(refused) or max(codes, key=order.index)
 
 
 def _next(given: Path, own: "Replay", has_changes: bool) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, answer, explained, print_and_write, writable_folder
+from adacd_hil.cli.output import EPILOG, ExitCode, answer, complain_of, explained, print_and_write, writable_folder
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.lab.cli.compare_command import compare
 from adacd_hil.lab.cli.history_command import history
@@ -133,9 +133,10 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Ti
     from adacd_hil.lab.cli.report_command import as_json as in_json
     from adacd_hil.lab.cli.report_command import report_logs
 
-    reports, code = report_logs(logs, out, stretch)
-    answer(as_json, in_json(reports), "\n\n".join(entry.as_text() for entry in reports))
-    return code
+    reports, refused, code = report_logs(logs, out, stretch)
+    if reports:
+        answer(as_json, in_json(reports), "\n\n".join(entry.as_text() for entry in reports))
+    return complain_of(refused) or code
 
 
 @click.command(epilog=EPILOG)

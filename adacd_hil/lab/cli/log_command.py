@@ -1,5 +1,6 @@
 """`adacd-hil log`: logs at a glance, checked, recovered, cut and exported, with the text printed of them."""
 
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -7,7 +8,16 @@ import click
 
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table, tell
+from adacd_hil.cli.output import (
+    CommandError,
+    ExitCode,
+    answer,
+    complain_of,
+    explained,
+    format_table,
+    one_by_one,
+    tell,
+)
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.printable import in_line
 
@@ -39,10 +49,13 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     from adacd_hil.lab.logs.check.log_check import find_logs
     from adacd_hil.lab.logs.log_info import read_info
 
-    found = [read_info(path) for path in find_logs(logs)]
+    places, empty = one_by_one(logs, find_logs)
+    found, refused = one_by_one(chain.from_iterable(places), read_info)
     described = [{**vars(entry), "duration_s": entry.duration_s} for entry in found]
-    answer(as_json, described, "\n\n".join(map(info_as_text, found)))
-    return ExitCode.PARTIAL if any(entry.problems for entry in found) else ExitCode.OK
+    if found:
+        answer(as_json, described, "\n\n".join(map(info_as_text, found)))
+    code = complain_of([*empty, *refused])
+    return code or (ExitCode.PARTIAL if any(entry.problems for entry in found) else ExitCode.OK)
 
 
 @log.command(epilog="Exit status: 0 clean; 1 an error, or a log can't be read; 2 wrong usage; 3 warnings only.")
@@ -56,10 +69,12 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     """
     from adacd_hil.lab.logs.check.log_check import check_log, find_logs
 
-    checked = [check_log(path, tell) for path in find_logs(logs)]
-    answer(as_json, checked, "\n".join(map(check_as_text, checked)))
-    if any(entry.errors for entry in checked):
-        return ExitCode.FAILURE
+    places, empty = one_by_one(logs, find_logs)
+    checked, refused = one_by_one(chain.from_iterable(places), lambda path: check_log(path, tell))
+    if checked:
+        answer(as_json, checked, "\n".join(map(check_as_text, checked)))
+    if (code := complain_of([*empty, *refused])) or any(entry.errors for entry in checked):
+        return code or ExitCode.FAILURE
     return ExitCode.PARTIAL if any(entry.warnings for entry in checked) else ExitCode.OK
 
 

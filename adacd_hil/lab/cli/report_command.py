@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode, one_by_one
 from adacd_hil.file_replacement import replace_file
 from adacd_hil.lab.report.report_files import Report, write_report
 from adacd_hil.lab.runs.run_pages import INDEX_NAME, ListedRun, runs_page
@@ -36,42 +36,49 @@ class Index(NamedTuple):
 Reported = Report | Index
 
 
-def report_logs(logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow) -> tuple[list[Reported], ExitCode]:
-    """Write a report of each log, or of a stretch of it, beside it or in `out`; return reports and exit status.
+def report_logs(
+    logs: tuple[Path, ...], out: Path | None, stretch: TimeWindow
+) -> tuple[list[Reported], list[Exception], ExitCode]:
+    """Write a report of each log, or of a stretch of it, beside it or in `out`; return reports, errors, exit status.
 
     Reports of several logs are in subfolders of `out`. A folder stands for the run log in it, or without one for the
-    runs in its folders; one of these that can't be read doesn't stop the others.
+    runs in its folders. What can't be reported doesn't stop the others: the errors are those of given ones, and the
+    exit status is that of the reports.
 
-    Raises LogError, ConfigError, CommandError.
+    Raises CommandError if two reports would go to one folder.
     """
+    found, refused = one_by_one(logs, _runs_in)
     places: dict[Path, tuple[Path, tuple[Path, ...]]] = {}  # by folder of the report
-    for given in logs:
-        runs = _runs_in(given)
-        if given.is_dir() and not runs and not (given / LOG_NAME).exists():
-            raise LogError(f"{given} has no {LOG_NAME}, nor has any folder in it")
+    for given, runs in found:
         own = given if runs else log_in(given).parent
         folder = own if out is None else out if len(logs) == 1 else out / own.name
         if folder in places:
             raise CommandError(f"two reports would go to {folder}; report these logs one by one", ExitCode.USAGE)
         places[folder] = given, runs
-    reported: list[Reported] = []
-    codes = []
     with Progress() as progress:
-        for folder, (given, runs) in places.items():
+
+        def report(place: tuple[Path, tuple[Path, tuple[Path, ...]]]) -> Reported:
+            folder, (given, runs) = place
             if runs:
-                index = _report_runs(given, runs, folder, stretch, progress)
-                reported.append(index)
-                codes += [_code(report) for _, report in index.entries]
-            else:
-                report = _report_one(log_in(given), folder, stretch, progress)
-                reported.append(report)
-                codes.append(_code(report))
-    return reported, ExitCode.OK if set(codes) <= {ExitCode.OK} else ExitCode.PARTIAL
+                return _report_runs(given, runs, folder, stretch, progress)
+            return _report_one(log_in(given), folder, stretch, progress)
+
+        reported, failed = one_by_one(places.items(), report)
+    code = ExitCode.OK if all(map(_is_complete, reported)) else ExitCode.PARTIAL
+    return reported, refused + failed, code
 
 
-def _runs_in(given: Path) -> tuple[Path, ...]:
-    """Return the folders with a run below a folder; () for a file, or if the folder itself has a run."""
-    return () if not given.is_dir() or (given / LOG_NAME).exists() else tuple(find_runs(given))
+def _runs_in(given: Path) -> tuple[Path, tuple[Path, ...]]:
+    """Return what was given, and the folders with a run below it: () for a file, or if the folder itself has a run.
+
+    Raises LogError for a folder without a run.
+    """
+    if not given.is_dir() or (given / LOG_NAME).exists():
+        return given, ()
+    runs = tuple(find_runs(given))
+    if not runs:
+        raise LogError(f"{given} has no {LOG_NAME}, nor has any folder in it")
+    return given, runs
 
 
 def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWindow, progress: Progress) -> Index:
@@ -115,5 +122,7 @@ def _report_one(path: Path, folder: Path, stretch: TimeWindow, progress: Progres
     return write_report(path, truth_path, folder, stretch=stretch, progress=progress)
 
 
-def _code(report: Report | None) -> ExitCode:
-    return ExitCode.OK if report is not None and report.is_complete else ExitCode.PARTIAL
+def _is_complete(reported: Reported | None) -> bool:
+    if isinstance(reported, Index):
+        return all(_is_complete(report) for _, report in reported.entries)
+    return reported is not None and reported.is_complete

@@ -25,9 +25,9 @@ _SIMULATED_CONFIG = "certified"
 
 
 @click.command(
-    epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` has the reason; 1 the "
-    "cluster is lost, or the folder can't be written; 2 wrong usage or configuration; 130 interrupted: the same "
-    "command continues."
+    epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` has the reason, or a log is "
+    "damaged, see `notes`; 1 the cluster is lost, or the folder can't be written; 2 wrong usage or configuration; 130 "
+    "interrupted: the same command continues."
 )
 @click.argument("logs", nargs=-1, type=GivenPath(), shell_complete=complete_run)
 @click.option(
@@ -82,6 +82,7 @@ def sweep(
     """
     from adacd_hil.lab.tune.sweep import SweepStore, replay_task, run_sweep
     from adacd_hil.lab.tune.workers import TLS, TlsFiles, connect
+    from adacd_hil.log.logged_run import SHOWN
 
     if bool(logs) == bool(scenarios):
         raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
@@ -103,6 +104,7 @@ def sweep(
             outcome = run_sweep(plan, work, store, pool, progress)
         about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
         table = store.join(plan.row_keys(), about)
+        notes = store.notes(table)
     result = {
         "table": table,
         "rows": plan.size,
@@ -113,9 +115,11 @@ def sweep(
         "rows_per_s": round(outcome.computed / outcome.elapsed_s, 2) if outcome.elapsed_s else None,
     }
     verdict = f"{plan.size - outcome.failed} of {plan.size} rows are there"
-    lines = [verdict, *(in_line(f"{key}: {value}") for key, value in result.items())]
-    answer(as_json, result, "\n".join(lines), _next(table, outcome.failed))
-    return ExitCode.PARTIAL if outcome.failed else ExitCode.OK
+    lines = [verdict, *(f"{key}: {value}" for key, value in result.items()), *notes[:SHOWN]]
+    if len(notes) > SHOWN:
+        lines.append(f"and {len(notes) - SHOWN} more notes, see the table")
+    answer(as_json, result | {"notes": notes}, "\n".join(map(in_line, lines)), _next(table, outcome.failed))
+    return ExitCode.PARTIAL if outcome.failed or notes else ExitCode.OK
 
 
 def _next(table: Path, failed: int) -> str:

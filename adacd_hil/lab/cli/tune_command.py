@@ -150,13 +150,14 @@ def _cells(checked: "Found") -> tuple[str, ...]:
 
 def _row(candidate: "Candidate") -> tuple[str, ...]:
     from adacd_hil.lab.score.report_wording import delay_figures
+    from adacd_hil.lab.tune.tune import slowest_adaptation
 
     outcome = candidate.outcome
     median_ms, _, _ = delay_figures(outcome.delays_ms)
     return (
         candidate.name,
         ", ".join(f"{each:.3g}" for each in candidate.choice.thresholds.reshape(-1)),
-        f"{max(outcome.adaptation_s):.2f}" if outcome.adaptation_s else "never",
+        slowest_adaptation(outcome),
         "–" if outcome.missed is None else str(outcome.missed),
         "–" if outcome.false_alarms is None else str(outcome.false_alarms),
         "–" if median_ms is None else f"{median_ms:.1f}",

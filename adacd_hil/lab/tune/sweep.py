@@ -207,6 +207,7 @@ def finished(subject: Subject, row: SweepRow, found: Replay) -> Values:
     return row_labels(subject, row) | {
         "status": "ok",
         "error": None,
+        "notes": "; ".join(found.notes) or None,
         "cycles": found.cycles,
         "attempts": found.attempts,
         "identical": found.is_identical if found.compared else None,
@@ -277,6 +278,12 @@ class SweepStore:
         _write(self._parquet, path, table.replace_schema_metadata(metadata))
         replace_file(self.folder / PLAN_NAME, json.dumps(about, indent=2))
         return path
+
+    def notes(self, table: Path) -> list[str]:
+        """Return a line for each log or scenario of a joined table and each note on its replays, each once."""
+        rows = self._read(table).to_pylist()
+        noted = (f"{row['log'] or row['scenario']}: {row['notes']}" for row in rows if row.get("notes"))
+        return list(dict.fromkeys(noted))
 
     def _paths(self) -> list[Path]:
         return sorted(self._parts.glob("[0-9]*.parquet"))

@@ -267,12 +267,20 @@ def in_words(found: Found) -> str:
     return f"{text}; {share_phrase(found.delays_ms, found.contacts, found.share_bounds)}"
 
 
+def slowest_adaptation(outcome: TuningOutcome) -> str:
+    """Return the longest adaptation of the logs or of their stretches, s, as text; else why there is none."""
+    if outcome.adaptation_s:
+        return f"{max(outcome.adaptation_s):.2f}"
+    return "not finished" if outcome.unfinished else "not looked at"
+
+
 def outcome_in_words(candidate: Candidate) -> str:
     """Return a phrase on the replay of all logs with a candidate: adaptations, misses, false alarms, delays."""
     outcome = candidate.outcome
-    text = f"{len(outcome.adaptation_s)} adaptations"
+    slowest = slowest_adaptation(outcome)
+    text = f"adaptation {slowest}"
     if outcome.adaptation_s:
-        text += f" of {min(outcome.adaptation_s):.2f} to {max(outcome.adaptation_s):.2f} s"
+        text = f"{len(outcome.adaptation_s)} adaptations of {min(outcome.adaptation_s):.2f} to {slowest} s"
     if outcome.missed is None:
         return text
     return text + f", {outcome.missed} missed, {outcome.false_alarms} false alarms{delays_phrase(outcome.delays_ms)}"

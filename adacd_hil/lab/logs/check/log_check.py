@@ -6,7 +6,7 @@ record to the rules that concern it.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -234,22 +234,18 @@ class LogCheck(NamedTuple):
     notes: int
 
 
-def find_logs(paths: Iterable[Path]) -> list[Path]:
-    """Return the paths of logs: files as given, and each .mcap file in a given folder except the later parts of a log.
+def find_logs(given: Path) -> list[Path]:
+    """Return the paths of the logs in a folder: each .mcap file except the later parts of a log; of a file, the file.
 
     Raises LogError for a folder without a log.
     """
-    logs = []
-    for path in paths:
-        if not path.is_dir():
-            logs.append(path)
-            continue
-        files = sorted(path.rglob("*.mcap"))
-        later = {part for file in files for number, part in find_parts(file).items() if number}
-        if not files:
-            raise LogError(f"folder {path} has no .mcap file")
-        logs += [file for file in files if file not in later]
-    return logs
+    if not given.is_dir():
+        return [given]
+    files = sorted(given.rglob("*.mcap"))
+    if not files:
+        raise LogError(f"folder {given} has no .mcap file")
+    later = {part for file in files for number, part in find_parts(file).items() if number}
+    return [file for file in files if file not in later]
 
 
 def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> LogCheck:
