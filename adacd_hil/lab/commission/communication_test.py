@@ -232,4 +232,4 @@ class CommunicationTest:
                 with suppress(ValueError):  # a foreign frame whose length the contract's bus can't have
                     meter.count_frame(frame)
         periods = sum(cycle.state.periods for cycle in self._recent)
-        return meter.take_load(periods * self.settings.bus.period_ns).percent
+        return meter.take_percent(periods * self.settings.bus.period_ns)
