@@ -8,20 +8,20 @@ from rig import Rig
 from adacd_hil.cli.connection import Connection
 from adacd_hil.lab.cli.commtest_command import as_text, describe, open_log, write_page
 from adacd_hil.lab.cli.log_command import find_dbc
-from adacd_hil.lab.commission.communication_test import CommunicationReport, CommunicationTest, ZeroTorqueLoop
+from adacd_hil.lab.commission.communication_test import CommunicationTest, ZeroTorqueLoop
 from adacd_hil.lab.score.report_wording import number_text
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 
 
-def played(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationReport]:
+def played(rig: Rig, scheduler: str = "SCHED_FIFO 80") -> tuple[dict, CommunicationTest]:
     rig.start()
     rig.tap.take_passed()
     loop = ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master)
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
     loop.run(0.2, test.observe_cycle)
-    described = describe(test.report(), rig.settings, scheduler)
-    return described | {"fault": "NONE", "device_faults": [], "events": []}, test.report()
+    described = describe(test, rig.settings, scheduler)
+    return described | {"fault": "NONE", "device_faults": [], "events": []}, test
 
 
 def test_the_report_shows_shares_ages_times_and_the_verdict():
@@ -67,8 +67,8 @@ def test_the_page_has_the_curves_of_the_report_with_the_numbers_of_the_test(tmp_
 
 def test_a_test_without_a_cycle_has_no_pictures(tmp_path):
     rig = Rig(is_wall=True)
-    report = CommunicationTest(rig.settings, rig.arm, 1_000_000).report()
-    assert write_page(tmp_path, report, {}) == []
+    test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
+    assert write_page(tmp_path, test, {}) == []
 
 
 def test_a_log_of_another_contract_is_decoded_by_that_contract(tmp_path):

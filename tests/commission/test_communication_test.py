@@ -6,7 +6,6 @@ from rig import PERIOD_NS, Rig
 
 from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.lab.commission.communication_test import (
-    CommunicationReport,
     CommunicationTest,
     Verdict,
     ZeroTorqueLoop,
@@ -26,11 +25,11 @@ def loop_of(rig: Rig, is_enabling: bool = False) -> ZeroTorqueLoop:
     return ZeroTorqueLoop(rig.settings, rig.tap, rig.clock, rig.arm, rig.master, is_enabling)
 
 
-def run(rig: Rig, seconds: float = 0.2, is_enabling: bool = False) -> tuple[CommunicationReport, FaultReason]:
+def run(rig: Rig, seconds: float = 0.2, is_enabling: bool = False) -> tuple[CommunicationTest, FaultReason]:
     loop = loop_of(rig, is_enabling)
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
     fault = loop.run(seconds, test.observe_cycle)
-    return test.report(), fault
+    return test, fault
 
 
 def commands(rig: Rig) -> set[tuple[int, int]]:
@@ -44,7 +43,7 @@ def test_an_undisturbed_connection_is_good_and_complete_and_asks_the_drives_for_
     assert commands(rig) == {(0x0000, 0)}
     assert (report.cycles, report.complete, report.overruns) == (200, 200, 0)
     assert (report.verdict, report.share, fault) == (Verdict.GOOD, 1.0, FaultReason.NONE)
-    assert [device.ages[0] for device in report.devices.values()] == [200] * 4
+    assert [device["ages"][0] for device in report.devices().values()] == [200] * 4
 
 
 def test_enabled_drives_get_no_torque_and_are_disabled_at_the_end():
@@ -85,9 +84,9 @@ def test_every_fifteenth_torque_frame_lost_is_a_warning_and_told_by_device():
     report, _ = run(rig, 0.3)
     assert report.verdict is Verdict.WARNING
     assert report.complete == 280
-    assert [round(device.share, 3) for device in report.devices.values()] == [1.0, 1.0, 0.933, 1.0]
-    sensor = report.devices["Sensor1"]
-    assert (sensor.ages[:3], sensor.checks["OK_SOME_LOST"]) == ([280, 20, 0], 21)  # one more while disabling
+    assert [round(device["share"], 3) for device in report.devices().values()] == [1.0, 1.0, 0.933, 1.0]
+    sensor = report.devices()["Sensor1"]
+    assert (sensor["ages"][:3], sensor["checks"]["OK_SOME_LOST"]) == ([280, 20, 0], 21)  # one more while disabling
 
 
 def test_a_device_that_never_answers_is_not_sufficient():
@@ -95,7 +94,7 @@ def test_a_device_that_never_answers_is_not_sufficient():
     rig.tamper = lambda cycle, can_id, data: None if can_id == 0x182 else data
     report, _ = run(rig)
     assert (report.verdict, report.share) == (Verdict.NOT_SUFFICIENT, 0.0)
-    assert (report.devices["Drive2"].never, sum(report.devices["Drive2"].ages)) == (200, 0)
+    assert (report.devices()["Drive2"]["never"], sum(report.devices()["Drive2"]["ages"])) == (200, 0)
     assert set(report.columns["frames_missing"].tolist()) == {1}
 
 
@@ -106,12 +105,11 @@ def test_skipped_periods_count_as_without_data():
     rig.clock.oversleep_ns = lambda t_ns: 20 * PERIOD_NS + 5_000 if t_ns == begin_ns + 51 * PERIOD_NS else 0
     test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
     loop.run(0.2, test.observe_cycle)
-    report = test.report()
-    assert (report.overruns, report.cycles, report.periods) == (20, 180, 200)
-    assert (report.share, report.verdict) == (0.9, Verdict.WARNING)
-    assert report.columns["lateness_ns"].max() == 5_000
-    assert np.median(report.columns["slack_ns"]) - report.columns["slack_ns"].min() == 5_000
-    assert report.columns["overruns"][[49, 51, -1]].tolist() == [0, 20, 20]
+    assert (test.overruns, test.cycles, test.periods) == (20, 180, 200)
+    assert (test.share, test.verdict) == (0.9, Verdict.WARNING)
+    assert test.columns["lateness_ns"].max() == 5_000
+    assert np.median(test.columns["slack_ns"]) - test.columns["slack_ns"].min() == 5_000
+    assert test.columns["overruns"][[49, 51, -1]].tolist() == [0, 20, 20]
 
 
 def test_the_record_of_a_cycle_has_its_queues_and_what_was_lost(monkeypatch):

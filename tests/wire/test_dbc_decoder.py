@@ -111,9 +111,10 @@ def test_a_monitor_shows_the_values_of_any_dbc(tmp_path):
     view = BusView(read, *read_bitrates(read), 0)
     view.accept(Frame(512, bytes.fromhex("FFEE501900000080"), 1))
     view.accept(Frame(528, b"\x09\0", 2))
-    status, paged = view.snapshot(1_000_000_000).messages
-    assert (status.name, status.errors, status.values[0]) == ("Status", 0, ("speed", -19.0, "1/min"))
-    assert (paged.name, paged.values) == ("Paged", (("page", 9.0, ""),))
+    status, paged = view.describe(1_000_000_000)["messages"]
+    assert (status["message"], status["errors"]) == ("Status", 0)
+    assert (status["values"]["speed"], status["units"]["speed"]) == (-19.0, "1/min")
+    assert (paged["message"], paged["values"]) == ("Paged", {"page": 9.0})
 
 
 def test_a_monitor_with_a_contract_checks_its_frames():

@@ -22,54 +22,42 @@ CANGEN = ("cangen", "-g", "0", "-I", "r", "-L", "r", "-D", "r", "-n")
 
 
 def test_load_is_the_time_of_the_frames_over_the_interval() -> None:
-    meter = LoadMeter(500_000, start_ns=0)
+    meter = LoadMeter(500_000, 0, 0)
     for _ in range(10):
         meter.count_frame(Frame(0, b"", 0))  # 34 zeros with 6 stuff bits, and 13: 53
-    load = meter.take_load(2_000_000)
-    assert (load.frames, load.bits.total) == (10, 530)
-    assert load.percent == pytest.approx(100 * 530 * 2e-6 / 2e-3)
+    assert meter.bits.total == 530
+    assert meter.take_percent(2_000_000) == pytest.approx(100 * 530 * 2e-6 / 2e-3)
 
 
 def test_an_interval_begins_where_the_last_one_ended() -> None:
-    meter = LoadMeter(BITRATE, start_ns=0)
+    meter = LoadMeter(BITRATE, 0, 0)
     meter.count_frame(Frame(1, b"12345678", 0))
-    meter.take_load(SECOND_NS)
+    meter.take_percent(SECOND_NS)
     meter.count_frame(Frame(0, b"", 0))
-    load = meter.take_load(3 * SECOND_NS)
-    assert (load.frames, load.interval_ns) == (1, 2 * SECOND_NS)
-    assert meter.take_load(4 * SECOND_NS).percent == 0.0
-
-
-def test_without_a_start_the_first_frame_is_it() -> None:
-    assert LoadMeter(BITRATE).take_load(SECOND_NS).percent == 0.0
-    meter = LoadMeter(BITRATE)
-    meter.count_frame(Frame(0, b"", SECOND_NS))
-    assert meter.take_load(2 * SECOND_NS).interval_ns == SECOND_NS
+    assert meter.take_percent(3 * SECOND_NS) == pytest.approx(100 * 53e-6 / 2.0)
+    assert [meter.take_percent(end_s * SECOND_NS) for end_s in (4, 4)] == [0.0, 0.0]
 
 
 def test_can_fd_counts_at_both_rates() -> None:
-    meter = LoadMeter(BITRATE, 5_000_000, start_ns=0)
+    meter = LoadMeter(BITRATE, 5_000_000, 0)
     meter.count_frame(Frame(0x555, b"\x55" * 12, 0))  # SOF, id 101 0101 0101, 00 1 0 1: no run of five; 29 and 129 bits
-    load = meter.take_load(SECOND_NS)
-    assert load.bits == (29, 129)
-    assert load.percent == pytest.approx(100 * (29e-6 + 129 * 0.2e-6))
+    assert meter.bits == (29, 129)
+    assert meter.take_percent(SECOND_NS) == pytest.approx(100 * (29e-6 + 129 * 0.2e-6))
 
 
 def test_can_fd_on_a_classic_bus_and_a_rate_of_zero_are_refused() -> None:
-    meter = LoadMeter(BITRATE)
+    meter = LoadMeter(BITRATE, 0, 0)
     with pytest.raises(ValueError, match="frame 0x181 has 12 bytes: CAN FD, but no data bit rate is given"):
         meter.count_frame(Frame(0x181, bytes(12), 0))
     with pytest.raises(ValueError, match="bitrate = 0 bit/s is not above 0 bit/s"):
-        LoadMeter(0)
+        LoadMeter(0, 0, 0)
 
 
 def test_error_frames_and_extended_identifiers() -> None:
-    meter = LoadMeter(BITRATE, start_ns=0)
+    meter = LoadMeter(BITRATE, 0, 0)
     meter.count_frame(Frame(0x004, bytes(8), 0, is_error=True))
     meter.count_frame(Frame(0x1AAAAAAA, b"", 0))
-    load = meter.take_load(SECOND_NS)
-    assert load.frames == 1
-    assert load.bits.total >= 67
+    assert 67 <= meter.bits.total < 67 + 34
 
 
 @contextmanager
@@ -103,7 +91,7 @@ def test_the_meter_counts_the_bits_that_canbusload_counts() -> None:
         pytest.skip("canbusload (Debian package can-utils) is not installed")
     clock = MonotonicClock()
     sender, receiver = open_bus("socketcan", "vcan0", clock), open_bus("socketcan", "vcan0", clock)
-    meter = LoadMeter(BITRATE, start_ns=0)
+    meter = LoadMeter(BITRATE, 0, 0)
     theirs = [0, 0, 0]
     with canbusload("vcan0") as lines:
         next(lines)  # it listens
@@ -122,8 +110,6 @@ def test_the_meter_counts_the_bits_that_canbusload_counts() -> None:
                 line = next(lines)
                 counted += line[0]
                 theirs = [total + new for total, new in zip(theirs, line, strict=True)]
-    ours = meter.take_load(SECOND_NS)
-    assert ours.frames == 2 * BURST
-    assert [ours.frames, ours.bits.total] == theirs[:2]
+    assert [2 * BURST, meter.bits.total] == theirs[:2]
     sender.close()
     receiver.close()

@@ -15,7 +15,6 @@ from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_replacement import replace_files
 from adacd_hil.lab.commission.communication_test import (
     GOOD_SHARE,
-    CommunicationReport,
     CommunicationTest,
     Verdict,
     ZeroTorqueCycle,
@@ -90,8 +89,7 @@ def run_commtest(
             if recorder is not None:
                 summary = recorder.close()
                 log_error = "" if summary.is_complete else summary.error or f"log lacks {summary.dropped} packets"
-    report = test.report()
-    described = describe(report, settings, grant.scheduler)
+    described = describe(test, settings, grant.scheduler)
     described |= {
         "fault": fault.name,
         "is_interrupted": loop.is_interrupted,
@@ -100,8 +98,8 @@ def run_commtest(
     described |= {"events": [f"{event.name}: {event.message}" for event in master.take_events()]}
     if recorder is not None:
         described |= {"log": str(recorder.path), "log_error": log_error}
-        described |= {"pictures": [str(path) for path in write_page(recorder.path.parent, report, described)]}
-    return described, _exit_code(report, fault, loop.is_interrupted, bool(log_error))
+        described |= {"pictures": [str(path) for path in write_page(recorder.path.parent, test, described)]}
+    return described, _exit_code(test, fault, loop.is_interrupted, bool(log_error))
 
 
 def _run(
@@ -124,12 +122,12 @@ def _run(
             master.stop()
 
 
-def _exit_code(report: CommunicationReport, fault: FaultReason, is_interrupted: bool, has_lost_log: bool) -> ExitCode:
+def _exit_code(test: CommunicationTest, fault: FaultReason, is_interrupted: bool, has_lost_log: bool) -> ExitCode:
     if fault is not FaultReason.NONE:
         return ExitCode.SAFETY_STOP
     if is_interrupted:
         return ExitCode.INTERRUPTED
-    code = _EXIT[report.verdict]
+    code = _EXIT[test.verdict]
     return ExitCode.PARTIAL if code is ExitCode.OK and has_lost_log else code
 
 
@@ -158,7 +156,7 @@ def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection
     )
 
 
-def write_page(out: Path, report: CommunicationReport, described: dict[str, Any]) -> list[Path]:
+def write_page(out: Path, test: CommunicationTest, described: dict[str, Any]) -> list[Path]:
     """Write commtest.html into a folder, with tables and curves of the cycle's times as in the report of a run.
 
     described: the result of `run_commtest`. Return the files that were written, [] without a cycle. Raises LogError if
@@ -169,18 +167,18 @@ def write_page(out: Path, report: CommunicationReport, described: dict[str, Any]
     from adacd_hil.lab.report.report_tables import timing_tables
     from adacd_hil.lab.report.traces import pack_tracks, timing_track
 
-    if not len(report.columns):
+    if not len(test.columns):
         return []
     period_us = described["period_us"]
-    evidence = _evidence(report, period_us)
-    track = timing_track(report.columns, period_us, int(report.columns.t_ns[0]), has_grid=True)
+    evidence = _evidence(test, period_us)
+    track = timing_track(test.columns, period_us, int(test.columns.t_ns[0]), has_grid=True)
     findings = [line for line in _findings(described) if not line.startswith(("log: ", "pictures: "))]
     page = render_page(
         "communication_test_page.html.j2",
         "communication test",
         over="adacd-hil commtest",
         headline=findings[-1],
-        is_good=report.verdict is Verdict.GOOD,
+        is_good=test.verdict is Verdict.GOOD,
         problems=findings[:-1],
         traces=pack_tracks([track], period_us * 1e-6),
         timing=timing_tables(evidence),
@@ -189,20 +187,20 @@ def write_page(out: Path, report: CommunicationReport, described: dict[str, Any]
         return [*replace_files(out, {HTML_NAME: page})]
 
 
-def describe(report: CommunicationReport, settings: Settings, scheduler: str) -> dict[str, Any]:
-    """Return the report as a dictionary for JSON; times in µs. scheduler: granted to this process."""
-    evidence = _evidence(report, settings.bus.period_us)
+def describe(test: CommunicationTest, settings: Settings, scheduler: str) -> dict[str, Any]:
+    """Return a test as a dictionary for JSON; times in µs. scheduler: granted to this process."""
+    evidence = _evidence(test, settings.bus.period_us)
     return {
-        "verdict": report.verdict.value,
-        "share": round(report.share, 6),
-        "cycles": report.cycles,
-        "complete": report.complete,
-        "overruns": report.overruns,
+        "verdict": test.verdict.value,
+        "share": round(test.share, 6),
+        "cycles": test.cycles,
+        "complete": test.complete,
+        "overruns": test.overruns,
         "period_us": settings.bus.period_us,
         "scheduler": scheduler,
-        "load_percent": round(report.load_percent, 2),
-        "warnings": _warnings(report, scheduler),
-        "devices": {name: vars(device) for name, device in report.devices.items()},
+        "load_percent": round(test.load_percent(), 2),
+        "warnings": _warnings(test, scheduler),
+        "devices": test.devices(),
         "timing": plain_values(evidence.by_key()),
         "bins_us": {
             quantity.name: [
@@ -210,25 +208,25 @@ def describe(report: CommunicationReport, settings: Settings, scheduler: str) ->
                 for bound, count in doubling_bins(values_us, _FIRST_BIN_US, _BINS)
             ]
             for quantity in QUANTITIES
-            if (values_us := report.columns.times_us(quantity)) is not None
+            if (values_us := test.columns.times_us(quantity)) is not None
         },
     }
 
 
-def _evidence(report: CommunicationReport, period_us: float) -> TimingEvidence:
-    return collect_evidence(report.columns, period_us, is_modelled=False)
+def _evidence(test: CommunicationTest, period_us: float) -> TimingEvidence:
+    return collect_evidence(test.columns, period_us, is_modelled=False)
 
 
-def _warnings(report: CommunicationReport, scheduler: str) -> list[str]:
+def _warnings(test: CommunicationTest, scheduler: str) -> list[str]:
     """Return the warnings of a test, a line each: no real-time priority, silent devices, skipped periods."""
     warnings = []
     if not scheduler.startswith(("SCHED_FIFO", "SCHED_DEADLINE")):
         warnings.append(f"without real-time priority ({scheduler}) the times are those of a busy desktop")
-    silent = [name for name, device in report.devices.items() if not any(device.ages)]
+    silent = [name for name, device in test.devices().items() if not any(device["ages"])]
     if silent:
         warnings.append(f"never a cyclic frame from {', '.join(silent)}")
-    if report.overruns:
-        warnings.append(f"{report.overruns} of {report.periods} periods were skipped: this host was late")
+    if test.overruns:
+        warnings.append(f"{test.overruns} of {test.periods} periods were skipped: this host was late")
     return warnings
 
 

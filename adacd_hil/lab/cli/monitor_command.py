@@ -3,13 +3,12 @@
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 from adacd_hil.cli.connection import Connection, on_interrupt
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import Clock, MonotonicClock
-from adacd_hil.lab.commission.survey import BusView, MessageView, Snapshot
+from adacd_hil.lab.commission.survey import BusView
 from adacd_hil.lab.commission.traffic import receive_until
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import plain
@@ -98,8 +97,8 @@ class Monitor:
         if self._link_name is not None and now_ns - self._state_ns >= _LINK_S * 1e9:
             link = read_link(self._link_name)
             self._state, self._state_ns = (link.state or link.kind) if link else "gone", now_ns
-        snapshot = self._view.snapshot(now_ns, self._node_id)
-        return _describe(snapshot) | {"bus_state": self._state, "not_processed": self._count_missed()}
+        described = self._view.describe(now_ns, self._node_id)
+        return described | {"bus_state": self._state, "not_processed": self._count_missed()}
 
     def _count_carried(self) -> int | None:
         return None if self._link_name is None else carried_frames(self._link_name)
@@ -137,34 +136,6 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
                 described = monitor.describe()
                 screen.end(json_text(described) if as_json else fold(as_text(described), terminal_columns()))
     return ExitCode.OK
-
-
-def _describe(snapshot: Snapshot) -> dict[str, Any]:
-    return {
-        "frames": snapshot.frames,
-        "error_frames": snapshot.error_frames,
-        "strange_frames": snapshot.strange_frames,
-        "load_percent": round(snapshot.load_percent, 2),
-        "nodes": [asdict(node) | {"age_s": round(node.age_s, 3)} for node in snapshot.nodes],
-        "messages": [_describe_message(message) for message in snapshot.messages],
-    }
-
-
-def _describe_message(message: MessageView) -> dict[str, Any]:
-    return {
-        "id": message.can_id,
-        "message": message.name,
-        "is_known": message.is_known,
-        "is_protected": message.is_protected,
-        "count": message.count,
-        "rate_Hz": round(message.rate_Hz, 1),
-        "age_s": round(message.age_s, 4),
-        "lost": message.lost,
-        "errors": message.errors,
-        "data": message.data.hex(),
-        "values": {name: value for name, value, _ in message.values},
-        "units": {name: unit for name, _, unit in message.values},
-    }
 
 
 def as_text(described: dict[str, Any], is_cut: bool = False) -> str:

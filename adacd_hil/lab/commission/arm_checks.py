@@ -21,7 +21,6 @@ from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.device.torque_sensor import SensorStatus
 from adacd_hil.lab.commission.communication_test import (
-    CommunicationReport,
     CommunicationTest,
     Verdict,
     ZeroTorqueCycle,
@@ -98,12 +97,12 @@ class ArmExamination:
                 self._bus.close()
         return trouble
 
-    def communication(self) -> CommunicationReport:
-        """Return the communication test's report on the cycles so far."""
+    def communication(self) -> CommunicationTest:
+        """Return a communication test of the cycles so far."""
         test = CommunicationTest(self.settings, self.arm, self.bitrate, self.data_bitrate)
         for cycle in self.cycles:
             test.observe_cycle(cycle)
-        return test.report()
+        return test
 
     def joint_values(self, name: str) -> NDArray[np.float64]:
         """Return the values of the cycles with complete data (n, 2). name: "q", "dq" or "tau_J"."""
@@ -246,7 +245,7 @@ def check_rate(patient: ArmExamination) -> Finding:
     report = patient.communication()
     elapsed_s = report.periods * patient.settings.bus.period_s
     rates = ", ".join(
-        f"{name} {device.share * report.periods / elapsed_s:.0f}/s" for name, device in report.devices.items()
+        f"{name} {device['share'] * report.periods / elapsed_s:.0f}/s" for name, device in report.devices().items()
     )
     text = (
         f"SYNC {report.cycles / elapsed_s:.0f}/s of {1e6 / patient.settings.bus.period_us:.0f}, {rates}; "
@@ -262,7 +261,7 @@ def check_rate(patient: ArmExamination) -> Finding:
 
 def check_load(patient: ArmExamination) -> Finding:
     """Check that the bus load is at most `HIGH_LOAD_PERCENT`, which leaves room for frames that are not cyclic."""
-    load = patient.communication().load_percent
+    load = patient.communication().load_percent()
     text = f"{load:.1f} % at {patient.bitrate} bit/s"
     if load > HIGH_LOAD_PERCENT:
         return warning(text, "choose a longer bus.period_us or CAN FD; `adacd-hil budget` shows the time of each frame")

@@ -12,7 +12,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,30 +125,42 @@ def judge(share: float) -> Verdict:
     return Verdict.WARNING if share < GOOD_SHARE else Verdict.GOOD
 
 
-@dataclass(frozen=True)
-class DeviceReport:
-    """One device: share of periods with a fresh value, and number of cycles by age of the value.
+@dataclass
+class CommunicationTest:
+    """Collects the cycles of a test, and judges them: the loop calls `observe_cycle`.
 
-    checks: number of frames by result of the end-to-end check. never: cycles before its first frame.
+    complete: cycles with complete fresh data. overruns: periods that were skipped.
     """
 
-    share: float
-    ages: list[int]
-    never: int
-    checks: dict[str, int]
-    is_protected: bool
+    settings: Settings
+    arm: Arm
+    bitrate: int
+    data_bitrate: int = 0
+    complete: int = 0
+    overruns: int = 0
+    _t_ns: list[int] = field(default_factory=list)
+    _records: list[CycleRecord] = field(default_factory=list)
+    _ages: list[tuple[int, ...]] = field(default_factory=list)
+    _recent: deque[ZeroTorqueCycle] = field(default_factory=lambda: deque(maxlen=_LOAD_CYCLES))
 
+    def observe_cycle(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
+        """Add a cycle to the test; return its record for the log, with the overruns so far and `log_queue_bytes`."""
+        state = cycle.state
+        ages = (*state.age_q, *state.age_tau_J)
+        if self._ages:  # periods skipped before the first cycle don't count
+            self.overruns += state.periods - 1
+        self.complete += state.is_complete
+        self._ages.append(ages)
+        self._recent.append(cycle)
+        record = cycle.record._replace(overruns=self.overruns, log_queue_bytes=log_queue_bytes)
+        self._t_ns.append(state.t_ns)
+        self._records.append(record)
+        return record
 
-@dataclass(frozen=True)
-class CommunicationReport:
-    """Results of the test. columns: /cycle's; feedback_ns is -1 for an incomplete cycle. load: percent."""
-
-    cycles: int
-    overruns: int
-    complete: int
-    devices: dict[str, DeviceReport]
-    columns: CycleColumns
-    load_percent: float
+    @property
+    def cycles(self) -> int:
+        """Number of cycles."""
+        return len(self._ages)
 
     @property
     def periods(self) -> int:
@@ -164,72 +177,40 @@ class CommunicationReport:
         """Verdict on `share`."""
         return judge(self.share)
 
+    @cached_property
+    def columns(self) -> CycleColumns:
+        """The columns of /cycle, to be asked for when the test is over; feedback_ns is -1 for an incomplete cycle."""
+        return columns_of_records(self._t_ns, self._records)
 
-@dataclass
-class CommunicationTest:
-    """Collects the cycles of a test: the loop calls `observe_cycle`; `report` returns the results."""
+    def devices(self) -> dict[str, dict[str, Any]]:
+        """Return the results of each device, by its name and for JSON.
 
-    settings: Settings
-    arm: Arm
-    bitrate: int
-    data_bitrate: int = 0
-    _t_ns: list[int] = field(default_factory=list)
-    _records: list[CycleRecord] = field(default_factory=list)
-    _ages: list[tuple[int, ...]] = field(default_factory=list)
-    _recent: deque[ZeroTorqueCycle] = field(default_factory=lambda: deque(maxlen=_LOAD_CYCLES))
-    _overruns: int = 0
-    _complete: int = 0
+        share: of the periods with a fresh value; ages: number of cycles by age of the value; never: cycles before the
+        first frame; checks: number of frames by result of the end-to-end check.
+        """
+        devices: tuple[Drive | TorqueSensor, ...] = (*self.arm.drives, *self.arm.sensors)
+        ages = np.array(self._ages, dtype=np.int64).reshape(self.cycles, len(devices)).T
+        return {device.name: self._device(device, own) for device, own in zip(devices, ages, strict=True)}
 
-    def observe_cycle(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
-        """Add a cycle to the test; return its record for the log, with the overruns so far and `log_queue_bytes`."""
-        state = cycle.state
-        ages = (*state.age_q, *state.age_tau_J)
-        if self._ages:  # periods skipped before the first cycle don't count
-            self._overruns += state.periods - 1
-        self._complete += state.is_complete
-        self._ages.append(ages)
-        self._recent.append(cycle)
-        record = cycle.record._replace(overruns=self._overruns, log_queue_bytes=log_queue_bytes)
-        self._t_ns.append(state.t_ns)
-        self._records.append(record)
-        return record
-
-    def report(self) -> CommunicationReport:
-        """Return the results of the cycles so far: counts, ages of each device's values, bus load."""
-        cycles = len(self._ages)
-        ages = np.array(self._ages, dtype=np.int64).reshape(cycles, 2 * JOINTS)
-        periods = cycles + self._overruns
-        names = [drive.name for drive in self.arm.drives] + [sensor.name for sensor in self.arm.sensors]
-        return CommunicationReport(
-            cycles=cycles,
-            overruns=self._overruns,
-            complete=self._complete,
-            devices={name: self._device(ages[:, place], periods, place) for place, name in enumerate(names)},
-            columns=columns_of_records(self._t_ns, self._records),
-            load_percent=self._load_percent(),
-        )
-
-    def _device(self, ages: NDArray[np.int64], periods: int, place: int) -> DeviceReport:
+    def _device(self, device: Drive | TorqueSensor, ages: NDArray[np.int64]) -> dict[str, Any]:
         seen = ages[np.cumsum(ages == 0) > 0]
         counts = np.bincount(np.minimum(seen, OLDEST_CYCLES), minlength=OLDEST_CYCLES + 1)
-        devices: tuple[Drive | TorqueSensor, ...] = (*self.arm.drives, *self.arm.sensors)
-        device = devices[place]
         checks = {status.name: count for status, count in device.end_to_end.tally()} if device.is_protected else {}
         checks["IMPLAUSIBLE"] = device.implausible_frames
-        fresh = int(np.count_nonzero(ages == 0))
-        return DeviceReport(
-            share=fresh / periods if periods else 0.0,
-            ages=counts.tolist(),
-            never=len(ages) - len(seen),
-            checks=checks,
-            is_protected=device.is_protected,
-        )
+        return {
+            "share": int(np.count_nonzero(ages == 0)) / self.periods if self.periods else 0.0,
+            "ages": counts.tolist(),
+            "never": len(ages) - len(seen),
+            "checks": checks,
+            "is_protected": device.is_protected,
+        }
 
-    def _load_percent(self) -> float:
+    def load_percent(self) -> float:
+        """Return the bus load in the last cycles, percent."""
         meter = LoadMeter(self.bitrate, self.data_bitrate, 0)
         for cycle in self._recent:
             for _, frame in cycle.frames:
                 with suppress(ValueError):  # a foreign frame whose length the contract's bus can't have
                     meter.count_frame(frame)
         periods = sum(cycle.state.periods for cycle in self._recent)
-        return meter.take_load(periods * self.settings.bus.period_ns).percent
+        return meter.take_percent(periods * self.settings.bus.period_ns)

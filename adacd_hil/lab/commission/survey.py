@@ -5,13 +5,14 @@ clauses 7.2.4 (SDO), 7.2.8 (NMT, boot-up, heartbeat), 7.3.3 (predefined connecti
 0x1018. It also reads 0x2000, wire version and layout digest, of nodes whose profile has it.
 
 The listener's view sends no frame: nodes with their NMT state, messages with rate, age, checks and values, load.
-Everything is counted frame by frame; values are decoded when a caller requests a `Snapshot`.
+Everything is counted frame by frame; values are decoded by `BusView.describe`.
 """
 
 import struct
 from collections import deque
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
@@ -288,52 +289,6 @@ _WINDOW_NS = 1_000_000_000
 """Rates are means over one to two of these."""
 
 
-@dataclass(frozen=True)
-class NodeView:
-    """One node. state: by its last heartbeat; age in s since then."""
-
-    node_id: int
-    name: str
-    state: str
-    age_s: float
-
-
-@dataclass(frozen=True)
-class MessageView:
-    """One identifier. `values`: (signal, value, unit) of the last frame that passed its checks; empty if unknown.
-
-    lost: frames that a counter shows to be missing, as occasions. errors: frames that failed a check. is_protected:
-    whether there is a check at all.
-    """
-
-    can_id: int
-    name: str
-    is_known: bool
-    is_protected: bool
-    count: int
-    rate_Hz: float
-    age_s: float
-    lost: int
-    errors: int
-    data: bytes
-    values: tuple[tuple[str, float, str], ...]
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """The bus as seen up to now. load: percent, since the snapshot before.
-
-    strange_frames: of a length that the contract's bus can't carry; the load leaves them out.
-    """
-
-    frames: int
-    error_frames: int
-    strange_frames: int
-    load_percent: float
-    nodes: list[NodeView]
-    messages: list[MessageView]
-
-
 class _Entry:
     """One identifier's frames so far."""
 
@@ -408,10 +363,14 @@ class BusView:
             if entry.receiver is not None:
                 entry.receiver.restart_sequence()
 
-    def snapshot(self, t_ns: int, node_id: int | None = None) -> Snapshot:
-        """Return counts, nodes and messages as of `t_ns`, and the bus load since the snapshot before.
+    def describe(self, t_ns: int, node_id: int | None = None) -> dict[str, Any]:
+        """Return counts, nodes and messages as of `t_ns` for JSON, and the bus load since the call before, percent.
 
         node_id: return only nodes and messages of this node; counts and load are still of the whole bus.
+        strange_frames: of a length that the contract's bus can't carry; the load leaves them out. A node's state: by
+        its last heartbeat, age_s since then. Of a message: lost: frames that a counter shows to be missing, as
+        occasions; errors: frames that failed a check, if is_protected; values: of the last frame that passed its
+        checks.
         """
         mark_ns, counts = self._marks[0]
         elapsed_s = (t_ns - mark_ns) * 1e-9
@@ -420,48 +379,51 @@ class BusView:
             for can_id in sorted(self._entries)
             if node_id is None or (can_id <= MAX_STANDARD_ID and can_id & 0x7F == node_id)
         }
-        snapshot = Snapshot(
-            frames=self.frames,
-            error_frames=self._error_frames,
-            strange_frames=self._strange_frames,
-            load_percent=self._load.take_load(t_ns).percent,
-            nodes=[
+        described = {
+            "frames": self.frames,
+            "error_frames": self._error_frames,
+            "strange_frames": self._strange_frames,
+            "load_percent": round(self._load.take_percent(t_ns), 2),
+            "nodes": [
                 self._node(can_id & 0x7F, entry, t_ns)
                 for can_id, entry in wanted.items()
                 if can_id & ~0x7F == HEARTBEAT_ID and can_id != HEARTBEAT_ID
             ],
-            messages=[
+            "messages": [
                 self._message(
                     can_id, entry, t_ns, (entry.count - counts.get(can_id, 0)) / elapsed_s if elapsed_s else 0
                 )
                 for can_id, entry in wanted.items()
             ],
-        )
+        }
         if t_ns - self._marks[-1][0] >= _WINDOW_NS:
             self._marks.append((t_ns, {can_id: entry.count for can_id, entry in self._entries.items()}))
-        return snapshot
+        return described
 
-    def _node(self, node_id: int, entry: _Entry, t_ns: int) -> NodeView:
+    def _node(self, node_id: int, entry: _Entry, t_ns: int) -> dict[str, Any]:
         state = entry.data[0] & 0x7F if entry.data else -1
         name = message_name(self._codec, HEARTBEAT_ID + node_id).removesuffix("Heartbeat")
-        name = "" if name.startswith("(") else name
-        return NodeView(node_id, name, NMT_STATES.get(state, "unknown"), (t_ns - entry.last_ns) * 1e-9)
+        return {
+            "node_id": node_id,
+            "name": "" if name.startswith("(") else name,
+            "state": NMT_STATES.get(state, "unknown"),
+            "age_s": round((t_ns - entry.last_ns) * 1e-9, 3),
+        }
 
-    def _message(self, can_id: int, entry: _Entry, t_ns: int, rate_Hz: float) -> MessageView:
-        message = entry.message
-        values: tuple[tuple[str, float, str], ...] = ()
-        if message is not None and entry.valid is not None:
-            values = message.decode_named(entry.valid)
-        return MessageView(
-            can_id=can_id,
-            name=message_name(self._codec, can_id),
-            is_known=message is not None,
-            is_protected=entry.receiver is not None,
-            count=entry.count,
-            rate_Hz=rate_Hz,
-            age_s=(t_ns - entry.last_ns) * 1e-9,
-            lost=entry.lost,
-            errors=entry.errors,
-            data=entry.data,
-            values=values,
-        )
+    def _message(self, can_id: int, entry: _Entry, t_ns: int, rate_Hz: float) -> dict[str, Any]:
+        message, valid = entry.message, entry.valid
+        values = () if message is None or valid is None else message.decode_named(valid)
+        return {
+            "id": can_id,
+            "message": message_name(self._codec, can_id),
+            "is_known": message is not None,
+            "is_protected": entry.receiver is not None,
+            "count": entry.count,
+            "rate_Hz": round(rate_Hz, 1),
+            "age_s": round((t_ns - entry.last_ns) * 1e-9, 4),
+            "lost": entry.lost,
+            "errors": entry.errors,
+            "data": entry.data.hex(),
+            "values": {name: value for name, value, _ in values},
+            "units": {name: unit for name, _, unit in values},
+        }
