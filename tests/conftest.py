@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
+STARTS_WRITER = "adacd_hil.log.recording.recorder.start_module"
 os.environ.pop("COLUMNS", None)  # pytest-xdist gives its workers 80; what no terminal shows has none
 os.unsetenv("COLUMNS")  # readline, which pytest loads, sets it behind Python's back
 for name in ("FORCE_COLOR", "CLICOLOR_FORCE"):  # as of a CI: what programs read has no colours
@@ -27,3 +28,21 @@ def _ordinary_priority() -> Iterator[None]:
     yield
     if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _writer_thread() -> Iterator[None]:
+    """Let threads write the logs of lockstep: see writer_thread.py."""
+    from writer_thread import started
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(STARTS_WRITER, started)
+        yield
+
+
+@pytest.fixture
+def writer_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a process write all logs of the test."""
+    from adacd_hil.log.recording.processes import start_module
+
+    monkeypatch.setattr(STARTS_WRITER, start_module)

@@ -23,6 +23,8 @@ from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.message_table import MessageTable
 
+pytestmark = pytest.mark.usefixtures("writer_process")
+
 CONTROL_PROCESS = """
 import sys
 import threading

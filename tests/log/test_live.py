@@ -194,6 +194,7 @@ def subscribe(connection, channels):
     connection.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
 
 
+@pytest.mark.usefixtures("writer_process")
 def test_the_file_of_the_writer_is_the_same_watched_or_not(tmp_path):
     run = make_run(300, seed=6)
     run.cycles[-1].event = LAST

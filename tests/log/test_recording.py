@@ -297,6 +297,7 @@ def test_lockstep_chunks_hold_at_most_a_quarter_second(tmp_path):
     assert max(chunk.message_end_time - chunk.message_start_time for chunk in chunks) < 250_000_000
 
 
+@pytest.mark.usefixtures("writer_process")
 def test_the_writer_inherits_no_socket_of_ours_and_no_terminal(tmp_path):
     left, right = socket.socketpair()
     with left, right:
@@ -309,6 +310,7 @@ def test_the_writer_inherits_no_socket_of_ours_and_no_terminal(tmp_path):
     assert session == recorder.pid
 
 
+@pytest.mark.usefixtures("writer_process")
 def test_the_writer_of_a_real_time_process_is_scheduled_plainly(tmp_path):
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))

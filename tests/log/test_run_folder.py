@@ -49,6 +49,7 @@ def test_a_run_beside_one_that_is_going_on_is_told_its_process(tmp_path):
     assert read_log(path).scheme.block.tobytes() == run.blocks.tobytes()
 
 
+@pytest.mark.usefixtures("writer_process")
 def test_a_run_is_going_on_after_its_first_part(tmp_path):
     path = tmp_path / "run.mcap"
     recorder = start(path, make_run(0), settings=LogSettings(part_MiB=1, part_min=0.0))

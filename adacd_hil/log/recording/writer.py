@@ -232,15 +232,11 @@ def _schedule_plainly() -> None:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> None:
-    """Run the writer process: report readiness, write packets until the end of the log, send the summary."""
-    _schedule_plainly()
-    connection = socket.socket(fileno=socket_descriptor)
+def write_log(connection: socket.socket, file_descriptor: int, ring_descriptor: int, setup: WriterSetup) -> None:
+    """Report readiness, write packets until the end of the log, send the summary."""
     error = url = ""
     try:
-        setup: WriterSetup = read_setup()
         ring = RingReader(ring_descriptor)
-        os.dup(file_descriptor)  # never closed: the lock of the first part lasts as long as this process
         sink = Sink(file_descriptor, setup.path, waits=setup.is_blocking, on_written=ring.count_written)
         process = WriterProcess(connection, ring, sink, setup)
         sink.settle()
@@ -252,6 +248,13 @@ def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> 
     _send(connection, json.dumps({"error": error, "live_url": url}).encode())
     if not error:
         process.run()
+
+
+def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> None:
+    """Be the writer process."""
+    _schedule_plainly()
+    os.dup(file_descriptor)  # never closed: the lock of the first part lasts as long as this process
+    write_log(socket.socket(fileno=socket_descriptor), file_descriptor, ring_descriptor, read_setup())
 
 
 if __name__ == "__main__":
