@@ -20,11 +20,13 @@ from typing import Any
 import can
 import click
 from documents import ROOT
+from loaded import loaded_contract
 
 from adacd_hil.cli.main import cli as host_cli
 from adacd_hil.control.tare_file import Tare, read_tare
-from adacd_hil.device.contract import find_contract, load_contract
-from adacd_hil.device.profile import ProfileSettings, load_profile
+from adacd_hil.device.contract import find_contract
+from adacd_hil.device.device_files import load_profile
+from adacd_hil.device.profile import ProfileSettings
 from adacd_hil.given_path import WrittenPath
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.settings.configuration import Settings
@@ -267,7 +269,7 @@ def _resolve_files(value: tuple[str, ...], values: dict[str, Any]) -> None:
 RESOLVED: dict[str, Callable[[Any, dict[str, Any]], object]] = {
     "changes": _resolve_changes,
     "vary": _resolve_variations,
-    "config": lambda value, values: load_contract(load_settings(value, values.get("profile"))),
+    "config": lambda value, values: loaded_contract(load_settings(value, values.get("profile"))),
     "scenario": _resolve_scenarios,
     "scenarios": _resolve_scenarios,
     "dbc": _resolve_contract,
@@ -411,7 +413,7 @@ def _load_profile(path: Path) -> None:
 
 
 KINDS: dict[str, Callable[[Path], object]] = {
-    "configuration": lambda path: load_contract(load_settings(str(path))),
+    "configuration": lambda path: loaded_contract(load_settings(str(path))),
     "scenario": _load_scenario,
     "device profile": _load_profile,
     "map of a recording": read_map,

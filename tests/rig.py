@@ -16,6 +16,7 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.pacing import GridPacer
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.recording.recorder import Recorder
@@ -109,11 +110,11 @@ class Rig:
 
     @cached_property
     def arm(self) -> Arm:
-        return Arm(self.settings, self.codec, self.tap)
+        return Arm(self.settings, self.codec, place_devices(self.settings), self.tap)
 
     @cached_property
     def master(self) -> Master:
-        return Master(self.settings, self.codec, self.tap)
+        return Master(self.settings, self.codec, place_devices(self.settings), self.tap)
 
     def deliver(self, can_id: int, data: bytes) -> None:
         """Pass on what a device sends."""
@@ -183,7 +184,9 @@ class SessionRig(Rig):
         settings = settings or scripted(finish_s=finish_s, acknowledge_faults=acknowledge_faults)
         super().__init__(settings, scenario, **parts)
         operator = ScriptedOperator(settings.operator)
-        self.session = Session(settings, self.codec, self.host_bus, self.clock, operator, folder, "embedded")
+        self.session = Session(
+            settings, self.codec, place_devices(settings), self.host_bus, self.clock, operator, folder, "embedded"
+        )
 
     def run(self) -> tuple[SessionSummary, RunLog]:
         summary = self.session.run()

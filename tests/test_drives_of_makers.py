@@ -12,7 +12,7 @@ from adacd_hil.api import load
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import ExitCode, exit_code
-from adacd_hil.device.profile import load_profile
+from adacd_hil.device.device_files import load_profile
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.settings.configuration_files import load_settings
 

@@ -112,10 +112,11 @@ def test_the_installed_package_is_the_one_that_runs(installed: Path) -> None:
 def test_every_configuration_and_its_contract_load_where_the_wheel_is_installed(installed: Path) -> None:
     code = (
         "from adacd_hil.device.contract import load_contract\n"
+        "from adacd_hil.device.device_files import place_devices\n"
         "from adacd_hil.settings.configuration_files import load_settings\n"
         "from adacd_hil.settings.toml_files import builtin_names\n"
         "for name in builtin_names():\n"
-        "    load_contract(load_settings(name)); print(name)"
+        "    own = load_settings(name); load_contract(own, place_devices(own)); print(name)"
     )
     assert _run(installed, code).split() == sorted(path.stem for path in (ROOT / "adacd_hil" / "configs").iterdir())
 

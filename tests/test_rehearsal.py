@@ -14,7 +14,7 @@ from own_arm import LINKS, OWN_ARM, describe_arm, describe_geared_arm, touches
 from adacd_hil.cli.embedded_run import resolve
 from adacd_hil.cli.main import cli
 from adacd_hil.control.configuration_check import examine_configuration
-from adacd_hil.device.profile import load_profile
+from adacd_hil.device.device_files import load_profile
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from loaded import loaded_contract
 from two_arms_rig import FIRST, SECOND, TwoArms, first_beside
 
 from adacd_hil.cli.connection import received_ids
@@ -16,7 +17,7 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.pacing import make_pacer
 from adacd_hil.control.session import Session
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
@@ -55,8 +56,8 @@ class Rig:
         arms = TwoArms(settings, dies_ns=dies_ns)
         self.wire, self.first, self.end, clock = arms.wire, arms.first, arms.end, arms.clock
         self.tap = Tap(self.end, clock)
-        self.arm = Arm(settings, load_contract(settings), self.tap)
-        self.master = Master(settings, load_contract(settings), self.tap)
+        self.arm = Arm(settings, loaded_contract(settings), place_devices(settings), self.tap)
+        self.master = Master(settings, loaded_contract(settings), place_devices(settings), self.tap)
         self.pacer = make_pacer(settings, clock, self.tap, self.arm.sync_id)
         operator = ScriptedOperator(settings.operator)
         self.cycle = Cycle(settings, self.tap, self.arm, self.master, self.pacer, operator, lambda _: None, clock)
@@ -133,14 +134,16 @@ def test_an_arm_at_other_node_ids_runs_in_lockstep_on_a_bus_of_its_own(tmp_path:
     devices = dataclasses.replace(load_settings("paper").devices, drive_node=(5, 6), sensor_node=(7, 8))
     script = OperatorSettings(script=(RequestSettings(at_s=0.1, request="finish"),))
     settings = dataclasses.replace(load_settings("paper"), devices=devices, operator=script)
-    codec = load_contract(settings)
+    codec = loaded_contract(settings)
     clock = VirtualClock()
     embedded = EmbeddedBus(clock)
     bench = Bench(load_scenario("idle", "P"), codec, embedded.deliver)
     embedded.attach(bench.on_frame)
     bench.boot()
     bus = make_lockstep_bus(embedded, clock, codec, settings)
-    session = Session(settings, codec, bus, clock, ScriptedOperator(script), tmp_path, "embedded")
+    session = Session(
+        settings, codec, place_devices(settings), bus, clock, ScriptedOperator(script), tmp_path, "embedded"
+    )
     summary = session.run()
     assert (summary.error, summary.result and summary.result.fault) == ("", FaultReason.NONE)
     frames = read_log(summary.log.path).frames
@@ -168,6 +171,6 @@ def test_what_a_shared_bus_cannot_be_is_one_line(tmp_path: Path, bus: str, clock
 
 def test_the_receive_filter_has_what_only_this_host_sends_and_nothing_of_the_neighbour() -> None:
     settings = settings_of(SECOND)
-    heard = set(received_ids(load_contract(settings), settings))
+    heard = set(received_ids(loaded_contract(settings), settings, place_devices(settings)))
     assert heard >= {0x000, 0x080, 0x205, 0x206, 0x605, 0x608, 0x700 + settings.bus.host_node}
     assert {can_id & 0x7F for can_id in heard} - {0} == {5, 6, 7, 8, settings.bus.host_node}

@@ -5,12 +5,13 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
+from loaded import loaded_contract
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.pacing import GridPacer, Tick
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand
 from adacd_hil.settings.configuration import Settings
@@ -79,7 +80,7 @@ class Wire:
                 bench.on_frame(frame)
 
     def add_arm(self, settings: Settings, scenario: Scenario) -> None:
-        bench = Bench(scenario, load_contract(settings), lambda *frame: self._answer(bench, *frame))
+        bench = Bench(scenario, loaded_contract(settings), lambda *frame: self._answer(bench, *frame))
         self.benches.append(bench)
         bench.boot()
 
@@ -91,10 +92,10 @@ class FirstHost:
     """Pushes its arm a little, once per period; sends SYNC."""
 
     def __init__(self, wire: Wire, settings: Settings) -> None:
-        codec = load_contract(settings)
+        codec = loaded_contract(settings)
         self.tap = Tap(wire.ends[FIRST], wire.clock)
-        self.arm = Arm(settings, codec, self.tap)
-        self.master = Master(settings, codec, self.tap)
+        self.arm = Arm(settings, codec, place_devices(settings), self.tap)
+        self.master = Master(settings, codec, place_devices(settings), self.tap)
         pacer = GridPacer(wire.clock, settings.bus.period_ns)
         self._exchange = Exchange(settings, self.tap, self.arm, self.master, pacer, wire.clock)
         self.cycle = -1

@@ -33,6 +33,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.pacing import GridPacer, Tick
 from adacd_hil.control.session import Session
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
@@ -226,7 +227,9 @@ def bench_embedded() -> None:
         bus = model_time(embedded, clock, codec, settings)
         operator = ScriptedOperator(settings.operator)
         with patch("adacd_hil.control.pacing.GridPacer", StampedPacer):
-            summary = Session(settings, codec, bus, clock, operator, Path(folder), "embedded").run()
+            summary = Session(
+                settings, codec, place_devices(settings), bus, clock, operator, Path(folder), "embedded"
+            ).run()
         assert summary.result is not None
         show("devices: 1 ms of plant, sensors and drives", np.array(counted.period_ns[WARM_UP:]) * 1e-3)
         show("embedded bus, lockstep: one cycle of all", np.diff(StampedPacer.began_ns[WARM_UP:]) * 1e-3)

@@ -4,7 +4,7 @@ import dataclasses
 import shlex
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,8 @@ from typing import NoReturn
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
+from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.printable import in_line
 from adacd_hil.settings.arm_settings import MOST_BLIND_CYCLES
@@ -108,12 +110,14 @@ def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) 
     return make_lockstep_bus(bus, clock, codec, settings)
 
 
-def received_ids(codec: Codec, settings: Settings) -> list[int]:
+def received_ids(codec: Codec, settings: Settings, devices: Iterable[PlacedDevice]) -> list[int]:
     """Return the CAN identifiers that the host reads: the contract's, and those that only the host may send.
 
     A frame of the second kind shows another host.
     """
-    return sorted({message.can_id for message in codec.messages.values()} | host_frames(settings, codec).keys())
+    return sorted(
+        {message.can_id for message in codec.messages.values()} | host_frames(settings, codec, devices).keys()
+    )
 
 
 @dataclass(frozen=True)
@@ -150,10 +154,11 @@ class Connection:
             return settings
         return dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, contract=str(self.dbc)))
 
-    def load(self) -> tuple[Settings, Codec]:
-        """Return the settings, and the codec of their contract. Raises ConfigError, CodecError."""
+    def load(self) -> tuple[Settings, Codec, list[PlacedDevice]]:
+        """Return the settings, the codec of their contract, and the devices. Raises ConfigError, CodecError."""
         settings = self.settings()
-        return settings, load_contract(settings)
+        devices = place_devices(settings)
+        return settings, load_contract(settings, devices), devices
 
     def load_decoder(self) -> Codec | DbcDecoder:
         """Return the frame decoder for a command that only listens: of any DBC that --dbc names, else of the contract.
@@ -166,12 +171,12 @@ class Connection:
                 return decoder
         return self.load()[1]
 
-    def open(self, clock: Clock, codec: Codec, settings: Settings) -> Bus:
+    def open(self, clock: Clock, codec: Codec, settings: Settings, devices: Iterable[PlacedDevice]) -> Bus:
         """Open the bus for a run and return it; in real time it receives only the identifiers of `received_ids`.
 
         A VirtualClock means lockstep: the bus then models the time. Raises BusMissingError, CodecError.
         """
-        can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings)
+        can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings, devices)
         bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)
         return model_time(bus, clock, codec, settings) if isinstance(clock, VirtualClock) else bus
 

@@ -11,6 +11,7 @@ from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
 from adacd_hil.log.viewer_layout import viewer_files
 from adacd_hil.records import TRUTH_LAYOUT, Vector
@@ -95,7 +96,8 @@ def run_embedded(
     """
     settings, scenario = cast.settings, cast.scenario
     check_shared("lockstep", settings)  # an arm in this process is alone on its bus
-    codec = load_contract(settings)
+    devices = place_devices(settings)
+    codec = load_contract(settings, devices)
     contract = cast.contract or playable_contract(codec)
     clock = make_clock(clock_name)
     embedded = EmbeddedBus(clock)
@@ -126,6 +128,7 @@ def run_embedded(
             session = Session(
                 settings,
                 codec,
+                devices,
                 bus,
                 clock,
                 ScriptedOperator(settings.operator),

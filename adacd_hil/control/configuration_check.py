@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from adacd_hil.control.motions import motion_problems
 from adacd_hil.device.contract import load_contract
-from adacd_hil.device.profile import load_profile
+from adacd_hil.device.device_files import load_profile, place_devices
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
 from adacd_hil.settings.parsing import parse
@@ -50,7 +50,7 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
     if problems := _device_problems(settings):
         return ConfigurationFindings(problems, [], None)
     try:
-        codec = load_contract(settings)
+        codec = load_contract(settings, place_devices(settings))
     except (ConfigError, CodecError) as error:
         return ConfigurationFindings([str(error)], [], None)
     excess = describe_excess(codec, settings)

@@ -20,7 +20,7 @@ from adacd_hil.device.arm_report import describe_checks
 from adacd_hil.device.attached_devices import device_attachments
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity, Master
-from adacd_hil.device.profile import enable_timeout_s
+from adacd_hil.device.profile import PlacedDevice, enable_timeout_s
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import write_new_file
 from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, LOG_NAME, arithmetic
@@ -109,6 +109,7 @@ class Session:
 
     settings: Settings
     codec: Codec
+    devices: Sequence[PlacedDevice]
     bus: Bus
     clock: Clock
     operator: Operator
@@ -147,7 +148,7 @@ class Session:
         if self.is_lockstep:  # a simulated arm moves by whole periods, however late the modelled host sends SYNC
             realtime = replace(self.settings.realtime, sample_period="nominal")
             self.settings = replace(self.settings, realtime=realtime)
-        safety = replace(self.settings.safety, enable_timeout_s=enable_timeout_s(self.settings))
+        safety = replace(self.settings.safety, enable_timeout_s=enable_timeout_s(self.settings, self.devices))
         self.settings = replace(self.settings, safety=safety)  # logged, so that a replay needs no profiles
         tap = Tap(self.bus, self.clock)
         pacer = make_pacer(self.settings, self.clock, tap, self.codec.message("Sync").can_id)
@@ -203,8 +204,8 @@ class Session:
 
     def _prepare(self, tap: Tap, pacer: Pacer) -> Attempt:
         """Make and compile the objects of a new attempt, and return them; pass on an interruption so far."""
-        arm = Arm(self.settings, self.codec, tap)
-        master = Master(self.settings, self.codec, tap, watch_host=not self.is_lockstep)
+        arm = Arm(self.settings, self.codec, self.devices, tap)
+        master = Master(self.settings, self.codec, self.devices, tap, watch_host=not self.is_lockstep)
         cycle = Cycle(self.settings, tap, arm, master, pacer, self.operator, self.progress, self.clock, self.touched_ns)
         cycle.compile()
         self._cycle = cycle
@@ -222,7 +223,7 @@ class Session:
         try:
             self.progress(f"looking for the arm on {tap.channel}")
             if not self.is_lockstep:
-                refuse_company(tap, self.clock, self.settings, self.codec)
+                refuse_company(tap, self.clock, self.settings, self.codec, self.devices)
             self._boot(master, recorder, tap)
             self.progress("running")
             ending = Ending(self._run(cycle, master, recorder, tap), "", is_bus_failed=False)
@@ -272,7 +273,7 @@ class Session:
     def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
-        attachments = device_attachments(self.settings)
+        attachments = device_attachments(self.devices)
         attachments[DBC_NAME] = self.codec.text
         attachments[CONFIG_NAME] = to_toml(self.settings).encode()
         for file in self.files:

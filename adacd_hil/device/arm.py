@@ -10,7 +10,7 @@ import numpy as np
 
 from adacd_hil.device.answer_clock import KEPT, AnswerClock, newest_sample
 from adacd_hil.device.drive import Drive, option_codes, torque_limit_permille
-from adacd_hil.device.profile import PlacedDevice, place_devices
+from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.strangers import Strangers
 from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, FaultReason, FrameChecks
@@ -37,13 +37,9 @@ REMEMBERED_GAPS = 0xFF
 class Arm:
     """Both joints on one bus. Per cycle: `synchronise`, `accept` each frame, `state`, `send_command`."""
 
-    def __init__(self, settings: Settings, codec: Codec, bus: Bus) -> None:
-        """Place the devices.
-
-        Raises ConfigError when a device profile can't be used, CodecError when the contract lacks a signal.
-        """
+    def __init__(self, settings: Settings, codec: Codec, devices: Sequence[PlacedDevice], bus: Bus) -> None:
+        """Take the devices in the order of `device_files`. Raises CodecError when the contract lacks a signal."""
         period_s = settings.bus.period_s
-        devices = place_devices(settings)
         self.drives = tuple(_make_drive(settings, codec, device) for device in devices[:JOINTS])
         self.sensors = tuple(_make_sensor(codec, device, period_s) for device in devices[JOINTS:])
         self.devices: tuple[Drive | TorqueSensor, ...] = (*self.drives, *self.sensors)
@@ -87,7 +83,7 @@ class Arm:
         self._last_data = [b""] * len(self.devices)
         self.repeats = [0] * len(self.devices)
         """How often each device's frame came again, the same or with the same counter."""
-        self.strangers = Strangers(settings, codec)
+        self.strangers = Strangers(settings, codec, devices)
         self._emergency_ids = {EMERGENCY_ID + device.node_id: device for device in self.devices}
         self._tolerated_codes = frozenset(settings.safety.tolerated_emergencies)
         self._emergencies: dict[str, int] = {}

@@ -4,34 +4,27 @@ No threads: a request is sent, then the bus is read until its answer is in. Othe
 handed to their consumers. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).
 """
 
-import configparser
 import functools
-import io
 import logging
-import re
 import struct
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib import resources
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import canopen
 from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
-from adacd_hil.file_access import read_input
-from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Bus, BusError, Frame
 from adacd_hil.wire.contract_frames import NMT_ID, SDO_REQUEST_ID
-from adacd_hil.wire.eds_text import readable_eds
 
 ANSWER_TIMEOUT_S = 0.5
 """Longest wait for an answer. CiA 301 gives no value; drives answer within 100 ms."""
 _MAX_UNRELATED_FRAMES = 10_000
 SDO_ABORT = 0x80
-_UNFORESEEN = (
+UNFORESEEN = (
     canopen.ObjectDictionaryError,
     struct.error,
     LookupError,
@@ -44,20 +37,6 @@ _UNFORESEEN = (
 """Exceptions of canopen on an unexpected answer: canopen trusts lengths, toggle bits and types."""
 _ABSENT = (0x06020000, 0x06090011)  # no such object, no such sub-index: CiA 301, table 22
 
-_EDS_CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x19\x1b-\x1f\x7f]")
-"""All but tab, the ends of lines and the end of a file under DOS."""
-_EDS_OBJECT = re.compile("[0-9A-Fa-f]{4}(?:[Ss]ub[0-9A-Fa-f]+)?")
-_MAKERS_OBJECTS = range(0x2000, 0x6000)
-"""Manufacturer objects: those that a profile names have a default or no value; the others' values don't matter."""
-_EDS_INTEGERS = {
-    form
-    for number in canopen.objectdictionary.INTEGER_TYPES
-    if number != canopen.objectdictionary.BOOLEAN
-    for form in (str(number), f"0X{number:X}", f"0X{number:02X}", f"0X{number:04X}")
-}
-_EDS_NUMBERS = ("DefaultValue", "ParameterValue", "LowLimit", "HighLimit")
-_EDS_NUMBER = re.compile(r"(?i:\s*(?:\$NODEID\s*\+?)?\s*[-+]?\s*(?:0x[0-9a-f]+|[0-9]+)?\s*(?:\+?\s*\$NODEID)?\s*)")
-"""CiA 306, 4.5.1: decimal, octal or hexadecimal, the node id before or after it."""
 
 # canopen logs each error that it raises; the host prints the raised form only.
 logging.getLogger("canopen").addHandler(logging.NullHandler())
@@ -104,48 +83,6 @@ class EdsVariable(NamedTuple):
     is_writable: bool
     is_float: bool = False
     is_mappable: bool = True
-
-
-def read_eds(path: Path, node_id: int | None) -> Any:
-    """Read the object dictionary of an EDS; `$NODEID` in it becomes `node_id`, None: that of a DCF. Raises ConfigError.
-
-    canopen drops values that it can't read as a number. An object without a default is not compared.
-    """
-    try:
-        text = read_input(path).decode("utf-8", "replace").removeprefix("\ufeff")
-        _check_eds(text)
-        stream = io.StringIO(readable_eds(text))
-        stream.name = "object dictionary.eds"
-        return canopen.import_od(stream, node_id)
-    except OSError as error:
-        raise ConfigError(f"EDS {path}: {error.strerror}") from None
-    except ConfigError as error:
-        raise ConfigError(f"EDS {path}: {error}") from None
-    except (*_UNFORESEEN, configparser.Error, RecursionError) as error:
-        raise ConfigError(f"EDS {path}: {' '.join(str(error).split()) or repr(error)}") from None
-
-
-def _check_eds(text: str) -> None:
-    """Refuse control characters, and integers of standard objects that can't be read as numbers.
-
-    Raises ConfigError, configparser.Error.
-    """
-    if found := _EDS_CONTROL.search(text):
-        line = text.count("\n", 0, found.start()) + 1
-        raise ConfigError(f"line {line} has the control character 0x{ord(found[0]):02X}")
-    eds = configparser.RawConfigParser(inline_comment_prefixes=(";",))
-    eds.optionxform = str  # type: ignore[assignment,method-assign]
-    eds.read_string(text, "object dictionary.eds")
-    for section in eds.sections():
-        if not _EDS_OBJECT.fullmatch(section) or int(section[:4], 16) in _MAKERS_OBJECTS:
-            continue
-        entries = eds[section]
-        if entries.get("DataType", "").strip().upper() not in _EDS_INTEGERS:
-            continue
-        for key in _EDS_NUMBERS:
-            value = entries.get(key, "")
-            if value and not _EDS_NUMBER.fullmatch(value):
-                raise ConfigError(f"[{section}] {key} = {value[:40]!r} is no integer")
 
 
 def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
@@ -274,7 +211,7 @@ def as_device_error(name: str, node_id: int, what: str, answer_s: float = ANSWER
         raise RefusedError(f"{name} (node {node_id}): {what} refused: {error}", _REFUSED) from None
     except SdoCommunicationError:
         raise DeviceError(f"{name} (node {node_id}): no SDO answer within {answer_s:g} s ({what})", _SILENT) from None
-    except (SdoError, *_UNFORESEEN) as error:
+    except (SdoError, *UNFORESEEN) as error:
         raise DeviceError(f"{name} (node {node_id}): {what}: {' '.join(str(error).split()) or repr(error)}") from None
 
 

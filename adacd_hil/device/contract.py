@@ -4,12 +4,12 @@ A composed contract has the layout of a DBC written by hand for the same devices
 Source: Vector DBC file format; CiA 301 clause 7.3.3 (predefined connection set).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.device.profile import EMCY_INHIBIT_100US, PdoSettings, PlacedDevice, place_devices
+from adacd_hil.device.profile import EMCY_INHIBIT_100US, PdoSettings, PlacedDevice
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
@@ -81,13 +81,12 @@ _SDO = (_DbcSignal("command", 8), _DbcSignal("index", 16), _DbcSignal("subindex"
 _HEARTBEAT = (_DbcSignal("state", 8),)
 
 
-def load_contract(settings: Settings) -> Codec:
+def load_contract(settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
     """Return the codec of the configured devices: from the DBC that `devices.contract` names, or composed.
 
     The DBC's node ids are moved as a whole to the configured ones. Raises ConfigError for an unknown contract, and for
     a profile that can't be used or differs from the DBC; CodecError for a DBC that can't serve.
     """
-    devices = place_devices(settings)
     composed = compose(settings, devices)
     name = settings.devices.contract
     if not name:
@@ -97,7 +96,7 @@ def load_contract(settings: Settings) -> Codec:
     return codec
 
 
-def compose(settings: Settings, devices: list[PlacedDevice]) -> Codec:
+def compose(settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
     """Return the contract composed from the profiles of these devices. Raises ConfigError, CodecError."""
     text = _write_dbc(settings, _messages(settings, devices))
     return parse_codec(text.encode(), Path(COMPOSED_NAME))
@@ -120,7 +119,7 @@ def find_contract(name: str) -> Path:
     raise ConfigError(f"contract {name!r} is neither in dbc/ nor a file; {hint}")
 
 
-def _move(codec: Codec, settings: Settings, devices: list[PlacedDevice]) -> Codec:
+def _move(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
     """Return a DBC with the host, and the devices if all lie equally far from its own, at the configured node ids.
 
     A DBC without the host's heartbeat is returned unchanged.
@@ -165,7 +164,7 @@ def _scales(message: MessageCodec) -> str:
     return ", ".join(f"{signal.name} {signal.scale:.17g}" for signal in message.signals if signal.scale != 1.0)
 
 
-def _messages(settings: Settings, devices: list[PlacedDevice]) -> list[_DbcMessage]:
+def _messages(settings: Settings, devices: Sequence[PlacedDevice]) -> list[_DbcMessage]:
     names = tuple(device.name.upper() for device in devices)
     heartbeat_ms = settings.bus.heartbeat_ms
     nmt = (_DbcSignal("command", 8), _DbcSignal("node", 8))

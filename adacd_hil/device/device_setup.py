@@ -9,7 +9,7 @@ valid last. PDOs that the contract doesn't know are switched off: a stock device
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, NoReturn
 
 from adacd_hil.device.arm_watch import RateLimitedEvents, Recurrence
@@ -22,7 +22,7 @@ from adacd_hil.device.canopen_bus import (
 )
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, shows_mode, torque_limit_permille
 from adacd_hil.device.drive_units import name_velocity_unit, read_drive_units
-from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, ScaleSettings, place_devices
+from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, ScaleSettings
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
@@ -136,10 +136,10 @@ _ROUNDED_SHARE = 0.005
 _TORQUE_UNITS = {1.0: "Nm", 1e-3: "mNm", 1e-6: "µNm"}
 
 
-def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> list[str]:
+def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequence[PlacedDevice]) -> list[str]:
     """Check the drive, write limits, option codes and mode; return values that could not be checked, a line each.
 
-    Raises DeviceError.
+    `drives`: of all joints. Raises DeviceError.
     """
     joint, profile = slave.device.joint, slave.device.settings
     if slave.has(0x6502):
@@ -150,7 +150,7 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> list[str]:
                 "this drive can't be commanded by torque; a newer firmware may",
             )
     if slave.has(0x6076):
-        _check_rated_torque(slave, settings)
+        _check_rated_torque(slave, settings, drives)
     remarks = _check_units(slave, codec)
     if slave.device.can("option_codes"):
         quick_stop, fault_reaction = option_codes(settings, profile)
@@ -169,13 +169,12 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec) -> list[str]:
     return remarks
 
 
-def _check_rated_torque(slave: Slave, settings: Settings) -> None:
+def _check_rated_torque(slave: Slave, settings: Settings, drives: Sequence[PlacedDevice]) -> None:
     """Compare the motor's rated torque, behind its gear, with that of the joint. Raises DeviceError."""
     found = slave.read(0x6076)
     slave.known[0x6076, 0] = found
     scale, joint = slave.device.settings.scale, slave.device.joint
     rated_Nm = settings.arm.rated_torque_Nm
-    drives = [device for device in place_devices(settings) if device.settings.kind == "drive"]
     expected = [rated_Nm[drive.joint] / drive.settings.scale.joint_torque_Nm for drive in drives]
     alike = [other for other, counts in enumerate(expected) if abs(found - counts) <= _ROUNDED_SHARE * counts]
     if joint in alike:

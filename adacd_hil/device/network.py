@@ -5,6 +5,7 @@ Source: CiA 301 (4.2), clauses 7.2.8 (NMT) and 7.5.2 (communication objects); Ci
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from adacd_hil.device.arm_watch import OPERATIONAL, PATIENCE_PERIODS, EventSource, watch_heartbeats
@@ -17,7 +18,7 @@ from adacd_hil.device.device_setup import (
     set_up_drive,
     set_up_pdos,
 )
-from adacd_hil.device.profile import EMCY_INHIBIT_100US, place_devices
+from adacd_hil.device.profile import EMCY_INHIBIT_100US, PlacedDevice
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
@@ -47,11 +48,12 @@ class Identity(NamedTuple):
 class Master(EventSource):
     """The CANopen master of one arm."""
 
-    def __init__(self, settings: Settings, codec: Codec, bus: Bus, watch_host: bool = True) -> None:
-        """Load the profiles. Raises ConfigError when one can't be used.
+    def __init__(
+        self, settings: Settings, codec: Codec, devices: Sequence[PlacedDevice], bus: Bus, watch_host: bool = True
+    ) -> None:
+        """`watch_host`: devices shall watch the host by time: its heartbeat, and its commands where they count ms.
 
-        `watch_host`: devices shall watch the host by time: its heartbeat, and its commands where they count ms. Not in
-        lockstep: cycles have no fixed duration there, and a device waits by the wall clock.
+        Not in lockstep: cycles have no fixed duration there, and a device waits by the wall clock.
         """
         super().__init__()
         self._watch_host = watch_host
@@ -62,8 +64,8 @@ class Master(EventSource):
         self._emergencies: dict[str, str] = {}
         self._heartbeat_id = codec.message(HOST_HEARTBEAT).can_id
         self.slaves: list[Slave] = []
+        self._drives = [device for device in devices if device.settings.kind == "drive"]
         self.nodes: dict[str, Any] = {}
-        devices = place_devices(settings)
         for device in devices:
             listener = functools.partial(self._on_emergency, device.name)
             patience = device.settings.patience
@@ -192,7 +194,7 @@ class Master(EventSource):
             self._set_up_emergencies(slave)
             set_up_pdos(slave, command_deadline_ms(self._settings) if self._watch_host else 0)
             if slave.device.settings.kind == "drive":
-                for remark in set_up_drive(slave, self._settings, self._codec):
+                for remark in set_up_drive(slave, self._settings, self._codec, self._drives):
                     self.events.append(Event("warning", slave.name, remark))
             else:
                 status = check_sensor(slave, self._codec)

@@ -8,23 +8,17 @@ Source: CiA 306 (EDS), CiA 301 clause 7.5.2 (PDO parameters), CiA 402-2, CiA 404
 """
 
 import dataclasses
-import functools
 import math
-from dataclasses import dataclass
-from importlib import resources
-from importlib.resources.abc import Traversable
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adacd_hil.device.canopen_bus import ANSWER_TIMEOUT_S, EdsVariable, find_variable, read_eds
+from adacd_hil.device.canopen_bus import ANSWER_TIMEOUT_S, EdsVariable, find_variable
 from adacd_hil.device.drive_units import LEAST_INCREMENTS
-from adacd_hil.records import JOINTS
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError, setting
-from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
-from adacd_hil.wire.dbc_contract import contract_folder
 from adacd_hil.wire.e2e import PROFILES_BY_CODE
 
 FEATURES = (
@@ -68,7 +62,7 @@ def parse_object(text: str) -> ObjectName:
     return name
 
 
-_MERGED = ("scale", "plausibility", "patience")
+MERGED = ("scale", "plausibility", "patience")
 """Sections that are merged key by key where a profile extends another."""
 _TOGETHER = {
     "Feedback": ("position", "velocity"),
@@ -350,7 +344,7 @@ class ProfileSettings:
             raise ValueError(f"serial has {len(self.serial)} numbers, 2 expected")
 
     def _check_assumed(self) -> None:
-        known = [f"{name}.{field.name}" for name in _MERGED for field in dataclasses.fields(type(getattr(self, name)))]
+        known = [f"{name}.{field.name}" for name in MERGED for field in dataclasses.fields(type(getattr(self, name)))]
         for key in self.assumed:
             if key not in known:
                 nearest = nearest_name(key, known)
@@ -373,88 +367,36 @@ def _is_hex(text: str, digits: int) -> bool:
 
 
 class DeviceProfile(NamedTuple):
-    """A device profile with its name and the place of its EDS."""
+    """A device profile with its name, and its EDS: the file's place and content."""
 
     name: str
     eds: Path
+    eds_bytes: bytes
     settings: ProfileSettings
 
 
-def _builtin_folder() -> Traversable:
-    return resources.files("adacd_hil") / "device_profiles"
-
-
-def profile_names() -> list[str]:
-    """Return the names of the device profiles that come with the package."""
-    return toml_names(_builtin_folder())
-
-
-def load_profile(name_or_file: str, kind: str) -> DeviceProfile:
-    """Load a device profile by built-in name or file; `kind`: the required kind, drive or sensor.
-
-    Raises ConfigError for an unknown name or key, a value outside its bounds, an EDS that isn't there, another kind.
-    """
-    path = find_toml("device profile", name_or_file, _builtin_folder())
-    try:
-        table, folders = _read_profile(path)
-        settings = parse(ProfileSettings, table)
-    except ConfigError as error:
-        place = "" if str(error).startswith("device profile") else f"device profile {name_or_file}: "
-        raise ConfigError(f"{place}{error}") from None
-    if settings.kind != kind:
-        raise ConfigError(f"device profile {name_or_file} is a {settings.kind}, a {kind} is needed")
-    places = (folder / settings.eds for folder in (*folders, contract_folder()))
-    eds = next((place for place in places if place.is_file()), None)
-    if eds is None:
-        raise ConfigError(f"device profile {name_or_file}: eds = {settings.eds!r} is neither beside it nor in dbc/")
-    return DeviceProfile(path.stem, eds, settings)
-
-
-_MOST_EXTENDED = 8
-
-
-def _read_profile(path: Path, depth: int = 0) -> tuple[dict[str, Any], list[Path]]:
-    """Read a profile and those that it extends; return the merged table, and their folders, its own first."""
-    table = read_toml(path, "device profile")
-    extended = table.pop("extends", None)
-    if extended is None:
-        return table, [path.parent]
-    if not isinstance(extended, str) or depth >= _MOST_EXTENDED:
-        raise ConfigError(f"`extends` = {extended!r} must be the name of a profile, at most {_MOST_EXTENDED} in a row")
-    beside = path.parent / extended
-    base = beside if beside.is_file() else find_toml("device profile", extended, _builtin_folder())
-    below, folders = _read_profile(base, depth + 1)
-    merged = below | table
-    for key in _MERGED:
-        if isinstance(below.get(key), dict) and isinstance(table.get(key), dict):
-            merged[key] = below[key] | table[key]
-    if "assumed" not in table:
-        stated = {f"{key}.{name}" for key in _MERGED if isinstance(table.get(key), dict) for name in table[key]}
-        merged["assumed"] = [key for key in below.get("assumed", []) if key not in stated]
-    return merged, [path.parent, *folders]
+def device_name(kind: str, joint: int) -> str:
+    """Return the name in the contract of the device of a kind, drive or sensor, of a joint from 0: `Drive1`."""
+    return f"{kind.capitalize()}{joint + 1}"
 
 
 @dataclass(frozen=True)
 class PlacedDevice:
-    """One device of the arm. `joint` counts from 0."""
+    """One device of the arm. `joint` counts from 0. objects: the object dictionary of its EDS."""
 
     name: str
     joint: int
     node_id: int
     profile: DeviceProfile
+    objects: Any = field(compare=False, repr=False)
 
     @property
     def settings(self) -> ProfileSettings:
         """The settings of its profile."""
         return self.profile.settings
 
-    @property
-    def objects(self) -> Any:
-        """The object dictionary of its EDS. Raises ConfigError when it can't be read."""
-        return _objects(self.profile.eds.absolute(), self.node_id)
-
     def has(self, index: int, sub: int = 0) -> bool:
-        """Return whether the EDS lists an object. Raises ConfigError when the EDS can't be read."""
+        """Return whether the EDS lists an object."""
         return find_variable(self.objects, index, sub) is not None
 
     @property
@@ -501,31 +443,12 @@ class PlacedDevice:
         return [SignalSettings(object=text, signal="e2e") for text in self.settings.header]
 
 
-@functools.lru_cache(maxsize=32)
-def _objects(path: Path, node_id: int) -> Any:
-    return read_eds(path, node_id)
-
-
-def place_devices(settings: Settings) -> list[PlacedDevice]:
-    """Return all devices with their profiles: Drive1, Drive2, Sensor1, Sensor2, in this order. Raises ConfigError."""
-    chosen = settings.devices
-    devices = []
-    for kind, names, nodes in (
-        ("drive", chosen.drive, chosen.drive_node),
-        ("sensor", chosen.sensor, chosen.sensor_node),
-    ):
-        for joint in range(JOINTS):
-            profile = load_profile(names[joint], kind)
-            devices.append(PlacedDevice(f"{kind.capitalize()}{joint + 1}", joint, nodes[joint], profile))
-    return devices
-
-
-def enable_timeout_s(settings: Settings) -> float:
+def enable_timeout_s(settings: Settings, devices: Sequence[PlacedDevice]) -> float:
     """Return how long ENABLE may take, s: the configuration's value, else by the drives' profiles.
 
-    By the profiles: the larger `enable_s` + `mode_s`, but at least `safety.phase_timeout_s`. Raises ConfigError.
+    By the profiles: the larger `enable_s` + `mode_s`, but at least `safety.phase_timeout_s`.
     """
     if settings.safety.enable_timeout_s is not None:
         return settings.safety.enable_timeout_s
-    patience = [device.settings.patience for device in place_devices(settings) if device.settings.kind == "drive"]
+    patience = [device.settings.patience for device in devices if device.settings.kind == "drive"]
     return max(settings.safety.phase_timeout_s, *(one.enable_s + one.mode_s for one in patience))

@@ -16,7 +16,7 @@ Error frames are ignored. Of a cycle whose packet the logger dropped, all frames
 may differ until every counter and age has been renewed.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_watch import ArmWatch, watch_heartbeats
 from adacd_hil.device.network import RESET_COMMUNICATION, START
-from adacd_hil.device.profile import place_devices
+from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.records import JOINTS, ArmBatch, ArmState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Frame
@@ -54,17 +54,17 @@ class Ticks(NamedTuple):
 class RecordedArm:
     """Turns the logged frames of one run into the states that its arm reported, attempt after attempt."""
 
-    def __init__(self, settings: Settings, codec: Codec) -> None:
-        """Place the devices. Raises ConfigError and CodecError as `Arm`."""
+    def __init__(self, settings: Settings, codec: Codec, devices: Sequence[PlacedDevice]) -> None:
+        """Make the first arm. Raises CodecError as `Arm`."""
         self._settings, self._codec = settings, codec
         self._is_following = settings.bus.follows
-        self._devices = place_devices(settings)
+        self._devices = devices
         self._begin()
 
     def _begin(self) -> None:
         """Make a new arm and heartbeat watch, as at the start of an attempt."""
         settings = self._settings
-        self._arm = Arm(settings, self._codec, EmbeddedBus(VirtualClock()))  # with nobody on it
+        self._arm = Arm(settings, self._codec, self._devices, EmbeddedBus(VirtualClock()))  # with nobody on it
         self._heartbeats = watch_heartbeats(self._devices, settings.bus.heartbeat_ms, lambda _: None)
         self._watch = ArmWatch(settings, self._heartbeats.judge_nodes)
         self._is_running = False

@@ -12,11 +12,12 @@ CRC and alive counter find errors; they don't protect against intent. See `docs/
 """
 
 from collections import deque
+from collections.abc import Iterable, Sequence
 
 from adacd_hil.clock import Clock
 from adacd_hil.device.arm_watch import RateLimitedEvents
 from adacd_hil.device.canopen_bus import DeviceError
-from adacd_hil.device.profile import place_devices
+from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
@@ -36,7 +37,7 @@ _READING = (2, 3, 5)
 """SDO client commands that only read: upload initiate, segment, block. Source: CiA 301 (4.2), clause 7.2.4.3."""
 
 
-def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
+def host_frames(settings: Settings, codec: Codec, devices: Iterable[PlacedDevice]) -> dict[int, str]:
     """Return, by identifier of each frame that only this host sends, a description of another sender's action."""
     doing = {
         codec.message(HOST_HEARTBEAT).can_id: "sends this host's heartbeat",
@@ -44,7 +45,7 @@ def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
     }
     if not settings.bus.follows:
         doing[codec.message("Sync").can_id] = "sends SYNC"
-    for device in place_devices(settings):
+    for device in devices:
         name = _plain(device.name)
         doing[SDO_REQUEST_ID + device.node_id] = f"writes objects of {name}"
         if device.settings.kind == "drive":
@@ -52,13 +53,13 @@ def host_frames(settings: Settings, codec: Codec) -> dict[int, str]:
     return doing
 
 
-def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec) -> None:
+def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec, devices: Sequence[PlacedDevice]) -> None:
     """Listen for HOSTS_LISTEN_S; raise DeviceError if another host runs the arm, which a reset would take from it.
 
     Not for lockstep, where time passes only by this host's own frames. Requests that only read objects, and NMT
     commands to nodes of other arms, are ignored. Raises BusError, too.
     """
-    strangers = Strangers(settings, codec)
+    strangers = Strangers(settings, codec, devices)
     end_ns = clock.now_ns() + round(HOSTS_LISTEN_S * 1e9)
     while (remaining_ns := end_ns - clock.now_ns()) > 0:
         frame = bus.receive(remaining_ns * 1e-9)
@@ -76,10 +77,10 @@ def _plain(name: str) -> str:
 class Strangers(RateLimitedEvents):
     """Finds frames of other senders that act on the arm, and reports them as events."""
 
-    def __init__(self, settings: Settings, codec: Codec) -> None:
+    def __init__(self, settings: Settings, codec: Codec, devices: Sequence[PlacedDevice]) -> None:
         super().__init__()
-        self._doing = host_frames(settings, codec)
-        self._nodes = {0, *(device.node_id for device in place_devices(settings))}
+        self._doing = host_frames(settings, codec, devices)
+        self._nodes = {0, *(device.node_id for device in devices)}
         self._hold_cycles = round(HOLD_S / settings.bus.period_s)
         self._window_cycles = max(1, round(CONTRADICTION_WINDOW_S / settings.bus.period_s))
         self._until_cycle = -2  # before any, the first of which is -1: none begun

@@ -20,7 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.arm import FEEDBACK_SHARE
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.drive import DISABLE_CYCLES
+from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.frames.frame_log import read_frames
 from adacd_hil.log.log_files import LogError
@@ -252,9 +254,9 @@ class RecordingAlone:
         recording = self._recording
         return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
 
-    def with_own_devices(self, settings: Settings, _folder: Path) -> Settings:
-        """Return `settings`: a recording has no device profiles attached."""
-        return settings
+    def devices(self, settings: Settings) -> list[PlacedDevice]:
+        """Return the devices that some settings name. Raises ConfigError."""
+        return place_devices(settings)
 
     def parts(self, with_frames: bool) -> Iterator[Part]:  # noqa: ARG002 (there are only frames)
         """Yield the whole recording as one part; with_frames has no effect, since it has only frames."""

@@ -13,10 +13,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.device.attached_devices import with_attached_devices
+from adacd_hil.device.device_files import logged_devices, place_devices
 from adacd_hil.device.network import RESET_COMMUNICATION
+from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LogError, failing_as
+from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LogError
 from adacd_hil.log.logged_run import SHOWN, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS, joined_frames
@@ -294,15 +295,14 @@ class LogSource:
         topics = (*_TOPICS, self._partner, *(FRAME_TOPICS if with_frames else ()))
         return LogStream(self._path, topics, self._cycles_per_piece, is_ahead=False)  # replay reads in a thread
 
-    def with_own_devices(self, settings: Settings, folder: Path) -> Settings:
-        """Return `settings`, if they name the run's devices, with the profiles attached to the log, put into `folder`.
+    def devices(self, settings: Settings) -> list[PlacedDevice]:
+        """Return the devices of some settings: those attached to the log, if the settings name the run's.
 
-        Raises LogError when they can't be written.
+        Raises ConfigError.
         """
-        if settings.devices != self.settings.devices:
-            return settings
-        with failing_as("the log's device profiles can't be put into a temporary folder"):
-            return with_attached_devices(settings, self._stream.attachments, folder)
+        is_own = settings.devices == self.settings.devices
+        own = logged_devices(settings, self._stream.attachments) if is_own else None
+        return place_devices(settings) if own is None else own
 
     def parts(self, with_frames: bool) -> Iterator[Part]:
         """Yield the content of the log in parts, in order.

@@ -14,16 +14,15 @@ ends with the stretch, and compares and reports only the cycles in it.
 
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
-from adacd_hil.log.log_files import LogError, failing_as
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import SHOWN, Milestones, Mismatch, Progress, is_armed_in
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
@@ -261,29 +260,19 @@ def replay_source(
 
 def _decoded(source: ReplaySource, reader: "_ArmReader", end_ns: int) -> Generator[_DecodedPart]:
     """Yield the parts of a source with the arm's states, up to the stretch in which the reported part ends."""
-    with _device_folder() if reader.needs_frames else nullcontext(Path()) as folder:
-        for part in source.parts(reader.needs_frames):
-            stretches: list[CycleStretch] = []
-            arms: list[list[ArmBatch]] = []
-            is_over = False
-            for stretch in part.stretches:
-                stretches.append(stretch)
-                arms.append(reader.read(stretch, folder))
-                is_over = bool(stretch.ticks.t_ns[-1] >= end_ns)
-                if is_over:
-                    break
-            yield part._replace(stretches=stretches), arms
+    for part in source.parts(reader.needs_frames):
+        stretches: list[CycleStretch] = []
+        arms: list[list[ArmBatch]] = []
+        is_over = False
+        for stretch in part.stretches:
+            stretches.append(stretch)
+            arms.append(reader.read(stretch))
+            is_over = bool(stretch.ticks.t_ns[-1] >= end_ns)
             if is_over:
-                return
-
-
-@contextmanager
-def _device_folder() -> Iterator[Path]:
-    """Yield a temporary folder for the device profiles of a log. Raises LogError when it can't be made."""
-    with failing_as("no temporary folder for the log's device profiles"):
-        folder = TemporaryDirectory(prefix="adacd-hil-")
-    with folder as name:
-        yield Path(name)
+                break
+        yield part._replace(stretches=stretches), arms
+        if is_over:
+            return
 
 
 def _one_ahead(parts: Generator[_DecodedPart]) -> Iterator[_DecodedPart]:
@@ -368,13 +357,16 @@ class _ArmReader:
             self._logged_key = _decoding_key(source.settings)
             self._settings.pop(self._logged_key, None)
         self.needs_frames = bool(self._settings)
+        self._devices = {key: source.devices(settings) for key, settings in self._settings.items()}
         self._arms: dict[Any, RecordedArm] = {}
 
-    def read(self, stretch: CycleStretch, folder: Path) -> list[ArmBatch]:
-        """Return the arm's states in a stretch, for each of the variants; folder: for the devices' profiles."""
+    def read(self, stretch: CycleStretch) -> list[ArmBatch]:
+        """Return the arm's states in a stretch, for each of the variants."""
         if stretch.is_begin:
-            own = {key: self._source.with_own_devices(each, folder) for key, each in self._settings.items()}
-            self._arms = {key: RecordedArm(settings, self._source.codec) for key, settings in own.items()}
+            self._arms = {
+                key: RecordedArm(settings, self._source.codec, self._devices[key])
+                for key, settings in self._settings.items()
+            }
         batches = {key: arm.read(stretch.ticks, stretch.frames) for key, arm in self._arms.items()}
         if self._logged_key is not None and stretch.arms is not None:
             batches[self._logged_key] = stretch.arms

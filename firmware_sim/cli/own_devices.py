@@ -13,7 +13,8 @@ from importlib import resources
 from typing import NamedTuple
 
 from adacd_hil.device.contract import load_contract
-from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, SignalSettings, place_devices
+from adacd_hil.device.device_files import place_devices
+from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, SignalSettings
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
@@ -115,8 +116,8 @@ def rehearse_settings(
 
     Without a truth and keys of an own arm, the profile's arm and our own devices. Raises ConfigError, CodecError.
     """
-    codec = load_contract(settings)
     devices = place_devices(settings)
+    codec = load_contract(settings, devices)
     told = told_arm(settings, layers)
     table = read_table(scenario_name)
     is_builtin = scenario_name in builtin_scenarios()

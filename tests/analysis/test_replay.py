@@ -11,7 +11,8 @@ from log.recorded_run import make_run
 from log.recorded_run import record as record_log
 
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.device.profile import enable_timeout_s, load_profile
+from adacd_hil.device.device_files import load_profile, place_devices
+from adacd_hil.device.profile import enable_timeout_s
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.log_files import LogError
@@ -306,7 +307,10 @@ def test_what_a_replay_says_of_contacts_is_what_the_report_says(log, whole):
 
 def test_other_settings_decide_otherwise_about_the_same_motion(log):
     own = settings_of_run()
-    resolved = {"realtime.sample_period": "nominal", "safety.enable_timeout_s": str(enable_timeout_s(own))}
+    resolved = {
+        "realtime.sample_period": "nominal",
+        "safety.enable_timeout_s": str(enable_timeout_s(own, place_devices(own))),
+    }
     own = apply_settings(own, resolved)
     high, deaf, fast = (
         apply_settings(own, changes)

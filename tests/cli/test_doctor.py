@@ -10,6 +10,7 @@ from called import called
 from own_arm import describe_arm, describe_geared_arm
 from rig import CODEC, Rig
 
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.lab.cli.doctor_command import as_json, as_text
 from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
 from adacd_hil.lab.commission.host_checks import Check, Finding, Status, diagnose, failed, ok, summarise, warning
@@ -28,7 +29,9 @@ EARLIER = [Finding(name, Status.OK, "", "") for name in PASSED]
 
 
 def examination(rig: Rig, codec: Codec = CODEC, **more: Any) -> ArmExamination:
-    return ArmExamination(rig.settings, codec, rig.clock, lambda: rig.bus, lambda: None, **more)
+    return ArmExamination(
+        rig.settings, codec, place_devices(rig.settings), rig.clock, lambda: rig.bus, lambda: None, **more
+    )
 
 
 def doctor(rig: Rig, ask: Callable[[str], None] | None = None, codec: Codec | None = None) -> dict[str, Finding]:

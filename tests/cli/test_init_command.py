@@ -13,12 +13,12 @@ import pytest
 from called import called, complaints
 from click.testing import Result
 from eds_variants import EdsVariant
+from loaded import loaded_contract
 from own_arm import eds_of_two_channels, write_sensor_eds
 from rig import Rig, SessionRig
 
 from adacd_hil.control.configuration_check import examine_configuration
-from adacd_hil.device.contract import load_contract
-from adacd_hil.device.profile import load_profile
+from adacd_hil.device.device_files import load_profile
 from adacd_hil.lab.commission.arm_draft import planar_from_urdf, uniform_rods
 from adacd_hil.lab.commission.host_checks import Status, configuration_checks, diagnose
 from adacd_hil.lab.commission.profile_draft import DeviceRatings, draft_profile
@@ -333,7 +333,7 @@ def test_profiles_are_drafted_from_eds_files_beside_the_configuration(out, tmp_p
     sensor = out.parent / "my-arm-int32_sensor.toml"
     sensor.write_text(sensor.read_text().replace("torque_Nm = 1e-06", "torque_Nm = 1e-05"))
     monkeypatch.chdir(tmp_path)  # the profiles are found from anywhere
-    drafted, stock = (load_contract(load_settings(name)) for name in ("lab/my-arm.toml", "stock"))
+    drafted, stock = (loaded_contract(load_settings(name)) for name in ("lab/my-arm.toml", "stock"))
     assert drafted.layout_digest == stock.layout_digest
 
 
@@ -356,7 +356,7 @@ def test_the_guessed_worth_of_a_count_lets_16_bits_carry_a_joint_s_torque(tmp_pa
     assert "devices.sensor" in written(out).assumed
     warned = examine_configuration(str(out)).warnings
     assert not any("carries" in line for line in warned)
-    (signal,) = load_contract(written(out)).message("Sensor1Torque").values
+    (signal,) = loaded_contract(written(out)).message("Sensor1Torque").values
     assert (signal.bits, signal.scale) == (16, 2e-3)
 
 
@@ -365,7 +365,7 @@ def test_a_given_count_of_torque_is_no_guess(tmp_path, out):
     given = init(out, *NO_BUS, "--eds", str(tmp_path / "twin.eds"), "--torque-count-nm", "1e-5", "2e-5")
     assert given.exit_code == 0, given.stderr
     assert "devices.sensor" not in written(out).assumed
-    contract = load_contract(written(out))
+    contract = loaded_contract(written(out))
     scales = [[signal.scale for signal in contract.message(f"Sensor{joint}Torque").values] for joint in (1, 2)]
     assert scales == [[1e-5, 1.0], [2e-5, 1.0]]  # the second channel is in counts: nobody told their worth
 
@@ -402,7 +402,7 @@ def test_devices_are_recognised_with_their_ratings_and_no_drive_is_enabled(out, 
     assert settings.devices.sensor == ("adacd-sensor", "adacd-sensor")
     assert settings.arm.rated_torque_Nm == (12.0, 6.0)
     assert "arm.rated_torque_Nm" not in settings.assumed
-    assert load_contract(settings).layout_digest == load_codec().layout_digest
+    assert loaded_contract(settings).layout_digest == load_codec().layout_digest
     # SDO uploads only: no NMT command, no SYNC, no command, no download.
     assert {frame.can_id & 0x780 for frame in rig.sent} == {0x600}
     assert {frame.data[0] & 0xE0 for frame in rig.sent} <= {0x40, 0x60, 0x80}
@@ -417,7 +417,7 @@ def test_the_frames_of_the_devices_tell_profiles_apart(out, on_bus, contract, dr
     settings = written(out)
     assert settings.devices.drive == (drive, drive)
     assert settings.bus.period_us == (500 if contract.endswith("500us") else 1000)
-    assert load_contract(settings).layout_digest == load_codec(contract_folder() / f"{contract}.dbc").layout_digest
+    assert loaded_contract(settings).layout_digest == load_codec(contract_folder() / f"{contract}.dbc").layout_digest
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from rig import CODEC, Rig
 
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.lab.commission.tare_session import TareSession
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
@@ -52,7 +53,15 @@ class TareRig(Rig):
         self.start_rad = played.start_rad
         super().__init__(settings or tare_settings(), played)
         self.session = TareSession(
-            self.settings, CODEC, self.bus, self.clock, "embedded", old_offset_Nm, is_auto_zeroing, self._progress
+            self.settings,
+            CODEC,
+            place_devices(self.settings),
+            self.bus,
+            self.clock,
+            "embedded",
+            old_offset_Nm,
+            is_auto_zeroing,
+            self._progress,
         )
 
     def _progress(self, line: str) -> None:

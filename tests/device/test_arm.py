@@ -8,6 +8,7 @@ import pytest
 from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import describe_checks, describe_excess, describe_faults
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.records import ArmCommand, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import parse
@@ -27,7 +28,7 @@ class Devices:
         bus = EmbeddedBus(VirtualClock())
         bus.attach(self.sent.append)
         settings = parse(Settings, {"arm": arm_table or {}, "bus": {"schedule": schedule}})
-        self.arm = Arm(settings, CODEC, bus)
+        self.arm = Arm(settings, CODEC, place_devices(settings), bus)
         self._senders: dict[str, E2eSender] = {n: CODEC.message(n).sender() for n in ("Sensor1Torque", "Sensor2Torque")}
 
     def send(self, name: str, *values: float) -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil.device.attached_devices import device_attachments, with_attached_devices
-from adacd_hil.device.profile import load_profile, place_devices
+from adacd_hil.device.attached_devices import device_attachments
+from adacd_hil.device.device_files import load_profile, logged_devices, place_devices
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.toml_text import to_toml
@@ -27,27 +27,26 @@ def own_drive(folder: Path, eds: bytes) -> Path:
 
 
 @pytest.mark.parametrize("name", ["stock", "fd", "fd_500us", "certified"])
-def test_the_attached_devices_are_those_of_the_run(tmp_path: Path, name: str) -> None:
+def test_the_attached_devices_are_those_of_the_run(name: str) -> None:
     settings = load_settings(name)
-    attached = with_attached_devices(settings, device_attachments(settings), tmp_path)
-    assert {Path(file).parent for file in (*attached.devices.drive, *attached.devices.sensor)} == {tmp_path}
-    for mine, theirs in zip(place_devices(attached), place_devices(settings), strict=True):
+    run = place_devices(settings)
+    attached = logged_devices(settings, device_attachments(run))
+    assert attached is not None
+    for mine, theirs in zip(attached, run, strict=True):
         assert (mine.name, mine.node_id, mine.joint) == (theirs.name, theirs.node_id, theirs.joint)
         assert mine.settings == theirs.settings
-        assert mine.profile.eds.read_bytes() == theirs.profile.eds.read_bytes()
+        assert mine.profile.eds_bytes == theirs.profile.eds_bytes
 
 
 def test_two_files_of_one_name_are_kept_apart(tmp_path: Path) -> None:
     eds = (contract_folder() / "stock_drive.eds").read_bytes()
     files = own_drive(tmp_path / "a", eds), own_drive(tmp_path / "b", eds + b"\n; another\n")
     settings = with_drives(load_settings("stock"), *files)
-    attachments = device_attachments(settings)
+    run = place_devices(settings)
     for file in files:
         file.unlink()
-    there = tmp_path / "there"
-    there.mkdir()
-    first, second, *_ = place_devices(with_attached_devices(settings, attachments, there))
-    assert second.profile.eds.read_bytes() == first.profile.eds.read_bytes() + b"\n; another\n"
+    first, second, *_ = logged_devices(settings, device_attachments(run)) or ()
+    assert second.profile.eds_bytes == first.profile.eds_bytes + b"\n; another\n"
 
 
 @pytest.mark.parametrize(
@@ -55,21 +54,17 @@ def test_two_files_of_one_name_are_kept_apart(tmp_path: Path) -> None:
     [{"Drive2.toml": None}, {"stock_drive.eds": None}, {"Sensor1.toml": b"kind = "}, {"Drive1.toml": b"unknown = 1\n"}],
     ids=lambda change: str(*change),
 )
-def test_attachments_that_lack_a_device_leave_the_settings_as_they_are(
-    tmp_path: Path, change: dict[str, bytes | None]
-) -> None:
+def test_attachments_that_lack_a_device_give_none(change: dict[str, bytes | None]) -> None:
     settings = load_settings("stock")
-    changed = {**device_attachments(settings), **change}
+    changed = {**device_attachments(place_devices(settings)), **change}
     attachments = {name: data for name, data in changed.items() if data is not None}
-    assert with_attached_devices(settings, attachments, tmp_path) == settings
+    assert logged_devices(settings, attachments) is None
 
 
-def test_no_attachment_is_written_outside_the_folder(tmp_path: Path) -> None:
+def test_an_eds_is_found_by_its_name_alone() -> None:
     settings = load_settings("stock")
-    attachments = device_attachments(settings)
+    attachments = device_attachments(place_devices(settings))
     text = attachments["Drive1.toml"].replace(b'eds = "stock_drive.eds"', b'eds = "../stock_drive.eds"')
     assert text != attachments["Drive1.toml"]
-    there = tmp_path / "there"
-    there.mkdir()
-    with_attached_devices(settings, {**attachments, "Drive1.toml": text}, there)
-    assert list(tmp_path.iterdir()) == [there]
+    first, *_ = logged_devices(settings, {**attachments, "Drive1.toml": text}) or ()
+    assert first.profile.eds_bytes == attachments["stock_drive.eds"]

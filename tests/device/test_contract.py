@@ -6,11 +6,12 @@ from pathlib import Path
 
 import cantools
 import pytest
+from loaded import loaded_contract
 
 import adacd_hil
 from adacd_hil.control.session import write_contract
-from adacd_hil.device.contract import compose, load_contract
-from adacd_hil.device.profile import place_devices
+from adacd_hil.device.contract import compose
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
@@ -74,13 +75,13 @@ def test_a_contract_moves_to_the_configured_node_ids_and_is_what_the_profiles_sa
     devices = dataclasses.replace(devices, drive_node=(5, 6), sensor_node=(7, 8))
     named = dataclasses.replace(load_settings(config), bus=bus, devices=devices)
     composed = dataclasses.replace(named, devices=dataclasses.replace(devices, contract=""))
-    codec = load_contract(named)
+    codec = loaded_contract(named)
     assert (codec.message("Sensor2Torque").can_id, codec.message("HostHeartbeat").can_id) == (0x188, 0x77E)
-    assert codec.layout_digest == load_contract(composed).layout_digest
+    assert codec.layout_digest == loaded_contract(composed).layout_digest
 
 
 def test_a_contract_without_a_file_gets_one_for_the_log_and_is_not_mistaken_for_another(tmp_path: Path) -> None:
-    codec = load_contract(parse(Settings, {"devices": {"drive_node": [5, 6], "sensor_node": [7, 8]}}))
+    codec = loaded_contract(parse(Settings, {"devices": {"drive_node": [5, 6], "sensor_node": [7, 8]}}))
     written = write_contract(codec, tmp_path)
     assert written == tmp_path / "arm.dbc"
     assert load_codec(written).layout_digest == codec.layout_digest
@@ -89,7 +90,7 @@ def test_a_contract_without_a_file_gets_one_for_the_log_and_is_not_mistaken_for_
     with pytest.raises(FileExistsError, match="another one is there already"):
         write_contract(codec, tmp_path)
     assert written.read_bytes() == load_codec().text
-    composed = load_contract(parse(Settings, {"devices": {"contract": ""}}))
+    composed = loaded_contract(parse(Settings, {"devices": {"contract": ""}}))
     assert write_contract(composed, tmp_path) == tmp_path / "contract.dbc"
     assert load_codec(tmp_path / "contract.dbc").layout_digest == load_codec().layout_digest
     assert write_contract(load_codec(), tmp_path) == load_codec().path  # it has a file
@@ -102,7 +103,7 @@ def test_the_host_has_a_node_id_of_its_own() -> None:
 
 def test_a_misspelt_contract_is_told_the_nearest() -> None:
     with pytest.raises(ConfigError, match="did you mean 'arm'"):
-        load_contract(parse(Settings, {"devices": {"contract": "amr"}}))
+        loaded_contract(parse(Settings, {"devices": {"contract": "amr"}}))
 
 
 @pytest.mark.parametrize(
@@ -125,7 +126,7 @@ def test_a_contract_that_says_otherwise_than_the_profiles_is_named(
     path = tmp_path / "other.dbc"
     path.write_text(text.replace(*change) if change[0] else text)
     with pytest.raises(ConfigError, match=line):
-        load_contract(parse(Settings, {"devices": {"contract": str(path), **devices}}))
+        loaded_contract(parse(Settings, {"devices": {"contract": str(path), **devices}}))
 
 
 def test_two_messages_of_one_identifier_are_refused(tmp_path: Path) -> None:
@@ -134,7 +135,7 @@ def test_two_messages_of_one_identifier_are_refused(tmp_path: Path) -> None:
     path.write_text(text.replace("cob_id = 0x280", "cob_id = 0x180"))
     settings = parse(Settings, {"devices": {"drive": [str(path), "adacd-drive"], "contract": ""}})
     with pytest.raises(ConfigError, match="both have identifier 0x181"):
-        load_contract(settings)
+        loaded_contract(settings)
 
 
 def test_an_object_that_the_eds_lacks_cant_be_mapped(tmp_path: Path) -> None:
@@ -143,4 +144,4 @@ def test_an_object_that_the_eds_lacks_cant_be_mapped(tmp_path: Path) -> None:
     path.write_text(text.replace("0x603F", "0x603E"))
     settings = parse(Settings, {"devices": {"drive": [str(path), "adacd-drive"], "contract": ""}})
     with pytest.raises(ConfigError, match=r"object 0x603E is not in /.*/drive\.eds"):
-        load_contract(settings)
+        loaded_contract(settings)

@@ -5,9 +5,10 @@ import math
 from pathlib import Path
 
 import pytest
+from loaded import loaded_contract
 
 import adacd_hil
-from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import load_profile
 from adacd_hil.device.drive import (
     IMPLAUSIBLE_JUMP_RAD,
     Cia402State,
@@ -17,7 +18,6 @@ from adacd_hil.device.drive import (
     option_codes,
     torque_limit_permille,
 )
-from adacd_hil.device.profile import load_profile
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
@@ -293,7 +293,7 @@ signals = [
     path = folder / "wide.toml"
     path.write_text(text)
     sensor = list(load_settings("stock").devices.sensor)
-    return load_contract(
+    return loaded_contract(
         parse(
             Settings,
             {"devices": {"drive": [str(path)] * 2, "sensor": sensor, "contract": "", "data_bitrate": 5_000_000}},

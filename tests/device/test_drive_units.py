@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.drive_units import DriveUnits, name_velocity_unit, read_drive_units
 from adacd_hil.device.profile import ProfileSettings, ScaleSettings, enable_timeout_s
 from adacd_hil.settings.configuration_files import load_settings
@@ -104,4 +105,6 @@ def test_a_profile_names_its_guesses_by_keys_that_exist() -> None:
 def test_enabling_may_take_as_long_as_the_most_patient_profile_wants() -> None:
     settings = load_settings("certified")
     assert settings.safety.enable_timeout_s is None
-    assert enable_timeout_s(settings) == 15.0  # 5 s to Operation enabled, 10 s more until the mode shows
+    assert (
+        enable_timeout_s(settings, place_devices(settings)) == 15.0
+    )  # 5 s to Operation enabled, 10 s more until the mode shows

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from loaded import loaded_contract
 from long_cases import long_but
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.records import FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
@@ -30,9 +31,9 @@ class Devices:
 
     def __init__(self, config: str = "paper") -> None:
         self.settings: Settings = load_settings(config)
-        self.codec: Codec = load_contract(self.settings)
+        self.codec: Codec = loaded_contract(self.settings)
         clock = VirtualClock()
-        self.arm = Arm(self.settings, self.codec, EmbeddedBus(clock))
+        self.arm = Arm(self.settings, self.codec, place_devices(self.settings), EmbeddedBus(clock))
         self.senders: dict[str, E2eSender] = {name: self.codec.message(name).sender() for name in USUAL_NS}
         self.waiting: list[tuple[int, Frame]] = []
         self.cycle = -1

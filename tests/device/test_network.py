@@ -4,11 +4,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from loaded import loaded_contract
 from rig import Rig
 
 from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import DeviceError
-from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, FaultReason
 from adacd_hil.settings.configuration import Settings
@@ -28,7 +29,7 @@ class NetworkRig(Rig):
     def __init__(self, table: dict[str, object] | None = None, config: str = "paper") -> None:
         self.passed: list[tuple[int, bytes]] = []
         self.cycle = 0
-        codec = load_contract(load_settings(config))
+        codec = loaded_contract(load_settings(config))
         super().__init__(parse(Settings, table) if table else config, codec=codec)
         self.period_ns = self.settings.bus.period_ns
 
@@ -89,7 +90,7 @@ def test_devices_watch_the_host_for_two_and_a_half_periods() -> None:
 def test_devices_watch_the_host_and_its_commands_but_in_lockstep(watch_host: bool, deadline_ms: int) -> None:
     rig = NetworkRig(config="stock")
     settings = load_settings("stock")
-    rig.master = Master(settings, load_contract(settings), rig.bus, watch_host=watch_host)
+    rig.master = Master(settings, loaded_contract(settings), place_devices(settings), rig.bus, watch_host=watch_host)
     rig.start()
     assert read(rig, "Drive1", 0x1400, 5) == deadline_ms
     assert bool(read(rig, "Drive1", 0x1016, 1)) is watch_host

@@ -6,10 +6,11 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
+from loaded import loaded_contract
 
-from adacd_hil.device.canopen_bus import read_eds
-from adacd_hil.device.contract import load_contract
-from adacd_hil.device.profile import ProfileSettings, load_profile, profile_names
+from adacd_hil.device.device_files import load_profile, profile_names
+from adacd_hil.device.eds_file import read_eds
+from adacd_hil.device.profile import ProfileSettings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
@@ -203,7 +204,7 @@ def test_a_float_is_not_read_as_an_integer(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError, match=r"0x9130:1 \(AI input PV 32 bit, AI input PV 1\) is a float, REAL32; .* integers"
     ):
-        load_contract(dataclasses.replace(load_settings("certified"), devices=devices))
+        loaded_contract(dataclasses.replace(load_settings("certified"), devices=devices))
 
 
 def test_a_profile_extends_another_section_by_section(tmp_path: Path) -> None:

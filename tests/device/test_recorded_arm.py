@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from fault_rig import run_realtime, scenario_of
+from loaded import loaded_contract
 from numpy.typing import NDArray
 from rig import CODEC, CycleRig, SessionRig, scripted
 from test_two_arms import SECOND
@@ -15,7 +16,7 @@ from test_two_arms import Rig as TwoArms
 from test_two_arms import settings_of as two_arms_settings
 
 from adacd_hil.device.arm_watch import ArmWatch
-from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.records import ArmBatch, ArmState, FaultReason
@@ -47,7 +48,7 @@ class Live(NamedTuple):
     log: RunLog
 
     def recorded_arm(self) -> RecordedArm:
-        return RecordedArm(self.settings, self.codec)
+        return RecordedArm(self.settings, self.codec, place_devices(self.settings))
 
     def read(self) -> ArmBatch:
         """Read the arm from the log, all at once."""
@@ -82,7 +83,7 @@ def play(
     """Run a session in lockstep with a scenario's faults."""
     operator = {"acknowledge_faults": acknowledge_faults, "acknowledge_fault_after_s": 0.05}
     settings = scripted(config, finish_s, **operator)
-    codec = load_contract(settings)
+    codec = loaded_contract(settings)
     rig = SessionRig(folder, settings, scenario_of(rows), codec=codec, is_modelled=True)
     with live_states() as states:
         _, log = rig.run()
@@ -212,7 +213,7 @@ def test_a_host_that_follows_anothers_sync_is_read_by_the_sync_that_came(tmp_pat
     with live_states() as states:
         rig.run()
     settings = two_arms_settings(SECOND)
-    live = Live(settings, load_contract(settings), states, read_log(rig.path))
+    live = Live(settings, loaded_contract(settings), states, read_log(rig.path))
     assert differences(states, live.read()) == []
     assert differences(states, live.logged()) == []
     assert live.logged().is_enabled.any()

@@ -3,7 +3,7 @@
 import pytest
 
 from adacd_hil.device.contract import compose
-from adacd_hil.device.profile import place_devices
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.dbc_contract import load_codec

@@ -10,8 +10,8 @@ import cantools
 import pytest
 from bench_host import ENABLING, PERIOD_NS, BenchHost, Nmt, Word, quiet_scenario, remap
 from canopen.objectdictionary.datatypes import SIGNED_TYPES
+from loaded import loaded_contract
 
-from adacd_hil.device.contract import load_contract
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
@@ -233,7 +233,7 @@ def test_fd_devices_exchange_one_protected_frame_each_way():
 def test_a_composed_contract_is_played_by_the_devices_that_have_its_frames(config, name, nodes) -> None:
     settings = load_settings(config)
     devices = dataclasses.replace(settings.devices, contract="", **nodes)
-    composed = load_contract(dataclasses.replace(settings, devices=devices))
+    composed = loaded_contract(dataclasses.replace(settings, devices=devices))
     assert playable_contract(composed) == CONTRACTS[name]
 
 

@@ -11,6 +11,7 @@ from adacd_hil.cli.connection import model_time
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.lab.logs.frame_writer import FrameWriter
 from adacd_hil.log.frames.mcap_frames import RecordedFrame
 from adacd_hil.log.reader import topic_bytes
@@ -177,6 +178,15 @@ def test_a_host_against_the_recorded_arm_decides_as_it_did(tmp_path):
     embedded.attach(bench.on_frame)
     bench.boot()
     modelled = model_time(embedded, clock, CODEC, settings)
-    again = Session(settings, CODEC, modelled, clock, ScriptedOperator(operator), tmp_path / "again", "embedded").run()
+    again = Session(
+        settings,
+        CODEC,
+        place_devices(settings),
+        modelled,
+        clock,
+        ScriptedOperator(operator),
+        tmp_path / "again",
+        "embedded",
+    ).run()
     for topic in ("/scheme", "/control", "/cycle", "/to_can_bus"):
         assert topic_bytes(again.log.path, topic) == topic_bytes(log.path, topic)

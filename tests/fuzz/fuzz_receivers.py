@@ -21,6 +21,7 @@ from fuzz_frames import CanFrame
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, Request, SchemeState
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
@@ -122,8 +123,8 @@ class HostReceiver:
         bus = EmbeddedBus(VirtualClock())
         self._sent: list[Frame] = []
         bus.attach(self._sent.append)
-        self.arm = Arm(settings, CODEC, bus)
-        self._master = Master(settings, CODEC, bus)
+        self.arm = Arm(settings, CODEC, place_devices(settings), bus)
+        self._master = Master(settings, CODEC, place_devices(settings), bus)
         self._pipeline = new_pipeline(settings)
         self._pipeline.compile_cycle()
         self._owner = {}

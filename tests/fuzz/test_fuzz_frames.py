@@ -25,6 +25,7 @@ from fuzz_receivers import (
 )
 
 from adacd_hil.clock import VirtualClock
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
 from adacd_hil.log.reader import topic_bytes
 from adacd_hil.settings.configuration_files import load_settings
@@ -81,7 +82,7 @@ def test_the_master_drops_and_counts_what_is_cut_short() -> None:
     sent: list[Frame] = []
     bus = EmbeddedBus(VirtualClock())
     bus.attach(sent.append)
-    master = Master(load_settings("paper"), CODEC, bus)
+    master = Master(load_settings("paper"), CODEC, place_devices(load_settings("paper")), bus)
     for can_id in (*range(0x081, 0x085), *range(0x581, 0x585), *range(0x701, 0x705)):
         for length in range(9):
             master.accept(Frame(can_id, bytes(length), 0))

@@ -23,14 +23,14 @@ from typing import Any
 
 import llvmlite.binding
 import numpy as np
+from loaded import loaded_contract
 from numpy.typing import NDArray
 from rig import SessionRig
 from two_arms_rig import TwoArms
 
 from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.session import Session
-from adacd_hil.device.contract import load_contract
-from adacd_hil.device.profile import place_devices
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.reader import RunLog, Series, read_log
 from adacd_hil.records import Request, SchemeState
 from adacd_hil.settings.configuration import Settings
@@ -89,10 +89,10 @@ def play(name: str, folder: Path, cycles: int = 0) -> RunLog:
 
 def _session(settings: Settings, scenario: Scenario, operator: Operator, folder: Path) -> Session:
     """Prepare a host and its arm: alone on the bus, or behind another arm whose host sends SYNC."""
-    codec = load_contract(settings)
+    codec = loaded_contract(settings)
     if settings.bus.follows:
         arms = TwoArms(settings, scenario)
-        return Session(settings, codec, arms.end, arms.clock, operator, folder, "embedded")
+        return Session(settings, codec, place_devices(settings), arms.end, arms.clock, operator, folder, "embedded")
     own = None if settings.devices.contract else describe_devices(codec, place_devices(settings), settings)
     rig = SessionRig(folder, settings, scenario, codec=codec, contract=own, is_modelled=True)
     rig.session.operator = operator

@@ -21,7 +21,7 @@ from reference_runs import (
 )
 
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.device.profile import place_devices
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import SchemeState
 from adacd_hil.replay.log_source import LogSource

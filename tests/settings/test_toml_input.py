@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from adacd_hil.control.tare_file import read_tare
-from adacd_hil.device.profile import load_profile
+from adacd_hil.device.device_files import load_profile
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings

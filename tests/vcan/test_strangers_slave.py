@@ -21,6 +21,7 @@ from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, ArmState, FaultReason
 from adacd_hil.settings.configuration_files import load_settings
@@ -277,8 +278,8 @@ class Rig:
         self.drives = [StrangeDrive(self.wire, 1, 12_000), StrangeDrive(self.wire, 2, 6_000)]
         self.sensors = [StrangeSensor(self.wire, node, contract_folder() / sensor_eds) for node in (3, 4)]
         codec = compose_once(self.settings)
-        self.arm = Arm(self.settings, codec, self.wire)
-        self.master = Master(self.settings, codec, self.wire)
+        self.arm = Arm(self.settings, codec, place_devices(self.settings), self.wire)
+        self.master = Master(self.settings, codec, place_devices(self.settings), self.wire)
         self.cycle = 0
 
     def boot(self) -> None:

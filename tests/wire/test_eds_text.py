@@ -4,7 +4,8 @@ import re
 
 import pytest
 
-from adacd_hil.device.canopen_bus import find_variable, read_eds
+from adacd_hil.device.canopen_bus import find_variable
+from adacd_hil.device.eds_file import read_eds
 from adacd_hil.wire.dbc_contract import contract_folder
 from adacd_hil.wire.eds_text import readable_eds
 from firmware_sim.canopen.object_dictionary import read_eds as read_emulated

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.reader import LoggedEvent, RunLog, read_log
 from adacd_hil.log.types.topics import EVENTS, SCHEME
 from adacd_hil.records import TRUTH_LAYOUT, SchemeState
@@ -240,7 +241,8 @@ def play_attack(case: AttackCase | None, folder: Path) -> tuple[Finding, RunLog]
     folder.mkdir(parents=True, exist_ok=True)
     lasts_s = 1.5 if case is None else case.lasts_s
     settings = settings_of(lasts_s)
-    codec = load_contract(settings)
+    devices = place_devices(settings)
+    codec = load_contract(settings, devices)
     clock = VirtualClock()
     wire = Wire(clock)
     scenario = parse(Scenario, {"profile": "P", "start_deg": [-30.0, -60.0]}) if case is None else scenario_of(case)
@@ -255,7 +257,7 @@ def play_attack(case: AttackCase | None, folder: Path) -> tuple[Finding, RunLog]
             wire.end_ns = wire.begin_ns + round(lasts_s * 1e9)
 
     operator = ScriptedOperator(settings.operator)
-    session = Session(settings, codec, wire, clock, operator, folder, "embedded", progress=on_progress)
+    session = Session(settings, codec, devices, wire, clock, operator, folder, "embedded", progress=on_progress)
     summary = session.run()
     wire.close()
     clock.sleep_until_ns(clock.now_ns() + round(AFTER_S * 1e9))

@@ -21,6 +21,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.control.operator import FaultAnswer, Operator, ScriptedOperator
 from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, SCHEME
@@ -199,7 +200,8 @@ def allowed_s(settings: Settings) -> float:
 def play_witnessed(settings: Settings, scenario: Scenario, folder: Path, user: User | None = None) -> Played:
     """Play a run to its end, or until it is overdue. Raises ConfigError, CodecError for what can't be played."""
     folder.mkdir(parents=True, exist_ok=True)
-    codec = load_contract(settings)
+    devices = place_devices(settings)
+    codec = load_contract(settings, devices)
     clock = VirtualClock()
     embedded = EmbeddedBus(clock)
     bus = WitnessBus(model_time(embedded, clock, codec, settings), clock)
@@ -229,7 +231,7 @@ def play_witnessed(settings: Settings, scenario: Scenario, folder: Path, user: U
         bus.limit_ns = min(bus.limit_ns, due_ns)
 
     watching.on_finish = on_finish
-    session = watching.session = Session(settings, codec, bus, clock, operator, folder, "embedded")
+    session = watching.session = Session(settings, codec, devices, bus, clock, operator, folder, "embedded")
     summary, crash, overdue = None, "", ""
     try:
         with _at_most(HANG_S):

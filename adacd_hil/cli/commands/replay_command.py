@@ -173,6 +173,7 @@ def _open(
 ) -> "tuple[ReplaySource, bool]":
     """Return a log or a recording, and whether it is a recording without log. Raises CommandError without settings."""
     from adacd_hil.device.contract import load_contract
+    from adacd_hil.device.device_files import place_devices
     from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone
     from adacd_hil.replay.log_source import LogSource
     from adacd_hil.settings.configuration_files import load_settings
@@ -187,7 +188,8 @@ def _open(
     if config is None:
         raise CommandError(f"{path} holds no settings: give --against the log of its run, or --config", ExitCode.USAGE)
     settings = load_settings(config, profile)
-    return RecordingAlone(path, settings, load_codec(dbc) if dbc else load_contract(settings)), True
+    codec = load_codec(dbc) if dbc else load_contract(settings, place_devices(settings))
+    return RecordingAlone(path, settings, codec), True
 
 
 def _name(choice: dict[str, str]) -> str:

@@ -32,6 +32,7 @@ from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.control.tare_file import TARED, use_tare
 from adacd_hil.dates import format_date
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.viewer_layout import viewer_files
 from adacd_hil.printable import in_line, one_line
@@ -102,12 +103,13 @@ def run_on_bus(
     if settings.scheme == "certified" and not without_anchor and may_be_hardware(interface, channel):
         ask_without_anchor(unanchored_joints(settings), connection.arguments)
     files = [file for file in (tare, history) if file is not None]
-    codec = load_contract(settings)
+    devices = place_devices(settings)
+    codec = load_contract(settings, devices)
     if clock_name == "realtime" and (excess := describe_excess(codec, settings)):
         raise ConfigError(excess)
     clock = make_clock(clock_name)
     with run_folder(out, (LOG_NAME,), "run") as folder, ExitStack() as stack, never_stopped():
-        bus = connection.open(clock, codec, settings)
+        bus = connection.open(clock, codec, settings, devices)
         stack.callback(bus.close)
         drop_old_frames(bus, interface)
         operator: Operator = ScriptedOperator(settings.operator)
@@ -117,6 +119,7 @@ def run_on_bus(
         session = Session(
             settings,
             codec,
+            devices,
             bus,
             clock,
             operator,

@@ -13,7 +13,8 @@ from adacd_hil.cli.output import CommandError, ExitCode, tell
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.control.configuration_check import ConfigurationFindings, examine_configuration
 from adacd_hil.dates import format_date
-from adacd_hil.device.profile import ProfileSettings, ScaleSettings, load_profile, profile_names
+from adacd_hil.device.device_files import load_profile, profile_names
+from adacd_hil.device.profile import ProfileSettings, ScaleSettings
 from adacd_hil.file_access import read_input
 from adacd_hil.file_replacement import replace_file
 from adacd_hil.lab.cli.interview import Interview

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from adacd_hil.device.contract import find_contract, load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.printable import in_line
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.table_layout import fit_table
@@ -36,7 +37,7 @@ def judge(
     neither option nor DBC gives one; so does its number of arms on the bus.
     """
     settings = load_settings(config)
-    codec = load_contract(settings) if dbc is None else load_codec(find_contract(dbc))
+    codec = load_contract(settings, place_devices(settings)) if dbc is None else load_codec(find_contract(dbc))
     declared_us = int(read_attribute(codec.database, "BusPeriod_us"))
     budget = compute_budget(
         codec, period_us or declared_us or settings.bus.period_us, bitrate, data_bitrate, arms or settings.bus.arms

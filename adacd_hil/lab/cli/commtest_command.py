@@ -55,16 +55,16 @@ def run_commtest(
 
     Raises ConfigError, CodecError, BusMissingError, LogExistsError, LogError, CommandError.
     """
-    settings, codec = connection.load()
+    settings, codec, devices = connection.load()
     clock = MonotonicClock()
     if out is not None:
         check_free(out / LOG_NAME)
     with connection.bus(clock, codec.is_fd) as bus:
         tap = Tap(bus, clock)
-        arm, master = Arm(settings, codec, tap), Master(settings, codec, tap)
+        arm, master = Arm(settings, codec, devices, tap), Master(settings, codec, devices, tap)
         tell(f"looking for the arm on {bus.channel}")
         try:
-            refuse_company(tap, clock, settings, codec)
+            refuse_company(tap, clock, settings, codec, devices)
             master.reset()
             master.identify()
             master.configure()

@@ -33,7 +33,7 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
 
     Raises ConfigError, CodecError.
     """
-    settings, codec = connection.load()
+    settings, codec, devices = connection.load()
     bitrate, data_bitrate = read_bitrates(codec)
     clock = MonotonicClock()
 
@@ -52,6 +52,7 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
     patient = ArmExamination(
         settings,
         codec,
+        devices,
         clock,
         lambda: open_bus(connection.interface, connection.channel, clock, None, connection.bitrate, codec.is_fd),
         link,

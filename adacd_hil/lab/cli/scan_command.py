@@ -19,10 +19,10 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
 
     Raises ConfigError, CodecError, BusMissingError, CommandError.
     """
-    settings, codec = connection.load()
+    settings, codec, devices = connection.load()
     clock = MonotonicClock()
     with connection.bus(clock, codec.is_fd) as bus:
-        expected = expected_nodes(Master(settings, codec, bus).slaves, codec)
+        expected = expected_nodes(Master(settings, codec, devices, bus).slaves, codec)
         reporting = {node.node_id for node in expected if node.layout_digest is not None}
         found = survey(bus, clock, listen_s, tell, reporting)
     described = describe(found, compare(found, expected), codec)

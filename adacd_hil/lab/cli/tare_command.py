@@ -10,6 +10,7 @@ from adacd_hil.clock import VirtualClock
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.contract import load_contract
+from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.lab.commission.tare import TareRefusedError
 from adacd_hil.lab.commission.tare_session import TareSession
@@ -63,14 +64,17 @@ def tare_on_bus(
     check_shared(clock_name, settings)
     # A file that isn't a tare is not overwritten.
     old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
-    codec = load_contract(settings)
+    devices = place_devices(settings)
+    codec = load_contract(settings, devices)
     clock = make_clock(clock_name)
-    bus = connection.open(clock, codec, settings)
+    bus = connection.open(clock, codec, settings, devices)
     try:
         with Progress() as progress, closing(bus):
             if not isinstance(clock, VirtualClock):
-                refuse_company(bus, clock, settings, codec)
-            session = TareSession(settings, codec, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress)
+                refuse_company(bus, clock, settings, codec, devices)
+            session = TareSession(
+                settings, codec, devices, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress
+            )
             with never_stopped(), on_interrupt(session.interrupt, signal.SIGTSTP):
                 tare = session.run()
     except TareRefusedError as reason:

@@ -4,7 +4,7 @@ The drives get no command beyond Disable voltage. `ArmExamination.leave` puts th
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,6 +18,7 @@ from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import read_object
 from adacd_hil.device.device_setup import Slave, command_deadline_ms, pdo_differences, torque_unit
 from adacd_hil.device.network import Master
+from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.strangers import host_frames
 from adacd_hil.device.torque_sensor import SensorStatus
 from adacd_hil.lab.commission.communication_test import (
@@ -53,6 +54,7 @@ class ArmExamination:
 
     settings: Settings
     codec: Codec
+    devices: Sequence[PlacedDevice]
     clock: Clock
     open_bus: Callable[[], Bus]
     read_link: Callable[[], InterfaceState | None]
@@ -71,8 +73,8 @@ class ArmExamination:
         """Open the bus; make arm and master on it. `leave` closes it. Raises BusMissingError."""
         self._bus = self.open_bus()
         self.tap = Tap(self._bus, self.clock)
-        self.arm = Arm(self.settings, self.codec, self.tap)
-        self.master = Master(self.settings, self.codec, self.tap)
+        self.arm = Arm(self.settings, self.codec, self.devices, self.tap)
+        self.master = Master(self.settings, self.codec, self.devices, self.tap)
 
     @cached_property
     def loop(self) -> ZeroTorqueLoop:
@@ -121,7 +123,7 @@ def check_other_masters(patient: ArmExamination) -> Finding:
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
     patient.tap.take_passed()
-    doing = host_frames(patient.settings, patient.codec)
+    doing = host_frames(patient.settings, patient.codec, patient.devices)
     if patient.settings.bus.is_shared:
         del doing[patient.codec.message("Nmt").can_id]
     heard = [f"{doing[can_id]} (0x{can_id:03X})" for can_id in sorted(doing.keys() & traffic.talks.keys())]

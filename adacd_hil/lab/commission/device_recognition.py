@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from adacd_hil.clock import Clock
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.contract import compose
-from adacd_hil.device.profile import load_profile, place_devices
+from adacd_hil.device.device_files import load_profile, place_devices
 from adacd_hil.lab.commission.profile_draft import (
     KINDS,
     SENSOR,

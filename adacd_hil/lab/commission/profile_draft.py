@@ -15,9 +15,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from adacd_hil.device.canopen_bus import EdsVariable, find_variable, read_eds
+from adacd_hil.device.canopen_bus import EdsVariable, find_variable
+from adacd_hil.device.device_files import load_profile, profile_names
 from adacd_hil.device.device_setup import NEWTON_METRE, PREFIX_SHIFT
 from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, name_velocity_unit, read_drive_units
+from adacd_hil.device.eds_file import read_eds
 from adacd_hil.device.profile import (
     HOST_SIGNALS,
     DeviceProfile,
@@ -25,8 +27,6 @@ from adacd_hil.device.profile import (
     PatienceSettings,
     ProfileSettings,
     ScaleSettings,
-    load_profile,
-    profile_names,
 )
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError

@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import getpass
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +18,7 @@ from adacd_hil.dates import format_date
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, as_device_error
 from adacd_hil.device.network import ENTER_PRE_OPERATIONAL, START, Identity, Master
+from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.lab.commission.communication_test import ZeroTorqueLoop
 from adacd_hil.lab.commission.tare import (
     ArmMovedError,
@@ -51,6 +52,7 @@ class TareSession:
 
     settings: Settings
     codec: Codec
+    devices: Sequence[PlacedDevice]
     bus: Bus
     clock: Clock
     interface: str
@@ -66,8 +68,8 @@ class TareSession:
         # Nothing subtracted: tau_J is the sensor's value in joint direction.
         arm = dataclasses.replace(self.settings.arm, torque_offset_Nm=(0.0, 0.0))
         tap = Tap(self.bus, self.clock)
-        self._arm = Arm(dataclasses.replace(self.settings, arm=arm), self.codec, tap)
-        self._master = Master(self.settings, self.codec, tap)
+        self._arm = Arm(dataclasses.replace(self.settings, arm=arm), self.codec, self.devices, tap)
+        self._master = Master(self.settings, self.codec, self.devices, tap)
         self._canopen = CanopenBus(self.bus)
         self._loop = ZeroTorqueLoop(self.settings, tap, self.clock, self._arm, self._master)
         self._period_s = self.settings.bus.period_s

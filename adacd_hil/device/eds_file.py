@@ -1,0 +1,83 @@
+"""EDS files: their content checked, and read by canopen as an object dictionary. Source: CiA 306."""
+
+import configparser
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import canopen
+
+from adacd_hil.device.canopen_bus import UNFORESEEN
+from adacd_hil.file_access import read_input
+from adacd_hil.settings.schema import ConfigError
+from adacd_hil.wire.eds_text import readable_eds
+
+_EDS_CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x19\x1b-\x1f\x7f]")
+"""All but tab, the ends of lines and the end of a file under DOS."""
+_EDS_OBJECT = re.compile("[0-9A-Fa-f]{4}(?:[Ss]ub[0-9A-Fa-f]+)?")
+_MAKERS_OBJECTS = range(0x2000, 0x6000)
+"""Manufacturer objects: those that a profile names have a default or no value; the others' values don't matter."""
+_EDS_INTEGERS = {
+    form
+    for number in canopen.objectdictionary.INTEGER_TYPES
+    if number != canopen.objectdictionary.BOOLEAN
+    for form in (str(number), f"0X{number:X}", f"0X{number:02X}", f"0X{number:04X}")
+}
+_EDS_NUMBERS = ("DefaultValue", "ParameterValue", "LowLimit", "HighLimit")
+_EDS_NUMBER = re.compile(r"(?i:\s*(?:\$NODEID\s*\+?)?\s*[-+]?\s*(?:0x[0-9a-f]+|[0-9]+)?\s*(?:\+?\s*\$NODEID)?\s*)")
+"""CiA 306, 4.5.1: decimal, octal or hexadecimal, the node id before or after it."""
+
+
+def read_eds(path: Path, node_id: int | None) -> Any:
+    """Return the object dictionary of an EDS file, as `parse_eds`. Raises ConfigError."""
+    return parse_eds(eds_bytes(path), path, node_id)
+
+
+def eds_bytes(path: Path) -> bytes:
+    """Return the content of an EDS file. Raises ConfigError."""
+    try:
+        return read_input(path)
+    except OSError as error:
+        raise ConfigError(f"EDS {path}: {error.strerror}") from None
+
+
+def parse_eds(data: bytes, path: Path, node_id: int | None) -> Any:
+    """Return the object dictionary of an EDS; `$NODEID` in it becomes `node_id`, None: that of a DCF.
+
+    canopen drops values that it can't read as a number. An object without a default is not compared. `path`: names it
+    in errors. Raises ConfigError.
+    """
+    try:
+        text = data.decode("utf-8", "replace").removeprefix("\ufeff")
+        _check_eds(text)
+        stream = io.StringIO(readable_eds(text))
+        stream.name = "object dictionary.eds"
+        return canopen.import_od(stream, node_id)
+    except ConfigError as error:
+        raise ConfigError(f"EDS {path}: {error}") from None
+    except (*UNFORESEEN, configparser.Error, RecursionError) as error:
+        raise ConfigError(f"EDS {path}: {' '.join(str(error).split()) or repr(error)}") from None
+
+
+def _check_eds(text: str) -> None:
+    """Refuse control characters, and integers of standard objects that can't be read as numbers.
+
+    Raises ConfigError, configparser.Error.
+    """
+    if found := _EDS_CONTROL.search(text):
+        line = text.count("\n", 0, found.start()) + 1
+        raise ConfigError(f"line {line} has the control character 0x{ord(found[0]):02X}")
+    eds = configparser.RawConfigParser(inline_comment_prefixes=(";",))
+    eds.optionxform = str  # type: ignore[assignment,method-assign]
+    eds.read_string(text, "object dictionary.eds")
+    for section in eds.sections():
+        if not _EDS_OBJECT.fullmatch(section) or int(section[:4], 16) in _MAKERS_OBJECTS:
+            continue
+        entries = eds[section]
+        if entries.get("DataType", "").strip().upper() not in _EDS_INTEGERS:
+            continue
+        for key in _EDS_NUMBERS:
+            value = entries.get(key, "")
+            if value and not _EDS_NUMBER.fullmatch(value):
+                raise ConfigError(f"[{section}] {key} = {value[:40]!r} is no integer")
