@@ -68,7 +68,7 @@ def parse_object(text: str) -> ObjectName:
 
 
 _MERGED = ("scale", "plausibility", "patience")
-"""Sections that are merged key by key where a profile extends another."""
+"""Sections that are merged key by key where a profile extends another; `pdo` is merged frame by frame."""
 _TOGETHER = {
     "Feedback": ("position", "velocity"),
     "Command": ("controlword", "target_torque"),
@@ -276,7 +276,10 @@ class ProfileSettings:
             raise ValueError(f"pdo: a {self.kind} needs {' and '.join(missing)}")
         if len(set(found)) != len(found) or not set(found) <= {*wanted, "Status"}:
             raise ValueError(f"pdo: a {self.kind} has {', '.join(wanted)} and perhaps Status, once each")
+        taken: dict[int, str] = {}
         for pdo in self.pdo:
+            if (first := taken.setdefault(pdo.communication_index, pdo.message)) != pdo.message:
+                raise ValueError(f"pdo {pdo.message}: number = {pdo.number} is that of {first}, too")
             names = [signal.signal for signal in pdo.signals]
             if not names or len(set(names)) != len(names):
                 raise ValueError(f"pdo {pdo.message}: signals must be there and differ")
@@ -427,10 +430,18 @@ def _read_profile(path: Path, depth: int = 0) -> tuple[dict[str, Any], list[Path
     for key in _MERGED:
         if isinstance(below.get(key), dict) and isinstance(table.get(key), dict):
             merged[key] = below[key] | table[key]
+    if isinstance(below.get("pdo"), list) and isinstance(table.get("pdo"), list):
+        own = [_message(pdo) for pdo in table["pdo"]]
+        merged["pdo"] = [pdo for pdo in below["pdo"] if _message(pdo) not in own] + table["pdo"]
     if "assumed" not in table:
         stated = {f"{key}.{name}" for key in _MERGED if isinstance(table.get(key), dict) for name in table[key]}
         merged["assumed"] = [key for key in below.get("assumed", []) if key not in stated]
     return merged, [path.parent, *folders]
+
+
+def _message(pdo: object) -> object:
+    """Return which frame a `pdo` of a table is, None where it doesn't say."""
+    return pdo.get("message") if isinstance(pdo, dict) else None
 
 
 @dataclass(frozen=True)
