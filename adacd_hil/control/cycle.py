@@ -13,7 +13,7 @@ import numpy as np
 from adacd_hil.clock import Clock
 from adacd_hil.control.controller import Controller, Floating
 from adacd_hil.control.exchange import Exchange
-from adacd_hil.control.fault_recovery import FaultReport, SelfChecks, StopEscalation
+from adacd_hil.control.fault_recovery import BOUNDS, FaultReport, SelfChecks, StopEscalation
 from adacd_hil.control.first_motion import FirstMotion, is_shown
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator, RunNarration
@@ -122,6 +122,7 @@ class Cycle:
             self._exchange.events,
             self._first_motion,
             self._reference,
+            self._faults.commission,
         )
         self._state = SchemeState.INIT
         self._first_cycle = -1  # before the first
@@ -282,7 +283,7 @@ class Cycle:
         events = [event for source in self._sources if source.events for event in source.take_events()]
         for event in (*events, *self._pipeline.take_events()):
             recorder.event(t_ns, event)
-            if event.name in CERTIFICATE_EVENTS or event.name == MOTION or is_shown(event):
+            if event.name in CERTIFICATE_EVENTS or event.name in (MOTION, BOUNDS) or is_shown(event):
                 self._narration.event(t_ns, event.operator_text)
         if output.state is not self._state:
             event = self._transition(output, arm)

@@ -20,7 +20,7 @@ from adacd_hil.control.operator import FaultAnswer, Operator
 from adacd_hil.control.pacing import MOST_FRAMES
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import describe_disabled, describe_excess, describe_faults, describe_gaps
-from adacd_hil.device.arm_watch import ArmWatch, RateLimitedEvents
+from adacd_hil.device.arm_watch import ArmWatch, EventSource, RateLimitedEvents
 from adacd_hil.device.device_setup import ParameterWatch
 from adacd_hil.device.drive import Cia402State, Drive
 from adacd_hil.device.network import Master
@@ -145,7 +145,7 @@ class FaultReport:
         checks: SelfChecks,
         master: Master,
     ) -> None:
-        self._commission = CommissionReport(settings, arm)
+        self.commission = CommissionReport(settings, arm)
         self._arm, self._watch, self._checks, self._master = arm, watch, checks, master
         self._causes: dict[FaultReason, tuple[Callable[[], list[str]], ...]] = {
             FaultReason.DATA_AGE: (lambda: describe_gaps(arm),),
@@ -154,7 +154,7 @@ class FaultReport:
             FaultReason.DEADLINE: (lambda: [watch.deadline.describe_misses()],),
             FaultReason.COMMISSION_TIMEOUT: (
                 pipeline.describe_withheld,
-                self._commission.list_unrest,
+                self.commission.list_unrest,
                 lambda: describe_excess(arm),
             ),
             FaultReason.ENABLE_TIMEOUT: (lambda: describe_disabled(arm),),
@@ -163,7 +163,7 @@ class FaultReport:
 
     def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
         """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
-        self._commission.count_cycle(state, arm)
+        self.commission.count_cycle(state, arm)
 
     def list_causes(self, fault: FaultReason) -> list[str]:
         """Return the causes of a fault as lines: first those of its reason, then those of devices and bus."""
@@ -180,11 +180,20 @@ class FaultReport:
 _STATES = (SchemeState.INIT, SchemeState.COMMISSION)
 
 
-class CommissionReport:
-    """Counts the reasons why an arm stays in INIT or COMMISSION, by cycles."""
+BOUNDS = "bounds"
+"""Name of the event that tells a value outside its bounds before the drives are enabled: shown at once."""
+
+
+class CommissionReport(EventSource):
+    """Counts the reasons why an arm stays in INIT or COMMISSION, by cycles; tells values outside their bounds at once.
+
+    `events`: one for each device whose values are outside.
+    """
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
+        super().__init__()
         self._arm = arm
+        self._bounded = [device for device in arm.devices if device.has_bounds]
         torque = settings.safety.rest_torque_Nm
         self._bounds = (
             ("moves: |dq|", "safety.rest_velocity_rad_s", settings.safety.rest_velocity_rad_s, "rad/s"),
@@ -205,6 +214,11 @@ class CommissionReport:
         if state not in _STATES:
             return
         self._cycles += 1
+        for device in tuple(self._bounded):
+            if lines := device.describe_known_excess():
+                self._bounded.remove(device)
+                text = f"{'; '.join(lines)}: no drive is enabled before"
+                self.events.append(Event("warning", BOUNDS, text))
         if not arm.is_complete:
             self._causes.update(f"{name}: no usable frame in time" for name in self._arm.missing_names())
         if arm.fault is not FaultReason.NONE:

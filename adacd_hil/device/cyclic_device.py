@@ -103,10 +103,14 @@ class CyclicDevice(ABC):
 
     def describe_excess(self, cycle: int) -> list[str]:
         """Return a line per bounded value that is outside its bounds, and one if such values are missing or old."""
-        lines = [bound.describe(values) for bound, values in self._excesses()]
+        lines = self.describe_known_excess()
         if self._is_status_old(cycle):
-            lines.append(f"no status for more than {self.status_age_limit:g} cycles")
-        return [f"{self.name}: {line}" for line in lines]
+            lines.append(f"{self.name}: no status for more than {self.status_age_limit:g} cycles")
+        return lines
+
+    def describe_known_excess(self) -> list[str]:
+        """Return a line per bounded value that came and is outside its bounds."""
+        return [f"{self.name}: {bound.describe(values)}" for bound, values in self._excesses()]
 
     def _is_status_old(self, cycle: int) -> bool:
         return bool(self._status_bounds) and cycle - self._status_came > self.status_age_limit

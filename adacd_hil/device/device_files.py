@@ -68,10 +68,18 @@ def _read_profile(path: Path, depth: int = 0) -> tuple[dict[str, Any], list[Path
     for key in MERGED:
         if isinstance(below.get(key), dict) and isinstance(table.get(key), dict):
             merged[key] = below[key] | table[key]
+    if isinstance(below.get("pdo"), list) and isinstance(table.get("pdo"), list):
+        own = [_message(pdo) for pdo in table["pdo"]]
+        merged["pdo"] = [pdo for pdo in below["pdo"] if _message(pdo) not in own] + table["pdo"]
     if "assumed" not in table:
         stated = {f"{key}.{name}" for key in MERGED if isinstance(table.get(key), dict) for name in table[key]}
         merged["assumed"] = [key for key in below.get("assumed", []) if key not in stated]
     return merged, [path.parent, *folders]
+
+
+def _message(pdo: object) -> object:
+    """Return which frame a `pdo` of a table is, None where it doesn't say."""
+    return pdo.get("message") if isinstance(pdo, dict) else None
 
 
 def place_devices(settings: Settings) -> list[PlacedDevice]:

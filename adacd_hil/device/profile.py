@@ -63,7 +63,7 @@ def parse_object(text: str) -> ObjectName:
 
 
 MERGED = ("scale", "plausibility", "patience")
-"""Sections that are merged key by key where a profile extends another."""
+"""Sections that are merged key by key where a profile extends another; `pdo` is merged frame by frame."""
 _TOGETHER = {
     "Feedback": ("position", "velocity"),
     "Command": ("controlword", "target_torque"),
@@ -72,6 +72,15 @@ _TOGETHER = {
 """Signals that are one sample or one command, and so travel in one frame."""
 HOST_SIGNALS = ("controlword", "target_torque", "torque_offset", "max_torque", "mode")
 """Signals that the host can fill in a command frame."""
+
+_WORDS, _INTEGERS = (0x603F, 0x6040, 0x6041, 0x6072), (0x6071, 0x6077, 0x60B2)
+STANDARD_TYPES = {
+    **dict.fromkeys(_WORDS, (16, False)),
+    **dict.fromkeys(_INTEGERS, (16, True)),
+    **dict.fromkeys((0x6060, 0x6061), (8, True)),
+    **dict.fromkeys((0x6064, 0x606C), (32, True)),
+}
+"""Bits and sign of the objects by which a drive lives, by index. Source: CiA 402-2."""
 
 _DBC_MARKS = '"', "\\"
 """What the text of a unit can't have in a DBC."""
@@ -271,7 +280,10 @@ class ProfileSettings:
             raise ValueError(f"pdo: a {self.kind} needs {' and '.join(missing)}")
         if len(set(found)) != len(found) or not set(found) <= {*wanted, "Status"}:
             raise ValueError(f"pdo: a {self.kind} has {', '.join(wanted)} and perhaps Status, once each")
+        taken: dict[int, str] = {}
         for pdo in self.pdo:
+            if (first := taken.setdefault(pdo.communication_index, pdo.message)) != pdo.message:
+                raise ValueError(f"pdo {pdo.message}: number = {pdo.number} is that of {first}, too")
             names = [signal.signal for signal in pdo.signals]
             if not names or len(set(names)) != len(names):
                 raise ValueError(f"pdo {pdo.message}: signals must be there and differ")
@@ -418,7 +430,10 @@ class PlacedDevice:
         return pdo.cob_id + self.node_id
 
     def variable(self, name: ObjectName) -> EdsVariable:
-        """Return an object of the EDS. Raises ConfigError when it isn't listed, is a float, or fits no PDO."""
+        """Return an object of the EDS.
+
+        Raises ConfigError when it isn't listed, is a float, fits no PDO, or has another type than its standard says.
+        """
         found = find_variable(self.objects, name.index, name.sub)
         if found is None:
             raise ConfigError(f"device profile {self.profile.name}: object {name} is not in {self.profile.eds}")
@@ -429,6 +444,12 @@ class PlacedDevice:
             )
         if not found.bits:
             raise ConfigError(f"device profile {self.profile.name}: object {name} ({found.name}) fits no PDO")
+        bits, is_signed = STANDARD_TYPES.get(name.index, (found.bits, found.is_signed))
+        if (found.bits, found.is_signed) != (bits, is_signed):
+            raise ConfigError(
+                f"device profile {self.profile.name}: {name} is {_type(found.bits, found.is_signed)} in "
+                f"{self.profile.eds}, {_type(bits, is_signed)} by CiA 402: correct DataType there"
+            )
         return found
 
     def mapping(self, pdo: PdoSettings) -> list[int]:
@@ -441,6 +462,10 @@ class PlacedDevice:
         if not pdo.data_ids:
             return []
         return [SignalSettings(object=text, signal="e2e") for text in self.settings.header]
+
+
+def _type(bits: int, is_signed: bool) -> str:
+    return f"{'INTEGER' if is_signed else 'UNSIGNED'}{bits}"
 
 
 def enable_timeout_s(settings: Settings, devices: Sequence[PlacedDevice]) -> float:

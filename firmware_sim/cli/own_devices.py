@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
-from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, SignalSettings
+from adacd_hil.device.profile import STANDARD_TYPES, ObjectName, PdoSettings, PlacedDevice, SignalSettings
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
@@ -226,20 +226,23 @@ def _live_value(device: PlacedDevice, pdo: PdoSettings, signal: SignalSettings) 
     return LiveValue(objects[twin.signal], twin_count / count)
 
 
-_STANDARD_BITS = {0x603F: 16, 0x6040: 16, 0x6041: 16, 0x6060: 8, 0x6061: 8, 0x6064: 32, 0x606C: 32, 0x6071: 16}
-"""Size of the objects that a drive lives by. Source: CiA 402-2."""
+_BOTH_WAYS = ("position", "velocity", "torque", "target_torque")
+"""Signals with negative values."""
 
 
 def _check_objects(device: PlacedDevice) -> None:
-    """Raise ConfigError for a device that can't be played: it lacks a PDO's objects, or one has another size."""
+    """Raise ConfigError for a device that can't be played: it lacks a PDO's objects, or one has another type."""
     place = f"device profile {device.profile.name}"
     for pdo in device.settings.pdo:
         for index in (pdo.communication_index, pdo.mapping_index):
             if not device.has(index):
                 raise ConfigError(f"{place}: 0x{index:04X} of [[pdo]] {pdo.message} is not in {device.profile.eds}")
-    for index, bits in _STANDARD_BITS.items():
-        if device.has(index) and (found := device.variable(ObjectName(index)).bits) != bits:
-            raise ConfigError(f"{place}: 0x{index:04X} has {found} bits in {device.profile.eds}, {bits} by CiA 402")
+    for index in STANDARD_TYPES:
+        if device.has(index):
+            device.variable(ObjectName(index))
+    for signal in (signal for pdo in device.settings.pdo for signal in pdo.signals if signal.signal in _BOTH_WAYS):
+        if not device.variable(signal.name).is_signed:
+            raise ConfigError(f"{place}: {signal.name} ({signal.signal}) is unsigned and can't be played")
 
 
 def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:

@@ -218,6 +218,38 @@ def test_a_profile_extends_another_section_by_section(tmp_path: Path) -> None:
     assert [pdo.message for pdo in settings.pdo] == ["Feedback", "Status", "Command"]
 
 
+STATUS = """
+[[pdo]]
+message = "Status"
+number = {}
+cob_id = 0x280
+transmission = 255
+signals = [{{ object = "0x6041", signal = "statusword" }}]
+"""
+
+
+def test_a_frame_of_an_extending_profile_replaces_that_one_alone(tmp_path: Path) -> None:
+    base = load_profile("stock-drive", "drive").settings
+    mine = profile_file(tmp_path, 'extends = "stock-drive"\n' + STATUS.format(3))
+    found = {pdo.message: pdo for pdo in load_profile(mine, "drive").settings.pdo}
+    assert (found["Feedback"], found["Command"]) == (base.pdo[0], base.pdo[2])
+    assert (found["Status"].number, len(found["Status"].signals), len(found)) == (3, 1, 3)
+
+
+@pytest.mark.parametrize(
+    ("frames", "line"),
+    [
+        (STATUS.format(1), "pdo Status: number = 1 is that of Feedback, too"),
+        (STATUS.format(2) * 2, "a drive has Feedback, Command and perhaps Status, once each"),
+        (STATUS.format(2).replace("Status", "State"), "must be one of Feedback, Status, Command, Torque"),
+        ("pdo = [1]\n", "must be a table"),
+    ],
+)
+def test_a_frame_of_an_extending_profile_that_cant_be_is_one_line(tmp_path: Path, frames: str, line: str) -> None:
+    with pytest.raises(ConfigError, match=line):
+        load_profile(profile_file(tmp_path, 'extends = "stock-drive"\n' + frames), "drive")
+
+
 def test_a_profile_extends_a_built_in_one_by_its_name(tmp_path: Path) -> None:
     mine = profile_file(tmp_path, 'extends = "stock-drive"\n[patience]\npause_ms = 15\n')
     profile = load_profile(mine, "drive")

@@ -145,6 +145,16 @@ def test_no_arm_is_enabled_before_a_bounded_value_has_come(folder: Path) -> None
     assert "Sensor1: no status for more than 250 cycles" in said
 
 
+def test_a_value_outside_its_bounds_before_the_start_is_named_at_once(folder: Path) -> None:
+    fault, cycles, said = play(folder, "before", f'{HOT_WINDING}, since = "power_on", at_s = 0.0', arm="arm")
+    assert (fault, cycles) == (FaultReason.COMMISSION_TIMEOUT, None)
+    log = read_log(folder / "before" / "run.mcap")
+    (told_s,) = (each.t_ns * 1e-9 for each in log.events if each.event.name == "bounds")
+    assert told_s < 1.0
+    assert not np.any(log.control["tau_c"])
+    assert said.count("Drive2: temperature 91.2 degC, at most 85 allowed") >= 2  # at once, and as the cause
+
+
 def test_a_replaced_value_ends_with_its_fault(folder: Path) -> None:
     rows = f'{HOT_WINDING}, since = "power_on", at_s = 0.0, duration_s = 0.1'
     assert play(folder, "cooled", rows)[0] is FaultReason.NONE
