@@ -182,3 +182,9 @@ def test_a_full_disk_behind_the_output_is_a_partial_result():
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=60)
     assert done.returncode == PARTIAL
     assert done.stderr == "adacd-hil: standard output can't be written: No space left on device\n"
+
+
+@pytest.mark.parametrize("module", ["adacd_hil", "adacd_hil.cli.main"])
+def test_python_m_is_the_command(module):
+    ran = subprocess.run([sys.executable, "-m", module, "config", "shw"], capture_output=True, text=True, check=False)
+    assert (ran.returncode, "did you mean 'show'?" in ran.stderr.lower()) == (USAGE, True)
