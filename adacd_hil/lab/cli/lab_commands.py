@@ -29,7 +29,7 @@ from adacd_hil.lab.cli.log_command import log
 from adacd_hil.lab.cli.play_command import play
 from adacd_hil.lab.cli.runs_command import runs, trend
 from adacd_hil.lab.cli.sweep_command import sweep
-from adacd_hil.lab.cli.tune_command import tune
+from adacd_hil.lab.cli.tune_command import rate_option, tune
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.settings.toml_files import to_toml
 
@@ -141,13 +141,7 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Ti
 
 @click.command(epilog=EPILOG)
 @click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
-@click.option(
-    "--rate-per-h",
-    type=click.FloatRange(1e-6, 1e4),
-    default=0.01,
-    show_default=True,
-    help="Wanted false alarms per hour of a detector.",
-)
+@rate_option
 @click.option("--out", type=WrittenPath(dir_okay=False), help="Write the thresholds here, as TOML.")
 @click.option(
     "--report",
