@@ -30,6 +30,7 @@ from adacd_hil.lab.cli.play_command import play
 from adacd_hil.lab.cli.runs_command import runs, trend
 from adacd_hil.lab.cli.sweep_command import sweep
 from adacd_hil.lab.cli.tune_command import rate_option, tune
+from adacd_hil.lab.stated_bounds import GOOD_SHARE, SUFFICIENT_SHARE
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.settings.toml_files import to_toml
 
@@ -263,7 +264,10 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
     return code
 
 
-@click.command(epilog=EPILOG)
+@click.command(
+    epilog=f"Below a share of {SUFFICIENT_SHARE:.2f} the connection is not sufficient (exit status 1), below "
+    f"{GOOD_SHARE:.2f} there is a warning. {EPILOG}"
+)
 @on_bus
 @click.option(
     "--seconds", type=click.FloatRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test."
@@ -274,8 +278,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
     """Test the connection: cycles at zero torque, and the share of them that brings complete fresh data.
 
-    Below 0.90 the connection is not sufficient (exit status 1), below 0.95 there is a warning. The drives are not
-    enabled unless asked for.
+    The drives are not enabled unless asked for.
     """
     from adacd_hil.lab.cli.commtest_command import as_text, run_commtest
 
