@@ -89,7 +89,9 @@ class OutcomeGatherer:
         self._was_over = bool(over[-1])
         self._crossings += ticks.t_ns[rises].tolist()
         is_reported = np.zeros(count, np.bool_)
-        is_reported[batch.contact_places] = [report.cycle for report in batch.contacts] == ticks.cycle[batch.contact_places]
+        is_reported[batch.contact_places] = [report.cycle for report in batch.contacts] == ticks.cycle[
+            batch.contact_places
+        ]
         for row in np.flatnonzero(begins_alarm(batch.previous_state, batch.state, over, is_reported)).tolist():
             is_armed = bool(is_armed_in(batch.previous_state[row]))
             self._alarms.append((int(ticks.cycle[row]), Detection(int(ticks.t_ns[row]), is_armed)))
