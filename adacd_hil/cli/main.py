@@ -151,3 +151,7 @@ def _missing(error: ImportError) -> Exception:
         return error
     line = f"package {package} is not installed, which this command needs: {pip_command()} install {package}"
     return CommandError(line, ExitCode.USAGE)
+
+
+if __name__ == "__main__":
+    main()

@@ -147,6 +147,17 @@ def enters_react(previous: NDArray[np.uint8], state: NDArray[np.uint8]) -> NDArr
     return np.asarray((state == SchemeState.REACT) & ~is_interrupted(previous))
 
 
+def begins_alarm(
+    previous: NDArray[np.uint8], state: NDArray[np.uint8], is_over: Mask, is_reported: Mask
+) -> NDArray[np.bool_]:
+    """Return for each cycle (n,) whether an alarm begins: a reaction to a contact, not to a host that is late.
+
+    is_over (n,): some joint is over its threshold, or it is not known. is_reported (n,): a report of a contact that
+    began in this cycle.
+    """
+    return enters_react(previous, state) & np.asarray(is_over | is_reported)
+
+
 class Mismatch(NamedTuple):
     """A value that isn't the logged one. `place`: joint, parameter or channel of the field, "" for a plain one."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.logged_run import Mismatch, enters_react, host_span, is_armed_in
+from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed_in
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.supervisor import LEARNING
@@ -88,8 +88,11 @@ class OutcomeGatherer:
         rises = np.flatnonzero(over & ~np.concatenate(([self._was_over], over[:-1])))
         self._was_over = bool(over[-1])
         self._crossings += ticks.t_ns[rises].tolist()
-        over[batch.contact_places] |= np.array([r.cycle for r in batch.contacts]) == ticks.cycle[batch.contact_places]
-        for row in np.flatnonzero(enters_react(batch.previous_state, batch.state) & over).tolist():
+        is_reported = np.zeros(count, np.bool_)
+        is_reported[batch.contact_places] = [report.cycle for report in batch.contacts] == ticks.cycle[
+            batch.contact_places
+        ]
+        for row in np.flatnonzero(begins_alarm(batch.previous_state, batch.state, over, is_reported)).tolist():
             is_armed = bool(is_armed_in(batch.previous_state[row]))
             self._alarms.append((int(ticks.cycle[row]), Detection(int(ticks.t_ns[row]), is_armed)))
             if follows_gap:

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, CONFIG_NAME, SCENARIO_NAME, TRUTH_NAME
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, CONFIG_NAME, SCENARIO_NAME, TRUTH_NAME, LogError
 from adacd_hil.log.log_walk import attachment, run_metadata
 from adacd_hil.log.logged_run import Cycles, EmulatorSpan, Progress, Truth, is_armed_in, is_interrupted
 from adacd_hil.log.reader import LogStream, Series
@@ -206,11 +206,15 @@ _PLAYED = ("scenario", "seed")
 
 
 def foreign_truth(log: Path, truth: Path) -> str:
-    """Return in one line why a truth is of another run than a log; "" if no field contradicts the log.
+    """Return in one line why a truth can't be read or is of another run than a log; "" if no field contradicts the log.
 
     Both name scenario and seed if one process played host and arm, and the truth has a digest of the host's
     configuration: in lockstep, the same three make the same run. On a bus the host doesn't know the scenario.
     """
+    try:
+        LogStream(truth, ())
+    except LogError as error:
+        return str(error)
     ours, theirs = run_metadata(log), _played(truth)
     for key in _PLAYED:
         if key in ours and key in theirs and ours[key] != theirs[key]:

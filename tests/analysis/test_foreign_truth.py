@@ -56,6 +56,14 @@ def test_logs_tell_runs_apart_by_what_was_played(host, emulator, seed, reason, t
     assert told == ([f"{truth} is of another run: {reason}; it is left out"] if reason else [])
 
 
+@pytest.mark.parametrize(("content", "reason"), [(b"", "is empty"), (b"hello", "is not an MCAP file")])
+def test_a_truth_that_cannot_be_read_is_left_out(content, reason, tmp_path):
+    log, truth = make_logs(tmp_path, {}, {})
+    truth.write_bytes(content)
+    told: list[str] = []
+    assert (contacts_beside(log, told.append), told) == (None, [f"{truth} {reason}; it is left out"])
+
+
 def recorded(folder: Path, run: Run) -> tuple[Path, Path]:
     """Write both logs of a run."""
     record(folder / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adacd_hil.log.logged_run import enters_react
+from adacd_hil.log.logged_run import begins_alarm, enters_react
 from adacd_hil.records import SchemeState
 from adacd_hil.score.judge import (
     Detection,
@@ -134,3 +134,17 @@ def test_another_index_or_another_attempt_is_another_contact():
 
 def test_windows_of_contacts_do_not_overlap():
     assert explained_until(np.array([100, 150, 900]), np.array([400, 200, 950])).tolist() == [149, 400, 950]
+
+
+@pytest.mark.parametrize(
+    ("previous", "is_over", "is_reported", "is_alarm"),
+    [
+        (SchemeState.MONITOR, True, False, True),
+        (SchemeState.MONITOR, False, True, True),
+        (SchemeState.MONITOR, False, False, False),  # a late host
+        (SchemeState.STOPPED, True, True, False),
+    ],
+)
+def test_a_reaction_is_an_alarm_if_something_touches(previous, is_over, is_reported, is_alarm):
+    states = (np.array([state], np.uint8) for state in (previous, SchemeState.REACT))
+    assert begins_alarm(*states, np.array([is_over]), np.array([is_reported])).tolist() == [is_alarm]

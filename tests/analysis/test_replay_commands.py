@@ -52,6 +52,9 @@ def test_a_log_that_cannot_be_read_keeps_no_other_back(log, tmp_path):
     done = called("replay", tmp_path / "gone.mcap", log, tmp_path / "gone.mcap", "--json")
     assert (done.exit_code, [each["log"] for each in json.loads(done.stdout)]) == (FAILURE, [str(log)])
     assert [str(tmp_path / "gone.mcap") in line for line in complaints(done)] == [True]
+    done = called("compare", log, tmp_path / "gone.mcap", log, "--json")
+    assert (done.exit_code, [each["cycles"] > 0 for each in json.loads(done.stdout)]) == (FAILURE, [True])
+    assert [str(tmp_path / "gone.mcap") in line for line in complaints(done)] == [True]
 
 
 def test_a_cut_log_ends_with_status_3(log, tmp_path):

@@ -15,6 +15,7 @@ import pytest
 from hand_made_run import A, M, like_an_old_log, make_run, record, record_truth, touched_run, without_cycles
 from parsed_page import Page
 
+from adacd_hil.device.value_bounds import ValueBound
 from adacd_hil.lab.report import run_page
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.report_files import write_report, write_run_report
@@ -229,9 +230,18 @@ def test_the_first_screen_of_a_bad_run_has_one_cause_and_a_list():
     cause = "drive1: " + "an error with a very long name, " * 30
     run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("error", "supervisor", f"x; {cause}")),))
     first, *further = headlines(evaluate(run))
-    assert (first[:30], len(first) <= 110, len(further) >= 2) == ("FAULT (DRIVE) at 0.10 s: drive1"[:30], True, True)
+    assert (first[:30], len(first) <= 160, len(further) >= 2) == ("FAULT (DRIVE) at 0.10 s: drive1"[:30], True, True)
     first, *_ = headlines(evaluate(make_run((A, 1000), (M, 500), (SchemeState.PAYLOAD, 20), (A, 100))))
     assert "not again" in first
+
+
+def test_the_headline_of_a_value_outside_its_bounds_has_the_value():
+    run = make_run((A, 100), (SchemeState.FAULT, 50))
+    run.fault[100:] = FaultReason.SENSOR
+    bound = ValueBound("torque_of_channel_2 - torque_of_channel_1", "Nm", 0, 1, -0.2, 0.2)
+    cause = f"Sensor1: {bound.describe((4.05156, 0.2))}"
+    run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("error", "supervisor", f"x; {cause}")),))
+    assert headlines(evaluate(run))[0].endswith(cause)
 
 
 def test_the_heading_does_not_part_a_number_from_its_unit(html):

@@ -11,6 +11,7 @@ import pytest
 from called import called
 from numpy.lib.stride_tricks import sliding_window_view
 
+from adacd_hil.cli.main import cli
 from adacd_hil.lab.detectors.detectors import DetectorBankSettings, register, unregister
 from adacd_hil.lab.thresholds import free_motion as module
 from adacd_hil.lab.thresholds.detector_comparison import (
@@ -319,3 +320,10 @@ def test_the_command_refuses_what_is_too_short():
     assert (played.exit_code, played.stdout) == (1, "")
     (line,) = played.stderr.splitlines()
     assert "19 s of contact-free motion are too few for a tail, at least 50 s" in line
+
+
+@pytest.mark.parametrize("command", ["thresholds", "tune"])
+def test_a_rate_that_can_be_asked_for_can_be_written(command):
+    (rate,) = (param.type for param in cli.commands[command].params if param.name == "rate_per_h")
+    metadata = Thresholds.__dataclass_fields__["rate_per_h"].metadata
+    assert (rate.min, rate.max) == (metadata["low"], metadata["high"])

@@ -140,11 +140,11 @@ def test_events_of_a_log_stay_within_their_line(tmp_path):
     assert line == "  error: arm: fell\\u000aproblem: none"
 
 
-@pytest.mark.parametrize("text", ["", "(1.000000) can0 123#11\n" * 100])
-def test_info_of_another_file_is_an_error(tmp_path, text):
+@pytest.mark.parametrize(("text", "what"), [("", "empty"), ("(1.000000) can0 123#11\n" * 100, "not an MCAP file")])
+def test_info_of_another_file_is_an_error(tmp_path, text, what):
     (tmp_path / "x.mcap").write_text(text)
     code, out, err = call("info", tmp_path / "x.mcap")
-    assert (code, out, err) == (1, "", f"adacd-hil: {tmp_path / 'x.mcap'} is not an MCAP file\n")
+    assert (code, out, err) == (1, "", f"adacd-hil: {tmp_path / 'x.mcap'} is {what}\n")
 
 
 @pytest.mark.parametrize(("end", "status"), [(None, 0), (-30, 3)])

@@ -111,7 +111,10 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("report folder", FAILURE, ("folder has no run.mcap, nor has any folder in it",)),
     ("report none.mcap", FAILURE, ("log none.mcap can't be read: No such file",)),
     ("report notes.txt", FAILURE, ("notes.txt is not an MCAP file",)),
-    ("report cut.mcap", FAILURE, ("cut.mcap",)),
+    ("report cut.mcap", FAILURE, ("cut.mcap is empty",)),
+    ("replay cut.mcap", FAILURE, ("cut.mcap is empty",)),
+    ("thresholds cut.mcap", FAILURE, ("cut.mcap is empty",)),
+    ("compare cut.mcap cut.mcap", FAILURE, ("cut.mcap is empty",)),
     ("replay none", FAILURE, ("log none can't be read: No such file",)),
     ("replay folder", FAILURE, ("folder has no run.mcap", "name a log, or the folder of a run")),
     ("log info folder", FAILURE, ("folder folder has no .mcap file",)),
@@ -179,3 +182,9 @@ def test_a_full_disk_behind_the_output_is_a_partial_result():
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=60)
     assert done.returncode == PARTIAL
     assert done.stderr == "adacd-hil: standard output can't be written: No space left on device\n"
+
+
+@pytest.mark.parametrize("module", ["adacd_hil", "adacd_hil.cli.main"])
+def test_python_m_is_the_command(module):
+    ran = subprocess.run([sys.executable, "-m", module, "config", "shw"], capture_output=True, text=True, check=False)
+    assert (ran.returncode, "did you mean 'show'?" in ran.stderr.lower()) == (USAGE, True)

@@ -14,7 +14,6 @@ from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_replacement import replace_files
 from adacd_hil.lab.commission.communication_test import (
-    GOOD_SHARE,
     CommunicationTest,
     Verdict,
     ZeroTorqueCycle,
@@ -24,6 +23,7 @@ from adacd_hil.lab.score.evaluation import collect_evidence
 from adacd_hil.lab.score.histogram import bar_chart, doubling_bins
 from adacd_hil.lab.score.metrics import TimingEvidence
 from adacd_hil.lab.score.run_arrays import QUANTITIES
+from adacd_hil.lab.stated_bounds import GOOD_SHARE
 from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, failing_as
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free

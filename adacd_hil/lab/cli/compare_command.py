@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import ExitCode, answer, explained, format_table
+from adacd_hil.cli.output import ExitCode, answer, complain_of, explained, format_table, one_by_one
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.printable import in_line
@@ -39,9 +39,12 @@ def compare(first: Path, others: tuple[Path, ...], as_json: bool, stretch: "Time
     from adacd_hil.lab.runs.log_comparison import compare_logs
 
     with Progress() as progress:
-        found = [compare_logs(log_in(first), log_in(other), progress, stretch) for other in others]
-    tables = [each.by_key() for each in found]
-    answer(as_json, tables[0] if len(tables) == 1 else tables, "\n\n".join(map(_as_text, found)))
+        found, refused = one_by_one(others, lambda other: compare_logs(log_in(first), log_in(other), progress, stretch))
+    if found:
+        tables = [each.by_key() for each in found]
+        answer(as_json, tables[0] if len(others) == 1 else tables, "\n\n".join(map(_as_text, found)))
+    if code := complain_of(refused):
+        return code
     if not all(each.is_same_where_whole for each in found):
         return ExitCode.FAILURE
     return ExitCode.OK if all(each.is_same and not each.notes for each in found) else ExitCode.PARTIAL

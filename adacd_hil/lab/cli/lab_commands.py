@@ -29,7 +29,8 @@ from adacd_hil.lab.cli.log_command import log
 from adacd_hil.lab.cli.play_command import play
 from adacd_hil.lab.cli.runs_command import runs, trend
 from adacd_hil.lab.cli.sweep_command import sweep
-from adacd_hil.lab.cli.tune_command import tune
+from adacd_hil.lab.cli.tune_command import rate_option, tune
+from adacd_hil.lab.stated_bounds import GOOD_SHARE, SUFFICIENT_SHARE
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.settings.toml_text import to_toml
 
@@ -141,13 +142,7 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Ti
 
 @click.command(epilog=EPILOG)
 @click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
-@click.option(
-    "--rate-per-h",
-    type=click.FloatRange(1e-6, 1e4),
-    default=0.01,
-    show_default=True,
-    help="Wanted false alarms per hour of a detector.",
-)
+@rate_option
 @click.option("--out", type=WrittenPath(dir_okay=False), help="Write the thresholds here, as TOML.")
 @click.option(
     "--report",
@@ -269,7 +264,10 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
     return code
 
 
-@click.command(epilog=EPILOG)
+@click.command(
+    epilog=f"Below a share of {SUFFICIENT_SHARE:.2f} the connection is not sufficient (exit status 1), below "
+    f"{GOOD_SHARE:.2f} there is a warning. {EPILOG}"
+)
 @on_bus
 @click.option(
     "--seconds", type=click.FloatRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test."
@@ -280,8 +278,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
     """Test the connection: cycles at zero torque, and the share of them that brings complete fresh data.
 
-    Below 0.90 the connection is not sufficient (exit status 1), below 0.95 there is a warning. The drives are not
-    enabled unless asked for.
+    The drives are not enabled unless asked for.
     """
     from adacd_hil.lab.cli.commtest_command import as_text, run_commtest
 

@@ -19,6 +19,7 @@ from adacd_hil.cli.output import (
     writable_folder,
 )
 from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.lab.stated_bounds import LEAST_RATE_PER_H, MOST_RATE_PER_H
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line
@@ -29,18 +30,22 @@ if TYPE_CHECKING:
     from adacd_hil.log.time_window import TimeWindow
 
 
+rate_option = click.option(
+    "--rate-per-h",
+    type=click.FloatRange(LEAST_RATE_PER_H, MOST_RATE_PER_H),
+    default=0.01,
+    show_default=True,
+    help="Wanted false alarms per hour of a detector.",
+)
+"""The option of `tune` and `thresholds`."""
+
+
 @click.command(
     epilog="Exit status: 0 found, and the half to check on shows the wanted rate; 3 it can't show it, or no candidate "
     "is fit; 1 a log can't be read, or has no motion that counts; 2 wrong usage or configuration; 130 interrupted."
 )
 @click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
-@click.option(
-    "--rate-per-h",
-    type=click.FloatRange(1e-6, 1e4),
-    default=0.01,
-    show_default=True,
-    help="Wanted false alarms per hour.",
-)
+@rate_option
 @click.option("--config", metavar="NAME|FILE", help="Settings to start from and to extend; default: the logs' own.")
 @click.option("--out", type=WrittenPath(dir_okay=False), help="Write the suggested configuration here.")
 @click.option("--report", type=WrittenPath(file_okay=False), help="Folder for tune.json and the figures.")

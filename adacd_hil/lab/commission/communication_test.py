@@ -1,7 +1,7 @@
 """The communication test: share of cycles with complete fresh data, and the lateness of each part of a cycle.
 
-Judged as libfranka's `examples/communication_test.cpp` does by its success rate: below 0.90 the connection isn't
-sufficient, below 0.95 it is poor. A period that was skipped counts as one without data.
+Judged as libfranka's `examples/communication_test.cpp` does by its success rate: below `SUFFICIENT_SHARE` the
+connection isn't sufficient, below `GOOD_SHARE` it is poor. A period that was skipped counts as one without data.
 
 Tests and tares cycle at zero torque on the fixed grid (`ZeroTorqueLoop`): SYNC out, feedback and torque in, zero torque
 out.
@@ -28,6 +28,7 @@ from adacd_hil.device.torque_sensor import TorqueSensor
 from adacd_hil.lab.commission.load_meter import LoadMeter
 from adacd_hil.lab.score.evaluation import OLDEST_CYCLES
 from adacd_hil.lab.score.run_arrays import CycleColumns, columns_of_records
+from adacd_hil.lab.stated_bounds import GOOD_SHARE, SUFFICIENT_SHARE
 from adacd_hil.records import JOINTS, ArmCommand, ArmState, CycleRecord, FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Frame, Tap
@@ -104,8 +105,6 @@ class ZeroTorqueLoop:
         return ZeroTorqueCycle(arm, record, self._bus.take_passed())
 
 
-SUFFICIENT_SHARE = 0.90
-GOOD_SHARE = 0.95
 _LOAD_CYCLES = 1000
 """Cycles at the end of the test from whose frames the bus load is computed."""
 

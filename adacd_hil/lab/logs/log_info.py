@@ -23,13 +23,12 @@ from adacd_hil.log.log_files import (
     PART_KEY,
     RUN_METADATA,
     SUMMARY_METADATA,
-    LogError,
     failing_as,
 )
 from adacd_hil.log.log_parts import DROPPED_KEY, missing_parts, parts_of, summary_count
 from adacd_hil.log.log_walk import run_metadata
 from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_contents
-from adacd_hil.log.mcap.mcap_records import Definitions, FileEnd, RawRecord, parse, read_end, read_record
+from adacd_hil.log.mcap.mcap_records import Definitions, FileEnd, RawRecord, check_magic, parse, read_end, read_record
 from adacd_hil.log.mcap.record_layout import MAGIC, MESSAGE_HEAD
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.types.message_types import LOG, log_time_ns, payload_dtype, unpack_log
@@ -92,16 +91,17 @@ def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
     parts = parts_of(path)
     info = LogInfo(path, files=len(parts))
     view = _InfoView(info, is_brief)
-    is_mcap = False
+    begin = b""
     for part in parts.values():
         with failing_as(f"log {part} can't be read"), open_input(part) as file:
             info.size_bytes += part.stat().st_size
-            is_mcap |= file.read(len(MAGIC)) == MAGIC
+            magic = file.read(len(MAGIC))
+            begin = begin if begin == MAGIC else magic
             view.add_file(part, file)
     info.problems += [f"{part.name} is missing" for part in missing_parts(path, parts, info.ending)]
     view.sum_up()
-    if not (is_mcap or info.topics or info.attachments or info.metadata or info.summary):
-        raise LogError(f"{path} is not an MCAP file")
+    if not (info.topics or info.attachments or info.metadata or info.summary):
+        check_magic(begin, str(path))
     return info
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.lab.score.run_arrays import Run
-from adacd_hil.log.logged_run import Cycles, enters_react, is_armed_in
+from adacd_hil.log.logged_run import Cycles, begins_alarm, is_armed_in
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.score.emulator_truth import HostCycles, placed_contact
@@ -21,16 +21,16 @@ from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge
 
 def find_detections(run: Run) -> tuple[Detection, ...]:
     """Return the alarms of a run, each with the reports that belong to it by their cycle."""
-    rows = np.flatnonzero(enters_react(run.state[:-1], run.state[1:])) + 1
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
     detections = []
-    for row in rows.tolist():
+    is_over = np.ones(run.state.size, np.bool_) if run.contact_joints is None else run.contact_joints != 0
+    is_reported = np.isin(run.cycle, [*alarms, *finals])
+    begins = begins_alarm(run.state[:-1], run.state[1:], is_over[1:], is_reported[1:])
+    for row in (np.flatnonzero(begins) + 1).tolist():
         cycle = int(run.cycle[row])
         final = finals.get(cycle)
         first = alarms.get(cycle, final)
-        if first is None and run.contact_joints is not None and not run.contact_joints[row]:
-            continue
         is_armed = bool(is_armed_in(run.state[row - 1]))
         is_known = run.truth is None or run.truth.covers(cycle)
         detections.append(Detection(int(run.t_ns[row]), is_armed, is_known, row, first, final or first))

@@ -98,7 +98,8 @@ def _judged_text(run: Run, found: str) -> str:
     return f"{found}, from {first_s:.2f} to {last_s:.2f} s: the truth covers no more"
 
 
-_HEADLINE_LETTERS: Final = 110
+_HEADLINE_LETTERS: Final = 160
+"""Enough for a fault's device, a difference of two signals with long names, its value and its bounds."""
 
 
 def headlines(metrics: Metrics) -> list[str]:

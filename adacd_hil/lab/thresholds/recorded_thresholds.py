@@ -15,6 +15,7 @@ import numpy as np
 
 from adacd_hil.lab.detectors import detectors
 from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
+from adacd_hil.lab.stated_bounds import LEAST_RATE_PER_H, MOST_RATE_PER_H
 from adacd_hil.lab.thresholds.false_alarms import (
     BLOCK_S,
     Sensing,
@@ -168,7 +169,12 @@ class DetectorRow:
 class Thresholds:
     """Thresholds for a wanted rate of false alarms, with confidence bounds."""
 
-    rate_per_h: float = setting(unit="1/h", low=1e-6, high=1e4, meaning="wanted false alarms per hour of a detector")
+    rate_per_h: float = setting(
+        unit="1/h",
+        low=LEAST_RATE_PER_H,
+        high=MOST_RATE_PER_H,
+        meaning="wanted false alarms per hour of a detector",
+    )
     hours: float = setting(unit="h", low=0.0, meaning="contact-free motion that they come from")
     is_extrapolated: bool = setting(meaning="less than one alarm is expected in that motion")
     lag_s: float = setting(unit="s", low=0.0, high=1.0, meaning="lag of the velocity, identified")

@@ -24,7 +24,7 @@ from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import EPOCH_KEY, RUN_METADATA, LogError, failing_as
 from adacd_hil.log.log_parts import parts_of
 from adacd_hil.log.mcap.chunks import Block, Contents, read_blocks
-from adacd_hil.log.mcap.mcap_records import DEFINITIONS, Definitions, Problem, RawRecord, parse, summary_of
+from adacd_hil.log.mcap.mcap_records import DEFINITIONS, Definitions, Problem, RawRecord, check_magic, parse, summary_of
 from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, MESSAGE_HEAD, record_dtype
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
@@ -76,9 +76,9 @@ class McapFrames:
         with failing_as(f"log {source} can't be read"):
             if isinstance(first, Path):
                 with open_input(first) as file:
-                    _check_magic(file, str(first))
+                    check_magic(file.read(len(MAGIC)), str(first))
             else:
-                _check_magic(first, "the file")
+                check_magic(first.read(len(MAGIC)), "the file")
                 first.seek(0)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
@@ -181,11 +181,6 @@ class McapFrames:
             return _NO_FRAMES
         frames: NDArray[Any] = np.concatenate(found)[np.argsort(np.concatenate(places))]
         return frames
-
-
-def _check_magic(file: IO[bytes], name: str) -> None:
-    if file.read(len(MAGIC)) != MAGIC:
-        raise LogError(f"{name} is not an MCAP file")
 
 
 def _unpack(source: _Source, rows: NDArray[np.uint8], name_bytes: int, epoch_ns: int) -> NDArray[Any]:

@@ -154,6 +154,13 @@ def parse(opcode: int, body: bytes) -> Any:
         raise LogError(f"{name_of(opcode)} can't be read: {error or type(error).__name__}") from None
 
 
+def check_magic(begin: bytes, name: str) -> None:
+    """Raise LogError, which begins with `name`, unless a file that begins with these bytes is MCAP."""
+    if begin != MAGIC:
+        cut = f"cut after {len(begin)} bytes" if begin else "empty"
+        raise LogError(f"{name} is {cut if MAGIC.startswith(begin) else 'not an MCAP file'}")
+
+
 def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[RawRecord | IndexRun | Problem]:
     """Yield the records of a file up to its end, or to bytes that can't be a record.
 
@@ -163,10 +170,8 @@ def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[R
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
-    magic = file.read(len(MAGIC))
-    if not MAGIC.startswith(magic):
-        raise LogError(f"{name} is not an MCAP file")
-    position, is_whole = len(magic), False
+    check_magic(file.read(len(MAGIC)), name)
+    position, is_whole = len(MAGIC), False
     while len(head := file.read(HEAD.size)) == HEAD.size:
         opcode, length = HEAD.unpack(head)
         if length > MOST_RECORD_BYTES:
