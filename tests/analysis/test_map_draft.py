@@ -12,7 +12,7 @@ from click.testing import Result
 from foreign_arms import AXES, Motion, record, urdf_text
 from joint_state_bags import State, write_mcap
 
-from adacd_hil.lab.offline.map_draft import MapDraft, draft_map
+from adacd_hil.lab.offline.map_draft import DraftedKey, draft_map, map_text
 from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.log.log_files import LogError
 from adacd_hil.settings.schema import ConfigError
@@ -31,14 +31,15 @@ def table(heads: str, *columns, delimiter: str = ",", form: Callable[[float], st
     return "\n".join([*([heads] if heads else []), *rows]) + "\n"
 
 
-def draft(folder: Path, text: str, urdf: str = URDF) -> tuple[MapDraft, dict]:
+def draft(folder: Path, text: str, urdf: str = URDF) -> tuple[list[DraftedKey], dict]:
     """Draft a map, write and read it, and return it with its tables."""
     (folder / "arm.urdf").write_text(urdf)
     (folder / "r.csv").write_text(text)
     found = draft_map(folder / "r.csv", folder / "arm.urdf", folder / "map.toml")
-    (folder / "map.toml").write_text(found.text())
+    text = map_text(folder / "r.csv", found)
+    (folder / "map.toml").write_text(text)
     read_map(folder / "map.toml")
-    return found, tomllib.loads(found.text())
+    return found, tomllib.loads(text)
 
 
 HEADS = {
@@ -85,7 +86,7 @@ def test_measured_columns_go_before_desired_and_filtered_ones(tmp_path, motion):
     text = table(heads, motion.t, motion.q, motion.q, motion.q, motion.tau, motion.tau, motion.q)
     found, keys = draft(tmp_path, text)
     assert keys["columns"] == {"time": "t", "q": ["q_meas1", "q_meas2"], "tau_J": ["tau_meas1", "tau_meas2"]}
-    reasons = {key.key: key.reason for key in found.guesses}
+    reasons = {key.key: key.reason for key in found if key.reason}
     assert reasons["q"] == "one of q_des1, q_filt1, q_meas1"
 
 
@@ -94,7 +95,7 @@ def test_what_heads_leave_open_is_guessed_from_spans_against_the_urdf(tmp_path, 
     columns = (5.0 * np.arange(len(motion.t)), np.degrees(motion.q), np.degrees(motion.dq), 1e3 * motion.tau)
     found, keys = draft(tmp_path, table(heads, *columns))
     assert keys["units"] == {"time": "ms", "q": "deg", "dq": "deg/s", "tau_J": "mNm"}
-    reasons = {key.key: key.reason for key in found.guesses}
+    reasons = {key.key: key.reason for key in found if key.reason}
     assert reasons["time"] == "rows are 5 ms apart"
     assert "the URDF to 2 rad" in reasons["q"]
     assert "the effort of the URDF is 20 Nm" in reasons["tau_J"]
@@ -164,7 +165,7 @@ def bag(folder: Path, names: tuple[str, ...], motion: Motion, **more) -> dict:
         for t, q, tau in zip(motion.t.tolist(), motion.q.tolist(), motion.tau.tolist(), strict=True)
     ]
     path = write_mcap(folder / "r.mcap", states)
-    return tomllib.loads(draft_map(path, folder / "arm.urdf", folder / "map.toml").text())
+    return tomllib.loads(map_text(path, draft_map(path, folder / "arm.urdf", folder / "map.toml")))
 
 
 def test_a_bag_needs_its_urdf_alone_where_it_has_the_urdfs_names(tmp_path, motion):

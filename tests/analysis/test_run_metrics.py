@@ -478,4 +478,4 @@ def test_the_verdict_says_how_it_went_and_a_run_is_clean_if_nothing_went_wrong(r
 
 def test_a_log_without_cycles_has_no_sections():
     metrics = evaluate(without_cycles(make_run((A, 1))))
-    assert (metrics.sections, metrics.cycle.count) == ((), 0)
+    assert (metrics.sections, metrics.cycle["count"]) == ((), 0)

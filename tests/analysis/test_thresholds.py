@@ -11,7 +11,6 @@ import pytest
 from called import called
 from numpy.lib.stride_tricks import sliding_window_view
 
-from adacd_hil.cli.main import cli
 from adacd_hil.lab.detectors.detectors import DetectorBankSettings, register, unregister
 from adacd_hil.lab.thresholds import free_motion as module
 from adacd_hil.lab.thresholds.detector_comparison import (
@@ -23,11 +22,10 @@ from adacd_hil.lab.thresholds.detector_comparison import (
     write_comparison,
 )
 from adacd_hil.lab.thresholds.free_motion import read_motion, sample_of
-from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, compute_thresholds, find_lag, run_detectors
+from adacd_hil.lab.thresholds.recorded_thresholds import compute_thresholds, find_lag, run_detectors
 from adacd_hil.log.log_files import LogError
 from adacd_hil.plain_values import plain_values
 from adacd_hil.records import SchemeState
-from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.toml_files import read_toml
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
@@ -309,9 +307,9 @@ def test_the_command_prints_a_table_and_writes_toml(tmp_path):
         "torque noise",
     ):
         assert words in played.output
-    stored = parse(Thresholds, read_toml(out))
-    assert (stored.logs, stored.rate_per_h) == (("a.mcap", "b.mcap"), 5.0)
-    assert len(stored.channels) >= 10
+    stored = read_toml(out)
+    assert (stored["logs"], stored["rate_per_h"]) == (["a.mcap", "b.mcap"], 5.0)
+    assert len(stored["channels"]) >= 10
 
 
 @compiled_only
@@ -320,10 +318,3 @@ def test_the_command_refuses_what_is_too_short():
     assert (played.exit_code, played.stdout) == (1, "")
     (line,) = played.stderr.splitlines()
     assert "19 s of contact-free motion are too few for a tail, at least 50 s" in line
-
-
-@pytest.mark.parametrize("command", ["thresholds", "tune"])
-def test_a_rate_that_can_be_asked_for_can_be_written(command):
-    (rate,) = (param.type for param in cli.commands[command].params if param.name == "rate_per_h")
-    metadata = Thresholds.__dataclass_fields__["rate_per_h"].metadata
-    assert (rate.min, rate.max) == (metadata["low"], metadata["high"])

@@ -23,6 +23,7 @@ from adacd_hil.lab.commission.arm_draft import (
     ArmFacts,
     Fact,
     PlanarArm,
+    assumed_keys,
     draft_arm,
     draft_as_toml,
     draw_arm,
@@ -51,6 +52,7 @@ from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
 from adacd_hil.settings.parsing import bounds_of, parse
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import known_keys
+from adacd_hil.settings.toml_text import toml_value
 from adacd_hil.wire.can_interface import can_interfaces, read_link
 from adacd_hil.wire.open_bus import open_bus
 
@@ -168,8 +170,8 @@ class Drafting:
         title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]}"
         title += f" from {self.bus['interface']} {self.bus['channel']}." if self.bus else " without hardware."
         for period_us in _PERIODS_US if facts.period_us in _PERIODS_US else (facts.period_us,):
-            draft = draft_arm(facts._replace(period_us=period_us))
-            text = draft_as_toml(draft, title, self.writing.out.name)
+            entries, warnings = draft_arm(facts._replace(period_us=period_us))
+            text = draft_as_toml(entries, title, self.writing.out.name)
             if not self.writing.examine(text).is_late:
                 break
         summary: dict[str, Any] = {
@@ -178,8 +180,8 @@ class Drafting:
             "drive_node": list(facts.drive_node.value),
             "sensor": list(facts.sensor.value),
             "sensor_node": list(facts.sensor_node.value),
-            "assumed": [*draft.assumed, *self._profile_guesses(facts)],
-            "warnings": [*self.warnings, *draft.warnings],
+            "assumed": [*assumed_keys(entries), *self._profile_guesses(facts)],
+            "warnings": [*self.warnings, *warnings],
         }
         return text, summary
 
@@ -932,6 +934,5 @@ def _extension(name: str, shipped: ScaleSettings, scale: ScaleSettings, left: Se
     rows = [
         f"{key} = {value!r}" for key, value in vars(scale).items() if not math.isclose(value, getattr(shipped, key))
     ]
-    assumed = ", ".join(f'"{key}"' for key in left)
     head = [f"# {name} with gear and encoder of this arm, by `adacd-hil init`.", "", f'extends = "{name}"']
-    return "\n".join([*head, f"assumed = [{assumed}]", "", "[scale]", *rows]) + "\n"
+    return "\n".join([*head, f"assumed = {toml_value(tuple(left))}", "", "[scale]", *rows]) + "\n"

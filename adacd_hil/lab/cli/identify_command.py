@@ -89,7 +89,7 @@ def identify(
 
 def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
     """Write the map of a recording, and list its guesses."""
-    from adacd_hil.lab.offline.map_draft import draft_map
+    from adacd_hil.lab.offline.map_draft import draft_map, map_text
     from adacd_hil.lab.offline.recording_map import read_map
 
     urdfs = [path for path in given if path.suffix.lower() in (".urdf", ".xml")]
@@ -98,16 +98,16 @@ def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
         raise CommandError("--init takes one recording and one URDF, a file that ends in .urdf", ExitCode.USAGE)
     recording = others[0]
     target = map_path or recording.parent / "map.toml"
-    draft = draft_map(recording, urdfs[0], target)
+    keys = draft_map(recording, urdfs[0], target)
     try:
-        write_new_file(target, draft.text().encode())
+        write_new_file(target, map_text(recording, keys).encode())
     except FileExistsError:
         line = f"{target} is another map already; --map names a file for this one"
         raise CommandError(line, ExitCode.USAGE) from None
     read_map(target)
-    rows = [(f"{key.section}.{key.key}", toml_value(key.value), key.reason) for key in draft.keys]
-    table = format_table(("key", "value", "a guess, because"), [row for row in rows if row[2]])
-    text = f"{target} written" + (f"; look at these:\n{table}" if draft.guesses else ", without guesses")
+    guesses = [(f"{key.section}.{key.key}", toml_value(key.value), key.reason) for key in keys if key.reason]
+    table = format_table(("key", "value", "a guess, because"), guesses)
+    text = f"{target} written" + (f"; look at these:\n{table}" if guesses else ", without guesses")
     show(text, f"adacd-hil identify {quoted(recording)} --map {quoted(target)}")
     return ExitCode.OK
 

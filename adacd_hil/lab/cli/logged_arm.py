@@ -11,7 +11,7 @@ from adacd_hil.device.contract import find_contract
 from adacd_hil.file_access import exists
 from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
 from adacd_hil.lab.cli.interview import Interview
-from adacd_hil.lab.commission.arm_draft import ArmDraft, Entry, draft_as_toml
+from adacd_hil.lab.commission.arm_draft import Entry, draft_as_toml
 from adacd_hil.log.log_files import CONFIG_NAME
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.log.log_walk import attachment
@@ -59,10 +59,9 @@ def draft_from_log(
         names = getattr(options, kind)
         if names is not None and all(entry.key != f"devices.{kind}" for entry in entries):
             entries.append(Entry(f"devices.{kind}", tuple(devices.beside(name, kind) for name in names), "given"))
-    draft = ArmDraft(tuple(entries), tuple(warnings))
     title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]} from the log {path.name}."
     summary = {"from": str(path), "assumed": list(settings.assumed), "warnings": warnings}
-    written = draft_as_toml(draft, title, files.out.name, base)
+    written = draft_as_toml(entries, title, files.out.name, base)
     files.examine(written)
     return written, summary
 

@@ -16,7 +16,7 @@ Friction is not known from a description; it is 0.
 """
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -368,23 +368,18 @@ class Entry(NamedTuple):
     is_assumed: bool = False
 
 
-class ArmDraft(NamedTuple):
-    """The entries of a configuration. warnings: abilities that the arm may lack, a line each."""
+def draft_arm(facts: ArmFacts) -> tuple[list[Entry], list[str]]:
+    """Draft all settings of an arm's configuration from its facts; return them, and warnings.
 
-    entries: tuple[Entry, ...]
-    warnings: tuple[str, ...]
-
-    @property
-    def assumed(self) -> tuple[str, ...]:
-        """Keys whose values are guesses."""
-        return tuple(entry.key for entry in self.entries if entry.is_assumed)
-
-
-def draft_arm(facts: ArmFacts) -> ArmDraft:
-    """Draft all settings of an arm's configuration from its facts."""
+    Warnings: abilities that the arm may lack, a line each.
+    """
     warnings = list(facts.geometry.doubts)
-    entries = [*_arm(facts), *_devices(facts), *_motion(facts, warnings)]
-    return ArmDraft(tuple(entries), tuple(warnings))
+    return [*_arm(facts), *_devices(facts), *_motion(facts, warnings)], warnings
+
+
+def assumed_keys(entries: Iterable[Entry]) -> list[str]:
+    """Return the keys whose values are guesses."""
+    return [entry.key for entry in entries if entry.is_assumed]
 
 
 def _arm(facts: ArmFacts) -> Iterator[Entry]:
@@ -635,27 +630,27 @@ extends = "{base}"
 """
 
 
-def draft_as_toml(draft: ArmDraft, title: str, name: str, base: str = "certified") -> str:
+def draft_as_toml(entries: Sequence[Entry], title: str, name: str, base: str = "certified") -> str:
     """Return a draft as the text of a commented TOML file.
 
     title: its first comment. name: of the file, for the commands in its comments. base: configuration that it extends.
     """
     lines = [_HEAD.format(title=one_line(title), name=one_line(name), base=base).rstrip()]
-    if draft.assumed:
+    if assumed := assumed_keys(entries):
         lines += [
             "",
             "# Guesses. `adacd-hil doctor` asks for each: measure it or look it up, write it, take the key off here.",
             "assumed = [",
-            *(f'    "{key}",' for key in draft.assumed),
+            *(f'    "{key}",' for key in assumed),
             "]",
         ]
     order = [known.partition(".")[0] for known in known_keys()]
-    top = [entry for entry in draft.entries if "." not in entry.key]
+    top = [entry for entry in entries if "." not in entry.key]
     lines += [line for entry in top for line in _lines_of(entry)]
-    sections = sorted({entry.key.partition(".")[0] for entry in draft.entries if "." in entry.key}, key=order.index)
+    sections = sorted({entry.key.partition(".")[0] for entry in entries if "." in entry.key}, key=order.index)
     for section in sections:
         lines += ["", f"[{section}]"]
-        for entry in draft.entries:
+        for entry in entries:
             if entry.key.startswith(f"{section}."):
                 lines += _lines_of(entry)
     return "\n".join(lines) + "\n"

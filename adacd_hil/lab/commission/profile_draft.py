@@ -31,6 +31,7 @@ from adacd_hil.device.profile import (
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml
+from adacd_hil.settings.toml_text import toml_value
 from adacd_hil.wire.contract_frames import NOT_VALID
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
@@ -202,12 +203,7 @@ def shipped_profiles(kind: str) -> Iterator[tuple[str, DeviceProfile]]:
 
 _TORQUE_OBJECTS = ((0x9130, 1), (0x7130, 1))
 """CiA 404: process value of an input as int32, as int16."""
-_FEATURES = {
-    "heartbeat_consumer": (0x1016, 1),
-    "sync_counter": (0x1019, 0),
-    "option_codes": (0x605A, 0),
-    "torque_limits": (0x6072, 0),
-}
+_SENSOR_FEATURES = {"heartbeat_consumer": (0x1016, 1), "sync_counter": (0x1019, 0)}
 _PERMILLE = ("torque_actual", "torque_demand", "target_torque", "torque_offset", "max_torque")
 _STATUS_OBJECTS = ((0x6041, 0), (0x6061, 0), (0x6077, 0), (0x603F, 0))
 _EVENT_TYPE, _EVENT_MS = 255, 100
@@ -259,6 +255,7 @@ class _Record(NamedTuple):
 
 class _ProfileWriter(ABC):
     kind = ""
+    features = _SENSOR_FEATURES
 
     def __init__(self, eds: Path, objects: Any, ratings: DeviceRatings, answers: Mapping[str, float]) -> None:
         self.eds, self.objects, self.ratings, self.answers = eds, objects, ratings, answers
@@ -350,8 +347,7 @@ class _ProfileWriter(ABC):
 
     def text(self) -> str:
         """Return the profile as the text of a TOML file; store guesses and remarks. Raises ConfigError."""
-        self.check()
-        features = [name for name, place in _FEATURES.items() if self.can_write(*place) and self.allows(name)]
+        features = [name for name, place in self.features.items() if self.can_write(*place)]
         frames = self.frames()
         scale = self.scale()
         lines = [
@@ -363,23 +359,15 @@ class _ProfileWriter(ABC):
         if self.is_fixed:
             lines.append('mapping = "fixed"')
         lines += self.watchdog()
-        lines.append(f"features = [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in features)}]")
+        lines.append(f"features = {toml_value(tuple(features))}")
         lines += self.options("option_codes" in features)
         if self.guessed:
-            keys = ", ".join(f'"{key}"' for key in self.guessed)
             lines += [
                 "# Guesses: look each up or measure it, write it, and take the key off here.",
-                f"assumed = [{keys}]",
+                f"assumed = {toml_value(tuple(self.guessed))}",
             ]
         lines += ["", "[scale]", *scale, ""]
         return "\n".join([*lines, *self.further(), *frames])
-
-    def check(self) -> None:
-        """Raise ConfigError if the device lacks a function that a cycle needs."""
-
-    def allows(self, feature: str) -> bool:
-        """Return whether devices of this kind can have a feature."""
-        return self.kind == DRIVE or feature in ("heartbeat_consumer", "sync_counter")
 
     def watchdog(self) -> list[str]:
         """Return the profile's lines on the deadline of commands."""
@@ -461,8 +449,10 @@ class _ProfileWriter(ABC):
 
 class _DriveWriter(_ProfileWriter):
     kind = DRIVE
+    features = _SENSOR_FEATURES | {"option_codes": (0x605A, 0), "torque_limits": (0x6072, 0)}
 
-    def check(self) -> None:
+    def _check(self) -> None:
+        """Raise ConfigError if the drive lacks a function that a cycle needs."""
         target = self.find((0x6071, 0))
         if target is None:
             raise self.refuse("no 0x6071 (target torque): it can't be commanded by torque")
@@ -619,6 +609,7 @@ class _DriveWriter(_ProfileWriter):
         raise self.refuse("no RPDO takes 0x6040 (controlword) and 0x6071 (target torque) together")
 
     def frames(self) -> list[str]:
+        self._check()
         sample = ((0x6064, 0), (0x606C, 0))
         sent = self.records(is_received=False)
         feedback = next(

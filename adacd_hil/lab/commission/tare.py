@@ -175,23 +175,17 @@ def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
 
 def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
     """Solve the poses by least squares. Raises TareRefusedError if they don't determine gravity; checks no result."""
-    is_estimated = settings.estimator.gravity and settings.tare.gravity_model == "estimated"
-    gravity = np.zeros(len(_GRAVITY))
-    if settings.estimator.gravity and not is_estimated:
-        gravity = settings.cad_theta[list(_GRAVITY)]
     torque = np.array([pose.mean_Nm for pose in poses])
-    columns = (
-        np.array([gravity_columns(pose.q, settings.level_rad) for pose in poses])
-        if settings.estimator.gravity
-        else None
-    )
-    if columns is not None and not is_estimated:
-        torque = torque - columns @ gravity
-    offsets = np.tile(np.eye(JOINTS), (len(poses), 1))
-    if columns is not None and is_estimated:
-        matrix = np.hstack((columns.reshape(-1, len(_GRAVITY)), offsets))
-    else:
-        matrix = offsets
+    matrix = np.tile(np.eye(JOINTS), (len(poses), 1))
+    gravity, is_estimated = np.zeros(len(_GRAVITY)), False
+    if settings.estimator.gravity:
+        columns = np.array([gravity_columns(pose.q, settings.level_rad) for pose in poses])
+        is_estimated = settings.tare.gravity_model == "estimated"
+        if is_estimated:
+            matrix = np.hstack((columns.reshape(-1, len(_GRAVITY)), matrix))
+        else:
+            gravity = settings.cad_theta[list(_GRAVITY)]
+            torque = torque - columns @ gravity
     condition = _check_condition(matrix, poses, settings) if is_estimated else 1.0
     unknowns, *_ = np.linalg.lstsq(matrix, torque.ravel(), rcond=None)
     residual = torque - (matrix @ unknowns).reshape(-1, JOINTS)

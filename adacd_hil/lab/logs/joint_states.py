@@ -4,6 +4,7 @@ Ours have two joints and one layout (`message_types.JOINT_STATE_DTYPE`). `rosbag
 """
 
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -58,7 +59,7 @@ def joint_state_columns(payloads: Iterable[bytes]) -> Iterator[tuple[tuple[str, 
     """
     groups: dict[tuple[str, ...], list[JointStateMessage]] = {}
     for payload in payloads:
-        if is_joint_state(payload):
+        with suppress(LogError):
             message = decode_joint_state(payload)
             groups.setdefault(message.names, []).append(message)
     for names, messages in groups.items():

@@ -5,7 +5,7 @@ The map marks each guess with its reason; `identify` reports wrong ones.
 
 import os
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -38,31 +38,19 @@ class DraftedKey(NamedTuple):
     reason: str
 
 
-@dataclass(frozen=True)
-class MapDraft:
-    """The keys of a map."""
-
-    recording: Path
-    keys: tuple[DraftedKey, ...]
-
-    @property
-    def guesses(self) -> tuple[DraftedKey, ...]:
-        """The keys that the user should check."""
-        return tuple(key for key in self.keys if key.reason)
-
-    def text(self) -> str:
-        """Return the map as the text of a TOML file, each guess with its reason in a comment."""
-        lines = [f"# Drafted from {self.recording.name}: check the guesses."]
-        for section in dict.fromkeys(key.section for key in self.keys):
-            lines += ["", f"[{section}]"]
-            for key in (key for key in self.keys if key.section == section):
-                comment = f"  # a guess: {key.reason}" if key.reason else ""
-                lines.append(f"{key.key} = {toml_value(key.value)}{comment}")
-        return "\n".join(lines) + "\n"
+def map_text(recording: Path, keys: Sequence[DraftedKey]) -> str:
+    """Return a map as the text of a TOML file, each guess with its reason in a comment."""
+    lines = [f"# Drafted from {recording.name}: check the guesses."]
+    for section in dict.fromkeys(key.section for key in keys):
+        lines += ["", f"[{section}]"]
+        for key in (key for key in keys if key.section == section):
+            comment = f"  # a guess: {key.reason}" if key.reason else ""
+            lines.append(f"{key.key} = {toml_value(key.value)}{comment}")
+    return "\n".join(lines) + "\n"
 
 
-def draft_map(recording: Path, urdf: Path, map_path: Path) -> MapDraft:
-    """Draft the map of a recording; write no file. Raises ConfigError, LogError.
+def draft_map(recording: Path, urdf: Path, map_path: Path) -> list[DraftedKey]:
+    """Return the keys of the map of a recording; write no file. Raises ConfigError, LogError.
 
     map_path: file in which the caller will save the map; the URDF's path is relative to its folder.
     """
@@ -71,8 +59,7 @@ def draft_map(recording: Path, urdf: Path, map_path: Path) -> MapDraft:
     keys = [DraftedKey("arm", "urdf", where, "")]
     if locked:
         keys.append(DraftedKey("arm", "locked", locked, "by their names joints of a gripper"))
-    keys += _of_bag(recording, arm) if is_bag(recording) else _of_table(recording, arm)
-    return MapDraft(recording, tuple(keys))
+    return keys + (_of_bag(recording, arm) if is_bag(recording) else _of_table(recording, arm))
 
 
 def _read_arm(urdf: Path) -> tuple[SerialArm, tuple[str, ...]]:

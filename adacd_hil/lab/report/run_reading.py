@@ -21,7 +21,7 @@ The outline suffices for sections, detections and contacts.
 """
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -58,7 +58,7 @@ from adacd_hil.log.reader import LoggedEvent, LogStream, Series, check_states, c
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, FRAME_CHECKS, SCHEME
 from adacd_hil.printable import one_line
-from adacd_hil.records import JOINTS, ContactReport, Request, SchemeState
+from adacd_hil.records import JOINTS, ContactReport, CycleRecord, Request, SchemeState
 from adacd_hil.score.emulator_truth import Rows, TruthTable, extreme_rows, foreign_truth, read_truth
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
@@ -113,7 +113,7 @@ def read_run(
     truth = None if truth_path is None or problem else read_truth(truth_path)
     stream = LogStream(log_path, RUN_TOPICS)
     shell = _shell(stream, truth)
-    reading = RunReading(shell, stream.empty().series[SCHEME.name], truth, full_cycles)
+    reading = RunReading(shell, stream.empty().series, truth, full_cycles)
     if stretch.is_whole:
         _read(stream, reading, progress)
     else:
@@ -123,7 +123,7 @@ def read_run(
         _read(stream, reading, progress, until_ns=stretch.bounds_ns(start_ns)[1])
         shell, bounds_ns = _widened(reading.outline(), shell, stretch, start_ns)
         stream = LogStream(log_path, RUN_TOPICS)
-        reading = RunReading(shell, stream.empty().series[SCHEME.name], None, full_cycles)
+        reading = RunReading(shell, stream.empty().series, None, full_cycles)
         _read(stream, reading, progress, bounds_ns)
     run = reading.finished()
     if run.cycle.size == 0 and run.stretch is not None:
@@ -211,7 +211,7 @@ def _count(summary: Mapping[str, str], key: str) -> int | None:
 class RunReading:
     """One reading of a log, front to back."""
 
-    def __init__(self, shell: Run, empty: Series, truth: TruthTable | None, full_cycles: int) -> None:
+    def __init__(self, shell: Run, empty: Mapping[str, Series], truth: TruthTable | None, full_cycles: int) -> None:
         """`shell`: a run with empty arrays: settings, metadata, and a truth on the host's cycles if there is one.
 
         truth: rows whose cycle of the host is still to be found.
@@ -222,11 +222,11 @@ class RunReading:
         rows = shell.truth if truth is None else truth.rows
         index = np.empty(0) if rows is None else rows.contact_index
         self._is_onset = (index >= 0.0) & (np.concatenate(([-1.0], index))[:-1] != index)
-        self._rows = SchemeRows(empty)
-        self._times = ThinnedTimes(shell.timing, full_cycles)
+        self._rows = KeptRows(empty[SCHEME.name], _FIELDS, BUCKETS)
+        self._times = KeptRows(empty[CYCLE.name], CycleRecord._fields, TIME_BUCKETS)
+        self._thinned = self._waiting = 0  # rows of /cycle that have been thinned, and those that wait
         self.sums = RunGatherer(shell.settings, not is_realtime(shell))
         self._full_cycles = full_cycles
-        self._bucket = 1
         self._settled = 0  # rows that have been gathered
         self._last: tuple[int, bool] | None = None  # state of the row before, and whether the paper's scheme was armed
         self._busy_ns = 0  # time of the last cycle in a state of `BUSY`, or of a later row of the truth
@@ -247,7 +247,10 @@ class RunReading:
         scheme, columns = series[SCHEME.name], columns_of_series(series[CYCLE.name])
         cycle, state = scheme.records["cycle"].astype(np.int64), scheme.records["state"]
         self.sums.add_times(columns, cycle, state)
-        self._times.add_columns(columns)
+        self._times.add_records(series[CYCLE.name], [])
+        self._waiting += len(columns)
+        if self._waiting > _WAITING:
+            self._thin_times()
         if not len(scheme):
             return
         self._attempts.add_cycles(cycle, state)
@@ -337,15 +340,21 @@ class RunReading:
         self._settled = end
         if cycles <= self._full_cycles or first == end:
             return
-        bucket = _bucket_of(cycles, BUCKETS, self._bucket)
-        if bucket != self._bucket:
-            first, self._bucket = 0, bucket
-        self._rows.mark_kept(slice(first, end), _around(outline))
-        rows = slice(first, end)
-        index = self._rows.column("index")[rows]
-        is_kept = self._rows.column("is_kept")[rows] | (index % (_NOISE_BUCKETS * bucket) < _NOISE_CYCLES)
-        is_kept[_extremes_by_bucket(self._curves(shell, rows), index, bucket)] = True
-        self._settled -= self._rows.drop(first + np.flatnonzero(~is_kept))
+        around_ns = _around(outline)
+        self._settled -= self._rows.thin(first, end, lambda rows: self._curves(shell, rows), around_ns, _NOISE_CYCLES)
+
+    def _thin_times(self) -> None:
+        """Of a long run, drop the waiting cycles' rows of /cycle without an extreme value."""
+        self._waiting = 0
+        if self._times.cycles > self._full_cycles:
+            self._times.thin(self._thinned, self._times.count, self._time_curves)
+            self._thinned = self._times.count
+
+    def _time_curves(self, rows: slice) -> Iterator[NDArray[np.float64]]:
+        """Yield the curves of the cycles' times, queues and skipped periods."""
+        for name in (*(quantity.column for quantity in QUANTITIES), *QUEUES.values(), "overruns"):
+            if name in self._times.names:
+                yield self._times.column(name)[rows].astype(np.float64)
 
     def _curves(self, shell: Run, rows: slice) -> Iterator[NDArray[np.float64]]:
         """Yield the curves that the report draws over the whole run."""
@@ -356,23 +365,11 @@ class RunReading:
     def finished(self) -> Run:
         """Sum up the last cycles, so that `sums` has all; return the run with the kept cycles. Call at the end."""
         self._settle(self._rows.count)
-        timing = self._times.columns()
-        return replace(self.outline(), timing=timing, all_cycles=self._rows.cycles, bucket=self._bucket)
-
-
-def _bucket_of(cycles: int, most: int, bucket: int) -> int:
-    """Return the size of buckets, cycles: `bucket`, doubled until at most `most` buckets hold all cycles."""
-    while cycles > most * bucket:
-        bucket *= 2
-    return bucket
-
-
-def _extremes_by_bucket(curves: Iterator[NDArray[np.float64]], index: Cycles, bucket: int) -> Rows:
-    """Return, of every bucket of cycles, the rows in which a curve is smallest or largest.
-
-    index: of each row among all cycles. bucket: cycles per bucket.
-    """
-    return extreme_rows(curves, np.flatnonzero(np.diff(index // bucket, prepend=-1)))
+        if self._waiting:
+            self._thin_times()
+        columns = {name: self._times.column(name).astype(np.int64) for name in self._times.names}
+        timing = CycleColumns(self._times.column("t_ns").copy(), columns)
+        return replace(self.outline(), timing=timing, all_cycles=self._rows.cycles, bucket=self._rows.bucket)
 
 
 def _around(run: Run) -> list[Bounds]:
@@ -439,65 +436,26 @@ class TruthClock:
         return np.asarray(t_ns[0] + np.rint(since_ns).astype(np.int64))
 
 
-class ThinnedTimes:
-    """The columns of /cycle: all of them, or of a long run those with extremes."""
-
-    def __init__(self, empty: CycleColumns, full_cycles: int) -> None:
-        self._parts = [empty]
-        self._index = [np.empty(0, np.int64)]
-        self._full_cycles = full_cycles
-        self._bucket = 1
-        self._cycles = 0
-        self._waiting = 0
-
-    def add_columns(self, columns: CycleColumns) -> None:
-        """Add the next cycles; of a long run, drop those without an extreme value."""
-        if not len(columns):
-            return
-        self._parts.append(columns)
-        self._index.append(np.arange(self._cycles, self._cycles + len(columns)))
-        self._cycles += len(columns)
-        self._waiting += len(columns)
-        if self._waiting > _WAITING:
-            self._thin()
-
-    def _thin(self) -> None:
-        waiting, self._waiting = self._waiting, 0
-        if self._cycles <= self._full_cycles or not waiting:
-            return
-        bucket = _bucket_of(self._cycles, TIME_BUCKETS, self._bucket)
-        kept = 0 if bucket != self._bucket else 1  # parts that have been thinned
-        self._bucket = bucket
-        columns, index = CycleColumns.joined(self._parts[kept:]), np.concatenate(self._index[kept:])
-        names = (*(quantity.column for quantity in QUANTITIES), *QUEUES.values(), "overruns")
-        series = (columns[name].astype(np.float64) for name in names if name in columns)
-        rows = _extremes_by_bucket(series, index, bucket)
-        columns, index = columns.rows(rows), index[rows]
-        self._parts = [CycleColumns.joined([*self._parts[:kept], columns])]
-        self._index = [np.concatenate([*self._index[:kept], index])]
-
-    def columns(self) -> CycleColumns:
-        """Return the columns of the kept cycles."""
-        self._thin()
-        return CycleColumns.joined(self._parts)
-
-
 _PLAIN: Final = ("state", "fault", "contact_joints", "tau_ext_hat", "tau_ext_hat_cad", "theta_hat", "threshold")
 _MOTION: Final = ("q", "dq", "tau_J")
 _CERTIFIED: Final = ("tau_ext_bank", "threshold_bank", "theta_further", "theta_std", "promotions")
 _PAPER: Final = ("paper_is_armed", "paper_tau_ext_hat", "paper_threshold")
+_FIELDS: Final = ("cycle", *_PLAIN, *_MOTION, *_CERTIFIED, *_PAPER)
 _ROOM: Final = 1 << 16
 """Rows to allocate at first."""
 
 
-class SchemeRows:
-    """Rows of /scheme, gathered piece by piece: only the fields that a report reads.
+class KeptRows:
+    """Rows of a topic, gathered piece by piece: only the fields that a report reads, of a long run only some rows.
 
     One block of memory holds them: columns that are gathered apart and joined at the end need the memory twice, and
     fragment it. `index`: place among all cycles that were read; `is_kept`: never dropped.
     """
 
-    def __init__(self, empty: Series) -> None:
+    def __init__(self, empty: Series, fields: Sequence[str], most_buckets: int) -> None:
+        self.bucket = 1
+        """Cycles of a bucket, of which there are at most `most_buckets`."""
+        self._fields, self._most_buckets = fields, most_buckets
         self.count = 0
         self.cycles = 0
         """All that were read, of which `count` are here."""
@@ -505,14 +463,14 @@ class SchemeRows:
 
     def _begin(self, scheme: Series) -> None:
         """Allocate the block of rows, with the fields of `scheme` that a report reads."""
-        names = [name for name in ("cycle", *_PLAIN, *_MOTION, *_CERTIFIED, *_PAPER) if name in scheme.fields]
+        names = [name for name in self._fields if name in scheme.fields]
         own = [("t_ns", np.dtype(np.int64)), ("index", np.dtype(np.int64)), ("is_kept", np.dtype(np.bool_))]
         fields = [*own, *((name, scheme.records.dtype[name]) for name in names)]
-        self._names = names
+        self.names = names
         self._rows = np.empty(_ROOM, np.dtype(fields, align=True))
 
-    def add_records(self, scheme: Series, kept: Rows) -> None:
-        """Add the records of a piece of /scheme. kept: its rows that are never dropped."""
+    def add_records(self, scheme: Series, kept: Rows | list[int]) -> None:
+        """Add the records of a piece of the topic. kept: its rows that are never dropped."""
         if self.count == 0:
             self._begin(scheme)  # only a record shows the fields of a log
         end = self.count + len(scheme)
@@ -525,7 +483,7 @@ class SchemeRows:
         here["index"] = np.arange(self.cycles, self.cycles + len(scheme))
         here["is_kept"] = False
         here["is_kept"][kept] = True
-        for name in self._names:
+        for name in self.names:
             here[name] = scheme.records[name]
         self.count = end
         self.cycles += len(scheme)
@@ -534,22 +492,36 @@ class SchemeRows:
         """Return a column (n,)."""
         return self._rows[name][: self.count]
 
-    def mark_kept(self, rows: slice, around_ns: list[Bounds]) -> None:
-        """Mark those of `rows` that lie within some times (first and last ns each) as never to be dropped."""
-        t_ns, is_kept = self.column("t_ns")[rows], self.column("is_kept")[rows]
+    def thin(
+        self,
+        first: int,
+        end: int,
+        curves: Callable[[slice], Iterable[NDArray[np.float64]]],
+        around_ns: Sequence[Bounds] = (),
+        noise_cycles: int = 0,
+    ) -> int:
+        """Drop the rows from `first` to before `end` in which no curve is smallest or largest in its bucket.
+
+        If the buckets have to grow, rows before `first` are dropped likewise. curves: of some rows. Rows within
+        `around_ns`, first and last ns each, are never dropped; in every `_NOISE_BUCKETS`-th bucket the first
+        `noise_cycles` are left, too. Return the number of dropped rows.
+        """
+        while self.cycles > self._most_buckets * self.bucket:
+            first, self.bucket = 0, 2 * self.bucket
+        rows = slice(first, end)
+        t_ns, index, is_kept = (self.column(name)[rows] for name in ("t_ns", "index", "is_kept"))
         for start_ns, end_ns in around_ns:
             is_kept[np.searchsorted(t_ns, start_ns) : np.searchsorted(t_ns, end_ns, side="right")] = True
-
-    def drop(self, rows: Rows) -> int:
-        """Remove rows; return their number."""
-        left = np.delete(self._rows[: self.count], rows)
-        self.count = len(left)
+        is_left = is_kept | (index % (_NOISE_BUCKETS * self.bucket) < noise_cycles)
+        is_left[extreme_rows(curves(rows), np.flatnonzero(np.diff(index // self.bucket, prepend=-1)))] = True
+        left = np.delete(self._rows[: self.count], first + np.flatnonzero(~is_left))
+        dropped, self.count = self.count - len(left), len(left)
         self._rows[: self.count] = left
-        return len(rows)
+        return dropped
 
     def run(self, shell: Run, rows: slice = slice(None)) -> Run:
         """Return `shell` with the cycles of all or some of the gathered rows."""
-        columns = {name: self.column(name)[rows] for name in ("t_ns", *self._names)}
+        columns = {name: self.column(name)[rows] for name in ("t_ns", *self.names)}
         return replace(shell, **_arrays(columns, shell.settings))
 
 

@@ -8,16 +8,16 @@ the first command that reacts.
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.lab.score.histogram import LogHistogram, log_histogram
+from adacd_hil.lab.score.histogram import histogram_by_key, log_counts
 from adacd_hil.lab.score.margins import UntouchedGatherer, evaluate_certified, last_row
 from adacd_hil.lab.score.metrics import (
     Count,
-    CycleStatistics,
     Metrics,
     ReportedContact,
     TimingEvidence,
@@ -72,12 +72,10 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
         gathered = RunGatherer(run.settings, not is_realtime(run))
         gathered.add_times(run.timing, run.cycle, run.state)
         gathered.untouched.add_untouched(run, run)
-    untouched, timing, data = gathered.untouched.untouched(run), gathered.timing.evidence(), gathered.data.data(run)
+    timing, data = gathered.timing.evidence(), gathered.data.data(run)
     detections = find_detections(run)
     score = judge_run(run, contacts_of(run), detections)
     sections = split_sections(run)
-    contacts = list_contacts(run, sections, detections, score)
-    evidence = evaluate_certified(run, sections, untouched)
     adaptation_s = {
         section.label: section.duration_s if section.is_complete else None
         for section in sections
@@ -85,33 +83,34 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
     }
     has_truth = run.truth is not None
     false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
-    faults, payload_kg = find_faults(run), _payloads(run, sections)
-    return Metrics(
+    faults = find_faults(run)
+    metrics = Metrics(
         sections=sections,
         adaptation_s=adaptation_s,
-        frozen_residual_max_Nm=untouched.residuals,
-        contacts=contacts,
+        frozen_residual_max_Nm=gathered.untouched.residuals(sections),
+        contacts=list_contacts(run, sections, detections, score),
         false_alarms=len(false_s) if has_truth else None,
         false_alarms_s=false_s if has_truth else None,
         missed=score.missed if has_truth else None,
         parameters=_parameters(run, sections),
-        payload_kg=payload_kg,
+        payload_kg=_payloads(run, sections),
         fault=faults[0].reason if faults else None,
         fault_s=faults[0].at_s if faults else None,
-        cycle=_cycle_statistics(run, timing.cycles),
+        cycle={
+            "count": timing.cycles,  # those before motion start, too
+            "duration_s": float((run.t_ns[-1] - run.t_ns[0]) * 1e-9) if run.t_ns.size else 0.0,
+            "clock": run.metadata.get("clock"),
+            "scheduler": run.metadata.get("scheduler"),
+        },
         timing=timing,
         data=data,
         frames=run.frames,
         dropped=run.dropped,
-        evidence=evidence,
-        paper=compare_with_paper(
-            run, sections, adaptation_s, untouched.residuals, contacts, len(false_s), payload_kg, evidence
-        ),
-        findings=list_findings(
-            run, sections, score, contacts, adaptation_s, payload_kg, evidence, faults, find_causes(run), data
-        ),
+        evidence=evaluate_certified(run, sections, gathered.untouched),
         armed_false_alarms=score.armed_false_alarms if has_truth else None,
     )
+    findings = list_findings(run, metrics, score, faults, find_causes(run))
+    return replace(metrics, paper=compare_with_paper(run, metrics), findings=findings)
 
 
 def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, tuple[float | None, float]]]:
@@ -151,16 +150,6 @@ def _payloads(run: Run, sections: tuple[Section, ...]) -> dict[str, float | None
 def _payload_at(run: Run, cycle: int) -> float | None:
     row = None if run.truth is None else run.truth.model_row(cycle)
     return None if run.truth is None or row is None else float(run.truth.payload_kg[row])
-
-
-def _cycle_statistics(run: Run, count: int) -> CycleStatistics:
-    """Return the statistics of all cycles, those before motion start included; count: of these cycles."""
-    return CycleStatistics(
-        count=count,
-        duration_s=float((run.t_ns[-1] - run.t_ns[0]) * 1e-9) if run.t_ns.size else 0.0,
-        clock=run.metadata.get("clock"),
-        scheduler=run.metadata.get("scheduler"),
-    )
 
 
 def list_contacts(
@@ -330,7 +319,7 @@ class TimingGatherer:
         self._is_modelled = is_modelled
         self._cycles = 0
         self._times: dict[str, Distribution] = {}
-        self._histograms: dict[str, LogHistogram] = {}
+        self._histograms: dict[str, Cycles] = {}
         self._depths: dict[str, Distribution] = {}
         self._ages: Cycles | None = None
         self._totals: dict[str, int] = {}
@@ -365,9 +354,7 @@ class TimingGatherer:
         if values_us is None or (self._is_modelled and quantity is LATENESS):  # lockstep has no grid to be late on
             return
         self._times.setdefault(quantity.name, Distribution()).add_values(values_us)
-        found = log_histogram(values_us)
-        before = self._histograms.get(quantity.name)
-        self._histograms[quantity.name] = found if before is None else before.joined(found)
+        self._histograms[quantity.name] = self._histograms.get(quantity.name, 0) + log_counts(values_us)
 
     def evidence(self) -> TimingEvidence:
         """Return the statistics of all columns added so far."""
@@ -377,7 +364,7 @@ class TimingGatherer:
             is_modelled=self._is_modelled,
             cycles=self._cycles,
             times={quantity.name: self._percentiles(quantity) for quantity in QUANTITIES},
-            histograms={quantity.name: self._histograms.get(quantity.name) for quantity in QUANTITIES},
+            histograms={name: histogram_by_key(counts) for name, counts in self._histograms.items()},
             reaction=None if reactions is None else {"count": reactions.count, **reactions.percentiles()},
             data_age=None if self._ages is None else tuple(self._ages.tolist()),
             queues_bytes={name: self._depths[name].percentiles() if name in self._depths else None for name in QUEUES},

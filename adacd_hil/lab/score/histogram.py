@@ -1,50 +1,32 @@
 """Histograms of times: their bins, and bars as text."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.score.distribution import Values
 
-BINS_PER_DECADE = 20
-
-
-DECADES = 6
-"""Of a histogram with logarithmic bins, from 1 on: of times in µs up to 1 s."""
-
-
+EDGES: Final = np.logspace(0.0, 6.0, 121)
+"""Of a histogram with logarithmic bins, twenty per decade: of times in µs from 1 to 1 s."""
 _BAR = 40
 
 
-class LogHistogram(NamedTuple):
-    """Counts (n,) of values in bins of equal width on a logarithmic axis, between `edges` (n + 1,).
+def log_counts(values: Values) -> NDArray[np.int64]:
+    """Return how many values lie below EDGES, in each bin between them, and above (n + 1,).
 
-    below: values less than the first edge, negative ones too. above: values from the last edge on.
+    A value on an edge belongs to the upper bin.
     """
-
-    edges: NDArray[np.float64]
-    counts: NDArray[np.int64]
-    below: int
-    above: int
-
-    def joined(self, other: "LogHistogram") -> "LogHistogram":
-        """Return the sum of this histogram and another one with the same bins."""
-        return LogHistogram(self.edges, self.counts + other.counts, self.below + other.below, self.above + other.above)
-
-    def trimmed(self) -> "LogHistogram":
-        """Return the histogram without the empty bins at both ends."""
-        filled = np.flatnonzero(self.counts)
-        first, end = (int(filled[0]), int(filled[-1]) + 1) if filled.size else (0, 0)
-        return self._replace(edges=self.edges[first : end + 1], counts=self.counts[first:end])
+    return np.bincount(np.searchsorted(EDGES, values, side="right"), minlength=EDGES.size + 1)
 
 
-def log_histogram(values: Values) -> LogHistogram:
-    """Return a histogram of values in logarithmic bins from 1 on; a value on an edge belongs to the upper bin."""
-    edges = np.logspace(0.0, DECADES, BINS_PER_DECADE * DECADES + 1)
-    places = np.bincount(np.searchsorted(edges, values, side="right"), minlength=edges.size + 1)
-    return LogHistogram(edges, places[1:-1], int(places[0]), int(places[-1]))
+def histogram_by_key(counts: NDArray[np.int64]) -> dict[str, Any]:
+    """Return a histogram, as of `log_counts`, by the keys of report.json, without the empty bins at both ends."""
+    below, *inside, above = counts.tolist()
+    filled = np.flatnonzero(inside)
+    first, end = (int(filled[0]), int(filled[-1]) + 1) if filled.size else (0, 0)
+    return {"edges": EDGES[first : end + 1], "counts": inside[first:end], "below": below, "above": above}
 
 
 def doubling_bins(values: Values, first: float, count: int) -> list[tuple[float, int]]:

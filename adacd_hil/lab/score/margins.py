@@ -26,7 +26,6 @@ from adacd_hil.lab.score.metrics import (
     ChannelMargin,
     ParameterEstimate,
     Residual,
-    Untouched,
     certificates_in,
 )
 from adacd_hil.lab.score.run_arrays import CertifiedStream, Run, Section, rows_of, split_sections
@@ -151,30 +150,6 @@ def _parked(time_s: Vector, sections: Sequence[Section], end_s: float) -> Mask:
     return parked
 
 
-def evaluate_certified(run: Run, sections: Sequence[Section], untouched: Untouched) -> CertifiedEvidence | None:
-    """Return tests, estimates, margins and certificates of a run; None for the paper's scheme.
-
-    untouched: the sums over all its cycles free of contact.
-    """
-    stream = run.certified
-    if stream is None:
-        return None
-    adaptations = [section for section in sections if section.kind == "adaptation"]
-    stays = {section.label: _tests(run, section) for section in adaptations}
-    return CertifiedEvidence(
-        tests={label: len(lengths_s) for label, lengths_s in stays.items()},
-        test_s={label: lengths_s[-1] if lengths_s else None for label, lengths_s in stays.items()},
-        estimates={section.label: _estimates(run, stream, section) for section in adaptations},
-        margins=untouched.margins,
-        promotions=untouched.promotions,
-        paper_beside=untouched.beside,
-        is_anchored=all(event.level == "info" for _, event in run.events if event.name == "certificate"),
-        revoked=tuple(event.message for _, event in run.events if event.name == "revoked"),
-        smallest_push=untouched.smallest_push,
-        certificates=tuple(certificates_in((event.name, event.message) for _, event in run.events)),
-    )
-
-
 def last_row(run: Run, section: Section) -> int:
     """Return the row with an adaptation's result: the next section's first cycle, which still learns.
 
@@ -255,8 +230,9 @@ class UntouchedGatherer:
         self._residuals: dict[str, Residual] = {}
         self._margins: dict[str, MarginGatherer] = {}
         self._done: dict[str, tuple[ChannelMargin, ...]] = {}
-        self._push = PushGatherer(settings)
-        self._promotions = 0
+        self.push = PushGatherer(settings)
+        self.promotions = 0
+        """Refined models that took over."""
         self._promoted = 0.0  # the count so far
         self._beside: BesideGatherer | None = None
 
@@ -330,7 +306,7 @@ class UntouchedGatherer:
             margin.add_residuals(piece.certified.tau_ext[rows][chosen], threshold[chosen])
         armed = chosen & is_armed_in(piece.state[rows])
         if armed.any():
-            self._push.add_residuals(piece.certified.tau_ext[rows][armed], threshold[armed])
+            self.push.add_residuals(piece.certified.tau_ext[rows][armed], threshold[armed])
 
     def _close(self, label: str) -> None:
         """Replace a section's margins by their sums, when the section is complete: its values need not be kept."""
@@ -339,18 +315,46 @@ class UntouchedGatherer:
 
     def _count_promotions(self, promotions: Vector) -> None:
         steps = np.diff(promotions, prepend=self._promoted)
-        self._promotions += int(np.maximum(steps, 0.0).sum())
+        self.promotions += int(np.maximum(steps, 0.0).sum())
         self._promoted = float(promotions[-1])
 
-    def untouched(self, run: Run) -> Untouched:
-        """Return the sums over all cycles free of contact; run: the outline of all cycles."""
+    def residuals(self, sections: Sequence[Section]) -> dict[str, Residual]:
+        """Return the largest residuals of all cycles free of contact, by section."""
+        return {each.label: self._residuals[each.label] for each in sections if each.label in self._residuals}
+
+    def margins(self, sections: Sequence[Section]) -> dict[str, tuple[ChannelMargin, ...]]:
+        """Return the margins of all cycles free of contact, by section."""
         for label in list(self._margins):
             self._close(label)
-        sections = split_sections(run)
-        residuals = {each.label: self._residuals[each.label] for each in sections if each.label in self._residuals}
-        margins = {each.label: self._done[each.label] for each in sections if each.label in self._done}
-        beside = None if self._beside is None else self._beside.beside(run, sections)
-        return Untouched(residuals, margins, self._promotions, beside, self._push.smallest_push())
+        return {each.label: self._done[each.label] for each in sections if each.label in self._done}
+
+    def beside(self, run: Run, sections: Sequence[Section]) -> Beside | None:
+        """Return the results of the paper's scheme beside; run: the outline of all cycles. None if it didn't run."""
+        return None if self._beside is None else self._beside.beside(run, sections)
+
+
+def evaluate_certified(run: Run, sections: Sequence[Section], untouched: UntouchedGatherer) -> CertifiedEvidence | None:
+    """Return tests, estimates, margins and certificates of a run; None for the paper's scheme.
+
+    untouched: the sums over all its cycles free of contact.
+    """
+    stream = run.certified
+    if stream is None:
+        return None
+    adaptations = [section for section in sections if section.kind == "adaptation"]
+    stays = {section.label: _tests(run, section) for section in adaptations}
+    return CertifiedEvidence(
+        tests={label: len(lengths_s) for label, lengths_s in stays.items()},
+        test_s={label: lengths_s[-1] if lengths_s else None for label, lengths_s in stays.items()},
+        estimates={section.label: _estimates(run, stream, section) for section in adaptations},
+        margins=untouched.margins(sections),
+        promotions=untouched.promotions,
+        paper_beside=untouched.beside(run, sections),
+        is_anchored=all(event.level == "info" for _, event in run.events if event.name == "certificate"),
+        revoked=tuple(event.message for _, event in run.events if event.name == "revoked"),
+        smallest_push=untouched.push.smallest_push(),
+        certificates=tuple(certificates_in((event.name, event.message) for _, event in run.events)),
+    )
 
 
 def _pair(values: Vector | None) -> tuple[float, float] | None:

@@ -28,7 +28,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from adacd_hil.lab.score.histogram import LogHistogram
 from adacd_hil.lab.score.rates import rate_bound_per_h
 from adacd_hil.lab.score.run_arrays import Section
 from adacd_hil.log.types.topics import CERTIFIED_MODEL
@@ -59,7 +58,7 @@ class TimingEvidence:
     is_modelled: bool
     cycles: int
     times: Mapping[str, Mapping[str, float] | None]
-    histograms: Mapping[str, LogHistogram | None]
+    histograms: Mapping[str, Mapping[str, Any]]
     reaction: Mapping[str, float] | None
     data_age: tuple[int, ...] | None
     queues_bytes: Mapping[str, Mapping[str, float] | None]
@@ -76,7 +75,7 @@ class TimingEvidence:
             "data_age_cycles": self.data_age,
             "queues_bytes": self.queues_bytes,
             "counts": self.counts,
-            "histograms_us": {name: found and found.trimmed() for name, found in self.histograms.items()},
+            "histograms_us": {name: self.histograms.get(name) for name in self.times},
         }
 
 
@@ -214,20 +213,6 @@ class Residual:
     cycles: int
 
 
-@dataclass(frozen=True)
-class Untouched:
-    """Sums over free cycles, by section. promotions: refined models that took over; beside: None if it didn't run.
-
-    smallest_push: None for the paper's scheme, and for a run that never armed detection.
-    """
-
-    residuals: dict[str, Residual]
-    margins: dict[str, tuple[ChannelMargin, ...]]
-    promotions: int
-    beside: Beside | None
-    smallest_push: SmallestPush | None
-
-
 class PaperRow(NamedTuple):
     """One line of *paper against measured*.
 
@@ -323,20 +308,11 @@ class ReportedContact:
 
 
 @dataclass(frozen=True)
-class CycleStatistics:
-    """Number of cycles, duration, clock and scheduler."""
-
-    count: int
-    duration_s: float
-    clock: str | None
-    scheduler: str | None
-
-
-@dataclass(frozen=True)
 class Metrics:
     """The content of the report, see the module's first lines for the definitions.
 
-    fault, fault_s: the first one of the run. findings: a clause each, the gravest first.
+    fault, fault_s: the first one of the run. cycle: number, duration, clock and scheduler of all cycles. findings: a
+    clause each, the gravest first.
     """
 
     sections: tuple[Section, ...]
@@ -350,15 +326,15 @@ class Metrics:
     payload_kg: dict[str, float | None]
     fault: str | None
     fault_s: float | None
-    cycle: CycleStatistics
+    cycle: dict[str, Any]
     timing: TimingEvidence
     data: CyclicData
     frames: int | None
     dropped: int | None
     evidence: CertifiedEvidence | None
-    paper: tuple[PaperRow, ...]
-    findings: tuple[Finding, ...]
     armed_false_alarms: int | None  # of them those in MONITOR
+    paper: tuple[PaperRow, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def verdict(self) -> str:

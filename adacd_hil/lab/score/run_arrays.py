@@ -85,13 +85,6 @@ class CycleColumns:
         """Return some of the cycles; rows: their indices."""
         return CycleColumns(self.t_ns[rows], {name: column[rows] for name, column in self.columns.items()})
 
-    @staticmethod
-    def joined(parts: "Sequence[CycleColumns]") -> "CycleColumns":
-        """Return parts with the same columns, one after the other, as one."""
-        names = parts[0].columns
-        columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in names}
-        return CycleColumns(np.concatenate([part.t_ns for part in parts]), columns)
-
     def times_us(self, quantity: Quantity) -> Vector | None:
         """Return a time of the cycles that have it, µs; None if the log lacks it."""
         if quantity.column not in self:

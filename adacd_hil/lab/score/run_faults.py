@@ -7,7 +7,6 @@ new frame or a repeated one; they are logged once a second, so the counts of the
 ended, are missing.
 """
 
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from adacd_hil.lab.score.metrics import CyclicData, DeviceShares, Fault
 from adacd_hil.lab.score.report_wording import percent_text
 from adacd_hil.lab.score.run_arrays import CheckCounts, CycleColumns, Run
-from adacd_hil.log.logged_run import Cycles, Mask
+from adacd_hil.log.logged_run import Cycles
 from adacd_hil.printable import one_line
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.scheme.supervisor.supervisor import POWERED
@@ -82,7 +81,7 @@ class CyclicDataGatherer:
         self._cycles = 0  # with powered drives
         self._logged = 0  # with a record in /cycle
         self._worst = 0.0
-        self._present = (0, 0, -1)  # of the window under way: cycles, incomplete ones, the last cycle's number
+        self._present = np.empty((2, 0), np.int64)  # of the window under way: each cycle's number, and if incomplete
 
     def add_columns(self, columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
         """Count incomplete and aged data in the next cycles. cycle, state: those of /scheme (k,)."""
@@ -99,35 +98,29 @@ class CyclicDataGatherer:
         for name in self._counted:
             self._counted[name] += int(np.count_nonzero(powered[name]))
         if "frames_missing" in powered:
-            self._add_windows(powered["cycle"], powered["frames_missing"] > 0)
+            self._add_windows(np.array([powered["cycle"], powered["frames_missing"] > 0]))
 
-    def _add_windows(self, cycle: Cycles, is_incomplete: Mask) -> None:
-        """Count incomplete cycles in windows of one second, and keep the worst window; a gap in `cycle` ends one."""
-        edges = np.flatnonzero(np.diff(cycle, prepend=self._present[2]) != 1)
-        counted = np.concatenate(([0], np.cumsum(is_incomplete)))
-        bounds = np.unique(np.concatenate(([0], edges, [len(cycle)]))).tolist()
-        for start, end in pairwise(bounds):
-            if start in edges:
-                self._end_window()
-            first = start
-            while first < end:
-                cycles, incomplete, _ = self._present
-                last = min(end, first + self._window - cycles)
-                self._present = cycles + last - first, incomplete + int(counted[last] - counted[first]), 0
-                first = last
-                if self._present[0] == self._window:
-                    self._end_window()
-        self._present = (*self._present[:2], int(cycle[-1]))
+    def _add_windows(self, cycles: Cycles) -> None:
+        """Keep the worst window of one second; a gap in the numbers of the cycles ends one. cycles: as `_present`."""
+        cycles = np.concatenate((self._present, cycles), axis=1)
+        begins = np.flatnonzero(np.diff(cycles[0], prepend=-2) != 1)
+        place = np.arange(cycles.shape[1])
+        place -= np.repeat(begins, np.diff(begins, append=cycles.shape[1]))
+        firsts = np.flatnonzero(place % self._window == 0)
+        self._judge_windows(cycles[1, : firsts[-1]], firsts[:-1])
+        self._present = cycles[:, firsts[-1] :]
 
-    def _end_window(self) -> None:
-        cycles, incomplete, last = self._present
-        if cycles >= SHORTEST_DATA_WINDOW * self._window:
-            self._worst = max(self._worst, incomplete / cycles)
-        self._present = 0, 0, last
+    def _judge_windows(self, is_incomplete: Cycles, firsts: Cycles) -> None:
+        """Keep the share of the worst window that is long enough; firsts: where in the cycles each begins."""
+        sizes = np.diff(firsts, append=is_incomplete.size)
+        is_long = sizes >= SHORTEST_DATA_WINDOW * self._window
+        if is_long.any():
+            shares = np.add.reduceat(is_incomplete, firsts) / sizes
+            self._worst = max(self._worst, float(shares[is_long].max()))
 
     def data(self, run: Run) -> CyclicData:
         """Return the shares of incomplete and aged data so far. run: has the cycles in which the state changes."""
-        self._end_window()
+        self._judge_windows(self._present[1], np.zeros(1, np.int64))
         limits = run.settings.data
         shares = {name: count / self._logged for name, count in self._counted.items()} if self._logged else {}
         incomplete = shares.get("frames_missing")

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from adacd_hil.lab.score.run_arrays import Run
 from adacd_hil.log.logged_run import Cycles, begins_alarm, is_armed_in
@@ -82,17 +83,12 @@ def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) ->
 def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float) -> float | None:
     """Return the delay after which a torque step crosses a threshold behind two first-order low-passes; None: never.
 
-    The response rises steadily, so that bisection finds the crossing.
+    The response rises steadily, so that there is one crossing.
     """
     if not abs(tau_ext_Nm) > threshold_Nm:
         return None
     wanted = threshold_Nm / abs(tau_ext_Nm)
-    low_s, high_s = 0.0, 40.0 / min(a_rad_s, b_rad_s)
-    for _ in range(60):
-        middle_s = 0.5 * (low_s + high_s)
-        is_below = step_response(middle_s, a_rad_s, b_rad_s) < wanted
-        low_s, high_s = (middle_s, high_s) if is_below else (low_s, middle_s)
-    return high_s
+    return float(brentq(lambda t_s: step_response(t_s, a_rad_s, b_rad_s) - wanted, 0.0, 40.0 / min(a_rad_s, b_rad_s)))
 
 
 @dataclass(frozen=True)

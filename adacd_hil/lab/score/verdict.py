@@ -13,15 +13,12 @@ from typing import Final, TypeGuard
 import numpy as np
 
 from adacd_hil.lab.score.metrics import (
-    Beside,
     CertifiedEvidence,
     CyclicData,
     Fault,
     Finding,
     Metrics,
     PaperRow,
-    ReportedContact,
-    Residual,
 )
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
 from adacd_hil.lab.score.run_arrays import Run, Section
@@ -39,28 +36,20 @@ _NO_LOSS: Final = "no cyclic data was late or lost"
 
 
 def list_findings(
-    run: Run,
-    sections: tuple[Section, ...],
-    score: Score,
-    contacts: tuple[ReportedContact, ...],
-    adaptation_s: dict[str, float | None],
-    payload_kg: dict[str, float | None],
-    evidence: CertifiedEvidence | None,
-    faults: tuple[Fault, ...],
-    causes: tuple[str, ...],
-    data: CyclicData,
+    run: Run, metrics: Metrics, score: Score, faults: tuple[Fault, ...], causes: tuple[str, ...]
 ) -> tuple[Finding, ...]:
     """Return the findings of a run, failures first. causes: of attempts that ended without a fault."""
     if run.cycle.size == 0:
         cause = "; ".join(causes) or "the log does not say why"
         return (Finding(f"no cycle was run: {cause}", True),)
+    evidence, adaptation_s, data = metrics.evidence, metrics.adaptation_s, metrics.data
     done = "identified" if evidence is None else "certified"
-    identified = identified_text(adaptation_s, payload_kg, begun_anew(sections), done)
+    identified = identified_text(adaptation_s, metrics.payload_kg, begun_anew(metrics.sections), done)
     found = score_sentence(score)
     has_wrong = score.missed > 0 or (run.truth is not None and bool(score.false_alarms))
     if run.truth is None:
         found = f"{number_of(len(score.false_alarms), 'detection')}, whose truth is not recorded"
-    elif not has_wrong and not score.contacts and all(section.kind != "detection" for section in sections):
+    elif not has_wrong and not score.contacts and all(section.kind != "detection" for section in metrics.sections):
         found = "the arm was not watched for contacts"
     else:
         found = _judged_text(run, found)
@@ -75,7 +64,7 @@ def list_findings(
     if is_margin_below_1(evidence):
         grave.append(f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}")
     findings = [*(Finding(text, True) for text in grave), Finding(found, has_wrong)]
-    misread = [contact for contact in contacts if contact.link_ok is False or contact.direction_ok is False]
+    misread = [contact for contact in metrics.contacts if contact.link_ok is False or contact.direction_ok is False]
     if misread:
         findings.append(Finding(f"link or direction of {number_of(len(misread), 'contact')} is wrong", True))
     if adaptation_s or run.stretch is None:  # a part of a run need not have any
@@ -218,90 +207,108 @@ def _papers_arm(profile: str) -> ArmSettings:
     return load_settings(_EXPERIMENT, profile).arm
 
 
-def compare_with_paper(
-    run: Run,
-    sections: tuple[Section, ...],
-    adaptation_s: dict[str, float | None],
-    residuals: dict[str, Residual],
-    contacts: tuple[ReportedContact, ...],
-    false_alarms: int,
-    payload_kg: dict[str, float | None],
-    evidence: CertifiedEvidence | None,
-) -> tuple[PaperRow, ...]:
+_WITHIN: Final = "within ±0.15"
+_PAPERS: Final = {
+    "First adaptation": "5.2 s",
+    "Adaptation after the payload change": "about 5.3 s",
+    "Payload": "1 kg",
+    "Frozen residual without payload, joints 1 / 2": _WITHIN,
+    "Frozen residual with payload, joints 1 / 2": _WITHIN,
+    "The CAD model's, without payload": "larger; joint 2 good",
+    "The CAD model's, with payload": "much larger, both joints",
+    "First contact detected at": "10 s",
+}
+"""The paper's figures by quantity."""
+_COUNTED: Final = ("Contacts detected", "Median delay", "False alarms")
+
+
+def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
     """Return a row per figure: measured, the paper's, and of the paper's scheme on the same stream.
 
     For a run that is not the paper's experiment, the paper's figures are left out.
     """
-    settings = run.settings
-    times_s = list(adaptation_s.values())
-    detections = [section.label for section in sections if section.kind == "detection"]
-    frozen = [residuals[label] for label in detections]
-    identified, cad = [residual.identified for residual in frozen], [residual.cad for residual in frozen]
-    adaptations = list(adaptation_s)
-    payload = payload_kg.get(adaptations[1]) if len(adaptations) > 1 else None
-    law = {"least_squares": "least squares", "gradient": "gradient"}[settings.estimator.law]
+    settings, evidence = run.settings, metrics.evidence
+    detections = [section.label for section in metrics.sections if section.kind == "detection"]
+    frozen = [metrics.frozen_residual_max_Nm[label] for label in detections]
+    cad, payloads = [residual.cad for residual in frozen], list(metrics.payload_kg.values())[1:2]
+    same = {
+        "Payload": NONE if payloads in ([], [None]) else f"{payloads[0]:g} kg",
+        "The CAD model's, without payload": _residual_text(cad, 0),
+        "The CAD model's, with payload": _residual_text(cad, 1),
+    }
+    ours = same | _figures(
+        metrics.adaptation_s,
+        [residual.identified for residual in frozen],
+        [(contact.is_armed, contact.detected_s, contact.delay_ms) for contact in metrics.contacts],
+        metrics.missed,
+        metrics.false_alarms,
+    )
+    if run.truth is None:
+        ours["Contacts detected"] = str(len(metrics.contacts))
     a, b = settings.filter.a_rad_s, settings.filter.b_rad_s
-    within = "within ±0.15"
-    seen = [contact.detected_s for contact in contacts if contact.detected_s is not None]
-    first = f"{seen[0]:.2f} s" if seen else NONE
-    kilograms = NONE if payload is None else f"{payload:g} kg"
     settled = (
         ("Bound β of eq. (15)", "0.1 Nm", f"{settings.termination.beta_Nm:g} Nm"),
         ("Hold T of eq. (15)", "5 s", f"{settings.termination.hold_s:g} s"),
         ("Threshold, joints 1 / 2", "0.15 Nm", _pair(settings.detector.threshold_Nm)),
         ("Filter a / b", "10 / 10 rad/s", f"{a:g} / {b:g} rad/s"),
-        ("Estimator", "least squares", law),
+        ("Estimator", "least squares", settings.estimator.law.replace("_", " ")),
     )
     rate = f"{1e3 / settings.bus.period_us:g} kHz"
-    names = (
-        ("First adaptation", "5.2 s"),
-        ("Adaptation after the payload change", "about 5.3 s"),
-        ("Payload", "1 kg"),
-        ("Frozen residual without payload, joints 1 / 2", within),
-        ("Frozen residual with payload, joints 1 / 2", within),
-        ("The CAD model's, without payload", "larger; joint 2 good"),
-        ("The CAD model's, with payload", "much larger, both joints"),
-        ("First contact detected at", "10 s"),
-    )
-    measured = (
-        _seconds(times_s, 0),
-        _seconds(times_s, 1),
-        kilograms,
-        _residual_text(identified, 0),
-        _residual_text(identified, 1),
-        _residual_text(cad, 0),
-        _residual_text(cad, 1),
-        first,
-    )
     if evidence is None:
-        plain = [(*name, value) for name, value in zip(names, measured, strict=True)]
-        plain += [*settled, ("Control rate", "1 kHz", rate)]
-        return _of_what_was_played(run, [PaperRow(quantity, paper, None, value) for quantity, paper, value in plain])
-    beside = _beside_values(evidence.paper_beside, detections, (kilograms, *measured[5:7]))
-    rows = [(*name, theirs, value) for name, theirs, value in zip(names, beside[:8], measured, strict=True)]
-    armed = [contact for contact in contacts if contact.is_armed]
-    found = [contact for contact in armed if contact.delay_ms is not None]
-    has_truth = run.truth is not None
-    rows += [
-        ("Contacts detected", NONE, beside[8], found_text(len(found), len(armed)) if has_truth else str(len(contacts))),
-        ("Median delay", NONE, beside[9], _median_text([c.delay_ms for c in found if c.delay_ms is not None])),
-        ("False alarms", NONE, beside[10], str(false_alarms) if has_truth else NONE),
-    ]
-    ours = (
+        rows = [PaperRow(quantity, paper, None, ours[quantity]) for quantity, paper in _PAPERS.items()]
+        rows += [PaperRow(quantity, paper, None, value) for quantity, paper, value in settled]
+        return _of_what_was_played(run, [*rows, PaperRow("Control rate", "1 kHz", None, rate)])
+    theirs, beside = dict.fromkeys(ours, NONE), evidence.paper_beside
+    if beside is not None:
+        theirs = same | _figures(
+            beside.adaptation_s,
+            [beside.frozen_residual_max_Nm[label] for label in detections],
+            [(contact["is_armed"], contact["detected_s"], contact["delay_ms"]) for contact in beside.contacts],
+            beside.missed,
+            beside.false_alarms,
+        )
+    papers = _PAPERS | dict.fromkeys(_COUNTED, NONE)
+    rows = [PaperRow(quantity, paper, theirs[quantity], ours[quantity]) for quantity, paper in papers.items()]
+    certified = (
         f"{settings.certified.beta_Nm:g} Nm, of the frozen model",
         _tests_text(list(evidence.test_s.values())),
         _threshold_text(evidence, detections),
         f"{', '.join(f'{cutoff:g}' for cutoff in settings.certified.cutoffs_rad_s)} rad/s",
         "least squares from a prior",
     )
-    rows += [(quantity, paper, theirs, value) for (quantity, paper, theirs), value in zip(settled, ours, strict=True)]
+    rows += [PaperRow(*row, value) for row, value in zip(settled, certified, strict=True)]
     margin = evidence.smallest_margin
-    rows.append(("Smallest threshold / residual", NONE, NONE, NONE if margin is None else f"{margin:.2f}"))
-    rows.append(
-        (f"Smallest push found within {PUSH_WITHIN}, estimated, joints 1 / 2", NONE, NONE, _push_text(evidence))
-    )
-    rows.append(("Control rate", "1 kHz", rate, rate))
-    return _of_what_was_played(run, [PaperRow(*row) for row in rows])
+    push = f"Smallest push found within {PUSH_WITHIN}, estimated, joints 1 / 2"
+    rows += [
+        PaperRow("Smallest threshold / residual", NONE, NONE, NONE if margin is None else f"{margin:.2f}"),
+        PaperRow(push, NONE, NONE, _push_text(evidence)),
+        PaperRow("Control rate", "1 kHz", rate, rate),
+    ]
+    return _of_what_was_played(run, rows)
+
+
+def _figures(
+    adaptation_s: dict[str, float | None],
+    frozen: list[tuple[float, float] | None],
+    contacts: list[tuple[bool, float | None, float | None]],
+    missed: int | None,
+    false_alarms: int | None,
+) -> dict[str, str]:
+    """Return a scheme's figures as text by quantity. contacts: armed, detected at, s, and delay, ms, of each."""
+    times_s = list(adaptation_s.values())
+    seen = [at_s for _, at_s, _ in contacts if at_s is not None]
+    delays_ms = [delay_ms for is_armed, _, delay_ms in contacts if is_armed and delay_ms is not None]
+    armed = sum(is_armed for is_armed, _, _ in contacts)
+    return {
+        "First adaptation": _seconds(times_s, 0),
+        "Adaptation after the payload change": _seconds(times_s, 1),
+        "Frozen residual without payload, joints 1 / 2": _residual_text(frozen, 0),
+        "Frozen residual with payload, joints 1 / 2": _residual_text(frozen, 1),
+        "First contact detected at": f"{seen[0]:.2f} s" if seen else NONE,
+        "Contacts detected": NONE if missed is None else found_text(len(delays_ms), armed),
+        "Median delay": f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else NONE,
+        "False alarms": NONE if false_alarms is None else str(false_alarms),
+    }
 
 
 def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, ...]:
@@ -323,29 +330,6 @@ def _tests_text(times_s: list[float | None]) -> str:
     return "test of " + (" and ".join(NONE if t is None else f"{t:.2f} s" for t in times_s) or NONE)
 
 
-def _beside_values(beside: Beside | None, detections: list[str], same: tuple[str, str, str]) -> tuple[str, ...]:
-    """Return the column of the paper's scheme on the same stream; same: payload and the CAD model's residuals."""
-    if beside is None:
-        return (NONE,) * 11
-    times_s = list(beside.adaptation_s.values())
-    frozen = [beside.frozen_residual_max_Nm[label] for label in detections]
-    armed = [contact for contact in beside.contacts if contact["is_armed"]]
-    delays_ms = [contact["delay_ms"] for contact in armed if contact["delay_ms"] is not None]
-    seen = [contact["detected_s"] for contact in beside.contacts if contact["detected_s"] is not None]
-    return (
-        _seconds(times_s, 0),
-        _seconds(times_s, 1),
-        same[0],
-        _residual_text(frozen, 0),
-        _residual_text(frozen, 1),
-        *same[1:],
-        f"{seen[0]:.2f} s" if seen else NONE,
-        NONE if beside.missed is None else found_text(len(delays_ms), len(armed)),
-        _median_text(delays_ms),
-        NONE if beside.false_alarms is None else str(beside.false_alarms),
-    )
-
-
 def _threshold_text(evidence: CertifiedEvidence, detections: list[str]) -> str:
     """Return the range of the slowest channel's thresholds as text: smallest and largest median of a section."""
     found = [h for label in detections for row in evidence.margins.get(label, ())[:1] for h in row.threshold_Nm]
@@ -360,10 +344,6 @@ def _push_text(evidence: CertifiedEvidence) -> str:
         " / ".join(f"{joint[name]:.2f}" for joint in evidence.smallest_push.push_Nm) for name in ("p50", "max")
     )
     return f"median {median}, at worst {worst} Nm"
-
-
-def _median_text(delays_ms: list[float]) -> str:
-    return f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else NONE
 
 
 def _seconds(times_s: list[float | None], index: int) -> str:

@@ -15,7 +15,6 @@ import numpy as np
 
 from adacd_hil.lab.detectors import detectors
 from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
-from adacd_hil.lab.stated_bounds import LEAST_RATE_PER_H, MOST_RATE_PER_H
 from adacd_hil.lab.thresholds.false_alarms import (
     BLOCK_S,
     Sensing,
@@ -35,7 +34,6 @@ from adacd_hil.log.logged_run import Milestones, Progress
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.model.regressor import mass_matrix
-from adacd_hil.settings.schema import setting
 
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0
@@ -141,47 +139,50 @@ def _peaks(
 
 @dataclass(frozen=True)
 class ChannelRow:
-    """One channel of a detector, a row of the thresholds file."""
+    """One channel of a detector, a row of the thresholds file, per joint.
 
-    detector: str = setting(meaning="name of the detector")
-    channel: str = setting(meaning="name of the channel")
-    threshold: tuple[float, ...] = setting(low=0.0, meaning="per joint; Nm, but sigmas of likelihood and Nm s of cusum")
-    limit: tuple[str, ...] = setting(meaning="largest cause of its height, per joint; empty where it can't be split")
-    achievable_Nm: tuple[float, ...] = setting(
-        unit="Nm", low=0.0, meaning="per joint, with an exact model; empty where it can't be split"
-    )
+    threshold: Nm, but sigmas of likelihood and Nm s of cusum. limit: largest cause of its height; achievable_Nm: with
+    an exact model; both empty where the height can't be split.
+    """
+
+    detector: str
+    channel: str
+    threshold: tuple[float, ...]
+    limit: tuple[str, ...]
+    achievable_Nm: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class DetectorRow:
-    """Rates of a detector with all of its thresholds together, a row of the thresholds file."""
+    """Rates of a detector with all of its thresholds together, a row of the thresholds file.
 
-    name: str = setting(meaning="name of the detector")
-    rate_bound_per_h: float = setting(unit="1/h", low=0.0, meaning="upper 95 % bound of the rate of false alarms")
-    bound_ratio: float = setting(low=0.0, meaning="factor on the thresholds with which the bound is the wanted rate")
-    predicted_per_h: float | None = setting(
-        None, unit="1/h", low=0.0, meaning="rate predicted from one half of the motion; absent: too short"
-    )
-    measured_per_h: float | None = setting(None, unit="1/h", low=0.0, meaning="rate counted in the other half")
+    rate_bound_per_h: upper 95 % bound. bound_ratio: factor on the thresholds with which the bound is the wanted rate.
+    predicted_per_h: from one half of the motion, None if it is too short; measured_per_h: counted in the other half.
+    """
+
+    name: str
+    rate_bound_per_h: float
+    bound_ratio: float
+    predicted_per_h: float | None
+    measured_per_h: float | None
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Thresholds for a wanted rate of false alarms, with confidence bounds."""
+    """Thresholds for a wanted rate of false alarms of a detector, from `hours` of contact-free motion in the logs.
 
-    rate_per_h: float = setting(
-        unit="1/h",
-        low=LEAST_RATE_PER_H,
-        high=MOST_RATE_PER_H,
-        meaning="wanted false alarms per hour of a detector",
-    )
-    hours: float = setting(unit="h", low=0.0, meaning="contact-free motion that they come from")
-    is_extrapolated: bool = setting(meaning="less than one alarm is expected in that motion")
-    lag_s: float = setting(unit="s", low=0.0, high=1.0, meaning="lag of the velocity, identified")
-    logs: tuple[str, ...] = setting(meaning="logs of the motion")
-    missing: tuple[str, ...] = setting(meaning="detectors whose tail can't be fitted from this motion")
-    detectors: tuple[DetectorRow, ...] = setting(meaning="the detectors")
-    channels: tuple[ChannelRow, ...] = setting(meaning="their channels")
+    is_extrapolated: less than one alarm is expected in that motion. lag_s: of the velocity, identified. missing:
+    detectors whose tail can't be fitted from this motion.
+    """
+
+    rate_per_h: float
+    hours: float
+    is_extrapolated: bool
+    lag_s: float
+    logs: tuple[str, ...]
+    missing: tuple[str, ...]
+    detectors: tuple[DetectorRow, ...]
+    channels: tuple[ChannelRow, ...]
 
 
 def calibrate_all(

@@ -1,6 +1,7 @@
 """The rules on definitions (schemas, channels, .msg texts) and messages (order of times, cdr payloads)."""
 
 import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from adacd_hil.log.types.message_types import (
     FD_FRAME,
     FD_FRAME_DTYPE,
     JOINT_STATE,
-    JOINT_STATE_DTYPE,
     LOG,
     SEPARATOR,
     is_log,
@@ -134,9 +134,7 @@ class ContentCheck:
         self._latest = np.zeros(CHANNEL_NUMBERS, np.uint64)  # log time of each channel
         self._sizes = np.full(CHANNEL_NUMBERS, _ANY_SIZE, np.int64)
         self._is_cdr = np.zeros(CHANNEL_NUMBERS, np.bool_)
-        self._fd_frames: set[int] = set()
-        self._logs: set[int] = set()
-        self._joint_states: set[int] = set()
+        self._checks: dict[int, Callable[[bytes], bool]] = {}  # of payloads that don't have that size
 
     def schema(self, schema: Schema, offset: int) -> None:
         """Check the text of a schema, once for each number; add a finding if it can't be read."""
@@ -159,13 +157,9 @@ class ContentCheck:
         self._described.add(channel.id)
         self._is_cdr[channel.id] = channel.message_encoding == "cdr"
         self._sizes[channel.id] = _ANY_SIZE if (size := payload_size(channel, schema)) is None else size
-        if schema is not None and is_own(channel, schema, FD_FRAME):
-            self._fd_frames.add(channel.id)
-        elif schema is not None and is_own(channel, schema, LOG):
-            self._logs.add(channel.id)
-        elif schema is not None and is_own(channel, schema, JOINT_STATE):
-            self._joint_states.add(channel.id)
-            self._sizes[channel.id] = _ANY_SIZE  # others have the same text, and other joints
+        for own, check in _VARYING:
+            if schema is not None and is_own(channel, schema, own):
+                self._checks[channel.id] = check
 
     def _check_order(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
         order = np.argsort(contents.channels, kind="stable")
@@ -190,17 +184,13 @@ class ContentCheck:
         sizes = contents.ends - contents.starts - MESSAGE_HEAD
         is_cdr = self._is_cdr[contents.channels]
         expected = self._sizes[contents.channels]
-        is_wrong = is_cdr & ((sizes < len(ENCAPSULATION)) | ((expected != _ANY_SIZE) & (sizes != expected)))
+        is_odd, is_varying = sizes != expected, np.isin(contents.channels, [*self._checks])
+        is_wrong = is_cdr & ((sizes < len(ENCAPSULATION)) | ((expected != _ANY_SIZE) & is_odd & ~is_varying))
         looked_at = np.flatnonzero(is_cdr & ~is_wrong)
         heads = data[contents.starts[looked_at, np.newaxis] + np.arange(MESSAGE_HEAD, MESSAGE_HEAD + 4)]
         is_wrong[looked_at] = (heads[:, 0] != 0) | (heads[:, 1] > _LAST_ENCAPSULATION)
-        for place in np.flatnonzero(np.isin(contents.channels, [*self._fd_frames, *self._logs]) & ~is_wrong).tolist():
-            payload = contents.payload(place)
-            is_fd = int(contents.channels[place]) in self._fd_frames
-            is_wrong[place] = not (_is_fd_frame(payload) if is_fd else is_log(payload))
-        is_others = np.isin(contents.channels, [*self._joint_states]) & (sizes != JOINT_STATE_DTYPE.itemsize)
-        for place in np.flatnonzero(is_others & ~is_wrong).tolist():
-            is_wrong[place] = not is_joint_state(contents.payload(place))
+        for place in np.flatnonzero(is_varying & is_odd & ~is_wrong).tolist():
+            is_wrong[place] = not self._checks[int(contents.channels[place])](contents.payload(place))
         for place in np.flatnonzero(is_wrong)[:1].tolist():
             channel = definitions.channels[int(contents.channels[place])]
             count = np.count_nonzero(is_wrong)
@@ -212,6 +202,10 @@ def _is_fd_frame(payload: bytes) -> bool:
     assert FD_FRAME_DTYPE.fields is not None
     head, place = int(FD_FRAME_DTYPE.fields["data"][1]), int(FD_FRAME_DTYPE.fields["count"][1])
     return len(payload) >= head and len(payload) == head + int.from_bytes(payload[place : place + 4], "little")
+
+
+_VARYING = ((FD_FRAME, _is_fd_frame), (LOG, is_log), (JOINT_STATE, is_joint_state))
+"""Types of payloads that vary in size, and their checks; joint states of others have our text, and other joints."""
 
 
 _PRIMITIVES = {

@@ -42,6 +42,8 @@ _SUMMARY = {
     Opcode.METADATA_INDEX,
     Opcode.SUMMARY_OFFSET,
 }
+_ONCE = {Opcode.HEADER: "header", Opcode.DATA_END: "data-end", Opcode.FOOTER: "footer"}
+"""Records of which a file has one, and their rules."""
 _PROFILES = ("", "ros1", "ros2")
 _FOOTER_CRC = 4
 _DATA_SECTION = "data section"
@@ -61,7 +63,7 @@ class _FileCheck:
         self._summary = SummaryCheck(self.findings, self._definitions, self._chunks)
         self._is_summary = False  # DataEnd is behind
         self._crc = 0  # of the section so far
-        self._counts = {Opcode.HEADER: 0, Opcode.DATA_END: 0, Opcode.FOOTER: 0}
+        self._counts = dict.fromkeys(_ONCE, 0)
         self._has_trailer = False
         self._run()
 
@@ -124,8 +126,7 @@ class _FileCheck:
         opcode = Opcode(record.opcode)
         self._counts[opcode] += 1
         if self._counts[opcode] > 1:
-            rule = {Opcode.HEADER: "header", Opcode.DATA_END: "data-end", Opcode.FOOTER: "footer"}[opcode]
-            self.findings.add_finding(rule, f"there is more than one {name_of(opcode)}", record.offset)
+            self.findings.add_finding(_ONCE[opcode], f"there is more than one {name_of(opcode)}", record.offset)
 
     def _data_end(self, record: RawRecord) -> None:
         self._count(record)
@@ -192,7 +193,7 @@ class _FileCheck:
 
     def _finish(self, end: int) -> None:
         """Add the findings on the file as a whole; end: offset up to which it was read."""
-        for opcode, rule in ((Opcode.HEADER, "header"), (Opcode.DATA_END, "data-end"), (Opcode.FOOTER, "footer")):
+        for opcode, rule in _ONCE.items():
             if not self._counts[opcode]:
                 self.findings.add_finding(rule, f"there is no {name_of(opcode)}")
         self._file.seek(0, 2)
