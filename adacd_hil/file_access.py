@@ -16,7 +16,6 @@ MOST_TEXT_BYTES = 4 << 20
 """Limit for a configuration, scenario, contract, EDS or URDF; the largest in the package has 0.1 MB."""
 NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 """Flags of `os.open` for a file that isn't there."""
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _LOCKS = Path("/proc/locks")
 _ANOTHER = "another one is there already, which is left as it is"
 
@@ -102,22 +101,6 @@ def _owner(descriptor: int) -> str:
             if len(words) >= 6 and words[1] == "FLOCK" and words[5] == place and words[4] != "0":
                 return f"process {words[4]}"
     return "another process"
-
-
-def is_disk_full(error: BaseException | None) -> bool:
-    """Return whether an error, or one that caused it, means that the disk or quota is full, or a file too large."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno in _NO_ROOM:
-            return True
-        error = error.__cause__ or error.__context__
-    return False
-
-
-def error_text(error: BaseException) -> str:
-    """Return the text of an error; of an OSError file and reason, without its number."""
-    if isinstance(error, OSError) and error.strerror:
-        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
-    return str(error)
 
 
 def write_new_file(path: Path, content: bytes) -> None:

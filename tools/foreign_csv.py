@@ -14,7 +14,8 @@ import numpy as np
 
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.types.topics import SCHEME, TRUTH
+from adacd_hil.log.types.topics import SCHEME
+from adacd_hil.log.types.truth_topic import TRUTH
 from adacd_hil.records import SchemeState
 
 EVERY = 2  # cycles of 1 ms

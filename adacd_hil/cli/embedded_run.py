@@ -13,8 +13,9 @@ from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.log.viewer_layout import viewer_files
-from adacd_hil.records import TRUTH_LAYOUT, Vector
+from adacd_hil.records import Vector
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.score.emulator_truth import config_digest
 from adacd_hil.settings.configuration import Settings

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from adacd_hil.clock import wall_ns
-from adacd_hil.file_access import error_text, is_disk_full
+from adacd_hil.error_texts import error_text, is_disk_full
 from adacd_hil.file_replacement import Replacement, removing_empty_folders, replace_file
 from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.plain_values import json_text

@@ -29,22 +29,11 @@ from adacd_hil.log.types.message_types import (
     JOINT_STATE_DTYPE,
     LOG,
     MessageType,
-    log_time_ns,
-    unpack_log,
 )
 from adacd_hil.log.types.record_arrays import FRAME_DTYPE, FRAME_TOPICS, LONG_FRAME_DTYPE, Topic
-from adacd_hil.log.types.topics import (
-    CONTACT,
-    CONTROL,
-    CYCLE,
-    DECODED,
-    EVENTS,
-    SCHEME,
-    TRUTH,
-    contact_report,
-    run_channels,
-    truth_channels,
-)
+from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, DECODED, EVENTS, SCHEME, run_channels
+from adacd_hil.log.types.truth_topic import TRUTH, truth_channels
+from adacd_hil.log.types.unpacking import contact_report, log_time_ns, unpack_log
 from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactReport,
@@ -170,7 +159,7 @@ class RunLog:
 
     @property
     def truth(self) -> Series:
-        """The emulator's truth, records.TRUTH_LAYOUT."""
+        """The emulator's truth, truth_topic.TRUTH_LAYOUT."""
         return self.topics[TRUTH.name]
 
 

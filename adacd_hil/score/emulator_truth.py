@@ -22,7 +22,7 @@ from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, CONFIG_NAME, SCENARIO_NAM
 from adacd_hil.log.log_walk import attachment, run_metadata
 from adacd_hil.log.logged_run import Cycles, EmulatorSpan, Progress, Truth, is_armed_in, is_interrupted
 from adacd_hil.log.reader import LogStream, Series
-from adacd_hil.log.types.topics import TRUTH
+from adacd_hil.log.types.truth_topic import TRUTH
 from adacd_hil.records import PARAMETER_NAMES, Vector
 from adacd_hil.score.judge import TrueContact, forgotten_after_s, true_contacts
 from adacd_hil.settings.configuration import Settings

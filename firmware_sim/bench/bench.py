@@ -15,7 +15,8 @@ The first SYNC after boot-up or an NMT reset communication (of all nodes or of d
 from collections.abc import Callable, Sequence
 from typing import Literal
 
-from adacd_hil.records import TRUTH_LAYOUT, Vector
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
+from adacd_hil.records import Vector
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import HOST_MARK

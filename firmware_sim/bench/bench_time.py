@@ -24,8 +24,9 @@ import numpy as np
 
 from adacd_hil.log.log_files import SCENARIO_NAME, find_parts
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.types.topics import ChannelId, pack_truth
-from adacd_hil.records import TRUTH_LAYOUT, Event, Vector
+from adacd_hil.log.types.topics import ChannelId
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT, pack_truth, truth_channels
+from adacd_hil.records import Event, Vector
 from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.time_marks import NEVER_NS, MarkKind, unpack_mark
 from firmware_sim.bench.bench_nodes import TICK_NS, BenchNodes
@@ -86,7 +87,8 @@ class TruthLog(Recorder):
             metadata={**(metadata or {}), **{f"fault_{index}": row.timed_text for index, row in enumerate(faults)}},
             epoch_ns=epoch_ns,
             blocking=blocking,
-            is_truth=True,
+            messages=(),
+            channels=truth_channels(),
         )
 
     def write(self, cycle: int, t_ns: int, block: Vector) -> None:

@@ -13,7 +13,8 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.records import TRUTH_LAYOUT, Vector
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
+from adacd_hil.records import Vector
 from adacd_hil.structured import Structured
 from firmware_sim.arm.arms import EmulatedArm
 from firmware_sim.arm.mechanics import work_space

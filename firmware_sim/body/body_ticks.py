@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import TRUTH_LAYOUT, Vector
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
+from adacd_hil.records import Vector
 from adacd_hil.structured import Structured, float_fields
 from firmware_sim.arm.joint_forces import MECHANICS_NUMBERS
 from firmware_sim.arm.mechanics import integrate_mechanics, observe

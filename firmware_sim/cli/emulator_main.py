@@ -14,7 +14,7 @@ import click
 
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.compiled import compiling
-from adacd_hil.file_access import error_text
+from adacd_hil.error_texts import error_text
 from adacd_hil.file_replacement import removing_empty_folders
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
 from adacd_hil.log.log_files import TRUTH_NAME, LogError, LogExistsError

@@ -10,16 +10,9 @@ from numpy.typing import NDArray
 from adacd_hil.lab.score.run_arrays import CertifiedStream, CycleColumns, PaperStream, Run, columns_of_records
 from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme, pack_truth
-from adacd_hil.records import (
-    TRUTH_LAYOUT,
-    ContactReport,
-    CycleRecord,
-    FaultReason,
-    Request,
-    SchemeOutput,
-    SchemeState,
-)
+from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT, pack_truth, truth_channels
+from adacd_hil.records import ContactReport, CycleRecord, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import layout_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import parse
@@ -236,7 +229,7 @@ def record(path: Path, run: Run, attachments: dict[str, bytes], clock: str = "lo
 def record_truth(path: Path, run: Run) -> None:
     """Write the emulator's log of a hand-made run."""
     assert run.truth is not None
-    with Recorder(path, metadata={"seed": "7"}, blocking=True, is_truth=True) as recorder:
+    with Recorder(path, metadata={"seed": "7"}, blocking=True, messages=(), channels=truth_channels()) as recorder:
         for row, cycle in enumerate(run.truth.cycle.tolist()):
             block = np.zeros(TRUTH_LAYOUT.size)
             block[TRUTH_LAYOUT.slices["tau_ext"]] = run.truth.tau_ext[row]

@@ -8,7 +8,7 @@ import pytest
 from called import called
 
 from adacd_hil.cli.output import CommandError, print_and_write, writable_folder
-from adacd_hil.file_access import is_disk_full
+from adacd_hil.error_texts import is_disk_full
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import ExcitationSettings
 from adacd_hil.settings.toml_files import parse_toml

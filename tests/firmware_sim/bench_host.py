@@ -8,7 +8,7 @@ from typing import Any
 import canopen
 import numpy as np
 
-from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec

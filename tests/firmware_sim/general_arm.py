@@ -7,7 +7,7 @@ import numpy as np
 import pinocchio
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from firmware_sim.arm.arms import ARMS, EmulatedArm
 from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.joint_forces import gravity_torque

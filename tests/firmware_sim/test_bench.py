@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from bench_host import PERIOD_NS, BenchHost, Nmt, Word, quiet_scenario
 
-from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.wire.bus import Frame
 
 TWITCH = [{"at_s": 0.02, "link": 2, "point_m": 0.3, "force_N": 20.0, "duration_s": 0.02}]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from bench_host import PERIOD_NS, BenchHost, Word, quiet_scenario
 
-from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 
 Q, DQ, TAU_M = (TRUTH_LAYOUT.slices[name] for name in ("q", "dq", "tau_m"))
 FREE = {"mechanics": {"stop_low_deg": [-720.0, -720.0], "stop_high_deg": [720.0, 720.0]}}

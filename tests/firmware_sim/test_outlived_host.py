@@ -5,7 +5,7 @@ import pytest
 from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, patient_host, quiet_scenario
 from served_bench import MS, enabling_script, serve
 
-from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 
 REST_RAD_S = 0.02
 DQ = TRUTH_LAYOUT.slices["dq"]

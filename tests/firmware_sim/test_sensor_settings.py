@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from general_arm import TORQUE
 
-from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.toml_text import to_toml
 from firmware_sim.arm.sensing import (

@@ -9,7 +9,7 @@ from test_faults import example, scenario_of
 
 from adacd_hil.log.log_files import SCENARIO_NAME
 from adacd_hil.log.reader import read_log
-from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.settings.parsing import parse
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.scenario.scenario import Scenario

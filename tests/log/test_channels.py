@@ -24,14 +24,12 @@ from adacd_hil.log.types.topics import (
     pack_control,
     pack_cycle,
     pack_scheme,
-    pack_truth,
     run_channels,
-    truth_channels,
-    unpack_contact,
 )
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT, pack_truth, truth_channels
+from adacd_hil.log.types.unpacking import unpack_contact
 from adacd_hil.records import (
     CONTROL_LAYOUT,
-    TRUTH_LAYOUT,
     ArmState,
     ContactKind,
     ContactLevel,

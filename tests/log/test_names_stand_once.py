@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from adacd_hil.log.log_files import CONFIG_NAME, HISTORY_NAME, LOG_NAME, SCENARIO_NAME, TARE_NAME, TRUTH_NAME
-from adacd_hil.log.types.topics import RUN_TOPICS, TRUTH
+from adacd_hil.log.types.topics import RUN_TOPICS
+from adacd_hil.log.types.truth_topic import TRUTH
 
 ROOT = Path(__file__).parents[2]
 OWN_RULES = {"straightforward.py", "mutations.py"}
@@ -30,7 +31,7 @@ def spelled_out(path: Path, names: tuple[str, ...]) -> list[str]:
     ("names", "rooms", "homes"),
     [
         # joint_state_bags.py: the topic of other programs' bags, which ROS names
-        pytest.param(TOPICS, (*PRODUCT, "tools"), {"topics.py", "joint_state_bags.py"}, id="topics"),
+        pytest.param(TOPICS, (*PRODUCT, "tools"), {"topics.py", "truth_topic.py", "joint_state_bags.py"}, id="topics"),
         pytest.param(FILES, PRODUCT, {"log_files.py"}, id="files"),
     ],
 )

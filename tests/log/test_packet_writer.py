@@ -16,8 +16,8 @@ from adacd_hil.log.mcap.chunked_file import CHUNK_BYTES
 from adacd_hil.log.recording.log_file import McapFile
 from adacd_hil.log.recording.packet import pack_cycle, pack_event, unpack
 from adacd_hil.log.recording.packet_writer import PacketWriter
-from adacd_hil.log.types.message_types import unpack_log
 from adacd_hil.log.types.topics import ChannelId, run_channels
+from adacd_hil.log.types.unpacking import unpack_log
 from adacd_hil.records import Event
 from adacd_hil.wire.bus import Frame
 

@@ -26,9 +26,10 @@ from recorded_run import (
 from adacd_hil import __version__
 from adacd_hil.log.reader import read_log, topic_bytes
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.types.topics import ChannelId, pack_truth, run_channels
+from adacd_hil.log.types.topics import ChannelId, run_channels
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT, pack_truth, truth_channels
 from adacd_hil.log.viewer_layout import viewer_layout
-from adacd_hil.records import CONTROL_LAYOUT, TRUTH_LAYOUT, Event, scheme_layout
+from adacd_hil.records import CONTROL_LAYOUT, Event, scheme_layout
 from adacd_hil.wire.frame_lengths import FD_LENGTHS
 
 pytestmark = pytest.mark.slow  # each log starts a process
@@ -261,7 +262,7 @@ def test_gravity_adds_two_parameters(tmp_path):
 
 def test_the_truth_has_a_log_of_its_own(tmp_path):
     blocks = np.random.default_rng(3).normal(size=(300, TRUTH_LAYOUT.size))
-    with Recorder(tmp_path / "truth.mcap", blocking=True, is_truth=True) as recorder:
+    with Recorder(tmp_path / "truth.mcap", blocking=True, messages=(), channels=truth_channels()) as recorder:
         for number, block in enumerate(blocks):
             recorder.cycle(number * PERIOD_NS, [(ChannelId.TRUTH, pack_truth(number, block))])
         recorder.event(5, Event("info", "contact", "begins"))

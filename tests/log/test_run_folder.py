@@ -101,7 +101,9 @@ def kill_host(path, before_death):
     dies = (
         "import os, sys; from pathlib import Path; from adacd_hil.records import Event;"
         "from adacd_hil.log.recording.recorder import Recorder;"
-        f"recorder = Recorder(Path(sys.argv[1]), metadata={{'name': 'made'}}, is_truth=True); {before_death};"
+        "from adacd_hil.log.types.truth_topic import truth_channels;"
+        "recorder = Recorder(Path(sys.argv[1]), metadata={'name': 'made'}, messages=(), channels=truth_channels());"
+        f"{before_death};"
         "os.kill(os.getpid(), 9)"
     )
     subprocess.run([sys.executable, "-c", dies, str(path)], check=False, timeout=HANG_S)

@@ -20,8 +20,9 @@ from adacd_hil.lab.logs.signal_tables import export_tables
 from adacd_hil.log import log_walk
 from adacd_hil.log.log_files import FIELDS_KEY, find_parts, part_path
 from adacd_hil.log.reader import LogStream, read_log
-from adacd_hil.log.types.message_types import LOG, pack_log, unpack_log
+from adacd_hil.log.types.message_types import LOG, pack_log
 from adacd_hil.log.types.topics import run_channels
+from adacd_hil.log.types.unpacking import unpack_log
 from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.dbc_decoder import load_decoder

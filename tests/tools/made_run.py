@@ -12,7 +12,8 @@ from wire_record import Passed, WireRecord, data_ids
 from witnessed_run import Played, Truth
 
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.records import TRUTH_LAYOUT, Event, FaultReason, Request, SchemeState
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
+from adacd_hil.records import Event, FaultReason, Request, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.dbc_contract import contract_folder

@@ -14,7 +14,8 @@ from attacks import ATTACKS, MS, Forged, Forger, find_attack
 from crccheck.crc import Crc8Autosar
 
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.records import TRUTH_LAYOUT, Event
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
+from adacd_hil.records import Event
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from adacd_hil.wire.e2e import E2eStatus
 

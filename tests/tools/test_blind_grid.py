@@ -8,7 +8,8 @@ from blind_grid import FIRST, SHORT, Outcome, Row
 from made_run import Made, states
 from run_rules import Case
 
-from adacd_hil.records import TRUTH_LAYOUT, SchemeState
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
+from adacd_hil.records import SchemeState
 
 ROW = Row("certified", "arm", "torque", "sensor1", 550, 1.0, "random")
 PUSH = 700  # cycles

@@ -16,7 +16,7 @@ from vcan_kills import VcanKill
 
 from adacd_hil.cli.embedded_run import Cast, run_embedded
 from adacd_hil.log.reader import Series
-from adacd_hil.records import TRUTH_LAYOUT
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings

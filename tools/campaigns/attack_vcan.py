@@ -23,7 +23,8 @@ from side_by_side import BIN, ROOT, TimingError, emulator
 
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.types.topics import EVENTS, SCHEME, TRUTH
+from adacd_hil.log.types.topics import EVENTS, SCHEME
+from adacd_hil.log.types.truth_topic import TRUTH
 from adacd_hil.settings.toml_text import to_toml
 
 START_S = 600.0

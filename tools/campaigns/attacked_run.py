@@ -23,7 +23,8 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.reader import LoggedEvent, RunLog, read_log
 from adacd_hil.log.types.topics import EVENTS, SCHEME
-from adacd_hil.records import TRUTH_LAYOUT, SchemeState
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
+from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse

@@ -12,17 +12,8 @@ import numpy as np
 from adacd_hil.control.controller import Controller, Floating
 from adacd_hil.control.gate import Gate
 from adacd_hil.control.reference import Reference
-from adacd_hil.records import (
-    TRUTH_LAYOUT,
-    ArmState,
-    ContactReport,
-    FaultReason,
-    Reaction,
-    Request,
-    SchemeOutput,
-    SchemeState,
-    Vector,
-)
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
+from adacd_hil.records import ArmState, ContactReport, FaultReason, Reaction, Request, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.contact import course
 from adacd_hil.scheme.contact.contact_report import new_rows, put_row, recalled_report
 from adacd_hil.scheme.kernel import paper_kernel

@@ -11,7 +11,7 @@ from witnessed_run import Played, Truth
 
 from adacd_hil.log.log_files import DBC_NAME
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.types.topics import TRUTH
+from adacd_hil.log.types.truth_topic import TRUTH
 from adacd_hil.settings.configuration import Settings
 from firmware_sim.scenario.scenario import Scenario
 

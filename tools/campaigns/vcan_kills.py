@@ -28,7 +28,7 @@ from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.types.topics import TRUTH
+from adacd_hil.log.types.truth_topic import TRUTH
 from adacd_hil.records import SchemeState
 
 VICTIMS = ("host", "logger", "emulator", "host and logger", "host and emulator")

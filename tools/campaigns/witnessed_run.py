@@ -25,7 +25,8 @@ from adacd_hil.device.device_files import place_devices
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, EVENTS, SCHEME
-from adacd_hil.records import TRUTH_LAYOUT, Request, SchemeState
+from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
+from adacd_hil.records import Request, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench

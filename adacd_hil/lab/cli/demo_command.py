@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from adacd_hil.cli.embedded_run import SCENARIO, resolve, run_embedded
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
 from adacd_hil.control.session import LiveView, SessionSummary
-from adacd_hil.file_access import error_text
+from adacd_hil.error_texts import error_text
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.progress_lines import Progress
 from adacd_hil.records import FaultReason, SchemeState

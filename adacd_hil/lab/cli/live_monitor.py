@@ -16,8 +16,8 @@ from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.cli.monitor_command import Screen
 from adacd_hil.lab.live.client import LiveClient, LiveMessage, live_client
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.types.message_types import unpack_log
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, SCHEME
+from adacd_hil.log.types.unpacking import unpack_log
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import one_line
 from adacd_hil.records import (

@@ -44,7 +44,8 @@ from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.processes import LoggedMessage, WriterSetup, start_module
 from adacd_hil.log.recording.ring import Ring
 from adacd_hil.log.types.message_types import ENCAPSULATION, JOINT_STATE_DTYPE, MessageType
-from adacd_hil.log.types.topics import DECODED, RUN_TOPICS, ChannelId, LogChannel, unpack_contact
+from adacd_hil.log.types.topics import DECODED, RUN_TOPICS, ChannelId, LogChannel
+from adacd_hil.log.types.unpacking import unpack_contact
 from adacd_hil.log.viewer_layout import SCENE_TOPIC
 from adacd_hil.records import SchemeState
 

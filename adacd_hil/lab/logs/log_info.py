@@ -31,9 +31,10 @@ from adacd_hil.log.mcap.chunks import ChunkError, Contents, Opening, read_conten
 from adacd_hil.log.mcap.mcap_records import Definitions, FileEnd, RawRecord, check_magic, parse, read_end, read_record
 from adacd_hil.log.mcap.record_layout import MAGIC, MESSAGE_HEAD
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.log.types.message_types import LOG, log_time_ns, payload_dtype, unpack_log
+from adacd_hil.log.types.message_types import LOG, payload_dtype
 from adacd_hil.log.types.record_arrays import count_frames
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS
+from adacd_hil.log.types.unpacking import log_time_ns, unpack_log
 from adacd_hil.records import ContactLevel, Event
 
 _READ = (EVENTS.name, CONTACT.name)

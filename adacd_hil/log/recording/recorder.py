@@ -21,7 +21,7 @@ from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.processes import LiveService, WriterSetup, start_module
 from adacd_hil.log.recording.ring import Ring, padded_bytes
 from adacd_hil.log.recording.run_folder import check_free, make_room
-from adacd_hil.log.types.topics import run_channels, truth_channels
+from adacd_hil.log.types.topics import LogChannel, run_channels
 from adacd_hil.records import PARAMETER_NAMES, Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.bus import Frame
@@ -66,15 +66,14 @@ class Recorder:
         metadata: Mapping[str, str] | None = None,
         epoch_ns: int = 0,
         blocking: bool = False,
-        is_truth: bool = False,
+        channels: tuple[LogChannel, ...] | None = None,
         settings: LogSettings | None = None,
         live: LiveService | None = None,
     ) -> None:
         """Create the file, which must not exist (see run_folder.py), and start the writer.
 
         messages: of the DBC, by default the package's. epoch_ns: added to t_ns for the log's times; 0 in lockstep.
-        is_truth: the emulator's own log, /truth and /events only. live: live view to open. Raises LogExistsError,
-        LogError.
+        channels: of a log that is no run's. live: live view to open. Raises LogExistsError, LogError.
         """
         settings = settings or LogSettings()
         own = {
@@ -90,13 +89,12 @@ class Recorder:
         self._summary: LogSummary | None = None
         self._is_blocking = blocking
         self._unannounced = 0  # bytes in the ring since the writer was last woken
-        told = () if is_truth else plain_tables(_own_messages() if messages is None else messages)
+        is_run, told = channels is None, plain_tables(_own_messages() if messages is None else messages)
         try:
-            run = (parameter_count, told, further_count, channel_count)
-            channels = truth_channels() if is_truth else run_channels(*run)
+            channels = channels or run_channels(parameter_count, told, further_count, channel_count)
         except LogError as error:
             raise LogError(f"log {path} can't be written: {error}") from None
-        file = _create(path, is_truth)
+        file = _create(path, is_run)
         setup = WriterSetup(
             path=path.absolute(),
             is_blocking=blocking,
@@ -240,12 +238,12 @@ class Recorder:
         self.close()
 
 
-def _create(path: Path, is_truth: bool) -> int:
+def _create(path: Path, is_run: bool) -> int:
     """Create the first part of a log; return its file descriptor. Raises LogExistsError, LogError."""
-    if is_truth:
-        check_free(path)
-    else:
+    if is_run:
         make_room(path)
+    else:
+        check_free(path)
     try:
         return create_file(path)
     except FileExistsError:  # created since `check_free`

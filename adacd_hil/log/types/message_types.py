@@ -221,8 +221,7 @@ FD_FRAME_DTYPE = np.dtype(
 )
 """The longest payload; others end after `count` bytes of data."""
 
-_LEVELS = {"info": 2, "warning": 3, "error": 4}
-_LEVEL_NAMES = {number: name for name, number in _LEVELS.items()} | {0: "info", 1: "info", 5: "error"}
+LEVELS = {"info": 2, "warning": 3, "error": 4}
 
 
 def pack_can_frame(
@@ -288,37 +287,8 @@ def pack_joint_state(stamp: bytes, q: bytes, dq: bytes, tau_J: bytes) -> bytes:
 
 def pack_log(stamp: bytes, event: Event) -> bytes:
     """Return an event as a payload of foxglove_msgs/Log; an unknown level counts as an error."""
-    payload = ENCAPSULATION + stamp + bytes((_LEVELS.get(event.level, _LEVELS["error"]),))
+    payload = ENCAPSULATION + stamp + bytes((LEVELS.get(event.level, LEVELS["error"]),))
     for text in (event.message, event.name, ""):
         encoded = text.encode("utf-8", "replace") + b"\0"
         payload += bytes(-len(payload) % 4) + struct.pack("<I", len(encoded)) + encoded
     return payload + bytes(-len(payload) % 4) + struct.pack("<I", 0)
-
-
-def is_log(payload: bytes) -> bool:
-    """Return whether `unpack_log` can unpack a payload."""
-    try:
-        unpack_log(payload)
-    except (struct.error, IndexError):
-        return False
-    return True
-
-
-def log_time_ns(payload: bytes) -> int:
-    """Return when an event was logged, ns of the log. Raises struct.error when the payload is cut."""
-    sec, nanosec = struct.unpack_from("<II", payload, 4)
-    return int(sec) * 1_000_000_000 + int(nanosec)
-
-
-def unpack_log(payload: bytes) -> Event:
-    """Return the event in a payload of foxglove_msgs/Log. Raises struct.error or IndexError when it is cut."""
-    level = _LEVEL_NAMES.get(payload[12], "error")
-    position = 13
-    texts = []
-    for _ in range(2):
-        position += -position % 4
-        (size,) = struct.unpack_from("<I", payload, position)
-        position += 4
-        texts.append(payload[position : position + size].rstrip(b"\0").decode("utf-8", "replace"))
-        position += size
-    return Event(level, texts[1], texts[0])

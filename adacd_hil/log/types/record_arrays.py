@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.log.types.message_types import FD_FRAME, LOG, MAX_DATA, is_log
+from adacd_hil.log.types.message_types import FD_FRAME, LOG, MAX_DATA
 from adacd_hil.log.types.topics import FROM_CAN_BUS, FROM_CAN_BUS_FD, TO_CAN_BUS, TO_CAN_BUS_FD
+from adacd_hil.log.types.unpacking import is_log
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 
 if TYPE_CHECKING:

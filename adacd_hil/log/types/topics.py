@@ -20,7 +20,7 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 | /cycle | adacd_hil_msgs/msg/Cycle | every cycle; records.CycleRecord |
 | /frame_checks | adacd_hil_msgs/msg/FrameChecks | once a second: counts of the checks of each device's cyclic frames |
 | /events | foxglove_msgs/msg/Log | when something happens |
-| /truth | adacd_hil_msgs/msg/Truth | every cycle, in the emulator's own log; records.TRUTH_LAYOUT |
+| /truth | adacd_hil_msgs/msg/Truth | every cycle, in the emulator's own log; truth_topic.TRUTH_LAYOUT |
 """
 
 import struct
@@ -29,8 +29,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
 from typing import Any
-
-import numpy as np
 
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.message_types import (
@@ -46,7 +44,6 @@ from adacd_hil.log.types.message_types import (
 )
 from adacd_hil.records import (
     CONTROL_LAYOUT,
-    TRUTH_LAYOUT,
     ArmState,
     ContactKind,
     ContactLevel,
@@ -147,7 +144,7 @@ class OwnTopic:
         return packed if block is None else packed + block.tobytes()
 
 
-_CYCLE_NUMBER = Member("cycle", "uint64", meaning="number of the cycle")
+CYCLE_NUMBER = Member("cycle", "uint64", meaning="number of the cycle")
 _FRAME_RATE_HZ = 10
 
 
@@ -166,7 +163,7 @@ SCHEME = OwnTopic(
     "/scheme",
     "Scheme",
     head=(
-        _CYCLE_NUMBER,
+        CYCLE_NUMBER,
         _choice("state", SchemeState),
         Member("previous_state", "uint8", meaning="SchemeState of the cycle before"),
         _choice("fault", FaultReason),
@@ -182,7 +179,7 @@ ARM = OwnTopic(
     "/arm",
     "ArmState",
     head=(
-        _CYCLE_NUMBER,
+        CYCLE_NUMBER,
         Member("first_cycle", "uint64", meaning="number of the cycle with which this attempt began"),
         Member("periods", "int64", meaning="since the cycle before, 1 unless some were skipped"),
         Member("steps", "int64", meaning="periods from the last complete sample to this one; 0: it is not complete"),
@@ -202,7 +199,7 @@ CONTACT = OwnTopic(
     "/contact",
     "Contact",
     head=(
-        _CYCLE_NUMBER,
+        CYCLE_NUMBER,
         Member("link", "uint8", meaning="link that was touched"),
         Member("direction", "int8", 2, meaning="sign of the external torque, 0 below the threshold"),
         Member("is_final", "bool", meaning="the isolation window has ended"),
@@ -227,7 +224,7 @@ CONTROL = OwnTopic(
     "/control",
     "Control",
     head=(
-        _CYCLE_NUMBER,
+        CYCLE_NUMBER,
         Member("gate_flags", "uint8", meaning="limits that acted, one bit each"),
         Member("enable", "bool", meaning="drives are asked to be enabled"),
         Member("quick_stop", "bool", meaning="drives are asked for a quick stop"),
@@ -240,7 +237,7 @@ CYCLE = OwnTopic(
     "/cycle",
     "Cycle",
     head=(
-        _CYCLE_NUMBER,
+        CYCLE_NUMBER,
         Member("lateness_ns", "int64", unit="ns", meaning="wake-up after the grid point"),
         Member("feedback_ns", "int64", unit="ns", meaning="SYNC sent to last frame decoded"),
         Member("command_ns", "int64", unit="ns", meaning="SYNC sent to last command handed to the bus"),
@@ -267,7 +264,7 @@ FRAME_CHECKS = OwnTopic(
     "/frame_checks",
     "FrameChecks",
     head=(
-        _CYCLE_NUMBER,
+        CYCLE_NUMBER,
         *(
             Member(f"{device}_checks", "uint64", len(E2eStatus), "", "frames so far, by E2eStatus", values, "E2E")
             for device, values in zip(_DEVICES, (E2eStatus, None, None, None), strict=True)
@@ -278,7 +275,6 @@ FRAME_CHECKS = OwnTopic(
 EVENTS = OwnTopic(ChannelId.EVENTS, "/events", LOG)
 CERTIFIED_MODEL = "certified model"
 """Name of the events at the end of an attempt with a certificate each, as JSON."""
-TRUTH = OwnTopic(ChannelId.TRUTH, "/truth", "Truth", head=(_CYCLE_NUMBER,), block=lambda *_: TRUTH_LAYOUT)
 RUN_TOPICS = (
     TO_CAN_BUS,
     FROM_CAN_BUS,
@@ -310,11 +306,6 @@ def run_channels(
     )
     _check_names((*own, *decoded))
     return (*own, *decoded)
-
-
-def truth_channels() -> tuple[LogChannel, ...]:
-    """Return the topics of the emulator's own log as channels of a file."""
-    return TRUTH.channel(), EVENTS.channel()
 
 
 def _decoded_channel(channel_id: int, message: MessageTable) -> LogChannel:
@@ -351,24 +342,6 @@ def pack_contact(report: ContactReport) -> bytes:
     return CONTACT.pack(*(getattr(report, member.name) for member in CONTACT.head))
 
 
-def contact_report(record: Any) -> ContactReport:
-    """Convert a record of /contact to a report; records of older logs have fewer fields.
-
-    Raises ValueError or OverflowError for a value that has no name.
-    """
-    members = [member for member in CONTACT.head if member.name in (record.dtype.names or ())]
-    return ContactReport(**{member.name: member.value_of(record[member.name].tolist()) for member in members})
-
-
-def unpack_contact(body: bytes) -> ContactReport:
-    """Return the report in the bytes of `pack_contact`. Raises ValueError if cut, or for a value without a name."""
-    head = bytes(_CONTACT_DTYPE.itemsize - CONTACT.body.size)
-    return contact_report(np.frombuffer(head + body, _CONTACT_DTYPE)[0])
-
-
-_CONTACT_DTYPE = CONTACT.channel().type.dtype
-
-
 def pack_control(cycle: int, block: Vector, gate_flags: int, enable: bool, quick_stop: bool) -> bytes:
     """Return a /control message as bytes, without the stamp; `block` is laid out by CONTROL_LAYOUT.
 
@@ -385,8 +358,3 @@ def pack_cycle(record: CycleRecord) -> bytes:
 def pack_frame_checks(checks: FrameChecks) -> bytes:
     """Return a /frame_checks message as bytes, without the stamp."""
     return FRAME_CHECKS.pack(checks.cycle, *checks.counts, checks.implausible)
-
-
-def pack_truth(cycle: int, block: Vector) -> bytes:
-    """Return a /truth message as bytes, without the stamp; `block` is laid out by TRUTH_LAYOUT."""
-    return TRUTH.pack(cycle, block=block)

@@ -14,15 +14,8 @@ from adacd_hil.lab.logs.payload_sizes import is_own, payload_size
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS
 from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD
-from adacd_hil.log.types.message_types import (
-    ENCAPSULATION,
-    FD_FRAME,
-    FD_FRAME_DTYPE,
-    JOINT_STATE,
-    LOG,
-    SEPARATOR,
-    is_log,
-)
+from adacd_hil.log.types.message_types import ENCAPSULATION, FD_FRAME, FD_FRAME_DTYPE, JOINT_STATE, LOG, SEPARATOR
+from adacd_hil.log.types.unpacking import is_log
 
 _ANY_SIZE = -1
 _LAST_ENCAPSULATION = 0x0D
