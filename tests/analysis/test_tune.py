@@ -508,6 +508,15 @@ def test_without_truth_only_thresholds_are_looked_for(log, tmp_path):
     assert "filter.a_rad_s" not in done.stdout
 
 
+def test_tune_notes_what_a_replay_notes_of_a_damaged_log(log, tmp_path):
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[:-1000])
+    (replayed,) = json.loads(called("replay", cut, "--json").stdout)
+    found = json.loads(tune(cut, "--json").stdout)
+    assert replayed["notes"]
+    assert found["notes"][-len(replayed["notes"]) :] == [f"{cut}: {note}" for note in replayed["notes"]]
+
+
 def test_what_can_not_be_tuned_is_said_in_one_line(log):
     for words, code, said in (
         ((log, log), 2, "a log is given twice"),

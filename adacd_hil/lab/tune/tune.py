@@ -97,6 +97,7 @@ def tune(
         for filter_and_gain, choice in zip(tried, choices, strict=True)
     ]
     own, *outcomes = replay_all(logs, [{}, *changes], progress)
+    notes += own.notes
     judged = [
         Candidate(name_of(filter_and_gain), change, choice, outcome, problems_of(choice, outcome, own, rate_per_h))
         for filter_and_gain, change, choice, outcome in zip(tried, changes, choices, outcomes, strict=True)
@@ -162,6 +163,7 @@ def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
         hours=sum(found.monitored_s for found, _ in judged) / 3600.0,
         delays_ms=tuple(delays),
         armed_false_alarms=sum(score.armed_false_alarms for _, score in judged),
+        notes=tuple(f"{log.path}: {note}" for log, found in replays for note in found.notes),
     )
 
 

@@ -396,6 +396,8 @@ class TuningOutcome:
     hours: float
     delays_ms: tuple[float, ...]
     armed_false_alarms: int
+    notes: tuple[str, ...] = ()
+    """Of the replays, a line each: parts of a log that could not be replayed or judged."""
 
 
 @dataclass(frozen=True)
