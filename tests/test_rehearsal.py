@@ -219,6 +219,7 @@ signals = [{ object = "0x9130:1", signal = "torque" }]
     ("variant", "said"),
     [
         (EdsVariant().without("1A00"), "0x1A00 of [[pdo]] Feedback is not in"),
+        (EdsVariant().without("1801"), "0x1801:1 of [[pdo]] Status is not in"),
         (EdsVariant().with_value("0x0003", "6064", key="DataType"), "0x6064 is INTEGER16 in"),
         (EdsVariant().with_value("0x0005", "6041", key="DataType"), "0x6041 is UNSIGNED8 in"),
         (EdsVariant().with_value("0x0007", "6040", key="DataType"), "0x6040 is UNSIGNED32 in"),
@@ -236,4 +237,4 @@ def test_a_drive_that_its_eds_lets_nobody_play_is_named(tmp_path: Path, variant:
     assert status == 2
     assert said in error
     found = examine_configuration(str(tmp_path / "my-arm.toml")).errors
-    assert any(said in line for line in found) is ("CiA 402" in error)  # a type is the host's business, too
+    assert any(said in line for line in found)  # the host needs them, too
