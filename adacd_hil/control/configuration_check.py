@@ -168,7 +168,16 @@ def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
 
 
 def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
-    """Yield a warning for each torque sensor whose frame can't carry the joint's rated torque."""
+    """Yield a warning for each frame that can't carry the joint's rated torque, or its positions up to the limit."""
+    limits_deg, zeros_deg = settings.arm.position_limit_deg, settings.arm.zero_deg
+    for joint, (limit_deg, zero_deg) in enumerate(zip(limits_deg, zeros_deg, strict=True)):
+        message = codec.message(f"Drive{joint + 1}Feedback")
+        signal = message.values[message.place("position")]
+        if (most_deg := math.degrees(signal.raw_high * signal.scale)) < limit_deg + abs(zero_deg):
+            yield (
+                f"{message.name} carries ±{most_deg:.3g} deg, `arm.position_limit_deg[{joint}]` = {limit_deg:g} deg: "
+                f"is `increments_per_joint_rev` of {settings.devices.drive[joint]} right?"
+            )
     for joint, rated_Nm in enumerate(settings.arm.rated_torque_Nm):
         message = codec.message(f"Sensor{joint + 1}Torque")
         signal = message.values[message.place("torque")]

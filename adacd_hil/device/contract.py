@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
-from adacd_hil.device.profile import EMCY_INHIBIT_100US, PdoSettings, PlacedDevice
+from adacd_hil.device.profile import EMCY_INHIBIT_100US, ObjectName, PdoSettings, PlacedDevice
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
@@ -212,6 +212,12 @@ def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], pe
 
 def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
     profile, name = device.settings, device.name.upper()
+    for place in (ObjectName(pdo.communication_index, 1), ObjectName(pdo.mapping_index)):
+        if not device.has(place.index, place.sub):
+            raise ConfigError(
+                f"device profile {device.profile.name}: {place} of [[pdo]] {pdo.message} is not in "
+                f"{device.profile.eds}: correct its `number`"
+            )
     signals: list[_DbcSignal] = []
     if pdo.data_ids:
         signals = [_DbcSignal(signal, bits) for signal, bits in PROFILES_BY_CODE[profile.protection].signals]

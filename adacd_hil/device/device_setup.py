@@ -441,12 +441,6 @@ def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
     command PDO where the profile has the deadline there.
     """
     profile = slave.device.settings
-    for pdo in profile.pdo:
-        if not slave.has(pdo.communication_index, _COB_ID) or not slave.has(pdo.mapping_index, 0):
-            slave.fail(
-                f"{pdo.message}: 0x{pdo.communication_index:04X} and 0x{pdo.mapping_index:04X} are not in the EDS",
-                f"correct `number` of [[pdo]] {pdo.message} in {slave.device.profile.name}",
-            )
     timers = {pdo.message: _event_timer(slave, pdo, command_deadline_ms) for pdo in profile.pdo}
     compared = set()
     _switch_off_others(slave)

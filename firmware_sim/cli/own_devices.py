@@ -231,12 +231,8 @@ _BOTH_WAYS = ("position", "velocity", "torque", "target_torque")
 
 
 def _check_objects(device: PlacedDevice) -> None:
-    """Raise ConfigError for a device that can't be played: it lacks a PDO's objects, or one has another type."""
+    """Raise ConfigError for a device that can't be played: an object has another type."""
     place = f"device profile {device.profile.name}"
-    for pdo in device.settings.pdo:
-        for index in (pdo.communication_index, pdo.mapping_index):
-            if not device.has(index):
-                raise ConfigError(f"{place}: 0x{index:04X} of [[pdo]] {pdo.message} is not in {device.profile.eds}")
     for index in STANDARD_TYPES:
         if device.has(index):
             device.variable(ObjectName(index))
