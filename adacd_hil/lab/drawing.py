@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import matplotlib as mpl
 import numpy as np
@@ -24,6 +24,7 @@ from adacd_hil.file_replacement import replace_files
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.plain_values import json_text
 from adacd_hil.records import Vector
+from adacd_hil.score.emulator_truth import extreme_rows
 
 COLOURS: Final = {
     "ink": "#1a2027",
@@ -110,33 +111,24 @@ def write_figures(out_dir: Path, name: str, described: dict[str, Any], drawings:
         return replace_files(out_dir, contents)
 
 
-def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.intp]:
+def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.int64]:
     """Return indices of y (k,): the smallest and the largest value of each of `bins` equal parts, and both ends.
 
-    Indices ascend. Of a series with at most two rows per part, all are returned. The index of a NaN is returned only
-    for a part without a number.
+    Indices ascend. Of a series with at most two rows per part, all are returned. NaN is neither.
     """
-    count = y.shape[0]
-    width = -(-count // bins)
+    width = -(-len(y) // bins)
     if width <= 2:
-        return np.arange(count)
-    whole = count // width * width
-    low = np.where(np.isnan(y), np.inf, y)
-    high = np.where(np.isnan(y), -np.inf, y)
-    starts = np.arange(0, whole, width)
-    chosen = [starts + part[:whole].reshape(-1, width).argmin(axis=1) for part in (low, -high)]
-    if whole < count:
-        chosen += [[whole + part[whole:].argmin()] for part in (low, -high)]
-    return np.unique(np.concatenate([*chosen, [0, count - 1]]))
+        return np.arange(len(y))
+    return np.union1d(extreme_rows([y], np.arange(0, len(y), width)), [0, len(y) - 1])
 
 
-def plot(axes: Axes, x: Vector, y: Vector, bins: int = _ENVELOPE_BINS, **look: Any) -> None:
+def plot(axes: Axes, x: Vector, y: Vector, **look: Any) -> None:
     """Draw y over x, both (k,), on the axes, reduced to the rows of y's `envelope`. look: as of `Axes.plot`."""
-    rows = envelope(y, bins)
+    rows = envelope(y)
     axes.plot(x[rows], y[rows], **look)
 
 
-def note(axes: Axes, text: str, colour: str = COLOURS["muted"]) -> None:
+def note(axes: Axes, text: str) -> None:
     """Write a text above the upper right corner of a panel."""
     axes.annotate(
         text,
@@ -147,20 +139,15 @@ def note(axes: Axes, text: str, colour: str = COLOURS["muted"]) -> None:
         ha="right",
         va="bottom",
         fontsize=7.8,
-        color=colour,
+        color=COLOURS["muted"],
     )
 
 
 SIGMAS = 2.0
 
 
-class HistoryPanel(NamedTuple):
-    """One panel: values and their deviations (n, m), a curve for each of m names; nan: not known."""
-
-    title: str
-    names: tuple[str, ...]
-    values: Vector
-    std: Vector
+HistoryPanel = tuple[str, tuple[str, ...], Vector, Vector]
+"""A panel: title, names of m curves, their values and deviations (n, m); nan: not known."""
 
 
 def history_figure(dates: Sequence[str], panels: Sequence[HistoryPanel]) -> Drawing:
@@ -169,16 +156,16 @@ def history_figure(dates: Sequence[str], panels: Sequence[HistoryPanel]) -> Draw
     with style():
         figure = Figure(figsize=(7.2, 2.0 * len(panels)), layout="constrained")
         rows = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
-        for axes, panel in zip(rows, panels, strict=True):
-            for m, label in enumerate(panel.names):
+        for axes, (title, names, values, std) in zip(rows, panels, strict=True):
+            for m, label in enumerate(names):
                 colour = COLOURS[("joint1", "joint2", "beside")[m]]
                 axes.errorbar(
-                    at, panel.values[:, m], SIGMAS * panel.std[:, m], marker="o", ms=3, lw=1, capsize=2, color=colour,
+                    at, values[:, m], SIGMAS * std[:, m], marker="o", ms=3, lw=1, capsize=2, color=colour,
                     label=label,
                 )  # fmt: skip
-            axes.set_title(panel.title, loc="left")
+            axes.set_title(title, loc="left")
             axes.grid(color=COLOURS["grid"])
             axes.margins(x=0.02)
-            axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(panel.names))
+            axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(names))
         rows[-1].tick_params(axis="x", rotation=20)
     return Drawing("history", "What the arm's runs have certified", "Bars: two deviations.", figure)

@@ -295,7 +295,7 @@ def test_many_adaptations_are_summed_up():
 def test_of_many_stays_those_that_are_narrower_than_a_mark_are_drawn_together():
     stays = [(SchemeState.MONITOR, 3), (SchemeState.REACT, 1)] * 800 + [(SchemeState.MONITOR, 4000)]
     timeline = timeline_of(run := make_run(*stays), evaluate(run))
-    marks = [mark.title for mark in timeline.states]
+    marks = [mark.title for mark in timeline["states"]]
     assert 100 < len(marks) < 650  # 612 fit beside each other
     assert sum(int(mark.split()[0]) for mark in marks if "states" in mark) == 1600
     assert any(mark.startswith("watching, 3.20 to") for mark in marks)

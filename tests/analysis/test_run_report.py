@@ -19,7 +19,7 @@ from adacd_hil.device.value_bounds import ValueBound
 from adacd_hil.lab.report import run_page
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.report_files import write_report, write_run_report
-from adacd_hil.lab.report.report_json import report_json
+from adacd_hil.lab.report.report_json import JSON_NAME, report_json
 from adacd_hil.lab.report.report_tables import timing_tables
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
@@ -40,7 +40,7 @@ def report(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def table(report):
-    return json.loads(report.json_path.read_text(encoding="utf-8"))
+    return json.loads(report.html_path.with_name(JSON_NAME).read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
@@ -132,7 +132,7 @@ def test_the_table_says_what_happened(table, path, value):
 
 
 def test_the_table_in_the_file_is_the_reports(report, table):
-    assert table == report.as_json()
+    assert table == report.content
 
 
 def table_of(run):
@@ -336,9 +336,9 @@ def test_a_report_from_files_says_the_same_as_one_from_memory(tmp_path):
     record(tmp_path / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
     record_truth(tmp_path / "truth.mcap", run)
     report = write_report(tmp_path / "run.mcap", tmp_path / "truth.mcap", tmp_path / "a")
-    from_files = report.as_json()
-    assert report.metadata["emulator_seed"] == "7"
-    from_memory = write_run_report(run, tmp_path / "b", SOURCE).as_json()
+    from_files = report.content
+    assert from_files["run"]["emulator_seed"] == "7"
+    from_memory = write_run_report(run, tmp_path / "b", SOURCE).content
     assert without_cycle_times(from_files) == without_cycle_times(from_memory)
 
 

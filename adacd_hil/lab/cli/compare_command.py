@@ -1,5 +1,6 @@
 """`adacd-hil compare`: two logs beside each other."""
 
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -92,11 +93,8 @@ def contact_in_words(contact: "Contact | None") -> str:
 
 
 def _states(found: "LogComparison") -> list[tuple[str, str, str]]:
-    first, second = found.first.states, found.second.states
     rows = []
-    for index in range(max(len(first), len(second))):
-        a = first[index] if index < len(first) else None
-        b = second[index] if index < len(second) else None
+    for a, b in zip_longest(found.first.states, found.second.states):
         name = a[1] if a and b and a[1] == b[1] else f"{a[1] if a else '–'} / {b[1] if b else '–'}"
         rows.append((name, f"{a[0]:.3f} s" if a else "–", f"{b[0]:.3f} s" if b else "–"))
     return rows

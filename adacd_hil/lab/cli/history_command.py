@@ -1,7 +1,7 @@
 """`adacd-hil history`: the certificates of an arm's runs."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -49,13 +49,13 @@ def _as_png(found: "History") -> bytes:
     shown = found.certificates
     joints = tuple(f"joint {number}" for number in range(1, len(found.last.offset_Nm) + 1))
 
-    def panel(title: str, names: tuple[str, ...], values: str, std: str) -> HistoryPanel:
-        found, deviations = (np.array([getattr(each, name) for each in shown]) for name in (values, std))
-        return HistoryPanel(title, names, found, deviations)
+    def panel(title: str, names: tuple[str, ...], values: str, std: str, at: Any = slice(None)) -> HistoryPanel:
+        found, deviations = (np.array([getattr(each, name)[at] for each in shown]) for name in (values, std))
+        return title, names, found, deviations
 
-    friction = panel(f"Friction at {FRICTION_AT_RAD_S:g} rad/s, Nm", joints, "friction_Nm", "friction_std_Nm")
+    title = f"Friction at {FRICTION_AT_RAD_S:g} rad/s, Nm"
     panels = (
-        friction._replace(values=friction.values[:, FRICTION_AT], std=friction.std[:, FRICTION_AT]),
+        panel(title, joints, "friction_Nm", "friction_std_Nm", FRICTION_AT),
         panel("Inertia, kg m²", ("a1", "a2", "a3"), "inertia_kgm2", "inertia_std_kgm2"),
         panel("Torque offset, Nm", joints, "offset_Nm", "offset_std_Nm"),
     )

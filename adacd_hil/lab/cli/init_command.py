@@ -94,7 +94,7 @@ def init(
         from adacd_hil.lab.cli.demo_command import play
 
         report, code = play(str(out), "paper", None, None, "lockstep", None)
-        summary["rehearsal"] = report.as_json()
+        summary["rehearsal"] = report.content
         if not as_json:
             show(report.as_text())
     if doctor and bus is None:

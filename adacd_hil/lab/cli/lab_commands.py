@@ -84,7 +84,7 @@ def demo(
     from adacd_hil.lab.cli.demo_command import next_of_report, play
 
     report, code = play(config, scenario, profile, seed, clock, out, live, truth)
-    answer(as_json, report.as_json(), report.as_text(), *next_of_report(report.html_path))
+    answer(as_json, report.content, report.as_text(), *next_of_report(report.html_path))
     return code
 
 

@@ -89,7 +89,7 @@ def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWind
         progress(f"{number} of {len(runs)}: {run}")
         try:
             report = _report_one(run / LOG_NAME, out / name, stretch, progress)
-            listed = ListedRun(reported(run, name, report.as_json()), report.html_path)
+            listed = ListedRun(reported(run, name, report.content), report.html_path)
             entries.append((listed, report))
         except (LogError, ConfigError) as error:
             problem = one_line(error)
@@ -108,10 +108,10 @@ def as_json(reported: Sequence[Reported]) -> list[dict[str, Any]]:
     tables = []
     for each in reported:
         if isinstance(each, Report):
-            tables.append(each.as_json())
+            tables.append(each.content)
             continue
         for listed, report in each.entries:
-            table = {"problem": listed.problem} if report is None else report.as_json()
+            table = {"problem": listed.problem} if report is None else report.content
             tables.append({"folder": listed.run.name, **table})
     return tables
 

@@ -128,7 +128,7 @@ def runs(
             run_table.write_parquet(found, parquet_path)
         if html_path is not None:
             run_table.write_result(_page(found, html_path), html_path)
-    described = [{column.name: column.value(run) for column in run_table.COLUMNS} for run in found]
+    described = [run_table.values_of(run) for run in found]
     answer(as_json, {"folder": folder, "runs": described}, _as_text(found))
     return _code(found)
 

@@ -81,7 +81,7 @@ def sweep(
     A folder stands for every run.mcap below it. With the same folder again, a sweep computes only missing rows.
     """
     from adacd_hil.lab.tune.sweep import SweepStore, replay_task, run_sweep
-    from adacd_hil.lab.tune.workers import TLS, TlsFiles, connect
+    from adacd_hil.lab.tune.workers import NO_FILES, TLS, connect
     from adacd_hil.log.logged_run import SHOWN
 
     if bool(logs) == bool(scenarios):
@@ -89,13 +89,13 @@ def sweep(
     plan = _plan(logs, scenarios, seeds, vary, config, profile or "")
     work = replay_task if logs else simulate_task
     store = SweepStore(out)
-    tls = TlsFiles(tls_ca_file, tls_cert, tls_key)
+    tls = dict(zip(NO_FILES, (tls_ca_file, tls_cert, tls_key), strict=True))
     with Progress() as progress:
         progress(
             f"{counted(plan.size, 'row')}: {counted(len(plan.subjects), 'log' if logs else 'run')} × "
             f"{counted(len(plan.variants), 'setting')}"
         )
-        if scheduler and not scheduler.startswith(TLS) and not any(tls):
+        if scheduler and not scheduler.startswith(TLS) and not any(tls.values()):
             progress(
                 f"{scheduler} is open: it runs whatever anybody sends who reaches it; tls:// asks for a certificate"
             )

@@ -22,7 +22,7 @@ from adacd_hil.lab.report.timeline import stays_of
 from adacd_hil.lab.score.evaluation import RunGatherer, evaluate
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.lab.score.report_wording import number_text
-from adacd_hil.lab.score.run_arrays import Run, StretchOfRun, section_at
+from adacd_hil.lab.score.run_arrays import Run, section_at
 from adacd_hil.lab.score.verdict import headlines
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.log.logged_run import Progress
@@ -38,24 +38,18 @@ HTML_NAME: Final = "report.html"
 
 @dataclass(frozen=True)
 class Report:
-    """A report that has been written."""
+    """A report that has been written. content: of report.json."""
 
     metrics: Metrics
-    metadata: Mapping[str, str]
     source: ReportSource
+    content: dict[str, Any]
     html_path: Path
-    json_path: Path
     next_steps: tuple[NextStep, ...]
-    stretch: StretchOfRun | None = None
 
     @property
     def is_complete(self) -> bool:
         """Whether the log is whole and no record was dropped before it was written."""
         return self.source.is_complete
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the content of report.json as a dictionary."""
-        return report_json(self.metrics, self.metadata, self.source, self.stretch)
 
     def as_text(self) -> str:
         """Return the result of the run, the next steps and the path of the report, as text for a terminal."""
@@ -113,24 +107,16 @@ def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: Ru
     """
     metrics = evaluate(run, gathered)
     shown_run = run if has_paper(metrics) else dataclasses.replace(run, beside=None)
-    report = Report(
-        metrics=metrics,
-        metadata=run.metadata,
-        source=source,
-        html_path=out_dir / HTML_NAME,
-        json_path=out_dir / JSON_NAME,
-        next_steps=tuple(next_steps(metrics, run, source)[0]),
-        stretch=run.stretch,
-    )
-    table = json.dumps(report.as_json(), indent=2, ensure_ascii=False, allow_nan=False)
+    content = report_json(metrics, run.metadata, source, run.stretch)
     files: dict[str, bytes | str] = {
         **report_tables(run, metrics),
-        report.json_path.name: table + "\n",
-        report.html_path.name: report_page(metrics, shown_run, source),
+        JSON_NAME: json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n",
+        HTML_NAME: report_page(metrics, shown_run, source),
     }
     with failing_as(f"report in {out_dir} can't be written"):
         replace_files(out_dir, files)
-    return report
+    steps = tuple(next_steps(metrics, run, source)[0])
+    return Report(metrics, source, content, out_dir / HTML_NAME, steps)
 
 
 _PARAMETERS: Final = ("section", "parameter", "unit", "true", "identified", "std", "cad")

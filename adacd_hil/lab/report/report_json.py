@@ -6,7 +6,7 @@ It draws no figure, so that lists of runs read it quickly; the keys are describe
 from collections.abc import Mapping
 from typing import Any, Final
 
-from adacd_hil.lab.score.metrics import CertifiedEvidence, Metrics, ReportSource
+from adacd_hil.lab.score.metrics import Metrics, ReportSource
 from adacd_hil.lab.score.run_arrays import StretchOfRun
 from adacd_hil.plain_values import plain_values
 
@@ -20,6 +20,7 @@ def report_json(
     metrics: Metrics, metadata: Mapping[str, str], source: ReportSource, stretch: StretchOfRun | None = None
 ) -> dict[str, Any]:
     """Return the content of report.json; the keys are described in `adacd_hil.lab.score.metrics`."""
+    evidence = metrics.evidence
     fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
     plain: dict[str, Any] = plain_values(
         {
@@ -39,7 +40,7 @@ def report_json(
             "missed": metrics.missed,
             "parameters": metrics.parameters,
             "payload_kg": metrics.payload_kg,
-            "certified": None if metrics.evidence is None else _evidence_json(metrics.evidence),
+            "certified": evidence and {**vars(evidence), "smallest_margin": evidence.smallest_margin},
             "fault": fault,
             "cycle": metrics.cycle,
             "timing": metrics.timing.by_key(),
@@ -69,8 +70,3 @@ def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
         "asked_until_s": stretch.asked.end_s,
         "motion_start_s": stretch.motion_start_s,
     }
-
-
-def _evidence_json(evidence: CertifiedEvidence) -> dict[str, Any]:
-    """Return the evidence of the certified scheme; the keys are described in `adacd_hil.lab.score.margins`."""
-    return {**vars(evidence), "smallest_margin": evidence.smallest_margin}

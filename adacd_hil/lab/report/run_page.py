@@ -1,7 +1,6 @@
 """The page of a report, put together, and its cards of contacts."""
 
 import math
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -83,22 +82,11 @@ class Stroke(NamedTuple):
     kind: str
 
 
-@dataclass(frozen=True)
-class ArmDrawing:
-    """The picture's content. view: its left, top, width and height with y down; force: strokes of arrow and spread."""
+def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, description: str) -> dict[str, Any]:
+    """Return a drawing of the arm, for its template, at joint angles q, rad (2,), with the arrow of a push, if any.
 
-    description: str
-    view: tuple[float, float, float, float]
-    reach: float
-    links: tuple[Stroke, Stroke]
-    force: list[Stroke]
-    arrowhead: list[_Point]
-
-
-def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, description: str) -> ArmDrawing:
-    """Return a drawing of the arm at joint angles q, rad (2,), with the arrow of a push, None: without.
-
-    description: of the picture, in words.
+    description: of the picture, in words. view: left, top, width and height of the picture with y down; force: strokes
+    of arrow and spread; arrowhead: its corners.
     """
     angles = (float(q[0]), float(q[0] + q[1]))
     l1, l2 = (1000.0 * length for length in length_m)
@@ -115,7 +103,14 @@ def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, descri
     width, height = 1.5 * reach, 1.1 * reach
     left = 0.5 * (min(xs) + max(xs)) - 0.5 * width
     top = -0.5 * (min(ys) + max(ys)) - 0.5 * height
-    return ArmDrawing(description, (left, top, width, height), reach, (first, second), force, arrowhead)
+    return {
+        "description": description,
+        "view": (left, top, width, height),
+        "reach": reach,
+        "links": (first, second),
+        "force": force,
+        "arrowhead": arrowhead,
+    }
 
 
 def _along(start: _Point, angle: float, distance: float) -> _Point:
@@ -281,7 +276,7 @@ def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
     return entries
 
 
-def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> ArmDrawing | None:
+def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, Any] | None:
     """Return a drawing of the arm when a contact was found, or else began; None without measured positions."""
     if run.motion is None:
         return None

@@ -6,8 +6,7 @@ words.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -68,19 +67,6 @@ class Mark(NamedTuple):
     label: str = ""
 
 
-@dataclass(frozen=True)
-class Timeline:
-    """The content of each lane. ticks: place and label; is_thinned: stays narrower than a mark are drawn together."""
-
-    left: float
-    width: float
-    states: list[Mark]
-    contacts: list[Mark]
-    notices: list[Mark]
-    ticks: list[tuple[float, str]]
-    is_thinned: bool
-
-
 def stays_of(run: Run) -> list[Stay]:
     """Return the stretches of a run in one state each, in order of time."""
     if run.state.size == 0:
@@ -127,21 +113,24 @@ def state_key(run: Run) -> list[tuple[str, str]]:
     return [(colour, STATE_WORDS[state]) for state, colour in STATE_COLOURS.items() if state in there]
 
 
-def timeline_of(run: Run, metrics: Metrics) -> Timeline | None:
-    """Return the timeline of a run, with all marks placed; None for a run without cycles."""
+def timeline_of(run: Run, metrics: Metrics) -> dict[str, Any] | None:
+    """Return the timeline of a run, for its template, with the marks of each lane; None for a run without cycles.
+
+    ticks: place and label; is_thinned: stays narrower than a mark are drawn together.
+    """
     if run.state.size == 0:
         return None
     time_s, stays = run.time_s(), stays_of(run)
     scale = float(time_s[0]), max(float(time_s[-1]), float(time_s[0]) + 1e-3)
-    return Timeline(
-        left=_LEFT,
-        width=_RIGHT - _LEFT,
-        states=list(_state_marks(stays, scale)),
-        contacts=list(_contact_marks(metrics, scale)),
-        notices=list(_notice_marks(notices_of(run, metrics), scale)),
-        ticks=list(_ticks(scale)),
-        is_thinned=max(len(stays), len(metrics.contacts)) > MARKS,
-    )
+    return {
+        "left": _LEFT,
+        "width": _RIGHT - _LEFT,
+        "states": list(_state_marks(stays, scale)),
+        "contacts": list(_contact_marks(metrics, scale)),
+        "notices": list(_notice_marks(notices_of(run, metrics), scale)),
+        "ticks": list(_ticks(scale)),
+        "is_thinned": max(len(stays), len(metrics.contacts)) > MARKS,
+    }
 
 
 _Scale = tuple[float, float]

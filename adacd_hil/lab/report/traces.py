@@ -237,16 +237,6 @@ STEPS_PER_SIGMA: Final = 2.0
 _LARGEST_CODE: Final = 2**30
 
 
-class Packed(NamedTuple):
-    """A series as text: `low` and `step` in its unit, how often it was differenced, bytes per number."""
-
-    low: float
-    step: float
-    order: int
-    planes: int
-    text: str
-
-
 def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = None) -> float:
     """Return the step to round a series to: half the deviation of its white noise, but at least `finest`.
 
@@ -259,8 +249,12 @@ def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = N
     return max(finest, float(white_noise(*parts)) / STEPS_PER_SIGMA)
 
 
-def pack(values: Vector, step: float) -> Packed:
-    """Return a series (n,) as text, rounded to `step`, or coarser if its range has more than 2^30 steps."""
+def pack(values: Vector, step: float) -> tuple[str, dict[str, Any]]:
+    """Return a series (n,) as text, rounded to `step`, or coarser if its range has more than 2^30 steps.
+
+    Return with it what the page's script needs to read it: low and step in its unit, order: how often it was
+    differenced, planes: bytes per number.
+    """
     is_finite = np.isfinite(values)
     finite = values[is_finite]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
@@ -274,7 +268,8 @@ def pack(values: Vector, step: float) -> Packed:
     planes = numbers.astype("<u4").view(np.uint8).reshape(-1, 4).T[:count]
     squeezer = zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_RLE)  # only zeros repeat in noise
     squeezed = squeezer.compress(planes.tobytes()) + squeezer.flush()
-    return Packed(low, step, order + 1, count, b64encode(squeezed).decode("ascii"))
+    form = {"low": low, "step": step, "order": order + 1, "planes": count}
+    return b64encode(squeezed).decode("ascii"), form
 
 
 def _zigzag(numbers: NDArray[np.int32]) -> NDArray[np.uint32]:
@@ -334,6 +329,5 @@ def pack_tracks(
 
 
 def _packed(blocks: dict[str, str], name: str, values: Vector, step: float) -> dict[str, Any]:
-    packed = pack(values, step)
-    blocks[name] = packed.text
-    return {"id": name, "low": packed.low, "step": packed.step, "order": packed.order, "planes": packed.planes}
+    blocks[name], form = pack(values, step)
+    return {"id": name, **form}

@@ -36,12 +36,13 @@ Contact = tuple[float, ContactReport]
 class RunReader:
     """One of the logs: iterate once for its rows of /scheme; its figures are complete then.
 
-    states: entered, s since motion start; parameters: at each beginning of MONITOR, else at the end.
+    zero_cycle, zero_ns: of motion start. states: entered, s since then; parameters: at each beginning of MONITOR, else
+    at the end.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._zero = _motion_start(path)
+        self.zero_cycle, self.zero_ns = _motion_start(path)
         self._stream = LogStream(path, _TOPICS)
         self.settings = settings_of(path, self._stream.attachments)
         self.metadata = {key: value for key, value in self._stream.metadata.items() if key not in _NOT_METADATA}
@@ -51,16 +52,6 @@ class RunReader:
         self._contacts: list[Contact] = []
         self._times = {name: Distribution() for name in _TIMES}
         self._bounds: tuple[int, int] | None = None
-
-    @property
-    def zero_cycle(self) -> int:
-        """Cycle at motion start."""
-        return self._zero[0]
-
-    @property
-    def zero_ns(self) -> int:
-        """Motion start, ns of the run's clock."""
-        return self._zero[1]
 
     def only(self, first: int, end: int) -> None:
         """Limit the reading to the cycles from `first` to before `end`, counted since motion start."""
@@ -79,12 +70,11 @@ class RunReader:
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         """Yield the records of /scheme, piece by piece, and gather states, parameters, contacts and times."""
-        zero_ns = self.zero_ns
         for piece in self._stream:
             if self._is_over(piece.series[SCHEME.name]):
                 break
             scheme = self._wanted(piece.series[SCHEME.name])
-            t_s = (scheme.t_ns - zero_ns) * 1e-9
+            t_s = (scheme.t_ns - self.zero_ns) * 1e-9
             records = scheme.records
             self.cycles += len(records)
             for row in np.flatnonzero(records["state"] != records["previous_state"]).tolist():
@@ -94,7 +84,7 @@ class RunReader:
             if len(records):
                 last = records[-1].copy()
             contacts = self._wanted(piece.series[CONTACT.name])
-            times_s = ((contacts.t_ns - zero_ns) * 1e-9).tolist()
+            times_s = ((contacts.t_ns - self.zero_ns) * 1e-9).tolist()
             self._contacts = each_once((*self._contacts, *zip(times_s, _reports(contacts), strict=True)))
             cycles = self._wanted(piece.series[CYCLE.name])
             for name in _TIMES:

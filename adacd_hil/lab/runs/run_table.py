@@ -7,11 +7,11 @@ empty. Parquet's columns have fixed types, so that tables of several folders can
 import csv
 import fnmatch
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from adacd_hil.file_replacement import replace_files, replacing
 from adacd_hil.lab.logs.signal_tables import import_pyarrow
@@ -20,52 +20,36 @@ from adacd_hil.lab.score.report_wording import number_text, pair_text
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.score.wording import NONE, found_text
 
-
-class Column(NamedTuple):
-    """A column of the table: its value of a run, and its type in Parquet; `joints`: one for each joint."""
-
-    name: str
-    kind: str
-    value: Callable[[RunSummary], Any]
-    joints: bool = False
-
-
-def _pair_column(name: str) -> Column:
-    return Column(name, "float64", lambda run: getattr(run, name), joints=True)
-
-
-def _text_column(name: str) -> Column:
-    return Column(name, "string", lambda run: getattr(run, name) or None)
+_PAIR: Final = ("float64", "float64")
+COLUMNS: Final[Mapping[str, str | tuple[str, str]]] = {
+    **dict.fromkeys(("run", "log", "status", "verdict", "started", "started_by", "arm"), "string"),
+    **dict.fromkeys(("config", "profile", "scenario", "interface", "version"), "string"),
+    "duration_s": "float64",
+    "certificate": "string",
+    "certified_s": "float64",
+    "certificates": "int64",
+    "threshold_Nm": _PAIR,
+    "margin": "float64",
+    **dict.fromkeys(("found", "expected", "false_alarms"), "int64"),
+    **dict.fromkeys(("friction_Nm", "friction_std_Nm", "offset_Nm", "offset_std_Nm"), _PAIR),
+}
+"""The table's columns, each with its type in Parquet, or those of a value per joint."""
 
 
-def _certificate_column(name: str, kind: str, field: str) -> Column:
-    return Column(name, kind, lambda run: None if run.certificate is None else getattr(run.certificate, field))
+def values_of(run: RunSummary) -> dict[str, Any]:
+    """Return a run's values by column; None: not known."""
+    state, at_s, given = run.certificate or (None, None, None)
+    own = {
+        "run": run.name,
+        "log": str(run.log),
+        "started": None if run.started is None else run.started.isoformat(timespec="seconds"),
+        "certificate": state,
+        "certified_s": at_s,
+        "certificates": given,
+    }
+    values = {name: own[name] if name in own else getattr(run, name) for name in COLUMNS}
+    return {name: None if value == "" else value for name, value in values.items()}
 
-
-COLUMNS: Final = (
-    Column("run", "string", lambda run: run.name),
-    Column("log", "string", lambda run: str(run.log)),
-    _text_column("status"),
-    _text_column("verdict"),
-    Column("started", "string", lambda run: None if run.started is None else run.started.isoformat(timespec="seconds")),
-    _text_column("started_by"),
-    _text_column("arm"),
-    _text_column("config"),
-    _text_column("profile"),
-    _text_column("scenario"),
-    _text_column("interface"),
-    _text_column("version"),
-    Column("duration_s", "float64", lambda run: run.duration_s),
-    _certificate_column("certificate", "string", "state"),
-    _certificate_column("certified_s", "float64", "at_s"),
-    _certificate_column("certificates", "int64", "given"),
-    _pair_column("threshold_Nm"),
-    Column("margin", "float64", lambda run: run.margin),
-    Column("found", "int64", lambda run: run.found),
-    Column("expected", "int64", lambda run: run.expected),
-    Column("false_alarms", "int64", lambda run: run.false_alarms),
-    *(_pair_column(name) for name in ("friction_Nm", "friction_std_Nm", "offset_Nm", "offset_std_Nm")),
-)
 
 HEAD: Final = (
     "run", "started", "verdict", "certificate", "thresholds Nm", "margin", "contacts", "lasts s", "arm", "scenario",
@@ -152,35 +136,34 @@ def certificate_text(run: RunSummary) -> str:
     return f"{state}{when}" + (f", {given} in all" if given > 1 and state == CERTIFIED else "")
 
 
-def _flat(column: Column) -> list[str]:
-    """Return the name of a column in CSV and Parquet, or two names for a value per joint."""
-    if not column.joints:
-        return [column.name]
-    stem, unit = column.name.rsplit("_", 1)
-    return [f"{stem}_{joint}_{unit}" for joint in (1, 2)]
-
-
-def _values(column: Column, run: RunSummary) -> Sequence[Any]:
-    value = column.value(run)
-    return (value,) if not column.joints else (None, None) if value is None else value
+def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row by the columns of CSV and Parquet: a value per joint in two, `threshold_1_Nm`. row: by COLUMNS."""
+    flat: dict[str, Any] = {}
+    for name, value in row.items():
+        if isinstance(COLUMNS[name], str):
+            flat[name] = value
+            continue
+        stem, unit = name.rsplit("_", 1)
+        flat |= {f"{stem}_{joint}_{unit}": value and value[joint - 1] for joint in (1, 2)}
+    return flat
 
 
 def as_csv(runs: Sequence[RunSummary]) -> str:
     """Return the table of runs as CSV, with the head of COLUMNS."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow([name for column in COLUMNS for name in _flat(column)])
-    writer.writerows([[value for column in COLUMNS for value in _values(column, run)] for run in runs])
+    writer.writerow(_flat(COLUMNS))
+    writer.writerows(_flat(values_of(run)).values() for run in runs)
     return out.getvalue()
 
 
 def write_parquet(runs: Sequence[RunSummary], path: Path) -> None:
     """Write the table of runs as Parquet, in one step. Raises LogError without pyarrow, or if it can't be written."""
     arrow, parquet = import_pyarrow()
-    columns: Mapping[str, Any] = {
-        name: arrow.array([_values(column, run)[place] for run in runs], type=getattr(arrow, column.kind)())
-        for column in COLUMNS
-        for place, name in enumerate(_flat(column))
+    rows = [_flat(values_of(run)) for run in runs]
+    columns = {
+        name: arrow.array([row[name] for row in rows], type=getattr(arrow, kind)())
+        for name, kind in _flat(COLUMNS).items()
     }
     with failing_as(f"{path} can't be written"):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,12 +13,12 @@ import signal
 import ssl
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing import forkserver
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.extras import install_command
@@ -33,15 +33,9 @@ _PATIENCE_S = 2.0
 """Time for a process to end after SIGTERM; it may be in compiled code."""
 
 
-class TlsFiles(NamedTuple):
-    """Files in PEM format; Dask's configuration, `distributed.comm.tls`, gives those that are None."""
-
-    ca_file: Path | None = None
-    cert: Path | None = None
-    key: Path | None = None
-
-
-NO_FILES = TlsFiles()
+TlsFiles = Mapping[str, Path | None]
+"""Files in PEM format by Dask's names; Dask's configuration, `distributed.comm.tls`, gives those that are None."""
+NO_FILES: TlsFiles = dict.fromkeys(("tls_ca_file", "tls_client_cert", "tls_client_key"))
 
 
 @contextlib.contextmanager
@@ -171,7 +165,7 @@ def _security_of(scheduler: str, tls: TlsFiles) -> Any:
     from distributed.security import Security
 
     if not scheduler.startswith(TLS):
-        if any(tls):
+        if any(tls.values()):
             raise ConfigError(f"--tls-ca-file, --tls-cert and --tls-key are for {TLS} addresses, not {scheduler}")
         return None
     try:
@@ -193,12 +187,9 @@ def _security_of(scheduler: str, tls: TlsFiles) -> Any:
 
 def _given(tls: TlsFiles) -> dict[str, str | None]:
     """Return the given TLS files by Dask's names, to replace those of Dask's configuration. Raises ConfigError."""
-    if tls.key is not None and tls.cert is None:
+    if tls["tls_client_key"] is not None and tls["tls_client_cert"] is None:
         raise ConfigError("--tls-key needs --tls-cert, the certificate that it belongs to")
-    given: dict[str, str | None] = {}
-    if tls.ca_file is not None:
-        given["tls_ca_file"] = str(tls.ca_file)
-    if tls.cert is not None:  # with its own key, never with the configuration's
-        given["tls_client_cert"] = str(tls.cert)
-        given["tls_client_key"] = None if tls.key is None else str(tls.key)
+    given: dict[str, str | None] = {name: str(path) for name, path in tls.items() if path is not None}
+    if tls["tls_client_cert"] is not None:
+        given.setdefault("tls_client_key", None)  # with its own key, never with the configuration's
     return given
