@@ -109,20 +109,25 @@ class EdsVariable(NamedTuple):
 def read_eds(path: Path, node_id: int | None) -> Any:
     """Read the object dictionary of an EDS; `$NODEID` in it becomes `node_id`, None: that of a DCF. Raises ConfigError.
 
-    canopen drops values that it can't read as a number. An object without a default is not compared.
+    canopen drops values that it can't read as a number. An object without a default is not compared. Whoever reads the
+    same text again gets the same dictionary: don't change it.
     """
     try:
-        text = read_input(path).decode("utf-8", "replace").removeprefix("\ufeff")
-        _check_eds(text)
-        stream = io.StringIO(readable_eds(text))
-        stream.name = "object dictionary.eds"
-        return canopen.import_od(stream, node_id)
+        return _parse_eds(read_input(path).decode("utf-8", "replace").removeprefix("\ufeff"), node_id)
     except OSError as error:
         raise ConfigError(f"EDS {path}: {error.strerror}") from None
     except ConfigError as error:
         raise ConfigError(f"EDS {path}: {error}") from None
     except (*_UNFORESEEN, configparser.Error, RecursionError) as error:
         raise ConfigError(f"EDS {path}: {' '.join(str(error).split()) or repr(error)}") from None
+
+
+@functools.lru_cache(maxsize=32)
+def _parse_eds(text: str, node_id: int | None) -> Any:
+    _check_eds(text)
+    stream = io.StringIO(readable_eds(text))
+    stream.name = "object dictionary.eds"
+    return canopen.import_od(stream, node_id)
 
 
 def _check_eds(text: str) -> None:

@@ -447,10 +447,10 @@ class PlacedDevice:
         """The settings of its profile."""
         return self.profile.settings
 
-    @property
+    @functools.cached_property
     def objects(self) -> Any:
         """The object dictionary of its EDS. Raises ConfigError when it can't be read."""
-        return _objects(self.profile.eds.absolute(), self.node_id)
+        return read_eds(self.profile.eds, self.node_id)
 
     def has(self, index: int, sub: int = 0) -> bool:
         """Return whether the EDS lists an object. Raises ConfigError when the EDS can't be read."""
@@ -492,11 +492,6 @@ class PlacedDevice:
         if not pdo.data_ids:
             return []
         return [SignalSettings(object=text, signal="e2e") for text in self.settings.header]
-
-
-@functools.lru_cache(maxsize=32)
-def _objects(path: Path, node_id: int) -> Any:
-    return read_eds(path, node_id)
 
 
 def place_devices(settings: Settings) -> list[PlacedDevice]:

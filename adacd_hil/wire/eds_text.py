@@ -10,6 +10,7 @@ from collections.abc import Iterator
 _SECTION = re.compile(r"\s*\[([^\]]*)\]")
 _DEVICE_NAMES = ("vendorname", "productname", "ordercode")
 _DUMMIES = range(1, 8)
+_USED_DUMMY = re.compile(r"\s*Dummy(\d{4})\s*=\s*(0x0*)?1\s*(;.*)?", re.IGNORECASE)
 
 
 def readable_eds(text: str) -> str:
@@ -28,13 +29,10 @@ def _readable(lines: list[str]) -> Iterator[str]:
             if section != "comments":
                 yield line
             if section == "dummyusage":
-                yield from (f"Dummy{number:04d}={int(_has_dummy(lines, number))}" for number in _DUMMIES)
+                used = {int(dummy[1]) for line in lines if (dummy := _USED_DUMMY.fullmatch(line))}
+                yield from (f"Dummy{number:04d}={int(number in used)}" for number in _DUMMIES)
         elif section not in ("comments", "dummyusage") and (section != "deviceinfo" or _is_device_datum(line)):
             yield line
-
-
-def _has_dummy(lines: list[str], number: int) -> bool:
-    return any(re.fullmatch(rf"\s*Dummy{number:04d}\s*=\s*(0x0*)?1\s*(;.*)?", line, re.IGNORECASE) for line in lines)
 
 
 def _is_device_datum(line: str) -> bool:
