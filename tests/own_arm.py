@@ -118,7 +118,7 @@ def describe_geared_arm(folder: Path) -> list[str]:
 
 
 _ROW = "[[contacts]]\nat_s = {:.1f}\nlink = {}\npoint_m = {}\nangle_deg = {}\nforce_N = 20.0\nduration_s = 0.1\n"
-_TOUCHES = ((1, 0.3, 90.0), (1, 0.3, -90.0), (2, 0.2, 90.0), (2, 0.2, -90.0)) * 2
+_TOUCHES = ((1, 0.3, 90.0), (1, 0.3, -90.0), (2, 0.2, 90.0), (2, 0.2, -90.0))
 
 
 def touches(count: int) -> str:

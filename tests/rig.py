@@ -32,7 +32,7 @@ from firmware_sim.scenario.scenario import Scenario, load_scenario
 CODEC = load_codec()
 PERIOD_NS = 1_000_000
 ENABLED_CYCLE = 203  # in lockstep always the same
-TROUBLE_CYCLE = 1000
+TROUBLE_CYCLE = 450
 QUICK_STOP, DISABLE_VOLTAGE, ENABLE_OPERATION = 0x0002, 0x0000, 0x000F
 
 
