@@ -24,10 +24,10 @@ MOUNTINGS = {
 }
 START = "start_deg = [-20.0, 25.0]\n"
 TOUCHED = f"""
-lasts_s = 8.0
+lasts_s = 6.6
 {START}contacts = [
-    {{ at_s = 5.0, link = 1, point_m = 0.25, angle_deg = 90.0, force_N = 20.0, duration_s = 0.25 }},
-    {{ at_s = 6.5, link = 2, point_m = 0.20, angle_deg = -90.0, force_N = 15.0, duration_s = 0.25 }},
+    {{ at_s = 4.3, link = 1, point_m = 0.25, angle_deg = 90.0, force_N = 20.0, duration_s = 0.25 }},
+    {{ at_s = 5.5, link = 2, point_m = 0.20, angle_deg = -90.0, force_N = 15.0, duration_s = 0.25 }},
 ]
 """
 HEAVIER = "[factor]\nmass = [1.25, 0.8]\n"

@@ -3,7 +3,6 @@
 A run loads them once: a profile or EDS that is changed meanwhile counts from the next run on.
 """
 
-import functools
 from collections.abc import Callable, Mapping
 from importlib import resources
 from importlib.resources.abc import Traversable
@@ -115,11 +114,6 @@ def _placed(settings: Settings, profile_of: Callable[[str, int], DeviceProfile])
     for kind, nodes in (("drive", chosen.drive_node), ("sensor", chosen.sensor_node)):
         for joint in range(JOINTS):
             profile, node_id = profile_of(kind, joint), nodes[joint]
-            objects = _objects(profile.eds_bytes, profile.eds, node_id)
+            objects = parse_eds(profile.eds_bytes, profile.eds, node_id)
             devices.append(PlacedDevice(device_name(kind, joint), joint, node_id, profile, objects))
     return devices
-
-
-@functools.lru_cache(maxsize=32)
-def _objects(data: bytes, path: Path, node_id: int) -> Any:
-    return parse_eds(data, path, node_id)

@@ -1,6 +1,7 @@
 """EDS files: their content checked, and read by canopen as an object dictionary. Source: CiA 306."""
 
 import configparser
+import functools
 import io
 import re
 from pathlib import Path
@@ -45,19 +46,24 @@ def eds_bytes(path: Path) -> bytes:
 def parse_eds(data: bytes, path: Path, node_id: int | None) -> Any:
     """Return the object dictionary of an EDS; `$NODEID` in it becomes `node_id`, None: that of a DCF.
 
-    canopen drops values that it can't read as a number. An object without a default is not compared. `path`: names it
-    in errors. Raises ConfigError.
+    canopen drops values that it can't read as a number. An object without a default is not compared. Of the same data
+    the same dictionary is returned: don't change it. `path`: names it in errors. Raises ConfigError.
     """
     try:
-        text = data.decode("utf-8", "replace").removeprefix("\ufeff")
-        _check_eds(text)
-        stream = io.StringIO(readable_eds(text))
-        stream.name = "object dictionary.eds"
-        return canopen.import_od(stream, node_id)
+        return _parse(data, node_id)
     except ConfigError as error:
         raise ConfigError(f"EDS {path}: {error}") from None
     except (*UNFORESEEN, configparser.Error, RecursionError) as error:
         raise ConfigError(f"EDS {path}: {' '.join(str(error).split()) or repr(error)}") from None
+
+
+@functools.lru_cache(maxsize=32)
+def _parse(data: bytes, node_id: int | None) -> Any:
+    text = data.decode("utf-8", "replace").removeprefix("\ufeff")
+    _check_eds(text)
+    stream = io.StringIO(readable_eds(text))
+    stream.name = "object dictionary.eds"
+    return canopen.import_od(stream, node_id)
 
 
 def _check_eds(text: str) -> None:

@@ -187,10 +187,14 @@ def _compare_lengths(length: int, expected: int) -> None:
         refuse(Abort.TOO_LONG if length > expected else Abort.TOO_SHORT)
 
 
-@cache
 def read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
     """Return the objects of an EDS or DCF in any encoding; `node_id` replaces $NODEID. Cached: don't change it."""
-    stream = io.StringIO(readable_eds(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff")))
+    return _parse_eds(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff"), node_id)
+
+
+@cache
+def _parse_eds(text: str, node_id: int) -> canopen.ObjectDictionary:
+    stream = io.StringIO(readable_eds(text))
     stream.name = "object dictionary.eds"
     return canopen.import_od(stream, node_id)
 

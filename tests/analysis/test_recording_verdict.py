@@ -210,14 +210,11 @@ def test_a_passive_joint_is_told_from_a_dead_sensor(tmp_path):
     arm, period_s = read_urdf(text), 5e-3
     t_s = period_s * np.arange(1600)
 
-    def torque(q: np.ndarray, dq: np.ndarray, ddq: np.ndarray) -> np.ndarray:
-        return rigid_torque(arm, np.array([q, dq, ddq])[:, None])[0] + [0.4, 0.02] * dq
-
     def slope(state: np.ndarray, tau: float) -> np.ndarray:
         q, dq = state[:2], state[2:]
-        rest = torque(q, dq, np.zeros(2))
-        M = np.column_stack([torque(q, dq, unit) - rest for unit in np.eye(2)])
-        return np.concatenate([dq, np.linalg.solve(M, [tau - 6.0 * q[0] - 2.0 * dq[0], 0.0] - rest)])
+        rest, *columns = rigid_torque(arm, np.array([[q] * 3, [dq] * 3, [np.zeros(2), *np.eye(2)]]))
+        M, friction = np.column_stack([column - rest for column in columns]), [0.4, 0.02] * dq
+        return np.concatenate([dq, np.linalg.solve(M, [tau - 6.0 * q[0] - 2.0 * dq[0], 0.0] - rest - friction)])
 
     states, driven, state = [], [], np.array([0.1, 1.3, 0.0, 0.0])
     for tau in 6.0 * np.sin(1.3 * t_s) + 3.0 * np.sin(3.1 * t_s):

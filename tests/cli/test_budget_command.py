@@ -122,12 +122,12 @@ MANY = "".join(
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        (200 * ARM, "message Nmt is defined more than once"),
+        (40 * ARM, "message Nmt is defined more than once"),
         (ARM.replace(" Drive2Emcy:", " Drive1Emcy:"), "message Drive1Emcy is defined more than once"),
         (ARM.replace("BO_ 130 Drive2Emcy", "BO_ 129 Drive2Emcy"), "Drive1Emcy and Drive2Emcy have the same identifier"),
         (ARM + MANY, "1029 messages are more than 1000"),
     ],
-    ids=["200 times", "a name", "an identifier", "too many"],
+    ids=["40 times", "a name", "an identifier", "too many"],
 )
 def test_messages_that_are_defined_twice_or_too_many_are_one_line(text, line, tmp_path):
     path = tmp_path / "x.dbc"

@@ -22,15 +22,16 @@ def test_a_push_as_large_as_at_the_worst_moment_is_found_where_it_is_hardest_and
     pushes = PushGatherer(SETTINGS)
     pushes.add_residuals(untouched.y[armed], untouched.h[armed])
     within = round(WITHIN_S / PERIOD_S)
+    alone = pushed_by(untouched, armed[:-within])
     for joint, figures in enumerate(pushes.smallest_push().push_Nm):
         assert 0.02 < figures["p50"] < figures["p99"] < figures["max"] < 1.0
-        own = pushed_by(untouched, armed[:-within])[:, joint]
+        own = alone[:, joint]
         hard = armed[np.argsort(own)[:: -max(own.size // 2000, 1)][:8]]
 
         def is_found(at, torque_Nm, joint=joint):
-            tau_J = measured.tau_J.copy()
+            q, dq, tau_J = (each[: at + within + 1].copy() for each in (measured.q, measured.dq, measured.tau_J))
             tau_J[at:, joint] += torque_Nm
-            seen = play(Record(measured.q, measured.dq, tau_J)).observation[at : at + within + 1]
+            seen = play(Record(q, dq, tau_J)).observation[at:]
             return bool((seen.astype(int) & transitions.CONTACT).any())
 
         assert all(is_found(at, sign * figures["max"]) for at in hard for sign in (-1.0, 1.0))

@@ -33,13 +33,23 @@ def run_cantools(*commands: tuple[str, ...]) -> list[str]:
     return done.stdout.split("-- done\n")[: len(commands)]
 
 
+@pytest.fixture(scope="module")
+def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[Path, tuple[str, str, list[Path]]]:
+    """What it lists and dumps of each file, and what it has converted it to."""
+    folder, commands, converted = tmp_path_factory.mktemp("converted"), [], {}
+    for path in FILES:
+        converted[path] = [folder / f"{path.stem}.{form}" for form in ("dbc", "kcd", "sym")]
+        commands += [("list", str(path)), ("dump", str(path))]
+        commands += [("convert", str(path), str(target)) for target in converted[path]]
+    said = run_cantools(*commands)
+    return {path: (said[5 * n], said[5 * n + 1], converted[path]) for n, path in enumerate(FILES)}
+
+
 @pytest.mark.slow
 @EVERY_FILE
-def test_cantools_lists_dumps_and_converts_the_file(path: Path, tmp_path: Path) -> None:
+def test_cantools_lists_dumps_and_converts_the_file(path: Path, seen: dict[Path, tuple[str, str, list[Path]]]) -> None:
     ours = load_codec(path)
-    converted = [tmp_path / f"converted.{form}" for form in ("dbc", "kcd", "sym")]
-    convert = [("convert", str(path), str(target)) for target in converted]
-    listed, dumped, *_ = run_cantools(("list", str(path)), ("dump", str(path)), *convert)
+    listed, dumped, converted = seen[path]
     assert sorted(listed.split()) == sorted(ours.messages)
     for message in ours.messages.values():
         assert message.name in dumped
