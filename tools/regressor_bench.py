@@ -18,7 +18,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.lab.serial_arm import chain, offline
 from adacd_hil.lab.serial_arm.urdf import read_urdf
 from adacd_hil.scheme.identify import estimator
-from adacd_hil.scheme.model import filter_bank, regressor
+from adacd_hil.scheme.model import regressor, torque_filter
 
 ROOT = Path(__file__).resolve().parent.parent
 BLOCK, BLOCKS = 100, 300
@@ -45,7 +45,7 @@ def by_chain(arm, place, first_friction, q, dq, scratch, Y_p, Y_h):
 def filtered(count, hold, cutoff, Y_p, Y_h, input_old, S, W_f):
     """Filter the regressor `count` times."""
     for _ in range(count):
-        filter_bank.advance_regressor(hold, cutoff, cutoff, Y_p, Y_h, input_old, S, W_f)
+        torque_filter.advance_regressor(hold, cutoff, cutoff, Y_p, Y_h, input_old, S, W_f)
 
 
 @compiled
@@ -78,7 +78,7 @@ def show(name: str, block: Callable[[], object], steps: int) -> None:
 def show_rest(named: str, Y_p: np.ndarray, Y_h: np.ndarray) -> None:
     """Print what follows the regressor: one filter, the uncertainty, one correction."""
     n, p = Y_p.shape
-    hold = filter_bank.first_order_hold(CUTOFF_RAD_S, CUTOFF_RAD_S, PERIOD_S)
+    hold = torque_filter.first_order_hold(CUTOFF_RAD_S, CUTOFF_RAD_S, PERIOD_S)
     input_old, S, W_f, WP = (np.zeros((n, p)) for _ in range(4))
     P, noise = np.eye(p), np.full(n, 0.02)
     show(f"{named}: one filter of it", lambda: filtered(BLOCK, hold, CUTOFF_RAD_S, Y_p, Y_h, input_old, S, W_f), BLOCK)

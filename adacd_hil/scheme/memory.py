@@ -118,7 +118,7 @@ class Ring:
 class Motion:
     """Ranges of position and velocity of the joints in a fit, and the information from them.
 
-    Written by `termination`.
+    Written by `excitation`.
     """
 
     q_low: PerJoint

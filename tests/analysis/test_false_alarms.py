@@ -22,7 +22,7 @@ from adacd_hil.lab.thresholds.false_alarms import (
     largest_ratio,
     peak_factor,
 )
-from adacd_hil.scheme.detect.margin import MarginWatch
+from adacd_hil.scheme.detect.margin_watch import MarginWatch
 
 T = 1e-3
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adacd_hil.records import ContactKind
-from adacd_hil.scheme.contact.contact_report import classify, share_left
+from adacd_hil.scheme.contact.contact_kind import classify, share_left
 from adacd_hil.settings.scheme_settings import KIND_S
 
 SIGMA = np.array([0.03, 0.015])

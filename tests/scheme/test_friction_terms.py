@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adacd_hil.scheme.model.regressor import (
+from adacd_hil.scheme.model.further_friction import (
     ASYMMETRIC,
     DAHL_LONG,
     DAHL_SHORT,

@@ -11,7 +11,7 @@ from planar_arm import THETA
 from adacd_hil.records import CERTIFICATE_EVENTS, POSITION_TERMS, Request, SchemeState
 from adacd_hil.scheme.identify import missing_torque
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
-from adacd_hil.scheme.model import filter_bank, regressor
+from adacd_hil.scheme.model import filter_bank, torque_by_place
 from adacd_hil.settings.configuration_files import load_settings
 
 TOLD = replace(FREE, arm=replace(FREE.arm, position_torque_Nm=0.15))
@@ -43,9 +43,9 @@ def learnt(settings, measured):
 
 
 def test_columns_are_those_of_a_tilted_base_and_of_cables():
-    X = np.zeros((2, regressor.PLACE_TERMS))
+    X = np.zeros((2, torque_by_place.PLACE_TERMS))
     q = np.array((0.4, -1.1))
-    regressor.fill_position(q, X)
+    torque_by_place.fill_position(q, X)
     for i in range(2):
         expected = np.sin(q[i]), np.cos(q[i]), np.sin(2 * q[i]), np.cos(2 * q[i]), np.sin(q.sum()), np.cos(q.sum())
         assert X[i] == pytest.approx(expected, abs=1e-15)
@@ -57,7 +57,7 @@ def test_the_evidence_filters_its_columns_as_the_model_would():
     first = names.index(f"{POSITION_TERMS[0]}1")
     assert names[first:] == tuple(f"{term}{joint}" for term in POSITION_TERMS for joint in (1, 2))
     W_f = memory[0].filters.W_f[filter_bank.LEARNT]
-    for term in range(regressor.PLACE_TERMS):
+    for term in range(torque_by_place.PLACE_TERMS):
         for joint in range(2):
             in_model = W_f[joint, first + 2 * term + joint]
             assert memory[0].missing_torque.X_f[joint, term] == pytest.approx(in_model, abs=1e-12)

@@ -6,7 +6,7 @@ from planar_arm import PAYLOAD_1KG, THETA
 from smooth_motion import PLACES, run_kernel, settings_with, smooth_motion, torque_of
 
 from adacd_hil.scheme.kernel import paper_kernel
-from adacd_hil.scheme.model.filter_bank import first_order_hold
+from adacd_hil.scheme.model.torque_filter import first_order_hold
 
 T = 1e-3
 LEFT_NM = 1e-5

@@ -7,7 +7,7 @@ import pytest
 import scipy.signal
 from excited_arm import NAMES, SETTINGS, Kernel
 
-from adacd_hil.scheme.detect import margin, sensitivity
+from adacd_hil.scheme.detect import margin, margin_watch, sensitivity
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.supervisor import transitions
 
@@ -207,7 +207,7 @@ def test_what_of_a_touch_was_seen_before_it_was_flagged_raises_no_threshold():
 
 
 def test_a_margin_that_shrinks_is_named_against_what_it_was_once_the_watch_had_settled():
-    watch = margin.MarginWatch(2, memory_blocks=5.0)
+    watch = margin_watch.MarginWatch(2, memory_blocks=5.0)
     for _ in range(10):
         watch.add_block(np.array([0.4, 0.4]))
         assert watch.warning == ""

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from adacd_hil.scheme.identify.termination import add_information, eigenvalue_range, has_moved, is_quiet
+from adacd_hil.scheme.identify.excitation import add_information, eigenvalue_range, has_moved
+from adacd_hil.scheme.identify.termination import is_quiet
 from adacd_hil.scheme.memory import Motion
 from adacd_hil.structured import zeros_of
 

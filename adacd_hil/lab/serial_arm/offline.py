@@ -48,7 +48,7 @@ from adacd_hil.lab.serial_arm.chain import BaseParameters, Chain, Indices, Scrat
 from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.identify import estimator
-from adacd_hil.scheme.model import filter_bank
+from adacd_hil.scheme.model import torque_filter
 from adacd_hil.settings.schema import setting
 
 _PARTS = 12
@@ -424,7 +424,7 @@ def _noise_gains(cutoff_rad_s: float, settings: OfflineSettings, is_smoothed: bo
     Torque: y_1 = F u. Velocity: y_1 = a (u - F u). Behind both, where smoothed, a low-pass of the same cut-off. With
     V = A V A' + B B' the variance of y is C V C' + D², its covariance over j samples C A^(j - 1) (A V C' + B D).
     """
-    hold = filter_bank.first_order_hold(cutoff_rad_s, cutoff_rad_s, settings.period_s)
+    hold = torque_filter.first_order_hold(cutoff_rad_s, cutoff_rad_s, settings.period_s)
     kept = hold.decay if is_smoothed else 0.0
     gains: list[float] = []
     R = 1.0
@@ -468,7 +468,7 @@ def _trace(
         )
     is_smoothed = theta_M is not None
     cutoff_rad_s = settings.fit_cutoff_rad_s if is_smoothed else settings.detection_cutoff_rad_s
-    hold = filter_bank.first_order_hold(cutoff_rad_s, cutoff_rad_s, settings.period_s)
+    hold = torque_filter.first_order_hold(cutoff_rad_s, cutoff_rad_s, settings.period_s)
     gains = _noise_gains(cutoff_rad_s, settings, is_smoothed)
     memory = _new_memory(n, estimate.theta.size)
     memory.Y_h[:, model.place_of("offset")] = np.eye(n)
@@ -514,7 +514,7 @@ def _run(
     q: Vector,
     dq: Vector,
     tau_J: Vector,
-    hold: filter_bank.FirstOrderHold,
+    hold: torque_filter.FirstOrderHold,
     cutoff_rad_s: float,
     smoothing: float,
     noise_Nm: Vector,
@@ -549,10 +549,10 @@ def _run(
         chain.fill_friction(dq[k], friction_column, m.Y_h)
         _fill_rotors(dq[k], rotor_column, m.Y_p)
         if k == 0:
-            filter_bank.resume(a, a, m.Y_p, m.Y_h, tau_J[k], m.input_old, m.tau_old, m.S, m.W_f)
+            torque_filter.resume(a, a, m.Y_p, m.Y_h, tau_J[k], m.input_old, m.tau_old, m.S, m.W_f)
         else:
-            filter_bank.advance_torque(hold, m.tau_old, tau_J[k], m.tau_f)
-            filter_bank.advance_regressor(hold, a, a, m.Y_p, m.Y_h, m.input_old, m.S, m.W_f)
+            torque_filter.advance_torque(hold, m.tau_old, tau_J[k], m.tau_f)
+            torque_filter.advance_regressor(hold, a, a, m.Y_p, m.Y_h, m.input_old, m.S, m.W_f)
         _smooth(smoothing, m)
         external_torque.follow_standstill(dq[k], standstill_rad_s, hold.decay, m.standstill)
         external_torque.predict(m.W, theta, m.tau_f_hat)

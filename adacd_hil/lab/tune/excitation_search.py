@@ -28,8 +28,8 @@ from adacd_hil.compiled import compiled
 from adacd_hil.control.motions import TOLERANCE
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.kernel.certified_memory import constants_of
-from adacd_hil.scheme.model.filter_bank import first_order_hold
 from adacd_hil.scheme.model.regressor import F_C1, F_C2, regressor
+from adacd_hil.scheme.model.torque_filter import first_order_hold
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.run_settings import ExcitationSettings
 from adacd_hil.settings.schema import ConfigError

@@ -9,16 +9,6 @@ exceeds two bounds: chance noise, and the trace that a blow on link 1 leaves in 
 
 Each cycle writes only one row; the rest runs three times in a contact.
 
-**Kind.** Push or hit: by the share of the torque that remains 100 ms after the detection.
-
-A hit is over by then: after a blow of 100 ms at most a seventh of its largest torque remains, and after a body is
-pushed away no torque remains. A push still grows or lasts. The remaining torque is measured in standard deviations of
-the joints, so that the more certain joint weighs more.
-
-A hand that grasps a moving arm stops it and then guides it; the kind follows from the torque that remains when the arm
-has stopped. A clamped body is a hit if it springs back, a push if it stays under load: transient and quasi-static
-contact of ISO/TS 15066.
-
 **The paper's scheme** (`integrated_report`). Link 2 if joint 2 is over its threshold at any time until the isolation
 window ends, else link 1. At the alarm the answer is often too early: joint 1 has the longer arm and crosses first. The
 report is given at once and becomes final when the window ends.
@@ -31,6 +21,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, ContactKind, ContactLevel, ContactReport, Reaction, Vector
 from adacd_hil.scheme.contact import localisation
+from adacd_hil.scheme.contact.contact_kind import classify
 from adacd_hil.scheme.contact.course import CourseMemory
 from adacd_hil.scheme.detect.external_torque import ONSET_FRACTION
 from adacd_hil.settings.configuration import Settings
@@ -201,36 +192,3 @@ def _link(rows: Vector) -> int:
 
 def _pair(values: Vector) -> tuple[float, float]:
     return float(values[0]), float(values[1])
-
-
-END_S = 0.01
-"""The remaining torque is the mean over this time at the end of the window."""
-LEFT = 0.18
-"""A push retains at least this part of its largest torque. Of 600 random contacts of 5 to 60 N the 299 half-sines of 20
-to 100 ms left at most 0.142, the 301 pushes that rise in 0.2 to 1 s at least 0.239."""
-
-
-def classify(tau_ext_wide_hat: Vector, sigma: Vector, period_s: float) -> ContactKind:
-    """Return PUSH if at least LEFT of the largest torque remains at the end of the samples, else HIT.
-
-    tau_ext_wide_hat: external torque (n, 2), Nm, with the filter undone, from the contact's beginning to the end of
-    its window; sigma: its standard deviation (2,), Nm.
-    """
-    share = share_left(tau_ext_wide_hat, sigma, max(1, round(END_S / period_s)))
-    return ContactKind.PUSH if share >= LEFT else ContactKind.HIT
-
-
-@compiled
-def share_left(tau: Vector, sigma: Vector, end_samples: int) -> float:
-    """Return the ratio of the mean torque of the last `end_samples` to the largest torque; 0 without any torque.
-
-    tau (n, 2), sigma (2,): the joints' torques are added in units of their standard deviations.
-    """
-    count = tau.shape[0]
-    largest = 0.0
-    for k in range(count):
-        largest = max(largest, (tau[k, 0] / sigma[0]) ** 2 + (tau[k, 1] / sigma[1]) ** 2)
-    left = 0.0
-    for i in range(2):
-        left += (np.mean(tau[max(count - end_samples, 0) :, i]) / sigma[i]) ** 2
-    return float(np.sqrt(left / largest)) if largest > 0.0 else 0.0

@@ -31,17 +31,12 @@ worst of that test. A mean of more than LESS times that is a warning. BLIND_S of
 
 Shapes: C filters, n joints; y, h (2 C - 1, n); shown (2 C - 1,): g; seen (bins, n): cycles by threshold in force;
 seen_worst_Nm, seen_push_Nm, sum_push_Nm, sum_cycles, mean_push_Nm, dim_s (n,). Units: Nm.
-
-**Watch.** The margin of a running detector: how far the residuals of contact-free motion stay below their thresholds.
-
-Source of the law of block maxima: E. J. Gumbel, "Statistics of Extremes", 1958.
 """
 
 import math
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
@@ -50,78 +45,6 @@ from adacd_hil.scheme.detect.sensitivity import AGREES, MOVING
 from adacd_hil.scheme.memory import Constants, MarginConstants, Memory
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.settings.configuration import Settings
-
-
-class MarginWatch:
-    """Monitors the distance of contact-free peaks from the thresholds during a run.
-
-    Each block, of a second for instance, gives the largest ratio of statistic to threshold per joint. The margin is one
-    over the largest ratio to be expected within the horizon, by a Gumbel law for block maxima whose mean and deviation
-    follow the last blocks; bounded tails stay below it.
-    """
-
-    def __init__(
-        self, joints: int, horizon_blocks: float = 3600.0, memory_blocks: float = 300.0, warn_share: float = 0.75
-    ) -> None:
-        """Begin without blocks and without a reference.
-
-        horizon_blocks: blocks over which the largest peak is expected: 3600 blocks of 1 s are an hour.
-        memory_blocks: memory of the mean and the deviation, and number of blocks after which the reference is set.
-        warn_share: part of the reference below which `warning` reports a margin.
-        """
-        self._forget = 1.0 / memory_blocks
-        self._horizon = math.log(horizon_blocks)
-        self._warn_share = warn_share
-        self._mean = np.zeros(joints)
-        self._square = np.zeros(joints)
-        self._blocks = 0
-        self._settled = round(memory_blocks)
-        self.reference: Vector | None = None
-        """Margin per joint (n,) when the watch had settled; None until then."""
-
-    def add_block(self, ratio: Vector) -> None:
-        """Add each joint's largest ratio (n,) of statistic to threshold in a contact-free block; ignore NaN and inf.
-
-        Set `reference` at block number `memory_blocks`.
-        """
-        if not np.isfinite(ratio).all():
-            return
-        self._blocks += 1
-        share = max(self._forget, 1.0 / self._blocks)
-        self._mean += share * (ratio - self._mean)
-        self._square += share * (ratio * ratio - self._square)
-        if self._blocks == self._settled:
-            self.reference = self.margin
-
-    def forget(self) -> None:
-        """Drop all blocks and the reference, as after a change of the model or the thresholds."""
-        self._blocks = 0
-        self.reference = None
-
-    @property
-    def margin(self) -> Vector:
-        """Threshold over expected peak of each joint (n,); infinite before the first block."""
-        if self._blocks == 0:
-            return np.full(self._mean.shape, np.inf)
-        scale = np.sqrt(np.maximum(self._square - self._mean**2, 0.0)) * math.sqrt(6.0) / math.pi
-        # mode of the largest in the horizon: mean - Euler's constant * scale + ln(horizon) * scale
-        expected = self._mean + (self._horizon - 0.5772156649015329) * scale
-        return np.asarray(1.0 / np.maximum(expected, 1e-9))
-
-    @property
-    def warning(self) -> str:
-        """Return the joints whose margin has shrunk below `warn_share` of the reference, as text; "" without one.
-
-        Such as `joint 1: margin 1.4 x, was 2.1 x`.
-        """
-        if self.reference is None:
-            return ""
-        margin = self.margin
-        shrunk: NDArray[np.bool_] = margin < self._warn_share * self.reference
-        return "; ".join(
-            f"joint {i + 1}: margin {margin[i]:.1f} x, was {self.reference[i]:.1f} x" for i in np.flatnonzero(shrunk)
-        )
-
 
 HOUR_S = 3600.0
 RATE_HZ = 1.0 / HOUR_S

@@ -45,7 +45,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.memory import Constants, Memory, NoiseConstants
-from adacd_hil.scheme.model import filter_bank, regressor
+from adacd_hil.scheme.model import filter_bank, further_friction, regressor
 from adacd_hil.settings.scheme_settings import CertifiedSettings
 
 SECOND_DIFFERENCE = 0.36
@@ -329,10 +329,10 @@ def _static_friction(k: Constants, m: Memory, joint: int, load_Nm: float) -> flo
     further = 0.0
     for position in range(k.terms.shape[0]):
         term = int(k.first_term) + position * m.filters.r.shape[1] + joint
-        if k.terms[position] == regressor.STRIBECK:
+        if k.terms[position] == further_friction.STRIBECK:
             open_Nm = min(np.sqrt(max(m.models.P[term, term], 0.0)), STATIC_SHARE * total)
             further += max(m.models.theta[term], 0.0) + open_Nm
-        elif k.terms[position] == regressor.LOAD:
+        elif k.terms[position] == further_friction.LOAD:
             further += max(m.models.theta[term], 0.0) * abs(load_Nm)
     return float(total + further)
 

@@ -33,7 +33,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.memory import Constants, Memory, TermConstants
 from adacd_hil.scheme.model import filter_bank
-from adacd_hil.scheme.model.regressor import PLACE_TERMS
+from adacd_hil.scheme.model.torque_by_place import PLACE_TERMS
 from adacd_hil.settings.configuration import Settings
 
 EXPECTED_NM = 0.06
@@ -80,7 +80,7 @@ def rest(m: Memory) -> None:
 def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
     """Advance the columns X (n, PLACE_TERMS) over one period behind the learnt filter; after a gap the filter resumes.
 
-    rates (3,): the filter's coefficients for one period, see `filter_bank.FirstOrderHold`; smoothing: of the pole
+    rates (3,): the filter's coefficients for one period, see `torque_filter.FirstOrderHold`; smoothing: of the pole
     behind it.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]

@@ -2,18 +2,9 @@
 
 Eq. (15): |tau_ext_hat| <= beta on every joint for T without a break. The paper's t0 is the time of the last violation;
 counted from the start of the adaptation, a start from theta_hat = 0 could never end. An arm that stands still fulfils
-it with any parameters, so three things must have been seen since the adaptation began:
+it with any parameters, so the motion since the adaptation began counts, too (`excitation`).
 
-- each joint has travelled far enough;
-- each joint has moved fast enough in both directions, which shows both signs of its Coulomb friction;
-- no combination of parameters stayed hidden. The information matrix sum T W_f' W_f is scaled by a parameter error of
-  each kind (`TerminationSettings.excitation_scale`): D I D with D = diag(scale). Its smallest eigenvalue is the least
-  energy, in (filtered Nm)² s, with which an error of that size has shown in the residual, whatever its direction. The
-  scale is not P(0): with a gain a hundred times as high, the evidence must not become a hundred times as easy.
-  The paper's motion, as printed or synchronous, reaches 6.7e-4 to 7.9e-4 in 5.2 s on the profiles P, S and M; the
-  default of 2e-4 is a third of that, and is passed only after joint 1 has gone back and forth once.
-
-Shapes: tau_ext_hat, q, dq (2,); W_f (2, p); information (p, p).
+Shapes: tau_ext_hat, q, dq (2,); W_f (2, p).
 
 **The certified scheme.** The evidence that completes a fit, its missing parts, and the test that makes it a
 certificate.
@@ -21,8 +12,8 @@ certificate.
 A fit is complete after its shortest time when
 
 - each joint has travelled and moved in both directions far and fast enough (a payload leaves friction as it was);
-- no combination of parameters stayed hidden: smallest eigenvalue and condition number of D (∫ W_f' W_f) D, see
-  above; with a payload, earlier knowledge counts too, so only the next point is required;
+- no combination of parameters stayed hidden: smallest eigenvalue and condition number of
+  D (∫ W_f' W_f) D; with a payload, earlier knowledge counts too, so only the next point is required;
 - each parameter is known: the standard deviation that the belief gives it is small enough;
 - the inertia is positive definite at every q.
 
@@ -33,25 +24,9 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
-from adacd_hil.scheme.memory import Constants, Memory, Motion
+from adacd_hil.scheme.identify.excitation import begin, begin_speeds, eigenvalue_range, gather, has_moved, widen
+from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model.regressor import is_positive_definite
-
-EXCITATION_EVERY = 64
-"""Samples between two looks at the smallest eigenvalue: it takes 4 µs, the rest of a step less than 1 µs."""
-
-_SWEEPS = 12
-"""Most sweeps of Jacobi's method. Convergence is quadratic; 6 sweeps reach rounding for 9 x 9."""
-
-
-@compiled
-def begin(motion: Motion) -> None:
-    """Clear the ranges of the joints' position and velocity, the information matrix, and the count of samples."""
-    motion.samples = 0.0
-    motion.q_low[:] = np.inf
-    motion.q_high[:] = -np.inf
-    motion.dq_low[:] = np.inf
-    motion.dq_high[:] = -np.inf
-    motion.information[:] = 0.0
 
 
 @compiled
@@ -61,97 +36,6 @@ def is_quiet(tau_ext_hat: Vector, beta_Nm: float) -> bool:
     for i in range(tau_ext_hat.shape[0]):
         is_within = is_within and abs(tau_ext_hat[i]) <= beta_Nm
     return is_within
-
-
-@compiled
-def widen(value: Vector, low: Vector, high: Vector) -> None:
-    """Widen the range low .. high (2,) in place so that it holds `value` (2,)."""
-    for i in range(value.shape[0]):
-        low[i] = min(low[i], value[i])
-        high[i] = max(high[i], value[i])
-
-
-@compiled
-def has_moved(motion: Motion, travel_rad: float, velocity_rad_s: float) -> bool:
-    """Return whether each joint's range is at least `travel_rad`, and its speed at least `velocity_rad_s` both ways."""
-    for i in range(motion.q_low.shape[0]):
-        if not (motion.q_high[i] - motion.q_low[i] >= travel_rad):
-            return False
-        if not (motion.dq_high[i] >= velocity_rad_s and motion.dq_low[i] <= -velocity_rad_s):
-            return False
-    return True
-
-
-@compiled
-def add_information(W_f: Vector, period_s: float, information: Vector) -> None:
-    """Add T W_f' W_f to the lower triangle of `information` (p, p) in place."""
-    for j in range(W_f.shape[1]):
-        for k in range(j + 1):
-            for i in range(W_f.shape[0]):
-                information[j, k] += period_s * W_f[i, j] * W_f[i, k]
-
-
-@compiled
-def gather(motion: Motion, q: Vector, dq: Vector, W_f: Vector, period_s: float) -> bool:
-    """Add a sample to the ranges of motion and the information matrix; return True every EXCITATION_EVERY samples."""
-    widen(q, motion.q_low, motion.q_high)
-    widen(dq, motion.dq_low, motion.dq_high)
-    add_information(W_f, period_s, motion.information)
-    motion.samples += 1.0
-    return bool(motion.samples % EXCITATION_EVERY == 0.0)
-
-
-@compiled
-def eigenvalue_range(information: Vector, scale: Vector, scratch: Vector) -> tuple[float, float]:
-    """Return the smallest and the largest eigenvalue of D I D, D = diag(scale), from the lower triangle of I (p, p).
-
-    By Jacobi's cyclic rotations on `scratch` (p, p): the same bits on every machine, which LAPACK does not promise.
-    """
-    count = scale.shape[0]
-    trace = 0.0
-    for j in range(count):
-        for k in range(j + 1):
-            scratch[j, k] = scale[j] * information[j, k] * scale[k]
-            scratch[k, j] = scratch[j, k]
-        trace += scratch[j, j]
-    for _ in range(_SWEEPS):
-        off_diagonal = 0.0
-        for j in range(count):
-            for k in range(j):
-                off_diagonal = max(off_diagonal, abs(scratch[j, k]))
-        if off_diagonal <= 1e-15 * trace:
-            break
-        for j in range(count):
-            for k in range(j):
-                _rotate(scratch, j, k)
-    smallest: float = scratch[0, 0]
-    largest: float = scratch[0, 0]
-    for j in range(1, count):
-        smallest = min(smallest, scratch[j, j])
-        largest = max(largest, scratch[j, j])
-    return max(smallest, 0.0), max(largest, 0.0)
-
-
-@compiled
-def _rotate(matrix: Vector, j: int, k: int) -> None:
-    """Rotate the symmetric `matrix` in place in the plane of axes j and k so that its element (j, k) becomes zero."""
-    if matrix[j, k] == 0.0:
-        return
-    half_difference = 0.5 * (matrix[k, k] - matrix[j, j])
-    ratio = half_difference / matrix[j, k]
-    tangent = 1.0 / (abs(ratio) + np.sqrt(1.0 + ratio * ratio))
-    if ratio < 0.0:
-        tangent = -tangent
-    cosine = 1.0 / np.sqrt(1.0 + tangent * tangent)
-    sine = tangent * cosine
-    for i in range(matrix.shape[0]):
-        at_j, at_k = matrix[i, j], matrix[i, k]
-        matrix[i, j] = cosine * at_j - sine * at_k
-        matrix[i, k] = sine * at_j + cosine * at_k
-    for i in range(matrix.shape[0]):
-        at_j, at_k = matrix[j, i], matrix[k, i]
-        matrix[j, i] = cosine * at_j - sine * at_k
-        matrix[k, i] = sine * at_j + cosine * at_k
 
 
 @compiled
@@ -180,8 +64,7 @@ def begin_test(k: Constants, m: Memory, square: float) -> None:
     """
     m.fit.tested = 0.0
     m.fit.test_limit_Nm = test_limit_Nm(k, square)
-    m.motion.dq_low[:] = np.inf
-    m.motion.dq_high[:] = -np.inf
+    begin_speeds(m.motion)
 
 
 @compiled

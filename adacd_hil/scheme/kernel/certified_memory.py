@@ -21,7 +21,7 @@ from adacd_hil.scheme.identify import (
 )
 from adacd_hil.scheme.kernel.kernel_samples import Numbers, limits_of
 from adacd_hil.scheme.memory import Constants, Memory
-from adacd_hil.scheme.model import filter_bank, regressor
+from adacd_hil.scheme.model import filter_bank, further_friction, regressor, torque_by_place
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.scheme_settings import CROSS_TALK, FRICTION_TERMS
 from adacd_hil.structured import Structured, packed, zeros_of
@@ -69,7 +69,7 @@ def prior_std_of(settings: Settings) -> Vector:
         elif name.startswith(POSITION_TERMS):
             std[j] = settings.arm.position_torque_Nm / anchor.LARGEST_OF_STD
         else:
-            std[j] *= next((share for term, share in regressor.SHARES.items() if name.startswith(term)), 1.0)
+            std[j] *= next((share for term, share in further_friction.SHARES.items() if name.startswith(term)), 1.0)
     return std
 
 
@@ -201,9 +201,9 @@ def sizes_of(settings: Settings) -> dict[str, int]:
     return {
         "n": JOINTS,
         "p": count,
-        "t": regressor.PLACE_TERMS,
-        "f": count + JOINTS * regressor.PLACE_TERMS,
-        "places": JOINTS * regressor.PLACE_TERMS,
+        "t": torque_by_place.PLACE_TERMS,
+        "f": count + JOINTS * torque_by_place.PLACE_TERMS,
+        "places": JOINTS * torque_by_place.PLACE_TERMS,
         "filters": settings.filter_count,
         "channels": settings.channel_count,
         "wide": external_torque.WIDE_SAMPLES + 1,

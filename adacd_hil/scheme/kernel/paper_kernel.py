@@ -5,7 +5,7 @@ Constants, memory and block: as in `kernel_samples`; the block is `records.schem
 A cycle without a fresh sample leaves filters and estimate as they were. Up to `MOST_FILLED` missing samples are
 interpolated on a straight line between their neighbours, so that a lost frame causes no blind time. A longer gap, a
 value that is not a number, or an interval far from the nominal one makes a gap; the filters resume from it as described
-in `filter_bank`. The step returns whether they took a sample in.
+in `torque_filter`. The step returns whether they took a sample in.
 
 The measured interval enters the quantities that integrate: filters, estimator, information, impulse. It does not enter
 the quantities that count. T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is right to a period.
@@ -23,7 +23,7 @@ import numpy as np
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, CertifiedBlock, SchemeBlock, Vector, block_sizes
 from adacd_hil.scheme.detect import external_torque
-from adacd_hil.scheme.identify import estimator, termination
+from adacd_hil.scheme.identify import estimator, excitation, termination
 from adacd_hil.scheme.kernel.kernel_samples import (
     Numbers,
     is_filled,
@@ -34,7 +34,7 @@ from adacd_hil.scheme.kernel.kernel_samples import (
     put_sample,
 )
 from adacd_hil.scheme.memory import Limits, Motion, Sample, Wide
-from adacd_hil.scheme.model import filter_bank, regressor
+from adacd_hil.scheme.model import regressor, torque_filter
 from adacd_hil.scheme.supervisor.transitions import (
     ADAPTED,
     ANY_CONTACT,
@@ -111,7 +111,7 @@ def constants_of(settings: Settings) -> Structured:
     """Return the constants (1,) of the paper's compiled step."""
     count = len(settings.estimator.parameter_names)
     period_s = settings.bus.period_s
-    hold = filter_bank.first_order_hold(settings.filter.a_rad_s, settings.filter.b_rad_s, period_s)
+    hold = torque_filter.first_order_hold(settings.filter.a_rad_s, settings.filter.b_rad_s, period_s)
     inertia, viscous, coulomb, gravity = settings.termination.excitation_scale
     scale = (inertia,) * 3 + (viscous,) * 2 + (coulomb,) * 2 + (gravity,) * 2
     return packed(
@@ -175,7 +175,7 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     external_torque.forget(m.wide)
     m.mode = LEARN  # used by a step beside; in charge, the mode follows from the state
     estimator.reset_gain(c.P0, m.P)
-    termination.begin(m.motion)
+    excitation.begin(m.motion)
     m.quiet_cycles = 0.0
     out.quiet_s = 0.0
     out.excitation = 0.0
@@ -223,9 +223,9 @@ def _filter(c: PaperConstants, m: PaperMemory, out: SchemeBlock, steps: int) -> 
     is_seen = m.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, MOST_FILLED)
     if is_seen:
         step_s = period_s / steps
-        hold = filter_bank.FirstOrderHold(c.decay, c.weight_old, c.weight_new)
+        hold = torque_filter.FirstOrderHold(c.decay, c.weight_old, c.weight_new)
         if step_s != nominal_s:
-            hold = filter_bank.first_order_hold(a, b, step_s)
+            hold = torque_filter.first_order_hold(a, b, step_s)
         for k in range(1, steps):
             put_between(m.last, out.q, out.dq, out.tau_J, k / steps, m.between)
             _advance(c, m, m.between[0], m.between[1], m.between[2], hold, out.tau_f)
@@ -236,7 +236,7 @@ def _filter(c: PaperConstants, m: PaperMemory, out: SchemeBlock, steps: int) -> 
         period_s = nominal_s
         regressor.fill_momentum(q, dq, m.Y_p)
         regressor.fill_remainder(q, dq, c.level_rad, m.Y_h)
-        filter_bank.resume(a, b, m.Y_p, m.Y_h, tau_J, m.input_old, m.tau_old, m.S, m.W_f)
+        torque_filter.resume(a, b, m.Y_p, m.Y_h, tau_J, m.input_old, m.tau_old, m.S, m.W_f)
         m.has_gap = 0.0
         _compare(c, m, dq, c.decay, out)
     keep_sample(out.q, out.dq, out.tau_J, m.last)
@@ -250,15 +250,15 @@ def _advance(
     q: Vector,
     dq: Vector,
     tau_J: Vector,
-    hold: filter_bank.FirstOrderHold,
+    hold: torque_filter.FirstOrderHold,
     tau_f: Vector,
 ) -> None:
     """Advance the filters by one period to a sample."""
     a, b = c.a_rad_s, c.b_rad_s
     regressor.fill_momentum(q, dq, m.Y_p)
     regressor.fill_remainder(q, dq, c.level_rad, m.Y_h)
-    filter_bank.advance_torque(hold, m.tau_old, tau_J, tau_f)
-    filter_bank.advance_regressor(hold, a, b, m.Y_p, m.Y_h, m.input_old, m.S, m.W_f)
+    torque_filter.advance_torque(hold, m.tau_old, tau_J, tau_f)
+    torque_filter.advance_regressor(hold, a, b, m.Y_p, m.Y_h, m.input_old, m.S, m.W_f)
 
 
 @compiled
@@ -275,14 +275,14 @@ def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: S
 @compiled
 def _learn(c: PaperConstants, m: PaperMemory, out: SchemeBlock, period_s: float) -> int:
     """Test the estimate by eq. (15) on this sample, then correct it; return ADAPTED if the adaptation is over, or 0."""
-    if termination.gather(m.motion, out.q, out.dq, m.W_f, period_s):
-        out.excitation = termination.eigenvalue_range(m.motion.information, c.scale, m.motion.scratch)[0]
+    if excitation.gather(m.motion, out.q, out.dq, m.W_f, period_s):
+        out.excitation = excitation.eigenvalue_range(m.motion.information, c.scale, m.motion.scratch)[0]
     m.quiet_cycles = m.quiet_cycles + 1.0 if termination.is_quiet(out.tau_ext_hat, c.beta_Nm) else 0.0
     out.quiet_s = m.quiet_cycles * c.period_s
     is_over = (
         m.quiet_cycles >= c.hold_cycles
         and out.excitation >= c.excitation_Nm2s
-        and termination.has_moved(m.motion, c.travel_rad, c.velocity_rad_s)
+        and excitation.has_moved(m.motion, c.travel_rad, c.velocity_rad_s)
     )
     R = 1.0 / period_s
     estimator.update(m.W_f, out.tau_f, R, c.is_least_squares != 0.0, out.theta_hat, m.P, m.v, m.K)

@@ -12,38 +12,16 @@ Split as the filter needs it, without acceleration:
     tau = d/dt (Y_p theta) + Y_h theta,    Y_p theta = M dq,    Y_h theta = -C' dq + g + F_v dq + F_c sgn(dq)
 
 Shapes: q, dq, ddq, tau (2,); theta (p,); W, Y_p, Y_h (2, p); M (2, 2). Units: rad, rad/s, rad/s², Nm.
-
-**Further friction.** Optional friction terms, linear in their parameters, beside viscous and Coulomb friction.
-
-    stribeck     sgn(dq) exp(-(dq / v_s)²)      static friction that falls off with speed, Nm
-    load         sgn(dq) |tau_J|                friction in proportion to the transmitted torque, Nm/Nm
-    asymmetric   |sgn(dq)|                      half the difference of the two directions' Coulomb friction, Nm
-    width        -x / cosh²(x), x = dq / w      a width of tanh that is not w, to first order: F_c log(width / w), Nm
-    dahl_short   z - sgn(dq)                    deficit of Coulomb friction after a reversal, until bristles of a length
-    dahl_long                                   d have bent the other way: z' = dq (1 - z sgn(dq)) / d, Nm
-
-sgn stands for tanh(dq / w), or with w = 0 for the sign itself, 0 of a joint that may stand still (no `width` then).
-One parameter per joint and term, in the order of the settings. While a joint moves its asymmetry looks like an offset
-of its torque sensor; only rest separates the two.
-
-Bristles don't bend while a joint may stand still. Two lengths together stand for those between them.
-
-Shapes: dq, tau_J (n,); bent (2, n): z of the short and of the long ones; Y_h (n, p).
-
-**Torque by place.** One that depends on where the arm is, as of a cable, a hose, or a base that is not level. Per joint
-i six columns, Nm each: sin q_i, cos q_i, sin 2q_i, cos 2q_i, sin Q, cos Q, Q the sum of all q. The last two are gravity
-on the last link of a tilted base; on the links before it are among the first two. X (n, PLACE_TERMS).
 """
-
-import math
 
 import numpy as np
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, POSITION_TERMS, Vector
+from adacd_hil.records import GRAVITY_PARAMETER_NAMES, JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.memory import Constants, Memory
-from adacd_hil.settings.scheme_settings import FRICTION_TERMS
+from adacd_hil.scheme.model.further_friction import bend_bristles, fill_terms, smooth_sign
+from adacd_hil.scheme.model.torque_by_place import fill_position, put_position_columns
 
 # Columns of the regressors, named so that no offset is written by hand.
 _NAMES = PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES
@@ -125,88 +103,8 @@ def is_positive_definite(theta: Vector) -> bool:
     return bool(theta[A3] > 0.0 and theta[A3] * (theta[A1] - theta[A3]) > theta[A2] ** 2)
 
 
-STRIBECK, LOAD, ASYMMETRIC, WIDTH, DAHL_SHORT, DAHL_LONG = range(len(FRICTION_TERMS))
-
 SLOW_RAD_S = 0.02
 """Speed below which noise dominates the expected friction."""
-SHARES = {"load": 0.25, "dahl": 0.5}
-"""Share of the prior of further friction, by the first part of a term's name; 1 for the others."""
-
-
-@compiled
-def smooth_sign(dq: float, still_rad_s: float, width_rad_s: float) -> float:
-    """Return tanh(dq / width); for a width of 0 the sign of dq, or 0 for a joint that may stand still."""
-    if width_rad_s > 0.0:
-        return float(math.tanh(dq / width_rad_s))
-    return float(np.sign(dq)) if abs(dq) >= still_rad_s else 0.0
-
-
-@compiled
-def bend_bristles(dq: Vector, period_s: float, still_rad_s: float, dahl_rad: Vector, bent: Vector) -> None:
-    """Advance `bent` (2, n), the bristles' bend of each length dahl_rad (2,), by one period; -1 or 1: they slide."""
-    for length in range(bent.shape[0]):
-        for i in range(dq.shape[0]):
-            if abs(dq[i]) >= still_rad_s:
-                sign = np.sign(dq[i])
-                bent[length, i] = sign + (bent[length, i] - sign) * math.exp(-abs(dq[i]) * period_s / dahl_rad[length])
-
-
-@compiled
-def fill_terms(
-    dq: Vector,
-    tau_J: Vector,
-    terms: Vector,
-    speeds: tuple[float, float, float],
-    bent: Vector,
-    first_column: int,
-    Y_h: Vector,
-) -> None:
-    """Fill the columns of Y_h (n, p) for the optional friction terms, from `first_column` on, by term and then joint.
-
-    terms: their indices in `FRICTION_TERMS`. speeds: still, width w and v_s, rad/s. bent (2, n): of the bristles, see
-    `bend_bristles`.
-    """
-    count = dq.shape[0]
-    still_rad_s, width_rad_s, stribeck_rad_s = speeds
-    for position in range(terms.shape[0]):
-        for i in range(count):
-            sign = smooth_sign(dq[i], still_rad_s, width_rad_s)
-            if terms[position] == STRIBECK:
-                value = sign * math.exp(-((dq[i] / stribeck_rad_s) ** 2))
-            elif terms[position] == LOAD:
-                value = sign * abs(tau_J[i])
-            elif terms[position] == ASYMMETRIC:
-                value = abs(sign)
-            elif terms[position] == DAHL_SHORT or terms[position] == DAHL_LONG:
-                value = bent[0 if terms[position] == DAHL_SHORT else 1, i] - sign
-            else:
-                x = dq[i] / width_rad_s if width_rad_s > 0.0 else 0.0
-                value = -x / np.cosh(min(abs(x), 300.0)) ** 2
-            Y_h[i, first_column + position * count + i] = value
-
-
-PLACE_TERMS = len(POSITION_TERMS)
-
-
-@compiled
-def fill_position(q: Vector, X: Vector) -> None:
-    """Fill X (n, PLACE_TERMS) with the columns of torque by place at q (n,), in the order of `POSITION_TERMS`."""
-    total = np.sum(q)
-    sin_sum, cos_sum = np.sin(total), np.cos(total)
-    for i in range(q.shape[0]):
-        s, c = np.sin(q[i]), np.cos(q[i])
-        X[i, 0], X[i, 1] = s, c
-        X[i, 2], X[i, 3] = 2.0 * s * c, c * c - s * s
-        X[i, 4], X[i, 5] = sin_sum, cos_sum
-
-
-@compiled
-def put_position_columns(X: Vector, first_column: int, Y_h: Vector) -> None:
-    """Put X (n, PLACE_TERMS) into Y_h (n, p) from `first_column` on, by term and then by joint."""
-    joints = X.shape[0]
-    for i in range(joints):
-        for term in range(PLACE_TERMS):
-            Y_h[i, first_column + term * joints + i] = X[i, term]
 
 
 @compiled

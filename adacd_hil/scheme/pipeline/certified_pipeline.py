@@ -10,7 +10,7 @@ from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, Event, Sch
 from adacd_hil.scheme.contact import course
 from adacd_hil.scheme.contact.contact_report import compile_recalled, new_rows, recalled_report
 from adacd_hil.scheme.detect import margin, sensitivity
-from adacd_hil.scheme.detect.margin import MarginWatch
+from adacd_hil.scheme.detect.margin_watch import MarginWatch
 from adacd_hil.scheme.identify import anchor, certificate, doubt, earlier, termination
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import Doubt
