@@ -78,27 +78,32 @@ class Wide:
 
 
 class Models:
-    """Model in use, certified model, belief and candidate: written by `belief`."""
+    """Model in use, certified model and belief: written by `belief`."""
 
     theta: PerParameter
     certified: PerParameter
     belief: PerParameter
-    candidate: PerParameter
     v: PerParameter
     K: PerParameter
     P: Square
     P_certified: Square
     P_belief: Square
-    P_candidate: Square
     promotions: float
-    candidate_cycles: float
-    candidate_square: float
-    candidate_worst: float
-    frozen_square: float
     since_learnt: float
     are_lags_held: float
     recovering_cycles: float
     is_payload: float
+
+
+class Candidate:
+    """A candidate for the certified model, and its test: written by `refinement`."""
+
+    theta: PerParameter
+    P: Square
+    cycles: float
+    square: float
+    worst: float
+    frozen_square: float
 
 
 class Ring:
@@ -300,6 +305,7 @@ class Memory:
     filters: Filters
     wide: Wide
     models: Models
+    candidate: Candidate
     ring: Ring
     motion: Motion
     fit: Fit

@@ -3,7 +3,6 @@
 A tap around a bus records every frame in both directions, for the log.
 """
 
-from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
@@ -109,16 +108,6 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Release the bus; ignore a second call."""
-
-
-def take_first(received: deque[Frame], most: int) -> list[Frame]:
-    """Remove up to `most` frames from a queue and return them: none behind an error frame, and an error frame alone."""
-    frames: list[Frame] = []
-    while received and len(frames) < most:
-        if received[0].is_error:
-            return frames or [received.popleft()]
-        frames.append(received.popleft())
-    return frames
 
 
 class Tap(Bus):

@@ -4,7 +4,8 @@ from collections import deque
 from collections.abc import Callable
 
 from adacd_hil.clock import Clock
-from adacd_hil.wire.bus import Bus, Frame, take_first
+from adacd_hil.wire.bus import Bus, Frame
+from adacd_hil.wire.frame_queue import take_first
 
 
 class EmbeddedBus(Bus):

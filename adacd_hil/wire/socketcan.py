@@ -27,12 +27,12 @@ from adacd_hil.wire.bus import (
     InterfaceDownError,
     QueueBytes,
     TransmitQueueError,
-    take_first,
 )
 from adacd_hil.wire.can_interface import CanInterface
 from adacd_hil.wire.error_frames import ERROR_CLASS_MASK, is_bus_off
 from adacd_hil.wire.frame_batches import CAN_ID_MASK, FrameReceiver, FrameSender
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS, MAX_STANDARD_ID
+from adacd_hil.wire.frame_queue import take_first
 
 CAN_RTR_FLAG = 0x40000000
 CAN_EFF_FLAG = 0x80000000

@@ -7,7 +7,8 @@ from random import Random
 import pytest
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError, take_first
+from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
+from adacd_hil.wire.frame_queue import take_first
 from adacd_hil.wire.lockstep_bus import LockstepBus
 from adacd_hil.wire.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
 

@@ -279,8 +279,8 @@ def test_a_contact_pauses_the_test_of_a_candidate_until_the_arm_has_recovered():
     before = 100.0
     while not kernel.step(rest, rest, [-2.0, 0.0], mode) & transitions.CONTACT:
         before += 1.0
-    sums = ("candidate_cycles", "candidate_square", "frozen_square", "candidate_worst")
-    paused = [float(kernel.m.models[name]) for name in sums]
+    sums = ("cycles", "square", "frozen_square", "worst")
+    paused = [float(kernel.m.candidate[name]) for name in sums]
     assert paused[0] == before
     assert kernel.m.ring.used == 0.0
     assert kernel.m.models.recovering_cycles == RECOVER
@@ -288,9 +288,9 @@ def test_a_contact_pauses_the_test_of_a_candidate_until_the_arm_has_recovered():
         pass
     for _ in range(RECOVER - 2):
         kernel.step(rest, rest, rest, mode)
-    assert [float(kernel.m.models[name]) for name in sums] == paused
+    assert [float(kernel.m.candidate[name]) for name in sums] == paused
     kernel.step(rest, rest, rest, mode)
-    assert kernel.m.models.candidate_cycles == before + 1.0
+    assert kernel.m.candidate.cycles == before + 1.0
 
 
 @pytest.mark.parametrize(("mode", "strain"), [("LEARN", 4.0), ("TEST", 4.0), ("REFINE", 1.0)])

@@ -5,7 +5,7 @@ import pytest
 from excited_arm import NAMES, kernel_of
 
 from adacd_hil.scheme.detect import sensitivity
-from adacd_hil.scheme.identify import anchor, belief
+from adacd_hil.scheme.identify import anchor, refinement
 
 K, _ = kernel_of()
 COUNT = len(NAMES)
@@ -22,8 +22,8 @@ class Refined:
         self.m.models.belief[:] = candidate
         self.m.models.P_belief[:] = 0.25 * np.eye(COUNT)
         self.m.sensitivity.h[:] = 0.5
-        belief.restart_candidate(self.m)
-        self.m.models.candidate_cycles = K.refine_cycles - CYCLES
+        refinement.begin(self.m)
+        self.m.candidate.cycles = K.refine_cycles - CYCLES
         self.random = np.random.default_rng(1)
 
     def sample(self, tau_ext=0.0):
@@ -31,7 +31,7 @@ class Refined:
         m.filters.W_f[:] = 0.3 * self.random.standard_normal(m.filters.W_f.shape)
         m.filters.tau_f[:] = m.filters.W_f @ TRUE - tau_ext
         m.filters.r[:] = m.filters.W_f @ m.models.theta - m.filters.tau_f
-        return belief.test_candidate(K, m)
+        return refinement.test(K, m)
 
     def run(self):
         """Return whether it is against an anchor, by sample."""
@@ -99,18 +99,18 @@ def test_a_joint_that_rests_has_no_say_in_which_model_is_better():
     refined.sample()
     m = refined.m
     squares = [(m.filters.W_f[0, 1] @ (theta - TRUE)) ** 2 for theta in (off_by(0.05), off_by(0.2))]
-    np.testing.assert_allclose([m.models.candidate_square, m.models.frozen_square], squares, rtol=1e-10)
+    np.testing.assert_allclose([m.candidate.square, m.candidate.frozen_square], squares, rtol=1e-10)
     m.sensitivity.still[:] = 1.0
     refined.sample()
-    np.testing.assert_allclose([m.models.candidate_square, m.models.frozen_square], squares, rtol=1e-10)
+    np.testing.assert_allclose([m.candidate.square, m.candidate.frozen_square], squares, rtol=1e-10)
 
 
 @pytest.mark.parametrize(("off_Nm", "is_excluded"), [(0.0, False), (0.1, True)])
 def test_a_better_candidate_that_an_anchor_excludes_is_said_once_and_does_not_take_over(off_Nm, is_excluded):
     refined = Refined(off_by(0.05), off_by(0.2))
     refined.m.models.P_belief[:] = 1e-6 * np.eye(COUNT)
-    belief.restart_candidate(refined.m)
-    refined.m.models.candidate_cycles = K.refine_cycles - CYCLES
+    refinement.begin(refined.m)
+    refined.m.candidate.cycles = K.refine_cycles - CYCLES
     refined.m.anchor.anchor_Nm[anchor.TARE] = TRUE[[7, 8]] + [off_Nm, 0.0]
     refined.m.anchor.anchor_std[anchor.TARE] = 0.001
     assert refined.run() == [False] * (CYCLES - 1) + [is_excluded]
@@ -130,6 +130,6 @@ def test_after_a_test_the_next_begins_with_the_belief_as_it_is_then():
     refined.sample()
     refined.m.models.belief[:] = off_by(0.01)
     [refined.sample() for _ in range(CYCLES - 1)]
-    np.testing.assert_array_equal(refined.m.models.candidate, off_by(0.01))
-    sums = ("candidate_cycles", "candidate_square", "frozen_square", "candidate_worst")
-    assert [float(refined.m.models[name]) for name in sums] == [0.0] * 4
+    np.testing.assert_array_equal(refined.m.candidate.theta, off_by(0.01))
+    sums = ("cycles", "square", "frozen_square", "worst")
+    assert [float(refined.m.candidate[name]) for name in sums] == [0.0] * 4

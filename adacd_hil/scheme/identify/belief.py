@@ -19,27 +19,16 @@ lags are learnt on the excitation, and *held* after it (`hold_lags`).
 **Hold-back.** A sample waits in a ring until `waiting` others have followed. `discard` empties it.
 
 Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R, ring_still (h, n).
-
-**Refinement.** Refinement of a certified model while it detects: a candidate, its own test, and its promotion.
-
-The belief goes on learning while the arm is free of contact. At intervals its mean is frozen as a candidate and runs
-beside the model in use on motion that neither was fitted to. It replaces that model if it explains the motion better
-and would have raised no alarm. So the model follows friction that warms up, and improves if it was armed early, but
-does not follow a touch: a contact pauses the test, and a torque below the thresholds can't move a candidate by more
-than itself. An offset that has left its anchor (`anchor`) takes the certificate back: a person leans lightly, or a
-sensor moves.
 """
 
 import numpy as np
 
-from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import sensitivity
-from adacd_hil.scheme.identify import anchor, estimator, fit_check, missing_torque
+from adacd_hil.scheme.identify import estimator, fit_check, missing_torque
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
-from adacd_hil.scheme.model.regressor import is_positive_definite
 
 _SWEEPS = 200
 """Most sweeps over the parameters that must not be negative; a handful is enough unless P couples them closely."""
@@ -79,11 +68,19 @@ def freeze(k: Constants, m: Memory) -> None:
 
 @compiled
 def certify(k: Constants, m: Memory) -> None:
-    """Store the model in use as the certified one, hold the lags, and begin the test of the first candidate."""
+    """Store the model in use as the certified one, and hold the lags."""
     m.models.promotions = 0.0
     _certify(m)
     hold_lags(k, m)
-    restart_candidate(m)
+
+
+@compiled
+def promote(m: Memory, theta: Vector, P: Vector) -> None:
+    """Use a better tested model, theta (p,) and P (p, p), as the certified one, and count it in `promotions`."""
+    m.models.theta[:] = theta
+    m.models.P[:] = P
+    _certify(m)
+    m.models.promotions += 1.0
 
 
 @compiled
@@ -258,46 +255,3 @@ def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
             break
     for j in range(first, last):
         theta[j] = max(theta[j], 0.0)
-
-
-@compiled
-def restart_candidate(m: Memory) -> None:
-    """Freeze the present belief as the candidate, and begin its test: set its count, squares and worst share to 0."""
-    own = m.models
-    own.candidate_cycles = 0.0
-    own.candidate_square = 0.0
-    own.frozen_square = 0.0
-    own.candidate_worst = 0.0
-    own.candidate[:] = own.belief
-    own.P_candidate[:] = own.P_belief
-
-
-@compiled
-def test_candidate(k: Constants, m: Memory) -> bool:
-    """Add one sample to the candidate's test; at the test's end use a better candidate as the certified model.
-
-    Begin the next test then. Return True only at the end of a test that the candidate passes, but for an anchor that
-    excludes its torque offset: the certificate is to be revoked.
-    """
-    own = m.models
-    own.candidate_cycles += 1.0
-    for c in range(m.filters.W_f.shape[0]):
-        for i in range(m.filters.W_f.shape[1]):
-            residual = linalg.misfit(m.filters.W_f[c, i], own.candidate, m.filters.tau_f[c, i])
-            if c == filter_bank.SLOW and m.sensitivity.still[c, i] < sensitivity.MOVING:
-                own.candidate_square += residual * residual
-                own.frozen_square += m.filters.r[c, i] ** 2
-            bare = max(m.filters.r.shape[0] + c - 1, 0) if c > 0 else 0
-            own.candidate_worst = max(own.candidate_worst, abs(residual) / m.sensitivity.h[bare, i])
-    if own.candidate_cycles < k.refine_cycles:
-        return False
-    is_better = own.candidate_square < own.frozen_square and own.candidate_worst < 1.0
-    is_fit = is_better and is_positive_definite(own.candidate)
-    is_anchored = is_fit and anchor.is_within(k, m, own.candidate, own.P_candidate)
-    if is_anchored:
-        own.theta[:] = own.candidate
-        own.P[:] = own.P_candidate
-        _certify(m)
-        own.promotions += 1.0
-    restart_candidate(m)
-    return bool(is_fit and not is_anchored)

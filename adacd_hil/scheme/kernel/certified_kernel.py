@@ -29,6 +29,7 @@ from adacd_hil.scheme.identify import (
     evidence,
     fit_check,
     missing_torque,
+    refinement,
     termination,
 )
 from adacd_hil.scheme.kernel.kernel_samples import (
@@ -102,6 +103,7 @@ def begin_refinement(constants: Structured, memory: Structured) -> None:
     """Store the model in use as certified, begin to test candidates, and drop kept beliefs and missing torque."""
     k, m = constants[0], memory[0]
     belief.certify(k, m)
+    refinement.begin(m)
     earlier.forget(m)
     missing_torque.clear(k, m)
 
@@ -298,7 +300,7 @@ def _refine(k: Constants, m: Memory) -> int:
         belief.wander(k.drift_std, m.filters.W_learnt, k.period_s * k.learn_every, m.models.P_belief)
         if missing_torque.is_confirmed(k, m):
             cause = certificate.BY_PLACE
-    if belief.test_candidate(k, m):
+    if refinement.test(k, m):
         cause = certificate.ANCHOR
     certificate.withhold(m, cause)
     return 0 if cause == certificate.NOTHING else WITHHELD
