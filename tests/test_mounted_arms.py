@@ -7,10 +7,10 @@ from typing import NamedTuple
 import pytest
 from click.testing import CliRunner
 from long_cases import long_but
+from played_outcome import outcome_of
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.cli.main import cli
-from adacd_hil.lab.cli.demo_command import outcome_of
 from firmware_sim.scenario.scenario import ScenarioOutcome
 
 ARM = ("--no-bus", "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", "--yes")

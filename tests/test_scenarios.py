@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 from long_cases import long_but
+from played_outcome import outcome_of
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
-from adacd_hil.lab.cli.demo_command import outcome_of
 from adacd_hil.log.reader import read_log
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.toml_text import to_short_toml, to_toml

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from adacd_hil.lab.serial_arm import chain
 from adacd_hil.lab.serial_arm.chain import Chain, point_mass
 from adacd_hil.lab.serial_arm.urdf import SerialArm, read_urdf
 
@@ -25,7 +26,7 @@ def random_chain(seed, n):
     """Return a chain with random axes, about a third of them prismatic, and the parameters (10 n,) of real bodies."""
     random = np.random.default_rng(seed)
     axis = random.normal(size=(n, 3))
-    chain = Chain(
+    arm = Chain(
         np.array([random_rotation(random) for _ in range(n)]),
         random.uniform(-0.4, 0.4, (n, 3)),
         axis / np.linalg.norm(axis, axis=1)[:, None],
@@ -33,7 +34,7 @@ def random_chain(seed, n):
         random.uniform(-6.0, 6.0, 3),
     )
     bodies = [point_mass(random.uniform(0.2, 2.0), at) for at in random.uniform(-0.2, 0.2, (6 * n, 3))]
-    return chain, np.sum(np.reshape(bodies, (n, 6, 10)), axis=1).ravel()
+    return arm, np.sum(np.reshape(bodies, (n, 6, 10)), axis=1).ravel()
 
 
 def planar_chain(gravity_m_s2):
@@ -45,3 +46,14 @@ def planar_chain(gravity_m_s2):
 
 def random_state(seed, n):
     return np.random.default_rng(seed).uniform(-3.0, 3.0, (3, n))
+
+
+def mass_matrix(arm, q, theta_full):
+    """Return M(q) (n, n), kg m²: column j is the momentum at dq_j = 1."""
+    n, scratch, place = q.shape[0], chain.new_scratch(arm), chain.all_columns(arm)
+    Y_p, Y_h = np.zeros((n, place.size)), np.zeros((n, place.size))
+    M = np.zeros((n, n))
+    for j in range(n):
+        chain.fill(arm, place, q, np.eye(n)[j], scratch, Y_p, Y_h)
+        M[:, j] = Y_p @ theta_full
+    return M

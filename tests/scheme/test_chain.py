@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from serial_arms import PLANAR_LENGTH_M, planar_chain, random_chain, random_state, seven_joint_arm
+from serial_arms import PLANAR_LENGTH_M, mass_matrix, planar_chain, random_chain, random_state, seven_joint_arm
 
 from adacd_hil.lab.serial_arm import chain
 from adacd_hil.records import GRAVITY_PARAMETER_NAMES, PARAMETER_NAMES
@@ -62,7 +62,7 @@ def test_the_planar_closed_form_is_a_chain_of_two_however_it_is_mounted(seed, le
     level, mounted = planar_chain((0.0, 0.0, 0.0)), planar_chain(G_M_S2 * pull)
     theta = np.array([0.4, 0.07, 0.04])
     body = theta @ np.array(list(INERTIA.values()))
-    np.testing.assert_allclose(regressor.mass_matrix(q, theta), chain.mass_matrix(level, q, body), rtol=1e-12)
+    np.testing.assert_allclose(regressor.mass_matrix(q, theta), mass_matrix(level, q, body), rtol=1e-12)
     level, upright = full_parts(level, q, dq), full_parts(mounted, q, dq)
     for name, change in INERTIA.items():
         Y_p[:, CLOSED_NAMES.index(name)] = level[0] @ change

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from foreign_arms import rigid_torque, sines
 from planar_arm import THETA
-from serial_arms import planar_chain, seven_joint_arm
+from serial_arms import mass_matrix, planar_chain, seven_joint_arm
 from smooth_motion import smooth_motion, torque_of
 
 from adacd_hil.lab.serial_arm import offline
-from adacd_hil.lab.serial_arm.chain import mass_matrix, point_mass
+from adacd_hil.lab.serial_arm.chain import point_mass
 from adacd_hil.lab.serial_arm.offline import OfflineSettings, Record
 
 NOISE_NM = 0.03

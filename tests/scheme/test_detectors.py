@@ -19,7 +19,6 @@ from adacd_hil.lab.detectors.detectors import (
     record,
     register,
 )
-from adacd_hil.settings.schema import ConfigError
 
 T = 1e-3
 THETA = ARMS["M"]
@@ -132,12 +131,10 @@ def test_the_covariance_of_a_moving_average_is_found():
         (lambda: autocovariance(np.zeros(90), 10), "90 samples"),
         (lambda: likelihood_windows(np.zeros(8), (4,), 0.0, T), "variance"),
         (lambda: likelihood_windows(np.ones(8), (9,), 0.0, T), "8 samples"),
-        (lambda: DetectorBankSettings(band_rad_s=(50.0, 20.0)), "band_rad_s"),
-        (lambda: DetectorBankSettings(observer_rad_s=()), "observer_rad_s"),
     ],
 )
 def test_what_cannot_be_designed_is_refused(call, words):
-    with pytest.raises((ValueError, ConfigError), match=words):
+    with pytest.raises(ValueError, match=words):
         call()
 
 

@@ -54,8 +54,9 @@ class Row:
 
 def play(task: tuple[str, str], seed: int | None, keep: Path | None) -> Row:
     """Play one scenario, or its file, with one configuration, its logs in a folder of `keep` or nowhere."""
+    from played_outcome import outcome_of
+
     from adacd_hil.cli.embedded_run import resolve, run_embedded
-    from adacd_hil.lab.cli.demo_command import outcome_of
 
     name_or_file, config = task
     scenario = load_scenario(name_or_file)

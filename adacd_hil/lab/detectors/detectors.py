@@ -47,7 +47,6 @@ from adacd_hil.lab.detectors import detector_registry
 from adacd_hil.lab.detectors.detector_registry import Maker, Registered
 from adacd_hil.records import Vector
 from adacd_hil.scheme.model import regressor
-from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.structured import PerJoint, Structured, packed, zeros_of
 
 VELOCITY_LAG_S: Final = 1.25e-3
@@ -74,30 +73,20 @@ def unregister(name: str) -> None:
 class DetectorBankSettings:
     """Parameters of the detectors of one stream."""
 
-    cutoff_rad_s: tuple[float, ...] = setting(
-        (10.0, 50.0, 200.0), unit="rad/s", low=0.1, high=2000.0, meaning="first-order and smoothed channels"
-    )
-    smoothing_rad_s: float = setting(200.0, unit="rad/s", low=1.0, high=2000.0, meaning="second pole when smoothed")
-    band_rad_s: tuple[float, float] = setting(
-        (10.0, 100.0), unit="rad/s", low=0.1, high=2000.0, meaning="lower and upper cut-off of the band-pass"
-    )
-    observer_rad_s: tuple[float, ...] = setting(
-        (25.0, 100.0), unit="rad/s", low=0.1, high=2000.0, meaning="gains of the momentum observers"
-    )
-    onset_samples: tuple[int, ...] = setting(
-        (4, 8, 16, 32, 64, 128), low=1, high=1000, meaning="ages of the steps that the likelihood ratio knows"
-    )
-    drift_Nm: float = setting(0.02, unit="Nm", low=0.0, high=10.0, meaning="smoothed torque that cusum ignores")
-    standstill_rad_s: float = setting(
-        2e-3, unit="rad/s", low=0.0, high=1.0, meaning="a slower joint stands still; five times the velocity's noise"
-    )
-
-    def __post_init__(self) -> None:
-        if not self.band_rad_s[0] < self.band_rad_s[1]:
-            raise ConfigError(f"band_rad_s = {self.band_rad_s}: the lower cut-off is not below the upper one")
-        for name in ("cutoff_rad_s", "observer_rad_s", "onset_samples"):
-            if not getattr(self, name):
-                raise ConfigError(f"{name} is empty")
+    cutoff_rad_s: tuple[float, ...] = (10.0, 50.0, 200.0)
+    """Of the first-order and smoothed channels."""
+    smoothing_rad_s: float = 200.0
+    """The second pole of the smoothed channels."""
+    band_rad_s: tuple[float, float] = (10.0, 100.0)
+    """Lower and upper cut-off of the band-pass."""
+    observer_rad_s: tuple[float, ...] = (25.0, 100.0)
+    """Gains of the momentum observers."""
+    onset_samples: tuple[int, ...] = (4, 8, 16, 32, 64, 128)
+    """Ages of the steps that the likelihood ratio knows."""
+    drift_Nm: float = 0.02
+    """Smoothed torque that cusum ignores."""
+    standstill_rad_s: float = 2e-3
+    """A slower joint stands still; five times the velocity's noise."""
 
     @property
     def own_channels(self) -> tuple[str, ...]:

@@ -271,17 +271,6 @@ def _cross(v: Vector, u: Vector, y: Vector) -> None:
     y[5] = v[0] * u4 - v[1] * u3 + v[3] * u1 - v[4] * u0
 
 
-def mass_matrix(chain: Chain, q: Vector, theta_full: Vector) -> Vector:
-    """Return M(q) (n, n), kg m²: column j is the momentum at dq_j = 1."""
-    n, scratch, place = q.shape[0], new_scratch(chain), all_columns(chain)
-    Y_p, Y_h = np.zeros((n, place.size)), np.zeros((n, place.size))
-    M = np.zeros((n, n))
-    for j in range(n):
-        fill(chain, place, q, np.eye(n)[j], scratch, Y_p, Y_h)
-        M[:, j] = Y_p @ theta_full
-    return M
-
-
 def regressor(chain: Chain, q: Vector, dq: Vector, ddq: Vector) -> Vector:
     """Return W (n, 10 n) of tau = W theta_full, friction left out."""
     place = all_columns(chain)
