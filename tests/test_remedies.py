@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from adacd_hil import remedies
+from adacd_hil import extras
 from adacd_hil.extras import install_command
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
@@ -107,7 +107,7 @@ def test_from_elsewhere_it_names_the_clone_and_a_pip_that_is_there(
 
 
 def test_without_a_source_tree_it_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remedies, "_SOURCE_TREE", tmp_path)
+    monkeypatch.setattr(extras, "_SOURCE_TREE", tmp_path)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "bin" / "python"))
     monkeypatch.chdir(tmp_path)
     assert install_command("mf4") == "bin/python -m pip install 'adacd-hil[mf4]'"

@@ -226,6 +226,11 @@ def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
             raise ConfigError(f"device profile {device.profile.name}: header objects have {mapped} bits in all")
     for signal in pdo.signals:
         variable = device.variable(signal.name)
+        if not variable.is_mappable:
+            raise ConfigError(
+                f"device profile {device.profile.name}: object {signal.name} ({variable.name}) fits no PDO: "
+                f"PDOMapping=0 in {device.profile.eds}"
+            )
         scale, unit = profile.unit_of(signal)
         signals.append(_DbcSignal(signal.signal, variable.bits, variable.is_signed, scale, unit))
     _check_bounds(device, pdo, signals)

@@ -86,13 +86,12 @@ def test_the_frames_are_read_by_the_devices_of_the_run_whatever_became_of_their_
         assert found.cycles > 1000
 
 
-def test_only_a_replay_of_frames_needs_a_temporary_folder_and_says_so_in_one_line(log, monkeypatch, tmp_path):
+@pytest.mark.parametrize("by_frames", [False, True])
+def test_a_replay_needs_no_temporary_folder(log, monkeypatch, tmp_path, by_frames):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "absent"))
     source = LogSource(log)
-    (found,) = replay_source(source, [source.settings], script_of=ScriptedOperator)
+    (found,) = replay_source(source, [source.settings], script_of=ScriptedOperator, by_frames=by_frames)
     assert found.mismatch_count == 0
-    with pytest.raises(LogError, match=r"^no temporary folder for the log's device profiles: No such file"):
-        replay_source(source, [source.settings], script_of=ScriptedOperator, by_frames=True)
 
 
 def test_without_the_states_of_the_arm_a_proof_by_frames_is_not_whole(log, whole):

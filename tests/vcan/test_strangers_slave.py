@@ -16,11 +16,11 @@ import can
 import canopen
 import numpy as np
 import pytest
+from loaded import loaded_contract
 
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import DeviceError
-from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, ArmState, FaultReason
@@ -46,7 +46,7 @@ def read_once(eds: Path, node_id: int) -> canopen.ObjectDictionary:
     return canopen.import_od(str(eds), node_id)
 
 
-compose_once = functools.cache(load_contract)
+compose_once = functools.cache(loaded_contract)
 
 
 class Timer:

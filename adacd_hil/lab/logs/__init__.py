@@ -1,1 +1,1 @@
-"""Logs as files: check, cut, merge, recover, export."""
+"""Logs as files: check, cut, recover, export."""
