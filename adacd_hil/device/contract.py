@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+from adacd_hil.device.canopen_bus import EdsVariable
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, ObjectName, PdoSettings, PlacedDevice
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
@@ -210,6 +211,17 @@ def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], pe
     )
 
 
+def _mapped(device: PlacedDevice, name: ObjectName) -> EdsVariable:
+    """Return an object of a PDO. Raises ConfigError as `PlacedDevice.variable`, and if the EDS lets no PDO carry it."""
+    variable = device.variable(name)
+    if not variable.is_mappable:
+        raise ConfigError(
+            f"device profile {device.profile.name}: object {name} ({variable.name}) fits no PDO: PDOMapping=0 in "
+            f"{device.profile.eds}; correct it there if the device maps it"
+        )
+    return variable
+
+
 def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
     profile, name = device.settings, device.name.upper()
     for place in (ObjectName(pdo.communication_index, 1), ObjectName(pdo.mapping_index)):
@@ -221,16 +233,11 @@ def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
     signals: list[_DbcSignal] = []
     if pdo.data_ids:
         signals = [_DbcSignal(signal, bits) for signal, bits in PROFILES_BY_CODE[profile.protection].signals]
-        mapped = sum(device.variable(signal.name).bits for signal in device.header(pdo))
+        mapped = sum(_mapped(device, signal.name).bits for signal in device.header(pdo))
         if mapped != sum(signal.bits for signal in signals):
             raise ConfigError(f"device profile {device.profile.name}: header objects have {mapped} bits in all")
     for signal in pdo.signals:
-        variable = device.variable(signal.name)
-        if not variable.is_mappable:
-            raise ConfigError(
-                f"device profile {device.profile.name}: object {signal.name} ({variable.name}) fits no PDO: "
-                f"PDOMapping=0 in {device.profile.eds}"
-            )
+        variable = _mapped(device, signal.name)
         scale, unit = profile.unit_of(signal)
         signals.append(_DbcSignal(signal.signal, variable.bits, variable.is_signed, scale, unit))
     _check_bounds(device, pdo, signals)

@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
+from eds_variants import EdsVariant
 from loaded import loaded_contract
 
 from adacd_hil.device.device_files import load_profile, profile_names
@@ -205,6 +206,19 @@ def test_a_float_is_not_read_as_an_integer(tmp_path: Path) -> None:
         ConfigError, match=r"0x9130:1 \(AI input PV 32 bit, AI input PV 1\) is a float, REAL32; .* integers"
     ):
         loaded_contract(dataclasses.replace(load_settings("certified"), devices=devices))
+
+
+@pytest.mark.parametrize("section", ["2100sub1", "9130sub1"])
+def test_an_object_of_a_frame_that_its_eds_lets_no_pdo_carry_is_named(section: str, tmp_path: Path) -> None:
+    EdsVariant("torque_sensor.eds").with_value("0", section, key="PDOMapping").write(tmp_path / "torque_sensor.eds")
+    own = (resources.files("adacd_hil") / "device_profiles" / "adacd-sensor.toml").read_text()
+    sensor = profile_file(tmp_path, own)
+    settings = load_settings("certified")
+    devices = dataclasses.replace(settings.devices, sensor=(sensor, sensor))
+    with pytest.raises(
+        ConfigError, match=rf"0x{section[:4]}:1 \(.*\) fits no PDO: PDOMapping=0 in .*torque_sensor.eds"
+    ):
+        loaded_contract(dataclasses.replace(settings, devices=devices))
 
 
 def test_a_profile_extends_another_section_by_section(tmp_path: Path) -> None:
