@@ -225,6 +225,7 @@ signals = [{ object = "0x9130:1", signal = "torque" }]
         (EdsVariant().with_value("0x0007", "6040", key="DataType"), "0x6040 is UNSIGNED32 in"),
         (EdsVariant().with_value("0x0007", "6064", key="DataType"), "0x6064 is UNSIGNED32 in"),
         (EdsVariant().with_value("0", "6064", key="PDOMapping"), "fits no PDO: PDOMapping=0 in"),
+        (EdsVariant().with_value("ro", "6071", key="AccessType"), "can't be written by a PDO"),
     ],
 )
 def test_a_drive_that_its_eds_lets_nobody_play_is_named(tmp_path: Path, variant: EdsVariant, said: str) -> None:

@@ -21,4 +21,4 @@ def device_attachments(devices: Iterable[PlacedDevice]) -> dict[str, bytes]:
 def _free_name(device: PlacedDevice, eds: bytes, attachments: Mapping[str, bytes]) -> str:
     """Return the name of a device's EDS, or one of its own if another EDS has it."""
     name = device.profile.eds.name
-    return name if attachments.get(name, eds) == eds else f"{device.name}.eds"
+    return name if attachments.get(name, eds) == eds else f"{device.name}-{name}"

@@ -211,12 +211,15 @@ def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], pe
     )
 
 
-def _mapped(device: PlacedDevice, name: ObjectName) -> EdsVariable:
+def _mapped(device: PlacedDevice, pdo: PdoSettings, name: ObjectName) -> EdsVariable:
     """Return an object of a PDO. Raises ConfigError as `PlacedDevice.variable`, and if the EDS lets no PDO carry it."""
     variable = device.variable(name)
-    if not variable.is_mappable:
+    refused = "fits no PDO: PDOMapping=0" if not variable.is_mappable else ""
+    if pdo.is_received and not variable.is_writable:
+        refused = "can't be written by a PDO: its AccessType is read-only"
+    if refused:
         raise ConfigError(
-            f"device profile {device.profile.name}: object {name} ({variable.name}) fits no PDO: PDOMapping=0 in "
+            f"device profile {device.profile.name}: object {name} ({variable.name}) {refused} in "
             f"{device.profile.eds}; correct it there if the device maps it"
         )
     return variable
@@ -233,11 +236,11 @@ def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
     signals: list[_DbcSignal] = []
     if pdo.data_ids:
         signals = [_DbcSignal(signal, bits) for signal, bits in PROFILES_BY_CODE[profile.protection].signals]
-        mapped = sum(_mapped(device, signal.name).bits for signal in device.header(pdo))
+        mapped = sum(_mapped(device, pdo, signal.name).bits for signal in device.header(pdo))
         if mapped != sum(signal.bits for signal in signals):
             raise ConfigError(f"device profile {device.profile.name}: header objects have {mapped} bits in all")
     for signal in pdo.signals:
-        variable = _mapped(device, signal.name)
+        variable = _mapped(device, pdo, signal.name)
         scale, unit = profile.unit_of(signal)
         signals.append(_DbcSignal(signal.signal, variable.bits, variable.is_signed, scale, unit))
     _check_bounds(device, pdo, signals)

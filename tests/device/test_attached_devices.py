@@ -17,11 +17,11 @@ def with_drives(settings: Settings, first: Path, second: Path) -> Settings:
     return dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, drive=(str(first), str(second))))
 
 
-def own_drive(folder: Path, eds: bytes) -> Path:
-    """Write a drive's profile and its EDS, which has the same name in every folder."""
+def own_drive(folder: Path, name: str, eds: bytes) -> Path:
+    """Write a drive's profile and its EDS."""
     folder.mkdir()
-    (folder / "mine.eds").write_bytes(eds)
-    profile = dataclasses.replace(load_profile("stock-drive", "drive").settings, eds="mine.eds")
+    (folder / name).write_bytes(eds)
+    profile = dataclasses.replace(load_profile("stock-drive", "drive").settings, eds=name)
     (folder / "drive.toml").write_text(to_toml(profile))
     return folder / "drive.toml"
 
@@ -38,9 +38,10 @@ def test_the_attached_devices_are_those_of_the_run(name: str) -> None:
         assert mine.profile.eds_bytes == theirs.profile.eds_bytes
 
 
-def test_two_files_of_one_name_are_kept_apart(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["mine.eds", "Drive2.eds"])
+def test_two_files_of_one_name_are_kept_apart(tmp_path: Path, name: str) -> None:
     eds = (contract_folder() / "stock_drive.eds").read_bytes()
-    files = own_drive(tmp_path / "a", eds), own_drive(tmp_path / "b", eds + b"\n; another\n")
+    files = own_drive(tmp_path / "a", name, eds), own_drive(tmp_path / "b", name, eds + b"\n; another\n")
     settings = with_drives(load_settings("stock"), *files)
     run = place_devices(settings)
     for file in files:
