@@ -182,6 +182,16 @@ def test_a_drive_whose_position_does_not_reach_the_arm_s_limit_is_named(tmp_path
     assert [line.partition(" carries ±118 deg")[0] for line in warnings] == ["Drive2Feedback"]
 
 
+def test_a_drive_whose_torque_is_in_no_frame_is_named(tmp_path: Path) -> None:
+    stock = resources.files("adacd_hil").joinpath("device_profiles", "stock-drive.toml").read_text()
+    torque = '    { object = "0x6077", signal = "torque_actual", unit = "permille" },\n'
+    (tmp_path / "mute.toml").write_text(stock.replace(torque, ""))
+    mine = 'extends = "stock"\n[devices]\ndrive = ["stock-drive", "mute.toml"]\ncontract = ""\n'
+    (tmp_path / "mine.toml").write_text(mine)
+    warnings = [line for line in examine_configuration(str(tmp_path / "mine.toml")).warnings if "TORQUE" in line]
+    assert [line.partition(":")[0] for line in warnings] == ["no frame of Drive2 carries `torque_actual`"]
+
+
 def test_a_drive_with_its_maker_s_objects_follows_its_commands(tmp_path: Path) -> None:
     written = CliRunner().invoke(cli, ["init", *describe_arm(tmp_path)])
     assert written.exit_code == 0, written.stderr

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from adacd_hil.control.motions import motion_problems
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import load_profile, place_devices
+from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
 from adacd_hil.settings.parsing import parse
@@ -50,14 +51,16 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
     if problems := _device_problems(settings):
         return ConfigurationFindings(problems, [], None)
     try:
-        codec = load_contract(settings, place_devices(settings))
+        devices = place_devices(settings)
+        codec = load_contract(settings, devices)
     except (ConfigError, CodecError) as error:
         return ConfigurationFindings([str(error)], [], None)
     excess = describe_excess(codec, settings)
     late = [excess] if excess else []
     guesses = [*settings.assumed, *profile_guesses(settings)]
     assumed = [f"assumed, not known: {', '.join(f'`{key}`' for key in guesses)}"] if guesses else []
-    warnings = [*oddities(settings), *_narrow(codec, settings), *assumed, *_layer_warnings(layers), *late]
+    found = [*oddities(settings), *_narrow(codec, settings), *_unseen(devices)]
+    warnings = [*found, *assumed, *_layer_warnings(layers), *late]
     return ConfigurationFindings([], warnings, settings, bool(late))
 
 
@@ -186,6 +189,14 @@ def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
                 f"{message.name} carries ±{most_Nm:.3g} Nm, `arm.rated_torque_Nm[{joint}]` = {rated_Nm:g} Nm: is "
                 f"`torque_Nm` of {settings.devices.sensor[joint]} right?"
             )
+
+
+def _unseen(devices: Sequence[PlacedDevice]) -> Iterator[str]:
+    """Yield a warning for each drive whose actual torque is in no frame, so that the fault TORQUE can't be found."""
+    for device in devices:
+        sent = {signal.signal for pdo in device.settings.pdo for signal in pdo.signals}
+        if device.settings.kind == "drive" and "torque_actual" not in sent:
+            yield f"no frame of {device.name} carries `torque_actual`: nothing watches for the fault TORQUE"
 
 
 def _pair(values: Sequence[float]) -> str:

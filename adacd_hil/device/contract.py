@@ -261,7 +261,7 @@ def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
     if message.length > CLASSIC_BYTES and message.length not in FD_LENGTHS:
         raise ConfigError(
             f"device profile {device.profile.name}: {pdo.message} has {message.length} bytes; "
-            f"a frame has 0 to 8, {', '.join(map(str, FD_LENGTHS))}"
+            f"a frame has 0 to 8, {', '.join(map(str, FD_LENGTHS))}: map fewer or other objects"
         )
     return message
 
