@@ -274,7 +274,7 @@ class ProfileSettings:
         self._check_assumed()
 
     def _check_frames(self) -> None:
-        """Raise ValueError for missing, doubled or misplaced frames or signals, and for feedback that is not on SYNC."""
+        """Raise ValueError for missing, doubled or misplaced frames or signals, and for feedback apart from SYNC."""
         wanted = {"drive": ("Feedback", "Command"), "sensor": ("Torque",)}[self.kind]
         found = [pdo.message for pdo in self.pdo]
         if missing := [name for name in wanted if name not in found]:
