@@ -88,6 +88,7 @@ class CompileCount:
             listener(self._line)
 
     def _line(self) -> str:
+        """Return the count as a line; include expected functions that another process has compiled meanwhile."""
         kept = self._versions().items()
         self._done |= {name for name, version in kept if version is not None and version != self._before[name]}
         done, total = len(self._done), len(self._expected)

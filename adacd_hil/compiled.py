@@ -330,7 +330,7 @@ class _Compilation(event.Listener):
         return self._count
 
     def on_start(self, event: Any) -> None:  # noqa: ARG002
-        """Note that a function begins to compile."""
+        """Pause garbage collection as a function begins to compile; call `on_first`, once, and the listeners."""
         if self._depth == 0:
             self._was_collecting = gc.isenabled()
             gc.disable()
@@ -341,7 +341,7 @@ class _Compilation(event.Listener):
         self._count.call_listeners()
 
     def on_end(self, event: Any) -> None:
-        """Count a function that is compiled."""
+        """Resume garbage collection when the outermost function is compiled; count the function."""
         self._depth -= 1
         if self._depth == 0 and self._was_collecting:
             gc.enable()

@@ -105,6 +105,7 @@ def _check_replaceable(path: Path, is_log: bool) -> None:
 
 
 def _create_beside(path: Path) -> Path:
+    """Create an empty hidden file beside `path`, and return its path. Raises OSError."""
     for number in itertools.count():
         beside = path.with_name(f".{path.name}.{os.getpid()}-{number}.part")
         with contextlib.suppress(FileExistsError):  # left by a process of this id that was killed

@@ -60,6 +60,7 @@ class Progress:
             self._lines.put((f"{line()}, {(now_ns - self._begun_ns) / 1e9:.0f} s", self._has_cursor))
 
     def _print(self) -> None:
+        """Print the queued lines until None comes; overwrite a passing one with the next."""
         is_overwritten = False
         while (queued := self._lines.get()) is not None:
             line, is_passing = queued

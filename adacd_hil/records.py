@@ -144,6 +144,7 @@ def block_sizes(parameter_count: int, further_count: int = 0, channel_count: int
 
 
 def _layout(block: type, sizes: dict[str, int]) -> Layout:
+    """Return the layout of a class of block, from its annotations: size, unit, meaning. sizes: by name."""
     hints = get_type_hints(block, include_extras=True)
     return Layout(
         tuple(
@@ -331,7 +332,7 @@ class Location(IntEnum):
 
 
 class ContactReport(NamedTuple):
-    """A contact, as first detected and then refined until the isolation window ends.
+    """A contact, as first detected and then refined until its report is final.
 
     link: 1 or 2. direction: sign of the external torque per joint, 0 where below the threshold. tau_ext_peak: largest
     external torque with the filter undone, Nm. impulse: integral of the external torque so far, Nm s. Each `_sigma` is
@@ -368,12 +369,12 @@ class SchemeOutput(NamedTuple):
     state: SchemeState
     previous_state: SchemeState
     fault: FaultReason
-    contact_joints: int  # bit i: joint i over the threshold
+    contact_joints: int  # bit i: joint i, counted from 0, over the threshold
     is_model_valid: bool  # theta_ff may be fed forward
     theta_hat: Vector
     theta_ff: Vector  # parameters of the last finished adaptation, zeros before; for the feedforward
     tau_ext_hat: Vector
-    contact: ContactReport | None  # set in the cycle in which a report begins or becomes final
+    contact: ContactReport | None  # set in each cycle in which a report is due, the final one last
     block: Vector
     reaction: Reaction = Reaction.NONE  # to the contact of REACT and STOPPED
 

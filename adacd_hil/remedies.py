@@ -23,6 +23,7 @@ def nearest_name(word: str, known: Iterable[str]) -> str | None:
 
 
 def _likeness(word: str, name: str) -> float:
+    """Return the least likeness of the dotted parts of word and name, 0 to 1; 0 if their numbers of parts differ."""
     parts = word.split("."), name.split(".")
     if len(parts[0]) != len(parts[1]):
         return 0.0

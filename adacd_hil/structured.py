@@ -74,6 +74,7 @@ def _flat(shapes: tuple[tuple[str, Shape], ...]) -> Record:
 
 
 def _field_of(name: str, hint: Any, sizes: Mapping[str, int]) -> _Field:
+    """Return name, type and shape of a field from its annotation: an array, a number, or a record in it."""
     if hasattr(hint, "__metadata__"):
         kind, dimensions = hint.__origin__, hint.__metadata__[0]
         if isinstance(dimensions, type):
@@ -86,6 +87,7 @@ def _field_of(name: str, hint: Any, sizes: Mapping[str, int]) -> _Field:
 
 
 def _described_as(values: Any) -> Record:
+    """Return the description of a record that holds an instance of a dataclass, all float64."""
     found = ((field.name, getattr(values, field.name)) for field in dataclasses.fields(values))
     return _described(
         tuple(
@@ -96,6 +98,7 @@ def _described_as(values: Any) -> Record:
 
 
 def _fill(record: Any, values: Any) -> None:
+    """Copy the fields of an instance of a dataclass, and of instances in it, into a record."""
     for field in dataclasses.fields(values):
         value = getattr(values, field.name)
         if dataclasses.is_dataclass(value):
@@ -106,6 +109,7 @@ def _fill(record: Any, values: Any) -> None:
 
 @cache
 def _described(fields: tuple[_Field, ...]) -> Record:
+    """Return the description of a record, the same object for equal fields. Raises ValueError for a name of numpy's."""
     if taken := [name for name, _, _ in fields if hasattr(np.record, name)]:
         raise ValueError(f"field {', '.join(taken)}: numpy's own attribute of a record")
     return np.dtype((np.record, list(fields)))

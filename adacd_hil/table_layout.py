@@ -102,10 +102,12 @@ def _rows(line: Sequence[str], widths: Sequence[int]) -> list[tuple[str, ...]]:
 
 
 def _cut(line: Sequence[str], widths: Sequence[int]) -> list[list[str]]:
+    """Return a line as its only row, each cell cut to its column's width."""
     return [[cell if len(cell) <= width else f"{cell[: width - 1]}…" for cell, width in zip(line, widths, strict=True)]]
 
 
 def _wrapped(text: str, width: int, indent: str) -> list[str]:
+    """Return the lines of a cell, wrapped to a width; `indent` begins each but the first."""
     if len(text) <= width:
         return [text]
     indent = indent if len(indent) < width else ""
@@ -126,6 +128,7 @@ def _broken(word: str, room: int) -> str:
 
 
 def _aligned(lines: Sequence[Sequence[str]], widths: Sequence[int], right: Collection[int]) -> list[str]:
+    """Return rows as text, cells padded to their column's width; columns in `right` are aligned to the right."""
     return [
         _GAP.join(
             cell.rjust(width) if column in right else cell.ljust(width)

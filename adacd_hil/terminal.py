@@ -73,6 +73,7 @@ def fold(text: str, width: int | None) -> str:
 
 
 def _parts(line: str, width: int) -> list[str]:
+    """Return a line folded as `fold` does, as its parts."""
     if len(line.expandtabs()) <= width:
         return [line]
     field = _FIRST_FIELD.match(line, 0, width // 3)
@@ -213,6 +214,7 @@ class Terminal(io.TextIOBase):
         return True
 
     def _put(self, view: memoryview) -> None:
+        """Write all bytes, and wait while the output blocks; give up when the patience is over. Raises OSError."""
         poll = select.poll()
         poll.register(self._descriptor, select.POLLOUT)
         polls = 0
@@ -324,5 +326,6 @@ def _ask_again(lost: "sys.UnraisableHookArgs") -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
+    """Handle SIGINT: shorten the waits of both streams, and raise KeyboardInterrupt."""
     hurry()
     signal.default_int_handler(number, frame)

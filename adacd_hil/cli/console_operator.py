@@ -51,6 +51,7 @@ class ConsoleOperator:
         self._thread.join(timeout_s)
 
     def _listen(self) -> None:
+        """Queue the request of each known word until the terminal's stream ends; print that a word is unknown."""
         if isinstance(self._stream, io.TextIOWrapper):
             self._stream.reconfigure(errors="replace")  # an invalid character must not end the thread
         with contextlib.suppress(OSError):  # the terminal has hung up, or this process is in its background

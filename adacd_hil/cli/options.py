@@ -95,6 +95,7 @@ _BUS_OPTIONS = (  # last first: click lists them the other way round
 
 
 def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
+    """Return the options --channel and --interface."""
     return (
         click.option(
             "-c",
@@ -128,6 +129,11 @@ def on_bus_or_url(help_text: str) -> Callable[[Callable[..., ExitCode]], Callabl
 
 
 def _connected(command: Callable[..., ExitCode], is_required: bool) -> Callable[..., None]:
+    """Return a command, as `explained`, with the options of a bus; it receives a `Connection`, or the URL, first.
+
+    It raises CommandError without interface and channel, unless there is a URL.
+    """
+
     @functools.wraps(command)
     def connect(
         interface: str | None,
@@ -216,6 +222,10 @@ def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
 
 
 def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int) -> "LiveView":
+    """Return the live view of an installed package.
+
+    Raises CommandError if there is no such package, an origin is wrong, or the port can't be listened on.
+    """
     require_extra("--live", "websockets")
     try:
         (view,) = entry_points(group=LIVE_ENTRY_POINTS)

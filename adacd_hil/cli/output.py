@@ -39,7 +39,7 @@ Done = TypeVar("Done")
 
 
 class ExitCode(IntEnum):
-    """Documented exit statuses."""
+    """Exit statuses of the commands; `EPILOG` explains them to the user."""
 
     OK = 0
     FAILURE = 1
@@ -72,7 +72,10 @@ class CommandError(Exception):
 
 
 def exit_code(summary: "SessionSummary") -> ExitCode:
-    """Return the exit status of a run: not started, broken off, faulted, log incomplete, interrupted, or fine."""
+    """Return the exit status of a run; the first that applies.
+
+    BUS_MISSING: not started. SAFETY_STOP: broken off, or faulted. PARTIAL: the log is incomplete. INTERRUPTED. OK.
+    """
     from adacd_hil.records import FaultReason
 
     if summary.result is None:
@@ -318,6 +321,7 @@ def run_folder(out: Path | None, log_names: tuple[str, ...], name: str) -> Itera
 
 
 def _make_dated() -> Path:
+    """Make a new folder in `runs`, named by the date, with a number if that is taken; return it. Raises OSError."""
     RUNS.mkdir(parents=True, exist_ok=True)
     date = datetime.fromtimestamp(wall_ns() // 1_000_000_000).strftime(_DATE)
     for number in itertools.count(1):

@@ -95,6 +95,7 @@ def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
 
 
 def _device_problems(settings: Settings) -> list[str]:
+    """Return the errors of the drives' and sensors' device profiles, each once."""
     devices = settings.devices
     problems: dict[str, None] = {}
     for kind, names in (("drive", devices.drive), ("sensor", devices.sensor)):
@@ -114,6 +115,7 @@ _BOUNDS = (
 
 
 def _over(settings: Settings) -> Iterator[str]:
+    """Yield a warning for each joint's value that exceeds its bound in `_BOUNDS`."""
     for key, bound_key, unit, outcome in _BOUNDS:
         pairs = zip(value_of(settings, key), value_of(settings, bound_key), strict=True)
         for joint, (value, bound) in enumerate(pairs):
@@ -123,6 +125,7 @@ def _over(settings: Settings) -> Iterator[str]:
 
 
 def _radians(settings: Settings) -> Iterator[str]:
+    """Yield a warning for each setting in degrees that is so small that radians were probably meant."""
     for key in ("arm.position_limit_deg", "trajectory.amplitude_deg", "arm.velocity_limit_deg_s"):
         values = value_of(settings, key)
         if 0.0 < max(values) <= _MOST_RAD:
@@ -132,6 +135,7 @@ def _radians(settings: Settings) -> Iterator[str]:
 
 
 def _unknown_assumptions(settings: Settings) -> Iterator[str]:
+    """Yield a warning for each key in `assumed` that is no setting."""
     known = known_keys()
     for key in settings.assumed:
         if key not in known:

@@ -37,7 +37,10 @@ class Controller:
         )
 
     def feed_forward(self, theta: Vector) -> None:
-        """Begin to blend the feedforward to theta (p,) over HANDOVER_S; do nothing for the same array as last."""
+        """Begin to blend the feedforward to theta (p,) over HANDOVER_S.
+
+        Do nothing for the same array as in the last call, or if the settings have no feedforward.
+        """
         if theta is self._new or not self._has_feedforward:
             return
         self._old, self._new = self._theta, theta

@@ -225,6 +225,7 @@ class Cycle:
         return self._finish() if request is Request.FINISH else request
 
     def _finish(self) -> Request:
+        """Begin to park the arm if its drives may have torque, and store when; return FINISH."""
         if not self._is_finishing:
             self._finish_cycle = self._arm.cycle
         self._is_finishing = True
@@ -292,6 +293,7 @@ class Cycle:
             self._narration.transition(t_ns, output, event.message)
 
     def _transition(self, output: SchemeOutput, arm: ArmState) -> Event:
+        """Return the event of a change of state, with the cause where the states' names don't show it."""
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is SchemeState.REACT and output.contact is None:
             late = f"{FaultReason.DEADLINE.name}; {self._watch.deadline.describe_misses()}"
@@ -305,6 +307,10 @@ class Cycle:
         return Event("error", "supervisor", f"{text}: {details}")
 
     def _follow_state(self, state: SchemeState, cycle: int) -> None:
+        """Store a new state, and the cycle in which the drives were enabled or the fault came.
+
+        Compare the first certificate with the link lengths. Drop a request that the state serves.
+        """
         self._state = state
         if state in (SchemeState.ADAPT, SchemeState.REACT) and self._enabled_cycle is None:
             self._enabled_cycle = cycle
@@ -315,6 +321,10 @@ class Cycle:
         self._kept.serve((state,))
 
     def _is_over(self, output: SchemeOutput | None) -> bool:
+        """Return whether the loop ends: FAULT_LINGER_S after a fault, at a second interrupt, or when FINISH is done.
+
+        FINISH is done once the arm is parked, has no power, or hasn't parked within FINISH_S.
+        """
         if output is None:
             return False
         if self._faulted_cycle is not None:

@@ -228,7 +228,7 @@ def solve_readings(normals: Vector, count: int, blocks: int, shares: Vector, sol
 
 
 class DeviceReadings:
-    """Fits all readings to the blocks of a motion."""
+    """Fits all readings to the blocks of a motion, and returns and names those that the motion doesn't refute."""
 
     def __init__(self, settings: Settings) -> None:
         """Prepare the normal equations of all readings, without blocks."""
@@ -273,9 +273,9 @@ class DeviceReadings:
     def left(self, found: Sequence[TorqueRatio | None], error: float) -> list[Reading]:
         """Return the readings that neither equation nor torques refute, best first; the best of each kind and joint.
 
-        found: ratios of the torque sensors, by node; None: unknown. error: possible relative error of a scale. Empty if
-        the best reading of all is refuted but explains far more than the others: then the right one is not
-        among them.
+        found: ratios of the torque sensors, by node; None: unknown. error: possible relative error of a scale. Empty
+        with fewer than _SUSPECT_BLOCKS blocks, or if the best reading of all is refuted but explains far more than the
+        others: then the right one is not among them.
         """
         if self._blocks < _SUSPECT_BLOCKS:
             return []

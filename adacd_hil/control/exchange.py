@@ -86,9 +86,9 @@ class Exchange:
         self.events.report(self.sync_ns, "late", Event("warning", "late commands", text), count)
 
     def _await_feedback(self, last_ns: int) -> int:
-        """Take frames until all of this cycle are in or the time for them is over; return that moment, ns.
+        """Take frames until all of this cycle are in, their time is over, or another host's next SYNC comes.
 
-        `last_ns`: time of the last frame taken so far.
+        Return that moment, ns. `last_ns`: time of the last frame taken so far.
         """
         bus, arm, sync_ns = self._bus, self._arm, self.sync_ns
         patience_s = self._patience_s
@@ -120,11 +120,15 @@ class Exchange:
             self._accept(late)
 
     def _accept(self, frame: Frame) -> None:
+        """Give a frame to the arm; pass it on if the arm doesn't take it."""
         if not self._arm.accept(frame):
             self._pass_on(frame)
 
     def _pass_on(self, frame: Frame) -> None:
-        """Report an error frame; give any other frame that isn't the arm's to the CANopen master."""
+        """Report an error frame; give any other frame to the CANopen master.
+
+        Call it with frames that the arm has not taken.
+        """
         if frame.is_error:
             say_trouble(self.events, frame)
         else:
@@ -147,6 +151,7 @@ class Exchange:
         return record
 
     def _record(self, tick: Tick, arm: ArmState, log_queue_bytes: int) -> CycleRecord:
+        """Return the record of a cycle whose commands have just left; report frames that the kernel has dropped."""
         command_ns = self._clock.now_ns()
         frames_lost = self._bus.frames_lost
         if frames_lost != self._said_lost and self.events.is_due("lost", command_ns):

@@ -72,7 +72,7 @@ class SelfChecks:
             return self._fail(FaultReason.TORQUE, Request.FAULT_TORQUE, line)
         if self._first_motion.line:
             return self._fail(FaultReason.MISCONFIGURED, Request.FAULT_MISCONFIGURED, self._first_motion.line)
-        line = self._judge_motion(arm) if state in _JUDGED else self._follow()
+        line = self._judge_motion(arm) if state in _JUDGED else self._skip_motion()
         return self._fail(FaultReason.FOLLOWING, Request.FAULT_FOLLOWING, line) if line else Request.NONE
 
     def suspicions(self, fault: FaultReason) -> list[str]:
@@ -81,15 +81,18 @@ class SelfChecks:
         return [line] if line else []
 
     def _fail(self, reason: FaultReason, request: Request, line: str) -> Request:
+        """Store `reason` and `line` unless an earlier failure is stored; return `request`."""
         if self.reason is FaultReason.NONE:
             self.reason, self.line = reason, line
         return request
 
-    def _follow(self) -> str:
+    def _skip_motion(self) -> str:
+        """Set the time outside the following window to 0; return "", for no failure."""
         self._away_cycles = 0
         return ""
 
     def _judge_motion(self, arm: ArmState) -> str:
+        """Return a line if the arm has been outside its following window for the timeout, else ""."""
         (q1, q2), (desired1, desired2), (window1, window2) = arm.q.tolist(), self._q_d.tolist(), self._window_rad
         errors = abs(q1 - desired1), abs(q2 - desired2)
         is_near = errors[0] <= window1 and errors[1] <= window2
@@ -103,6 +106,10 @@ class SelfChecks:
         )
 
     def _judge_torque(self, cycle: int) -> str:
+        """Return a line for a drive whose torque has been outside its recent commands' range for too long, else "".
+
+        Only statuses of this cycle are judged. Too long: TORQUE_STATUSES in a row, and TORQUE_S.
+        """
         for drive, rated_Nm in zip(self._arm.drives, self._arm.limits.rated_torque_Nm, strict=True):
             if drive.status_cycle != cycle or not drive.shows_torque:
                 continue
@@ -239,6 +246,7 @@ class CommissionReport(EventSource):
         return lines
 
     def _text(self, cause: str | tuple[int, int]) -> str:
+        """Return a counted cause as text; a joint beyond a bound with its largest value."""
         if isinstance(cause, str):
             return cause
         joint, place = cause
@@ -298,6 +306,7 @@ class Recovery:
         return False
 
     def _await_bus(self) -> bool:
+        """Try to empty the bus, each _RETRY_NS, until it is empty; return False if the run is interrupted before."""
         self._say("info", "fault acknowledged")
         while not self._is_interrupted():
             if self.empty():

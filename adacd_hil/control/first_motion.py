@@ -194,6 +194,7 @@ class FirstMotion(EventSource):
         return [] if self._readings is None else self._readings.left(self._ratios(), self._error)
 
     def _ratios(self) -> list[TorqueRatio | None]:
+        """Return each joint's ratios of sensed to commanded torque; None with fewer than _FEWEST_BLOCKS in motion."""
         return [
             ratio_of(self._normal[joint], self._moving[joint]) if self._moving[joint] >= _FEWEST_BLOCKS else None
             for joint in range(JOINTS)
@@ -220,6 +221,7 @@ class FirstMotion(EventSource):
         )
 
     def _take_block(self, block: "_Block") -> None:
+        """Add a long block to the sums of positions, and of torques where a joint moves; judge each fifth block."""
         self._path += block.travel * block.way, block.way * block.way, block.travel * block.travel
         self._way_rad += np.abs(block.way)
         for joint in range(JOINTS):
@@ -250,6 +252,7 @@ class FirstMotion(EventSource):
         self.line = self._judge_position() or self._judge_torque()
 
     def _judge_position(self) -> str:
+        """Return the contradiction of a joint's position to its velocity, a wrong scale or sign; "" without one."""
         for joint in range(JOINTS):
             if self._way_rad[joint] < _LEAST_WAY_RAD:
                 continue
@@ -266,6 +269,7 @@ class FirstMotion(EventSource):
         return ""
 
     def _judge_torque(self) -> str:
+        """Return the contradiction of a torque sensor to the commands, "" without one; close joints that agree."""
         found = self._ratios()
         first, second = found
         if first is not None and second is not None and is_of_other(first) and is_of_other(second):
@@ -298,6 +302,7 @@ class FirstMotion(EventSource):
         self.events.append(Event("warning" if is_off else "info", "first motion", text))
 
     def _scales(self, joint: int) -> str:
+        """Return, as text, the settings that scale a joint's torque."""
         gear, rated_Nm = self._arm.gear_ratios[joint], self._settings.arm.rated_torque_Nm[joint]
         gear_text = f"scale.gear_ratio = {gear:g} of devices.drive[{joint}]"
         text = f"scale.torque_Nm of devices.sensor[{joint}], arm.rated_torque_Nm[{joint}] = {rated_Nm:g} Nm"
@@ -306,6 +311,7 @@ class FirstMotion(EventSource):
         return f"{gear_text}, its scale.gear_efficiency, {text}, and the motor's torque constant"
 
     def _describe(self, joint: int, ratio: "TorqueRatio") -> str:
+        """Return the contradiction of a joint whose torque ratio is wrong: the ratio, likely mistake and remedy."""
         head = f"joint {joint + 1}: its torque sensor measures {ratio.own:+.2f} times the commanded torque"
         if abs(ratio.own) <= _NOTHING:
             return (
@@ -375,7 +381,10 @@ class _Blocks:
 
 
 def is_of_other(ratio: TorqueRatio) -> bool:
-    """Return whether the sensor measures the other joint's torque instead of its own."""
+    """Return whether the sensor measures the other joint's torque instead of its own; False while a ratio is uncertain.
+
+    Uncertain: a standard deviation of 2 _SURE or more.
+    """
     is_known = max(ratio.own_std, ratio.other_std) < 2.0 * _SURE
     return is_known and abs(ratio.own) < 0.4 and abs(ratio.other) > 0.6
 

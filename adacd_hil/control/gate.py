@@ -60,6 +60,7 @@ class Gate:
         return flags
 
     def _close(self, tau_c: Vector, flag: GateFlag) -> GateFlag:
+        """Set `tau_c` and the last torque to zero; return `flag`."""
         self._last_Nm = [0.0] * JOINTS
         tau_c[:] = 0.0
         return flag

@@ -52,6 +52,7 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
 
 
 def _by_direction(settings: Settings, theta: tuple[float, ...]) -> Event | None:
+    """Return a warning if gravity acts against the configured mounting, by the sign of a5; else None."""
     expected_Nm = settings.gravity_m_s2 * theta[A2] / settings.arm.link_length_m[0]
     if theta[A5] >= -_SEEN * abs(expected_Nm) or expected_Nm <= 0.0:
         return None
@@ -62,6 +63,10 @@ def _by_direction(settings: Settings, theta: tuple[float, ...]) -> Event | None:
 
 
 def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:
+    """Compare the length of link 1 by inertia over gravity with the configured one; return an event if they differ.
+
+    An info if link 1 seems longer, as a smaller tilt has the same effect; a warning if it seems shorter.
+    """
     configured_m, configured_tilt_deg = settings.arm.link_length_m[0], settings.mounting_deg[0]
     if theta[A2] == 0.0 or theta[A5] == 0.0:
         return None
@@ -82,6 +87,7 @@ def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:
 
 
 def _by_cad(theta: tuple[float, ...], cad: tuple[float, ...], lengths: tuple[float, float]) -> Event | None:
+    """Return a warning if the inertias differ from the CAD model's as if one link had another length; else None."""
     cross, near, far = (
         _ratio(theta[A2], cad[A2]),
         _ratio(theta[A1] - theta[A3], cad[A1] - cad[A3]),

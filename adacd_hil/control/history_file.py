@@ -197,6 +197,7 @@ class UsedHistory:
         return [Event("info", "history", f"{self.path}: {self._count()}, the last of {self.history.last.date_utc}")]
 
     def _count(self) -> str:
+        """Return the number of certificates that were read, as text."""
         count = 0 if self.history is None else len(self.history.certificates)
         return f"{count} certificate{'' if count == 1 else 's'}"
 
@@ -233,7 +234,7 @@ class UsedHistory:
 
 
 class Origin(NamedTuple):
-    """Origin of certificates: run, log, profile, version; see `CertificateRecord`."""
+    """Origin of certificates: end of the run, log, arm profile, version of adacd-hil; see `CertificateRecord`."""
 
     date_utc: str
     log: str

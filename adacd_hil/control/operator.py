@@ -61,6 +61,7 @@ class ScriptedOperator:
         return self._acknowledge(elapsed_s, state)
 
     def _acknowledge(self, elapsed_s: float, state: SchemeState) -> Request:
+        """Return ACKNOWLEDGE each time that the arm has been stopped for the settings' time, else NONE."""
         if state is not SchemeState.STOPPED:
             self._stopped_since_s = None
             return Request.NONE
@@ -118,6 +119,7 @@ class RunNarration:
         self.event(t_ns, f"{words}  [{names}]{': ' if details else ''}{details}")
 
     def _words(self, t_ns: int, output: SchemeOutput) -> str:
+        """Return the text of a new state."""
         contact = output.contact
         if output.state is SchemeState.REACT:
             return self._touch(t_ns, output) if contact is not None else "stops"
@@ -128,6 +130,7 @@ class RunNarration:
         return _STATES.get(output.state, output.state.name.lower())
 
     def _touch(self, t_ns: int, output: SchemeOutput) -> str:
+        """Return the text of a detected touch: its level, the delay of the detection if known, the reaction."""
         contact = output.contact
         assert contact is not None
         what = "light touch" if contact.level is ContactLevel.CONTACT else "touch"

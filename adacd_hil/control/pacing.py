@@ -52,6 +52,7 @@ class HostLatency:
         return self._drawn.pop()
 
     def _draw_block(self) -> list[int]:
+        """Return the latencies of the next _BLOCK cycles, ns, that of the next cycle last."""
         settings, generator = self._settings, self._generator
         low_us, high_us = settings.latency_us, settings.latency_high_us
         if settings.latency == "uniform":

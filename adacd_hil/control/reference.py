@@ -57,7 +57,10 @@ Path = Callable[[float, Vector, Vector, Vector], None]
 
 
 class Reference(EventSource):
-    """The desired motion. `q_d`, `dq_d`, `ddq_d` (2,) are views of the control block that it fills."""
+    """The desired motion: fills `q_d`, `dq_d`, `ddq_d` (2,), views of the control block, in each cycle.
+
+    `events`: joints that can't stop within their position limits.
+    """
 
     def __init__(self, settings: Settings, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
         """Prepare the motions. Raises ConfigError if trajectory or excitation leave the arm's limits."""
@@ -184,6 +187,7 @@ class Reference(EventSource):
         return False
 
     def _stay(self, arm: ArmState) -> None:
+        """Set the desired motion to rest at the measured position."""
         self._q_d[:] = arm.q
         self._dq_d[:] = 0.0
         self._ddq_d[:] = 0.0
@@ -204,6 +208,7 @@ class Reference(EventSource):
 
     @property
     def _wanted_share(self) -> float:
+        """Return the pace that the arm shall reach: 0 while stopping, less than 1 for SLOW_DOWN, else 1."""
         if self._is_stopping:
             return 0.0
         return self._slow_share if self._reaction is Reaction.SLOW_DOWN and self._state in REACTING else 1.0
@@ -303,9 +308,11 @@ class Reference(EventSource):
         self._beyond.update(withdrawal.beyond_limits)
 
     def _stop_from(self, q: Vector, dq: Vector) -> Withdrawal:
+        """Return the soonest stop from q, dq (2,): a withdrawal without a push."""
         return Withdrawal(self._settings, q, dq, np.zeros(JOINTS))
 
     def _brake(self, cycle: int) -> None:
+        """Make the soonest stop from the present desired motion the path."""
         self._withdraw(self._stop_from(self._q_d, self._dq_d), cycle)
 
     def _approach(self) -> None:
@@ -331,8 +338,10 @@ class Reference(EventSource):
         self._is_stopping = False
 
     def _start(self, path: Path, cycle: int) -> None:
+        """Begin a path in this cycle, at full pace."""
         self._path, self._start_cycle = path, cycle
         self._pace.begin_path()
 
     def _follow(self, elapsed_s: float, q: Vector, dq: Vector, ddq: Vector) -> None:
+        """Fill q, dq, ddq (2,) of the trajectory, as a `Path`."""
         corner_to_corner(elapsed_s, self._amplitude, self._half_period_s, q, dq, ddq)

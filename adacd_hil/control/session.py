@@ -252,6 +252,7 @@ class Session:
         recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _run(self, cycle: Cycle, master: Master, recorder: Recorder, tap: Tap) -> RunResult:
+        """Set the devices to Operational, run the cycles, and stop the devices in any case; return the result."""
         if not self._has_started:
             self._has_started = True
             self.on_started()
@@ -271,6 +272,7 @@ class Session:
         recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
+        """Create the log with its attachments and metadata, and the files beside it; return its recorder."""
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
         attachments = device_attachments(self.devices)

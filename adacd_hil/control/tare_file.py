@@ -198,9 +198,10 @@ class UsedTare:
 
 
 def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
-    """Read a tare for a run with these settings, with warnings about its age. now_ns: wall clock.
+    """Read a tare for a run with these settings, with warnings about its age and a zero set by the sensors themselves.
 
-    Raises ConfigError if it is missing, too old, or measured with another sign, mounting or zero of the arm.
+    now_ns: wall clock. Raises ConfigError if the tare is missing, too old, or measured with another sign, or in gravity
+    with another mounting or zero of the arm.
     """
     tare = read_tare(path)
     if tare.sign != settings.arm.sign:

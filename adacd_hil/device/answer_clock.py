@@ -89,6 +89,7 @@ class AnswerClock:
         return position_error is None or position_error(1) <= position_error(-1) + CLEAR_RAD
 
     def _is_usual(self, offset_ns: int) -> bool:
+        """Return whether a frame comes no later after SYNC than the device usually answers; True if that is unknown."""
         return not self._usual_count or offset_ns <= self._latest_ns + TOLERANCE_NS
 
     def _follows_lost_ones(self, owed: int, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:

@@ -131,6 +131,7 @@ class Arm:
                 device.miss()
 
     def _remember_gaps(self) -> None:
+        """Shift the cycle that ends now into each device's bits of `gaps`."""
         for place, gaps in enumerate(self.gaps):
             self.gaps[place] = (gaps << 1 | ~self.received >> place & 1) & REMEMBERED_GAPS
         self._has_gaps = any(self.gaps)
@@ -301,6 +302,7 @@ class Arm:
         )
 
     def _device_fault(self, is_enabled: bool) -> FaultReason:
+        """Return the arm's first fault: a drive that dropped out, a device's own, EMCY, another sender; else NONE."""
         has_dropped_out = self.was_enabled and not is_enabled
         self.was_enabled |= is_enabled
         if has_dropped_out:
@@ -325,6 +327,7 @@ class Arm:
             self._bus.send_all(self._encode(*values))
 
     def _encode(self, tau_c: list[float], enable: bool, quick_stop: bool) -> tuple[tuple[int, bytes], ...]:
+        """Return identifier and data of both commands; each call advances their alive counters."""
         (drive1, drive2), (ratio1, ratio2), (tau1, tau2) = self.drives, self._permille_per_Nm, tau_c
         return (
             (drive1.command_id, drive1.command(round(tau1 * ratio1), enable, quick_stop)),

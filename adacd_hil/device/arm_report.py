@@ -236,6 +236,7 @@ def describe_excess(arm: Arm) -> list[str]:
 
 
 def _describe_disabled(drive: Drive) -> list[str]:
+    """Return a line with state and mode of a drive that is not enabled; empty for one that is."""
     if drive.is_enabled:
         return []
     return [f"{drive.name}: {drive.state.name}, mode {drive.mode}, OPERATION_ENABLED in mode 10 expected"]

@@ -119,6 +119,8 @@ _STATES = {0: "boot-up", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
 
 @dataclass
 class _WatchedNode:
+    """A node and its last heartbeat. has_run: it was OPERATIONAL since `start`. complaint: its failure, or ""."""
+
     name: str
     node_id: int
     state: int | None = None
@@ -182,6 +184,10 @@ class HeartbeatWatch:
         return lines
 
     def _judge(self, node: _WatchedNode, t_ns: int, since_ns: int) -> str:
+        """Return a node's failure now in one line, or ""; report a failure that is new, another than before, or over.
+
+        since_ns: time of the first judgement after `start`.
+        """
         heard_ns = since_ns if node.heard_ns is None else max(node.heard_ns, since_ns)
         silent_ns = t_ns - heard_ns
         state = node.state if node.left_to is None else node.left_to

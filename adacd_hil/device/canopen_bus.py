@@ -157,6 +157,7 @@ class CanopenBus:
         self._bus.send(NMT_ID, bytes((nmt_command, node_id)))
 
     def _send(self, can_id: int, data: bytes) -> None:
+        """Send a frame for canopen; after an SDO request, read the bus until its answer is in or overdue."""
         is_request = can_id & 0x780 == SDO_REQUEST_ID and data[0] != SDO_ABORT
         answer_s, pause_s = self._patience.get(can_id & 0x7F, (ANSWER_TIMEOUT_S, 0.0))
         if is_request and pause_s:
@@ -228,6 +229,7 @@ def read_object(node: Any, index: int, subindex: int = 0) -> bytes | None:
 
 @functools.cache
 def _emergency_names() -> dict[str, dict[int, str]]:
+    """Return the names of error codes, by code, and of their classes, by high byte."""
     text = resources.files("adacd_hil.device").joinpath("emergency_codes.toml").read_text(encoding="utf-8")
     return {kind: {int(key, 16): name for key, name in names.items()} for kind, names in tomllib.loads(text).items()}
 

@@ -37,6 +37,8 @@ _FRAME_FORMATS = ("StandardCAN", "ExtendedCAN", "reserved", "J1939PG", *("reserv
 
 
 class _DbcSignal(NamedTuple):
+    """One signal of a composed DBC; value = raw x scale, in `unit`."""
+
     name: str
     bits: int
     is_signed: bool = False
@@ -52,6 +54,11 @@ class _DbcSignal(NamedTuple):
 
 @dataclass
 class _DbcMessage:
+    """One message of a composed DBC; its signals follow each other without gaps.
+
+    period_ms, delay_ms: GenMsgCycleTime, GenMsgDelayTime. values: names of values, by signal.
+    """
+
     can_id: int
     name: str
     sender: str
@@ -166,6 +173,7 @@ def _scales(message: MessageCodec) -> str:
 
 
 def _messages(settings: Settings, devices: Sequence[PlacedDevice]) -> list[_DbcMessage]:
+    """Return the messages of an arm, sorted by identifier. Raises ConfigError as `_pdo_message`, and for equal ones."""
     names = tuple(device.name.upper() for device in devices)
     heartbeat_ms = settings.bus.heartbeat_ms
     nmt = (_DbcSignal("command", 8), _DbcSignal("node", 8))
@@ -226,6 +234,7 @@ def _mapped(device: PlacedDevice, pdo: PdoSettings, name: ObjectName) -> EdsVari
 
 
 def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
+    """Return the message of a PDO. Raises ConfigError if its objects, header, bounds or length don't fit."""
     profile, name = device.settings, device.name.upper()
     for place in (ObjectName(pdo.communication_index, 1), ObjectName(pdo.mapping_index)):
         if not device.has(place.index, place.sub):
@@ -284,6 +293,7 @@ def _check_bounds(device: PlacedDevice, pdo: PdoSettings, signals: list[_DbcSign
 
 
 def _check_identifiers(messages: list[_DbcMessage]) -> None:
+    """Raise ConfigError for two messages with the same identifier."""
     owner: dict[int, str] = {}
     for message in messages:
         if message.can_id in owner:
@@ -328,6 +338,7 @@ BA_DEF_DEF_ "GenMsgDelayTime" 0;
 
 
 def _write_dbc(settings: Settings, messages: list[_DbcMessage]) -> str:
+    """Return the text of a DBC. Raises ConfigError for frames of CAN FD without a data bit rate in the settings."""
     senders = sorted({message.sender for message in messages} - {"HOST"})
     is_fd = any(message.length > CLASSIC_BYTES for message in messages)
     if is_fd and not settings.devices.data_bitrate:

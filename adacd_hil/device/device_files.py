@@ -109,6 +109,7 @@ def _logged_profile(name: str, attachments: Mapping[str, bytes]) -> DeviceProfil
 
 
 def _placed(settings: Settings, profile_of: Callable[[str, int], DeviceProfile]) -> list[PlacedDevice]:
+    """Return all devices in order; profile_of: returns the profile by kind and joint from 0. Raises ConfigError."""
     chosen = settings.devices
     devices = []
     for kind, nodes in (("drive", chosen.drive_node), ("sensor", chosen.sensor_node)):

@@ -81,7 +81,7 @@ class Slave:
             )
 
     def compare(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False) -> str:
-        """Return an object's difference from its expected value in words, "" if equal; note the value in `known`.
+        """Return an object's difference from its expected value in words, "" if equal; note that value in `known`.
 
         Raises DeviceError, BusError.
         """
@@ -107,6 +107,7 @@ class Slave:
         raise DeviceError(f"{self.name} (node {self.node_id}): {text}", remedy)
 
     def _entry(self, index: int, sub: int) -> Any:
+        """Return canopen's access to an object over SDO. Raises DeviceError if the EDS doesn't list the object."""
         entry = self._node.sdo.get_variable(index, sub)
         if entry is None:
             self.fail(f"{ObjectName(index, sub)} is not in the EDS")
@@ -331,6 +332,7 @@ def check_sensor(slave: Slave, codec: Codec) -> str:
 
 
 def _channel(slave: Slave) -> int:
+    """Return the channel of a sensor: the sub-index of the torque that its profile maps, 1 if that is 0."""
     pdo = slave.device.pdo("Torque")
     signals = () if pdo is None else pdo.signals
     return next((signal.name.sub for signal in signals if signal.signal == "torque"), 0) or 1
@@ -340,6 +342,8 @@ _UPLOAD = 0x40
 
 
 class _KnownObject(NamedTuple):
+    """An object of a device, and the value that it has had since the set-up."""
+
     slave: Slave
     place: tuple[int, int]
     """Index and sub-index."""
@@ -424,6 +428,7 @@ class ParameterWatch(RateLimitedEvents):
         return True
 
     def _compare(self, asked: _KnownObject, found: int, size: int) -> None:
+        """Store the first difference of an object of `size` bytes from its value at set-up in `first_difference`."""
         expected = asked.expected & (1 << 8 * size) - 1
         if found != expected and not self.first_difference:
             self.first_difference = f"{asked.name} is 0x{found:X}, 0x{expected:X} was set up"
@@ -459,11 +464,13 @@ def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
 
 
 def _event_timer(slave: Slave, pdo: PdoSettings, command_deadline_ms: int) -> int:
+    """Return the event timer that a PDO shall have, ms: the command deadline where the profile has it there."""
     has_deadline = pdo.is_received and slave.device.settings.command_watchdog == "0x1400:5"
     return command_deadline_ms if has_deadline else pdo.event_timer_ms
 
 
 def _switch_off_others(slave: Slave) -> None:
+    """Make the PDOs of a device invalid that its profile doesn't name."""
     used = {pdo.communication_index for pdo in slave.device.settings.pdo}
     for index in _RECORDS:
         if index in used or not slave.can_write(index, _COB_ID):

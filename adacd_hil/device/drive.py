@@ -171,7 +171,7 @@ class Drive(CyclicDevice):
         self.error_code = 0
 
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
-        """Return DATA_AGE for a status that is too old for an enabled drive, DRIVE for a bounded value outside."""
+        """Return DATA_AGE for a status too old for an enabled drive, DRIVE for a bounded value outside, else NONE."""
         if is_enabled and cycle - self.status_cycle > self.status_age_limit:
             return FaultReason.DATA_AGE
         return FaultReason.DRIVE if self.has_excess(cycle) else FaultReason.NONE
@@ -211,6 +211,7 @@ class Drive(CyclicDevice):
         return abs(values[self._main_at] - self._received - travel)
 
     def _take_status(self, values: Sequence[float], at: _StatusPlaces, cycle: int) -> None:
+        """Take the signals of the status that a frame carries, at their places; keep the values of all others."""
         self.status_cycle = cycle
         if at.statusword >= 0:
             self.statusword = int(values[at.statusword])
@@ -270,7 +271,10 @@ def _status_places(message: MessageCodec) -> _StatusPlaces:
 
 
 def _command_template(message: MessageCodec, max_torque_permille: int) -> tuple[list[int], int, int]:
-    """Return the raw values of a command with the constant ones filled in, and where controlword and torque are."""
+    """Return the raw values of a command with the constant ones filled in, and where controlword and torque are.
+
+    Raises CodecError for a signal that the host can't fill.
+    """
     constants = {
         "controlword": 0,
         "target_torque": 0,

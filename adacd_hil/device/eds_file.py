@@ -59,6 +59,7 @@ def parse_eds(data: bytes, path: Path, node_id: int | None) -> Any:
 
 @functools.lru_cache(maxsize=32)
 def _parse(data: bytes, node_id: int | None) -> Any:
+    """Check an EDS, and return canopen's object dictionary of it; the same one for the same arguments."""
     text = data.decode("utf-8", "replace").removeprefix("\ufeff")
     _check_eds(text)
     stream = io.StringIO(readable_eds(text))

@@ -79,6 +79,7 @@ class Master(EventSource):
         self._canopen.bystander = self._heartbeats.accept
 
     def _on_emergency(self, name: str, error: Any) -> None:
+        """Report an EMCY as an event, and keep it as the device's last error; forget that one after an error reset."""
         slave = next(slave for slave in self.slaves if slave.name == name)
         text = describe_emergency(error.code, bytes(error.data), slave.device.can("watchdog_in_emcy"))
         if error.code >> 8:
@@ -95,6 +96,7 @@ class Master(EventSource):
         self._canopen.accept(frame)
 
     def _let_pass(self, duration_s: float) -> None:
+        """Read the bus for so long, and hand its frames to their consumers."""
         self._canopen.pump(lambda _: False, duration_s)
 
     def describe_checks(self) -> list[str]:
@@ -131,6 +133,7 @@ class Master(EventSource):
         return [self._identify(slave) for slave in self.slaves]
 
     def _identify(self, slave: Slave) -> Identity:
+        """Return a device's identity. Raises DeviceError if it differs from DBC, EDS or profile, and BusError."""
         profile = slave.device.settings
         by_contract = self._codec.node_id(f"{slave.name}Heartbeat")
         if slave.node_id != by_contract:
@@ -176,6 +179,7 @@ class Master(EventSource):
             )
 
     def _check_contract(self, slave: Slave) -> None:
+        """Raise DeviceError unless the device has the DBC's wire version and layout digest in 0x2000."""
         version, digest = slave.read(0x2000, 1), slave.read(0x2000, 2)
         if version != self._codec.wire_version:
             slave.fail(f"wire version {version} is not the DBC's {self._codec.wire_version}", _SAME_DBC)
@@ -205,6 +209,7 @@ class Master(EventSource):
         self.parameters.follow(self.slaves)
 
     def _set_up_sync(self, slave: Slave) -> None:
+        """Compare the identifier of SYNC; write its period, and its counter's overflow if the device counts."""
         if slave.has(0x1005):
             identifier = slave.read(0x1005) & MAX_STANDARD_ID
             if identifier != SYNC_ID:
@@ -236,6 +241,10 @@ class Master(EventSource):
             slave.write_checked(0x1015, 0, EMCY_INHIBIT_100US, "x 100 µs")
 
     def _set_up_heartbeats(self, slave: Slave) -> None:
+        """Write the period of the device's heartbeat, and its patience with the host's; warn if it can't be written.
+
+        With `watch_host` False the device doesn't watch the host.
+        """
         period_ms = self._settings.bus.heartbeat_ms
         if slave.device.is_heartbeat_known:
             slave.write_checked(0x1017, 0, period_ms, "ms")

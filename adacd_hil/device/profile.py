@@ -274,6 +274,7 @@ class ProfileSettings:
         self._check_assumed()
 
     def _check_frames(self) -> None:
+        """Raise ValueError for missing, doubled or misplaced frames or signals, and for feedback apart from SYNC."""
         wanted = {"drive": ("Feedback", "Command"), "sensor": ("Torque",)}[self.kind]
         found = [pdo.message for pdo in self.pdo]
         if missing := [name for name in wanted if name not in found]:
@@ -325,6 +326,7 @@ class ProfileSettings:
                 raise ValueError(f"{place}: unit = {unit!r} must be that of {signal.of!r}, {other!r}")
 
     def _check_protection(self) -> None:
+        """Raise ValueError for a header or data ids that `protection` doesn't have."""
         profile = PROFILES_BY_CODE.get(self.protection)
         objects = 0 if profile is None else profile.objects
         if len(self.header) != objects:
@@ -342,6 +344,7 @@ class ProfileSettings:
                 raise ValueError(f"pdo {pdo.message}: signal {taken[0]!r} has the name of a part of the header")
 
     def _check_scale(self) -> None:
+        """Raise ValueError for a missing or impossible scale, and for serial numbers that are not two."""
         if self.kind == "drive" and not (self.scale.increments_per_joint_rev and self.scale.velocity_rad_s):
             raise ValueError("scale: a drive needs increments_per_joint_rev and velocity_rad_s")
         if self.kind == "drive" and self.scale.increments_per_joint_rev < LEAST_INCREMENTS:
@@ -356,6 +359,7 @@ class ProfileSettings:
             raise ValueError(f"serial has {len(self.serial)} numbers, 2 expected")
 
     def _check_assumed(self) -> None:
+        """Raise ValueError for a key in `assumed` that no section in MERGED has."""
         known = [f"{name}.{field.name}" for name in MERGED for field in dataclasses.fields(type(getattr(self, name)))]
         for key in self.assumed:
             if key not in known:

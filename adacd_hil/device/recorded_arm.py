@@ -131,6 +131,7 @@ class RecordedArm:
         self._is_running = True
 
     def _accept(self, frame: Frame, is_late: bool = False) -> None:
+        """Give a received frame to the arm, else to the heartbeat watch; drop it before the host's NMT start."""
         if self._is_running and not self._arm.accept(frame, is_late):
             self._heartbeats.accept(frame)
 

@@ -123,6 +123,7 @@ class Strangers(RateLimitedEvents):
         self.report(frame.t_ns, (frame.can_id, "once"), Event("warning", "bus", text))
 
     def _complain(self, frame: Frame, doing: str, cycle: int) -> None:
+        """Report an action of another sender as an error, and keep it for `have_acted` and `describe_senders`."""
         text = f"somebody else {doing} (0x{frame.can_id:03X})"
         self._until_cycle = cycle + self._hold_cycles
         self._complaints[text] = cycle

@@ -101,6 +101,7 @@ class TorqueSensor(CyclicDevice):
 
 
 def _judge_range(torque: float, range_Nm: float) -> SensorStatus:
+    """Return NOT_VALID and the overload's bit for a torque at or beyond the end of the range, else no bits."""
     if torque >= range_Nm:
         return SensorStatus.NOT_VALID | SensorStatus.POSITIVE_OVERLOAD
     if torque <= -range_Nm:

@@ -135,6 +135,10 @@ class LogWalk:
         return None
 
     def _find_parts(self) -> None:
+        """Plan the walk: the readable parts in order, and a problem for each missing, damaged or foreign one.
+
+        Raises LogError when no part can be read.
+        """
         parts = parts_of(self.path)
         self._is_alone = list(parts) == [0]
         first_error: LogError | None = None
@@ -152,6 +156,7 @@ class LogWalk:
         self._last = max(parts)
 
     def _plan_part(self, head: Extras, path: Path, number: int) -> None:
+        """Add a part to the plan, with its attachments; a part of another log is a problem. number: by its name."""
         metadata = head.metadata.get(RUN_METADATA, {})
         said = metadata.pop(PART_KEY, str(number))
         is_foreign = bool(self.metadata and metadata) and metadata != self.metadata
@@ -200,6 +205,10 @@ class LogWalk:
             yield builder.take_piece()
 
     def _sum_up(self, summary: dict[str, str]) -> None:
+        """Add a part's summary to the log's: counts are added up, other entries replaced.
+
+        A part without a summary has no ending.
+        """
         both = self.summary.keys() & summary.keys() & _COUNTS
         sums = {key: str(summary_count(self.summary, key) + summary_count(summary, key)) for key in both}
         self.summary = {**self.summary, **summary, **sums}
@@ -226,6 +235,7 @@ class _PartWalk:
         self._has_searched = False
 
     def _note(self, problem: str) -> None:
+        """Keep the first problem of the file."""
         self.problem = self.problem or problem
 
     def pieces(self, is_ahead: bool) -> Iterator[RawPiece]:
@@ -242,6 +252,7 @@ class _PartWalk:
                 self._note(item.text)
 
     def _take_block(self, block: Block) -> Iterator[RawPiece]:
+        """Gather the messages of a block, each by the definitions before it; yield full pieces, and note problems."""
         contents = block.contents
         marks: list[tuple[int, RawRecord | None]] = [(record.offset, record) for record in contents.definitions]
         marks += [(place, None) for place in contents.breaks]
@@ -262,6 +273,7 @@ class _PartWalk:
             self._note("a message is not as long as its schema says")
 
     def _take_messages(self, block: Block, messages: slice) -> Iterator[RawPiece]:
+        """Gather some messages of a block; yield full pieces. Of an unknown channel, search the definition first."""
         channels = block.contents.channels[messages]
         slots = self._slots[channels]
         if UNKNOWN in slots:

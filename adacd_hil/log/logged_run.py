@@ -123,7 +123,7 @@ class Truth:
 
 
 def is_armed_in(state: NDArray[np.uint8]) -> Mask:
-    """Return for each state (n,) whether detection is armed in it: what judges call armed."""
+    """Return for each state (n,) whether it is MONITOR, in which detection counts as armed."""
     return np.asarray(state == SchemeState.MONITOR)
 
 

@@ -215,6 +215,7 @@ def _own_layout(message_type: MessageType) -> "np.dtype[Any] | None":
 
 
 def _number(metadata: Mapping[str, str], key: str, default: int) -> int:
+    """Return the integer under a key of a log's metadata. Raises LogError for another text."""
     try:
         return int(metadata.get(key, default))
     except ValueError:

@@ -70,6 +70,10 @@ class CanRecording(NamedTuple):
 
 
 def _time_of(wanted: Places, number: Places, t_ns: Places) -> Places:
+    """Return the times of the cycles `wanted` (m,), from ascending cycles `number` (n,) and their times `t_ns`.
+
+    A cycle that isn't among them gets 1 ns more than the cycle before it, or 1 ns less than the first one.
+    """
     place = np.searchsorted(number, wanted)
     is_known = number[np.minimum(place, len(number) - 1)] == wanted
     before = np.where(place > 0, t_ns[np.maximum(place - 1, 0)] + 1, t_ns[0] - 1)
@@ -112,6 +116,7 @@ def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording
 
 
 def _of_busiest_channel(frames: NDArray[Any], sync_id: int) -> NDArray[Any]:
+    """Return the frames of the CAN channel with the most SYNCs; all frames without a SYNC."""
     channels = frames["channel"][frames["can_id"] == sync_id]
     return frames[frames["channel"] == np.bincount(channels).argmax()] if channels.size else frames
 
@@ -263,6 +268,7 @@ class RecordingAlone:
         yield Part(list(self._stretches()), {}, (), frozenset())
 
     def _stretches(self) -> Iterator[CycleStretch]:
+        """Yield each attempt as one stretch, without the cycles at its end that disable the drives."""
         recording = self._recording
         number, t_ns = recording.number, self._t_ns()
         frames = recording.in_time(number, t_ns, slice(None))

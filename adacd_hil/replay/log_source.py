@@ -156,6 +156,11 @@ class AttemptSplitter:
         frames: NDArray[Any],
         begins: dict[int, int],
     ) -> Iterator[CycleStretch]:
+        """Yield the stretches of a piece; count gaps, and leave out and count cycles before the first attempt.
+
+        t_ns, scheme, other (n,): time and records of each cycle. begins: index of the first frame of each attempt that
+        begins here, by the row of its first cycle.
+        """
         is_begin = np.zeros(len(t_ns), np.bool_)
         is_begin[list(begins)] = True
         number: Places = other["cycle"].astype(np.int64)
@@ -236,6 +241,7 @@ class AttemptSplitter:
 
 
 def _sync_counters(frames: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the counters of the SYNCs among some frames, in order; a SYNC without data is left out."""
     is_sync = (frames["can_id"] == SYNC_ID) & ~frames["is_error"] & (frames["length"] > 0)
     return np.asarray(frames["data"][is_sync, 0])
 

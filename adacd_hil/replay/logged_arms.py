@@ -16,7 +16,10 @@ _FIELDS: Final = frozenset(member.name for member in ARM.head)
 
 
 def has_arms(path: Path) -> bool:
-    """Return whether a log has the arm's states. Logs of earlier versions lack them. Raises LogError."""
+    """Return whether a log has the arm's states, all fields of /arm; False without a cycle. Raises LogError.
+
+    Logs of earlier versions lack them.
+    """
     for piece in LogStream(path, (ARM.name, SCHEME.name), cycles_per_piece=1, is_ahead=False):
         if len(piece.series[SCHEME.name]):
             arms = piece.series[ARM.name]

@@ -167,6 +167,7 @@ class _Player:
         self.comparison.compare_events(logged, replayed, int(ticks.cycle[0]))
 
     def _begin(self) -> None:
+        """Begin an attempt: a new pipeline in INIT, and a new attempt of the script."""
         self._pipeline = new_pipeline(self.settings)
         self._state = SchemeState.INIT
         self.attempts += 1
@@ -316,6 +317,7 @@ def _known(requests: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _arms_of(arms: ArmBatch, rows: slice) -> ArmBatch:
+    """Return the arm's states in some rows."""
     columns: tuple[NDArray[Any], ...] = arms
     return ArmBatch(*(column[rows] for column in columns))
 
@@ -332,6 +334,7 @@ def _split(stretch: CycleStretch, bounds_ns: tuple[int, int]) -> Iterator[tuple[
 
 
 def _rows_of(stretch: CycleStretch, rows: slice) -> CycleStretch:
+    """Return some cycles of a stretch, with all its frames; only a part from row 0 on may begin the attempt."""
     scheme, requests = stretch.scheme, stretch.requests
     return stretch._replace(
         is_begin=stretch.is_begin and rows.start == 0,

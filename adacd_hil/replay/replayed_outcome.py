@@ -29,7 +29,7 @@ from adacd_hil.settings.configuration import Settings
 
 
 class StateChange(NamedTuple):
-    """A change of state."""
+    """A change of the scheme's state in a cycle; fault: its reason if the new state is FAULT."""
 
     cycle: int
     t_ns: int
@@ -47,7 +47,10 @@ class Adaptation(NamedTuple):
 
 
 class OutcomeGatherer:
-    """Takes in the decisions of one replay. `truth`: the true contacts, None if unknown."""
+    """Gathers the outcome of one replay from its decisions: states, reports, alarms, adaptations, sensitivity, score.
+
+    `truth`: the true contacts, None if unknown.
+    """
 
     def __init__(self, settings: Settings, truth: KnownContacts | None) -> None:
         self.transitions: list[StateChange] = []
@@ -143,6 +146,7 @@ class OutcomeGatherer:
         return threshold, push
 
     def _enter(self, transition: StateChange, theta_hat: Vector) -> None:
+        """Record a change of state, and the beginning or end of an adaptation by it; theta_hat (p,): estimate there."""
         self.transitions.append(transition)
         state = transition.state
         if state is SchemeState.ADAPT and self._began is None:
@@ -292,6 +296,7 @@ def side_by_side(replays: Sequence[Replay]) -> list[Row]:
 
 
 def _contact_rows(replays: Sequence[Replay]) -> list[Row]:
+    """Return a row per true contact: its delay in each replay, or why it was not found."""
     contacts = [
         {contact.number: contact for contact in (each.score.contacts if each.score else ())} for each in replays
     ]
@@ -311,6 +316,7 @@ def _contact_rows(replays: Sequence[Replay]) -> list[Row]:
 
 
 def _detected(found: Replay) -> str:
+    """Return how many true contacts were detected, of how many; the number of alarms where the truth is not known."""
     if found.score is None:
         return str(len(found.detections_ns))
     return found_text(len(found.score.delays_ms), len(found.score.contacts))

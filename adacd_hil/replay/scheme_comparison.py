@@ -86,6 +86,7 @@ class SchemeComparison:
                 self._compare_reals(name, logged, np.ascontiguousarray(batch.block[:, place]), ticks)
 
     def _compare_whole(self, name: str, logged: NDArray[Any], replayed: NDArray[Any], ticks: Ticks) -> None:
+        """Compare a field of whole numbers, logged and replayed (n,) each, and note the cycles in which it differs."""
         is_other = np.asarray(logged != replayed)
         if is_other.any():
             self._note(SCHEME.name, name, is_other, logged, replayed, ticks)
@@ -104,6 +105,10 @@ class SchemeComparison:
             self._note(SCHEME.name, name, is_other, logged, replayed, ticks)
 
     def _is_near(self, name: str, logged: Vector, replayed: Vector) -> NDArray[np.bool_]:
+        """Return where a field's values (n, k) are equal, or differ by no more than the tolerance; two NaN are equal.
+
+        The tolerance is a share of the column's largest logged value so far, at least of 1.
+        """
         finite = np.where(np.isfinite(logged), np.abs(logged), 0.0)
         scale = np.maximum(self._scales.get(name, np.ones(logged.shape[1])), finite.max(axis=0, initial=0.0))
         self._scales[name] = scale
@@ -177,6 +182,7 @@ class SchemeComparison:
                     self.add_mismatch(Mismatch(CONTACT.name, field, place, *where, _text(there), _text(here)))
 
     def _is_same(self, logged: float, replayed: float) -> bool:
+        """Return whether two values have the same bits, or are finite reals within the tolerance of each other."""
         if struct.pack("<d", logged) == struct.pack("<d", replayed):
             return True
         is_real = isinstance(logged, float) and math.isfinite(logged) and math.isfinite(replayed)
@@ -210,6 +216,7 @@ def _text(value: float) -> str:
 
 
 def _contact_values(logged: Mapping[str, Any], replayed: ContactReport) -> Iterator[tuple[str, str, float, float]]:
+    """Yield field, joint ("" for one value), logged and replayed value of each field that the logged report has."""
     for field, theirs in logged.items():
         ours = getattr(replayed, field)
         if isinstance(theirs, list):
@@ -232,6 +239,7 @@ def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...
 
 
 def _names_of(name: str, size: int, named: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
+    """Return the names of a field's values: those in `named`, else by size none, joints, or channels and joints."""
     if name in named:
         return tuple(named[name])
     if size == 1:
@@ -335,9 +343,9 @@ class Asking:
 
 
 class RequestCheck:
-    """Compares the logged requests with the script's. One request to finish that isn't in it may be an interrupt.
+    """Compares the logged requests with the script's. One FINISH that isn't in the script may be an interrupt.
 
-    The script's own may follow it, while the arm parks; where it doesn't, it was the same one at another time.
+    If the script asks for FINISH later, in a cycle where the log doesn't, the first one was no interrupt.
     """
 
     def __init__(self) -> None:

@@ -38,7 +38,11 @@ class Sample:
 
 
 class Gaps:
-    """Samples before this one: written by `certified_kernel`, at first by `certified_memory`."""
+    """Sample before the present one, and samples missing since: written by `certified_kernel` and `certified_memory`.
+
+    has_gap: the filters resume at the next sample. is_steady: no sample is missing. last, between: q, dq, tau_J of the
+    sample before, and of an interpolated one.
+    """
 
     has_gap: float
     is_steady: float
@@ -107,7 +111,7 @@ class Candidate:
 
 
 class Ring:
-    """Learnt samples that wait until no contact can have bent them: written by `belief`.
+    """Samples to be learnt, which wait until no contact can have bent them: written by `belief`.
 
     It may have more places than samples wait.
     """
@@ -145,7 +149,7 @@ class Fit:
 
 
 class Sensitivity:
-    """Noise, standstill and thresholds: written by `sensitivity`."""
+    """Noise, standstill, friction at rest, missing samples, and the thresholds by them: written by `sensitivity`."""
 
     still: EachFilter
     still_smooth: EachFilter
@@ -211,7 +215,7 @@ class Evidence:
 
 
 class Anchor:
-    """Anchors of the torque offsets: written by `anchor`."""
+    """Anchors of the torque offsets, and the fit's largest torque by place: written by `anchor`."""
 
     rest_count: float
     anchor_Nm: Annotated[Vector, "kinds n"]
@@ -220,7 +224,7 @@ class Anchor:
 
 
 class FitCheck:
-    """Steps and samples of a fit, to be explained by its end: written by `fit_check`."""
+    """Steps and kept samples of a fit, which the fit must explain at its end: written by `fit_check`."""
 
     fit_square: float
     fit_rows: float
@@ -241,7 +245,7 @@ class FitCheck:
 
 
 class Earlier:
-    """Number of beliefs kept from before a disturbance: written by `earlier`."""
+    """State of kept beliefs: their number, refused fits in a row, whether they have lapsed: written by `earlier`."""
 
     kept_count: float
     refused_fits: float
@@ -249,7 +253,7 @@ class Earlier:
 
 
 class Certificate:
-    """Reason why a certificate is withheld: written by `certificate`."""
+    """Contradiction for which a certificate is withheld or taken back, or NOTHING: written by `certificate`."""
 
     withheld_by: float
 
@@ -290,7 +294,11 @@ class MissingTorque:
 
 
 class Watch:
-    """Tasks left to Python at intervals: written by `cycle` and `certified_pipeline`."""
+    """Counts that decide when a cycle leaves a task to Python: written by `cycle` and `certified_pipeline`.
+
+    has_forgotten: FORGET was asked for the present contact. monitored_cycles: since the last SECOND. until_push_cycles:
+    until the check for PUSHED, 0 without one.
+    """
 
     has_forgotten: float
     monitored_cycles: float
@@ -323,7 +331,10 @@ class Memory:
 
 @dataclass(frozen=True)
 class NoiseConstants:
-    """Constants of `sensitivity`: by channel (2 C - 1,) (k_tau sigma_tau)² in Nm², and nu² in rad²/s⁴."""
+    """Constants of `sensitivity`: variances by channel (2 C - 1,), and the weight of a sample in each mean (`_share`).
+
+    torque_variance: (k_tau sigma_tau)², Nm². velocity_variance: nu², rad²/s⁴.
+    """
 
     torque_variance: Vector
     torque_gain: Vector
@@ -385,7 +396,7 @@ class TermConstants:
 
 @dataclass(frozen=True)
 class Limits:
-    """Bounds for the checks of a measurement alone."""
+    """Bounds of position, speed and rest for the checks of `kernel_samples.observe`."""
 
     position_limit_rad: Vector
     velocity_limit_rad_s: Vector

@@ -27,7 +27,7 @@ def percentiles(values: Values) -> dict[str, float]:
 
 
 def low_percentiles(values: Values) -> dict[str, float]:
-    """Return p50, p1, p0.1 and min of values that occurred, for values that must not be small."""
+    """Return p50, p1, p0.1 and min of values that occurred, for values that must not be small; empty without values."""
     mirrored = percentiles(-values)
     return {name: -value for name, value in zip(LOW_PERCENTILE_NAMES, mirrored.values(), strict=False)}
 
@@ -78,6 +78,7 @@ class Distribution:
                 self._sort_in(part)
 
     def _sort_in(self, values: NDArray[np.float64]) -> None:
+        """Count values (k,), without NaN, in their bins."""
         size = np.minimum(np.abs(values), _HIGH)
         place = np.maximum(_code(size) - _FIRST + 1, 0)
         place = np.where(values < 0.0, -place, place)
@@ -110,6 +111,7 @@ class Distribution:
         return 0.5 * (self._at((self.count - 1) // 2) + self._at(self.count // 2))
 
     def _values(self) -> NDArray[np.float64]:
+        """Return the values that are kept as they are, as one array."""
         self._kept = [np.concatenate(self._kept)] if self._kept else [np.empty(0)]
         return self._kept[0]
 

@@ -123,6 +123,7 @@ class _TruthRows:
         self._last = rows[-1:]
 
     def _rows(self, truth: Series) -> NDArray[Any]:
+        """Return the records as rows of type _ROW; a cycle number that falls begins the next attempt."""
         records, rows = truth.records, np.zeros(len(truth), _ROW)
         for name in _ROW.names or ():
             if name in truth.fields:
@@ -199,6 +200,7 @@ class _TruthRows:
 
 
 def _place(row: NDArray[Any]) -> tuple[int, int]:
+    """Return attempt and cycle of a row (1,)."""
     return int(row["attempt"][0]), int(row["cycle"][0])
 
 
@@ -238,6 +240,7 @@ def config_digest(config: str) -> str:
 
 
 def _digest(config: bytes) -> str | None:
+    """Return the digest of an attached configuration; None for one that is no TOML."""
     try:
         return config_digest(config.decode("utf-8", "replace"))
     except ConfigError:

@@ -225,6 +225,7 @@ class StreamJudge:
 
 
 def _bounds(contacts: Sequence[TrueContact]) -> tuple[Times, Times]:
+    """Return onsets of contacts (k,), and the last instants at which they explain an alarm, ns."""
     onsets = np.array([contact.onset_ns for contact in contacts], np.int64)
     return onsets, explained_until(onsets, np.array([contact.forgotten_ns for contact in contacts], np.int64))
 
@@ -237,14 +238,15 @@ def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
 
 
 def _judged(contacts: Sequence[TrueContact], found: dict[int, int]) -> tuple[TrueContact, ...]:
+    """Return the contacts with their times of detection; found: these times, ns, by the contact's index."""
     return tuple(replace(contact, detected_ns=found.get(place)) for place, contact in enumerate(contacts))
 
 
 def contact_bounds(index: NDArray[Any], attempt: Times | None) -> list[tuple[int, int]]:
     """Return the first row of each contact of a truth, and the row after its last; index, attempt (m,): of the rows.
 
-    Another index is another contact, though the touch goes on. A contact that goes on as an attempt begins is another
-    one, too: the scheme begins anew.
+    A negative index is no contact. Another index is another contact, though the touch goes on. A contact that goes on
+    as an attempt begins is another one, too: the scheme begins anew.
     """
     is_edge = index[1:] != index[:-1]
     if attempt is not None:

@@ -71,6 +71,7 @@ class PushGatherer:
 
 @compiled
 def _fill(tau_ext: Vector, threshold: Vector, shown: Vector, push: Vector) -> None:
+    """Fill `push` (k, 2), Nm, by `margin.smallest_push` of k cycles. shown: each channel's response to a step."""
     for k in range(push.shape[0]):
         for i in range(push.shape[1]):
             push[k, i] = detect_margin.smallest_push(tau_ext[k], threshold[k], shown, i)

@@ -95,6 +95,7 @@ def _read_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
 
 
 def _unknown(key: str, known: Iterable[str], where: str) -> str:
+    """Return the error of an unknown key: with its successor or remedy, else the nearest known key, else all."""
     known = list(known)
     if gone := describe_gone(f"{where}{key}"):
         return gone
@@ -145,6 +146,7 @@ def _element_hints(hint: Any, value: Any, key: str) -> tuple[Any, ...]:
 
 
 def _check_bounds(value: float, key: str, metadata: Any) -> None:
+    """Raise ConfigError for a number that is not finite or is outside its bounds."""
     unit = f" {metadata['unit']}" if metadata["unit"] else ""
     if not math.isfinite(value):
         raise ConfigError(f"`{key}` = {value} is not finite")

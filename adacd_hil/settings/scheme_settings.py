@@ -91,7 +91,7 @@ class DetectorSettings:
 KIND_S = 0.1
 """Time from detection to the decision of a contact's kind by the certified scheme; its report is final then."""
 FRICTION_TERMS = ("stribeck", "load", "asymmetric", "width", "dahl_short", "dahl_long")
-"""Optional friction terms of the certified scheme, one parameter per joint each; see `scheme.model.regressor`."""
+"""Optional friction terms of the certified scheme, one parameter per joint each: `scheme.model.further_friction`."""
 CROSS_TALK = "cross_talk"
 """Name of the parameter: share of the other joint's torque in a torque sensor's value, Nm/Nm."""
 

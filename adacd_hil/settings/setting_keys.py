@@ -113,6 +113,7 @@ def explain_unknown(key: str) -> str:
 
 
 def _bounds(metadata: Any) -> str:
+    """Return `KnownKey.bounds` of a setting, from its field's metadata."""
     if metadata["choices"]:
         return ", ".join(metadata["choices"])
     low, high, unit = metadata["low"], metadata["high"], metadata["unit"]
@@ -152,6 +153,7 @@ def refuse_log_settings(changes: Mapping[str, str]) -> None:
 
 
 def _read_value(key: str, text: str) -> Any:
+    """Return the value of a TOML text; a word without quotes is a text. Raises ConfigError, which names the key."""
     try:
         return parse_toml(f"value = {text}")["value"]
     except ConfigError:
@@ -233,6 +235,7 @@ def changed_keys(before: Settings, after: Settings) -> dict[str, tuple[str, str]
 
 
 def _flat(table: Mapping[str, Any], prefix: str) -> dict[str, str]:
+    """Return the values of a table and its inner tables as Python writes them, by dotted key after `prefix`."""
     flat: dict[str, str] = {}
     for key, value in table.items():
         if isinstance(value, dict):

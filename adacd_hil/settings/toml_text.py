@@ -26,6 +26,10 @@ def is_default(field: "dataclasses.Field[Any]", value: Any) -> bool:
 
 
 def _write_section(section: Any, prefix: str, lines: list[str], is_short: bool = False) -> None:
+    """Append a section's settings to `lines`, then each section within it under its dotted name.
+
+    is_short: leave out defaults, and give each row of a list a line.
+    """
     nested = []
     for field in dataclasses.fields(section):
         value = getattr(section, field.name)

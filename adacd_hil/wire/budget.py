@@ -126,7 +126,7 @@ def _exceeded(stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns
 
 
 class LoadCase(Enum):
-    """Frames on the bus besides the cyclic ones."""
+    """Frames on the bus besides the cyclic ones: event frames without EMCY; those and requests; EMCY as well."""
 
     OPERATION = "operation"
     REQUESTS = "requests"
@@ -198,6 +198,7 @@ class Budget:
     frames: tuple[FrameBudget, ...]
 
     def _sum_ns(self, *triggers: Trigger) -> int:
+        """Return the duration of one frame each of all messages with these triggers."""
         return sum(entry.duration_ns for entry in self.frames if entry.trigger in triggers)
 
     @property
@@ -301,6 +302,7 @@ class Budget:
         return tuple(notes)
 
     def _describe_traffic(self, traffic: LoadCase) -> str:
+        """Return the latest cyclic frame in a load case, and whether it is in time, as text."""
         if not self.cyclic:
             return "no cyclic frames"
         last = max(self.cyclic, key=lambda entry: entry.responses[traffic].time_ns)
@@ -361,6 +363,7 @@ def compute_budget(
 
 
 def _given(codec: Codec, attribute: str, chosen: int | None) -> int:
+    """Return `chosen`, by default the value of a DBC's attribute. Raises CodecError unless it is above 0."""
     value = int(read_attribute(codec.database, attribute)) if chosen is None else chosen
     if value <= 0:
         raise CodecError(f"DBC {codec.path.name} has no {attribute}, and none is given")
@@ -368,6 +371,7 @@ def _given(codec: Codec, attribute: str, chosen: int | None) -> int:
 
 
 def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, data_bitrate: int) -> FrameBudget:
+    """Return the budget of a message, still without response times. Raises CodecError for an unknown Trigger."""
     choices = list(message.dbc.attribute_definitions["Trigger"].choices or ()) if message.dbc else []
     value = read_attribute(message, "Trigger")
     chosen = choices[value] if isinstance(value, int) and 0 <= value < len(choices) else value
@@ -428,6 +432,7 @@ def _share_bus(frames: list[FrameBudget], contract: str, arms: int) -> list[Fram
 
 
 def _is_sent(entry: FrameBudget, traffic: LoadCase) -> bool:
+    """Return whether a load case has the frame; none has NMT commands."""
     if entry.trigger is Trigger.REQUEST:
         return traffic is not LoadCase.OPERATION and entry.can_id != NMT_ID
     return not entry.is_emergency or traffic is LoadCase.EMERGENCIES

@@ -60,6 +60,7 @@ class CanInterface:
         return is_virtual("socketcan", self.name)
 
     def _number(self, file: str, base: int) -> int:
+        """Return the number in a file of the interface in sysfs; 0 without the file."""
         try:
             return int((self._folder / file).read_text(), base)
         except OSError:
@@ -148,6 +149,7 @@ def _queues() -> Iterator[tuple[int, int, int]]:
 
 
 def _netlink_messages(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield type and body of each netlink message in an answer of the kernel."""
     position = 0
     while position < len(data):
         length, kind, _, _, _ = _NETLINK_HEAD.unpack_from(data, position)
@@ -156,6 +158,7 @@ def _netlink_messages(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _attributes(data: bytes) -> dict[int, bytes]:
+    """Return the contents of netlink attributes, by their type."""
     found = {}
     position = 0
     while position < len(data):

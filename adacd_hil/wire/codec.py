@@ -167,11 +167,12 @@ class Codec:
             raise CodecError(f"message {name} is missing in the DBC") from None
 
     def node_id(self, message_name: str) -> int:
-        """Return the node id of a CANopen message: the low seven bits of its identifier. Raises CodecError."""
+        """Return the node id of a CANopen message: the low seven bits of its identifier. Raises as `message`."""
         return self.message(message_name).can_id & 0x7F
 
 
 def _describe(messages: dict[str, MessageCodec]) -> str:
+    """Return the text whose CRC-32 is `Codec.layout_digest`: a line per message and per signal."""
     lines = []
     for message in sorted(messages.values(), key=lambda message: message.can_id):
         # A list of ids alone says Profile 2, as in a DBC.

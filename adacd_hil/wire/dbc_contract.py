@@ -28,6 +28,7 @@ WIRE_VERSION = "WireVersion"
 
 
 def _message_codec(message: Message) -> MessageCodec:
+    """Return the codec of a message. Raises CodecError for a length, layout or protection that no contract has."""
     _check_length(message)
     protection, data_ids = _protection(message)
     signals, senders = _lay_out(message), tuple(message.senders)
@@ -73,6 +74,7 @@ def _protection(message: Message) -> tuple[Protection, bytes]:
 
 
 def _data_id_list(name: str, text: str, count: int) -> bytes:
+    """Return the data ids of a hexadecimal list. Raises CodecError unless they are `count` bytes."""
     try:
         ids = bytes.fromhex(text)
     except ValueError:
@@ -83,6 +85,7 @@ def _data_id_list(name: str, text: str, count: int) -> bytes:
 
 
 def _data_id(name: str, code: str, value: float | str | None, size: int) -> bytes:
+    """Return a data id as `size` bytes, the low one first. Raises CodecError if it is missing or doesn't fit."""
     if value is None:
         raise CodecError(f"{name}: E2EProfile {code} without E2EDataId")
     most = (1 << 8 * size) - 1
@@ -92,6 +95,7 @@ def _data_id(name: str, code: str, value: float | str | None, size: int) -> byte
 
 
 def _check_header(message: Message, code: str, profile: E2eProfile) -> None:
+    """Raise CodecError unless the message begins with the signals of its profile's header."""
     start, wanted = 0, []
     for name, bits in profile.signals:
         wanted.append((name, start, bits, False))

@@ -104,10 +104,11 @@ PROFILE_5_TOLERANCE = Tolerance(max_delta=5, max_missing=4, sync_frames=1)
 class E2eProfile:
     """A profile: everything that its frames, devices and contracts need to know; a new one is a row of `PROFILES`.
 
-    crc_bits, counter_bits, status_bits: the header's signals in this order, from bit 0 on. objects: of a device's
-    dictionary that carry the header. data_id_bytes: of one message; is_id_list: a list by counter, in the DBC attribute
-    `E2EDataIdList`, else a number, in `E2EDataId`. crc: returns the CRC of a frame, its counter, and the data ids.
-    is_growing: the largest tolerated step grows by one, and by one for each cycle since the last frame in sequence.
+    crc_bits, counter_bits, status_bits: the header's signals in this order, from bit 0 on. The CRC has whole bytes, the
+    counter the low bits of the next byte, 8 at most. objects: of a device's dictionary that carry the header.
+    data_id_bytes: of one message; is_id_list: a list by counter, in the DBC attribute `E2EDataIdList`, else a number,
+    in `E2EDataId`. crc: returns the CRC of a frame, its counter, and the data ids. is_growing: the largest tolerated
+    step is max_delta, and one more for each cycle since the last frame in sequence, the present cycle included.
     """
 
     crc_bits: int
@@ -190,14 +191,11 @@ class E2eReceiver:
         return status
 
     def step_of(self, frame: bytes) -> int | None:  # noqa: ARG002
-        """Return the step of a frame's counter from the last one's, unchecked.
-
-        None before the first frame, for a frame of another length, and without a counter.
-        """
+        """Return the counter's step from the last frame; None here, as these frames have no counter."""
         return None
 
     def is_signed(self, frame: bytes) -> bool:  # noqa: ARG002
-        """Return whether length and CRC of a frame are right; doesn't count it."""
+        """Return whether length and CRC of a frame are right, without counting it; True here, unchecked."""
         return True
 
     def miss(self) -> E2eStatus:
@@ -211,7 +209,7 @@ class E2eReceiver:
         return list(zip(E2eStatus, self.counts, strict=True))
 
     def restart_sequence(self) -> None:
-        """Forget the sequence: the next frame with a right CRC starts a new one. The counts stay."""
+        """Forget the sequence of the counter; these frames have none. The counts stay."""
 
     def _judge(self, frame: bytes) -> E2eStatus:  # noqa: ARG002
         return E2eStatus.OK
@@ -249,7 +247,10 @@ class ProtectedReceiver(E2eReceiver):
         return self._mask + 1
 
     def step_of(self, frame: bytes) -> int | None:
-        """Return the step of a frame's counter from the last one's, unchecked; None as in the base class."""
+        """Return the counter's step from the last frame; don't check the CRC.
+
+        None before the first frame, or for another length.
+        """
         if self._last is None or len(frame) != self._length:
             return None
         return frame[self._place] - self._last & self._mask
@@ -262,10 +263,12 @@ class ProtectedReceiver(E2eReceiver):
         return int.from_bytes(frame[: self._place], "little") == crc
 
     def _note_silence(self) -> None:
+        """Count a cycle without a frame, and widen the tolerated step if the profile's grows."""
         self._missing += 1
         self._max_delta += self._profile.is_growing
 
     def _judge(self, frame: bytes) -> E2eStatus:
+        """Return the status of a frame by its length, CRC and counter, and advance the sequence."""
         is_growing = self._profile.is_growing
         self._max_delta += is_growing
         if not self.is_signed(frame):
@@ -289,6 +292,7 @@ class ProtectedReceiver(E2eReceiver):
         return E2eStatus.OK
 
     def _lose_sequence(self) -> E2eStatus:
+        """Begin SYNC behind a counter that jumped too far; return WRONG_SEQUENCE."""
         self._missing = 0
         self._to_sync = self._tolerance.sync_frames
         return E2eStatus.WRONG_SEQUENCE

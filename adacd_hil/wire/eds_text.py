@@ -22,6 +22,7 @@ def readable_eds(text: str) -> str:
 
 
 def _readable(lines: list[str]) -> Iterator[str]:
+    """Yield the lines that `readable_eds` keeps, and those of `[DummyUsage]` that it writes."""
     section = ""
     for line in lines:
         if head := _SECTION.match(line):
@@ -36,6 +37,7 @@ def _readable(lines: list[str]) -> Iterator[str]:
 
 
 def _is_device_datum(line: str) -> bool:
+    """Return whether canopen can read a line of `[DeviceInfo]`: no entry, a name, or an entry with an integer."""
     key, is_pair, value = line.partition("=")
     if not is_pair or key.strip().lower() in _DEVICE_NAMES:
         return True

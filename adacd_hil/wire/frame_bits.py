@@ -62,8 +62,8 @@ def unstuffed_frame(length: int, is_extended: bool = False) -> FrameBits:
 def worst_case_frame(length: int, is_extended: bool = False) -> FrameBits:
     """Return the most bits of a frame, classic up to 8 bytes. Raises ValueError.
 
-    In CAN FD, stuff bits go from start of frame to the end of the data, as in a classic frame; as many of them as
-    possible are counted before the rate switch, where they take longest.
+    Classic frames have stuff bits up to the CRC's end, CAN FD up to the data's end. There, as many of them as possible
+    are counted before the rate switch, where they take longest.
     """
     plain = unstuffed_frame(length, is_extended)
     if length <= CLASSIC_BYTES:

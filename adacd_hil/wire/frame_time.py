@@ -1,7 +1,7 @@
 """Durations of frames on the bus, exact and at worst.
 
 Compiled, a byte at a time by table: a cycle has seven frames. Source: ISO 11898-1, frame formats and frame coding; for
-the counted bits, and CAN FD, see `adacd_hil.wire.frame_lengths`.
+the counted bits, and CAN FD, see `adacd_hil.wire.frame_bits`.
 """
 
 from collections.abc import Callable

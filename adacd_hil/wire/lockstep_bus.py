@@ -395,6 +395,7 @@ class LockstepBus(Bus):
         return has_come
 
     def _note(self, kind: MarkKind) -> None:
+        """Store whether a device acknowledges frames, by a mark DARK or LIT; ignore other marks."""
         if kind in (MarkKind.DARK, MarkKind.LIT):
             self._is_acknowledged = kind is MarkKind.LIT
 

@@ -63,6 +63,7 @@ class PythonCanBus(Bus):
         self._bus = self._open()
 
     def _open(self) -> can.BusABC:
+        """Return the opened interface. Raises BusMissingError with a remedy."""
         try:
             return can.Bus(self.channel, interface=self._interface, receive_own_messages=False, **self._options)
         except Exception as error:

@@ -90,6 +90,7 @@ class SocketCanBus(Bus):
         self._open()
 
     def _open(self) -> None:
+        """Open and bind a socket, and make its receiver and sender. Raises BusMissingError."""
         opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         try:
             opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, self._filters)
@@ -129,6 +130,7 @@ class SocketCanBus(Bus):
             self.send(can_id, data)
 
     def _pack(self, can_id: int, data: bytes) -> bytes:
+        """Return the kernel's struct of a frame. Raises BusError for data that the bus can't carry."""
         if can_id > MAX_STANDARD_ID:
             can_id |= CAN_EFF_FLAG
         length = len(data)
@@ -143,6 +145,7 @@ class SocketCanBus(Bus):
         return _FD_FRAME.pack(can_id, len(data), CANFD_BRS, data)
 
     def _send_patiently(self, packed: bytes) -> None:
+        """Send a frame as soon as there is room for it. Raises TransmitQueueError after _SEND_PATIENCE_S."""
         patience = self._patience
         deadline_ns = patience.now_ns() + int(_SEND_PATIENCE_S * 1e9)
         while patience.now_ns() < deadline_ns:
@@ -199,6 +202,10 @@ class SocketCanBus(Bus):
             self._fail("receiving", error)
 
     def _fail(self, doing: str, error: OSError) -> NoReturn:
+        """Raise an error of the socket as BusError; as InterfaceDownError, and close the socket, if that is the cause.
+
+        doing: the failed action, for the message.
+        """
         if error.errno in _DOWN:
             self._is_down = True
             self._retire_socket()

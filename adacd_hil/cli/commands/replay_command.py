@@ -111,6 +111,7 @@ def replay(
 
 
 def _next(given: Path, own: "Replay", has_changes: bool) -> tuple[str, ...]:
+    """Return the commands to suggest after a replay; () if no cycle was replayed."""
     if not own.cycles:
         return ()
     if has_changes:
@@ -135,6 +136,10 @@ def _replay_one(
     stretch: "TimeWindow",
     progress: Any,
 ) -> _Result:
+    """Replay one log or recording with its own settings, and with each variant that the options ask for.
+
+    configured: --config, --profile and --dbc. Raises CommandError, ConfigError, CodecError, LogError.
+    """
     from adacd_hil.control.operator import ScriptedOperator
     from adacd_hil.replay.replay import replay_source
     from adacd_hil.score.emulator_truth import contacts_beside
@@ -197,6 +202,10 @@ def _name(choice: dict[str, str]) -> str:
 
 
 def _code(replays: "list[Replay]") -> ExitCode:
+    """Return the exit status of a log's replays, by that with its own settings.
+
+    FAILURE: a mismatch, or no cycle. PARTIAL: parts of the log could not be compared. Else OK.
+    """
     own = replays[0]
     if own.mismatch_count or not own.cycles:
         return ExitCode.FAILURE
@@ -204,6 +213,7 @@ def _code(replays: "list[Replay]") -> ExitCode:
 
 
 def _verdict(own: "Replay") -> str:
+    """Return in words whether a replay with the log's own settings equals the log."""
     if own.mismatch_count:
         return f"{own.mismatch_count} values differ from the log's"
     if not own.cycles:
@@ -215,6 +225,10 @@ def _verdict(own: "Replay") -> str:
 
 
 def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow") -> str:
+    """Return a log's replays as text: the comparison with the log, then all replays side by side.
+
+    Without variants the second part is left out, unless no cycle was compared.
+    """
     from adacd_hil.replay.replayed_outcome import NOTE, side_by_side
 
     own = replays[0]

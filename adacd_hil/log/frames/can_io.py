@@ -167,6 +167,7 @@ class _CandumpReader(can.CanutilsLogReader):
                 return
 
     def _lines(self, file: Iterable[str]) -> Iterator[str]:
+        """Yield the lines in python-can's form, and note whether each has an error frame, whose flag is removed."""
         for self._line in file:
             self._number += 1
             error = re.search(r" ([23][0-9A-Fa-f]{7})#", self._line)
@@ -281,6 +282,7 @@ class PythonCanFrames:
             _LOGGER.removeHandler(passed_over)
 
     def _channel(self, name: str) -> int:
+        """Return the index of a CAN channel in `channels`; add a new one. Raises ValueError beyond MOST_CHANNELS."""
         if name not in self.channels:
             if len(self.channels) == MOST_CHANNELS:
                 raise ValueError(f"there are more than {MOST_CHANNELS} channels")

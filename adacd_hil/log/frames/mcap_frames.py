@@ -144,6 +144,7 @@ class McapFrames:
                 self._sources[definition.id] = self._source(definition)
 
     def _source(self, channel: Channel) -> _Source | None:
+        """Return the properties of an MCAP channel's frames, and add their CAN channel; None for other messages."""
         schema = self._definitions.schemas.get(channel.schema_id)
         if schema is None or schema.name not in (CAN_FRAME.name, FD_FRAME.name):
             return None

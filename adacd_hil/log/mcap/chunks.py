@@ -71,6 +71,7 @@ class Opening:
 
 
 def _checked(chunk: Chunk, data: bytes, is_size_certain: bool) -> bytes:
+    """Return the decompressed data of a chunk. Raises ChunkError for another CRC, or size unless `is_size_certain`."""
     if chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
         raise ChunkError("fails its CRC")
     if not is_size_certain and len(data) != chunk.uncompressed_size:
@@ -92,6 +93,10 @@ def decompress(compression: str, data: bytes, most_bytes: int = MOST_BYTES) -> b
 
 
 def _decompress(compression: str, data: bytes, most_bytes: int) -> bytes:
+    """Return decompressed data, of zstd and lz4 at most one byte more than `most_bytes`.
+
+    Raises ChunkError for cut or too much data, and the errors of the two libraries.
+    """
     if compression == "":
         return data
     if compression == "zstd":
@@ -108,6 +113,7 @@ def _decompressor() -> zstandard.ZstdDecompressor:
 
 
 def _unzstd(data: bytes, most_bytes: int) -> bytes:
+    """Return zstd data decompressed, at most `most_bytes` + 1. Raises ChunkError for data that claim a larger size."""
     size = zstandard.frame_content_size(data)
     decompressor = _decompressor()
     if size > most_bytes:
@@ -314,6 +320,7 @@ def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES, is_a
 
 
 def _finished(item: Future[Block] | RawRecord | Problem) -> Item:
+    """Wait for the block in a future and return it; return any other item as it is."""
     return item.result() if isinstance(item, Future) else item
 
 
@@ -374,6 +381,7 @@ def _packed(record: RawRecord, opening: Opening) -> _Packed | Problem:
 
 
 def _open(packed: list[_Packed]) -> Block:
+    """Decompress chunks, and return their records as a block; damaged chunks are left out, the first is its problem."""
     opened: list[bytes] = []
     ends: list[int] = []
     indexes, problem, end = [], "", 0

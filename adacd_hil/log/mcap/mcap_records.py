@@ -282,6 +282,7 @@ def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
 
 
 def _split(data: bytes, offset: int) -> list[RawRecord]:
+    """Return the records that follow each other in `data`; the last may be cut. offset: of the data in the file."""
     records = []
     position = 0
     while position + HEAD.size <= len(data):

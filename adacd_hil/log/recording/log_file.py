@@ -120,6 +120,7 @@ class Sink:
         self._thread.join()
 
     def _work(self) -> None:
+        """Write data and begin files, task by task, until `close_file`; then close the file."""
         while (task := self._next()) is not None:
             if isinstance(task, Path):
                 self._open(task)
@@ -128,6 +129,7 @@ class Sink:
         self._close()
 
     def _next(self) -> tuple[bytes, int] | Path | None:
+        """Wait for a task and return it: data with their packets, a file to begin, or None for the end."""
         with self._changed:
             self._is_idle = True
             self._changed.notify_all()
@@ -136,6 +138,7 @@ class Sink:
             return self._tasks.popleft()
 
     def _write(self, data: bytes, packets: int) -> None:
+        """Write data to the present file; after an error drop them and count their packets as lost."""
         if not self.error:
             try:
                 _write_all(self._descriptor, data)
@@ -153,6 +156,7 @@ class Sink:
             self._lost += packets if self.error else 0
 
     def _open(self, path: Path) -> None:
+        """Create a file and switch to it; the present one is emptied instead."""
         is_new = path != self.path or self._descriptor < 0
         if is_new:
             self._close()
@@ -169,6 +173,7 @@ class Sink:
             self._fail(error)
 
     def _close(self) -> None:
+        """Close the present file, if it is open; keep an error."""
         if self._descriptor < 0:
             return
         try:
@@ -178,6 +183,7 @@ class Sink:
         self._descriptor = -1
 
     def _fail(self, error: OSError) -> None:
+        """Keep the file's first error; print it unless one is printed already."""
         if not self._has_told:
             self._has_told = True
             what = "the log ends here" if self._waits else "packets are dropped until there is room"

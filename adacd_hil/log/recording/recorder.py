@@ -123,6 +123,7 @@ class Recorder:
         self._socket.setblocking(True)
 
     def _wait_until_ready(self) -> None:
+        """Wait until the writer is ready. If it fails, remove the file and raise LogError."""
         word = self._hear(START_TIMEOUT_S)
         error = "the writer did not start" if word is None else word["error"]
         if error:
@@ -165,6 +166,7 @@ class Recorder:
             self._socket.send(processes.WAKE, socket.MSG_DONTWAIT)
 
     def _put(self, data: bytes) -> None:
+        """Put a packet into the ring; if that fails, count it in `dropped`. In lockstep, wake the writer at times."""
         if not self._ring.put_packet(data) and not (self._is_blocking and self._put_patiently(data)):
             self.dropped += 1
             self._ring.count_dropped(self.dropped)

@@ -47,6 +47,7 @@ class _SharedRing:
         return self._counts[_PEAK]
 
     def _copy(self, start: int, size: int) -> bytes:
+        """Return `size` bytes of the ring, across its end if need be. start: a count such as TAIL."""
         place = start % self.capacity
         data = self._memory[_COUNTS_BYTES + place : _COUNTS_BYTES + min(place + size, self.capacity)]
         return data if len(data) == size else data + self._memory[_COUNTS_BYTES : _COUNTS_BYTES + size - len(data)]
@@ -137,6 +138,7 @@ class RingReader(_SharedRing):
         return data
 
     def _first_bytes(self, start: int) -> int:
+        """Return the bytes that the packet at `start`, a count such as TAIL, takes in the ring."""
         return padded_bytes(_SIZE.unpack(self._copy(start, _SIZE.size))[0])
 
 

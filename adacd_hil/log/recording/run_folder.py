@@ -64,6 +64,7 @@ def is_there(path: Path) -> bool:
 
 
 def _refusal(path: Path) -> LogExistsError:
+    """Return the error for a log `path` that is taken; it names the file in the way."""
     found = path if is_there(path) else next(iter(find_parts(path).values()))
     kind = "" if found.is_file() and not found.is_symlink() else ", which is no regular file"
     return LogExistsError(f"{found} is there already{kind}; choose another folder with --out, or move it away")

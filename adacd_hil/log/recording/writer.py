@@ -61,6 +61,7 @@ class WriterProcess:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", 0, POLL_PERIOD_US))
 
     def _open(self, live: LiveService) -> LiveFeed:
+        """Open the live view of the log, and return it. Raises LogError."""
         start_ns = self._setup.epoch_ns + (0 if self._setup.is_blocking else self._clock.now_ns())
         return live(self._setup, self._file.ids, start_ns)
 
@@ -164,6 +165,7 @@ class WriterProcess:
         self._packets.begin_file(self._file)
 
     def _begin_file(self) -> McapFile:
+        """Return a new file over the sink, with attachments and with the present part's number in its metadata."""
         setup = self._setup
         metadata = {**setup.metadata, PART_KEY: str(self._part)}
         return McapFile(self._sink, setup.channels, setup.attachments, metadata)
@@ -251,7 +253,7 @@ def write_log(connection: socket.socket, file_descriptor: int, ring_descriptor: 
 
 
 def main(socket_descriptor: int, file_descriptor: int, ring_descriptor: int) -> None:
-    """Be the writer process."""
+    """Run the writer process to the log's end, without real-time scheduling. Its setup comes by standard input."""
     _schedule_plainly()
     os.dup(file_descriptor)  # never closed: the lock of the first part lasts as long as this process
     write_log(socket.socket(fileno=socket_descriptor), file_descriptor, ring_descriptor, read_setup())

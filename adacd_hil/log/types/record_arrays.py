@@ -118,6 +118,7 @@ def _item(dtype: "np.dtype[Any]") -> str:
 
 
 def _lengthened(frames: NDArray[Any]) -> NDArray[Any]:
+    """Return frames as LONG_FRAME_DTYPE."""
     if frames.dtype == LONG_FRAME_DTYPE:
         return frames
     long = np.zeros(len(frames), LONG_FRAME_DTYPE)
@@ -283,6 +284,7 @@ class PieceBuilder:
             self._frames.append(reordered_frames(joined_frames([part for _, part in frames]), sequence))
 
     def _take_payloads(self, contents: "Contents", messages: Numbers, slot: int) -> None:
+        """Gather the payloads of a topic of varying size; count an event that can't be unpacked in `wrong`."""
         is_event = self.topics[slot].type_name == LOG.name
         for message in messages.tolist():
             payload = contents.payload(message)

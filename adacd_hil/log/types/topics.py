@@ -15,7 +15,7 @@ for all messages of a cycle: stamp = t_ns + epoch_ns. A block is logged as its b
 | /joint_states | sensor_msgs/msg/JointState | every cycle; measured q, dq, tau_J |
 | /scheme | adacd_hil_msgs/msg/Scheme | every cycle; records.scheme_layout or certified_layout |
 | /arm | adacd_hil_msgs/msg/ArmState | every cycle; records.ArmState but for q, dq, tau_J, which /scheme has |
-| /contact | adacd_hil_msgs/msg/Contact | when a report begins and when it is final |
+| /contact | adacd_hil_msgs/msg/Contact | each report of a contact, from its detection until one is final |
 | /control | adacd_hil_msgs/msg/Control | every cycle; records.CONTROL_LAYOUT |
 | /cycle | adacd_hil_msgs/msg/Cycle | every cycle; records.CycleRecord |
 | /frame_checks | adacd_hil_msgs/msg/FrameChecks | once a second: counts of the checks of each device's cyclic frames |

@@ -52,9 +52,9 @@ _COLUMNS = 7
 
 @compiled
 def put_row(rows: Vector, kept: int, q: Vector, tau: Vector, sigma: Vector, threshold: Vector) -> None:
-    """Write the row of one cycle. kept: number of rows before it.
+    """Write the row of one cycle: q2, and tau, sigma, threshold (2,) of the external torque, filter undone.
 
-    rows (2 m, 7): the last m cycles, each twice, so that any window is contiguous.
+    kept: number of rows before it. rows (2 m, 7): the last m cycles, each twice, so that any window is contiguous.
     """
     half = rows.shape[0] // 2
     place = kept % half
@@ -126,7 +126,7 @@ def new_rows(settings: Settings) -> Vector:
 
 
 def compile_recalled(settings: Settings) -> None:
-    """Compile the functions of `recalled_report` by a call of each, with one row and with several.
+    """Compile the compiled functions of `recalled_report` by a call of each, with one row and with two.
 
     Both are needed: numpy takes one row's columns as contiguous, which is another type.
     """

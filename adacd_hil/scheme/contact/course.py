@@ -55,9 +55,10 @@ class CourseMemory:
     """State of the present contact.
 
     link: touched link, 0 for none. is_open: a report has been made that is not final yet. level: the highest of this
-    contact. cause_link: link for which the reaction was chosen. kept_rows: rows written so far in the history for
-    reports. early_rows: those of the contact before its detection. way: direction of a withdrawal, a unit vector; zeros
-    without one.
+    contact. cause_link: link for which the reaction was chosen. is_given_up: a withdrawal was given up for the
+    `two_sided` reaction. cycles: of the withdrawal in force. kept_rows: rows written so far in the history for reports.
+    early_rows: those of the contact before its detection. way: direction of a withdrawal, a unit vector; zeros without
+    one.
     """
 
     is_reacting: int
@@ -179,9 +180,10 @@ def _is_due(k: CourseConstants, m: CourseMemory, cycle: int, joints: int, tau_ex
 def _reconsider(
     k: CourseConstants, m: CourseMemory, level: int, is_latched: bool, tau_ext_hat: Vector, is_valid: bool
 ) -> None:
-    """Choose the reaction anew if the contact has a higher level or another link.
+    """Choose the reaction anew if the contact has a higher level or another link, unless a withdrawal was given up.
 
-    Stop an arm that goes on along its path, if the supervisor has latched the contact. Judge a withdrawal in force.
+    Stop an arm that goes on along its path if the supervisor has latched a contact that is no collision. Judge a
+    withdrawal in force.
     """
     level = max(level, m.level)
     is_other = level != m.level or m.link != m.cause_link
@@ -196,6 +198,7 @@ def _reconsider(
 
 @compiled
 def _choose(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: bool) -> None:
+    """Begin the reaction of the settings to the contact's level and link, unless it is in force already."""
     reaction = k.reactions[m.level - 1, m.cause_link - 1]
     if reaction != m.reaction:
         _react(m, _possible(reaction, is_valid), tau_ext_hat, True)
@@ -203,6 +206,7 @@ def _choose(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: 
 
 @compiled
 def _possible(reaction: int, is_valid: bool) -> int:
+    """Return STOP in place of FLOAT without a valid model, else `reaction`."""
     return Reaction.STOP if reaction == Reaction.FLOAT and not is_valid else int(reaction)
 
 

@@ -109,7 +109,10 @@ def _top(forces: Vector) -> float:
 def _fit(
     tau: Vector, q2: Vector, sigma: Vector, length1_m: float, length2_m: float, tip_margin_m: float
 ) -> tuple[int, float, float, float, float]:
-    """Return the number of the Location, force, its sigma, lever arm and its sigma; N and m, inf where not known."""
+    """Fit one force across link 2 to the strong samples; return Location's number, force, its sigma, lever, its sigma.
+
+    Lever: the force's arm from joint 2. Units: N and m. A sigma is inf if its value is unknown.
+    """
     count = tau.shape[0]
     weight = np.zeros(count)
     for k in range(count):

@@ -128,7 +128,7 @@ class Withdrawal:
         return profile.position + profile.velocity * abs(profile.velocity) / (2.0 * limit)
 
     def describe_beyond(self, joint: int) -> str:
-        """Return a message for a joint of `beyond`, from 0: its speed, its position limit, and where it stops."""
+        """Return a message for a joint of `beyond_limits`: speed, position, position limit, and where it stops."""
         arm, wish = self._settings.arm, self._settings.reaction
         profile = self._profiles[joint]
         return (

@@ -167,8 +167,8 @@ def follow_velocity_noise(k: Constants, m: Memory, dq: Vector, is_steady: bool) 
     """Update `velocity_roughness` (n,), at least 1, by one sample: the velocity's noise over the settings', squared.
 
     Noise shows in the second difference of dq, motion does not: at 1 kHz 50 rad/s³ make 5e-5 rad/s of it, a coarse
-    encoder's counts 1e-3 and more. A single jump, as of a blow, counts as JUMP deviations at most. After a gap, or on
-    the line over one (is_steady: neither), a sample only becomes the last.
+    encoder's counts 1e-3 and more. A single jump, as of a blow, counts as at most JUMP deviations of the present noise.
+    Without is_steady (a gap, or a line over one) only store the sample.
 
     The roughness decays soon, except for the part that `keep_velocity_noise` keeps.
     """
@@ -302,8 +302,8 @@ def momentum_noise(m: Memory, joint: int) -> float:
 def follow_friction(k: Constants, m: Memory, tau_J: Vector) -> None:
     """Fill `hold` (n,), the torque that friction may hold at rest, and `held` (C, n), its part in each filter, Nm.
 
-    Friction at rest is not noise that averages out: `held` of a joint that mostly rested is inf, so that it is not
-    learnt.
+    Friction at rest is not noise that averages out: `held` is inf for a joint that rested for a share RESTING or more
+    of the filter's memory, so that the joint is not learnt.
     """
     own = m.sensitivity
     for i in range(own.hold.shape[0]):

@@ -215,7 +215,7 @@ def is_open(k: Constants, m: Memory, joint: int) -> bool:
 
 
 def tightest(k: Constants, m: Memory, joint: int) -> int | None:
-    """Return the number of the anchor that bounds a joint's last judged offset most closely; None if none is close."""
+    """Return the number of the anchor that bounds a joint's last judged offset most closely; None if it `is_open`."""
     return None if is_open(k, m, joint) else int(np.argmin(m.evidence.limit[:KINDS, OFFSETS + joint]))
 
 

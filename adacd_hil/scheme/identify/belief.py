@@ -68,7 +68,7 @@ def freeze(k: Constants, m: Memory) -> None:
 
 @compiled
 def certify(k: Constants, m: Memory) -> None:
-    """Store the model in use as the certified one, and hold the lags."""
+    """Store the model in use as the certified one, set `promotions` to 0, and hold the lags."""
     m.models.promotions = 0.0
     _certify(m)
     hold_lags(k, m)
@@ -85,6 +85,7 @@ def promote(m: Memory, theta: Vector, P: Vector) -> None:
 
 @compiled
 def _certify(m: Memory) -> None:
+    """Copy the model in use to the certified one."""
     own = m.models
     own.certified[:] = own.theta
     own.P_certified[:] = own.P
@@ -92,6 +93,7 @@ def _certify(m: Memory) -> None:
 
 @compiled
 def _use(m: Memory) -> None:
+    """Copy the belief to the model in use."""
     own = m.models
     own.theta[:] = own.belief
     own.P[:] = own.P_belief
@@ -148,10 +150,9 @@ def add_payload(direction: Vector, payload_std_kg: float, rest_std: Vector, P: V
 def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
     """Add the variance of a random walk of the parameters over elapsed_s to P (p, p) in place.
 
-    drift_std (p,): deviation after 1 s, grows with √s. It is scaled by the largest |w| of a parameter in W_f (n, p),
-    at most 1. A parameter that hardly
-    shows would otherwise be learnt from the error of the others, such as friction that grows with the load from a load
-    that hardly varies, and be far off where it counts.
+    drift_std (p,): deviation after 1 s; it grows with √s, and is scaled by the parameter's largest |w| in W_f (n, p),
+    at most 1. Without that scale a parameter that hardly shows would be learnt from the error of the others, such as
+    friction by load from a load that hardly varies, and would be far off where it counts.
     """
     for j in range(drift_std.shape[0]):
         shown = 0.0
@@ -216,6 +217,7 @@ def hold_lags(k: Constants, m: Memory) -> None:
 
 @compiled
 def _take_out_lags(k: Constants, m: Memory, place: int) -> None:
+    """Subtract the torque of the believed lags from the ring's sample at `place`, and set its columns of lags to 0."""
     joints = m.ring.tau.shape[1]
     first = int(k.first_offset) + joints
     for i in range(joints):

@@ -21,7 +21,7 @@ than at RARELY_PER_H by ODDS. Three in 6.8 min are.
 An arm that meets the next contact AT_REST_S after going on would never move far enough to show its cause: the
 thresholds of the joints in contact double, to MOST_STRAIN times at most, and fall back as in `sensitivity`.
 
-Both are rows of one table: v = (w of each of the h causes, s of each of the n joints, 0 but for the row's), and
+The sums over w and s are parts of one table: v = (w of each of the h causes, s of the row's joint, 0 of the others),
 
     L = Σ v v'/R,   b = Σ v r/R
 
@@ -131,6 +131,7 @@ def weigh(k: Constants, m: Memory) -> None:
 
 @compiled
 def _follow_peak(m: Memory) -> None:
+    """Raise `peak` to this sample's largest residual over its threshold, of all channels and joints."""
     for c in range(m.filters.y.shape[0]):
         for i in range(m.filters.y.shape[1]):
             m.doubt.peak = max(m.doubt.peak, abs(m.filters.y[c, i]) / m.sensitivity.h[c, i])
@@ -276,6 +277,10 @@ class Doubt:
         return _named(ALIKE, h, size, SPREAD * abs(size))
 
     def _other(self) -> CommonCause | None:
+        """Return the error of friction that explains the last FEWEST contacts, or None.
+
+        Each of them but the first must have come within AT_ONCE_S of going on.
+        """
         last = list(self._contacts)[-FEWEST:]
         if len(last) < FEWEST or max(contact.waited_s for contact in last[1:]) > AT_ONCE_S:
             return None
@@ -336,6 +341,7 @@ class Doubt:
         return float(sum(contact.rw[h] for contact in contacts[1:]) / ww), 2.0 * self._sigma(ww)
 
     def _sigma(self, ww: float) -> float:
+        """Return the standard deviation of a cause's size, in its unit. ww: sum of w² over the samples."""
         return float(RESIDUAL_NM * np.sqrt(self._correlated / ww))
 
 
@@ -351,7 +357,7 @@ def _weighed(m: Memory, waited_s: float, now_s: float) -> _Weighed:
 
 
 def _explained(contacts: list[_Weighed], h: int) -> float:
-    """Return the part of the contacts' squared residuals that cause h explains."""
+    """Return how much of the contacts' squared residuals cause h explains, Nm²."""
     return float(sum(contact.rw[h] ** 2 / contact.ww[h] for contact in contacts if contact.ww[h] > 0.0))
 
 

@@ -63,6 +63,7 @@ def forget(m: Memory) -> None:
 
 @compiled
 def _drop(m: Memory) -> None:
+    """Empty the sources of all kept beliefs."""
     m.earlier.kept_count = 0.0
     for s in range(KEPT, m.evidence.value.shape[0]):
         evidence.empty_source(m, s)
@@ -230,6 +231,10 @@ def describe_more(m: Memory) -> list[str]:
 
 
 def _changed(m: Memory, s: int, q: int, what: str, unit: str) -> str:
+    """Return a line about a contradiction: change of quantity `q` since kept belief `s`, its age, bound, likely cause.
+
+    what, unit: name and unit of the quantity.
+    """
     change, limit, age_s = (
         float(m.evidence.difference[s, q]),
         float(m.evidence.limit[s, q]),

@@ -112,6 +112,7 @@ def follow(k: Constants, m: Memory, W_f: Vector, tau_f: Vector) -> None:
 
 @compiled
 def _keep_sample(m: Memory, W_f: Vector, tau_f: Vector) -> None:
+    """Keep each `samples_every`-th sample. When the room is full, drop each second one and double `samples_every`."""
     own = m.fit_check
     own.samples_left_out += 1.0
     if own.samples_left_out < own.samples_every:
@@ -142,7 +143,8 @@ def unit_of(square: float, rows: float) -> float:
 def late_square(m: Memory) -> float:
     """Return the mean square of the residuals over their variances in the fit's later half; 1 before the second step.
 
-    The earlier half is left out, so that a touch of the beginning doesn't count.
+    Of a long fit only the last STEPS steps count. The earlier half is left out, so that a touch of the beginning
+    doesn't count.
     """
     own = m.fit_check
     used = int(own.steps_used)
@@ -164,10 +166,10 @@ def _better_square(m: Memory, s: int) -> float:
 
 @compiled
 def last_step_before_change(k: Constants, m: Memory) -> int:
-    """Return the number of the last step, from 0, that contradicts the whole fit; NONE if no step does.
+    """Return the number of the last step, from 0, before the fit contradicts itself; NONE if it doesn't.
 
-    If only the samples after a step contradict the fit, return the last step of all. -1: all steps are younger than the
-    contradiction.
+    As `last_step_before_contradiction`. If only the model of the samples after a step contradicts the fit, return the
+    last step of all; a payload's fit is not tested for that.
     """
     own = m.fit_check
     used, oldest = int(own.steps_used), max(int(own.steps_used) - own.steps_rows.shape[0], 0)
@@ -184,7 +186,7 @@ def last_step_before_change(k: Constants, m: Memory) -> int:
 def last_step_before_contradiction(k: Constants, m: Memory) -> int:
     """Return the number of the last step before the fit changed, or before the first sample that it doesn't explain.
 
-    NONE if neither happened.
+    Numbers from 0; -1: that sample is older than all steps. NONE if neither happened.
     """
     changed = last_unsteady_step(m)
     first = first_unexplained(m)
@@ -193,7 +195,10 @@ def last_step_before_contradiction(k: Constants, m: Memory) -> int:
 
 @compiled
 def first_unexplained(m: Memory) -> int:
-    """Return the index, from 0, of the first learnt sample that the fit's belief doesn't explain; -1 without one."""
+    """Return the index, from 0, of the first learnt sample that the fit's belief doesn't explain.
+
+    Only kept samples are examined. -1 without such a sample, and for a payload's fit.
+    """
     kept, first = int(m.fit_check.samples_kept), -1
     if m.models.is_payload != 0.0 or kept < 2:
         return first
@@ -213,7 +218,7 @@ def limit_Nm(m: Memory) -> float:
 
 @compiled
 def residual(m: Memory, s: int, joint: int) -> float:
-    """Return the belief's residual of sample s, Nm."""
+    """Return the belief's residual of kept sample s in a joint, both from 0, Nm."""
     return float(-linalg.misfit(m.fit_check.samples_W[s, joint], m.models.belief, m.fit_check.samples_tau[s, joint]))
 
 

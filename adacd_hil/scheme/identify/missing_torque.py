@@ -121,7 +121,7 @@ def _clear_sums(m: Memory) -> None:
 
 @compiled
 def add(k: Constants, m: Memory, slot: int, joint: int) -> None:
-    """Add the row of a joint, learnt now from a slot of the ring, to the sums; skip a joint that moves slowly."""
+    """Add a joint's row, learnt now from a slot of the ring, to the sums; skip it if the joint was slow or at rest."""
     own = m.missing_torque
     if m.ring.still[slot, joint] > STILL:
         return
@@ -238,6 +238,7 @@ def _is_found_again(k: Constants, m: Memory) -> bool:
 
 @compiled
 def _fill_missing(m: Memory) -> None:
+    """Fill `rms_Nm` (n,) with the torque by place found in each joint."""
     for i in range(m.missing_torque.rms_Nm.shape[0]):
         m.missing_torque.rms_Nm[i] = _rms_Nm(m, i)
 
@@ -255,7 +256,10 @@ def _rms_Nm(m: Memory, joint: int) -> float:
 
 @compiled
 def log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
-    """Return the log evidence of the columns with a deviation s (f,) above 0, less a common constant; fill x (f,)."""
+    """Return the log evidence of the columns with a deviation s (f,) above 0, less a common constant.
+
+    b (f,): the sums Σ v r/R. Fill x (f,) with the columns' most likely coefficients, 0 where s is 0.
+    """
     M, count, log_det = m.missing_torque.M, s.shape[0], 0.0
     for j in range(count):
         x[j] = s[j] * b[j]

@@ -10,7 +10,7 @@ the ring is emptied, so no sample of the touch, from its beginning on, is learnt
 estimates (`earlier`), and independent knowledge judges the offsets (`anchor`).
 
 **A certificate** is a test of the frozen model on motion that was not used for the fit (`termination`). While detection
-is armed the belief goes on learning; its mean replaces the frozen model after a test (`belief`).
+is armed the belief goes on learning; its mean replaces the frozen model after a test (`refinement`).
 
 Constants, memory and block: `certified_memory`.
 """

@@ -5,7 +5,7 @@ Constants, memory and block: as in `kernel_samples`; the block is `records.schem
 A cycle without a fresh sample leaves filters and estimate as they were. Up to `MOST_FILLED` missing samples are
 interpolated on a straight line between their neighbours, so that a lost frame causes no blind time. A longer gap, a
 value that is not a number, or an interval far from the nominal one makes a gap; the filters resume from it as described
-in `torque_filter`. The step returns whether they took a sample in.
+in `torque_filter`. The step's result has the bit UNSEEN unless the filters took the sample in.
 
 The measured interval enters the quantities that integrate: filters, estimator, information, impulse. It does not enter
 the quantities that count. T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is right to a period.

@@ -31,7 +31,7 @@ SHARES = {"load": 0.25, "dahl": 0.5}
 
 @compiled
 def smooth_sign(dq: float, still_rad_s: float, width_rad_s: float) -> float:
-    """Return tanh(dq / width); for a width of 0 the sign of dq, or 0 for a joint that may stand still."""
+    """Return tanh(dq / width); for a width of 0 the sign of dq, or 0 if |dq| is below still_rad_s."""
     if width_rad_s > 0.0:
         return float(math.tanh(dq / width_rad_s))
     return float(np.sign(dq)) if abs(dq) >= still_rad_s else 0.0

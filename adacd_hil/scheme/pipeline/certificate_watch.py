@@ -64,7 +64,10 @@ class _Refusal(NamedTuple):
 
 
 class CertificateWatch:
-    """Reports the kernel's findings, and accepts a refused fit for the user. last_utc: the last certificate's date."""
+    """Makes events of the kernel's findings on certificates, stores the certificates, and accepts a refused fit.
+
+    last_utc: date of the last run's certificate.
+    """
 
     def __init__(self, k: Constants, m: Memory, last_utc: str) -> None:
         self._k, self._m = k, m
@@ -113,6 +116,7 @@ class CertificateWatch:
         return "; ".join([*texts, *[known_by] * known_by.startswith((BY_WORD, BY_FITS_THAT_AGREE))])
 
     def _known_by(self) -> str:
+        """Return the evidence on which the fit's friction and inertia rest, as text."""
         if self._vouched_against:
             return BY_WORD + self._vouched_against
         if self._m.earlier.has_lapsed:
@@ -153,6 +157,7 @@ class CertificateWatch:
         return Event("warning", "revoked", "at the user's word the arm is learnt anew")
 
     def _take_back(self) -> None:
+        """Remove the last certificate from `certificates` if it still stands."""
         if self._is_standing:
             self._certificates.pop()
             self._vouched_against = _TAKEN_BACK
@@ -175,6 +180,7 @@ class CertificateWatch:
         return CommonCause("; ".join(self._describe(int(self._m.certificate.withheld_by))), is_payload=False)
 
     def _describe(self, cause: int) -> list[str]:
+        """Return the lines of a contradiction. cause: its number in `certificate`."""
         k, m = self._k, self._m
         match cause:
             case certificate.READING | certificate.ANCHOR:

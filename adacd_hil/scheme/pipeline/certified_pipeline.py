@@ -228,7 +228,10 @@ class CertifiedPipeline(Pipeline):
         certified_kernel.begin_adaptation(*self.numbers[:2], self._is_payload, is_first)
 
     def _revoke(self) -> None:
-        """Take back the certificate, drop the kept beliefs, and set the feedforward's model to 0."""
+        """Take back the certificate for the user, drop the kept beliefs, and set the feedforward's model to 0.
+
+        The paper's scheme beside begins an adaptation, too.
+        """
         self._is_payload = self._course.is_model_valid = False
         self.theta_ff = np.zeros(self.theta_ff.size)
         self._events.append(self._watch.revoke())

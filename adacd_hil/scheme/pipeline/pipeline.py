@@ -122,7 +122,7 @@ class Pipeline(ABC):
 
     @abstractmethod
     def _follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:
-        """Run a scheme's actions on a change of state, after the supervisor's step and before a contact's report.
+        """Run a scheme's tasks of BEFORE_CONTACT, such as a new state's first actions, before the contact's course.
 
         asked: bits of the tasks, see `kernel.cycle`. previous: state before this cycle. observation: the cycle's
         findings, see `transitions`.
@@ -152,7 +152,10 @@ class Pipeline(ABC):
         return ()
 
     def take_events(self) -> list[Event]:
-        """Return the events since the last call, such as a new certificate, and clear them."""
+        """Return the events since the last call, such as a new certificate, and clear them.
+
+        Empty for the paper's scheme.
+        """
         return []
 
     def step(self, arm: ArmState, request: Request = Request.NONE) -> SchemeOutput:

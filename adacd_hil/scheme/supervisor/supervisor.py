@@ -2,8 +2,8 @@
 
 INIT -> COMMISSION -> ENABLE -> ADAPT (-> CERTIFY) -> MONITOR; motion in ENABLE -> COMMISSION; a contact in any of
 ENABLE, ADAPT, CERTIFY, MONITOR and PAYLOAD -> REACT, and from there back; MONITOR or STOPPED -> PAYLOAD -> ADAPT;
-any -> FAULT, which is latched. A pair that is not in the table leaves the state as it is. Each cycle has one event: the
-first that applies in the order of `SchemeEvent`, so a fault outranks all others.
+any -> FAULT, which is latched. A pair that is not in the table leaves the state as it is. Each cycle has one event:
+`_event` chooses a fault first, then a contact, then the progress of the state.
 
 A collision is latched: REACT -> STOPPED until the user acknowledges. So are a late host, a contact that has grown into
 a collision, and a contact that has lasted too long. Any other contact clears itself: REACT returns to the state before.
@@ -130,8 +130,8 @@ class SupervisorMemory:
     origin: state to which REACT or STOPPED returns: the state before, or ADAPT after a broken test. cause: the event by
     which the state was entered. is_latched: the user must acknowledge the cause of REACT or STOPPED. is_doubted: the
     model is wrong. pending: bits of the requests that wait. is_weight_announced: the user has announced the payload's
-    weight since REACT began. is_announced_here: the user has announced a new payload in this state. periods, cycles:
-    counts up to now.
+    weight since REACT began. is_announced_here: the user has announced a new payload in this state. `phase_periods`,
+    `learning_periods`: periods in this state, and in the learning states. `_cycles`: cycles in a row.
     """
 
     state: int

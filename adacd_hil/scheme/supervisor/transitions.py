@@ -20,7 +20,7 @@ from adacd_hil.records import SchemeState
 
 
 class SchemeEvent(IntEnum):
-    """Events that can move the scheme to another state, in order of precedence."""
+    """Events that move the scheme to another state. The numbers are no order: `supervisor._event` sets precedence."""
 
     NONE = 0
     FAULT = 1  # a check of the running arm failed, or a phase took too long
@@ -42,7 +42,7 @@ class SchemeEvent(IntEnum):
     REVOKED = 17  # the user takes back the knowledge of the arm, or acknowledges that it is doubted
     DOUBTED = 18  # contacts that have cleared have one cause in common: the certificate is wrong
     MOVED = 19  # the arm moves before all its drives are enabled
-    CONTRADICTED = 20  # later evidence contradicts the certificate: an anchor, or a torque by place
+    CONTRADICTED = 20  # later evidence contradicts the certificate: an anchor, a torque by place, or less sight
 
 
 STAYS = -1
@@ -120,7 +120,7 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, int]] = MappingProx
             SchemeEvent.CONTACT: SchemeState.REACT,
             SchemeEvent.PAYLOAD_CHANGED: SchemeState.ADAPT,
         },
-        # Latched. Out: a new run.
+        # Latched. No way out: a recovery begins the next attempt in INIT.
         SchemeState.FAULT: {},
     }
 )
