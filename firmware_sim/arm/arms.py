@@ -125,7 +125,7 @@ class EmulatedArm:
 
     @property
     def wiring(self) -> "Wiring":
-        """Joint and sign of each device, joints counted from 0."""
+        """Joint, directions and zero of the device at each place."""
         drive, sensor = (tuple(joint - 1 for joint in places) for places in (self.drive_joint, self.sensor_joint))
         torque = tuple(turn * up for turn, up in zip(self.drive_sign, self.motor_sign, strict=True))
         zero = tuple(round(math.radians(zero_deg) / POSITION_LSB_RAD) for zero_deg in self.zero_deg)

@@ -262,7 +262,7 @@ VELOCITY_LOOP_HZ = 200.0
 
 @dataclass(frozen=True)
 class HabitSettings:
-    """Ways of a drive that its standard leaves open, or that it has beside it."""
+    """Behaviour of a drive that CiA 402 leaves open, or that deviates from the standard."""
 
     shows_mode: str = setting(
         "always",

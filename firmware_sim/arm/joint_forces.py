@@ -278,7 +278,10 @@ def is_free(joint: int, state: np.void, mechanics: np.void) -> bool:
 
 @compiled
 def decide(now: np.void, around: Surroundings, forces: np.void) -> Slips:
-    """Return the slips of both links and both motors, 1, -1 or 0 (sticks), by the present forces."""
+    """Return the slips of both links and both motors by the present forces: 1, -1 or 0 (sticks).
+
+    A link or motor that never sticks has 1.
+    """
     state, mechanics = around.state, around.mechanics
     slip1, slip2 = decide_slips(
         state, forces, forces["link_Nm"][0], forces["link_Nm"][1], now["q"][1], now["dq"][0], now["dq"][1]

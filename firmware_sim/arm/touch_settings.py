@@ -77,7 +77,7 @@ def ticks(duration_s: float) -> int:
 
 @dataclass(frozen=True)
 class ContactSettings:
-    """One touch."""
+    """One scripted force on a point of a link."""
 
     at_s: float = setting(unit="s", low=0.0, high=1e6, meaning="onset, since the drives were enabled")
     link: int = setting(low=1, high=2, meaning="which link is touched")

@@ -281,7 +281,7 @@ class Bench:
 
     @property
     def _is_plain(self) -> bool:
-        """Whether all cyclic frames, undisturbed and without company, answer this SYNC."""
+        """Whether just the contract's cyclic frames answer this SYNC: no fault acts, and no held frame is due."""
         is_undisturbed = self._plan.is_quiet and self._outbox.due_ns >= self.time.now_ns + self._nodes.period_ns
         return is_undisturbed and self._nodes.has_all_answers
 

@@ -45,7 +45,7 @@ class FaultEdge(NamedTuple):
 
 
 class ActionKind(Enum):
-    """Actions on a node. The comment says what `NodeAction.value` is."""
+    """Actions on a node. A comment describes `NodeAction.value`, which the others don't use."""
 
     POWER_OFF = "power off"
     POWER_ON = "power on"
@@ -299,6 +299,7 @@ class FaultPlan:
         self._replaced = replaced
 
     def _switch_failures(self, failing: tuple[FaultRow, ...]) -> None:
+        """Queue the failure of a drive whose fault begins, and its repair once no fault is left on it."""
         for row in self._rows:
             if row.settings.kind != "drive_fault" or not row.settings.duration_ns:
                 continue

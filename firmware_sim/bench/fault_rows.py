@@ -42,7 +42,11 @@ Place = tuple[int, int]
 
 
 class FaultRow:
-    """One row and its progress."""
+    """One row of faults and its progress.
+
+    sent: frames of its flood so far. held: by identifier, frames to be overtaken. kept: stuck counts by node, or frozen
+    counters by identifier.
+    """
 
     def __init__(self, index: int, settings: FaultSettings, seed: str, period_ns: int) -> None:
         self.index = index

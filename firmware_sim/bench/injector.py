@@ -111,7 +111,7 @@ class Outbox:
 
 
 class Departure:
-    """Gathers frames until `send_waiting`."""
+    """Gathers frames that `send_waiting` sends to the bus together."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
@@ -134,7 +134,10 @@ OnEvent = Callable[[int, str, str, str], None]
 
 
 class Injector:
-    """The faults of one bench. Without any it costs one look at `is_quiet` per SYNC."""
+    """Applies the faults of one bench to frames, measured values and nodes.
+
+    Without faults it costs one look at `is_quiet` per SYNC.
+    """
 
     def __init__(
         self, scenario: Scenario, seed: int, period_ns: int, codec: Codec, outbox: Outbox, on_event: OnEvent | None
@@ -158,7 +161,7 @@ class Injector:
     def attach(
         self, devices: Sequence[EmulatedDevice], drives: Sequence[DriveNode], sensors: Sequence[SensorNode]
     ) -> None:
-        """Set the nodes on which faults act. Raises ConfigError for an object that a node lacks or that can't be so."""
+        """Set the nodes on which faults act. Raises ConfigError for a missing object, or a value that it can't have."""
         self._devices, self._drives, self._sensors = devices, drives, sensors
         for index, row in enumerate(self._rows):
             for place in row.nodes if row.kind == "object_value" else ():
@@ -180,7 +183,7 @@ class Injector:
 
     @property
     def due_ns(self) -> int:
-        """Time of the next beginning, end or repetition of a fault."""
+        """Time at which a fault next begins, ends or sends, ns."""
         return min(self.now_ns + self.plan.wait_ns, self._flooded_ns if self.plan.is_flooding else NEVER_NS)
 
     def sender(self, place: int) -> Send:

@@ -32,7 +32,7 @@ Answer = tuple[int, bytes]
 
 
 class RecordedCycle(NamedTuple):
-    """The answers to one SYNC."""
+    """The answers to one SYNC, with the numbers of its attempt and of its cycle there."""
 
     attempt: int
     cycle: int

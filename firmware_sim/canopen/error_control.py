@@ -106,7 +106,7 @@ class ErrorReporter:
             dictionary.serve(0x2210, _COUNT_SUB + watchdog, lambda w=watchdog: self._counts[w] & 0xFFFF)  # type: ignore[misc]
 
     def report_error(self, code: int, t_ns: int, number: int = 0, time_ms: int = 0) -> None:
-        """Add a code other than 0 to the history, and send an EMCY once the inhibit time is over.
+        """Add a code other than 0 to the history; send an EMCY after the inhibit time if 0x1014 and NMT state allow it.
 
         number: of the watchdog, 0 for none. time_ms: on the device's clock.
         """
@@ -246,6 +246,7 @@ class HeartbeatConsumer:
         self._find(self._now_ns())  # a node that isn't monitored any more isn't missing
 
     def _find(self, t_ns: int) -> None:
+        """Report the return of a lost heartbeat; otherwise do nothing."""
         if self.is_lost:
             self.is_lost = False
             self._on_return(t_ns)
@@ -266,7 +267,7 @@ _LOST_SUB = 5  # of 0x2211
 
 
 class SyncKind(Enum):
-    """The place of one SYNC in the order of those before. The value of an odd one is its sub-index of 0x2211."""
+    """Kind of one SYNC beside those before. Except for RIGHT, the value is its sub-index of 0x2211."""
 
     RIGHT = 0
     REPEATED = 1
@@ -337,7 +338,7 @@ class SyncOrder:
 
 
 class SyncCounts:
-    """The odd SYNCs that one device has received: 0x2211."""
+    """Counts of the odd and the lost SYNCs of one device: 0x2211."""
 
     def __init__(self, dictionary: ObjectDictionary) -> None:
         self.odd = 0

@@ -330,7 +330,7 @@ class ObjectDictionary:
             self._replaced[index, subindex] = lambda: value
 
     def range_of(self, index: int, subindex: int) -> tuple[int, int]:
-        """Return the least and the greatest value of an integer that the EDS lists; raise `Refusal` if it doesn't."""
+        """Return the least and the greatest value of an object's integer type; raise `Refusal` if the EDS lacks it."""
         variable = self.find(index, subindex)
         bits, is_signed = len(variable), variable.data_type in datatypes.SIGNED_TYPES
         return (-(1 << bits - 1), (1 << bits - 1) - 1) if is_signed else (0, (1 << bits) - 1)
@@ -409,6 +409,7 @@ class ObjectDictionary:
         return None if read is None else read()
 
     def _write(self, index: int, subindex: int, od: ODVariable, data: bytes) -> None:
+        """Refuse a write that lock, range or a check forbids; else pass the value to the functions that watch it."""
         if self._is_requested and self.is_locked(index, subindex):
             refuse(Abort.DEVICE_STATE)
         if od.data_type not in datatypes.NUMBER_TYPES:
@@ -430,7 +431,7 @@ def _call_all(functions: list[Callable[[int], None]], value: int) -> None:
 
 @dataclass(frozen=True)
 class EmulatedContract:
-    """File names within `contract_folder`.
+    """A contract that the emulator plays: its DBC and its EDS, as file names within `contract_folder`.
 
     devices: those of an arm of one's own, by place, in their stead. period_us: time of a SYNC where no master can
     write 0x1006; 0: 1 ms.

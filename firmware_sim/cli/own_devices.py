@@ -140,7 +140,7 @@ def rehearse_settings(
 
 
 def _omissions(devices: list[PlacedDevice], contract: EmulatedContract) -> list[str]:
-    """Return a line for each EDS with the objects that it omits and the emulator adds."""
+    """Return a line for each EDS that omits objects, with those that the emulator adds."""
     lines: dict[str, None] = {}
     for device, description in zip(devices, contract.devices, strict=True):
         if names := ", ".join(f"0x{index:04X} ({made.name})" for index, made in description.made_up.items()):
@@ -165,6 +165,7 @@ def _maker_habits(device: PlacedDevice) -> HabitSettings:
 
 
 def _counts(codec: Codec, devices: list[PlacedDevice]) -> DeviceCounts:
+    """Return position counts, torque ranges, and rated torques with their counts, by profiles and EDS."""
     drives, sensors = devices[:JOINTS], devices[JOINTS:]
     first, second = (float(drive.settings.scale.increments_per_joint_rev) for drive in drives)
     ranges = []
@@ -184,6 +185,7 @@ def _default(device: PlacedDevice, index: int, sub: int) -> int:
 
 
 def _can_be_set(device: PlacedDevice, index: int, sub: int) -> bool:
+    """Return whether an object may get another value than its EDS's: it is writable, or the increments are assumed."""
     if not device.has(index, sub):
         return False
     is_guess = "scale.increments_per_joint_rev" in device.settings.assumed
@@ -231,7 +233,7 @@ _BOTH_WAYS = ("position", "velocity", "torque", "target_torque")
 
 
 def _check_objects(device: PlacedDevice) -> None:
-    """Raise ConfigError for a device that can't be played: an object has another type."""
+    """Raise ConfigError if an object's type isn't the standard's, or a signal with negative values is unsigned."""
     place = f"device profile {device.profile.name}"
     for index in STANDARD_TYPES:
         if device.has(index):

@@ -105,6 +105,7 @@ class Service:
         return frame
 
     def _await_interface(self) -> None:
+        """Try to recover the interface until it is back or a stop is requested."""
         while not self._stop.is_made:
             try:
                 self._bus.recover()

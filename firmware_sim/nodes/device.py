@@ -138,7 +138,7 @@ class EmulatedDevice(ObjectDictionary):
 
     @property
     def is_sync_odd(self) -> bool:
-        """Whether an odd SYNC is remembered, so that right ones count."""
+        """Whether a watchdog of SYNC's order or length is tripped, so that right SYNCs count, too."""
         return bool(_OF_SYNC & self.tripped)
 
     def attach(self, application: Application) -> None:
@@ -216,7 +216,7 @@ class EmulatedDevice(ObjectDictionary):
             self.on_request(data, t_ns)
 
     def on_heartbeat(self, node_id: int, t_ns: int) -> None:
-        """Pass another node's heartbeat to the heartbeat consumer."""
+        """Pass another node's heartbeat to the heartbeat consumer; ignore it off the bus."""
         if self.is_on_bus:
             self._consumer.on_heartbeat(node_id, self.clock.own_ns(t_ns))
 
@@ -302,6 +302,7 @@ class EmulatedDevice(ObjectDictionary):
         return (t_ns - self.power_on_ns) // 1_000_000
 
     def _enter(self, state: NmtState, t_ns: int) -> None:
+        """Change the NMT state; begin or end PDOs, and report leaving and entering Operational to the application."""
         was_operational, self.is_operational = self.is_operational, state == NmtState.OPERATIONAL
         if was_operational and not self.is_operational:
             self._application.leave_operational(t_ns)
@@ -357,7 +358,7 @@ class NodeClock:
 
 
 class SyncListeners:
-    """All devices of a bench. A SYNC in order takes no work here."""
+    """Reports each SYNC to the devices of a bench, with the number lost before. A SYNC in order needs no report."""
 
     def __init__(self, devices: Sequence[EmulatedDevice]) -> None:
         self._devices = devices
@@ -415,6 +416,7 @@ class SyncListeners:
         self.is_remembering = any(self._unheard) or any(device.is_sync_odd for device in self._devices)
 
     def _sort(self) -> None:
+        """Update the takers of SYNC by its length, and `overflow`, by the devices' 0x1019."""
         overflows = [device.sync_overflow for device in self._devices]
         self._takers = {
             0: tuple(int(not overflow) for overflow in overflows),

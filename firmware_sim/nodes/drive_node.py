@@ -182,7 +182,7 @@ class DriveNode(Application):
 
     @property
     def statusword(self) -> int:
-        """0x6041. Target reached (bit 10) has no meaning in mode 10 and stays 0; so does all of set-point and halt."""
+        """0x6041, by state, warnings and limits. Target reached (bit 10) has no meaning in mode 10 and stays 0."""
         word = STATE_BITS[self.state] | _REMOTE
         if Watchdog.COMMAND_PDO in self._tripped:
             word |= _WARNING
@@ -278,7 +278,7 @@ class DriveNode(Application):
         return self._clock.bench_ns(due_ns)
 
     def fail(self, code: int, t_ns: int) -> None:
-        """Enter Fault with an error code of 0x603F; its cause stays until `mend`."""
+        """Latch a fault with this error code, 0x603F, now or once powered, and again after each reset until `mend`."""
         self._failure = code
         self._feel_failure(self._clock.own_ns(t_ns))
 
@@ -313,12 +313,12 @@ class DriveNode(Application):
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def distrust_sync(self, t_ns: int) -> None:
-        """Enter Fault if enabled: torque that acts at SYNC has no time."""
+        """Enter Fault if enabled: torque acts at SYNC, which is no time base any more."""
         if self.is_enabled:
             self._fault(Watchdog.SYNC, t_ns)
 
     def restart_node(self, is_node_reset: bool) -> None:
-        """Forget the last command; a node reset also runs the state machine from its start (0, 1)."""
+        """Forget the last command; at a node reset also fault and target torque, and run transitions 0 and 1."""
         self._received_word = None
         if not is_node_reset:
             return
@@ -394,6 +394,7 @@ class DriveNode(Application):
         self._brake(stop, t_ns)
 
     def _apply(self, event: DriveEvent, t_ns: int) -> None:
+        """Make the transition of an event, if this state has one, and set the motor's mode by the new state."""
         transition = find_transition(self.state, event)
         if transition is None:
             return
@@ -408,6 +409,7 @@ class DriveNode(Application):
             self._stop_by(FAULT_REACTIONS[self.device.value_or(2, 0x605E)], DriveEvent.FAULT_REACTION_DONE, t_ns)
 
     def _stop_by(self, stop: Stop, done: DriveEvent, t_ns: int) -> None:
+        """Begin to brake, or apply the event `done` at once if the option code has no braking."""
         if stop is DISABLE:
             self._apply(done, t_ns)
         else:
@@ -436,6 +438,7 @@ class DriveNode(Application):
         self._latch(ERROR_CODES[cause], cause, t_ns, is_found_by_time)
 
     def _latch(self, code: int, cause: Watchdog | None, t_ns: int, is_found_by_time: bool = False) -> None:
+        """Latch a fault, begin the fault reaction, and send the EMCY; ignored while a fault is latched."""
         if self.state in (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT):
             return
         self.error_code = code
@@ -477,10 +480,12 @@ class DriveNode(Application):
         self._find_command_pdo(t_ns)
 
     def _find_command_pdo(self, t_ns: int) -> None:
+        """Clear the watchdog of the command PDO if nothing keeps the drive from Operation enabled."""
         if not self._obstacle:
             self.device.clear(Watchdog.COMMAND_PDO, t_ns)
 
     def _miss_command(self, t_ns: int) -> None:
+        """Count a SYNC without a command; latch a fault of an enabled drive after too many."""
         self._patience.silent_syncs += 1
         if self.is_enabled and self._patience.is_command_missing:
             self._fault(Watchdog.COMMAND, t_ns)
@@ -518,7 +523,7 @@ class DriveNode(Application):
             self._apply(DriveEvent.QUICK_STOP_DONE, t_ns)
 
     def _drive_motor(self) -> None:
-        """Set the motor's torque set-point: 0 except in Operation enabled with mode 10."""
+        """Set the motor's torque set-point: 0 except in Operation enabled with mode 10, and not while it ramps down."""
         self._demand = self._limits.demand() if self._follows_target else 0
         self.torque_Nm = self._demand * self._rated_mNm * 1e-6
 

@@ -167,7 +167,7 @@ FAULT_REACTIONS = {code: QUICK_STOPS[code] for code in (0, 1, 2, 3)}
 
 
 class Standstill:
-    """Watches a braking motor."""
+    """Finds when a braking motor stands still, or has braked for long enough."""
 
     def __init__(self) -> None:
         self._since_ns = self._moving_ns = 0
@@ -191,7 +191,7 @@ _UNLIMITED = 0xFFFF  # where the EDS lacks a limit
 
 
 class TorqueLimits:
-    """Target, offset and limits, as written by SDO or PDO."""
+    """Target, offset and limits of torque, as written by SDO or PDO, and the demand that follows from them."""
 
     def __init__(self, dictionary: ObjectDictionary, pdos: Pdos) -> None:
         self.target = self._offset = 0
@@ -237,7 +237,7 @@ class TorqueLimits:
 
 
 class Motor(NamedTuple):
-    """The drive's knowledge of its motor without the bus: velocity in rad/s, torque in Nm.
+    """Functions that read the motor's state: velocity in rad/s, torque in Nm.
 
     is_limited: whether current limit, I²t or temperature leave less torque than the drive asks for. error_code: the
     fault that the motor's state calls for now, 0 without a fault. is_ideal: neither ever occurs, so both need no

@@ -73,7 +73,7 @@ class DeviceCounts(NamedTuple):
 
 @dataclass(frozen=True)
 class _Links:
-    """Mass and place of it, by link."""
+    """Length, mass, centre of mass from the link's joint, and inertia about that centre, by link."""
 
     length_m: Pair
     mass_kg: Pair
@@ -219,6 +219,7 @@ def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
 
 
 def _multiply(links: _Links, truth: ArmTruth) -> _Links:
+    """Return the links with lengths and masses multiplied by the truth's factors."""
     (f1, f2), (m1, m2) = truth.factor.link_length, truth.factor.mass
     return _Links(
         _times(links.length_m, (f1, f2)),
@@ -229,6 +230,7 @@ def _multiply(links: _Links, truth: ArmTruth) -> _Links:
 
 
 def _weighed(length_m: Pair, body: TruthArmSettings | ArmSettings, source: str, assumed: list[str]) -> _Links:
+    """Return links with the masses of `body`; a missing centre or inertia is a rod's, with a line in `assumed`."""
     assert body.mass_kg is not None
     rods = _rods(length_m, body.mass_kg)
     for key, meaning in (
@@ -284,6 +286,10 @@ def _joint_inertia(links: _Links) -> Pair:
 
 
 def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -> tuple[Pair, Pair]:
+    """Return viscous and Coulomb friction: of the truth, else configuration, `arm.cad_theta`, profile.
+
+    Without any of these: a share of the rated torque, with a line in `assumed`.
+    """
     theta = told.settings.arm.cad_theta if "arm.cad_theta" in told.own_keys else ()
     known = theta[3:7] if any(theta[3:7]) else ()
     found: list[Pair] = []

@@ -282,7 +282,7 @@ class Scenario:
 
     @property
     def wiring(self) -> Wiring:
-        """Joint and sign of each device."""
+        """Joint, directions and zero of the device at each place."""
         return STRAIGHT if self.own_arm is None else self.own_arm.wiring
 
     @property
@@ -396,7 +396,7 @@ SWAPS = ("nothing", "drives", "sensors", "joints")
 
 @dataclass(frozen=True)
 class WiringSettings:
-    """Devices that are elsewhere than in the host's configuration."""
+    """Devices that are exchanged or reversed against the host's configuration."""
 
     swapped: str = setting(
         "nothing", choices=SWAPS, meaning="what is exchanged between the joints; `joints`: drives and sensors"

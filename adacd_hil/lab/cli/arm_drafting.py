@@ -260,6 +260,7 @@ class Drafting:
                 )
 
     def _profile(self, kind: str, name: str, joint: int) -> ProfileSettings:
+        """Return a joint's profile: its draft, else the built-in one of this name, or the file of it."""
         draft = self._drafts.get((kind, joint))
         if draft is not None:
             return draft.settings
@@ -771,6 +772,7 @@ def _word_or_deg(option: str, text: str, words: dict[str, float], low: float, hi
 
 
 def _masses(value: Any) -> Pair | None:
+    """Return the masses of both links, kg; None for "-". Raises ConfigError for values out of bounds."""
     if value == "-":
         return None
     masses = _numbers(value, float, "--mass-kg")

@@ -105,6 +105,10 @@ def run_commtest(
 def _run(
     loop: ZeroTorqueLoop, master: Master, test: CommunicationTest, recorder: Recorder | None, seconds: float
 ) -> FaultReason:
+    """Run the cycles of the test and log them; return the fault that ended them, NONE without one.
+
+    Raises CommandError if the bus fails. Stops the nodes at the end.
+    """
     freeze_garbage()
 
     def observe(cycle: ZeroTorqueCycle) -> None:
@@ -123,6 +127,7 @@ def _run(
 
 
 def _exit_code(test: CommunicationTest, fault: FaultReason, is_interrupted: bool, has_lost_log: bool) -> ExitCode:
+    """Return SAFETY_STOP after a fault, else INTERRUPTED, else FAILURE or OK by the verdict, PARTIAL for a cut log."""
     if fault is not FaultReason.NONE:
         return ExitCode.SAFETY_STOP
     if is_interrupted:

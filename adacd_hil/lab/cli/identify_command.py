@@ -88,7 +88,10 @@ def identify(
 
 
 def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
-    """Write the map of a recording, and list its guesses."""
+    """Write the map of a recording by a URDF, and list its guesses; return OK. given: both files.
+
+    Raises CommandError for other files, or if another map is in the way.
+    """
     from adacd_hil.lab.offline.map_draft import draft_map, map_text
     from adacd_hil.lab.offline.recording_map import read_map
 

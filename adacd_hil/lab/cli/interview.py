@@ -19,7 +19,7 @@ def is_terminal() -> bool:
 
 
 class Interview:
-    """Asks questions that no option has answered; without a terminal it takes proposals if allowed, else fails."""
+    """Answers a question by its option, else (`--yes`) by the proposal, else asks; without a terminal it fails."""
 
     def __init__(self, takes_proposals: bool) -> None:
         self.takes_proposals = takes_proposals
@@ -60,6 +60,7 @@ class Interview:
     def _prompt(
         self, question: str, read: Callable[[Any], Answer], proposal: tuple[Any, str], help_text: str
     ) -> tuple[Answer, str]:
+        """Ask on the terminal until an answer can be read; return it and its source. help_text: printed on `?`."""
         value, source = proposal
         default = None if value is None else as_typed(value)
         while True:

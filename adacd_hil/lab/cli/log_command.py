@@ -254,6 +254,7 @@ class TableFormat(click.Choice[str]):
 
 
 def _refuse(ctx: click.Context, _param: click.Parameter, value: object) -> None:
+    """Fail if an option of the formats of frames is given; the error names the tool that makes them."""
     if value:
         raise click.UsageError(_CONVERTED, ctx)
 

@@ -154,6 +154,7 @@ class Playback:
                     yield PlayedFrame(t_ns, can_id, data[:length].tobytes())
 
     def _pieces(self) -> "Iterator[NDArray[Any]]":
+        """Yield arrays of the chosen frames that are sent; count the others, and store the recording's problem."""
         import numpy as np
 
         from adacd_hil.log.frames.frame_log import open_frames
@@ -176,7 +177,8 @@ def _run(
 ) -> tuple[dict[str, Any], ExitCode]:
     """Play a recording onto a bus, `times` times (0: until interrupted), and close the bus.
 
-    Return counts and lateness of the frames for JSON, and the exit status. Raises LogError, CommandError.
+    Return counts and lateness of the frames for JSON, and the exit status: INTERRUPTED, PARTIAL for a damaged
+    recording, else OK. Raises LogError, CommandError if the bus fails.
     """
     from adacd_hil.cli.connection import on_interrupt
     from adacd_hil.lab.logs.playback import play as play_frames

@@ -19,7 +19,7 @@ from adacd_hil.settings.schema import ConfigError
 
 
 class Index(NamedTuple):
-    """Runs of a folder, each with its report, None if it can't be reported; and their index page."""
+    """Runs of a folder, each with its report, None if it can't be reported. path: of their index page."""
 
     path: Path
     entries: list[tuple[ListedRun, Report | None]]
@@ -42,8 +42,8 @@ def report_logs(
     """Write a report of each log, or of a stretch of it, beside it or in `out`; return reports, errors, exit status.
 
     Reports of several logs are in subfolders of `out`. A folder stands for the run log in it, or without one for the
-    runs in its folders. What can't be reported doesn't stop the others: the errors are those of given ones, and the
-    exit status is that of the reports.
+    runs in its folders. An error doesn't stop the others. The exit status is PARTIAL if a report is incomplete, or a
+    run in a folder has none, else OK; the returned errors, those of given logs, don't count.
 
     Raises CommandError if two reports would go to one folder.
     """
@@ -123,6 +123,7 @@ def _report_one(path: Path, folder: Path, stretch: TimeWindow, progress: Progres
 
 
 def _is_complete(reported: Reported | None) -> bool:
+    """Return whether a report is complete, of an index all reports; False for None, a run without one."""
     if isinstance(reported, Index):
         return all(_is_complete(report) for _, report in reported.entries)
     return reported is not None and reported.is_complete

@@ -132,6 +132,7 @@ def _next(table: Path, failed: int) -> str:
 def _plan(
     logs: Sequence[Path], scenarios: Sequence[str], seeds: str, vary: Sequence[str], config: str, profile: str
 ) -> "Plan":
+    """Return the plan of a sweep. Raises ConfigError, CommandError for settings, scenarios or seeds that are wrong."""
     from adacd_hil import __version__
     from adacd_hil.compiled import program_digest
     from adacd_hil.lab.tune.sweep import plan_logs, plan_scenarios

@@ -133,7 +133,7 @@ def check_other_masters(patient: ArmExamination) -> Finding:
 
 
 def check_nodes(patient: ArmExamination) -> Finding:
-    """Check that the expected nodes are there, with the expected identity."""
+    """Check that the expected nodes are there, with the expected identity; warn of further nodes."""
     expected = expected_nodes(patient.master.slaves)
     found = survey(patient.tap, patient.clock, 0.0)
     verdicts = compare(found, expected)
@@ -373,7 +373,7 @@ def check_noise(patient: ArmExamination) -> Finding:
 
 
 def check_bus_errors(patient: ArmExamination) -> Finding:
-    """Check that no error frame came while the cycle ran."""
+    """Check that no error frame came during the cycles, and that the controller is in state ERROR-ACTIVE."""
     link = patient.read_link()
     errors = patient.traffic.error_frames
     counters = ""
@@ -385,6 +385,8 @@ def check_bus_errors(patient: ArmExamination) -> Finding:
 
 
 def _check_joint(joint: int) -> Callable[[ArmExamination], Finding]:
+    """Return the check of a joint's signs, for which the user moves the joint by hand; skipped without a user."""
+
     def check(patient: ArmExamination) -> Finding:
         if patient.ask is None:
             return skipped(patient.no_move_reason)

@@ -615,6 +615,7 @@ def draw_arm(mounting_deg: Pair) -> str:
 
 
 def _stated(key: str, fact: Fact, what: str) -> Entry:
+    """Return the entry of a fact, its meaning and source as comment; one without a source is a guess."""
     return Entry(key, fact.value, f"{what}: {fact.source or 'a guess'}", not fact.source)
 
 

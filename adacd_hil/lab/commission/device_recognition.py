@@ -94,6 +94,7 @@ _OF_DRIVES = (
 
 
 def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> int | None:
+    """Return an object of a node as a number; None if it is missing, refused or too long."""
     try:
         data = read_object(remote, index, sub)
     except DeviceError:  # it refuses the upload, or answers with another type
@@ -130,6 +131,7 @@ def choose_family(
 
 
 def _digest_of(drive: str, sensor: str, drive_nodes: tuple[int, ...], sensor_nodes: tuple[int, ...]) -> int | None:
+    """Return the layout digest of the contract composed of two profiles, for both joints; None if there is none."""
     settings = load_settings("certified")
     devices = dataclasses.replace(
         settings.devices,

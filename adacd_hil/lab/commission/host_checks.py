@@ -102,6 +102,7 @@ def diagnose(
 
 
 def _run(check: Check[Examination], examination: Examination) -> Finding:
+    """Return the finding of a check; an error of the bus or of a device becomes a failure."""
     try:
         return check.run(examination)
     except DeviceError as error:
@@ -136,6 +137,8 @@ def check_settings(settings: Settings) -> Finding:
 
 
 def _asking_for(known: KnownKey) -> Callable[[Settings], Finding]:
+    """Return a check that always warns: the value of this key is a guess."""
+
     def ask(settings: Settings) -> Finding:
         value = value_of(settings, known.key)
         text = "nothing is given" if value is None else f"{in_words(value)} is a guess"
@@ -146,6 +149,8 @@ def _asking_for(known: KnownKey) -> Callable[[Settings], Finding]:
 
 
 def _asking_for_profile(value: float) -> Callable[[Settings], Finding]:
+    """Return a check that always warns: this value of a device profile is a guess."""
+
     def ask(_: Settings) -> Finding:
         remedy = "look it up or measure it, write it into that profile, and take the key off its `assumed`"
         return warning(f"{value:.10g} is a guess", remedy)

@@ -98,9 +98,10 @@ class DeviceRatings(NamedTuple):
 
 
 class ProfileDraft(NamedTuple):
-    """The text of a profile, and what it says. remarks: limits of the device, a line each.
+    """The text of a profile, and its settings. guessed: by key, a guess and its reason as text.
 
-    rated_torque_Nm: at the joint, by 0x6076; None if unknown. is_rated_known: no guess went into it.
+    remarks: limits of the device, a line each. rated_torque_Nm: at the joint, by 0x6076; None if unknown.
+    is_rated_known: no guess went into it.
     """
 
     text: str
@@ -254,6 +255,8 @@ class _Record(NamedTuple):
 
 
 class _ProfileWriter(ABC):
+    """Writes a device's profile by EDS, the user's answers, values read from the device, and the maker's profile."""
+
     kind = ""
     features = _SENSOR_FEATURES
 
@@ -305,7 +308,7 @@ class _ProfileWriter(ABC):
 
     @property
     def is_fixed(self) -> bool:
-        """Return whether no mapping can be written."""
+        """Whether no mapping of a PDO can be written."""
         return not any(record.room for is_received in (False, True) for record in self.records(is_received))
 
     def records(self, is_received: bool) -> list[_Record]:
@@ -404,7 +407,8 @@ class _ProfileWriter(ABC):
     def pdo(self, message: str, record: _Record, places: Sequence[_Place], transmission: int = 1) -> list[str]:
         """Return the profile's lines on one PDO.
 
-        places: objects to map; a fixed mapping keeps the EDS's default objects. transmission: type, unless read-only.
+        places: objects to map; a fixed mapping keeps the EDS's default objects. transmission: type if it can be
+        written; 1 is not printed. Adds inhibit time and event timer.
         """
         rows = [
             f'    {{ object = "{ObjectName(*place)}", {self.signal(place)} }},'
@@ -426,6 +430,7 @@ class _ProfileWriter(ABC):
         return [*head, "signals = [", *rows, "]", ""]
 
     def signal(self, place: _Place) -> str:
+        """Return the keys of a mapped object in a profile: the signal's name, and its unit if that is per mille."""
         index, sub = place
         if place in _TORQUE_OBJECTS:
             return 'signal = "torque"'
@@ -506,6 +511,7 @@ class _DriveWriter(_ProfileWriter):
         return [*lines, *self._velocity(gear, increments), *gear_lines, *torque_lines]
 
     def _gear(self, motor_Nm: float) -> tuple[float, list[str]]:
+        """Return the gear ratio from the best source, and the profile's lines on it and its efficiency."""
         by_drive = read_drive_units(self.number).gear_ratio
         lines: list[str] = []
         if "gear_ratio" in self.answers:
@@ -567,6 +573,7 @@ class _DriveWriter(_ProfileWriter):
         return lambda index, sub: None if index == 0x6091 and not is_set else self.number(index, sub)
 
     def _velocity(self, gear: float, increments: float) -> list[str]:
+        """Return the profile's lines on one count of velocity, in rad/s of the joint, from the best source."""
         unit = self.answers.get("velocity_unit")
         code = int(unit) if unit is not None else self.number(0x60A9, 0)
         objects = {(0x60A9, 0): code, (0x608F, 1): 1}

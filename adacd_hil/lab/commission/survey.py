@@ -290,7 +290,7 @@ _WINDOW_NS = 1_000_000_000
 
 
 class _Entry:
-    """One identifier's frames so far."""
+    """Counts and checks of one identifier's frames so far. valid: data of the last frame that passed its checks."""
 
     def __init__(self, message: MessageCodec | MessageDecoder | None) -> None:
         self.message = message
@@ -325,7 +325,7 @@ class _Entry:
 
 
 class BusView:
-    """Takes in every frame of a bus."""
+    """Counts, checks and decodes the frames of a bus for a listener; `describe` returns the results."""
 
     def __init__(self, codec: Codec | DbcDecoder, bitrate: int, data_bitrate: int, t_ns: int) -> None:
         """Begin at `t_ns`; the bit rates in bit/s are for the load."""

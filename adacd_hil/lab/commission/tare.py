@@ -40,7 +40,10 @@ class ArmMovedError(TareRefusedError):
 
 @dataclass(frozen=True)
 class Pose:
-    """One pose, measured at rest."""
+    """One pose, measured at rest: mean q; of tau_J, per joint, the mean, its standard error and its noise.
+
+    drift_Nm: mean of the second half of the window less that of the first.
+    """
 
     q: Vector
     mean_Nm: Vector

@@ -112,6 +112,7 @@ class TareSession:
         return int.from_bytes(data[:2], "little", signed=True) * 0.01
 
     def _step(self) -> ArmState:
+        """Run one cycle; return the arm's state. Raises KeyboardInterrupt after `interrupt`, BusError."""
         if self._is_interrupted:
             raise KeyboardInterrupt
         return self._loop.step().state

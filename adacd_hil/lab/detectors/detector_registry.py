@@ -67,6 +67,7 @@ def registered(reserved: Collection[str]) -> Mapping[str, Registered]:
 
 
 def _load(entry: importlib.metadata.EntryPoint, reserved: Collection[str]) -> None:
+    """Register the detector of an entry point. Raises DetectorError if it can't be loaded or breaks the contract."""
     package = f"package {entry.dist.name} {entry.dist.version}" if entry.dist is not None else entry.value
     try:
         add(entry.name, entry.load(), reserved, package)

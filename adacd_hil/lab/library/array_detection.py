@@ -164,6 +164,7 @@ def fit(
 def _fitted(
     recording: ForeignRecording, arm: OfflineArm, fit_s: tuple[float, float] | None, scheme: Mapping[str, Any]
 ) -> FittedModel:
+    """Fit a model to the free motion of a recording, and test it. Raises ArrayError if that is too little."""
     start_s, end_s = _span(recording, fit_s)
     described = _described(arm, recording.columns.values.shape[1] > 2 * arm.joints, scheme)
     try:

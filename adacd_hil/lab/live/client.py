@@ -72,6 +72,7 @@ class LiveClient:
         return self._waiting.popleft() if self._waiting else self._receive(timeout_s)
 
     def _receive(self, timeout_s: float) -> LiveMessage | None:
+        """Return the next message, after the server's words before it; None after the timeout or at the end."""
         while self.is_open:
             try:
                 data = self._connection.recv(timeout=timeout_s)

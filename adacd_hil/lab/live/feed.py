@@ -90,7 +90,7 @@ RING_BYTES = 8 * 1024 * 1024
 
 
 class LiveFeed:
-    """Messages for the live view. `url`: where it is; `process`: serves it; `hidden`: batches without room."""
+    """Passes messages to the live view. `url`: where it is; `process`: serves it; `hidden`: batches without room."""
 
     def __init__(self, live: LiveView, setup: WriterSetup, ids: dict[int, int], start_ns: int) -> None:
         """Start the view's process, and wait until it listens on the address of `live`. Raises LogError.
@@ -128,6 +128,7 @@ class LiveFeed:
         self._socket.setblocking(False)
 
     def _hear(self) -> dict[str, str]:
+        """Return the first word of the view's process: its address, or an error."""
         self._socket.settimeout(START_TIMEOUT_S)
         try:
             received = self._socket.recv(processes.MOST_BYTES)
@@ -277,6 +278,7 @@ class LiveTopics:
         return sources & self._decimators.keys()
 
     def _drawn_from(self, shown: Shown, wanted: Collection[int]) -> Iterator[Shown]:
+        """Yield the wanted messages that are drawn from a shown one: poses, or shapes of the scene."""
         channel, log_ns, payload = shown
         if channel == self._joint_states and self.transforms in wanted:
             q = np.frombuffer(payload, JOINT_STATE_DTYPE)[0]["q"]

@@ -120,7 +120,7 @@ class Viewer:
 
 
 class LiveServer:
-    """Serves the batches of a ring, as long as the writer is there."""
+    """Serves viewers the messages of a ring, as long as the writer is there."""
 
     def __init__(self, setup: LiveView, topics: LiveTopics, ring: RingReader, writer: socket.socket) -> None:
         self._setup = setup
@@ -191,6 +191,7 @@ class LiveServer:
             asyncio.get_running_loop().call_soon(self._show_some)
 
     def _show(self, batch: bytes) -> None:
+        """Queue the messages of a batch for the viewers that have subscribed to them."""
         wanted = {channel for viewer in self._viewers for channel in viewer.by_channel}
         for shown in self._topics.choose(unpack_batch(batch), wanted):
             self._tell_time(shown.log_ns)
@@ -199,6 +200,7 @@ class LiveServer:
         self._tell_time(self._topics.latest_ns)
 
     def _tell_time(self, log_ns: int) -> None:
+        """Queue the log time for all viewers, if `_TIME_STEP_NS` have passed since the last."""
         if log_ns - self._time_ns >= _TIME_STEP_NS:
             self._time_ns = log_ns
             for viewer in self._viewers:
@@ -237,6 +239,7 @@ class LiveServer:
         return connection.respond(refusal.status, refusal.reason + "\n")
 
     def _notice(self, refusal: ViewerRefusal) -> None:
+        """Print a refusal's line on the run's terminal, once for each kind."""
         if self._notices is not None and refusal.notice not in self._noticed:
             self._noticed.add(refusal.notice)
             with contextlib.suppress(OSError):
@@ -291,6 +294,7 @@ class LiveServer:
         return True
 
     def _subscribe(self, viewer: Viewer, asked: list[tuple[int, int]]) -> bool:
+        """Add subscriptions, wrong ones answered with an error; return False if they are too many."""
         for number, channel in asked:
             if len(viewer.subscriptions) >= _SUBSCRIPTIONS_PER_TOPIC * len(self._topics.advertised):
                 return False

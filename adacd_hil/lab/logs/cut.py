@@ -76,5 +76,6 @@ def cut(
 
 
 def _times(log: SalvagedLog, contents: Contents) -> NDArray[np.int64]:
+    """Return the times (n,) by which messages are cut, ns: publish_time in a log of ours, else log_time."""
     is_ours = RUN_METADATA in log.metadata
     return (contents.publish_times if is_ours else contents.log_times).astype(np.int64)

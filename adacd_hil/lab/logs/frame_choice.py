@@ -54,6 +54,7 @@ class FrameChoice:
         return is_chosen
 
     def _is_hosts(self, frames: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which frames (n,) are the host's: by the identifier, else those that were sent."""
         is_known = ~frames["is_error"] & ~frames["is_remote"]
         is_host = is_known & np.isin(frames["can_id"], list(self.host_ids))
         is_device = is_known & np.isin(frames["can_id"], list(self.device_ids))

@@ -28,7 +28,7 @@ _STAMP = struct.Struct("<II")
 
 
 class FrameWriter:
-    """Writes frames to a stream, which stays open."""
+    """Writes frames as an MCAP file to a stream; the stream stays open."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._messages = 0

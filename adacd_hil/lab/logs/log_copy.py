@@ -93,6 +93,7 @@ class LogCopy:
                 self._define(channel)
 
     def _define(self, channel: Channel) -> None:
+        """Define a channel of the other log in the copy, unless its schema is lost. Raises LogError for too many."""
         schema_id = 0
         if channel.schema_id:
             schema = self._log.definitions.schemas.get(channel.schema_id)

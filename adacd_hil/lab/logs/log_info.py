@@ -165,6 +165,7 @@ class _InfoView:
         return salvage.losses
 
     def _take_whole(self, file: IO[bytes], end: FileEnd, statistics: Statistics) -> None:
+        """Add the facts of a file's summary to the info, and events and contacts from the chunks that have some."""
         definitions = Definitions()
         definitions.add_records(end.summary)
         self._know(definitions)
@@ -196,6 +197,7 @@ class _InfoView:
             self._info.problems.append(f"the chunk at byte {record.offset} {error}")
 
     def _know(self, definitions: Definitions) -> None:
+        """Keep type and payload size of each topic."""
         for channel in definitions.channels.values():
             schema = definitions.schemas.get(channel.schema_id)
             name = schema.name if schema is not None else channel.message_encoding

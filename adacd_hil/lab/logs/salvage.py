@@ -188,6 +188,7 @@ class Salvage:
             self._lose(record.offset, len(record.body), str(error))
 
     def _take_chunk(self, record: RawRecord) -> Iterator[Contents]:
+        """Yield the content of a chunk. Raises ChunkError if no CRC vouches for it, except in a file without CRCs."""
         self._chunk = None
         chunk: Chunk = parse(record.opcode, record.body)
         is_vouched = self.is_vouched or chunk.uncompressed_crc != 0
@@ -206,6 +207,7 @@ class Salvage:
         yield from self._give(contents, is_vouched)
 
     def _give(self, contents: Contents, is_vouched: bool) -> Iterator[Contents]:
+        """Yield messages; count the saved, the unvouched and those without a channel, and add a gap before them."""
         known = np.isin(contents.channels, list(self.definitions.channels))
         self._left_out += int(np.count_nonzero(~known))
         saved = int(np.count_nonzero(known))

@@ -121,4 +121,5 @@ class _States:
             raise ConfigError(f'{self._where}: all stamps are 0; `bag.time` = "received" takes when it was recorded')
 
     def _find(self, names: tuple[str, ...]) -> list[int] | None:
+        """Return the places of the wanted joints among a message's names; None if one is missing."""
         return [names.index(name) for name in self._wanted] if set(self._wanted) <= set(names) else None

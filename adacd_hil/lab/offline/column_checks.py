@@ -167,6 +167,7 @@ def torques_and_limits(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
 
 
 def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
+    """Report the torque that is farthest beyond the URDF's effort, if it is by far; of currents, none."""
     largest, effort = torques_and_limits(columns.tau_J, described.urdf)
     is_over = largest > _BEYOND_EFFORT * effort
     if "A" in described.units.tau_J or not is_over.any():
@@ -275,6 +276,7 @@ def _spikes(column: Vector) -> NDArray[np.int64]:
 
 
 def _is_noise(column: Vector, period_s: float) -> bool:
+    """Return whether positions (k,) jump from sample to sample as white noise does; False for a long period."""
     return period_s <= _NOISE_PERIOD_S and float(np.mean(np.diff(column) ** 2)) > _NOISE_STEP * 2.0 * float(
         np.var(column)
     )

@@ -77,6 +77,7 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
 
 
 def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
+    """Return the cells of the first row, without empty ones at its end. Raises ConfigError for a wrong delimiter."""
     while first and not first[-1].strip():  # a delimiter at the end of every row
         first = first[:-1]
     heads = [cell.strip() for cell in first]
@@ -126,6 +127,7 @@ def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[lis
 
 
 def _open_text(path: Path) -> TextIO:
+    """Open a text file. Raises LogError, with the way out, if its first bytes are those of another format."""
     file = open_input(path)
     begin = file.peek(16)
     for magic, kind in _KINDS_OF_FILE:

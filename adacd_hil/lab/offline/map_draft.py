@@ -84,6 +84,7 @@ def _read_arm(urdf: Path) -> tuple[SerialArm, tuple[str, ...]]:
 
 
 def _of_table(recording: Path, arm: SerialArm) -> list[DraftedKey]:
+    """Draft the keys of a CSV file. Raises ConfigError if no columns look like positions or torques, LogError."""
     guess = guess_table(recording, arm.joint_names)
     n, form = len(arm.joint_names), guess.form
     for role, what in (("q", "positions"), ("tau_J", "torques or currents")):

@@ -142,6 +142,7 @@ def mass_rows(model: ArmModel, q: Vector, poses: int) -> Vector:
 
 
 def _step(settings: OfflineSettings) -> int:
+    """Return from how many samples one is used, so that these lie `_PERIOD_S` apart."""
     return max(1, math.floor(_PERIOD_S / settings.period_s + 1e-9))
 
 
@@ -308,6 +309,7 @@ def _moved(units: Sequence[float], places: Sequence[int]) -> Vector:
 
 
 def _exchanged(n: int, i: int, j: int) -> list[int]:
+    """Return the places 0 to n - 1 with i and j exchanged."""
     places = list(range(n))
     places[i], places[j] = j, i
     return places

@@ -152,6 +152,7 @@ class RecordedRows:
             self.drop(kind, f"row {number:.0f}: {first}", int(np.count_nonzero(is_wrong)))
 
     def _within(self, table: Vector) -> Vector:
+        """Return the rows of a table within the requested span, widened by `_SPARE_S` on both sides."""
         if self._span is None:
             return table
         time_s = table[:, 1] * self._unit_s - self._begin_s
@@ -175,6 +176,7 @@ class RecordedRows:
             raise LogError(f"recording {self._path}, {first}; {number_of(most, 'row')} {kind} are too many")
 
     def _check_values(self, given: Vector, values: Vector, time_s: Vector, names: list[str]) -> None:
+        """Raise LogError for a value above `LARGEST`. given: as recorded, values: in SI units, (k, c)."""
         too_large = np.argwhere(np.isfinite(given) & ~(np.abs(values) <= LARGEST))
         if len(too_large):
             row, column = too_large[0].tolist()

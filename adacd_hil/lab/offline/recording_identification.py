@@ -42,7 +42,7 @@ class Spell(NamedTuple):
 
 @dataclass(frozen=True)
 class Watched:
-    """Contacts in a recording that the model was not fitted to."""
+    """External torques, thresholds and contacts in a recording that the model was not fitted to."""
 
     recording: ForeignRecording
     tau_ext_hat: tuple[Vector, ...]  # per stretch (k, n), Nm

@@ -106,6 +106,7 @@ class ForeignRecording:
 
 
 def _true_runs(is_true: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the index of the first element of each run of True, and of the element after its last."""
     return contact_bounds(np.where(is_true, 0, -1), None)
 
 

@@ -109,7 +109,7 @@ class BagSection:
 
 @dataclass(frozen=True)
 class SamplingSection:
-    """Period and gaps of the samples."""
+    """Period and longest gap of the samples, and window of derived velocities."""
 
     period_s: float = setting(
         0.0,
@@ -233,6 +233,7 @@ def _read_arm(folder: Path, arm: ArmSection) -> SerialArm:
 
 
 def _check_lengths(found: RecordingMap) -> None:
+    """Raise ConfigError for a list that is given and doesn't have a value per moving joint."""
     lists: dict[str, tuple[Any, ...]] = {
         "columns.q": found.columns.q,
         "columns.tau_J": found.columns.tau_J,

@@ -85,7 +85,10 @@ class _Head(NamedTuple):
 
 
 def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
-    """Guess form and columns of a CSV file for an arm with these joints. Raises LogError."""
+    """Guess form and columns of a CSV file by its heads, or without heads by its values.
+
+    Raises LogError without rows of numbers.
+    """
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
     form, heads, units, first = _form(path, lines)

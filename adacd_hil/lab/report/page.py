@@ -56,7 +56,7 @@ STEPS: Final = 2
 
 
 class Cell(NamedTuple):
-    """The content of a table's cell, and its class."""
+    """The content of a table's cell, and its class for the style sheet."""
 
     content: object
     kind: str = ""

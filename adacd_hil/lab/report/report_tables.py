@@ -132,6 +132,7 @@ def sections_table(metrics: Metrics, run: Run) -> Table:
 
 
 def _judged(values: tuple[float, float] | None, threshold: tuple[float, float]) -> Cell:
+    """Return the cell of both joints' residuals, "bad" if one is over its threshold; a dash for None."""
     if values is None:
         return Cell(NONE)
     is_over = any(value > bound for value, bound in zip(values, threshold, strict=True))

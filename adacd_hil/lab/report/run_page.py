@@ -75,7 +75,7 @@ class Push(NamedTuple):
 
 
 class Stroke(NamedTuple):
-    """A straight line, and its class."""
+    """A straight line, and its class for the style sheet."""
 
     start: _Point
     end: _Point
@@ -235,7 +235,7 @@ def _why_not(contact: ReportedContact) -> str:
 
 
 def _found(contact: ReportedContact) -> list[tuple[str, str]]:
-    """Return name and text of each value that the run has reported of a contact."""
+    """Return six rows on a contact, name and text; a missing value has a placeholder."""
     lever = uncertain_text(scaled(contact.lever_m, 100.0), scaled(contact.lever_sigma_m, 100.0), 1, "cm")
     return [
         ("found after", number_text(contact.delay_ms, 0, "ms")),

@@ -209,7 +209,7 @@ def _count(summary: Mapping[str, str], key: str) -> int | None:
 
 
 class RunReading:
-    """One reading of a log, front to back."""
+    """Makes a run of the pieces of a log, front to back: `sums` over all cycles, and the cycles that are kept."""
 
     def __init__(self, shell: Run, empty: Mapping[str, Series], truth: TruthTable | None, full_cycles: int) -> None:
         """`shell`: a run with empty arrays: settings, metadata, and a truth on the host's cycles if there is one.
@@ -263,6 +263,7 @@ class RunReading:
             self._settle(int(np.searchsorted(self._rows.column("t_ns"), scheme.t_ns[-1] - beyond_ns)))
 
     def _add_facts(self, scheme: Series, cycle: Cycles, state: NDArray[np.uint8]) -> None:
+        """Note the first cycle, motion start, the first request to finish, and the last cycle in a state of `BUSY`."""
         if self._first_ns is None:
             self._first_ns = int(scheme.t_ns[0])
         adapting = np.flatnonzero(state == SchemeState.ADAPT)

@@ -138,6 +138,7 @@ _Scale = tuple[float, float]
 
 
 def _x(scale: _Scale, time_s: float) -> float:
+    """Return the place of a time on the drawing; of one outside, the nearer edge."""
     start_s, end_s = scale
     share = (time_s - start_s) / (end_s - start_s)
     return _LEFT + min(max(share, 0.0), 1.0) * (_RIGHT - _LEFT)
@@ -160,6 +161,7 @@ def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[list[Stay]]:
 
 
 def _gravity(stay: Stay) -> int:
+    """Return the rank of a stay's state: of stays drawn as one, the highest gives the colour."""
     order = list(STATE_COLOURS)
     return 1 + order.index(stay.state) if stay.state in order else 0
 

@@ -161,6 +161,7 @@ def _channels(run: Run) -> Iterator[TracePanel]:
 
 
 def _shares(stream: CertifiedStream) -> Vector:
+    """Return |residual| / threshold (n, 2), the largest of all channels in each cycle."""
     shares = np.zeros((len(stream.tau_ext), JOINTS))
     for channel in range(stream.tau_ext.shape[1]):
         with np.errstate(over="ignore"):  # a damaged log's threshold near 0
@@ -252,8 +253,8 @@ def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = N
 def pack(values: Vector, step: float) -> tuple[str, dict[str, Any]]:
     """Return a series (n,) as text, rounded to `step`, or coarser if its range has more than 2^30 steps.
 
-    Return with it what the page's script needs to read it: low and step in its unit, order: how often it was
-    differenced, planes: bytes per number.
+    Return with it, for the page's script, low and step in the series' unit; order: how often it was differenced;
+    planes: bytes per number.
     """
     is_finite = np.isfinite(values)
     finite = values[is_finite]
@@ -329,5 +330,6 @@ def pack_tracks(
 
 
 def _packed(blocks: dict[str, str], name: str, values: Vector, step: float) -> dict[str, Any]:
+    """Add a series, packed, to `blocks` under a name; return the name and the form by which the script reads it."""
     blocks[name], form = pack(values, step)
     return {"id": name, **form}

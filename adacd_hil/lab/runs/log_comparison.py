@@ -169,7 +169,9 @@ ContactPair = tuple[Contact | None, Contact | None]
 
 @dataclass(frozen=True)
 class LogComparison:
-    """How two runs differ. settings, metadata: by key, both values. cycles: compared, of `only` in one of them.
+    """How two runs differ. settings, metadata: both values of each key that differs. cycles: number of compared ones.
+
+    only: numbers of cycles that are in the first, and in the second log alone.
 
     stretch: of the first log, to which all but settings and metadata is limited.
     """
@@ -249,6 +251,7 @@ class _Differences:
                 self._compare(name, first[name], second[name], since)
 
     def _compare(self, name: str, first: NDArray[Any], second: NDArray[Any], since: NDArray[np.int64]) -> None:
+        """Add the differences of one field to `found`; the field to `missing` if its sizes differ. NaN equals NaN."""
         if first.shape != second.shape:
             self.missing.add(name)
             return

@@ -55,6 +55,7 @@ def runs_page(folder: Path, listed: Sequence[ListedRun]) -> str:
 
 
 def _place(folder: Path, report: Path | None) -> str:
+    """Return the link to a report, relative to a folder, quoted; "" without a report."""
     return "" if report is None else quote(Path(os.path.relpath(report, folder)).as_posix())
 
 

@@ -62,8 +62,9 @@ class RunSummary:
 
     name: of its folder, from the folder that was looked through. started: local time, by `started_by`: "log" where the
     log has the date, "folder" where its name has, else "file". status: of STATUSES; verdict: the reason in a sentence.
-    expected: contacts that there were while detection was armed, None on a real arm. margin: smallest threshold over
-    residual. duration_s: from the log's first message to its last.
+    expected: contacts that there were while detection was armed, None on a real arm; found: the detected ones, or all
+    detections if the run isn't judged. margin: smallest threshold over residual. duration_s: from the log's first
+    message to its last.
     """
 
     name: str
@@ -123,6 +124,7 @@ def find_runs(folder: Path) -> Iterator[Path]:
 
 
 def _has_run(folder: Path, names: Sequence[str]) -> bool:
+    """Return whether a folder has the log of a run, or later parts of one. names: of its files."""
     return LOG_NAME in names or (
         any(re.fullmatch(r"run_\d{3,5}\.mcap", name) for name in names) and bool(parts_of(folder / LOG_NAME))
     )
@@ -195,6 +197,7 @@ def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:
 
 
 def _settings(log: Path) -> Settings | None:
+    """Return the settings in a log; None if it has none, or those of another version."""
     text = attachment(log, CONFIG_NAME)
     try:
         return None if text is None else settings_of(log, {CONFIG_NAME: text})
@@ -330,6 +333,7 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
 
 
 def _reported_certificate(summary: RunSummary, table: Mapping[str, Any]) -> CertificateState:
+    """Return the state of a run's last certificate by its report; by the log's events if one was taken back."""
     certified = table["certified"]
     if certified is not None and certified["revoked"]:
         return _told_certificate(read_info(summary.log))

@@ -119,6 +119,7 @@ def arm_of(run: RunSummary) -> str:
 
 
 def _trend(arm: str, runs: Sequence[RunSummary], threshold_share: float) -> Trend:
+    """Return the trend of one arm: its judged runs, the changes of each quantity, and sentences on them."""
     judged = [run for run in runs if run.is_judged]
     unknown = [None] * len(judged)
     speed = f"{FRICTION_AT_RAD_S:g} rad/s"
@@ -149,6 +150,7 @@ def _trend(arm: str, runs: Sequence[RunSummary], threshold_share: float) -> Tren
 
 
 def _columns(pairs: Sequence[tuple[float, float] | None]) -> Vector:
+    """Return values per joint as rows (n, 2), nan for None."""
     rows = [(math.nan,) * JOINTS if pair is None else pair for pair in pairs]
     return np.array(rows, np.float64).reshape(-1, JOINTS)
 
@@ -234,6 +236,7 @@ def _settings_text(runs: Sequence[RunSummary], run: RunSummary) -> str:
 
 
 def _drift_sentence(quantity: TrendQuantity, what: str) -> str:
+    """Return a sentence on the last change of friction or torque offsets; what: which of the two."""
     known = np.isfinite(quantity.values) & np.isfinite(quantity.std)
     rows = int(known.all(axis=1).sum())
     if rows < 2:

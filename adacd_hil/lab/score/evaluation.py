@@ -47,7 +47,7 @@ from adacd_hil.settings.scheme_settings import KIND_S
 
 
 class RunGatherer:
-    """Sums up all cycles of a run, piece by piece, in bounded memory."""
+    """Sums up a run piece by piece, in bounded memory: `add_times` times and cyclic data, `untouched` residuals."""
 
     def __init__(self, settings: Settings, is_modelled: bool) -> None:
         self.untouched = UntouchedGatherer(settings)
@@ -211,6 +211,7 @@ def _state_at(run: Run, time_s: float) -> SchemeState:
 
 
 def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: Detection) -> ReportedContact:
+    """Return a detection as a contact of a run without the truth."""
     reported = _reported(run, detection)
     return ReportedContact(
         number=number,
@@ -224,6 +225,7 @@ def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: D
 def _contact(
     run: Run, sections: tuple[Section, ...], contact: TrueContact, detection: Detection | None
 ) -> ReportedContact:
+    """Return a true contact with its delays, and whether its detection named link and direction rightly."""
     truth, time_s = run.truth, contact.time_s
     assert truth is not None
     assert time_s is not None
@@ -291,6 +293,7 @@ def _is_direction_right(direction: tuple[int, int] | None, impulse: Vector) -> b
 
 
 def _torque_ratio(peak_hat: tuple[float, float] | None, peak: Vector) -> float | None:
+    """Return the reported over the true peak, at the joint with the larger true one; None without either."""
     joint = int(np.argmax(np.abs(peak)))
     if peak_hat is None or peak[joint] == 0.0:
         return None

@@ -171,6 +171,7 @@ def _tests(run: Run, section: Section) -> list[float]:
 
 
 def _estimates(run: Run, stream: CertifiedStream, section: Section) -> dict[str, ParameterEstimate]:
+    """Return the parameters at the end of an adaptation, by name, those beyond the paper's model included."""
     row = last_row(run, section)
     values = np.concatenate((run.theta_hat[row], stream.theta_further[row]))
     names = run.parameter_names + run.settings.further_names
@@ -222,7 +223,7 @@ def _inverse(share: float) -> float:
 
 
 class UntouchedGatherer:
-    """Gathers the cycles of a run that are free of contact, piece by piece."""
+    """Gathers residuals, margins and pushes of a run's cycles free of contact, and the paper's scheme beside."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings

@@ -4,7 +4,7 @@
 Torques in Nm, joint arrays (2,), histories time-first (n, 2); `tau_ext_hat` has the filter's DC gain taken out, so
 that a torque step tau crosses the threshold h after t = -ln(1 - h / |tau|) / a.
 
-**Sections** are lettered A, B, C, … in order, see `adacd_hil.log.logged_run`. An adaptation's time is that of its
+**Sections** are lettered A, B, C, … in order, see `adacd_hil.lab.score.run_arrays`. An adaptation's time is that of its
 section: up to MONITOR, the test of the frozen model and contacts on the way included.
 
 **Frozen residual**: largest |tau_ext_hat| of each joint free of contact. A cycle counts unless it lies in
@@ -18,8 +18,8 @@ to F_c: those cycles don't count.
 which detections are false alarms; detection is armed in MONITOR.
 
 **Certified scheme.** The residual is that of its slowest filter, `a` that filter's cut-off; `law_ms` and `ideal_ms` are
-those of the fastest channel of its bank. Its other results: `adacd_hil.lab.score.margins`; the paper's
-scheme that ran beside it on the same stream: `adacd_hil.lab.score.margins`.
+those of the fastest channel of its bank. Its margins, and the paper's scheme that ran beside it on the same stream:
+`adacd_hil.lab.score.margins`.
 """
 
 import json
@@ -149,7 +149,8 @@ class ParameterEstimate:
 class ChannelMargin:
     """A channel of the bank over a section: cut-off and smoothing, rad/s; then per joint, in cycles free of contact.
 
-    residual_max_Nm: largest. threshold_Nm: median of the threshold. margin: see the module's first lines.
+    residual_max_Nm: largest |residual|. threshold_Nm: median of the threshold. margin: smallest threshold / |residual|
+    of a cycle; inf if the residual was 0 throughout.
     """
 
     cutoff_rad_s: float
@@ -163,8 +164,8 @@ class ChannelMargin:
 class CertifiedEvidence:
     """Of each adaptation: how often the frozen model was tested, for how long the last time, and the parameters.
 
-    margins: by section. promotions: refined models that took over in the run. is_anchored: for each certificate,
-    whether it names the anchor of all its offsets; logs of versions without anchors lack it. revoked: why
+    margins: by section. promotions: refined models that took over in the run. is_anchored: whether every certificate in
+    the log names the anchors of all its offsets; True without a certificate. revoked: why
     certificates were withdrawn, in order. smallest_push: None where the scheme was never armed. certificates: those
     that were not withdrawn, as the log has them at its end; () for a log without its end, or of an earlier version.
     """
@@ -182,7 +183,7 @@ class CertifiedEvidence:
 
     @property
     def smallest_margin(self) -> float | None:
-        """The smallest of all margins where the certified model was in force or was learnt."""
+        """The smallest of all margins, of sections in which the model was learnt or in force; None without margins."""
         values = [min(row.margin) for rows in self.margins.values() for row in rows]
         return min(values, default=None)
 

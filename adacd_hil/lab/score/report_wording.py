@@ -139,7 +139,7 @@ def rate_phrase(alarms: int, hours: float, bound_per_h: float) -> str:
 
 
 def percent_text(share: float) -> str:
-    """Return a share (0…1) in percent, with two digits that count."""
+    """Return a share (0…1) in percent as text with two significant digits; below 0.005 % "less than 0.01 %"."""
     if 0.0 < share < 5e-5:
         return "less than 0.01 %"
     return f"{100.0 * share:.2g} %" if share < 0.995 else f"{100.0 * share:.0f} %"

@@ -365,7 +365,7 @@ def _residual_text(frozen: list[tuple[float, float] | None], index: int) -> str:
 
 
 def data_text(data: CyclicData) -> str:
-    """Return the verdict's clause on the share of data that arrived; "" if the drives never had torque."""
+    """Return the verdict's clause on cyclic data that was late, lost or repeated; "" if the drives never had torque."""
     if not data.cycles:
         return ""
     if data.incomplete is None:

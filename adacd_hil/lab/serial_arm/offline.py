@@ -116,7 +116,7 @@ class ArmModel:
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Return the names of the p parameters."""
+        """Names of the p parameters."""
         kinds = ("F_v", "F_c", "offset", *(("rotor",) if self.has_rotors else ()))
         per_joint = (f"{kind}{i + 1}" for kind in kinds for i in range(self.joints))
         return (*self.base.names, *per_joint)

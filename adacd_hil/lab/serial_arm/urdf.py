@@ -66,7 +66,7 @@ class SerialArm:
 
     @property
     def theta_full(self) -> Vector:
-        """Return the parameters (10 n,) of the links, with all that is fixed to them. Raises UrdfError."""
+        """Parameters (10 n,) of the links, with all that is fixed to them. Raises UrdfError."""
         theta = np.zeros((len(self.joint_names), PER_LINK))
         for name, (carrier, pose) in self.places.items():
             if carrier != BASE and name in self.links:
@@ -76,6 +76,8 @@ class SerialArm:
 
 @dataclass(frozen=True)
 class _Joint:
+    """One joint as the URDF has it; of a fixed or locked one only its place counts."""
+
     name: str
     kind: str
     parent: str

@@ -59,7 +59,7 @@ def clusters(peaks: Vector, level: float) -> Vector:
 
 @dataclass(frozen=True)
 class Tail:
-    """The tail of one statistic."""
+    """The tail of one statistic: a generalised Pareto distribution of the values above `level`."""
 
     level: float  # u
     scale: float  # sigma
@@ -145,7 +145,7 @@ def fit_tail(peaks: Vector) -> Tail:
 
 @dataclass(frozen=True)
 class TailCalibration:
-    """A threshold for a wanted rate."""
+    """A threshold for a wanted rate of alarms, with its confidence bounds and the tail that it comes from."""
 
     threshold: float
     bound: float  # upper confidence bound of the threshold
@@ -221,7 +221,7 @@ def peak_factor(rate_per_h: float, bandwidth_rad_s: float) -> float:
 
 @dataclass(frozen=True)
 class Sensing:
-    """Measurement properties of one joint that determine a threshold."""
+    """Noise, resolution and model errors of one joint that determine a threshold."""
 
     torque_noise_Nm: float
     torque_LSB_Nm: float

@@ -57,7 +57,9 @@ _COLUMNS: Final = ("q", "dq", "tau_J", "theta", "interval_s")
 
 @dataclass(frozen=True)
 class LoggedMotion:
-    """The motion in a log, or in a stretch of it: N samples at `period_s`, with p parameters; is_free (N,).
+    """Motion in a log, or in a stretch of it, read by `pieces`. is_free (N,): samples without contact.
+
+    parameters: number of columns of theta. bounds_ns: the stretch; None: all of the log.
 
     level_rad: q1 at which link 1 is level; 0 without gravity.
     """
@@ -136,6 +138,7 @@ def read_motion(
 
 
 def _level_rad(path: Path) -> float:
+    """Return q1 at which link 1 is level, by the configuration in a log; 0 without one."""
     text = attachment(path, CONFIG_NAME)
     return 0.0 if text is None else settings_of(path, {CONFIG_NAME: text}).level_rad
 

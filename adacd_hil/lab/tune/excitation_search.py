@@ -89,6 +89,7 @@ class ExcitationLimits(NamedTuple):
 
 @compiled
 def _fill_regressors(q: Vector, dq: Vector, ddq: Vector, level_rad: float, W: Vector) -> None:
+    """Fill W (N, 2, p) with the regressor of each sample."""
     for n in range(W.shape[0]):
         W[n] = regressor(q[n], dq[n], ddq[n], W.shape[2], level_rad)
 
@@ -198,6 +199,7 @@ class Search:
         return best
 
     def _climb(self, start: Vector, iterations: int) -> ExcitationSettings:
+        """Return the motion at the end of a climb; exceeded limits cost more and more. start: as in `_complete`."""
         found = start
         for penalty in _PENALTIES:
             found = minimize(self._cost, found, (penalty,), "L-BFGS-B", options={"maxiter": iterations}).x
@@ -259,10 +261,12 @@ class Search:
         return float(fit[0]), float(fit[-1]), float(inertia[0])
 
     def _eigenvalues(self, W_f: Vector, scale: Vector) -> Vector:
+        """Return the eigenvalues of the information of filtered regressors, ascending. scale: D, of the columns."""
         rows = (W_f * scale).reshape(-1, len(scale))
         return np.asarray(np.linalg.eigvalsh(self._step_s * rows.T @ rows), dtype=np.float64)
 
     def _cost(self, free: Vector, penalty: float) -> float:
+        """Return the cost of a motion, smooth in its coefficients, plus `penalty` times the excess over the limits."""
         motion = self.motion_of(*self._complete(free))
         W = self._regressors(motion)
         over = sum(float(np.mean(np.maximum(used - 1.0, 0.0) ** 2)) for used in self._used(motion, W))

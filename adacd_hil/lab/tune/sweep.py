@@ -54,7 +54,7 @@ class Subject(NamedTuple):
 
 
 class SweepRow(NamedTuple):
-    """One run or replay of the sweep."""
+    """One row of the sweep: a run or replay of the subject with changed settings."""
 
     key: str
     changes: Changes
@@ -234,7 +234,7 @@ _PARTS = "parts"
 
 
 class SweepStore:
-    """The folder of a sweep."""
+    """The folder of a sweep: parts, with rows as they come, and the table that joins them."""
 
     def __init__(self, folder: Path) -> None:
         """Open or create it. Raises LogError where pyarrow is missing, OSError where it can't be written."""
@@ -417,6 +417,7 @@ class _Flights:
         return bool(self._flying)
 
     def _next(self) -> Task | None:
+        """Return the next task: a suspect, else one to try again, else a new one; None if none is left."""
         for waiting in (self._suspects, self._again):
             if waiting:
                 return waiting.popleft()

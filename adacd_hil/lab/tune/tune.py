@@ -145,6 +145,7 @@ def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: 
 
 
 def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
+    """Return the outcome of all logs' replays with one variant; contacts count where the logged scheme was armed."""
     took_s = [each for _, found in replays for each in found.adaptation_s]
     judged = [(found, found.score) for _, found in replays if found.score is not None]
     armed = {(log.path, window.number) for log, _ in replays for window in log.windows or () if window.is_armed}
@@ -235,6 +236,7 @@ def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settin
 
 
 def _provenance(tuning: Tuning, best: Candidate) -> list[str]:
+    """Return lines on the origin of a suggestion: date, logs, method, and its effect on both halves."""
     date = datetime.fromtimestamp(wall_ns() // 1_000_000_000, tz=UTC).strftime("%Y-%m-%d %H:%M UTC")
     choice, tail = best.choice, best.choice.calibration
     lines = [

@@ -128,6 +128,7 @@ def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progr
 
 
 def _show_to(shown: "Sequence[ShownLog]") -> Watch:
+    """Return a function that passes a replayed stretch on to the `ShownLog` at the place of its variant."""
     return lambda place, ticks, batch: shown[place].take_stretch(ticks, batch)
 
 

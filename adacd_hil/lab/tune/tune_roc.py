@@ -206,6 +206,7 @@ def _predicted(calibration: TailCalibration | None, factor: float) -> float | No
 
 
 def _count(peaks: Vector, trials: tuple[Trial, ...] | None, thresholds: Vector) -> Found:
+    """Return the effect of thresholds: alarms in block maxima (B, channels, n), and contacts found in trials."""
     alarms = clusters(largest_ratio(peaks, thresholds), 1.0).size
     delays = [delay_ms(trial, thresholds) for trial in trials or ()]
     return Found(
@@ -288,6 +289,7 @@ def _tunable(settings: Settings) -> Settings:
 
 
 def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeWindow, progress: Progress) -> TunedLog:
+    """Read a log, the one at `place` of `count`, by which its half is chosen. The others: as of `read_logs`."""
     own = LogSource(path).settings
     parts = _Index()
     motion = read_motion(path, stretch, progress, parts.add_scheme)

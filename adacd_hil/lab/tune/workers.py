@@ -149,6 +149,7 @@ def _begin() -> None:
 
 
 def _end_with_parent() -> None:
+    """Wait until the parent process has ended; then end this one, by SIGTERM, and by force if that takes long."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

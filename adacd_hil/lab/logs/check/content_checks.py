@@ -23,7 +23,7 @@ _LAST_ENCAPSULATION = 0x0D
 
 
 class DefinitionCheck:
-    """Watches the definitions of a file, in the data section and then in the summary."""
+    """Checks the schemas and channels of a file, in the data section and then in the summary."""
 
     def __init__(self, findings: Findings) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -95,6 +95,7 @@ class DefinitionCheck:
             )
 
     def _place(self, kind: str, number: int, is_known: bool, offset: int, is_summary: bool) -> None:
+        """Note a definition that only the summary has; add a finding on one that the data section repeats."""
         name = f"{kind} {number}"
         if is_summary and not is_known:
             self._summary_only.append((kind, number, offset))
@@ -118,7 +119,7 @@ class DefinitionCheck:
 
 
 class ContentCheck:
-    """Watches the messages of a file."""
+    """Checks the messages of a file, their order and payloads, and the texts of the schemas."""
 
     def __init__(self, findings: Findings) -> None:
         self._findings = findings
@@ -236,6 +237,7 @@ def text_problem(data: bytes) -> str:
 
 
 def _line_problem(line: str, known: set[str]) -> str:
+    """Return the defect in a line of a schema's text, in words; "" without one. known: types as package/Type."""
     if not line or line.startswith("#") or line == _PARTS:
         return ""
     match = _LINE.fullmatch(line)

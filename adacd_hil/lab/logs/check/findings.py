@@ -62,7 +62,7 @@ RULES: dict[str, Severity] = {
     "data-end": _ERROR,  # one DataEnd
     "footer": _ERROR,  # one Footer
     "place": _ERROR,  # each kind of record is in its section
-    "library": _WARNING,  # the Header says what wrote the file
+    "library": _WARNING,  # the Header names the program that wrote the file
     "profile": _WARNING,  # the Header's profile is empty, ros1 or ros2
     "unknown-record": _WARNING,  # every kind of record is known
     # CRCs
@@ -89,13 +89,13 @@ RULES: dict[str, Severity] = {
     "message-index": _ERROR,  # the message indexes behind a chunk have exactly its messages
     "no-message-index": _WARNING,  # a chunk has message indexes
     "unindexed-messages": _WARNING,  # a file with indexes has no messages outside chunks
-    "chunk-index": _ERROR,  # one chunk index for each chunk, and all it says is so
+    "chunk-index": _ERROR,  # one chunk index for each chunk, with the chunk's values
     "no-chunk-index": _WARNING,  # the summary has chunk indexes
     "summary-channels": _ERROR,  # the summary defines the channels and schemas that it needs
-    "attachment-index": _ERROR,  # one index for each attachment, and all it says is so
-    "metadata-index": _ERROR,  # one index for each metadata record, and all it says is so
+    "attachment-index": _ERROR,  # one index for each attachment, with its values
+    "metadata-index": _ERROR,  # one index for each metadata record, with its values
     "summary-offset": _ERROR,  # summary offsets and Footer say where the groups are
-    "statistics": _ERROR,  # at most one Statistics, and all its counts and times are so
+    "statistics": _ERROR,  # at most one Statistics, with the right counts and times
     # messages
     "order": _WARNING,  # log_time doesn't run backwards within a channel
     "schema-text": _ERROR,  # the text of a ros2msg schema can be read
@@ -103,7 +103,7 @@ RULES: dict[str, Severity] = {
     # our logs
     "missing-part": _ERROR,  # a log has all its parts
     "foreign-part": _ERROR,  # the parts of a log are of one run
-    "counts": _ERROR,  # the summary's counts of messages and frames are so
+    "counts": _ERROR,  # the summary's counts of messages and frames are right
     "ending": _WARNING,  # the summary says why the log ended, and that it was meant to
     "dropped": _WARNING,  # no packet was dropped on the way to the log
     "lost": _WARNING,  # nothing was lost before the log was recovered

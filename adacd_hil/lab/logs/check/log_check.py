@@ -104,6 +104,7 @@ class _FileCheck:
         self._file.seek(position)
 
     def _record(self, record: RawRecord) -> None:
+        """Add a record to the CRC of its section, and judge it; a DataEnd ends the data section."""
         head = HEAD.pack(record.opcode, len(record.body))
         if record.opcode != Opcode.MESSAGE_INDEX:
             self._chunks.end_indexes()
@@ -139,6 +140,7 @@ class _FileCheck:
         self._crc = 0
 
     def _judge(self, record: RawRecord) -> None:
+        """Pass a record to the rules for its kind; add a finding on an unknown kind or a wrong section."""
         opcode = record.opcode
         if opcode not in set(Opcode):
             self.findings.add_finding("unknown-record", f"{name_of(opcode)} of {len(record.body)} bytes", record.offset)

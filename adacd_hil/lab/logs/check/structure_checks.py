@@ -64,7 +64,7 @@ def pack_offsets(offsets: Mapping[int, int]) -> bytes:
 
 
 class ChunkCheck:
-    """Watches the chunks of a file."""
+    """Checks the chunks of a file with their messages and indexes, and the messages outside of chunks."""
 
     def __init__(self, findings: Findings, definitions: DefinitionCheck) -> None:
         self.facts: dict[int, ChunkFacts] = {}
@@ -222,7 +222,7 @@ class ChunkCheck:
 
 
 class SummaryCheck:
-    """Watches the summary of a file, and the facts that it must state."""
+    """Compares the summary of a file with the facts that it must state; these are gathered before it."""
 
     def __init__(self, findings: Findings, definitions: DefinitionCheck, chunks: ChunkCheck) -> None:
         self.statistics: Statistics | None = None
@@ -280,6 +280,7 @@ class SummaryCheck:
             self._check_counted_channels(self.statistics, record.offset)
 
     def _compare(self, rule: str, expected: Mapping[int, Any], index: Any, offset: int) -> None:
+        """Compare an index of the summary with the expected ones, by offset; add a finding on a wrong or second one."""
         kind = rule.removesuffix("-index")
         if index.offset in self._indexed:
             self._findings.add_finding(rule, f"the {kind} at byte {index.offset} is indexed more than once", offset)
