@@ -4,7 +4,7 @@ from pathlib import Path
 
 import blind_grid
 import pytest
-from blind_grid import FIRST, SHORT, Outcome, Row
+from blind_grid import FIRST, SHORT, Row
 from made_run import Made, states
 from run_rules import Case
 
@@ -14,18 +14,6 @@ from adacd_hil.records import SchemeState
 ROW = Row("certified", "arm", "torque", "sensor1", 550, 1.0, "random")
 PUSH = 700  # cycles
 TOUCH = range(PUSH, PUSH + 500)
-
-
-def test_the_grid_has_every_frame_delay_and_share_of_both_schemes_and_three_contracts() -> None:
-    rows = blind_grid.grid()
-    assert len(rows) == len(set(rows))
-    for scheme in ("certified", "paper"):
-        mine = {row for row in rows if row.scheme == scheme and row.delay_us}
-        assert {row.contract for row in mine} == {"arm", "arm_fd", "arm_stock"}
-        assert {row.frame for row in mine} == {"feedback", "torque", "command", "status"}
-        assert {(row.delay_us, row.share) for row in mine} >= {(50, 0.01), (640, 0.5), (1500, 1.0)}
-    assert not [row for row in rows if row.contract == "arm_fd" and row.frame == "status"]
-    assert sum(not row.delay_us for row in rows) == 6
 
 
 def test_a_row_is_played_as_it_says() -> None:
@@ -79,15 +67,6 @@ def test_only_warnings_since_the_fault_name_it() -> None:
     case = _pushed_run(events=(early, info, late))
     assert blind_grid.named_trouble(case, 0.3) == "data: Sensor1 is late"
     assert blind_grid.named_trouble(_pushed_run(events=(early, info)), 0.3) == ""
-
-
-def test_the_summary_counts_what_was_missed_in_silence() -> None:
-    silent = Outcome(ROW, ["missed", "found"], "MONITOR NONE", 5, 5, 0, "", True, ["blind"])
-    named = Outcome(ROW, ["missed", "missed"], "FAULT DATA_AGE", 5, 5, 0, "supervisor: FAULT", False, [])
-    totals = blind_grid.summary([silent, named])
-    assert (totals["bad"], totals["missed_in_silence"], totals["stood_still_rows"]) == (1, 1, 1)
-    assert totals["pushes"] == {"missed": 3, "found": 1}
-    assert "BAD" in blind_grid.as_table([silent])
 
 
 @pytest.mark.long

@@ -1,7 +1,6 @@
 """tools/campaigns/campaign.py: what is chosen, and what a run that deviates or can't be played comes to."""
 
 import json
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -54,24 +53,3 @@ def test_a_pattern_chooses_by_name_or_group_and_each_configuration_plays_it(tmp_
     passed = [line.split()[:2] for line in done.stdout.splitlines() if "pass" in line]
     assert passed == [["one", "paper"], ["one", str(mine)]]
     assert done.stdout.splitlines()[-1] == "2 of 2 as expected"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--only", "nothing-fits"), "no scenario fits"),
-        (("papr",), "did you mean 'paper'"),
-        (("--config", "certfied"), "did you mean 'certified'"),
-        (("-j", "0"), "no process"),
-    ],
-)
-def test_wrong_usage_is_a_line_and_exit_status_2(
-    arguments: tuple[str, ...], words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(sys, "argv", [str(CAMPAIGN), *arguments])
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_path(str(CAMPAIGN), run_name="__main__")
-    told = capsys.readouterr()
-    assert (ended.value.code, told.out) == (2, "")
-    assert words in told.err

@@ -9,7 +9,6 @@ from campaign_loop import (
     add_jobs,
     add_seeds,
     exit_status,
-    parse_seeds,
     play_trials,
     print_figures,
 )
@@ -23,25 +22,10 @@ def process_of(_):
     return os.getpid()
 
 
-def test_one_job_plays_in_this_process():
-    assert set(play_trials(process_of, range(3), 1)) == {os.getpid()}
-
-
 @pytest.mark.slow
 def test_two_jobs_play_in_processes_of_their_own_and_give_the_results_in_order():
     assert list(play_trials(square, range(30), 2)) == [number * number for number in range(30)]
     assert os.getpid() not in set(play_trials(process_of, range(3), 2))
-
-
-def test_no_trial_gives_no_result():
-    assert list(play_trials(square, [], 4)) == []
-
-
-def test_progress_is_a_count_every_twenty_trials_or_a_line_for_each(capsys):
-    list(play_trials(square, range(45), 1))
-    assert capsys.readouterr().err == "20/45\n40/45\n"
-    list(play_trials(square, range(2), 1, lambda result: f"came to {result}"))
-    assert capsys.readouterr().err == "1/2 came to 0\n2/2 came to 1\n"
 
 
 def options_of(*arguments):
@@ -63,11 +47,6 @@ def test_wrong_usage_is_exit_status_2(arguments, capsys):
         options_of(*arguments)
     assert ended.value.code == 2
     assert arguments[0] in capsys.readouterr().err
-
-
-def test_seeds_are_one_or_a_range():
-    assert parse_seeds("17") == range(17, 18)
-    assert parse_seeds("0:40") == range(40)
 
 
 def test_a_figure_beyond_its_bound_is_named_in_the_table_and_is_the_exit_status(capsys):

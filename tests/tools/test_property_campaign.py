@@ -257,20 +257,7 @@ def test_what_is_allowed_is_not_named(name: str) -> None:
     assert violated(ALLOWED[name]) == set()
 
 
-def test_runs_are_broken_where_the_group_changes() -> None:
-    holds = np.array([True, True, False, True, True, True])
-    assert list(run_rules.runs(holds)) == [(0, 1), (3, 5)]
-    assert list(run_rules.runs(holds, np.array([0, 0, 0, 0, 1, 1]))) == [(0, 1), (3, 3), (4, 5)]
-
-
 # What is drawn, and the command
-
-
-def test_the_same_seed_draws_the_same_run() -> None:
-    first, again, other = (random_run.draw_run(seed) for seed in (5, 5, 6))
-    assert first.files == again.files
-    assert (first.user, first.line) == (again.user, again.line)
-    assert first.files != other.files
 
 
 def test_seeds_draw_every_scheme_contract_profile_and_most_kinds_of_fault() -> None:
@@ -291,16 +278,6 @@ def test_what_is_asked_bounds_how_long_a_run_may_take() -> None:
     assert witnessed_run.allowed_after_finish_s(settings) == 20.0
     assert witnessed_run.allowed_after_finish_s(patient) == 62.0
     assert witnessed_run.allowed_s(patient) == 3 * (40.0 + 51.0 + 20.0)
-
-
-def test_the_summary_counts_runs_and_not_violations() -> None:
-    violation = run_rules.Violation("blind", 1.0, "text")
-    first = property_campaign.Result(1, "a", cycles=5, is_armed=True, violations=[violation, violation])
-    totals = property_campaign.summary([first, property_campaign.Result(2, "b", cycles=7)])
-    assert (totals["violated_runs"], totals["violations"]) == (1, {"blind": 1})
-    assert (totals["cycles"], totals["reached_monitor_share"]) == (12, 0.5)
-    table = property_campaign.as_table([first])
-    assert "blind" in table
 
 
 def test_a_seed_that_the_judge_itself_cannot_bear_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,12 +8,8 @@ import reached_lines
     ("path", "is_counted"),
     [
         ("adacd_hil/control/session.py", True),
-        ("adacd_hil/log/recording/writer.py", True),
-        ("adacd_hil/replay/replay.py", True),
         ("adacd_hil/cli/commands/run_command.py", True),
-        ("adacd_hil/lab/cli/report_command.py", False),
         ("adacd_hil/lab/report/page.py", False),
-        ("adacd_hil/lab/commission/tare.py", False),
         ("adacd_hil/lab/score/verdict.py", False),
     ],
 )

@@ -10,7 +10,6 @@ import timing_campaign
 import timing_disk
 import timing_hour
 import witness
-import yardstick
 from mcap.writer import Writer
 
 from adacd_hil.settings.configuration_files import load_settings
@@ -56,13 +55,6 @@ def test_settings_are_laid_over_those_of_a_measured_run(tmp_path: Path) -> None:
     assert settings.bus.max_age_cycles == 100
 
 
-def test_the_period_is_no_setting_of_a_measured_run(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ending:
-        timing_campaign.parse_arguments(["hour", "--settings", "[bus]\nperiod_us = 2000"])
-    assert ending.value.code == 2
-    assert "period_us" in capsys.readouterr().err
-
-
 def test_a_part_that_no_reader_can_open_is_named(tmp_path: Path) -> None:
     with (tmp_path / "run.mcap").open("wb") as file:
         writer = Writer(file)
@@ -95,11 +87,6 @@ def test_the_bus_says_how_the_cycle_went() -> None:
     assert span["moved_deg"] == pytest.approx(90.0)
 
 
-def test_a_command_belongs_to_the_sync_before_it() -> None:
-    begin_ns, end_ns = np.array([10, 20, 30]), np.array([5, 12, 29, 30])
-    assert witness.times_after(begin_ns, end_ns).tolist() == [2, 9, 0]
-
-
 def test_a_cut_record_of_the_witness_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "witness.bin"
     whole = seen((1, 0x080, 5), (2, 0x201, 6)).frames.tobytes()
@@ -107,16 +94,3 @@ def test_a_cut_record_of_the_witness_is_left_out(tmp_path: Path) -> None:
     read = witness.read_witness(path)
     assert read.wall_ns.tolist() == [1, 2]
     assert read.of(0x201).data.tolist() == [6]
-
-
-def test_memory_is_judged_after_the_first_minute() -> None:
-    memory = [[0.0, 90.0, 10.0, 50.0], [60.0, 100.0, 20.0, 50.0], [70.0, 103.0, 19.0, 50.0], [80.0, 102.0, 21.0, 50.0]]
-    assert timing_hour.memory_spans(memory)["host"] == [100.0, 103.0, 2.0]
-    assert timing_hour.memory_spans(memory)["logger"] == [19.0, 21.0, 1.0]
-
-
-def test_the_witness_compiles_without_a_warning(tmp_path: Path) -> None:
-    program, reason = yardstick.build(tmp_path, witness.SOURCE)
-    if program is None:
-        pytest.skip(reason)
-    assert program.is_file()

@@ -25,11 +25,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         (GOOD[2:], "missing: -i, -s, -r or -c"),
         ([*GOOD, "-p", "10"], "not a number in range: 10"),
-        ([*GOOD, "-r", "800"], "not an 11-bit identifier: 800"),
         ([*GOOD, "-c", "202"], "not ID#DATA: 202"),
-        ([*GOOD, "-c", "202#0g"], "not hexadecimal: 0g"),
-        ([*GOOD, "-c", "202#00,01"], "commands: as many for each identifier"),
-        ([*GOOD, "-e", "77F#05"], "not N:ID#DATA: 77F#05"),
     ],
 )
 def test_a_wrong_argument_is_named(program: Path, arguments: list[str], complaint: str) -> None:
