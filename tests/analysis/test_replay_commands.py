@@ -5,9 +5,13 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from analysis.flipped_log import flip_in_file
 from analysis.replay_rig import write_candump
 from called import called, complaints
+from log.made_log import flipped as bit_flipped
+from log.made_log import kinds, put_together, rechunk, take_apart
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+from zstandard import decompress
 
 from adacd_hil.lab.runs.log_comparison import LogComparison
 from adacd_hil.log.reader import begin_of_log, read_log
@@ -24,8 +28,11 @@ def flipped(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The log with one bit of theta_hat[a1] flipped in a row."""
     record = read_log(log, ("/scheme",)).scheme.records[ROW : ROW + 1]
     begin, place = (record.dtype.fields[name][1] for name in ("sec", "theta_hat"))
+    wanted, parts = record.tobytes()[begin : place + 8], take_apart(log.read_bytes())
+    chunk = next(part for part in kinds(parts, Opcode.CHUNK) if wanted in decompress(part.read(Chunk).data))
+    rechunk(chunk, lambda data: bit_flipped(data, data.find(wanted) + place - begin))
     target = tmp_path_factory.mktemp("flipped") / "run.mcap"
-    flip_in_file(log, target, record.tobytes()[begin : place + 8], place - begin)
+    target.write_bytes(put_together(parts))
     return target
 
 
