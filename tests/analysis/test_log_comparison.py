@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from log.recorded_run import make_run, record
 
-from adacd_hil.lab.cli.compare_command import contact_in_words
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.runs.log_comparison import MATCH_S, Contact, compare_logs, match_contacts
 from adacd_hil.log import logged_run
@@ -104,19 +103,6 @@ def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone():
         (None, second[2]),
         (first[2], None),
     ]
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"force_N": -14.7, "location": 2}, ", ≥ 14.7 N"),
-        ({"force_N": -14.7, "location": 1}, ", -14.7 N"),
-        ({"force_N": 5.0, "location": 77}, ", 5.0 N"),  # a place that a later version may have
-        ({}, ""),
-    ],
-)
-def test_a_lower_bound_reads_as_one_in_a_comparison(changes, words):
-    assert contact_in_words(contact(1.0, **changes)) == f"1.000 s, link 1{words}"
 
 
 def test_a_contact_has_one_counterpart_at_most():
