@@ -13,7 +13,6 @@ from rosbags.rosbag2 import StoragePlugin
 from adacd_hil.lab.offline.recording_import import ForeignRecording, read_recording
 from adacd_hil.lab.offline.recording_map import RecordingMap, read_map
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.settings.schema import ConfigError
 
 NAMES = ("pan", "lift", "elbow")
@@ -78,13 +77,6 @@ def test_the_database_of_a_bag_is_read_without_its_folder(tmp_path, described):
     check(read_recording(database, described))
 
 
-def test_velocities_are_derived_where_a_bag_has_none(tmp_path, described):
-    recording = read_recording(write_mcap(tmp_path / "r.mcap", states(has_velocity=False)), described)
-    check(recording, has_velocity=False)
-    assert not recording.has_velocities
-    assert np.abs(recording.stretches[0].record.dq).max() == pytest.approx(25.0, rel=0.05)
-
-
 def test_messages_of_a_gripper_and_joints_beyond_the_arm_are_passed_over(tmp_path, described):
     arm = states(("pan", "lift", "elbow"))
     messages = [
@@ -107,12 +99,6 @@ def test_a_map_names_topic_joints_and_time_of_a_bag(tmp_path, described):
         '[bag]\ntopic = "/left/joint_states"\ntime = "received"\n'
     )
     check(read_recording(path, read_map(tmp_path / "map.toml")))
-
-
-def test_a_span_of_a_bag_is_what_is_kept_of_it(tmp_path, described):
-    path = write_mcap(tmp_path / "r.mcap", states())
-    part = read_recording(path, described, span=TimeWindow(0.1, 0.35)).between(0.1, 0.35)
-    assert part.duration_s == pytest.approx(0.25, abs=0.008)
 
 
 def changed(messages: list[State], **change) -> list[State]:

@@ -7,26 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analysis.replay_rig import ChangedLog, flip, record, settings_of_run, with_records, without_cycles, writable
-from log.recorded_run import make_run
-from log.recorded_run import record as record_log
 
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.device.device_files import load_profile, place_devices
 from adacd_hil.device.profile import enable_timeout_s
-from adacd_hil.lab.report.run_reading import read_run
-from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import begin_of_log, read_log
 from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.replay.log_source import LogSource
-from adacd_hil.replay.replay import replay, replay_many, replay_source
+from adacd_hil.replay.replay import replay_many, replay_source
 from adacd_hil.replay.replayed_outcome import Replay, side_by_side
 from adacd_hil.score.emulator_truth import contacts_beside
 from adacd_hil.score.judge import Score
 from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.settings.toml_text import to_toml
-from firmware_sim.bench.bench_time import TruthLog
 
 pytestmark = pytest.mark.slow
 
@@ -283,27 +278,6 @@ def test_of_a_log_that_begins_in_the_middle_the_next_attempt_is_compared(log, is
     assert not found.is_whole
 
 
-def test_a_cut_log_is_compared_as_far_as_it_goes(log, whole, tmp_path):
-    content = log.read_bytes()
-    cut = tmp_path / "run.mcap"
-    cut.write_bytes(content[: len(content) * 2 // 3])
-    found = replay(cut)
-    assert found.mismatches == ()
-    assert 1000 < found.compared < whole.compared
-    assert any("not whole" in note for note in found.notes)
-
-
-def test_what_a_replay_says_of_contacts_is_what_the_report_says(log, whole):
-    metrics = evaluate(read_run(log, log.with_name("truth.mcap")).run)
-    found = whole
-    assert found.score is not None
-    assert [each.delay_ms for each in found.score.contacts] == [contact.delay_ms for contact in metrics.contacts]
-    assert [each.link for each in found.score.contacts] == [contact.link for contact in metrics.contacts]
-    assert len(found.score.false_alarms) == metrics.false_alarms
-    assert found.score.missed == metrics.missed
-    assert found.adaptation_s == pytest.approx(list(metrics.adaptation_s.values()))
-
-
 def test_other_settings_decide_otherwise_about_the_same_motion(log):
     own = settings_of_run()
     resolved = {
@@ -334,12 +308,6 @@ def test_other_settings_decide_otherwise_about_the_same_motion(log):
     assert not any(row[0].startswith("smallest push") for row in side_by_side([mine, later]))  # of the certified scheme
     assert never.score.missed == 1
     assert contacts_beside(log) is not None
-
-
-def test_a_log_without_its_settings_is_refused(tmp_path):
-    record_log(tmp_path / "run.mcap", make_run(3))
-    with pytest.raises(LogError, match=r"no attachment config\.toml"):
-        replay(tmp_path / "run.mcap")
 
 
 def test_what_comes_before_or_after_the_truth_is_not_judged(log, whole):
@@ -373,10 +341,3 @@ def test_where_nothing_was_watched_no_alarm_is_counted(log):
     learning = replay_source(source, [source.settings], contacts_beside(log), stretch=TimeWindow(end_s=0.3))[0]
     rows = dict(side_by_side([learning]))
     assert (rows["watched, s"], rows["missed"], rows["false alarms"]) == ("0.00", "–", "–")
-
-
-def test_a_truth_without_a_cycle_knows_nothing(log, tmp_path):
-    (tmp_path / "run.mcap").write_bytes(log.read_bytes())
-    TruthLog(tmp_path / "truth.mcap", blocking=True).close()
-    found = replay(tmp_path / "run.mcap")
-    assert found.score is None

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from datetime import timedelta
 from pathlib import Path
 
 import pytest
@@ -48,8 +47,8 @@ def sweep(folder: Path, log: Path, *more: object) -> "subprocess.CompletedProces
     return subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False, cwd=folder)
 
 
-def files(authority: Authority, who: str, **changes: timedelta) -> list[object]:
-    certificate, key = authority.sign(who, **changes)
+def files(authority: Authority, who: str) -> list[object]:
+    certificate, key = authority.sign(who)
     return ["--tls-ca-file", authority.ca_file, "--tls-cert", certificate, "--tls-key", key]
 
 
@@ -59,27 +58,6 @@ def test_a_small_sweep_over_tls(tmp_path, log, cluster, authority):
     assert (played.returncode, "is open" in played.stderr) == (0, False)
     rows = parquet.read_table(tmp_path / "out/sweep.parquet").to_pylist()
     assert [(row["set.detector.threshold_Nm"], row["status"]) for row in rows] == [("0.1", "ok"), ("0.4", "ok")]
-
-
-@pytest.mark.long
-def test_certificates_can_stand_in_dasks_configuration(tmp_path, log, cluster, authority, monkeypatch):
-    certificate, key = authority.sign("configured")
-    tls = f"{{ca-file: {authority.ca_file}, client: {{cert: {certificate}, key: {key}}}}}"
-    (tmp_path / "dask.yaml").write_text(f"distributed: {{comm: {{tls: {tls}}}}}\n")
-    monkeypatch.setenv("DASK_CONFIG", str(tmp_path / "dask.yaml"))
-    assert sweep(tmp_path, log, "--scheduler", cluster.scheduler_address).returncode == 0
-
-
-@pytest.mark.long
-def test_who_has_no_certificate_of_the_clusters_is_one_line_and_status_1(tmp_path, log, cluster, authority):
-    stranger = Authority(tmp_path / "stranger")
-    mixed = files(stranger, "mixed")
-    mixed[1] = authority.ca_file  # trusts the cluster, but is not trusted
-    for words in (files(stranger, "stranger"), mixed, files(authority, "late", lasts=-timedelta(days=1))):
-        refused = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *words)
-        complaints = [line for line in refused.stderr.splitlines() if not line.startswith("2 rows")]
-        assert (refused.returncode, len(complaints)) == (1, 1), refused.stderr
-        assert complaints[0].startswith(f"adacd-hil: no Dask scheduler at {cluster.scheduler_address}: ")
 
 
 @pytest.mark.parametrize(
