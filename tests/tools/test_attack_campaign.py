@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import attack_campaign
 import attack_vcan
 import attacked_run
 import attacks
@@ -195,13 +194,6 @@ def test_travel_counts_from_the_attack_to_rest() -> None:
     assert (found.noticed_ms, found.stopped_ms, found.rest_after_notice_ms) == (10.0, 10.0, 80.0)
     assert found.travelled_deg == pytest.approx(9.0, abs=0.15)
     assert (found.fastest_deg_s, found.furthest_deg, found.verdict) == (100.0, 10.0, "ok")
-
-
-def test_virtual_time_plays_what_it_can_and_a_vcan_everything() -> None:
-    virtual, everything = set(attack_campaign.virtual_names()), set(attack_vcan.names())
-    assert {attack_campaign.NOTHING, "sync-doubled", "command-both"} <= virtual
-    assert virtual < everything
-    assert {"remote", "second-run", attack_vcan.KILLED} <= everything - virtual
 
 
 @pytest.mark.parametrize(

@@ -61,14 +61,6 @@ def test_a_push_is_found_if_the_arm_reacts_while_it_lasts(
     assert blind_grid.push_verdict(_pushed_run(*changes), 1) == "not armed"  # this push never came
 
 
-def test_only_warnings_since_the_fault_name_it() -> None:
-    early, late = (100, "warning", "realtime", "not granted"), (900, "warning", "data", "Sensor1 is late")
-    info = (800, "info", "supervisor", "ADAPT -> MONITOR")
-    case = _pushed_run(events=(early, info, late))
-    assert blind_grid.named_trouble(case, 0.3) == "data: Sensor1 is late"
-    assert blind_grid.named_trouble(_pushed_run(events=(early, info)), 0.3) == ""
-
-
 @pytest.mark.long
 @pytest.mark.slow
 def test_without_a_fault_both_pushes_are_found_and_nothing_is_bad(tmp_path: Path) -> None:

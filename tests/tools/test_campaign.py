@@ -38,18 +38,3 @@ def test_a_run_that_deviates_is_told_and_is_the_exit_status(tmp_path: Path) -> N
     assert rows["bad"]["outcome"]["end"] == "finished"
     assert (tmp_path / "logs" / "paper" / "bad" / "run.mcap").is_file()
     assert "2/2" in done.stderr
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_a_pattern_chooses_by_name_or_group_and_each_configuration_plays_it(tmp_path: Path) -> None:
-    one, two = tmp_path / "one.toml", tmp_path / "two.toml"
-    one.write_text(SHORT.format(adaptations=0))
-    two.write_text(SHORT.format(adaptations=0).replace('"short"', '"other"'))
-    mine = tmp_path / "mine.toml"
-    mine.write_text("extends = 'paper'\n")
-    done = campaign(str(one), str(two), "--only", "sho*", "--config", "paper", "--config", str(mine))
-    assert done.returncode == 0
-    passed = [line.split()[:2] for line in done.stdout.splitlines() if "pass" in line]
-    assert passed == [["one", "paper"], ["one", str(mine)]]
-    assert done.stdout.splitlines()[-1] == "2 of 2 as expected"

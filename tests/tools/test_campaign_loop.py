@@ -1,13 +1,10 @@
-"""campaign_loop.py: trials in order in any number of processes, progress, options, and the table of figures."""
+"""campaign_loop.py: trials in order in any number of processes, and the table of figures."""
 
-import argparse
 import os
 
 import pytest
 from campaign_loop import (
     Figure,
-    add_jobs,
-    add_seeds,
     exit_status,
     play_trials,
     print_figures,
@@ -26,27 +23,6 @@ def process_of(_):
 def test_two_jobs_play_in_processes_of_their_own_and_give_the_results_in_order():
     assert list(play_trials(square, range(30), 2)) == [number * number for number in range(30)]
     assert os.getpid() not in set(play_trials(process_of, range(3), 2))
-
-
-def options_of(*arguments):
-    parser = argparse.ArgumentParser()
-    add_seeds(parser, 60)
-    add_jobs(parser)
-    return parser.parse_args(arguments)
-
-
-def test_seeds_and_jobs_have_defaults():
-    assert options_of().seeds == range(60)
-    assert options_of().jobs == os.cpu_count()
-    assert options_of("--seeds", "5:7", "-j", "3").seeds == range(5, 7)
-
-
-@pytest.mark.parametrize("arguments", [("-j", "0"), ("-j", "two"), ("--seeds", "4:4"), ("--seeds", "x")])
-def test_wrong_usage_is_exit_status_2(arguments, capsys):
-    with pytest.raises(SystemExit) as ended:
-        options_of(*arguments)
-    assert ended.value.code == 2
-    assert arguments[0] in capsys.readouterr().err
 
 
 def test_a_figure_beyond_its_bound_is_named_in_the_table_and_is_the_exit_status(capsys):

@@ -52,14 +52,6 @@ def test_a_relative_clause_is_found_where_it_begins_a_sentence(text: str, is_fou
     assert ("relative clause as subject" in {name for name, _, _ in prose.find_hits(text)}) == is_found
 
 
-def test_code_and_targets_of_links_on_a_page_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = tmp_path / "page.md"
-    page.write_text("Run it:\n\n```sh\necho what\n```\n\nSee `what` and [this](that.md#what). It says so.\n")
-    assert prose.main([str(tmp_path)]) == 0
-    shown = capsys.readouterr().out.splitlines()
-    assert [line.removeprefix(str(page)).split(": ")[:2] for line in shown[:-5]] == [[":7", "hearsay"]]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("tops", [("adacd_hil", "firmware_sim"), PAGES], ids=["code", "pages"])
 def test_code_and_pages_keep_to_plain_sentences(tops: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:

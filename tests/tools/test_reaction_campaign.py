@@ -29,11 +29,6 @@ def test_peak_impulse_and_contacts_are_read_off_the_force() -> None:
     assert harm == Harm(20.0, pytest.approx(0.25), 2, False)
 
 
-def test_a_fault_and_an_arm_that_met_nobody_are_seen() -> None:
-    samples: Any = [Sample(0.0), Sample(0.0, SchemeState.FAULT)]
-    assert reaction_campaign.harm_of(samples, 1e-3) == Harm(0.0, 0.0, 0, True)
-
-
 def harms(withdrawal: Harm) -> reaction_campaign.Harms:
     stop = Harm(100.0, 1.0, 1, False)
     return {("chest", True): {reaction: [stop] for reaction in Reaction} | {Reaction.WITHDRAW: [withdrawal]}}

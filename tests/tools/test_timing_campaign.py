@@ -5,17 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import side_by_side
 import timing_campaign
 import timing_disk
-import timing_hour
 import witness
-from mcap.writer import Writer
 
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.dbc_contract import load_codec
-from firmware_sim.scenario.scenario import load_scenario
 
 MS = 1_000_000
 
@@ -27,18 +23,6 @@ def seen(*rows: tuple[int, int, int]) -> witness.Seen:
     return witness.Seen(frames)
 
 
-def test_an_hour_holds_more_than_a_thousand_contacts_that_can_be_played(tmp_path: Path) -> None:
-    path = tmp_path / "contacts.toml"
-    count = timing_hour.write_contacts(path, 3600.0, 3.0)
-    scenario = load_scenario(str(path))
-    assert len(scenario.contacts) == count
-    assert count > 1000
-    gaps = np.diff([contact.at_s for contact in scenario.contacts])
-    assert gaps.min() == pytest.approx(3.0)
-    assert {contact.link for contact in scenario.contacts} == {1, 2}
-    assert scenario.contacts[-1].at_s < 3600.0
-
-
 def test_a_contract_that_is_not_judged_is_the_same_on_the_wire(tmp_path: Path) -> None:
     fast = load_settings()
     fast = dataclasses.replace(fast, bus=dataclasses.replace(fast.bus, period_us=500))
@@ -46,25 +30,6 @@ def test_a_contract_that_is_not_judged_is_the_same_on_the_wire(tmp_path: Path) -
     unjudged = load_codec(timing_campaign.contract_without_budget(tmp_path))
     assert describe_excess(unjudged, fast) == ""
     assert unjudged.layout_digest == load_codec().layout_digest
-
-
-def test_settings_are_laid_over_those_of_a_measured_run(tmp_path: Path) -> None:
-    chosen = timing_campaign.parse_arguments(["hour", "--settings", "[bus]\nheartbeat_ms = 200"])
-    settings = load_settings(str(side_by_side.patient_config(tmp_path, more=chosen.settings)), "P")
-    assert settings.bus.heartbeat_ms == 200
-    assert settings.bus.max_age_cycles == 100
-
-
-def test_a_part_that_no_reader_can_open_is_named(tmp_path: Path) -> None:
-    with (tmp_path / "run.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.add_message(writer.register_channel("/topic", "json", 0), 0, b"{}", 0)
-        writer.finish()
-    (tmp_path / "run_001.mcap").write_bytes((tmp_path / "run.mcap").read_bytes()[:-20])
-    whole, cut = timing_hour.read_parts(tmp_path)
-    assert (whole["messages"], whole["problem"]) == (1, "")
-    assert cut["problem"]
 
 
 def test_the_bus_says_how_the_cycle_went() -> None:

@@ -31,16 +31,6 @@ def test_a_hand_pushes_and_lets_go():
     assert not loop.tau_ext.any()
 
 
-def test_a_spring_pulls_towards_where_it_was_taken_hold_of():
-    loop = HandLoop(3)
-    spring = Hand("spring", 5.0, 0.0, 1.0, np.zeros(7), np.zeros(2), spring_N_m=5.0)
-    loop.touch(spring, 0.0)
-    assert not loop.tau_ext.any()
-    loop.q += (0.1, 0.0)
-    loop.touch(spring, 0.1)
-    assert loop.tau_ext[0] < 0.0
-
-
 def test_the_error_of_a_model_is_that_of_its_torque_on_the_papers_motion():
     error = np.zeros(len(touch_trials.NAMES))
     error[touch_trials.OFFSETS[0]] = 0.3
