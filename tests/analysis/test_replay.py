@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analysis.replay_rig import ChangedLog, flip, record, settings_of_run, with_records, without_cycles, writable
+from analysis.replay_rig import ChangedLog, flipping, record, settings_of_run, with_records, without_cycles, writable
 
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.device.device_files import load_profile, place_devices
@@ -14,6 +14,7 @@ from adacd_hil.device.profile import enable_timeout_s
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import begin_of_log, read_log
 from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.replay.replay import replay_many, replay_source
@@ -99,12 +100,7 @@ ARM_FIELDS = ["steps", "sample_age_ns", "age_q", "age_tau_J", "is_enabled", "is_
 
 
 def test_what_the_log_says_of_the_arm_otherwise_than_its_frames_is_named(log):
-    def change(piece):
-        records = writable(piece.series["/arm"])
-        for place, name in enumerate(ARM_FIELDS):
-            flip(records, 300 + 7 * place, name)
-        return with_records(piece, "/arm", records)
-
+    change = flipping("/arm", *((300 + 7 * place, name) for place, name in enumerate(ARM_FIELDS)))
     found = changed(log, change, by_frames=True)
     named = {"sample_age_ns": "sampled_ns"}
     assert {(each.topic, each.field, each.cycle) for each in found.mismatches} == {
@@ -133,13 +129,7 @@ def test_every_flipped_bit_is_found_and_named(log):
     fields = read_log(log, ("/scheme",)).scheme.records.dtype
     names = [name for name in fields.names if name not in ("record_length", "log_time", "publish_time", "sec")]
     places = {name: (300 + 7 * k, max(int(np.prod(fields[name].shape)), 1) - 1) for k, name in enumerate(names)}
-
-    def change(piece):
-        records = writable(piece.series["/scheme"])
-        for name, (row, element) in places.items():
-            flip(records, row, name, element)
-        return with_records(piece, "/scheme", records)
-
+    change = flipping("/scheme", *((row, name, element) for name, (row, element) in places.items()))
     found = changed(log, change, by_frames=True)
     named = {"nanosec": "stamp_ns"}
     measured = ("q", "dq", "tau_J")
@@ -205,14 +195,8 @@ def test_of_a_stretch_that_alone_is_compared_and_told(log, cycles_per_piece):
 @pytest.mark.parametrize(("row", "count"), [(899, 0), (900, 1), (1099, 1), (1100, 0)])
 def test_only_what_differs_in_the_stretch_is_named(log, row, count):
     scheme = read_log(log, ("/scheme",)).scheme
-
-    def change(piece):
-        records = writable(piece.series["/scheme"])
-        flip(records, row, "tau_ext_hat")
-        return with_records(piece, "/scheme", records)
-
     stretch = TimeWindow(at_s(log, scheme.t_ns[900] - 400_000), at_s(log, scheme.t_ns[1100] - 400_000))
-    found = stretched(log, stretch, change)
+    found = stretched(log, stretch, flipping("/scheme", (row, "tau_ext_hat")))
     assert (found.compared, found.mismatch_count) == (200, count)
 
 
@@ -226,29 +210,16 @@ def test_a_stretch_in_which_nothing_changes_says_what_state_it_is_in(log, whole)
 
 @pytest.mark.parametrize("script_of", [ScriptedOperator, None])
 def test_a_request_that_nobody_can_make_is_named(log, script_of):
-    def change(piece):
-        records = writable(piece.series["/scheme"])
-        flip(records, 900, "request", bit=6)
-        return with_records(piece, "/scheme", records)
-
-    source = ChangedLog(log, change)
+    source = ChangedLog(log, flipping("/scheme", (900, "request", 0, 6)))
     (found,) = replay_source(source, [source.settings], script_of=script_of)
     (mismatch,) = found.mismatches
     assert (mismatch.name, mismatch.logged, mismatch.replayed) == ("/scheme.request", "64", "0")
 
 
 def test_a_flipped_bit_of_any_field_of_a_contact_report_is_found_and_named(log):
-    names: list[str] = []
-
-    def change(piece):
-        records = writable(piece.series["/contact"])
-        skipped = ("record_length", "log_time", "publish_time", "sec", "nanosec")
-        names.extend(name for name in records.dtype.names if name not in skipped)
-        for name in names:
-            flip(records, 0, name)
-        return with_records(piece, "/contact", records)
-
-    found = changed(log, change)
+    (contact,) = (channel.type for channel in run_channels(7) if channel.topic == "/contact")
+    names = [name for name in contact.dtype.names if name not in ("sec", "nanosec")]
+    found = changed(log, flipping("/contact", *((0, name) for name in names)))
     assert {(each.topic, each.field) for each in found.mismatches} == {("/contact", name) for name in names}
 
 
