@@ -7,27 +7,27 @@ from pathlib import Path
 import pytest
 from called import called
 from hang import HANG_S
-from made_certificates import Authority
+from made_certificates import self_signed
 
 distributed = pytest.importorskip("distributed")
 parquet = pytest.importorskip("pyarrow.parquet")
 
 
 @pytest.fixture(scope="module")
-def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
-    return Authority(tmp_path_factory.mktemp("tls") / "lab")
+def signed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return self_signed(tmp_path_factory.mktemp("tls"), "lab")
 
 
 @pytest.fixture(scope="module")
-def cluster(authority: Authority):
-    """A scheduler and a worker at tls://, that trust what the lab has signed."""
-    certificate, key = map(str, authority.sign("cluster"))
+def cluster(signed):
+    """A scheduler and a worker at tls://, that trust the certificate of the lab."""
+    certificate, key = map(str, signed)
     of_all = {
         f"tls_{who}_{what}": value
         for who in ("client", "scheduler", "worker")
         for what, value in (("cert", certificate), ("key", key))
     }
-    security = distributed.Security(require_encryption=True, tls_ca_file=str(authority.ca_file), **of_all)
+    security = distributed.Security(require_encryption=True, tls_ca_file=certificate, **of_all)
     with distributed.LocalCluster(
         n_workers=1,
         threads_per_worker=1,
@@ -47,14 +47,14 @@ def sweep(folder: Path, log: Path, *more: object) -> "subprocess.CompletedProces
     return subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False, cwd=folder)
 
 
-def files(authority: Authority, who: str) -> list[object]:
-    certificate, key = authority.sign(who)
-    return ["--tls-ca-file", authority.ca_file, "--tls-cert", certificate, "--tls-key", key]
+def files(signed: tuple[Path, Path]) -> list[object]:
+    certificate, key = signed
+    return ["--tls-ca-file", certificate, "--tls-cert", certificate, "--tls-key", key]
 
 
 @pytest.mark.long
-def test_a_small_sweep_over_tls(tmp_path, log, cluster, authority):
-    played = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *files(authority, "engineer"))
+def test_a_small_sweep_over_tls(tmp_path, log, cluster, signed):
+    played = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *files(signed))
     assert (played.returncode, "is open" in played.stderr) == (0, False)
     rows = parquet.read_table(tmp_path / "out/sweep.parquet").to_pylist()
     assert [(row["set.detector.threshold_Nm"], row["status"]) for row in rows] == [("0.1", "ok"), ("0.4", "ok")]
@@ -73,12 +73,10 @@ def test_a_small_sweep_over_tls(tmp_path, log, cluster, authority):
         ({"--scheduler": "tcp://127.0.0.1:1"}, "are for tls:// addresses, not tcp://127.0.0.1:1"),
     ],
 )
-def test_certificates_that_cant_be_used_are_one_line_and_status_2(
-    tmp_path, log, authority, monkeypatch, changes, reason
-):
+def test_certificates_that_cant_be_used_are_one_line_and_status_2(tmp_path, log, signed, monkeypatch, changes, reason):
     (tmp_path / "text.pem").write_text("no certificate\n")
-    (tmp_path / "other.pem").write_bytes(authority.sign("other")[1].read_bytes())
-    given = files(authority, "user")
+    self_signed(tmp_path, "other")[1].rename(tmp_path / "other.pem")
+    given = files(signed)
     words: dict[object, object] = {
         "--scheduler": "tls://127.0.0.1:1",
         **dict(zip(given[::2], given[1::2], strict=True)),
