@@ -13,6 +13,7 @@ from rosbags.rosbag2 import StoragePlugin
 from adacd_hil.lab.offline.recording_import import ForeignRecording, read_recording
 from adacd_hil.lab.offline.recording_map import RecordingMap, read_map
 from adacd_hil.log.log_files import LogError
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.settings.schema import ConfigError
 
 NAMES = ("pan", "lift", "elbow")
@@ -62,6 +63,7 @@ WRITERS: dict[str, Callable[[Path, list[State]], Path]] = {
         folder / "r.mcap", messages, profile="", has_index=False
     ),
     "a bag of ROS 2": lambda folder, messages: write_rosbag2(folder / "bag", messages),
+    "its database alone": lambda folder, messages: next(write_rosbag2(folder / "bag", messages).glob("*.db3")),
     "a bag of ROS 2 in MCAP": lambda folder, messages: write_rosbag2(folder / "bag", messages, StoragePlugin.MCAP),
     "a bag of ROS 1": lambda folder, messages: write_rosbag1(folder / "r.bag", messages),
 }
@@ -72,9 +74,11 @@ def test_joints_are_found_by_their_names_in_whatever_order_a_bag_has_them(tmp_pa
     check(read_recording(WRITERS[kind](tmp_path, states(("elbow", "pan", "lift"))), described))
 
 
-def test_the_database_of_a_bag_is_read_without_its_folder(tmp_path, described):
-    (database,) = write_rosbag2(tmp_path / "bag", states()).glob("*.db3")
-    check(read_recording(database, described))
+def test_velocities_are_derived_where_a_bag_has_none(tmp_path, described):
+    recording = read_recording(write_mcap(tmp_path / "r.mcap", states(has_velocity=False)), described)
+    check(recording, has_velocity=False)
+    assert not recording.has_velocities
+    assert np.abs(recording.stretches[0].record.dq).max() == pytest.approx(25.0, rel=0.05)
 
 
 def test_messages_of_a_gripper_and_joints_beyond_the_arm_are_passed_over(tmp_path, described):
@@ -99,6 +103,12 @@ def test_a_map_names_topic_joints_and_time_of_a_bag(tmp_path, described):
         '[bag]\ntopic = "/left/joint_states"\ntime = "received"\n'
     )
     check(read_recording(path, read_map(tmp_path / "map.toml")))
+
+
+def test_a_span_of_a_bag_is_what_is_kept_of_it(tmp_path, described):
+    path = write_mcap(tmp_path / "r.mcap", states())
+    part = read_recording(path, described, span=TimeWindow(0.1, 0.35)).between(0.1, 0.35)
+    assert part.duration_s == pytest.approx(0.25, abs=0.008)
 
 
 def changed(messages: list[State], **change) -> list[State]:

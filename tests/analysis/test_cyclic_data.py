@@ -40,25 +40,21 @@ def test_shares_are_those_of_cycles_with_powered_drives():
     assert (data.cycles, data.incomplete, data.aged) == (4000, 0.01, 0.01)
 
 
-def test_the_worst_second_tells_what_a_share_of_the_run_hides():
-    data = gather_data(missing_frames(make_run((A, 1000), (M, 59_000)), np.arange(30_000, 30_120)))
-    assert data.incomplete == pytest.approx(0.002)
-    assert data.worst_incomplete == 0.12
-    assert data.excesses == ("incomplete cycles: 12 % of the cycles of a second, 10 % allowed",)
-
-
-def test_a_second_within_its_limit_is_no_excess():
-    assert gather_data(missing_frames(make_run((A, 1000), (M, 1000)), np.arange(100))).excesses == ()
-
-
-def test_a_window_does_not_reach_over_a_stay_without_power():
-    run = make_run((A, 700), (SchemeState.FAULT, 500), (A, 700))
-    data = gather_data(missing_frames(run, np.arange(600, 700)))
-    assert data.worst_incomplete == pytest.approx(100 / 700)
-
-
-def test_a_few_last_cycles_are_no_second():
-    assert gather_data(missing_frames(make_run((A, 1000), (M, 100)), np.arange(1050, 1100))).worst_incomplete == 0.0
+@pytest.mark.parametrize(
+    ("stays", "rows", "worst"),
+    [
+        (((A, 1000), (M, 59_000)), slice(30_000, 30_120), 0.12),
+        (((A, 1000), (M, 1000)), slice(0, 100), 0.1),
+        (((A, 700), (SchemeState.FAULT, 500), (A, 700)), slice(600, 700), 100 / 700),
+        (((A, 1000), (M, 100)), slice(1050, 1100), 0.0),
+    ],
+    ids=["a share of the run hides it", "at its limit", "not over a stay without power", "a few last cycles are none"],
+)
+def test_the_worst_second_tells_whether_too_much_was_missing(stays, rows, worst):
+    data = gather_data(missing_frames(make_run(*stays), rows))
+    assert data.worst_incomplete == pytest.approx(worst)
+    text = f"incomplete cycles: {100 * worst:.2g} % of the cycles of a second, 10 % allowed"
+    assert data.excesses == ((text,) if worst > 0.1 else ())
 
 
 @pytest.mark.parametrize("size", [1, 333])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from log.recorded_run import make_run, record
 
+from adacd_hil.lab.cli.compare_command import contact_in_words
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.runs.log_comparison import MATCH_S, Contact, compare_logs, match_contacts
 from adacd_hil.log import logged_run
@@ -103,6 +104,13 @@ def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone():
         (None, second[2]),
         (first[2], None),
     ]
+
+
+def test_a_lower_bound_reads_as_one_in_a_comparison():
+    known, lower, later = (contact_in_words(contact(1.0, force_N=-14.7, location=place)) for place in (1, 2, 77))
+    assert (known, lower) == ("1.000 s, link 1, -14.7 N", "1.000 s, link 1, ≥ 14.7 N")
+    assert later == known  # a place that a later version may have
+    assert contact_in_words(contact(1.0)) == "1.000 s, link 1"
 
 
 def test_a_contact_has_one_counterpart_at_most():

@@ -11,6 +11,7 @@ from hand_made_run import make_certified_run, make_run, react, record, record_tr
 
 from adacd_hil.lab.report import run_reading
 from adacd_hil.lab.report.page import left_out_text, shown_contacts
+from adacd_hil.lab.report.report_files import write_run_report
 from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_reading import TruthClock, read_run
 from adacd_hil.lab.report.timeline import timeline_of
@@ -109,6 +110,13 @@ def test_around_the_first_contacts_every_cycle_is_kept(few_kept, monkeypatch, ce
     onset_s = 1.45
     around = run.cycle[(run.time_s() > onset_s - 0.14) & (run.time_s() < onset_s + 0.59)]
     assert (len(around), set(np.diff(around).tolist())) == (729, {1})
+
+
+@pytest.mark.long
+def test_the_page_of_a_long_run_says_that_cycles_are_left_out(few_kept, certified, tmp_path):
+    read = read_run(certified, truth_of(certified), full_cycles=1000)
+    report = write_run_report(read.run, tmp_path, read.source, read.gathered)
+    assert f"Of 9050 cycles {len(read.run.cycle)} are here: of every 4096" in report.html_path.read_text()
 
 
 def test_a_log_of_just_so_many_cycles_is_kept_whole(certified):

@@ -414,6 +414,14 @@ def test_what_is_named_makes_the_recording_explained(tmp_path, upright):
     assert judged(tmp_path, turned, more=keys).verdict.is_explained
 
 
+def test_three_positions_that_count_from_the_base_are_named_with_their_torques(tmp_path):
+    motion = record(urdf_text(3, AXES))
+    sums = np.tril(np.ones((3, 3)))
+    coupled = replace(motion, q=motion.q @ sums.T, tau=motion.tau @ np.linalg.inv(sums))
+    said = "each position counts from the base, not from the link before, and so do the torques"
+    assert said in judged(tmp_path, coupled, AXES).verdict.reasons[0]
+
+
 def test_which_joint_of_an_arm_without_gravity_is_turned_nobody_can_say(tmp_path, level):
     turned = replace(level, q=level.q * TURNED, tau=level.tau * TURNED)
     (reason,) = judged(tmp_path, turned, LEVEL).verdict.reasons

@@ -13,7 +13,7 @@ from adacd_hil.lab.report.page import has_paper
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
-from adacd_hil.lab.score.report_wording import uncertain_text
+from adacd_hil.lab.score.report_wording import STATE_WORDS, uncertain_text
 from adacd_hil.lab.score.run_arrays import Run
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, SchemeState
@@ -52,6 +52,11 @@ def test_text_and_curves_are_told_from_their_ground(colours):
     assert {pair: ratio for pair, ratio in text.items() if ratio < 4.5} == {}  # WCAG AA
     curves = {curve: contrast(colours[curve], colours["paper"]) for curve in CURVES}
     assert {curve: ratio for curve, ratio in curves.items() if ratio < 3.0} == {}
+
+
+def test_every_state_has_a_name_in_words():
+    assert set(STATE_WORDS) == set(SchemeState)
+    assert len(set(STATE_WORDS.values())) == len(SchemeState)
 
 
 def steps_of(run: Run, source: ReportSource = SOURCE) -> list[NextStep]:

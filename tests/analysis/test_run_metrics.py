@@ -39,6 +39,11 @@ def upright(run):
     return replace(run, settings=settings, theta_hat=np.pad(run.theta_hat, ((0, 0), (0, 2))))
 
 
+def test_time_counts_from_motion_start_and_without_one_from_the_first_cycle():
+    assert make_run().time_s()[[0, ZERO_ROW]] == pytest.approx((-0.05, 0.0))
+    assert make_run((SchemeState.COMMISSION, 10)).time_s()[3] == pytest.approx(0.003)
+
+
 def test_the_papers_experiment_has_sections_a_to_e_without_a_gap():
     sections = split_sections(make_run())
     assert {section.label: section.kind for section in sections} == {
@@ -264,6 +269,7 @@ def test_the_frozen_residual_is_the_largest_of_each_joint_and_section():
     assert (residual(run), residual(run, "E")) == ((0.04, 0.01), (0.03, 0.02))
     assert (residual(run, "A"), residual(run, "A", "cad")) == (None, (0.4, 0.5))  # theta_hat still moves
     assert "C" not in evaluate(run).frozen_residual_max_Nm
+    assert evaluate(run).frozen_residual_max_Nm["B"].cycles == 4000
 
 
 def test_without_a_cad_model_it_has_no_residual():

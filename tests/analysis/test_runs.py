@@ -179,6 +179,15 @@ def test_an_offset_that_creeps_adds_up_and_one_within_its_deviations_does_not():
     assert trend.further[1] == "Torque offsets: no change beyond what the certificates' uncertainty explains."
 
 
+def test_what_has_no_deviation_is_not_said_to_have_changed():
+    (trend,) = trends(series(friction_Nm=[(0.1, 0.1), (0.9, 0.9)]))
+    assert trend.friction.changes == ()
+    assert trend.further[0].startswith(
+        "Friction can't be compared: that takes two certificates with a deviation, there are 0."
+    )
+    assert trend.sentence == "Thresholds can't be compared: 0 of 2 runs have any."
+
+
 def test_an_emulated_arm_is_another_than_that_on_a_bus():
     runs = series(margin=[1.0, 2.0])
     found = trends([runs[0], replace(runs[1], interface="embedded"), replace(runs[1], status=BROKEN)])

@@ -38,20 +38,6 @@ def test_each_place_is_listed_with_its_line(tmp_path: Path, capsys: pytest.Captu
     ]
 
 
-@pytest.mark.parametrize(
-    ("text", "is_found"),
-    [
-        ("What is through counts.", True),
-        ("It ends. Who writes waits.", True),
-        ("What is it? A question.", False),
-        ("The frame that is through counts.", False),
-        ("Somewhat late.", False),
-    ],
-)
-def test_a_relative_clause_is_found_where_it_begins_a_sentence(text: str, is_found: bool) -> None:
-    assert ("relative clause as subject" in {name for name, _, _ in prose.find_hits(text)}) == is_found
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("tops", [("adacd_hil", "firmware_sim"), PAGES], ids=["code", "pages"])
 def test_code_and_pages_keep_to_plain_sentences(tops: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
