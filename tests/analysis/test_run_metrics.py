@@ -78,10 +78,10 @@ def test_a_filtered_step_follows_the_exponential_over_skipped_cycles_too():
     assert skipping[1, 0] == pytest.approx(1.0 - math.exp(-0.1))
 
 
-def contact_run():
-    """Push link 1 with 5 Nm for 250 cycles from row 2000 on."""
-    run = make_run()
-    touch(run, 2000, 250, (5.0, 0.0))
+def contact_run(*stays, row=2000):
+    """Push link 1 with 5 Nm for 250 cycles."""
+    run = make_run(*stays)
+    touch(run, row, 250, (5.0, 0.0))
     return run
 
 
@@ -379,18 +379,7 @@ def payload_taken_off():
     return run
 
 
-def one_detected():
-    run = make_run((A, 1000), (M, 4000))
-    touch(run, 2000, 250, (5.0, 0.0))
-    return react(run, 2005)
-
-
-def touched_in_the_only_adaptation():
-    run = make_run((A, 1000))
-    touch(run, 500, 50, (5.0, 0.0))
-    return run
-
-
+ONE_DETECTED = react(contact_run((A, 1000), (M, 4000)), 2005)
 FAULTED = make_run((A, 1000), (M, 500), (SchemeState.FAULT, 5), reason=FaultReason.DATA_AGE)
 NO_CONTACT = "o contact while the arm was watched, no false alarm"
 TWICE = "identified in 1.00 s and again in 0.80 s after"
@@ -407,10 +396,10 @@ TWICE = "identified in 1.00 s and again in 0.80 s after"
         (touched_run(), ("2 of 3 contacts detected within 5 ms, 1 missed, 1 false alarm", f"{TWICE} 1 kg"), False),
         (react(detected_run(), 8000), ("All 2 contacts", "1 false alarm"), False),
         (payload_taken_off(), (NO_CONTACT, f"{TWICE} taking off 1.5 kg"), True),
-        (one_detected(), ("The one contact detected within 5 ms, none false", "identified in 1.00 s;"), True),
+        (ONE_DETECTED, ("The one contact detected within 5 ms, none false", "identified in 1.00 s;"), True),
         (real_arm(), ("1 detection, whose truth is not recorded", f"{TWICE} the payload change"), True),
         (make_run((A, 1000)), ("The arm was not watched", "the model was not identified"), False),
-        (touched_in_the_only_adaptation(), ("1 more while it was not watched",), False),
+        (contact_run((A, 1000), row=500), ("1 more while it was not watched",), False),
         (make_run((A, 1000), (M, 10), (P, 10), (A, 10)), (NO_CONTACT, "but not again after the payload"), False),
         (FAULTED, ("The run ended in FAULT (DATA_AGE) at 1.50 s", NO_CONTACT), False),
         (make_run((SchemeState.COMMISSION, 10)), ("The arm was not watched", "the arm never moved to adapt"), False),
