@@ -1,4 +1,4 @@
-"""timing_campaign.py: the inputs it writes can be used, and what it makes of frames and memory is right."""
+"""timing_campaign.py: its contract is the same on the wire, and what it makes of the frames of a bus is right."""
 
 import dataclasses
 from pathlib import Path

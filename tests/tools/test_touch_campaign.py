@@ -1,4 +1,4 @@
-"""tools/campaigns/touch_campaign.py: what it draws, one of its trials, and its figures."""
+"""tools/campaigns/touch_campaign.py: its trials, played by the product, and its figures."""
 
 from dataclasses import replace
 
@@ -10,31 +10,13 @@ from excited_arm import PERIOD_S
 from long_cases import long_but
 from mujoco_arm import MujocoArm
 from planar_arm import THETA, advance
-from touch_trials import Hand, HandLoop, Trial
+from touch_trials import Trial
 
 GOOD = Trial(1, "P", "lean", False, True, False, 2.25, (0.01,), (), 2.0, True, "", ())
 
 
 def met(figures):
     return {name: is_met for name, _, _, is_met in figures}
-
-
-def test_a_hand_pushes_and_lets_go():
-    loop = HandLoop(3)
-    nothing = {"added": np.zeros(7), "torque_Nm": np.zeros(2)}
-    loop.touch(Hand("tip force", 2.0, 0.0, 1.0, **nothing, tip_N=2.0), 0.1)
-    l1, l2 = touch_trials.FREE.arm.link_length_m
-    assert loop.tau_ext == pytest.approx([2.0 * (l2 + l1 * np.cos(loop.q[1])), 2.0 * l2])
-    loop.touch(Hand("ramp", 1.0, 0.0, 1.0, np.zeros(7), np.array([1.0, 0.0]), ramp_s=0.5), 0.1)
-    assert loop.tau_ext == pytest.approx([0.2, 0.0])
-    loop.let_go()
-    assert not loop.tau_ext.any()
-
-
-def test_the_error_of_a_model_is_that_of_its_torque_on_the_papers_motion():
-    error = np.zeros(len(touch_trials.NAMES))
-    error[touch_trials.OFFSETS[0]] = 0.3
-    assert np.abs(touch_trials.paper_rows() @ error).max() == pytest.approx(0.3, rel=1e-3)
 
 
 @pytest.mark.slow

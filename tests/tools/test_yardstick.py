@@ -1,22 +1,25 @@
-"""tools/yardstick.c and .py: it compiles without a warning, checks its arguments, and gets frames that devices take."""
+"""tools/yardstick.py: what is in C compiles, devices take its frames, its arguments name all that the host hears."""
 
 from pathlib import Path
 
 import pytest
+import side_by_side
+import witness
 import yardstick
 
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from adacd_hil.wire.e2e import E2eStatus
 
-GOOD = ["-i", "none0", "-s", "080", "-r", "181", "-c", "201#0011"]
 
-
-@pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    built, reason = yardstick.build(tmp_path_factory.mktemp("yardstick"))
-    if built is None:
+@pytest.mark.parametrize(
+    ("source", "flags"),
+    [(yardstick.SOURCE, ()), (witness.SOURCE, ()), (side_by_side.WAITS, ("-shared", "-fPIC", "-ldl"))],
+)
+def test_what_is_in_c_compiles_without_a_warning(source: Path, flags: tuple[str, ...], tmp_path: Path) -> None:
+    program, reason = yardstick.build(tmp_path, source, *flags)
+    if program is None:
         pytest.skip(reason)
-    return built
+    assert program.is_file()
 
 
 @pytest.mark.parametrize(("contract", "count"), [("arm", 16), ("arm_fd", 256), ("arm_fd_500us", 256)])
