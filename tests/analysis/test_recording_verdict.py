@@ -489,14 +489,14 @@ def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path, upright):
     assert any("noise of the velocities, 1 rad/s, hides contacts" in remark for remark in verdict.remarks)
 
 
-# The command.
-
-
 def test_joints_at_rest_are_named_in_one_reason(tmp_path):
     motion = record(urdf_text(3, AXES))
     verdict = judged(tmp_path, still(motion, 0, 2), AXES).verdict
     (reason,) = verdict.reasons
     assert reason.startswith("the positions of joint1 (q1) and joint3 (q3) change by less than 0.01 rad: dead encoders")
+
+
+# The command.
 
 
 def test_the_command_says_verdict_rows_left_out_and_the_next_thing_to_do(tmp_path, upright):
