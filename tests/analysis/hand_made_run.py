@@ -16,6 +16,7 @@ from adacd_hil.records import ContactReport, CycleRecord, FaultReason, Request, 
 from adacd_hil.scheme.pipeline.pipeline import layout_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.toml_text import to_toml
 
 CAD_THETA = (0.1786065, 0.036855, 0.0189645, 0.0, 0.0, 0.0, 0.0)
 THETA = (0.2, 0.04, 0.02, 0.03, 0.015, 0.0375, 0.025)
@@ -31,8 +32,14 @@ PAPER_LIKE = ((SchemeState.ENABLE, 50), (A, 1000), (M, 4000), (P, 500), (A, 800)
 ZERO_ROW = 50
 
 
-def make_run(*stays: tuple[SchemeState, int], has_truth: bool = True, clock: str = "lockstep", **changes: Any) -> Run:
-    """Make a run that stays in the given states for the given numbers of cycles."""
+def make_run(
+    *stays: tuple[SchemeState, int],
+    has_truth: bool = True,
+    clock: str = "lockstep",
+    reason: FaultReason = FaultReason.DRIVE,
+    **changes: Any,
+) -> Run:
+    """Make a run that stays in the given states for the given numbers of cycles. reason: of all of its faults."""
     states = [state for state, cycles in stays or PAPER_LIKE for _ in range(cycles)]
     count = len(states)
     cycle = FIRST_CYCLE + np.arange(count, dtype=np.int64)
@@ -52,7 +59,7 @@ def make_run(*stays: tuple[SchemeState, int], has_truth: bool = True, clock: str
         cycle=cycle,
         t_ns=EPOCH_NS + cycle * 1_000_000,
         state=np.array(states, dtype=np.uint8),
-        fault=np.zeros(count, dtype=np.uint8),
+        fault=np.where(np.array(states) == SchemeState.FAULT, reason, FaultReason.NONE).astype(np.uint8),
         tau_ext_hat=np.zeros((count, 2)),
         tau_ext_hat_cad=np.zeros((count, 2)),
         theta_hat=np.zeros((count, 7)),
@@ -187,8 +194,8 @@ def without_cycles(run: Run) -> Run:
     return replace(run, timing=columns_of_records([], []), **{name: getattr(run, name)[:0] for name in names})
 
 
-def record(path: Path, run: Run, attachments: dict[str, bytes], clock: str = "lockstep") -> None:
-    """Write a log with the scheme's topic of a hand-made run."""
+def record(path: Path, run: Run, attachments: dict[str, bytes] | None = None, clock: str = "lockstep") -> None:
+    """Write a log with the scheme's topic of a hand-made run. attachments: instead of its configuration."""
     slices = layout_of(run.settings).slices
     blocks = np.zeros((len(run.cycle), layout_of(run.settings).size))
     columns = {name: getattr(run, name) for name in ("tau_ext_hat", "theta_hat", "threshold")}
@@ -204,7 +211,7 @@ def record(path: Path, run: Run, attachments: dict[str, bytes], clock: str = "lo
         blocks[:, slices[name]] = column.reshape(len(blocks), -1)
     with Recorder(
         path,
-        attachments=attachments,
+        attachments={"config.toml": to_toml(run.settings).encode()} if attachments is None else attachments,
         metadata={"clock": clock, "scenario": "paper"},
         further_count=0 if run.certified is None else run.settings.further_count,
         channel_count=0 if run.certified is None else run.settings.channel_count,

@@ -1,4 +1,4 @@
-"""Certificates for a cluster of the tests: an authority, and what it signs."""
+"""Certificates for a cluster of the tests."""
 
 import datetime
 from pathlib import Path
@@ -11,42 +11,15 @@ from cryptography.x509.oid import NameOID
 DAY = datetime.timedelta(days=1)
 
 
-class Authority:
-    """Signs certificates; `ca_file`, and what `sign` returns, are PEM files in `folder`."""
-
-    def __init__(self, folder: Path) -> None:
-        folder.mkdir()
-        self._folder = folder
-        self._key = ec.generate_private_key(ec.SECP256R1())
-        self._name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, folder.name)])
-        self.ca_file = folder / "ca.pem"
-        certificate = self._build(self._name, self._key, True, DAY)
-        self.ca_file.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
-
-    def _build(self, name, key, is_authority, lasts):
-        now = datetime.datetime.now(datetime.UTC)
-        builder = (
-            x509.CertificateBuilder()
-            .subject_name(name)
-            .issuer_name(self._name)
-            .public_key(key.public_key())
-            .serial_number(x509.random_serial_number())
-            .not_valid_before(now - 2 * DAY)
-            .not_valid_after(now + lasts)
-            .add_extension(x509.BasicConstraints(ca=is_authority, path_length=None), critical=True)
-        )
-        return builder.sign(self._key, hashes.SHA256())
-
-    def sign(self, who: str, lasts: datetime.timedelta = DAY) -> tuple[Path, Path]:
-        """Make a certificate and its key."""
-        key = ec.generate_private_key(ec.SECP256R1())
-        name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, who)])
-        certificate_file, key_file = self._folder / f"{who}.pem", self._folder / f"{who}-key.pem"
-        certificate = self._build(name, key, False, lasts)
-        certificate_file.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
-        key_file.write_bytes(
-            key.private_bytes(
-                serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-            )
-        )
-        return certificate_file, key_file
+def self_signed(folder: Path, who: str) -> tuple[Path, Path]:
+    """Make a certificate that is its own authority, and its key, as PEM files."""
+    key, now = ec.generate_private_key(ec.SECP256R1()), datetime.datetime.now(datetime.UTC)
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, who)])
+    builder = x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number(), now - DAY, now + DAY)
+    builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=None), critical=True)
+    certificate = builder.sign(key, hashes.SHA256())
+    pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
+    certificate_file, key_file = folder / f"{who}.pem", folder / f"{who}-key.pem"
+    certificate_file.write_bytes(certificate.public_bytes(pem))
+    key_file.write_bytes(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain))
+    return certificate_file, key_file

@@ -68,6 +68,18 @@ def flip(records: np.ndarray, row: int, field: str, element: int = 0, bit: int =
     rows[row, place] ^= 1 << bit % 8
 
 
+def flipping(topic: str, *flips: tuple[Any, ...]) -> Change:
+    """Flip bits of a topic: row, field, and element and bit if not the first."""
+
+    def change(piece: Piece) -> Piece:
+        records = writable(piece.series[topic])
+        for each in flips:
+            flip(records, *each)
+        return with_records(piece, topic, records)
+
+    return change
+
+
 def with_records(piece: Piece, topic: str, records: np.ndarray, epoch_ns: int = 0) -> Piece:
     series: dict[str, Any] = dict(piece.series)
     series[topic] = Series(records, epoch_ns)

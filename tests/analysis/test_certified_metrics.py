@@ -3,19 +3,16 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from hand_made_run import FIRST_CYCLE, A, C, M, P, R, S, contact_report, make_certified_run, make_run, react, touch
 
-from adacd_hil.lab.report.page import paper_cells, paper_head
-from adacd_hil.lab.report.report_json import report_json
 from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.run_arrays import split_sections
-from adacd_hil.lab.score.run_judge import FilterChannel, two_pole_delay_s
+from adacd_hil.lab.score.run_judge import two_pole_delay_s
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction
+from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction, SchemeState
 
 
 def test_an_adaptation_lasts_until_its_model_is_certified():
@@ -38,8 +35,9 @@ def test_an_adaptation_lasts_until_its_model_is_certified():
             [("adaptation", False), ("payload", True), ("adaptation", True), ("detection", False)],
         ),
         (((A, 10), (M, 10), (R, 10), (M, 10)), [("adaptation", True), ("detection", False)]),
+        (((A, 10), (SchemeState.FAULT, 5)), [("adaptation", False), ("fault", False)]),
     ],
-    ids=["while it learns", "while it parks", "then a payload change", "one that clears"],
+    ids=["while it learns", "while it parks", "then a payload change", "one that clears", "no contact, a fault"],
 )
 def test_a_contact_belongs_to_the_section_that_it_interrupts(stays, sections):
     assert [(section.kind, section.is_complete) for section in split_sections(make_run(*stays))] == sections
@@ -63,11 +61,6 @@ def test_a_contact_while_adapting_has_its_delay_and_is_not_missed():
     assert (contact.state, contact.is_armed, contact.delay_ms) == ("ADAPT", False, pytest.approx(2.0))
     assert "1 more while it was not watched (1 of them detected)" in metrics.verdict
     assert metrics.missed == 0
-
-
-@pytest.mark.parametrize("row", [800, 5200])
-def test_a_detection_without_contact_is_a_false_alarm_in_every_state(row):
-    assert evaluate(react(make_certified_run(), row, 20)).false_alarms == 1
 
 
 def test_a_log_that_ended_as_nobody_meant_it_to_is_not_good():
@@ -224,20 +217,10 @@ def test_what_a_report_does_not_know_is_none():
     assert (contact.location, contact.force_N, contact.kind) == (None, None, None)
 
 
-def test_a_step_behind_two_equal_low_passes_takes_as_long_as_it_should():
+def test_a_step_behind_two_low_passes_takes_as_long_as_it_should_and_below_the_threshold_for_ever():
     # 1 - (1 + x) exp(-x) is 0.5 at x = 1.67835.
     assert two_pole_delay_s(-2.0, 1.0, 100.0, 100.0) == pytest.approx(0.0167835, rel=1e-4)
-
-
-@pytest.mark.parametrize("tau_ext_Nm", [0.0, 1.0])
-def test_a_step_below_the_threshold_never_passes_two_low_passes(tau_ext_Nm):
-    assert two_pole_delay_s(tau_ext_Nm, 1.0, 10.0, 200.0) is None
-
-
-def test_a_fast_second_low_pass_changes_next_to_nothing():
-    bare, smoothed = (FilterChannel(10.0, b, np.array([0.15, 0.15])) for b in (None, 1e5))
-    step = np.array([1.0, 0.1])
-    assert smoothed.step_delay_s(step) == pytest.approx(bare.step_delay_s(step), abs=2e-5)
+    assert [two_pole_delay_s(tau_ext_Nm, 1.0, 10.0, 200.0) for tau_ext_Nm in (0.0, 1.0)] == [None, None]
 
 
 def test_the_law_is_that_of_the_fastest_channel():
@@ -246,12 +229,6 @@ def test_the_law_is_that_of_the_fastest_channel():
     (contact,) = evaluate(react(run, 3001)).contacts
     assert contact.law_ms == pytest.approx(-1e3 * math.log1p(-0.1) / 200.0)
     assert contact.ideal_ms == pytest.approx(1.0)
-
-
-def test_the_table_puts_three_columns_side_by_side():
-    metrics = evaluate(touched_beside(3000, 3005))
-    first = next(cells for cells in paper_cells(metrics) if cells[0] == "First adaptation")
-    assert (paper_head(metrics)[-1], first[1:]) == ("certified", ("5.2 s", "2.00 s", "1.00 s"))
 
 
 @pytest.mark.parametrize(
@@ -267,16 +244,3 @@ def test_a_force_is_told_as_far_as_it_is_known(location, words):
     made = contact_report(int(run.cycle[3001]), location=location, force_N=-14.2, force_sigma=0.5)
     run = replace(run, reports=(made,))
     assert f"<dt>{words}</dd>" in report_page(evaluate(run), run, ReportSource("run.mcap"))
-
-
-def test_the_page_marks_a_margin_below_one():
-    run = make_certified_run()
-    run.certified.tau_ext[3000, 4] = 0.2
-    html = report_page(evaluate(run), run, ReportSource("run.mcap"))
-    assert '<td data-head="margin" class="bad">0.5 / 0.5</td>' in html
-
-
-def test_a_margin_without_bound_is_null_in_the_table():
-    run = make_certified_run()
-    table = report_json(evaluate(run), run.metadata, ReportSource("run.mcap"))
-    assert table["certified"]["smallest_margin"] is None

@@ -38,7 +38,7 @@ def test_few_values_have_the_percentiles_that_they_would_have_together(values):
 
 @settings(max_examples=60, deadline=None)
 @given(VALUES)
-def test_many_values_have_theirs_within_a_bin_toward_zero(values):
+def test_many_values_have_theirs_within_a_bin_toward_zero_and_the_extremes_exactly(values):
     found = distribution_of(values, exact=values.size - 1)
     for ours, true in (
         (found.percentiles(), percentiles(values)),
@@ -47,15 +47,9 @@ def test_many_values_have_theirs_within_a_bin_toward_zero(values):
         for name, value in true.items():
             low, high = sorted((value, value * (1.0 - FINEST)))
             assert low <= ours[name] <= high
+    assert (found.percentiles()["max"], found.low_percentiles()["min"]) == (values.max(), values.min())
     middle = np.sort(np.abs(values))
     assert abs(found.median() - np.median(values)) <= FINEST * float(middle[-1])
-
-
-@settings(max_examples=60, deadline=None)
-@given(VALUES)
-def test_the_largest_and_the_smallest_of_many_values_are_exact(values):
-    found = distribution_of(values, exact=0)
-    assert (found.percentiles()["max"], found.low_percentiles()["min"]) == (values.max(), values.min())
 
 
 def test_whole_numbers_stay_whole():

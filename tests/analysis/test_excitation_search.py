@@ -95,12 +95,6 @@ def test_what_is_found_shows_more_than_the_start_within_the_limits(search, found
         assert (np.array(getattr(after, name)) <= np.array(limits) * (1.0 + TOLERANCE)).all()
 
 
-def test_a_seed_is_a_result(search):
-    first, again, other = (search.run(seed, lambda climbs: climbs < 2, iterations=6) for seed in (1, 1, 2))
-    assert first == again
-    assert first != other
-
-
 def test_a_better_motion_is_never_given_up(search, found):
     better = Search(small_settings(excitation=found))
     assert better.figures(better.run(2, lambda climbs: climbs < 2, iterations=6)).cost <= search.figures(found).cost

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from called import called
 from numpy.testing import assert_allclose
+from scheme.smooth_motion import smooth_motion, torque_of
 
 from adacd_hil.lab.offline import recorded_columns
 from adacd_hil.lab.offline.recording_identification import identify
@@ -15,7 +16,6 @@ from adacd_hil.lab.offline.recording_map import read_map
 from adacd_hil.lab.serial_arm.offline import model_of
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import WHOLE, TimeWindow
-from adacd_hil.scheme.model.regressor import inverse_dynamics
 from adacd_hil.settings.schema import ConfigError
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "foreign"
@@ -27,23 +27,11 @@ TOUCH_S = (6.0, 6.3)
 TOUCH_NM = np.array([0.5, 0.25])
 
 
-def motion(time_s):
-    """Return q, dq, ddq (n, 2) of two sines per joint."""
-    amplitudes, rates = np.array([[0.5, 0.9], [0.15, 0.2]]), np.array([[1.7, 1.1], [4.1, 3.3]])
-    phase = rates[:, None, :] * time_s[None, :, None] + np.array([[[0.3, 1.0]], [[0.0, 2.0]]])
-    factors = amplitudes[:, None, :] * rates[:, None, :] ** np.arange(3)[:, None, None, None]
-    return (
-        (factors[0] * np.sin(phase)).sum(axis=0),
-        (factors[1] * np.cos(phase)).sum(axis=0),
-        (-factors[2] * np.sin(phase)).sum(axis=0),
-    )
-
-
 def table(seconds: float, start_s: float = 0.0, touch=None):
     """Return time ms, q deg, tau mNm, touched, elbow turned, as the example's map wants it."""
     time_s = start_s + PERIOD_S * np.arange(round(seconds / PERIOD_S))
-    q, dq, ddq = motion(time_s)
-    tau_J = np.array([inverse_dynamics(*row, THETA, 0.0) for row in zip(q, dq, ddq, strict=True)])
+    q, dq, ddq = smooth_motion(time_s)
+    tau_J = torque_of(q, dq, ddq, THETA)
     tau_J += NOISE_NM * np.random.default_rng(7).standard_normal(tau_J.shape)
     touched = np.zeros(len(time_s))
     if touch:
@@ -90,11 +78,10 @@ def test_units_and_signs_are_those_of_the_map_period_and_noise_the_recordings(fr
     assert (recording.period_s, recording.duration_s) == pytest.approx((PERIOD_S, 10.0))
     assert_allclose(recording.noise_Nm, NOISE_NM, rtol=0.1)
     (stretch,) = recording.stretches
-    q, dq, ddq = motion(PERIOD_S * np.arange(len(stretch.record.q)))
+    q, dq, ddq = smooth_motion(PERIOD_S * np.arange(len(stretch.record.q)))
     assert_allclose(stretch.record.q, q, atol=1e-7)
     assert_allclose(stretch.record.dq[20:-20], dq[20:-20], atol=2e-3)
-    expected = np.array([inverse_dynamics(*row, THETA, 0.0) for row in zip(q[:200], dq[:200], ddq[:200], strict=True)])
-    assert_allclose(stretch.record.tau_J[:200], expected, atol=6 * NOISE_NM)
+    assert_allclose(stretch.record.tau_J[:200], torque_of(q[:200], dq[:200], ddq[:200], THETA), atol=6 * NOISE_NM)
 
 
 @pytest.mark.long
@@ -156,7 +143,7 @@ def test_a_test_in_two_stretches_is_judged_by_the_worse(free, tmp_path, example)
 def test_rotors_are_parameters_only_of_motors(tmp_path, example):
     described = read_map(copy_example(tmp_path, ("[columns]", "has_rotors = true\n\n[columns]")))
     rows = table(6.0)
-    acceleration = motion(rows[:, 0] * 1e-3)[2] * np.array([0.0, -0.05])
+    acceleration = smooth_motion(rows[:, 0] * 1e-3)[2] * np.array([0.0, -0.05])
     rows[:, 3:5] += acceleration * 1e3
     found = identify(described, [read_recording(write(tmp_path / "geared.csv", rows), described)], None)
     names = found.model.parameter_names

@@ -16,7 +16,6 @@ from adacd_hil.log.log_files import CONFIG_DIGEST_KEY
 from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.score.emulator_truth import TruthTable, config_digest, contacts_beside, foreign_truth
-from adacd_hil.settings.toml_text import to_toml
 from firmware_sim.bench.bench_time import TruthLog
 from firmware_sim.scenario.scenario import load_scenario
 
@@ -66,7 +65,7 @@ def test_a_truth_that_cannot_be_read_is_left_out(content, reason, tmp_path):
 
 def recorded(folder: Path, run: Run) -> tuple[Path, Path]:
     """Write both logs of a run."""
-    record(folder / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
+    record(folder / "run.mcap", run)
     record_truth(folder / "truth.mcap", run)
     return folder / "run.mcap", folder / "truth.mcap"
 

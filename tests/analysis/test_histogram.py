@@ -5,16 +5,8 @@ import pytest
 
 from adacd_hil.lab.score.histogram import bar_chart, doubling_bins, histogram_by_key, log_counts
 from adacd_hil.plain_values import plain_values
-from adacd_hil.score.distribution import low_percentiles, percentiles
 
 INF = float("inf")
-
-
-def test_percentiles_are_values_that_occurred():
-    values = np.arange(1, 1001)
-    assert percentiles(values) == {"p50": 501.0, "p99": 991.0, "p99.9": 1000.0, "max": 1000.0}
-    assert low_percentiles(values) == {"p50": 500.0, "p1": 10.0, "p0.1": 1.0, "min": 1.0}
-    assert percentiles(values[:0]) == low_percentiles(values[:0]) == {}
 
 
 def test_a_logarithmic_histogram_counts_every_value_once_an_edge_in_the_upper_bin():

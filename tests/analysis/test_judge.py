@@ -12,7 +12,6 @@ from adacd_hil.score.judge import (
     Score,
     StreamJudge,
     TrueContact,
-    begins_of,
     contact_bounds,
     explained_until,
     judge,
@@ -109,13 +108,6 @@ def test_a_stream_is_judged_the_same_in_whatever_pieces_it_comes(pieces):
 def test_a_stream_finds_contacts_where_its_false_alarms_do_not_count():
     score = stream([touch(100, 300)], [50, 105, 500], judged=lambda t_ms: t_ms < 50)
     assert (found_ms(score), false_ms(score)) == ([5.0], [])
-
-
-def test_samples_no_further_apart_than_the_pause_are_one_alarm():
-    at = np.array([10, 15, 21, 40])
-    assert at[begins_of(at, 5)].tolist() == [10, 21, 40]
-    assert at[begins_of(at, 5, last=6)].tolist() == [21, 40]
-    assert begins_of(at[:0], 5).tolist() == []
 
 
 def test_reacting_begins_once_until_the_stop_is_over():

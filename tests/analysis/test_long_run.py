@@ -26,7 +26,6 @@ from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import CycleRecord, FaultReason, SchemeState
 from adacd_hil.score import emulator_truth
 from adacd_hil.score.emulator_truth import TruthTable, read_truth
-from adacd_hil.settings.toml_text import to_toml
 
 
 def table_of(read):
@@ -70,7 +69,7 @@ def certified(tmp_path_factory):
     times = {name: 1000 * (1 + rows * place % 977) for place, name in enumerate(CycleRecord._fields[1:6], start=1)}
     run = with_columns(run, **times, **dict.fromkeys(CycleRecord._fields[6:], rows // 4000))
     folder = tmp_path_factory.mktemp("certified")
-    record(folder / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()}, clock="realtime")
+    record(folder / "run.mcap", run, clock="realtime")
     record_truth(folder / "truth.mcap", run)
     return folder / "run.mcap"
 

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from called import called
 from foreign_arms import AXES, Motion, record, rigid_torque, urdf_text, write_recording
+from scipy.integrate import solve_ivp
 
-from adacd_hil.lab.offline.other_readings import is_possible
 from adacd_hil.lab.offline.recording_identification import Identified, identify
 from adacd_hil.lab.offline.recording_import import read_recording
 from adacd_hil.lab.offline.recording_map import read_map
-from adacd_hil.lab.serial_arm.offline import model_of
 from adacd_hil.lab.serial_arm.urdf import read_urdf
 
 LEVEL, UPRIGHT = ("0 0 1",) * 7, ("0 1 0",) * 7
@@ -67,17 +66,6 @@ def test_a_good_recording_is_explained(tmp_path, kind):
     assert found.verdict.headline == f"explained; margin {found.certificate.margin:.2f}"
     assert (found.verdict.reasons, found.verdict.remedy) == ((), "")
     assert not any("times" in remark or "drives" in remark or "stuck" in remark for remark in found.verdict.remarks)
-
-
-def test_friction_and_inertia_of_a_good_recording_are_within_their_deviations(tmp_path):
-    text = urdf_text(7, AXES)
-    motion = record(text)
-    found = judged(tmp_path, motion, AXES, has_dq=True)
-    base = found.model.base.map @ read_urdf(text).theta_full
-    truth = np.concatenate([base, *(motion.truth[key] for key in ("F_v", "F_c", "offset"))])
-    apart = (found.estimate.theta - truth) / found.deviation
-    assert np.abs(apart).max() < 5.0
-    assert np.sqrt(np.mean(apart**2)) < 1.5
 
 
 def test_joints_are_explained_though_their_sensors_have_no_noise_and_the_margin_is_small(tmp_path):
@@ -134,11 +122,6 @@ def drift(motion: Motion) -> Motion:
 
 
 UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
-    "no torque at all": (
-        lambda m: replace(m, tau=0.0 * m.tau),
-        "the torque of joint1 (tau1) and joint2 (tau2) is always 0 Nm",
-        "`columns.tau_J`",
-    ),
     "a dead sensor": (
         lambda m: replace(m, tau=m.tau * [1.0, 0.0] + [0.0, 0.31]),
         "the torque of joint2 (tau2) is always 0.31 Nm",
@@ -207,24 +190,16 @@ def test_the_share_is_that_of_what_the_same_filter_leaves_of_the_torque(tmp_path
 def test_a_passive_joint_is_told_from_a_dead_sensor(tmp_path):
     """The forearm swings freely below a driven one: nothing but noise is at its sensor, as its motion says, too."""
     text = urdf_text(2, UPRIGHT)
-    arm, period_s = read_urdf(text), 5e-3
-    t_s = period_s * np.arange(1600)
+    arm, t_s = read_urdf(text), 5e-3 * np.arange(1600)
 
-    def slope(state: np.ndarray, tau: float) -> np.ndarray:
-        q, dq = state[:2], state[2:]
+    def slope(at_s: float, state: np.ndarray) -> np.ndarray:
+        q, dq, tau = state[:2], state[2:], 6.0 * np.sin(1.3 * at_s) + 3.0 * np.sin(3.1 * at_s)
         rest, *columns = rigid_torque(arm, np.array([[q] * 3, [dq] * 3, [np.zeros(2), *np.eye(2)]]))
         M, friction = np.column_stack([column - rest for column in columns]), [0.4, 0.02] * dq
         return np.concatenate([dq, np.linalg.solve(M, [tau - 6.0 * q[0] - 2.0 * dq[0], 0.0] - rest - friction)])
 
-    states, driven, state = [], [], np.array([0.1, 1.3, 0.0, 0.0])
-    for tau in 6.0 * np.sin(1.3 * t_s) + 3.0 * np.sin(3.1 * t_s):
-        states.append(state)
-        driven.append(tau - 6.0 * state[0] - 2.0 * state[2])
-        k1 = slope(state, tau)
-        k2 = slope(state + 0.5 * period_s * k1, tau)
-        k3 = slope(state + 0.5 * period_s * k2, tau)
-        state = state + period_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + slope(state + period_s * k3, tau))
-    moved = np.array(states)
+    moved = solve_ivp(slope, (0.0, 8.0), [0.1, 1.3, 0.0, 0.0], t_eval=t_s, rtol=1e-6).y.T
+    driven = 6.0 * np.sin(1.3 * t_s) + 3.0 * np.sin(3.1 * t_s) - 6.0 * moved[:, 0] - 2.0 * moved[:, 2]
     tau = np.column_stack([driven, np.zeros(len(t_s))]) + noise((len(t_s), 2))
     verdict = judged(tmp_path, Motion(t_s, moved[:, :2], moved[:, 2:], tau), has_dq=True).verdict
     assert verdict.joints[0].is_explained
@@ -483,7 +458,6 @@ def test_masses_of_a_urdf_that_are_none_make_no_verdict(tmp_path, upright):
 
 VELOCITIES: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
     "deg/s": (times(dq=1 / DEGREE), "the velocity of joint1 (dq1) is 57.3 times", '`units.dq` = "deg/s"'),
-    "rpm": (times(dq=30.0 / math.pi), "the velocity of joint1 (dq1) is 9.55 times", '`units.dq` = "rpm"'),
     "another sign": (times(dq=TURNED), "the velocity of joint2 (dq2) has the other sign", "`columns.dq`"),
     "exchanged": (exchanged("dq"), "the velocity of joint1 (dq1) is in the column of joint2", "`columns.dq`"),
     "exchanged, of joints that move much alike": (
@@ -522,15 +496,6 @@ def test_joints_at_rest_are_named_in_one_reason(tmp_path):
     assert reason.startswith("the positions of joint1 (q1) and joint3 (q3) change by less than 0.01 rad: dead encoders")
 
 
-def test_a_stuck_sensor_makes_no_share_that_is_no_number(tmp_path, upright):
-    tau = upright.tau.copy()
-    tau[len(tau) // 3 :, 0] = tau[len(tau) // 3, 0]
-    verdict = judged(tmp_path, replace(upright, tau=tau)).verdict
-    assert math.isnan(verdict.joints[0].share)
-    assert "is stuck at" in verdict.reasons[0]
-    assert not any(text.startswith("joint1:") for text in (*verdict.reasons, *verdict.remarks))
-
-
 # The command.
 
 
@@ -566,16 +531,3 @@ def test_the_picture_of_the_test_has_the_thresholds_of_its_margin(tmp_path, upri
     ]
     assert np.concatenate(ratios).min() == pytest.approx(found.certificate.margin)
     assert found.test.contacts
-
-
-def test_an_arm_has_an_inertia_about_every_joint_and_friction_that_takes_power(upright):
-    arm = read_urdf(urdf_text(2, UPRIGHT))
-    model = model_of(arm.chain)
-    theta = np.concatenate([model.base.map @ arm.theta_full, [0.1, 0.1, 0.2, 0.2, 0.0, 0.0]])
-    assert is_possible(model, theta, upright.q, upright.dq)
-    light = theta.copy()
-    light[model.parameter_names.index("Iyy_2")] = -0.01
-    driven = theta.copy()
-    driven[model.place_of("F_c")] = [0.2, -0.2]
-    assert not is_possible(model, light, upright.q, upright.dq)
-    assert not is_possible(model, driven, upright.q, upright.dq)

@@ -8,8 +8,6 @@ import pytest
 from called import called, complaints
 from hand_made_run import A, M, make_run, record
 
-from adacd_hil.settings.toml_text import to_toml
-
 pytestmark = pytest.mark.slow
 
 
@@ -20,7 +18,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     run = make_run((A, 60), (M, 60))
     for name in ("b/deep", "a c#1"):
         (runs / name).mkdir(parents=True)
-        record(runs / name / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
+        record(runs / name / "run.mcap", run)
     (runs / "d").mkdir()
     (runs / "d" / "run.mcap").write_bytes(b"nothing of a log\x1b[2J")
     (runs / "latest").symlink_to("b")

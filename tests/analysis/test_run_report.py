@@ -12,11 +12,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hand_made_run import A, M, like_an_old_log, make_run, record, record_truth, touched_run, without_cycles
+from hand_made_run import A, M, like_an_old_log, make_run, record, touched_run, without_cycles
 from parsed_page import Page
 
 from adacd_hil.device.value_bounds import ValueBound
-from adacd_hil.lab.report import run_page
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.report_files import write_report, write_run_report
 from adacd_hil.lab.report.report_json import JSON_NAME, report_json
@@ -27,7 +26,6 @@ from adacd_hil.lab.score.verdict import headlines
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, FaultReason, SchemeState
-from adacd_hil.settings.toml_text import to_toml
 
 pytestmark = pytest.mark.slow
 SOURCE = ReportSource("run.mcap")
@@ -110,18 +108,10 @@ def test_the_table_has_the_documented_keys(table, path):
         ("adaptation_s", {"A": 1.0, "D": 0.8}),
         ("frozen_residual_max_Nm.A.identified", None),
         ("contacts.1.direction", [-1, -1]),
-        ("contacts.2.detected_s", None),
         ("false_alarms_s", [8.95]),
         ("missed", 1),
-        ("parameters.A.a1", [0.2, 0.2]),
         ("payload_kg", {"A": 0.0, "D": 1.0}),
-        ("fault", None),
         ("cycle.count", 9350),
-        ("cycle.scheduler", "SCHED_FIFO 80"),
-        ("timing.times_us.slack.min", -67.45),
-        ("timing.reaction_us", {"count": 3, "p50": 204.004, "p99": 209.0, "p99.9": 209.0, "max": 209.0}),
-        ("timing.queues_bytes.log.max", 18698.0),
-        ("timing.counts.overruns", {"total": 349, "per_100000": 3732.62}),
         ("timing.data_age_cycles", [9350, *[0] * 10]),
         ("log", {"name": "run.mcap", "frames": 12, "dropped": 0, "is_complete": True, "problem": ""}),
         ("run.seed", "7"),
@@ -147,8 +137,7 @@ def test_a_value_that_is_not_finite_becomes_null():
 
 
 def test_a_fault_is_in_the_table():
-    run = make_run((A, 100), (SchemeState.FAULT, 5))
-    run.fault[100:] = FaultReason.DATA_AGE
+    run = make_run((A, 100), (SchemeState.FAULT, 5), reason=FaultReason.DATA_AGE)
     assert table_of(run)["fault"] == {"reason": "DATA_AGE", "at_s": 0.1}
 
 
@@ -219,14 +208,8 @@ def test_the_gravest_finding_is_the_pages_heading_and_the_others_a_list_below_it
     assert (len(heading.split()), len(further)) == (13, 1)
 
 
-def test_the_first_screen_is_short(html):
-    unfolded = re.sub(r"<(details|svg|script|style|head)\b.*?</\1>", "", html, flags=re.DOTALL)
-    assert len(re.sub(r"<[^>]*>", " ", unfolded).split()) < 150
-
-
 def test_the_first_screen_of_a_bad_run_has_one_cause_and_a_list():
     run = make_run((A, 100), (SchemeState.FAULT, 50), (A, 100), (SchemeState.FAULT, 50))
-    run.fault[100:] = FaultReason.DRIVE
     cause = "drive1: " + "an error with a very long name, " * 30
     run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("error", "supervisor", f"x; {cause}")),))
     first, *further = headlines(evaluate(run))
@@ -236,27 +219,11 @@ def test_the_first_screen_of_a_bad_run_has_one_cause_and_a_list():
 
 
 def test_the_headline_of_a_value_outside_its_bounds_has_the_value():
-    run = make_run((A, 100), (SchemeState.FAULT, 50))
-    run.fault[100:] = FaultReason.SENSOR
+    run = make_run((A, 100), (SchemeState.FAULT, 50), reason=FaultReason.SENSOR)
     bound = ValueBound("torque_of_channel_2 - torque_of_channel_1", "Nm", 0, 1, -0.2, 0.2)
     cause = f"Sensor1: {bound.describe((4.05156, 0.2))}"
     run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("error", "supervisor", f"x; {cause}")),))
     assert headlines(evaluate(run))[0].endswith(cause)
-
-
-def test_the_heading_does_not_part_a_number_from_its_unit(html):
-    assert "1.00\u00a0s and again in 0.80\u00a0s after 1\u00a0kg" in html
-
-
-def test_a_run_with_a_missed_contact_looks_bad_and_one_without_fault_good(html, tmp_path):
-    good = write_run_report(make_run(), tmp_path, SOURCE).html_path.read_text(encoding="utf-8")
-    assert ('<header class="bad">' in html, '<header class="good">' in good) == (True, True)
-
-
-def test_the_page_defines_free_of_contact_by_the_time_that_the_residuals_leave_out(tmp_path, monkeypatch):
-    monkeypatch.setattr(run_page, "SETTLING_TIME_CONSTANTS", 20.0)
-    page = write_run_report(touched_run(), tmp_path, SOURCE).html_path.read_text(encoding="utf-8")
-    assert f"{20.0 / touched_run().a_rad_s:g} s (20/a)" in page
 
 
 def test_every_curve_of_the_plan_has_its_place_on_the_page(html):
@@ -264,10 +231,6 @@ def test_every_curve_of_the_plan_has_its_place_on_the_page(html):
     planned = {f"panel-{panel['name']}" for track in plan["tracks"] for panel in track["panels"]}
     assert set(re.findall(r'<figure class="trace scripted" id="([^"]*)"', html)) == planned
     assert {"panel-residual1", "panel-theta-a1", "panel-time-slack", "panel-queues"} <= planned
-
-
-def test_curves_describe_themselves_to_those_who_cannot_see_them(html):
-    assert 'role="img" aria-label="Estimated external torque tau_ext_hat, joint 1, Nm: ' in html
 
 
 def row_of(html, title):
@@ -312,34 +275,10 @@ def test_the_page_of_a_log_without_cycles_is_well_formed(tmp_path):
 
 
 @pytest.mark.long
-def test_the_same_run_gives_the_same_page(html, tmp_path):
-    again = write_run_report(touched_run(), tmp_path, SOURCE)
-    assert again.html_path.read_text(encoding="utf-8") == html
-
-
-@pytest.mark.long
 def test_a_folder_that_cannot_be_made_is_a_log_error(tmp_path):
     (tmp_path / "taken").write_text("")
     with pytest.raises(LogError, match=r"report in .*taken can't be written"):
         write_run_report(make_run((A, 10)), tmp_path / "taken", SOURCE)
-
-
-def without_cycle_times(table):
-    """Leave out what the recorded run doesn't have, and what describes the file."""
-    skipped = ("cycle", "timing", "log", "run")
-    return {key: value for key, value in table.items() if key not in skipped}
-
-
-@pytest.mark.long
-def test_a_report_from_files_says_the_same_as_one_from_memory(tmp_path):
-    run = replace(touched_run(), tau_ext_hat_cad=touched_run().tau_ext_hat_cad * 0.0)
-    record(tmp_path / "run.mcap", run, {"config.toml": to_toml(run.settings).encode()})
-    record_truth(tmp_path / "truth.mcap", run)
-    report = write_report(tmp_path / "run.mcap", tmp_path / "truth.mcap", tmp_path / "a")
-    from_files = report.content
-    assert from_files["run"]["emulator_seed"] == "7"
-    from_memory = write_run_report(run, tmp_path / "b", SOURCE).content
-    assert without_cycle_times(from_files) == without_cycle_times(from_memory)
 
 
 @pytest.mark.parametrize(

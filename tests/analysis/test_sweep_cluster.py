@@ -2,33 +2,32 @@
 
 import subprocess
 import sys
-from datetime import timedelta
 from pathlib import Path
 
 import pytest
 from called import called
 from hang import HANG_S
-from made_certificates import Authority
+from made_certificates import self_signed
 
 distributed = pytest.importorskip("distributed")
 parquet = pytest.importorskip("pyarrow.parquet")
 
 
 @pytest.fixture(scope="module")
-def authority(tmp_path_factory: pytest.TempPathFactory) -> Authority:
-    return Authority(tmp_path_factory.mktemp("tls") / "lab")
+def signed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    return self_signed(tmp_path_factory.mktemp("tls"), "lab")
 
 
 @pytest.fixture(scope="module")
-def cluster(authority: Authority):
-    """A scheduler and a worker at tls://, that trust what the lab has signed."""
-    certificate, key = map(str, authority.sign("cluster"))
+def cluster(signed):
+    """A scheduler and a worker at tls://, that trust the certificate of the lab."""
+    certificate, key = map(str, signed)
     of_all = {
         f"tls_{who}_{what}": value
         for who in ("client", "scheduler", "worker")
         for what, value in (("cert", certificate), ("key", key))
     }
-    security = distributed.Security(require_encryption=True, tls_ca_file=str(authority.ca_file), **of_all)
+    security = distributed.Security(require_encryption=True, tls_ca_file=certificate, **of_all)
     with distributed.LocalCluster(
         n_workers=1,
         threads_per_worker=1,
@@ -48,38 +47,17 @@ def sweep(folder: Path, log: Path, *more: object) -> "subprocess.CompletedProces
     return subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False, cwd=folder)
 
 
-def files(authority: Authority, who: str, **changes: timedelta) -> list[object]:
-    certificate, key = authority.sign(who, **changes)
-    return ["--tls-ca-file", authority.ca_file, "--tls-cert", certificate, "--tls-key", key]
+def files(signed: tuple[Path, Path]) -> list[object]:
+    certificate, key = signed
+    return ["--tls-ca-file", certificate, "--tls-cert", certificate, "--tls-key", key]
 
 
 @pytest.mark.long
-def test_a_small_sweep_over_tls(tmp_path, log, cluster, authority):
-    played = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *files(authority, "engineer"))
+def test_a_small_sweep_over_tls(tmp_path, log, cluster, signed):
+    played = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *files(signed))
     assert (played.returncode, "is open" in played.stderr) == (0, False)
     rows = parquet.read_table(tmp_path / "out/sweep.parquet").to_pylist()
     assert [(row["set.detector.threshold_Nm"], row["status"]) for row in rows] == [("0.1", "ok"), ("0.4", "ok")]
-
-
-@pytest.mark.long
-def test_certificates_can_stand_in_dasks_configuration(tmp_path, log, cluster, authority, monkeypatch):
-    certificate, key = authority.sign("configured")
-    tls = f"{{ca-file: {authority.ca_file}, client: {{cert: {certificate}, key: {key}}}}}"
-    (tmp_path / "dask.yaml").write_text(f"distributed: {{comm: {{tls: {tls}}}}}\n")
-    monkeypatch.setenv("DASK_CONFIG", str(tmp_path / "dask.yaml"))
-    assert sweep(tmp_path, log, "--scheduler", cluster.scheduler_address).returncode == 0
-
-
-@pytest.mark.long
-def test_who_has_no_certificate_of_the_clusters_is_one_line_and_status_1(tmp_path, log, cluster, authority):
-    stranger = Authority(tmp_path / "stranger")
-    mixed = files(stranger, "mixed")
-    mixed[1] = authority.ca_file  # trusts the cluster, but is not trusted
-    for words in (files(stranger, "stranger"), mixed, files(authority, "late", lasts=-timedelta(days=1))):
-        refused = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *words)
-        complaints = [line for line in refused.stderr.splitlines() if not line.startswith("2 rows")]
-        assert (refused.returncode, len(complaints)) == (1, 1), refused.stderr
-        assert complaints[0].startswith(f"adacd-hil: no Dask scheduler at {cluster.scheduler_address}: ")
 
 
 @pytest.mark.parametrize(
@@ -95,12 +73,10 @@ def test_who_has_no_certificate_of_the_clusters_is_one_line_and_status_1(tmp_pat
         ({"--scheduler": "tcp://127.0.0.1:1"}, "are for tls:// addresses, not tcp://127.0.0.1:1"),
     ],
 )
-def test_certificates_that_cant_be_used_are_one_line_and_status_2(
-    tmp_path, log, authority, monkeypatch, changes, reason
-):
+def test_certificates_that_cant_be_used_are_one_line_and_status_2(tmp_path, log, signed, monkeypatch, changes, reason):
     (tmp_path / "text.pem").write_text("no certificate\n")
-    (tmp_path / "other.pem").write_bytes(authority.sign("other")[1].read_bytes())
-    given = files(authority, "user")
+    self_signed(tmp_path, "other")[1].rename(tmp_path / "other.pem")
+    given = files(signed)
     words: dict[object, object] = {
         "--scheduler": "tls://127.0.0.1:1",
         **dict(zip(given[::2], given[1::2], strict=True)),

@@ -3,13 +3,14 @@
 import json
 import math
 import os
+import runpy
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 from called import called
-from numpy.lib.stride_tricks import sliding_window_view
+from scheme.smooth_motion import torque_of
 
 from adacd_hil.lab.detectors.detectors import DetectorBankSettings, register, unregister
 from adacd_hil.lab.thresholds import free_motion as module
@@ -31,6 +32,7 @@ from adacd_hil.settings.toml_files import read_toml
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 compiled_only = pytest.mark.skipif(INTERPRETED, reason="minutes of recording take minutes when interpreted")
 
+EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "detector" / "lab_detectors.py"
 T = 1e-3
 THETA = np.array([0.3841, 0.06825, 0.04035, 0.12, 0.06, 0.15, 0.08])
 LAG_S = 1.5e-3
@@ -43,19 +45,6 @@ def positions(t_s):
     return 0.6 * np.sin(phase), 0.6 * RATES * np.cos(phase), -0.6 * RATES**2 * np.sin(phase)
 
 
-def torque(q, dq, ddq):
-    """Closed form of the arm, vectorised."""
-    a1, a2, a3, fv1, fv2, fc1, fc2 = THETA
-    c2, s2 = np.cos(q[:, 1]), np.sin(q[:, 1])
-    coriolis = a2 * s2
-    tau1 = (a1 + 2 * a2 * c2) * ddq[:, 0] + (a3 + a2 * c2) * ddq[:, 1]
-    tau1 += -coriolis * (2 * dq[:, 0] * dq[:, 1] + dq[:, 1] ** 2)
-    tau2 = (a3 + a2 * c2) * ddq[:, 0] + a3 * ddq[:, 1] + coriolis * dq[:, 0] ** 2
-    return np.stack(
-        [tau1 + fv1 * dq[:, 0] + fc1 * np.sign(dq[:, 0]), tau2 + fv2 * dq[:, 1] + fc2 * np.sign(dq[:, 1])], axis=1
-    )
-
-
 def log_of(seconds, seed=1, **changes):
     """A log in memory: the arm moves in MONITOR, its torque noisy, its velocity late and in steps of 5e-4 rad/s."""
     count = round(seconds / T)
@@ -66,7 +55,7 @@ def log_of(seconds, seed=1, **changes):
     scheme = {
         "q": q,
         "dq": np.round(late / 5e-4) * 5e-4,
-        "tau_J": torque(q, dq, ddq) + 0.02 * generator.standard_normal((count, 2)),
+        "tau_J": torque_of(q, dq, ddq, THETA) + 0.02 * generator.standard_normal((count, 2)),
         "theta_hat": np.tile(THETA, (count, 1)),
         "period_s": np.full((count, 1), T),
         "cycle": np.arange(count),
@@ -244,25 +233,11 @@ def test_the_detectors_are_compared_at_one_rate(statistics, tmp_path):
     assert "<svg" in paths[2].read_text()
 
 
-class MeanOfTwenty:
-    """A detector of this file: the mean of the last 20 samples, less what friction may hold."""
-
-    def __init__(self, period_s):
-        assert period_s == T
-        self.last = np.zeros((19, 2)), np.zeros((19, 2))
-
-    def take(self, z, held_Nm):
-        z, held_Nm = (np.concatenate(pair) for pair in zip(self.last, (z, held_Nm), strict=True))
-        self.last = z[len(z) - 19 :], held_Nm[len(z) - 19 :]
-        mean, allowance = (sliding_window_view(column, 20, axis=0).mean(axis=-1) for column in (z, held_Nm))
-        return np.abs(mean) - allowance
-
-
 @compiled_only
 def test_a_detector_that_is_registered_is_in_the_thresholds_and_in_the_report(tmp_path):
-    register("mean of 20", MeanOfTwenty)
+    register("mean of 20", runpy.run_path(str(EXAMPLE))["MeanOfTwenty"])
     try:
-        found = statistics_of({"run.mcap": log_of(70.0)}, count=7_001)
+        found = statistics_of({"run.mcap": log_of(55.0)}, count=7_001)
         thresholds = compute_thresholds(found, 5.0)
         comparison = compare_detectors(found, 5.0, onsets=4)
     finally:

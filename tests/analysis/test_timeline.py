@@ -8,12 +8,12 @@ import pytest
 from hand_made_run import A, M, make_run, react, touch, touched_run, without_cycles
 
 from adacd_hil.lab.report.page import render
-from adacd_hil.lab.report.run_page import CARDS, Push, contact_cards, contacts_table, draw_arm
+from adacd_hil.lab.report.run_page import CARDS, Push, contact_cards, draw_arm
 from adacd_hil.lab.report.timeline import notices_of, state_key, stays_of, timeline_of
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.run_arrays import MeasuredMotion
 from adacd_hil.log.reader import LoggedEvent
-from adacd_hil.records import Event, FaultReason, Location, SchemeState
+from adacd_hil.records import Event, Location, SchemeState
 
 
 def test_stays_follow_one_another_without_a_gap():
@@ -46,14 +46,8 @@ def test_marks_lie_where_their_time_is():
     assert [tuple(map(float, box)) for box in boxes] == [(78.0, 459.0), (537.0, 459.0)]
 
 
-def test_the_key_names_the_states_that_the_run_has_been_in():
-    key = state_key(make_run((A, 100), (M, 200), (SchemeState.STOPPED, 5)))
-    assert key == [("adaptation", "learning"), ("stopped", "stopped")]
-
-
 def test_a_fault_and_a_warning_are_notices_in_the_order_of_time():
     run = make_run((A, 100), (SchemeState.FAULT, 50))
-    run.fault[100:] = FaultReason.DRIVE
     told = ((50, "info", "fine"), (110, "error", "off"), (120, "warning", "slow"))
     events = tuple(LoggedEvent(int(run.t_ns[row]), Event(level, "bus", what)) for row, level, what in told)
     run = replace(run, events=events)
@@ -106,15 +100,6 @@ def test_the_force_pushes_toward_its_side_at_its_lever_arm_whose_spread_is_a_bar
     assert points_of(svg, "spread") == ((590, 0), (610, 0))
 
 
-def test_a_stronger_force_is_a_longer_arrow_and_one_without_a_place_dashed():
-    def length(share, kind="force", place=(0.1, 0.01)):
-        (_, tail), (_, neck) = points_of(arm_at((0.0, 0.0), Push(1, 1, share, *place)), kind)
-        return neck - tail
-
-    assert length(1.0) > 1.5 * length(0.2)
-    assert length(1.0, "force guessed", (None, None)) == length(1.0)
-
-
 def carded(run):
     metrics = evaluate(run)
     return render("contact_cards.html.j2", cards=contact_cards(metrics, run), metrics=metrics)
@@ -162,15 +147,3 @@ def test_cards_stop_where_the_table_goes_on():
         touch(run, 1100 + 20 * index, 10, (5.0, 0.0), index=index)
     html = carded(run)
     assert (html.count("<h3>"), f"The first {CARDS} of {CARDS + 2}." in html) == (CARDS, True)
-
-
-@pytest.mark.parametrize(
-    ("link", "direction", "marked"),
-    [(1, (1, 0), []), (2, (1, 0), ["found on link"]), (1, (-1, 0), ["direction right"])],
-)
-def test_a_wrong_link_or_direction_is_marked_in_the_table_of_contacts(link, direction, marked):
-    run = make_run()
-    touch(run, 2000, 250, (6.0, 0.0))
-    table = contacts_table(evaluate(react(run, 2005, link=link, direction=direction)))
-    named = zip(table.head, table.rows[0], strict=True)
-    assert [head.content for head, cell in named if cell.kind == "bad"] == marked

@@ -19,10 +19,6 @@ from adacd_hil.settings.setting_keys import (
 PAPER = load_settings("paper")
 
 
-def test_a_number_stands_for_a_list_of_it():
-    assert apply_settings(PAPER, {"detector.threshold_Nm": "0.1"}).detector.threshold_Nm == (0.1, 0.1)
-
-
 def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken():
     changed = apply_settings(
         PAPER,

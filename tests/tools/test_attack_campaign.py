@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import attack_campaign
 import attack_vcan
 import attacked_run
 import attacks
@@ -195,27 +194,6 @@ def test_travel_counts_from_the_attack_to_rest() -> None:
     assert (found.noticed_ms, found.stopped_ms, found.rest_after_notice_ms) == (10.0, 10.0, 80.0)
     assert found.travelled_deg == pytest.approx(9.0, abs=0.15)
     assert (found.fastest_deg_s, found.furthest_deg, found.verdict) == (100.0, 10.0, "ok")
-
-
-def test_the_table_and_the_status_tell_bad_rows() -> None:
-    bad = finding(noticed_ms=None, verdict="UNNOTICED")
-    assert attack_campaign.is_bad(bad)
-    assert not attack_campaign.is_bad(finding(verdict="ok, no effect"))
-    table = attack_campaign.as_table([bad, finding(verdict="ok")])
-    assert "never" in table
-    assert "UNNOTICED" in table
-
-
-def test_virtual_time_plays_what_it_can_and_a_vcan_everything() -> None:
-    virtual, everything = set(attack_campaign.virtual_names()), set(attack_vcan.names())
-    assert {attack_campaign.NOTHING, "sync-doubled", "command-both"} <= virtual
-    assert virtual < everything
-    assert {"remote", "second-run", attack_vcan.KILLED} <= everything - virtual
-
-
-def test_an_interface_that_is_not_there_is_said_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert attack_campaign.main(["--vcan", "nocan7", "command-both"]) == 5
-    assert "no interface nocan7" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

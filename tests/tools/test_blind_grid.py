@@ -1,56 +1,22 @@
-"""tools/campaigns/blind_grid.py: its rows, what it makes of a push, and the scenario that began it."""
+"""tools/campaigns/blind_grid.py: what it makes of a push, and a row without a fault."""
 
 from pathlib import Path
 
 import blind_grid
 import pytest
-from blind_grid import FIRST, SHORT, Outcome, Row
+from blind_grid import SHORT, Row
 from made_run import Made, states
 from run_rules import Case
 
 from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.records import SchemeState
 
-ROW = Row("certified", "arm", "torque", "sensor1", 550, 1.0, "random")
 PUSH = 700  # cycles
 TOUCH = range(PUSH, PUSH + 500)
 
 
-def test_the_grid_has_every_frame_delay_and_share_of_both_schemes_and_three_contracts() -> None:
-    rows = blind_grid.grid()
-    assert len(rows) == len(set(rows))
-    for scheme in ("certified", "paper"):
-        mine = {row for row in rows if row.scheme == scheme and row.delay_us}
-        assert {row.contract for row in mine} == {"arm", "arm_fd", "arm_stock"}
-        assert {row.frame for row in mine} == {"feedback", "torque", "command", "status"}
-        assert {(row.delay_us, row.share) for row in mine} >= {(50, 0.01), (640, 0.5), (1500, 1.0)}
-    assert not [row for row in rows if row.contract == "arm_fd" and row.frame == "status"]
-    assert sum(not row.delay_us for row in rows) == 6
-
-
-def test_a_row_is_played_as_it_says() -> None:
-    scenario = blind_grid.scenario_of(ROW, FIRST)
-    (fault,) = scenario.faults
-    assert (fault.frame, fault.node, fault.delay_us) == ("torque", "sensor1", 550.0)
-    assert (fault.at_s, fault.chance) == (FIRST.fault_s, 1.0)
-    assert [(contact.at_s, contact.force_N) for contact in scenario.contacts] == [(8.0, 8.0), (9.5, 3.0)]
-
-
-def test_a_contiguous_share_begins_just_before_each_push_and_is_that_share_of_the_time() -> None:
-    row = Row("paper", "arm_fd", "feedback", "drive2", 800, 0.1, "contiguous")
-    faults = blind_grid.scenario_of(row, SHORT).faults
-    assert [fault.at_s for fault in faults] == [pytest.approx(at_s - 0.005) for at_s in SHORT.pushes_s]
-    whole_s = SHORT.pushes_s[1] + 0.5 - SHORT.fault_s
-    assert sum(fault.duration_s or 0.0 for fault in faults) == pytest.approx(0.1 * whole_s, abs=1e-3)
-
-
-def _pushed_run(*changes: tuple[int, SchemeState], events: tuple[tuple[int, str, str, str], ...] = ()) -> Case:
-    played = Made(
-        cycles=1500,
-        state=states(*changes),
-        tau_ext=lambda k: 1.0 if k in TOUCH else 0.0,
-        events=list(events),
-    ).play()
+def _pushed_run(*changes: tuple[int, SchemeState]) -> Case:
+    played = Made(cycles=1500, state=states(*changes), tau_ext=lambda k: 1.0 if k in TOUCH else 0.0).play()
     played.truth.block[:, TRUTH_LAYOUT.slices["contact_index"]] = -1.0
     played.truth.block[list(TOUCH), TRUTH_LAYOUT.slices["contact_index"]] = 0.0
     return Case(played)
@@ -71,23 +37,6 @@ def test_a_push_is_found_if_the_arm_reacts_while_it_lasts(
 ) -> None:
     assert blind_grid.push_verdict(_pushed_run(*changes), 0) == verdict
     assert blind_grid.push_verdict(_pushed_run(*changes), 1) == "not armed"  # this push never came
-
-
-def test_only_warnings_since_the_fault_name_it() -> None:
-    early, late = (100, "warning", "realtime", "not granted"), (900, "warning", "data", "Sensor1 is late")
-    info = (800, "info", "supervisor", "ADAPT -> MONITOR")
-    case = _pushed_run(events=(early, info, late))
-    assert blind_grid.named_trouble(case, 0.3) == "data: Sensor1 is late"
-    assert blind_grid.named_trouble(_pushed_run(events=(early, info)), 0.3) == ""
-
-
-def test_the_summary_counts_what_was_missed_in_silence() -> None:
-    silent = Outcome(ROW, ["missed", "found"], "MONITOR NONE", 5, 5, 0, "", True, ["blind"])
-    named = Outcome(ROW, ["missed", "missed"], "FAULT DATA_AGE", 5, 5, 0, "supervisor: FAULT", False, [])
-    totals = blind_grid.summary([silent, named])
-    assert (totals["bad"], totals["missed_in_silence"], totals["stood_still_rows"]) == (1, 1, 1)
-    assert totals["pushes"] == {"missed": 3, "found": 1}
-    assert "BAD" in blind_grid.as_table([silent])
 
 
 @pytest.mark.long

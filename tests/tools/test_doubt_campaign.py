@@ -60,19 +60,3 @@ def test_what_an_error_meets_must_be_said(contacts, said, is_met):
     value, met = figures("wrong", [row])["torque offset: taken back, said, met by a contact"]
     assert met is is_met
     assert value.endswith("up to 0.50" if contacts == 0 else "up to 0.00")
-
-
-def test_what_was_not_played_has_no_figure():
-    assert [name[:6] for name in figures("payload", [GOOD])] == ["0.2 kg"]
-    row = Played(1, "viscous friction", 0.2, "the certificate is taken back", 0.2, 4, 7.25)
-    value, _ = figures("wrong", [row, row._replace(contacts=3)])["viscous friction: contacts until it is taken back"]
-    assert value == "1 of 2 within 3, the slowest after 7.2 s"
-
-
-def test_one_sequence_of_touches_in_a_hundred_may_be_named():
-    quiet = Played(1, "touches", 0.0, "", 0.0, 12, 30.0)
-    named = quiet._replace(said=LOADED, named=0.19)
-    for count, is_met in ((1, True), (2, False)):
-        rows = [quiet] * (100 - count) + [named] * count
-        value, met = figures("touches", rows)["sequences that were named as an error"]
-        assert (value, met) == (f"{count} of 100", is_met)

@@ -3,7 +3,6 @@
 import dataclasses
 from pathlib import Path
 
-import damage_campaign
 import numpy as np
 import pytest
 import run_rules
@@ -12,7 +11,6 @@ import timing_hogs
 import vcan_kills
 from judged_log import judged_log
 from run_rules import Violation
-from vcan_kills import VcanKill
 
 from adacd_hil.cli.embedded_run import Cast, run_embedded
 from adacd_hil.log.reader import Series
@@ -50,10 +48,6 @@ def test_a_host_that_outlives_its_arm_or_its_logger_ends_as_documented() -> None
     assert vcan_kills.status_violations("host", None, []) == []
 
 
-def test_a_drive_left_enabled_is_named() -> None:
-    assert vcan_kills.drive_violations(["fault", "operation enabled"]) == ["drive 2 ends in operation enabled"]
-
-
 def test_rest_after_a_kill_is_read_off_the_truth() -> None:
     times_ns = np.arange(100) * 10_000_000
     speed = np.where(np.arange(100) < 50, 1.0, 0.0)[:, None] * np.ones((1, 2))
@@ -62,23 +56,11 @@ def test_rest_after_a_kill_is_read_off_the_truth() -> None:
     assert vcan_kills.rest_s(times_ns, speed, 2_000_000_000) is None
 
 
-def test_kills_on_vcan_count_among_the_violations() -> None:
-    kills = [VcanKill(1, "host"), VcanKill(2, "logger", violations=["nothing saved"])]
-    totals = damage_campaign.summary([], [], kills)
-    assert (totals["killed_on_vcan"], totals["violations"]) == (2, 1)
-
-
 def test_a_set_clock_that_changes_a_run_is_told() -> None:
     forward = np.arange(5)
     assert timing_clock.violations_of(130, {"fault": "NONE"}, "", forward) == []
     told = timing_clock.violations_of(4, {"fault": "DATA_AGE"}, "cut", forward[::-1])
     assert told == ["exit status 4", "fault DATA_AGE", "cut", "the log's cycles go back in time"]
-
-
-def test_hogs_are_gone_when_the_block_ends(tmp_path: Path) -> None:
-    with timing_hogs.hogs(2, 1, tmp_path) as processes:
-        assert [process.poll() for process in processes] == [None] * 3
-    assert [process.returncode for process in processes] == [-9] * 3
 
 
 def test_what_follows_what_is_judged_but_for_a_second_after_missing_cycles() -> None:

@@ -37,16 +37,3 @@ def is_private(name: str) -> bool:
 @pytest.mark.parametrize("tool", PYTHON_TOOLS, ids=lambda path: path.name)
 def test_a_tool_uses_public_names_only(tool: Path) -> None:
     assert private_names(tool.read_text(encoding="utf-8")) == []
-
-
-@pytest.mark.parametrize(
-    ("source", "found"),
-    [
-        ("from adacd_hil.clock import _now", ["1: _now of adacd_hil.clock"]),
-        ("import body\nbody.Body()._state", ["2: body.Body()._state"]),
-        ("patch('adacd_hil.clock._now')", ["1: adacd_hil.clock._now"]),
-        ("self._state\ncls._made\nrow._asdict()\nos._exit(1)\n__file__\n_own = 1\n_own + 1", []),
-    ],
-)
-def test_what_is_private_is_found(source: str, found: list[str]) -> None:
-    assert private_names(source) == found

@@ -38,53 +38,6 @@ def test_each_place_is_listed_with_its_line(tmp_path: Path, capsys: pytest.Captu
     ]
 
 
-@pytest.mark.parametrize(
-    ("text", "is_found"),
-    [
-        ("What is through counts.", True),
-        ("It ends. Who writes waits.", True),
-        ("What is it? A question.", False),
-        ("The frame that is through counts.", False),
-        ("Somewhat late.", False),
-    ],
-)
-def test_a_relative_clause_is_found_where_it_begins_a_sentence(text: str, is_found: bool) -> None:
-    assert ("relative clause as subject" in {name for name, _, _ in prose.find_hits(text)}) == is_found
-
-
-def test_figures_are_per_1000_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    module = tmp_path / "module.py"
-    module.write_text(f'"""{"word " * 99}what"""\n')
-    assert prose.main(["--figures", str(module)]) == 0
-    figures = capsys.readouterr().out.splitlines()
-    assert figures[0] == "100 words"
-    assert figures[2].split() == ["what", "10.00", "per", "1000", "words,", "1", "in", "all"]
-
-
-@pytest.mark.parametrize("content", [None, b"def f(:\n", b"# caf\xe9\n"], ids=["missing", "no Python", "Latin-1"])
-def test_a_file_that_can_not_be_read_is_named(
-    content: bytes | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = tmp_path / "module.py"
-    if content is not None:
-        path.write_bytes(content)
-    assert prose.main([str(path)]) == 2
-    assert "module.py" in capsys.readouterr().err
-
-
-def test_docstrings_of_attributes_and_nested_functions_count(tmp_path: Path) -> None:
-    source = 'LIMIT = 1\n"""What it is."""\ndef f():\n    def g():\n        """Who asks."""\n    return f"what {g}"\n'
-    assert list(prose.prose(source)) == [(2, "What it is."), (5, "Who asks.")]
-
-
-def test_code_and_targets_of_links_on_a_page_do_not_count(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = tmp_path / "page.md"
-    page.write_text("Run it:\n\n```sh\necho what\n```\n\nSee `what` and [this](that.md#what). It says so.\n")
-    assert prose.main([str(tmp_path)]) == 0
-    shown = capsys.readouterr().out.splitlines()
-    assert [line.removeprefix(str(page)).split(": ")[:2] for line in shown[:-5]] == [[":7", "hearsay"]]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("tops", [("adacd_hil", "firmware_sim"), PAGES], ids=["code", "pages"])
 def test_code_and_pages_keep_to_plain_sentences(tops: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:

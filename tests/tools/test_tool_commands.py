@@ -66,10 +66,7 @@ def exists(dotted: str) -> bool:
 def test_modules_and_paths_that_a_tool_names_exist(tool: Path) -> None:
     assert [name for name in sorted(dotted_names(tool)) if not exists(name)] == []
     text = tool.read_text(encoding="utf-8")
-    paths = re.findall(
-        r"(?<![\w/.])(?:adacd_hil|firmware_sim|tests|tools|docs|dbc)/[\w/-]+\.(?:py|md|c|toml|dbc)", text
-    )
-    assert [path for path in dict.fromkeys(paths) if not (ROOT / path).exists()] == []
+    assert [path for path in dict.fromkeys(PATH.findall(text)) if not (ROOT / path).exists()] == []
 
 
 @pytest.mark.parametrize(("module", "patterns"), mutate.TARGETS.items())
