@@ -31,7 +31,9 @@ def run_on(host: BenchHost, periods: int) -> None:
 def test_a_torque_that_comes_with_a_sync_moves_the_arm_from_that_sync_on(clock_mode: str):
     host = BenchHost(quiet_scenario(), clock_mode=clock_mode)
     host.enable()
-    host.step(Word.ENABLE, 500)
+    host.command(Word.ENABLE, 500)
+    assert host.bench.drives[0].torque_Nm == 0.0
+    host.sync()
     assert host.true("tau_m").tolist() == [0.0, 0.0]
     host.step(Word.DISABLE_VOLTAGE)
     assert host.true("tau_m") == pytest.approx([6.0, 3.0], rel=0.01)

@@ -85,19 +85,6 @@ def test_a_second_host_finds_an_arm_at_rest_and_its_own_count():
     assert host.state_bits() == State.ENABLED
 
 
-def test_a_braking_that_a_watchdog_caused_by_time_is_told_too():
-    host = BenchHost()
-    for node in (1, 2):
-        host.write(node, 0x1016, 1, 127 << 16 | 50)
-    host.enable()
-    host.put(0x77F, b"\x05")
-    host.step(Word.ENABLE, 300, times=40)
-    begun = len(host.truths)
-    host.bench.advance_to(host.bench.now_ns + 1_000 * MS)
-    assert speeds(host, begun)[-1] < REST_RAD_S
-    assert 10 < len(host.truths) - begun < 1000
-
-
 def test_by_the_clock_the_truth_goes_on_once_sync_is_overdue():
     host = moving("wall")
     begun = len(host.truths)

@@ -78,18 +78,6 @@ def test_the_status_of_a_drive_follows_statusword_mode_and_error_and_not_the_tor
     assert [data[5:] for data in host.taken(0x281)] == [b"\x10\x23"]
 
 
-def test_the_status_of_a_sensor_follows_status_and_error_register():
-    host = running()
-    host.sync()
-    host.take()
-    host.bench.sensors[0].set_error(1)
-    host.sync()
-    host.sync()
-    assert host.taken(0x283) == [b"\x01\x00"]
-    host.put(0x080, b"")  # a SYNC of the wrong length: error register
-    assert host.taken(0x283) == [b"\x01\x11"]
-
-
 def test_what_sdo_writes_to_the_header_objects_is_dropped():
     host = running()
     host.step(Word.DISABLE_VOLTAGE)

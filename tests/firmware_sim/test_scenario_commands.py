@@ -59,25 +59,6 @@ def test_what_show_prints_loads_to_the_same_scenario(capsys, tmp_path, option):
     assert run_main("check", str(path)) == 0
 
 
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("name = ", "Invalid value"),
-        (
-            f"contacts = [{GOOD_CONTACT}, {GOOD_CONTACT.replace('link = 2', 'link = 3')}]",
-            "`contacts[1].link` = 3 is above 2",
-        ),
-    ],
-)
-def test_check_names_file_key_value_and_bound(capsys, tmp_path, text, problem):
-    path = tmp_path / "mine.toml"
-    path.write_text(text, encoding="utf-8")
-    assert run_main("check", str(path)) == 2
-    (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith(f"{path}: ")
-    assert problem in line
-
-
 def test_check_has_a_line_for_each_problem_of_each_file(capsys, tmp_path):
     first, second = tmp_path / "first.toml", tmp_path / "second.toml"
     first.write_text("seed = -1\npayload_kg = 21.0\nnoize = false\n[sensors]\ntorque_bits = [3, 16]\n")
