@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from bench_host import BenchHost, State, Word, quiet_scenario
+from bench_host import BenchHost, State, Word, moving_host
 from general_arm import BRAKE, OFF, TORQUE, truth_of
 
 from adacd_hil.settings.parsing import parse
@@ -202,9 +202,7 @@ def test_i2t_limits_or_faults_as_the_scenario_says(reaction, code):
 
 
 def make_host(**drives) -> BenchHost:
-    host = BenchHost(quiet_scenario(profile="S", drives=drives))
-    host.enable()
-    return host
+    return moving_host(times=0, profile="S", drives=drives)
 
 
 OVERHEATING = {"winding_rise_K": [400.0, 0.0], "winding_time_s": [0.05, 1.0], "overheat_C": [120.0, 130.0]}
@@ -223,7 +221,6 @@ def test_the_statusword_says_that_a_limit_is_active():
 
 def test_an_overheated_motor_faults_its_drive_and_no_other_until_it_has_cooled_and_is_reset():
     host = make_host(**OVERHEATING)
-    host.take()
     syncs = 0
     while not host.statusword() & 0x08:
         host.step(Word.ENABLE, 1000, joints=(1,))
