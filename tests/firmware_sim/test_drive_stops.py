@@ -171,10 +171,3 @@ def test_another_mode_takes_effect_at_the_next_sync_while_enabled_and_at_once_el
     host.step(Word.ENABLE, 100)
     assert host.read(1, 0x6061) == 0
     assert host.bench.drives[0].torque_Nm == 0.0
-
-
-def test_encoder_and_gear_give_the_counts_of_a_joint_revolution():
-    host = BenchHost()
-    increments = host.read(1, 0x608F, 1) / host.read(1, 0x608F, 2)
-    assert increments * host.read(1, 0x6091, 1) / host.read(1, 0x6091, 2) == 1 << 20
-    assert host.read(1, 0x6502) == 1 << 9

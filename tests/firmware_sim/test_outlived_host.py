@@ -78,19 +78,6 @@ def test_a_second_host_finds_an_arm_at_rest_and_its_own_count():
     assert host.state_bits() == State.ENABLED
 
 
-def test_by_the_clock_the_truth_goes_on_once_sync_is_overdue():
-    host = moving_host(clock_mode="wall")
-    begun = len(host.truths)
-    last_cycle, last_ns = host.truths[-1][:2]
-    host.bench.advance_to(host.t_ns + 2_000 * MS)
-    told = host.truths[begun:]
-    assert [(cycle - last_cycle) * PERIOD_NS for cycle, _, _ in told] == [t_ns - last_ns for _, t_ns, _ in told]
-    assert [cycle - last_cycle for cycle, _, _ in told[:3]] == [4, 5, 6]
-    assert speeds(host, begun)[-50:].max() < REST_RAD_S
-    assert len(told) < 1000
-    assert host.bench.is_at_rest
-
-
 def test_by_the_clock_a_lost_sync_or_two_leave_a_gap_as_ever():
     patience = {(node, index, 0): value for node in (1, 2) for index, value in ((0x2200, 255), (0x2201, 10_000))}
     host = moving_host(clock_mode="wall", objects=patience)
