@@ -1,4 +1,4 @@
-"""The arm against MuJoCo, an engine that is not ours: trajectories, springs, backlash, and what a push gives."""
+"""The arm against MuJoCo, an engine that is not ours: trajectories with springs and backlash."""
 
 import math
 

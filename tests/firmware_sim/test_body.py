@@ -1,4 +1,4 @@
-"""The emulated arm as the device nodes see it: timing, measurements, truth, braking, determinism."""
+"""The emulated arm as the device nodes see it: timing, measurements, truth, braking."""
 
 import dataclasses
 import math
