@@ -90,6 +90,13 @@ def test_another_period_can_be_written_again_once_the_nodes_have_left_operationa
     assert host.bench.now_ns == now_ns + 2 * PERIOD_NS
     assert np.abs(host.true("q") - position).max() < 0.05
     assert np.abs(position).max() > 0.005
+    host.nmt(Nmt.RESET_COMMUNICATION)  # a second host that leaves the default period
+    assert host.read(1, 0x1006) == 1000
+    host.cycle = 0
+    host.sync()
+    now_ns = host.bench.now_ns
+    host.sync()
+    assert host.bench.now_ns == now_ns + PERIOD_NS
 
 
 @pytest.mark.parametrize("command", [Nmt.RESET_COMMUNICATION, Nmt.RESET_NODE])

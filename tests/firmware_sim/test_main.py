@@ -97,7 +97,7 @@ duration_s = 0.02
 
 @pytest.mark.slow
 @pytest.mark.parametrize("clock_mode", ["sync", "wall"])
-def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, tmp_path, clock_mode):
+def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, capsys, tmp_path, clock_mode):
     clock = VirtualClock()
     bus = ScriptedBus(clock, StopRequest(), 0)
     bus.script.extend(((t_ms + 1) * MS, can_id, data) for t_ms, can_id, data in enabling_script(60))
@@ -108,8 +108,9 @@ def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, 
     monkeypatch.setattr("firmware_sim.cli.emulator_main.freeze_garbage", lambda: None)
     scenario = tmp_path / "scenario.toml"
     scenario.write_text(LOST_TORQUE)
-    options = ("--scenario", str(scenario), "--clock", clock_mode, "--out", str(tmp_path), "--once")
+    options = ("--scenario", str(scenario), "--clock", clock_mode, "--out", str(tmp_path), "--once", "--json")
     assert run_main("run", "-i", "scripted", "-c", "scripted", *options) == 0
+    assert json.loads(capsys.readouterr().out)["cycles"] == 60
     log = read_log(tmp_path / "truth.mcap")
     edges = np.flatnonzero(np.diff(log.truth["faults"])) + 1
     assert [(entry.t_ns, entry.event.message.split(":")[0]) for entry in log.events] == [
