@@ -5,23 +5,11 @@ import math
 import pytest
 
 from adacd_hil.settings.schema import ConfigError
-from firmware_sim.arm.arms import ARMS
 from firmware_sim.scenario.scenario import load_scenario
 
 CONTACT = "{ at_s = 1.0, link = 2, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }"
 LATER = "{ at_s = 2.0, link = 1, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }"
 OVERLAPPING = "{ at_s = 1.05, link = 1, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }"
-
-
-def test_nobody_touches_the_idle_arm():
-    scenario = load_scenario("idle")
-    assert (scenario.contacts, scenario.payloads, scenario.payload_kg) == ((), (), 0.0)
-    assert (scenario.name, scenario.profile, scenario.noise) == ("idle", "P", True)
-
-
-def test_profile_and_seed_of_the_caller_outweigh_the_file():
-    scenario = load_scenario("paper", profile="M", seed=77)
-    assert (scenario.profile, scenario.seed, scenario.arm) == ("M", 77, ARMS["M"])
 
 
 def test_the_paper_scenario_touches_each_link_both_ways_before_and_after_the_payload():

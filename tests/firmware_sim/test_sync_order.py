@@ -3,7 +3,7 @@
 import struct
 
 import pytest
-from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, moving_host, quiet_scenario
+from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, moving_host
 
 from firmware_sim.canopen.error_control import SyncKind, SyncOrder
 
@@ -105,22 +105,16 @@ def test_a_counter_that_runs_forward_by_sync_is_lost_syncs(lost):
     assert host.emergencies(3) == []
 
 
-def test_syncs_that_a_fault_keeps_from_a_node_are_its_own_loss():
-    rows = [{"kind": "lose", "node": "sensor1", "frame": "sync", "at_s": 0.01, "count": 5}]
-    host = BenchHost(quiet_scenario(faults=rows))
-    host.enable()
-    host.step(Word.ENABLE, times=30)
-    assert [counts(host, node) for node in NODES] == [[0] * 5, [0] * 5, [0, 0, 0, 0, 5], [0] * 5]
-
-
-@pytest.mark.parametrize("node", ["all", "sensor2"])
-def test_a_fault_that_doubles_sync_is_noticed_by_those_who_hear_it(node):
-    rows = [{"kind": "duplicate", "node": node, "frame": "sync", "at_s": 0.01, "count": 2}]
-    host = BenchHost(quiet_scenario(faults=rows))
-    host.enable()
-    host.step(Word.ENABLE, times=30)
-    repeated = [counts(host, number)[0] for number in NODES]
-    assert repeated == ([2] * 4 if node == "all" else [0, 0, 0, 2])
+@pytest.mark.parametrize(
+    ("kind", "node", "count", "hit"),
+    [("lose", "sensor1", 5, [3]), ("duplicate", "sensor2", 2, [4]), ("duplicate", "all", 2, NODES)],
+)
+def test_a_fault_that_loses_or_doubles_sync_is_counted_by_those_whom_it_hits(kind, node, count, hit):
+    host = moving_host(0, 30, faults=[{"kind": kind, "node": node, "frame": "sync", "at_s": 0.01, "count": count}])
+    seen = [count, 0, 0, 0, 0] if kind == "duplicate" else [0, 0, 0, 0, count]
+    assert {number: counts(host, number) for number in NODES} == {
+        number: seen if number in hit else [0] * 5 for number in NODES
+    }
     assert host.bench.cycle == 32
 
 

@@ -8,12 +8,7 @@ import pytest
 from general_arm import TORQUE, GeneralArm, TouchedArm, point_of, truth_of, without_friction
 
 from firmware_sim.arm.hardware_settings import MechanicsSettings
-from firmware_sim.arm.touch_forces import (
-    THING_STATE,
-    TOUCH_HEADER,
-    change_touch,
-    touch,
-)
+from firmware_sim.arm.touch_forces import THING_STATE, TOUCH_HEADER, change_touch, touch
 from firmware_sim.arm.touch_settings import (
     TICK_S,
     BodySettings,
