@@ -94,6 +94,7 @@ def test_another_period_can_be_written_again_once_the_nodes_have_left_operationa
     assert host.read(1, 0x1006) == 1000
     host.cycle = 0
     host.sync()
+    assert (host.bench.cycle, host.truths[-1][0]) == (0, 0)
     now_ns = host.bench.now_ns
     host.sync()
     assert host.bench.now_ns == now_ns + PERIOD_NS
