@@ -153,7 +153,8 @@ def test_a_late_command_acts_one_sync_later_or_holds_sync_up(is_fifo: bool, orde
     rig = Rig((0x181,), is_fifo=is_fifo)
     rig.at(950_000).bus.send(0x201, b"")
     rig.bus.send(0x202, b"")
-    rig.at(PERIOD_NS).bus.send(SYNC, b"\x01")
+    assert rig.at(PERIOD_NS).bus.waiting_frames == (() if is_fifo else (0x202,))
+    rig.bus.send(SYNC, b"\x01")
     assert rig.receive_all(0.0007) == [(0x181, answer_ns)]
     assert [can_id for can_id, _ in rig.devices.heard] == order
 
