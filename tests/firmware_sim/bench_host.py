@@ -179,9 +179,17 @@ class BenchHost:
         """The statusword's bits that name the state, bit 5 (quick stop) included."""
         return self.statusword(joint) & 0x6F
 
+    def emergencies(self, node: int = 1) -> list[tuple[int, int, int, int]]:
+        """Take everything; return code, register, watchdog and ms of one node's EMCYs."""
+        return [struct.unpack("<HBBI", data) for data in self.taken(0x080 + node)]
+
     def true(self, name: str) -> np.ndarray:
         """A field of the latest truth block."""
         return self.truths[-1][2][TRUTH_LAYOUT.slices[name]]
+
+    def history(self, name: str) -> np.ndarray:
+        """A field of all truth blocks."""
+        return np.array([block[TRUTH_LAYOUT.slices[name]] for _, _, block in self.truths])
 
     def wait_until_at_rest(self, controlword: int | None = Word.ENABLE) -> None:
         """Send SYNCs, with commands or without, until no drive has braked for 20 of them."""
@@ -220,13 +228,20 @@ def set_mode(host: BenchHost, mode: int) -> None:
     host.put(0x301, bytes([mode]))
 
 
-def patient_host() -> BenchHost:
-    """Enable an arm that goes by the clock and forgives every gap in SYNC and in commands."""
-    host = BenchHost(clock_mode="wall")
-    for node in (1, 2):
-        host.write(node, 0x2200, 0, 255)
-        host.write(node, 0x2201, 0, 10_000)
+def moving_host(
+    torque: int = 300,
+    times: int = 40,
+    clock_mode: str = "sync",
+    objects: dict[tuple[int, int, int], int] | None = None,
+    **scenario: Any,
+) -> BenchHost:
+    """Enable an arm and move it for so many SYNCs. `objects`: value by node, index and sub-index, written before."""
+    host = BenchHost(quiet_scenario(**scenario), clock_mode=clock_mode)
+    for place, value in (objects or {}).items():
+        host.write(*place, value)
     host.enable()
+    host.step(Word.ENABLE, torque, times=times)
+    host.take()
     return host
 
 

@@ -1,10 +1,9 @@
-"""The bench: order within a cycle, time, lost SYNCs, resets, determinism, and the contract's two descriptions."""
+"""The bench: order within a cycle, time, lost SYNCs, resets, and what it ignores."""
 
 import numpy as np
 import pytest
 from bench_host import PERIOD_NS, BenchHost, Nmt, Word, quiet_scenario
 
-from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.wire.bus import Frame
 
 TWITCH = [{"at_s": 0.02, "link": 2, "point_m": 0.3, "force_N": 20.0, "duration_s": 0.02}]
@@ -38,12 +37,7 @@ def test_scenario_time_starts_when_both_drives_are_first_enabled():
     assert host.bench.is_scenario_started
     enabled_at = host.truths[-1][0]
     host.step(Word.ENABLE, times=30)
-    touched = [cycle for cycle, _, _ in host.truths if _field(host, cycle, "contact_force") > 0.0]
-    assert touched[0] == enabled_at + 20
-
-
-def _field(host: BenchHost, cycle: int, name: str) -> float:
-    return float(host.truths[cycle][2][TRUTH_LAYOUT.slices[name]][0])
+    assert np.flatnonzero(host.history("contact_force"))[0] == enabled_at + 20
 
 
 def test_by_sync_the_arm_moves_one_period_per_sync_however_long_it_takes():
@@ -75,23 +69,6 @@ def test_the_counter_is_unwrapped_over_its_overflow():
     assert host.bench.cycle == 506
 
 
-def test_a_second_host_that_leaves_the_default_period_finds_the_arm_where_the_first_left_it():
-    host = BenchHost()
-    host.write(1, 0x1006, 0, 2000)
-    play(host, 50)
-    position = host.true("q").copy()
-    host.nmt(Nmt.RESET_COMMUNICATION)
-    assert host.read(1, 0x1006) == 1000
-    host.cycle = 0
-    host.sync()
-    assert (host.bench.cycle, host.truths[-1][0]) == (0, 0)
-    assert np.abs(host.true("q") - position).max() < 0.02
-    assert np.abs(position).max() > 0.02
-    now_ns = host.bench.now_ns
-    host.sync()
-    assert host.bench.now_ns == now_ns + PERIOD_NS
-
-
 @pytest.mark.parametrize("command", [Nmt.PRE_OPERATIONAL, Nmt.RESET_COMMUNICATION, Nmt.RESET_NODE])
 def test_another_period_can_be_written_again_once_the_nodes_have_left_operational(command):
     host = BenchHost()
@@ -113,6 +90,14 @@ def test_another_period_can_be_written_again_once_the_nodes_have_left_operationa
     assert host.bench.now_ns == now_ns + 2 * PERIOD_NS
     assert np.abs(host.true("q") - position).max() < 0.05
     assert np.abs(position).max() > 0.005
+    host.nmt(Nmt.RESET_COMMUNICATION)  # a second host that leaves the default period
+    assert host.read(1, 0x1006) == 1000
+    host.cycle = 0
+    host.sync()
+    assert (host.bench.cycle, host.truths[-1][0]) == (0, 0)
+    now_ns = host.bench.now_ns
+    host.sync()
+    assert host.bench.now_ns == now_ns + PERIOD_NS
 
 
 @pytest.mark.parametrize("command", [Nmt.RESET_COMMUNICATION, Nmt.RESET_NODE])
@@ -131,15 +116,6 @@ def test_a_reset_node_begins_the_sequences_of_its_protected_frames_anew(command)
     assert started() == first
 
 
-def test_by_wall_clock_a_sync_that_waited_in_the_queue_is_no_lost_sync():
-    host = BenchHost(clock_mode="wall")
-    host.enable()
-    host.command(Word.ENABLE)
-    host.t_ns += 5 * PERIOD_NS
-    host.put(0x080, bytes([1 + host.cycle]))
-    assert host.read(1, 0x603F) == 0
-
-
 def test_by_wall_clock_lost_syncs_do_not_move_the_arm_twice():
     host = BenchHost(clock_mode="wall")
     host.enable()
@@ -148,27 +124,6 @@ def test_by_wall_clock_lost_syncs_do_not_move_the_arm_twice():
     host.step(Word.ENABLE)
     assert host.bench.now_ns == host.t_ns
     assert host.bench.cycle == 5
-
-
-def run_twice_over() -> tuple[list[tuple[int, bytes]], list[bytes]]:
-    host = BenchHost(quiet_scenario(noise=True, contacts=TWITCH), seed=3)
-    for node in (1, 2, 3, 4):
-        host.write(node, 0x1017, 0, 10)
-    play(host, 400)
-    host.nmt(Nmt.RESET_COMMUNICATION)
-    host.start()
-    host.cycle = 0
-    for controlword in (Word.FAULT_RESET, 0x06, 0x07, 0x0F, 0x0F):
-        host.step(controlword)
-    return host.frames, [block.tobytes() for _, _, block in host.truths]
-
-
-def test_the_same_inputs_give_the_same_frames_and_the_same_truth_bit_for_bit():
-    first_frames, first_truths = run_twice_over()
-    second_frames, second_truths = run_twice_over()
-    assert len(first_frames) > 1800
-    assert first_frames == second_frames
-    assert first_truths == second_truths
 
 
 def test_error_frames_and_strangers_frames_are_ignored():

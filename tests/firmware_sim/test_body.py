@@ -1,4 +1,4 @@
-"""The emulated arm as the device nodes see it: timing, measurements, truth, braking, determinism."""
+"""The emulated arm as the device nodes see it: timing, measurements, truth, braking."""
 
 import dataclasses
 import math
@@ -16,18 +16,6 @@ from firmware_sim.scenario.scenario import PayloadSettings, Scenario, load_scena
 def step(at_s: float, **changes) -> ContactSettings:
     values = {"at_s": at_s, "link": 1, "point_m": 0.25, "force_N": 20.0, "duration_s": 0.05} | changes
     return ContactSettings(**values)
-
-
-def test_an_arm_at_power_on_rests_in_its_start_pose():
-    body = Body(dataclasses.replace(load_scenario("idle"), noise=False))
-    measured = body.sample()
-    assert measured.q == pytest.approx(np.radians([-30, -60]), abs=3e-6)
-    assert measured.dq.tolist() == [0.0, 0.0]
-    assert measured.tau_J.tolist() == [0.0, 0.0]
-    for _ in range(50):
-        body.advance((0.0, 0.0), OFF)
-        assert body.sample() == measured
-    assert truth_of(body)["dq"].tolist() == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("profile", ARMS)
@@ -48,18 +36,6 @@ def test_a_braking_drive_brings_every_arm_to_rest(profile, payload_kg, way):
         body.advance((12.0, 3.0), BRAKE)
     rest = truth_of(body)
     assert rest["dq"].tolist() == [0.0, 0.0]
-
-
-def test_nobody_comes_before_the_drives_are_enabled():
-    scenario = Scenario(contacts=(step(0.0),), payloads=(PayloadSettings(0.0, 1.0),))
-    body = Body(scenario)
-    for _ in range(20):
-        body.advance((0.0, 0.0), OFF)
-    truth = truth_of(body)
-    assert (truth["contact_force"], truth["contact_index"], truth["payload"]) == (0.0, -1.0, 0.0)
-    body.start_scenario()
-    truth = truth_of(body)
-    assert (truth["contact_force"], truth["contact_index"], truth["payload"]) == (20.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize("ticks", [5, 10, 40])
@@ -101,8 +77,9 @@ def test_truth_tells_the_parameters_with_payload():
         load_scenario("idle"), payloads=(PayloadSettings(0.005, 1.0), PayloadSettings(0.008, 0.0))
     )
     body = Body(scenario)
-    body.start_scenario()
-    for cycle in range(12):
+    for cycle in range(-7, 12):
+        if cycle == 0:
+            body.start_scenario()
         payload_kg = 1.0 if 5 <= cycle < 8 else 0.0
         truth = truth_of(body)
         assert truth["payload"] == payload_kg

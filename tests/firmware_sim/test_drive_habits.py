@@ -34,14 +34,17 @@ def test_a_mode_may_be_shown_only_once_the_drive_is_enabled() -> None:
 
 @pytest.mark.parametrize(("shows_change", "meanwhile"), [(False, 0), (True, IN_BETWEEN)])
 def test_a_mode_may_be_shown_long_after_it_was_asked_for(shows_change: bool, meanwhile: int) -> None:
+    """Scenario time begins when both drives show theirs."""
     host = host_of(mode_s=0.05, shows_change=shows_change)
     host.enable()
-    shown = []
+    started, shown = [], []
     for _ in range(60):
         host.step(Word.ENABLE)
+        started.append(host.bench.is_scenario_started)
         shown.append(shown_mode(host))
     assert shown[:40] == [meanwhile] * 40
     assert shown[-1] == TORQUE_MODE
+    assert abs(started.index(True) - shown.index(TORQUE_MODE)) <= 1
 
 
 def test_a_drive_may_take_its_time_to_be_enabled() -> None:
@@ -81,15 +84,3 @@ def test_a_drive_under_halt_refuses_another_mode() -> None:
     host.write(1, 0x6040, 0, 0)
     host.write(1, 0x6060, 0, TORQUE_MODE)
     assert shown_mode(host) == TORQUE_MODE
-
-
-def test_scenario_time_begins_when_both_drives_show_their_mode() -> None:
-    host = host_of(mode_s=0.05, shows_change=True)
-    host.enable()
-    started, modes = [], []
-    for _ in range(60):
-        host.step(Word.ENABLE)
-        started.append(host.bench.is_scenario_started)
-        modes.append(shown_mode(host))
-    assert modes.index(TORQUE_MODE) > 30
-    assert abs(started.index(True) - modes.index(TORQUE_MODE)) <= 1

@@ -64,45 +64,12 @@ def host() -> BenchHost:
     return BenchHost()
 
 
-@pytest.mark.parametrize(
-    ("before", "word"),
-    [
-        (State.DISABLED, 0),
-        (State.READY, Word.SHUTDOWN),
-        (State.SWITCHED_ON, Word.SWITCH_ON),
-        (State.FAULT, Word.ENABLE),
-    ],
-)
-def test_below_operation_enabled_the_motor_has_no_torque_whatever_the_target(before, word):
-    host = in_state(before)
-    for _ in range(20):
-        host.step(word, 1000)
-        assert host.state_bits() == before
-        assert host.true("tau_J").tolist() == [0.0, 0.0]
-        assert host.bench.drives[0].torque_Nm == 0.0
-    host.bench.advance_to(host.bench.now_ns + 100_000_000)
-    status = host.taken(0x281)[-1]
-    assert struct.unpack("<HbhH", status)[2] == 0
-
-
 def test_target_torque_is_per_mille_of_rated_torque_in_the_motors_direction(host):
     host.enable()
     host.step(Word.ENABLE, -250, times=10)
     assert host.true("tau_J").tolist() == pytest.approx([-3.0, -1.5], abs=1e-9)
     assert host.true("dq")[1] < 0.0
     assert host.read(1, 0x6077) == -250
-
-
-def test_a_command_acts_at_the_next_sync_and_not_before(host):
-    host.enable()
-    host.step(Word.ENABLE, 0)
-    host.sync()
-    host.command(Word.ENABLE, 100)
-    assert host.bench.drives[0].torque_Nm == 0.0
-    host.sync()  # latched here: from this SYNC to the next the torque builds up
-    assert host.true("tau_J")[0] == 0.0
-    host.sync()
-    assert host.true("tau_J")[0] == pytest.approx(1.2, rel=0.01)
 
 
 def test_a_command_with_any_one_bit_flipped_changes_nothing(host):
@@ -195,19 +162,6 @@ def test_the_rpdo_deadline_faults_by_time(host):
     assert host.state_bits(1) == State.REACTION
     assert host.state_bits(2) == State.ENABLED
     assert host.read(1, 0x603F) == 0x8250
-
-
-def test_feedback_comes_on_every_sync_in_operational_only(host):
-    host.sync()
-    assert host.taken(0x181) == []
-    host.nmt(Nmt.START)
-    host.take()
-    host.sync(times=3)
-    assert len(host.taken(0x181)) == 3
-    host.nmt(Nmt.STOP)
-    host.take()
-    host.sync()
-    assert host.taken(0x181) == []
 
 
 def test_feedback_carries_encoder_counts_and_velocity_as_served_by_sdo():

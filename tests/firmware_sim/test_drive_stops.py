@@ -1,21 +1,15 @@
 """How the emulated drive stops, by each option code, and which torque it is limited to; seen in state and motion."""
 
 import pytest
-from bench_host import BenchHost, State, Word, remap_mode, set_mode
+from bench_host import BenchHost, State, Word, moving_host, remap_mode, set_mode
 
 from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S, DriveMode
 
 SLOWLY, RAMP, HARD = DriveMode.BRAKE_SLOWLY, DriveMode.BRAKE, DriveMode.BRAKE_HARD
 
 
-def moving_host(option: int | None = None, code: int = 0) -> BenchHost:
-    host = BenchHost()
-    if option is not None:
-        for node in (1, 2):
-            host.write(node, option, 0, code)
-    host.enable()
-    host.step(Word.ENABLE, 300, times=40)
-    return host
+def moving_by(option: int, code: int) -> BenchHost:
+    return moving_host(objects={(node, option, 0): code for node in (1, 2)})
 
 
 @pytest.mark.parametrize(
@@ -45,7 +39,7 @@ def test_an_option_code_is_taken_or_refused(option, codes):
 )
 def test_quick_stop_brakes_by_its_ramp_and_ends_as_its_code_says(code, mode, end):
     """Operation resumes only from a stop that stays."""
-    host = moving_host(0x605A, code)
+    host = moving_by(0x605A, code)
     host.step(Word.QUICK_STOP)
     assert host.state_bits() == State.STOPPING
     assert host.bench.drives[0].motor_mode == mode
@@ -64,7 +58,7 @@ def damping(code: int) -> float:
 
     The period after a SYNC passes when the next one comes.
     """
-    host = moving_host(0x605A, code)
+    host = moving_by(0x605A, code)
     host.step(Word.QUICK_STOP, times=2)
     return -host.read(1, 0x6077) * 12e-3 / (host.read(1, 0x606C) * VELOCITY_LSB_RAD_S)
 
@@ -80,7 +74,7 @@ def test_the_ramps_brake_with_half_all_and_one_and_a_half_of_the_damping():
     ("option", "word", "end"), [(0x605B, Word.SHUTDOWN, State.READY), (0x605C, Word.SWITCH_ON, State.SWITCHED_ON)]
 )
 def test_shutdown_and_disable_operation_may_ramp_down_first(option, word, end):
-    host = moving_host(option, 1)
+    host = moving_by(option, 1)
     host.step(word, 300)
     assert host.state_bits() == State.ENABLED
     assert host.statusword() & 0x1000 == 0  # the target isn't followed any more
@@ -103,7 +97,7 @@ def test_shutdown_and_disable_operation_may_ramp_down_first(option, word, end):
 )
 def test_without_a_ramp_each_stop_ends_at_once(option, words, end):
     """Commands that are missing are a fault with the third SYNC."""
-    host = moving_host(option, 0)
+    host = moving_by(option, 0)
     for word in words:
         if word is not None:
             host.command(word)
@@ -114,7 +108,7 @@ def test_without_a_ramp_each_stop_ends_at_once(option, words, end):
 
 @pytest.mark.parametrize(("word", "end"), [(Word.DISABLE_VOLTAGE, State.DISABLED), (Word.QUICK_STOP, State.STOPPING)])
 def test_a_ramp_gives_way_to_a_stronger_stop(word, end):
-    host = moving_host(0x605B, 1)
+    host = moving_by(0x605B, 1)
     host.step(Word.SHUTDOWN)
     host.step(word)
     assert host.state_bits() == end
@@ -122,7 +116,7 @@ def test_a_ramp_gives_way_to_a_stronger_stop(word, end):
 
 @pytest.mark.parametrize(("code", "mode"), [(1, SLOWLY), (2, RAMP), (3, HARD)])
 def test_a_fault_brakes_by_its_reaction_code(code, mode):
-    host = moving_host(0x605E, code)
+    host = moving_by(0x605E, code)
     host.sync(times=4)
     assert host.bench.drives[0].motor_mode == mode
     host.wait_until_at_rest(None)
@@ -177,10 +171,3 @@ def test_another_mode_takes_effect_at_the_next_sync_while_enabled_and_at_once_el
     host.step(Word.ENABLE, 100)
     assert host.read(1, 0x6061) == 0
     assert host.bench.drives[0].torque_Nm == 0.0
-
-
-def test_encoder_and_gear_give_the_counts_of_a_joint_revolution():
-    host = BenchHost()
-    increments = host.read(1, 0x608F, 1) / host.read(1, 0x608F, 2)
-    assert increments * host.read(1, 0x6091, 1) / host.read(1, 0x6091, 2) == 1 << 20
-    assert host.read(1, 0x6502) == 1 << 9

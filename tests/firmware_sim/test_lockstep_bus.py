@@ -2,13 +2,11 @@
 
 from collections import deque
 from collections.abc import Callable
-from random import Random
 
 import pytest
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
-from adacd_hil.wire.frame_queue import take_first
 from adacd_hil.wire.lockstep_bus import LockstepBus
 from adacd_hil.wire.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
 
@@ -102,8 +100,8 @@ class Rig:
     def receive_all(self, timeout_s: float) -> list[tuple[int, int]]:
         received = []
         end_ns = self.clock.now_ns() + round(timeout_s * 1e9)
-        while frame := self.bus.receive((end_ns - self.clock.now_ns()) * 1e-9):
-            received.append((frame.can_id, frame.t_ns))
+        while frames := self.bus.receive_some((end_ns - self.clock.now_ns()) * 1e-9, 4):
+            received += [(frame.can_id, frame.t_ns) for frame in frames]
         return received
 
     def at(self, t_ns: int) -> "Rig":
@@ -147,16 +145,6 @@ def test_commands_in_time_reach_the_devices_before_the_next_sync() -> None:
     assert [can_id for can_id, _ in rig.devices.heard] == [SYNC, 0x201, 0x202, SYNC]
 
 
-def test_a_command_that_has_not_begun_when_sync_is_due_waits_for_the_answers() -> None:
-    rig = Rig((0x181, 0x182))
-    rig.bus.send(SYNC, b"\x01")
-    rig.receive_all(0.0007)
-    rig.at(920_000).bus.send(0x201, b"")
-    rig.bus.send(0x202, b"")
-    rig.at(PERIOD_NS)
-    assert rig.bus.waiting_frames == (0x202,)
-
-
 @pytest.mark.parametrize(
     ("is_fifo", "order", "answer_ns"),
     [(False, [0x201, SYNC, 0x202], 1_250_000), (True, [0x201, 0x202, SYNC], 1_350_000)],
@@ -165,7 +153,8 @@ def test_a_late_command_acts_one_sync_later_or_holds_sync_up(is_fifo: bool, orde
     rig = Rig((0x181,), is_fifo=is_fifo)
     rig.at(950_000).bus.send(0x201, b"")
     rig.bus.send(0x202, b"")
-    rig.at(PERIOD_NS).bus.send(SYNC, b"\x01")
+    assert rig.at(PERIOD_NS).bus.waiting_frames == (() if is_fifo else (0x202,))
+    rig.bus.send(SYNC, b"\x01")
     assert rig.receive_all(0.0007) == [(0x181, answer_ns)]
     assert [can_id for can_id, _ in rig.devices.heard] == order
 
@@ -246,30 +235,22 @@ def test_an_answer_is_handed_over_when_its_request_is_through() -> None:
     assert rig.receive_all(0.5) == [(0x581, 200_000)]
 
 
-def test_while_nobody_is_powered_frames_stay_in_the_queue_until_it_is_full() -> None:
+def test_while_nobody_is_powered_frames_stay_in_the_queue_until_it_is_full_and_go_out_later() -> None:
     rig = Rig(queue_length=3)
     rig.devices.mark(MarkKind.DARK)
     rig.bus.receive(0.0)
     rig.devices.mark(MarkKind.DARK)
     rig.bus.receive(0.001)
     for _ in range(3):
-        rig.bus.send(0x201, b"")
+        rig.bus.send(0x201, b"old")
     with pytest.raises(TransmitQueueError, match="full with 3 frames: nobody acknowledges"):
         rig.bus.send(0x201, b"")
-    assert rig.devices.heard == []
-
-
-def test_when_somebody_is_powered_again_the_stale_queue_goes_out() -> None:
-    rig = Rig(queue_length=3)
-    rig.bus.receive(0.0)
-    rig.devices.mark(MarkKind.DARK)
-    rig.bus.receive(0.001)
-    rig.bus.send(0x201, b"old")
     rig.bus.receive(0.5)
+    assert rig.devices.heard == []
     rig.devices.mark(MarkKind.LIT)
     rig.bus.receive(0.5)
     rig.bus.receive(0.001)
-    assert rig.devices.heard == [(0x201, b"old")]
+    assert rig.devices.heard == [(0x201, b"old")] * 3
 
 
 def test_devices_without_marks_are_waited_for() -> None:
@@ -279,42 +260,6 @@ def test_devices_without_marks_are_waited_for() -> None:
     assert rig.receive_all(0.0009) == [(0x181, 200_000)]
 
 
-@pytest.mark.parametrize("kind", list(MarkKind))
-def test_a_mark_survives_the_bus(kind: MarkKind) -> None:
-    assert unpack_mark(pack_mark(kind, 123_456_789_012_345)) == (kind, 123_456_789_012_345)
-
-
 @pytest.mark.parametrize("data", [b"", b"\x00" * 8, b"\x07" + bytes(7), bytes(7)])
 def test_what_is_no_mark_is_none(data: bytes) -> None:
     assert unpack_mark(data) is None
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_frames_received_together_are_those_received_one_by_one(seed: int) -> None:
-    """Whatever the devices and the host say, however the host asks; the clocks agree after each call."""
-    random = Random(seed)
-    answers = (0x181, 0x182, 0x183, 0x184)
-    one, some = Rig(answers), Rig(answers)
-    some.devices.receive_some = lambda timeout_s, most: take_first(some.devices.queue, most)  # type: ignore[method-assign]
-    for cycle in range(30):
-        said = random.sample((*answers, 0x185, 0x181, 0x701), random.randint(2, 7))
-        sent = [(random.choice((0x10, 0x201, 0x7FF)), bytes((n,))) for n in range(random.randint(0, 3))]
-        timeout_s = random.choice((0.0, 0.0003, 0.0007))
-        frames: list[list[Frame]] = []
-        for rig in (one, some):
-            rig.at(cycle * PERIOD_NS).answers = said
-            rig.bus.send_all([*sent, (SYNC, b"")])
-            end_ns = rig.clock.now_ns() + round(timeout_s * 1e9)
-            taken: list[Frame] = []
-            while True:
-                left_s = (end_ns - rig.clock.now_ns()) * 1e-9
-                batch = rig.bus.receive_some(left_s, 4) if rig is some else [rig.bus.receive(left_s)]
-                if batch in ([], [None]):
-                    break
-                taken += batch
-                if rig is some:
-                    assert all(frame.can_id in answers for frame in batch[:-1])
-            frames.append(taken)
-        assert frames[0] == frames[1]
-        assert one.clock.now_ns() == some.clock.now_ns()
-        assert one.devices.heard == some.devices.heard

@@ -1,9 +1,7 @@
 """What a device does when it loses power or the bus, fails by itself, or has a clock that drifts."""
 
-import struct
-
 import pytest
-from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word
+from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, moving_host
 
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import DriveMode
@@ -15,15 +13,7 @@ ERROR = 0x2310
 
 def enabled_host(objects: dict[tuple[int, int, int], int] | None = None) -> BenchHost:
     """An arm in motion. objects: value by node, index and sub-index."""
-    host = BenchHost()
-    for node in (1, 2, 3, 4):
-        host.write(node, 0x1017, 0, 10)
-    for (node, index, sub), value in (objects or {}).items():
-        host.write(node, index, sub, value)
-    host.enable()
-    host.step(Word.ENABLE, 100, times=5)
-    host.take()
-    return host
+    return moving_host(100, 5, objects={(node, 0x1017, 0): 10 for node in (1, 2, 3, 4)} | (objects or {}))
 
 
 def poll(host: BenchHost) -> None:
@@ -38,7 +28,7 @@ def pass_ms(host: BenchHost, count: int) -> None:
 
 
 def errors(host: BenchHost, node: int) -> list[int]:
-    return [struct.unpack_from("<H", data)[0] for data in host.taken(0x080 + node)]
+    return [code for code, *_ in host.emergencies(node)]
 
 
 @pytest.mark.parametrize(
@@ -103,8 +93,7 @@ def test_emergencies_that_waited_the_history_and_the_time_are_gone_with_the_powe
     assert errors(host, 1) == []
     host.nmt(Nmt.START, 1)
     host.put(0x201, b"\0")
-    (emergency,) = host.taken(0x081)
-    assert struct.unpack("<HBBI", emergency)[3] == 30
+    assert [time_ms for *_, time_ms in host.emergencies()] == [30]
 
 
 def test_a_powered_drive_off_the_bus_faults_and_brakes():
@@ -149,7 +138,7 @@ def test_a_drive_that_fails_faults_with_its_code_and_says_so():
     drive = host.bench.drives[0]
     drive.fail(ERROR, host.bench.now_ns)
     assert host.state_bits(1) == State.REACTION
-    assert struct.unpack_from("<HBB", host.taken(0x081)[0]) == (ERROR, 0x03, 0)
+    assert host.emergencies()[0][:3] == (ERROR, 0x03, 0)
     assert host.read(1, 0x603F) == ERROR
     assert host.read(1, 0x1003, 1) == ERROR
     assert drive.torque_Nm == 0.0
@@ -164,7 +153,7 @@ def test_a_drive_says_by_its_own_clock_when_it_lost_its_commands_with_sync():
     host.bench.devices[0].clock.set_drift(500_000.0, start_ns)
     host.cycle += 20
     host.sync()
-    code, _, _, time_ms = struct.unpack("<HBBI", host.taken(0x081)[0])
+    code, _, _, time_ms = host.emergencies()[0]
     assert (code, time_ms) == (0x8250, (start_ns + 1.5 * 10 * PERIOD_NS) // MS)
 
 

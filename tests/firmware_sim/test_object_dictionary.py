@@ -128,19 +128,6 @@ def test_a_reset_restores_the_communication_profile_or_everything(host):
     assert host.read(1, 0x6072) == 1000
 
 
-def test_another_masters_pdo_configuration_of_the_same_contract_is_accepted(host):
-    for node in (1, 3):
-        remote = host.nodes[node]
-        remote.tpdo.read()
-        remote.rpdo.read()
-        remote.tpdo.save()
-        remote.rpdo.save()
-    host.nmt(Nmt.START)
-    host.take()
-    host.sync()
-    assert [can_id for can_id, _ in host.take()][-4:] == [0x181, 0x182, 0x183, 0x184]
-
-
 def test_a_pdo_that_is_switched_off_is_not_sent_until_it_is_switched_on(host):
     host.nmt(Nmt.START)
     host.write(1, 0x1800, 1, 0x80000181)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, patient_host, quiet_scenario
+from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, moving_host
 from served_bench import MS, enabling_script, serve
 
 from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
@@ -16,19 +16,12 @@ PUSHED = {
 """Round and round."""
 
 
-def moving(clock_mode: str = "sync", torque: int = 300, **scenario) -> BenchHost:
-    host = BenchHost(quiet_scenario(**scenario), clock_mode=clock_mode)
-    host.enable()
-    host.step(Word.ENABLE, torque, times=40)
-    return host
-
-
 def speeds(host: BenchHost, first: int) -> np.ndarray:
-    return np.array([np.abs(block[DQ]).max() for _, _, block in host.truths[first:]])
+    return np.abs(host.history("dq")[first:]).max(axis=1)
 
 
 def test_the_truth_goes_on_period_by_period_until_the_arm_is_at_rest():
-    host = moving()
+    host = moving_host()
     begun = len(host.truths)
     assert speeds(host, begun - 1)[0] > 1.0
     host.bench.outlive_host()
@@ -43,7 +36,7 @@ def test_the_truth_goes_on_period_by_period_until_the_arm_is_at_rest():
 
 
 def test_it_is_outlived_once_until_a_sync_comes_again():
-    host = moving(**PUSHED)
+    host = moving_host(**PUSHED)
     host.bench.outlive_host()
     told = len(host.truths)
     host.bench.outlive_host()
@@ -55,7 +48,7 @@ def test_it_is_outlived_once_until_a_sync_comes_again():
 
 
 def test_an_arm_that_is_pushed_all_the_time_is_left_after_5_s():
-    host = moving(**PUSHED)
+    host = moving_host(**PUSHED)
     begun, begun_ns = len(host.truths), host.bench.now_ns
     host.bench.outlive_host()
     assert 4_999 * MS <= host.bench.now_ns - begun_ns <= 5_000 * MS
@@ -63,7 +56,7 @@ def test_an_arm_that_is_pushed_all_the_time_is_left_after_5_s():
 
 
 def test_after_an_ordinary_end_nothing_is_added():
-    host = moving(torque=0)
+    host = moving_host(torque=0)
     host.step(Word.DISABLE_VOLTAGE, times=20)
     told, now_ns = len(host.truths), host.bench.now_ns
     frames = len(host.frames)
@@ -72,7 +65,7 @@ def test_after_an_ordinary_end_nothing_is_added():
 
 
 def test_a_second_host_finds_an_arm_at_rest_and_its_own_count():
-    host = moving()
+    host = moving_host()
     host.bench.outlive_host()
     host.nmt(Nmt.RESET_COMMUNICATION)
     host.cycle = 0
@@ -85,35 +78,9 @@ def test_a_second_host_finds_an_arm_at_rest_and_its_own_count():
     assert host.state_bits() == State.ENABLED
 
 
-def test_a_braking_that_a_watchdog_caused_by_time_is_told_too():
-    host = BenchHost()
-    for node in (1, 2):
-        host.write(node, 0x1016, 1, 127 << 16 | 50)
-    host.enable()
-    host.put(0x77F, b"\x05")
-    host.step(Word.ENABLE, 300, times=40)
-    begun = len(host.truths)
-    host.bench.advance_to(host.bench.now_ns + 1_000 * MS)
-    assert speeds(host, begun)[-1] < REST_RAD_S
-    assert 10 < len(host.truths) - begun < 1000
-
-
-def test_by_the_clock_the_truth_goes_on_once_sync_is_overdue():
-    host = moving("wall")
-    begun = len(host.truths)
-    last_cycle, last_ns = host.truths[-1][:2]
-    host.bench.advance_to(host.t_ns + 2_000 * MS)
-    told = host.truths[begun:]
-    assert [(cycle - last_cycle) * PERIOD_NS for cycle, _, _ in told] == [t_ns - last_ns for _, t_ns, _ in told]
-    assert [cycle - last_cycle for cycle, _, _ in told[:3]] == [4, 5, 6]
-    assert speeds(host, begun)[-50:].max() < REST_RAD_S
-    assert len(told) < 1000
-    assert host.bench.is_at_rest
-
-
 def test_by_the_clock_a_lost_sync_or_two_leave_a_gap_as_ever():
-    host = patient_host()
-    host.step(Word.ENABLE, 300, times=40)
+    patience = {(node, index, 0): value for node in (1, 2) for index, value in ((0x2200, 255), (0x2201, 10_000))}
+    host = moving_host(clock_mode="wall", objects=patience)
     begun = len(host.truths)
     for lost in (1, 2):
         host.cycle += lost

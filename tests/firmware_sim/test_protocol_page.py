@@ -5,20 +5,12 @@ import struct
 from pathlib import Path
 
 import pytest
-from bench_host import CODEC, BenchHost, State, Word, quiet_scenario
+from bench_host import CODEC, BenchHost, State, Word, moving_host
 
 from firmware_sim.canopen.error_control import ERROR_CODES, WARNINGS, Watchdog
 
 PAGE = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
 REMOTE, REACHED, LIMITED, FOLLOWS = 1 << 9, 1 << 10, 1 << 11, 1 << 12
-
-
-def running(torque: int = 0) -> BenchHost:
-    host = BenchHost(quiet_scenario(noise=True))
-    host.enable()
-    host.step(Word.ENABLE, torque, times=20)
-    host.take()
-    return host
 
 
 def crc8(data: bytes) -> int:
@@ -65,7 +57,7 @@ def test_a_drive_ignores_the_status_nibble_of_a_command():
 
 
 def test_the_status_of_a_drive_follows_statusword_mode_and_error_and_not_the_torque():
-    host = running()
+    host = moving_host(0, 20, noise=True)
     for _ in range(50):
         host.step(Word.ENABLE, 50)  # torque actual changes in each
     assert [can_id for can_id, _ in host.take() if can_id == 0x281] == []
@@ -78,20 +70,8 @@ def test_the_status_of_a_drive_follows_statusword_mode_and_error_and_not_the_tor
     assert [data[5:] for data in host.taken(0x281)] == [b"\x10\x23"]
 
 
-def test_the_status_of_a_sensor_follows_status_and_error_register():
-    host = running()
-    host.sync()
-    host.take()
-    host.bench.sensors[0].set_error(1)
-    host.sync()
-    host.sync()
-    assert host.taken(0x283) == [b"\x01\x00"]
-    host.put(0x080, b"")  # a SYNC of the wrong length: error register
-    assert host.taken(0x283) == [b"\x01\x11"]
-
-
 def test_what_sdo_writes_to_the_header_objects_is_dropped():
-    host = running()
+    host = moving_host(0, 20, noise=True)
     host.step(Word.DISABLE_VOLTAGE)
     for sub in (1, 2):
         before = host.read(1, 0x2100, sub)

@@ -7,8 +7,6 @@ import pytest
 from firmware_sim.cli.emulator_main import main
 from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario
 
-GOOD_CONTACT = "{ at_s = 1.0, link = 2, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }"
-
 
 def run_main(*arguments: str) -> int:
     with pytest.raises(SystemExit) as ended:
@@ -59,25 +57,6 @@ def test_what_show_prints_loads_to_the_same_scenario(capsys, tmp_path, option):
     assert run_main("check", str(path)) == 0
 
 
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("name = ", "Invalid value"),
-        (
-            f"contacts = [{GOOD_CONTACT}, {GOOD_CONTACT.replace('link = 2', 'link = 3')}]",
-            "`contacts[1].link` = 3 is above 2",
-        ),
-    ],
-)
-def test_check_names_file_key_value_and_bound(capsys, tmp_path, text, problem):
-    path = tmp_path / "mine.toml"
-    path.write_text(text, encoding="utf-8")
-    assert run_main("check", str(path)) == 2
-    (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith(f"{path}: ")
-    assert problem in line
-
-
 def test_check_has_a_line_for_each_problem_of_each_file(capsys, tmp_path):
     first, second = tmp_path / "first.toml", tmp_path / "second.toml"
     first.write_text("seed = -1\npayload_kg = 21.0\nnoize = false\n[sensors]\ntorque_bits = [3, 16]\n")
@@ -92,16 +71,6 @@ def test_check_has_a_line_for_each_problem_of_each_file(capsys, tmp_path):
         "sensors.torque_bits[0]",
         "profile",
     ]
-
-
-def test_check_says_what_it_has_looked_at(capsys, tmp_path):
-    path = tmp_path / "mine.toml"
-    path.write_text(f"contacts = [{GOOD_CONTACT}]\n[[faults]]\nkind = 'reboot'\nnode = 'drive1'\nat_s = 1.0\n")
-    assert run_main("check", str(path)) == 0
-    (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith(f"{path}: good: ")
-    for what in ("1 of [[contacts]]", "1 of [[faults]]", "against arm P", "against contract arm"):
-        assert what in line
 
 
 def test_check_knows_the_contract(capsys, tmp_path):

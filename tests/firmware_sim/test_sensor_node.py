@@ -47,19 +47,22 @@ def test_the_value_is_the_converters_count_in_micronewtonmetres():
     assert host.read(3, 0x9130, 1) == pytest.approx(1e6, abs=lsb_uNm)
 
 
-@pytest.mark.parametrize(
-    ("offset_Nm", "status", "value_uNm"),
-    [(49.9, 0x00, 49.9e6), (50.0, 0x03, 50e6), (-49.9, 0x00, -49.9e6), (-50.0, 0x05, -50e6)],
-)
-def test_an_overload_is_flagged_in_the_frame_itself_and_in_the_status(offset_Nm, status, value_uNm):
-    host = BenchHost(quiet_scenario(torque_offset_Nm=[offset_Nm, 0.0]))
+@pytest.mark.parametrize(("range_Nm", "bits"), [(50.0, 16), (20.0, 12)])
+@pytest.mark.parametrize("beyond_Nm", [-0.1, 0.0, 15.0])
+@pytest.mark.parametrize(("way", "overload"), [(1.0, 0x03), (-1.0, 0x05)])
+def test_an_overload_is_flagged_in_the_frame_itself_and_in_the_status(range_Nm, bits, beyond_Nm, way, overload):
+    sensors = {"torque_range_Nm": [range_Nm, 50.0], "torque_bits": [bits, 16]}
+    offset_Nm = way * min(range_Nm + beyond_Nm, 50.0)
+    host = BenchHost(quiet_scenario(torque_offset_Nm=[offset_Nm, 0.0], sensors=sensors))
     host.nmt(Nmt.START)
     host.take()
     host.sync()
     frames = host.take()
     torque = next(data for can_id, data in frames if can_id == 0x183)
+    status = overload if beyond_Nm >= 0.0 else 0
     assert torque[1] >> 4 == status
-    assert torque_uNm(torque) == pytest.approx(value_uNm, abs=1600)
+    value_uNm, step_uNm = way * 1e6 * (range_Nm + min(beyond_Nm, 0.0)), 2e6 * range_Nm / 2**bits
+    assert torque_uNm(torque) == pytest.approx(value_uNm, abs=1.1 * step_uNm)
     assert host.read(3, 0x6150, 1) == status
     assert [data for can_id, data in frames if can_id == 0x283] == [bytes([status, 0])]
 

@@ -11,7 +11,6 @@ from general_arm import TORQUE
 
 from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.settings.parsing import parse
-from adacd_hil.settings.toml_text import to_toml
 from firmware_sim.arm.sensing import (
     POSITION_LSB_RAD,
     VELOCITY_LSB_RAD_S,
@@ -23,7 +22,7 @@ from firmware_sim.arm.sensing import (
 )
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.body.body import Body
-from firmware_sim.scenario.scenario import Scenario, load_scenario
+from firmware_sim.scenario.scenario import Scenario
 
 EVERY_SENSOR_ERROR = {
     "offset_drift_Nm_s": [0.1, -0.1],
@@ -167,10 +166,3 @@ def test_the_interpreted_errors_are_those_of_the_compiled_ones():
         results.append(np.frombuffer(finished.stdout))
     assert results[0].size == 60 * (10 + TRUTH_LAYOUT.size)
     assert np.allclose(results[0], results[1], rtol=1e-9, atol=1e-9)
-
-
-def test_a_scenario_with_every_error_can_be_written_and_read_again(tmp_path):
-    scenario = parse(Scenario, {"name": "all", "sensors": EVERY_SENSOR_ERROR, "drives": EVERY_DRIVE_ERROR})
-    path = tmp_path / "all.toml"
-    path.write_text(to_toml(scenario), encoding="utf-8")
-    assert load_scenario(str(path)) == scenario

@@ -53,15 +53,6 @@ def test_a_force_along_the_motion_has_the_power_of_its_part_that_helps(link, ang
         assert np.array(found) @ dq == pytest.approx(share * force_N * speed_m_s, rel=1e-6, abs=1e-8)
 
 
-@pytest.mark.parametrize("link", [1, 2])
-def test_a_force_along_the_motion_is_none_at_rest_and_grows_with_the_speed_from_there(link):
-    row = contact_table((contact(link=link, frame="motion", angle_deg=0.0),))[0]
-    assert contact_torque(row, 20.0, LENGTH_M, 0.7, -0.3, 0.0, 0.0) == (0.0, 0.0)
-    slow = np.array(contact_torque(row, 20.0, LENGTH_M, 0.7, -0.3, 1e-6, 2e-6))
-    assert np.abs(slow).max() > 0.0
-    assert np.array(contact_torque(row, 20.0, LENGTH_M, 0.7, -0.3, 2e-6, 4e-6)) == pytest.approx(2.0 * slow, rel=1e-6)
-
-
 @pytest.mark.parametrize(
     ("changes", "impulse_N_s"),
     [

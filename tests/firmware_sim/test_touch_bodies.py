@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from general_arm import TouchedArm, normal_of, point_of
 
-from firmware_sim.arm.arms import ARMS
-from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.touch_forces import touch
 from firmware_sim.arm.touch_settings import (
     BODY_REGIONS,
@@ -232,18 +230,6 @@ def test_things_that_are_never_there_together_do_not_add_up():
     alone = largest_rate_rad_s(TouchedArm(bodies=(one,)).things)
     assert largest_rate_rad_s(TouchedArm(bodies=(one, later)).things) == pytest.approx(alone)
     assert largest_rate_rad_s(TouchedArm(bodies=(one, also)).things) == pytest.approx(math.sqrt(2.0) * alone)
-
-
-@pytest.mark.parametrize(("stiffness_N_m", "substeps"), [(150_000.0, 2), (400_000.0, 3), (1e6, 5)])
-def test_a_stiffer_body_is_stepped_more_finely(stiffness_N_m, substeps):
-    body = BodySettings(at_s=1.0, link=2, x_m=9.0, y_m=9.0, mass_kg=4.4, stiffness_N_m=stiffness_N_m)
-    things = TouchedArm(bodies=(body,)).things
-    found = [
-        MechanicsSettings().substeps(ARMS["P"], [(0.0, (0.0, 0.0), 0.0)], largest_rate_rad_s(one))
-        for one in (things, things[:0])
-    ]
-    assert found == [substeps, 1]
-    assert largest_rate_rad_s(things) * TICK_S / substeps <= 0.05
 
 
 def test_the_strongest_of_several_is_reported_with_its_place_in_the_scenario():

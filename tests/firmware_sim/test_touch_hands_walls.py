@@ -8,12 +8,7 @@ import pytest
 from general_arm import TORQUE, GeneralArm, TouchedArm, point_of, truth_of, without_friction
 
 from firmware_sim.arm.hardware_settings import MechanicsSettings
-from firmware_sim.arm.touch_forces import (
-    THING_STATE,
-    TOUCH_HEADER,
-    change_touch,
-    touch,
-)
+from firmware_sim.arm.touch_forces import THING_STATE, TOUCH_HEADER, change_touch, touch
 from firmware_sim.arm.touch_settings import (
     TICK_S,
     BodySettings,
@@ -122,26 +117,21 @@ def wall_before(end: int, q, direction_deg: float, away_m: float = 1e-9, **chang
     return WallSettings(x_m=float(place[0]), y_m=float(place[1]), normal_deg=direction_deg + 180.0, **changes)
 
 
-@pytest.mark.parametrize("end", [1, 2])
-def test_a_wall_holds_the_end_of_a_link_against_the_motor(end):
-    q = (0.2, 0.4) if end == 2 else (0.2, -2.0)
-    direction_deg = math.degrees(q[0] + (q[1] if end == 2 else 0.0)) + 90.0
-    wall = wall_before(end, q, direction_deg, stiffness_N_m=2e4)
-    motor = (0.0, 1.5) if end == 2 else (4.0, 0.0)
-    arm = TouchedArm(q=q, motor=motor, damping=0.3, walls=(wall,))
-    jacobian = arm.jacobian(end, (0.35, 0.30)[end - 1], q)
-    if end == 2:
-        # Joint 1 is held by the motor as the wall's force asks.
-        normal = np.array([math.cos(math.radians(direction_deg)), math.sin(math.radians(direction_deg))])
-        arm.motor[0] = (jacobian.T @ normal)[0] * 1.5 / 0.30
+def test_a_wall_holds_the_tip_against_the_motors():
+    """Joint 2 presses with 1.5 Nm, and joint 1 is held by its motor as the wall's force asks."""
+    q = (0.2, 0.4)
+    direction_rad = sum(q) + 0.5 * math.pi
+    wall = wall_before(2, q, math.degrees(direction_rad), stiffness_N_m=2e4)
+    arm = TouchedArm(q=q, damping=0.3, walls=(wall,))
+    direction = np.array([math.cos(direction_rad), math.sin(direction_rad)])
+    arm.motor = arm.jacobian(2, 0.30, q).T @ direction * 1.5 / 0.30
+    assert arm.motor[1] == pytest.approx(1.5)
     seen = arm.play(2.0)
-    force_N = 1.5 / 0.30 if end == 2 else 4.0 / 0.35
-    assert seen["force"][-1] == pytest.approx(force_N, rel=5e-3)
-    normal = np.array([math.cos(math.radians(wall.normal_deg)), math.sin(math.radians(wall.normal_deg))])
-    reached = point_of(end, (0.35, 0.30)[end - 1], arm.q)
-    assert normal @ (np.array([wall.x_m, wall.y_m]) - reached) == pytest.approx(force_N / 2e4, rel=5e-3)
-    assert set(seen["link"][10:]) <= {0.0, float(end)}
-    assert seen["link"][-1] == end
+    assert seen["force"][-1] == pytest.approx(1.5 / 0.30, rel=5e-3)
+    beyond_m = direction @ (point_of(2, 0.30, arm.q) - np.array([wall.x_m, wall.y_m]))
+    assert beyond_m == pytest.approx(1.5 / 0.30 / 2e4, rel=5e-3)
+    assert set(seen["link"][10:]) <= {0.0, 2.0}
+    assert seen["link"][-1] == 2.0
     assert np.hypot(*(arm.q - q)) < 0.02
 
 

@@ -16,16 +16,6 @@ from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
 
 
-def test_the_sensor_of_a_stiff_joint_sees_what_is_left_for_the_link():
-    """The rotor takes its share of the torque: tau_J / tau_m is link inertia over total inertia."""
-    arm, inertia = one_joint()
-    settings = MechanicsSettings(rotor_inertia_kg_m2=(0.3, 0.0), motor_viscous_Nm_s=(0.5, 0.0))
-    driven = GeneralArm(arm, settings)
-    driven.run(1_000, 3.0)
-    expected_Nm = (3.0 - 0.5 * driven.dq[0]) * inertia / (inertia + 0.3)
-    assert driven.joint_torque[0] == pytest.approx(expected_Nm, rel=1e-9)
-
-
 def test_a_rotor_of_the_elbow_does_not_turn_the_shoulder():
     """Kinetic energy of a geared rotor is J dq² / 2 of its own joint: no coupling term."""
     driven = GeneralArm(without_friction(), MechanicsSettings(rotor_inertia_kg_m2=(0.0, 0.4)))
@@ -34,24 +24,6 @@ def test_a_rotor_of_the_elbow_does_not_turn_the_shoulder():
     bare11, bare12, bare22 = mass_matrix(GeneralArm(without_friction(), MechanicsSettings()).state, 0.0)
     assert (m11, m12) == (bare11, bare12)
     assert m22 == pytest.approx(bare22 + 0.4, rel=1e-14)
-
-
-@pytest.mark.parametrize("stiffness", [0.0, 8000.0])
-def test_motor_side_friction_is_invisible_to_the_sensor(stiffness):
-    """An arm that moves steadily on motor-side friction alone: the drive works, the sensor reads nothing."""
-    arm, _ = one_joint()
-    settings = MechanicsSettings(
-        rotor_inertia_kg_m2=(0.3, 0.0),
-        stiffness_Nm_rad=(stiffness, 0.0),
-        motor_coulomb_Nm=(0.7, 0.0),
-        motor_viscous_Nm_s=(0.4, 0.0),
-    )
-    moved = GeneralArm(arm, settings, dq=(1.0, 0.0))
-    moved.state["tau_m"][0] = 1.1
-    moved.run(1_000, 1.1)
-    assert moved.dq[0] == pytest.approx(1.0, abs=1e-9)
-    assert abs(moved.joint_torque[0]) < 1e-8
-    assert moved.observe()["friction"][0] == pytest.approx(0.0, abs=1e-12)
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])

@@ -19,19 +19,15 @@ pytestmark = pytest.mark.slow
 FAULTS = scenario_of(example("lose"), example("wrong_node_id"), example("silence", since="power_on"))
 
 
-def written(folder: Path, scenario: Scenario | None) -> Path:
-    path = folder / "truth.mcap"
+def test_the_log_has_truth_events_the_scenario_and_a_name_for_each_bit(tmp_path: Path) -> None:
+    path = tmp_path / "truth.mcap"
     block = np.zeros(TRUTH_LAYOUT.size)
-    with TruthLog(path, blocking=True, scenario=scenario, metadata={"profile": "P"}) as log:
+    with TruthLog(path, blocking=True, scenario=FAULTS, metadata={"profile": "P"}) as truth:
         for cycle in range(3):
             block[TRUTH_LAYOUT.slices["faults"]] = cycle
-            log.write(cycle, cycle * 1_000_000, block)
-        log.write_event(2_000_000, "warning", "faults", "begins: lose torque of sensor1")
-    return path
-
-
-def test_the_log_has_truth_events_the_scenario_and_a_name_for_each_bit(tmp_path: Path) -> None:
-    log = read_log(written(tmp_path, FAULTS))
+            truth.write(cycle, cycle * 1_000_000, block)
+        truth.write_event(2_000_000, "warning", "faults", "begins: lose torque of sensor1")
+    log = read_log(path)
     (entry,) = log.events
     assert (entry.t_ns, entry.event) == (2_000_000, ("warning", "faults", "begins: lose torque of sensor1"))
     assert log.truth["faults"].tolist() == [0.0, 1.0, 2.0]
@@ -42,9 +38,3 @@ def test_the_log_has_truth_events_the_scenario_and_a_name_for_each_bit(tmp_path:
         "fault_2": "silence of sensor2, at 1 s since power on",
     }
     assert log.metadata["profile"] == "P"
-
-
-def test_a_log_without_scenario_has_neither_attachment_nor_names(tmp_path: Path) -> None:
-    log = read_log(written(tmp_path, None))
-    assert SCENARIO_NAME not in log.attachments
-    assert [key for key in log.metadata if key.startswith("fault_")] == []

@@ -63,10 +63,6 @@ class Watched:
         else:
             self.host.write(1, 0x6040, 0, word)
 
-    def emergencies(self) -> list[tuple[int, int, int, int]]:
-        """Take the EMCYs of drive 1: code, register, watchdog, ms."""
-        return [struct.unpack("<HBBI", data) for data in self.host.taken(0x081)]
-
 
 FAULTING = (SYNC, COMMAND, HEARTBEAT, OPERATIONAL)
 
@@ -77,7 +73,7 @@ def test_a_watchdog_says_that_it_tripped_and_that_its_cause_has_gone_and_leaves_
     watched, is_fault = Watched(watchdog), watchdog in FAULTING
     host, before_ms = watched.host, watched.host.bench.now_ns // MS
     watched.lose()
-    (error,) = watched.emergencies()
+    (error,) = watched.host.emergencies()
     assert error[:3] == (CODES[watchdog], 0x11, watchdog)
     assert before_ms <= error[3] <= host.bench.now_ns // MS
     assert (host.read(1, 0x2210, 1), host.read(1, 0x2210, 2)) == (watchdog, error[3])
@@ -90,7 +86,7 @@ def test_a_watchdog_says_that_it_tripped_and_that_its_cause_has_gone_and_leaves_
         assert host.state_bits(1) == State.FAULT
     host.take()
     watched.find()
-    clearing = [error for error in watched.emergencies() if error[0] == 0]
+    clearing = [error for error in watched.host.emergencies() if error[0] == 0]
     assert [(code, register, number) for code, register, number, _ in clearing] == [(0, int(is_fault), watchdog)]
     assert (host.read(1, 0x1001), host.read(1, 0x603F)) == (int(is_fault), is_fault * CODES[watchdog])
     if is_fault:
@@ -104,9 +100,9 @@ def test_a_watchdog_that_trips_again_is_counted_and_reported_again():
         watched.lose()
         watched.lose()
         assert watched.host.read(1, 0x2210, 7) == count
-        assert [error[0] for error in watched.emergencies()] == [0x8210]
+        assert [error[0] for error in watched.host.emergencies()] == [0x8210]
         watched.find()
-        assert [error[:3] for error in watched.emergencies()] == [(0, 0, LENGTH)]
+        assert [error[:3] for error in watched.host.emergencies()] == [(0, 0, LENGTH)]
 
 
 def test_several_tripped_watchdogs_keep_the_communication_error_until_the_last_has_cleared():
@@ -125,9 +121,9 @@ def test_several_tripped_watchdogs_keep_the_communication_error_until_the_last_h
 def test_a_heartbeat_that_is_no_longer_watched_is_not_missing():
     watched = Watched(HEARTBEAT)
     watched.lose()
-    watched.emergencies()
+    watched.host.emergencies()
     watched.host.write(1, 0x1016, 1, 0)
-    assert [error[:3] for error in watched.emergencies()] == [(0, 1, HEARTBEAT)]
+    assert [error[:3] for error in watched.host.emergencies()] == [(0, 1, HEARTBEAT)]
 
 
 def test_a_reset_of_the_node_forgets_what_has_tripped():

@@ -8,34 +8,16 @@ from rig import SessionRig
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.session import SessionSummary
+from adacd_hil.log.reader import read_log
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 
 CanFrame = tuple[int, bytes]
 SHORT_RUN = '[operator]\nscript = [{ at_s = 0.3, request = "finish" }]\n'
 
 
-class ListeningBus(EmbeddedBus):
-    """An embedded bus that keeps all that passes, both ways."""
-
-    def __init__(self, clock: VirtualClock) -> None:
-        super().__init__(clock)
-        self.passed: list[CanFrame] = []
-
-    def send(self, can_id: int, data: bytes) -> None:
-        """Keep and send."""
-        self.passed.append((can_id, bytes(data)))
-        super().send(can_id, data)
-
-    def deliver(self, can_id: int, data: bytes) -> None:
-        """Keep and deliver."""
-        self.passed.append((can_id, bytes(data)))
-        super().deliver(can_id, data)
-
-
-def play_short_run(folder: Path, bus: ListeningBus, clock: VirtualClock) -> SessionSummary:
-    """Boot, enable and move the emulated arm for 0.3 s, on the bus given; its log is `run.mcap` in the folder."""
+def play_short_run(folder: Path, bus: EmbeddedBus | None = None, clock: VirtualClock | None = None) -> SessionSummary:
+    """Boot, enable and move the emulated arm for 0.3 s, on a bus that may be given; its log is in the folder."""
     (folder / "short.toml").write_text(SHORT_RUN)
     settings = load_settings(str(folder / "short.toml"))
     return SessionRig(folder, settings, bus=bus, clock=clock).session.run()
@@ -43,10 +25,8 @@ def play_short_run(folder: Path, bus: ListeningBus, clock: VirtualClock) -> Sess
 
 def record_legal_traffic(folder: Path) -> list[CanFrame]:
     """Return every frame of a short run: NMT, SDO, SYNC, heartbeats, status, the way to Operation enabled, torque."""
-    clock = VirtualClock()
-    bus = ListeningBus(clock)
-    play_short_run(folder, bus, clock)
-    return bus.passed
+    frames = read_log(play_short_run(folder).log.path).frames
+    return [(int(frame["can_id"]), bytes(frame["data"][: frame["length"]])) for frame in frames]
 
 
 def damaged(legal: Sequence[CanFrame], seed: int, longest: int = 8) -> Iterator[CanFrame]:
@@ -99,8 +79,3 @@ def _flip(can_id: int, data: bytes, dice: random.Random) -> CanFrame:
 def foreign(frames: Iterator[CanFrame], known: frozenset[int]) -> Iterator[CanFrame]:
     """Pass the frames whose identifier isn't known."""
     return (frame for frame in frames if frame[0] not in known)
-
-
-def as_frame(frame: CanFrame, t_ns: int = 0) -> Frame:
-    """Make what a bus delivers."""
-    return Frame(frame[0], frame[1], t_ns)

@@ -12,7 +12,6 @@ implementation that isn't ours finds right, or by an SDO write of 0x6040, which 
 """
 
 import logging
-import math
 import struct
 
 import numpy as np
@@ -27,9 +26,8 @@ from adacd_hil.records import ArmCommand, Request, SchemeState
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.bus import Frame
-from adacd_hil.wire.codec import CodecError, MessageCodec
+from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.dbc_contract import load_codec
-from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.arm.sensing import DriveMode
 from firmware_sim.bench.bench import Bench
@@ -42,73 +40,6 @@ CODEC = load_codec()
 def has_right_crc(message: MessageCodec, data: bytes) -> bool:
     """Judge a Profile 2 frame by cantools."""
     return len(data) == message.length and data[0] == compute_profile2_crc(data, message.data_ids[data[1] & 0x0F])
-
-
-class CodecReceiver:
-    """Decodes every frame that the DBC knows."""
-
-    def __init__(self) -> None:
-        self.decoded = self.refused = 0
-
-    def take(self, frame: CanFrame) -> None:
-        """Decode; what is decoded must encode to the same values, and only the length may be refused."""
-        can_id, data = frame
-        message = CODEC.by_id.get(can_id)
-        if message is None:
-            return
-        try:
-            values = message.decode(data)
-        except CodecError:
-            assert len(data) != message.length, f"{message.name} refused {data.hex()}"
-            self.refused += 1
-            return
-        self.decoded += 1
-        assert len(data) == message.length, f"{message.name} took {data.hex()}"
-        assert all(map(math.isfinite, values))
-        first = len(message.signals) - len(message.values)
-        assert message.decode_values(data) == values[first:]
-        assert message.decode(bytes(message.encode(*values[first:])))[first:] == values[first:]
-
-    @property
-    def summary(self) -> str:
-        """Say what was counted."""
-        return f"codec: {self.decoded} decoded, {self.refused} refused for their length"
-
-
-class EndToEndReceiver:
-    """Checks every frame of the right length by all protected messages' receivers."""
-
-    def __init__(self) -> None:
-        self._messages = [message for message in CODEC.messages.values() if message.is_protected]
-        self._receivers = [message.receiver() for message in self._messages]
-        self._counters: list[int | None] = [None] * len(self._messages)
-        self.checked = self.valid = 0
-
-    def take(self, frame: CanFrame) -> None:
-        """Check; valid needs cantools' CRC and a counter that moved; a wrong CRC must be called so, each is counted."""
-        _, data = frame
-        for index, (message, receiver) in enumerate(zip(self._messages, self._receivers, strict=True)):
-            if len(data) != message.length:
-                continue
-            self.checked += 1
-            status = receiver.check(data)
-            is_right = has_right_crc(message, data)
-            assert (status is E2eStatus.WRONG_CRC) is not is_right, f"{message.name}: {status.name} for {data.hex()}"
-            if is_right:
-                counter, last = data[1] & 0x0F, self._counters[index]
-                self._counters[index] = counter
-                assert not (status.is_valid and counter == last), f"{message.name}: {data.hex()} again is valid"
-            self.valid += status.is_valid
-
-    @property
-    def counted(self) -> int:
-        """Sum the receivers' counts."""
-        return sum(sum(receiver.counts) for receiver in self._receivers)
-
-    @property
-    def summary(self) -> str:
-        """Say what was counted."""
-        return f"end to end: {self.checked} checked, {self.valid} valid, {self.checked - self.valid} dropped"
 
 
 _MAY_RUN = (SchemeState.INIT, SchemeState.COMMISSION, SchemeState.FAULT)

@@ -89,11 +89,6 @@ def test_the_certified_configuration_differs_from_the_paper_s_in_scheme_excitati
     assert ours.scheme == "certified"
 
 
-def test_settings_read_back_from_a_log_are_the_same():
-    settings = load_settings("certified", "M")
-    assert parse(Settings, parse_toml(to_toml(settings))) == settings
-
-
 def test_a_log_from_before_cross_talk_was_identified_has_none_in_its_model():
     table = parse_toml(to_toml(load_settings("certified", "P")))
     assert parse(Settings, with_todays_keys(table)) == load_settings("certified", "P")

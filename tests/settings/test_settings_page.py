@@ -2,8 +2,6 @@
 
 import ast
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import settings_page
@@ -18,11 +16,6 @@ NAMED_IN = ("tests/**/*.py", "docs/**/*.md", "README.md", "adacd_hil/configs/*.t
 
 def test_the_page_is_what_the_declarations_say():
     assert PAGE.read_text(encoding="utf-8") == settings_page.page()
-
-
-def test_the_tool_prints_the_page():
-    done = subprocess.run([sys.executable, settings_page.__file__], capture_output=True, check=True)
-    assert done.stdout.decode() == settings_page.page()
 
 
 def test_a_setting_is_read_by_the_product():
