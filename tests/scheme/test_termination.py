@@ -67,9 +67,3 @@ def test_the_smallest_eigenvalue_is_that_of_lapack(seed, count):
     expected = np.linalg.eigvalsh(scale[:, None] * full * scale)[0]
     found = eigenvalue_range(information_of(columns), scale, np.zeros((count, count)))[0]
     np.testing.assert_allclose(found, expected, rtol=1e-8)
-
-
-def test_a_direction_that_was_never_moved_has_no_information():
-    columns = np.random.default_rng(1).standard_normal((40, 2, 7))
-    columns[:, :, 4] = 2.0 * columns[:, :, 3]
-    assert eigenvalue_range(information_of(columns), np.ones(7), np.zeros((7, 7)))[0] < 1e-15
