@@ -74,15 +74,6 @@ def test_a_block_keeps_its_largest_statistic():
     )
 
 
-def test_a_step_crosses_the_threshold_when_the_law_says():
-    step = np.zeros((300, 2))
-    step[100:, 0], step[100:, 1] = 0.3, -1.0
-    filtered = statistics(step)["first-order 10"]
-    late_ms = np.argmax(filtered > 0.15, axis=0) - 99
-    law_ms = [-math.log(1.0 - 0.15 / torque) / 10.0 * 1e3 for torque in (0.3, 1.0)]
-    assert np.all((late_ms >= law_ms) & (late_ms < np.array(law_ms) + 1.0))
-
-
 def test_cusum_adds_up_what_is_above_the_drift_and_forgets_it_at_zero():
     push = np.zeros((3000, 2))
     push[:1000] = (0.5, -0.3)

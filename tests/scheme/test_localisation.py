@@ -59,11 +59,6 @@ def test_a_jump_of_the_drives_torque_does_not_make_the_force_larger(samples, whe
     assert place.force_N == pytest.approx(10.0, rel=1e-6)
 
 
-def test_of_a_force_that_grows_the_strongest_part_counts():
-    tau = np.linspace(0.0, 1.0, 90)[:, None] * torques(12.0, 0.2, 0.6)
-    assert on_link2(tau, np.full(90, 0.6), SIGMA, LENGTHS).force_N == pytest.approx(11.0, rel=0.02)
-
-
 def test_one_sample_is_enough():
     place = on_link2(torques(-12.0, 0.2, 0.6)[None], np.full(1, 0.6), SIGMA, LENGTHS)
     assert place.force_N == pytest.approx(-12.0)
@@ -87,12 +82,6 @@ def test_a_weak_touch_is_uncertain():
 )
 def test_a_lever_arm_off_the_link_is_said(lever_m, location):
     assert on_link2(*blow(20.0, lever_m, 0.3), SIGMA, LENGTHS).location is location
-
-
-def test_a_clamp_has_no_place():
-    one, q2 = blow(60.0, 0.28, 0.2)
-    other, _ = blow(-50.0, 0.05, 0.2)
-    assert on_link2(one + other, q2, SIGMA, LENGTHS).location is Location.INCONSISTENT
 
 
 def test_on_link1_the_smallest_force_with_the_moment_is_given():
