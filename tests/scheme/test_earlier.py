@@ -10,9 +10,9 @@ from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FRICTION_SPEEDS_RAD_S, FaultReason, Request, SchemeState
-from adacd_hil.scheme.identify import anchor, certificate, earlier, evidence, fit_check
+from adacd_hil.scheme.identify import anchor, earlier, evidence, fit_check
 from adacd_hil.scheme.kernel import certified_memory
-from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD, CertificateWatch
+from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD
 
 UNKNOWN = replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=None))
 BRAKED = replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=(8.0, 8.0)))
@@ -84,15 +84,6 @@ def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_t
     assert loop.said("touch")[0].startswith("torque offset of joint 1 is 0.50")
     loop.recover()
     assert abs(loop.offset_error_Nm[0]) < 0.03
-
-
-def test_what_was_learnt_under_a_lean_judges_nothing_once_the_lean_has_gone():
-    loop = TouchedLoop(FREE, theta=THETA["S"])
-    loop.run_until(SchemeState.ADAPT)
-    loop.lean(1, 0.44, 0.35)
-    released_at = loop.cycle
-    loop.recover()
-    assert (loop.cycle - released_at) * PERIOD_S < 6.5
 
 
 @pytest.mark.long
@@ -309,15 +300,6 @@ def test_where_gravity_acts_later_samples_may_differ_by_what_they_do_not_know(sh
     assert room * far.max() > 1.2 * fit_check.LATER_NM
     fit.differ(0, share * room * np.eye(count)[1])
     assert is_whole(fit) is is_borne_out
-
-
-@pytest.mark.parametrize(("settings", "has_mounting"), [(FREE, False), (UPRIGHT, True)], ids=["flat", "upright"])
-def test_a_fit_that_no_model_explains_names_the_mounting_where_gravity_acts(settings, has_mounting):
-    constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
-    memory[0].certificate.withheld_by = certificate.CHANGED
-    said = CertificateWatch(constants[0], memory[0], "").refuse()
-    assert "no one model explains the whole fit" in said.message
-    assert ("arm.mounting_deg" in said.message) is has_mounting
 
 
 def test_a_fit_with_noise_may_differ_by_more():
