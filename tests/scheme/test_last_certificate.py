@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import FREE, NAMES, TouchedLoop, added, kernel_of, learnt_s, states
+from excited_arm import FREE, NAMES, TouchedLoop, added, kernel_of, states
 from long_cases import long_but
 from planar_arm import PAYLOAD_1KG, THETA
 
@@ -33,15 +33,6 @@ def known(theta, settings=FREE):
         offset_std_Nm=(0.01, 0.01),
     )
     return replace(settings, history=history)
-
-
-@pytest.mark.parametrize("profile", long_but(1, ["P", "S", "M"]))
-def test_an_arm_that_nobody_touches_is_certified_as_ever_and_its_certificate_says_what_it_was_compared_with(profile):
-    loop = TouchedLoop(known(THETA[profile]), theta=THETA[profile])
-    outputs = loop.run_until(SchemeState.MONITOR)
-    assert learnt_s(outputs) == pytest.approx(2.0, abs=0.01)
-    assert loop.said("touch") == []
-    assert loop.said("certificate")[0].endswith(f"; friction and inertia: within what the certificate of {DATE} allows")
 
 
 @pytest.mark.parametrize(
