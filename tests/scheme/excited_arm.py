@@ -182,10 +182,7 @@ class ExcitedLoop:
         q, dq = self.q.copy(), self.tracked_dq.copy()
         tau_J = self.tau + TORQUE_NOISE_NM * self.random.standard_normal(2)
         quantise(q, dq, tau_J)
-        return ArmState(
-            self.cycle, self.cycle * 1_000_000, 1, q, dq, tau_J + self.offset_Nm, (0, 0), (0, 0), is_enabled=True,
-            is_complete=True, fault=FaultReason.NONE,
-        )  # fmt: skip
+        return arm_state(self.cycle, q, dq, tau_J + self.offset_Nm)
 
     def move(self, output: SchemeOutput) -> None:
         """Go on with the desired motion."""

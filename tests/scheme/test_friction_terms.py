@@ -93,16 +93,16 @@ LENGTHS_RAD = np.array([0.001, 0.004])
 @pytest.mark.parametrize("dq", [0.3, -0.3])
 def test_bristles_bend_over_the_way_not_the_time_and_in_steady_sliding_the_column_is_nothing(dq):
     """After the way d from the opposite direction 2 / e of the reversal is left."""
-    by_steps, at_once = np.full((2, 2), -np.sign(dq)), np.full((2, 2), -np.sign(dq))
+    by_steps, at_once = np.full((2, 3), -np.sign(dq)), np.full((2, 3), -np.sign(dq))
     way_s = LENGTHS_RAD[1] / abs(dq)
     for _ in range(8):
-        bend_bristles(np.full(2, dq), way_s / 8.0, STILL, LENGTHS_RAD, by_steps)
-    bend_bristles(np.full(2, dq), way_s, STILL, LENGTHS_RAD, at_once)
+        bend_bristles(np.full(3, dq), way_s / 8.0, STILL, LENGTHS_RAD, by_steps)
+    bend_bristles(np.full(3, dq), way_s, STILL, LENGTHS_RAD, at_once)
     np.testing.assert_allclose(by_steps, at_once, rtol=1e-12)
     both = columns([DAHL_SHORT, DAHL_LONG], dq=np.full(2, dq), bent=at_once)
     left = -2.0 * np.sign(dq) * np.exp([-4.0, -1.0])
     np.testing.assert_allclose(both, np.hstack([left[0] * np.eye(2), left[1] * np.eye(2)]), rtol=1e-12)
-    bend_bristles(np.full(2, dq), 40.0 * way_s, STILL, LENGTHS_RAD, at_once)
+    bend_bristles(np.full(3, dq), 40.0 * way_s, STILL, LENGTHS_RAD, at_once)
     np.testing.assert_allclose(columns([DAHL_SHORT, DAHL_LONG], dq=np.full(2, dq), bent=at_once), 0.0, atol=1e-15)
 
 
