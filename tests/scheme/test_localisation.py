@@ -59,6 +59,11 @@ def test_a_jump_of_the_drives_torque_does_not_make_the_force_larger(samples, whe
     assert place.force_N == pytest.approx(10.0, rel=1e-6)
 
 
+def test_of_a_force_that_grows_the_strongest_part_counts():
+    tau = np.linspace(0.0, 1.0, 90)[:, None] * torques(12.0, 0.2, 0.6)
+    assert on_link2(tau, np.full(90, 0.6), SIGMA, LENGTHS).force_N == pytest.approx(11.0, rel=0.02)
+
+
 def test_one_sample_is_enough():
     place = on_link2(torques(-12.0, 0.2, 0.6)[None], np.full(1, 0.6), SIGMA, LENGTHS)
     assert place.force_N == pytest.approx(-12.0)
