@@ -137,16 +137,3 @@ def test_a_device_that_has_lost_its_set_up_faults(tmp_path: Path) -> None:
     assert result.fault is FaultReason.TAMPERED
     assert "Drive2 (node 2): 0x2200 " in transition(log, "FAULT")
     assert "is 0xC8, 0xA was set up" in transition(log, "FAULT")
-
-
-def test_the_set_up_is_read_again_while_the_arm_runs_and_differs_in_nothing(tmp_path: Path) -> None:
-    rig = rig_with(tmp_path, "devices", reread_ms=2)
-    result, log = rig.play()
-    assert result.fault is FaultReason.NONE
-    asked = {
-        (int(frame["can_id"]), bytes(frame["data"][1:4]))
-        for frame in log.frames
-        if frame["is_tx"] and 0x601 <= frame["can_id"] <= 0x604 and frame["t_ns"] > 500_000_000
-    }
-    assert len(asked) > 80
-    assert messages(log, "parameters") == []

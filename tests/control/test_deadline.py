@@ -21,62 +21,42 @@ ON_TIME = ArmState(
 )  # fmt: skip
 
 
-class Watched:
-    """A watch at 1 kHz that is told of each cycle by the periods since the one before."""
-
-    def __init__(self, **realtime: Any) -> None:
-        settings = RealtimeSettings(**({"misses": 3, "misses_window_s": 0.1} | realtime))
-        self.watch = DeadlineWatch(dataclasses.replace(load_settings(), realtime=settings))
-        self.cycle = 0
-
-    def after(self, periods: int, count: int = 1) -> ArmState:
-        for _ in range(count):
-            self.cycle += periods
-            arm = self.watch.judge(ON_TIME._replace(cycle=self.cycle, periods=periods))
-        return arm
+def judged(steps: list[tuple[int, int]], fault: FaultReason = FaultReason.NONE, **realtime: Any) -> ArmState:
+    """Tell a watch at 1 kHz of cycles by the periods since the one before, times a count; return its last judgement."""
+    settings = RealtimeSettings(**({"misses": 3, "misses_window_s": 0.1} | realtime))
+    watch, cycle = DeadlineWatch(dataclasses.replace(load_settings(), realtime=settings)), 0
+    for periods in [periods for periods, count in steps for _ in range(count)]:
+        cycle += periods
+        arm = watch.judge(ON_TIME._replace(cycle=cycle, periods=periods, fault=fault))
+    return arm
 
 
-@pytest.mark.parametrize(("periods", "fault"), [(3, FaultReason.NONE), (4, FaultReason.DEADLINE)])
-def test_one_stall_of_as_many_periods_as_are_too_many_faults(periods: int, fault: FaultReason) -> None:
-    assert Watched().after(periods).fault is fault
-    assert Watched(on_misses="hold").after(periods).fault is FaultReason.NONE  # the arm is held
-
-
-def test_single_misses_add_up_within_the_window() -> None:
-    watched = Watched()
-    watched.after(2)
-    watched.after(1, 40)
-    watched.after(2)
-    watched.after(1, 40)
-    assert watched.after(2).fault is FaultReason.DEADLINE
-    assert watched.watch.describe_misses() == "3 periods missed within 0.1 s; 3 are too many"
-
-
-def test_misses_further_apart_than_the_window_never_add_up() -> None:
-    watched = Watched()
-    for _ in range(20):
-        assert watched.after(2).fault is FaultReason.NONE
-        assert watched.after(1, 49).fault is FaultReason.NONE
-
-
-def test_a_window_later_the_host_counts_as_on_time_again() -> None:
-    watched = Watched(on_misses="hold")
-    assert watched.after(4).is_late
-    assert watched.after(1, 99).is_late
-    assert not watched.after(1).is_late
+@pytest.mark.parametrize(
+    ("steps", "is_late"),
+    [
+        ([(3, 1)], False),
+        ([(4, 1)], True),
+        ([(2, 1), (1, 40), (2, 1), (1, 40), (2, 1)], True),
+        ([(2, 1), (1, 49)] * 20, False),
+        ([(4, 1), (1, 99)], True),
+        ([(4, 1), (1, 100)], False),
+    ],
+    ids=["a stall", "a longer one", "they add up within the window", "further apart", "in it yet", "a window later"],
+)
+def test_a_host_is_late_while_it_has_missed_too_many_periods_within_the_window(
+    steps: list[tuple[int, int]], is_late: bool
+) -> None:
+    assert judged(steps, on_misses="hold").is_late is is_late
+    assert judged(steps, on_misses="hold").fault is FaultReason.NONE  # the arm is held
+    assert judged(steps).fault is (FaultReason.DEADLINE if is_late else FaultReason.NONE)
 
 
 def test_many_misses_that_leave_the_window_at_once_are_all_forgotten() -> None:
-    watched = Watched(misses=9, on_misses="hold")
-    watched.after(2, 4)
-    watched.after(1, 92)
-    assert not watched.after(8).is_late
+    assert not judged([(2, 4), (1, 92), (8, 1)], misses=9, on_misses="hold").is_late
 
 
 def test_a_fault_of_the_arm_keeps_its_name() -> None:
-    watched = Watched()
-    late = watched.watch.judge(ON_TIME._replace(periods=9, cycle=9, fault=FaultReason.SENSOR))
-    assert late.fault is FaultReason.SENSOR
+    assert judged([(9, 1)], FaultReason.SENSOR).fault is FaultReason.SENSOR
 
 
 def play(folder: Path, on_misses: str) -> RunLog:

@@ -39,10 +39,10 @@ class TimedBus(Bus):
 class Follower:
     """A follower on a timed bus."""
 
-    def __init__(self, counters: list[int], start_ns: int = PERIOD_NS) -> None:
+    def __init__(self, counters: list[int]) -> None:
         self.bus = TimedBus()
-        for place, counter in enumerate(counters):
-            self.bus.put(start_ns + place * PERIOD_NS, SYNC, counter)
+        for place, counter in enumerate(counters, 1):
+            self.bus.put(place * PERIOD_NS, SYNC, counter)
         self.tap = Tap(self.bus, self.bus.clock)
         self.pacer = FollowingPacer(self.tap, self.bus.clock, PERIOD_NS, SYNC, TIMEOUT_NS)
 
@@ -50,46 +50,29 @@ class Follower:
         self.bus.clock.sleep_until_ns(self.bus.clock.now_ns() + duration_ns)
 
 
-def test_each_sync_begins_a_cycle_at_the_time_it_came_also_where_the_counter_wraps() -> None:
-    follower = Follower([239, 240, 1])
-    ticks = [follower.pacer.next() for _ in range(3)]
-    assert [(tick.cycle, tick.t_ns, tick.periods) for tick in ticks] == [
-        (0, PERIOD_NS, 1),
-        (1, 2 * PERIOD_NS, 1),
-        (2, 3 * PERIOD_NS, 1),
-    ]
-
-
-def test_of_several_syncs_that_wait_the_last_one_counts() -> None:
-    follower = Follower([1, 2, 3, 4])
-    follower.pacer.next()
-    follower.stall(2 * PERIOD_NS)
-    tick = follower.pacer.next()
-    assert (tick.cycle, tick.periods, follower.pacer.overruns) == (2, 2, 1)
-    assert follower.pacer.next().cycle == 3
-
-
-def test_a_sync_that_was_lost_counts_by_the_counter_of_the_next() -> None:
-    follower = Follower([5])
-    follower.bus.put(4 * PERIOD_NS, SYNC, 8)
-    follower.pacer.next()
-    tick = follower.pacer.next()
-    assert (tick.cycle, tick.periods, follower.pacer.overruns) == (3, 3, 2)
-
-
-def test_a_gap_of_more_than_240_periods_is_counted_by_the_clock() -> None:
-    follower = Follower([10])
-    follower.pacer.next()
-    follower.bus.put(301 * PERIOD_NS, SYNC, 10 + 300 - 240)
-    follower.stall(299 * PERIOD_NS)
-    assert follower.pacer.next().periods == 300
-
-
-def test_a_sync_without_counter_is_counted_by_the_clock() -> None:
+@pytest.mark.parametrize(
+    ("syncs", "stall", "ticks"),
+    [
+        ({1: 239, 2: 240, 3: 1}, 0, [(0, 1), (1, 1), (2, 1)]),
+        ({1: 1, 2: 2, 3: 3, 4: 4}, 2, [(0, 1), (2, 2), (3, 1)]),
+        ({1: 5, 4: 8}, 0, [(0, 1), (3, 3)]),
+        ({1: 10, 301: 70}, 299, [(0, 1), (300, 300)]),
+        ({1: None, 2: None, 5: None}, 0, [(0, 1), (1, 1), (4, 3)]),
+    ],
+    ids=["the counter wraps", "the last of several", "one was lost", "a gap of more than 240", "without a counter"],
+)
+def test_syncs_are_counted_by_their_counter_and_by_the_clock(
+    syncs: dict[int, int | None], stall: int, ticks: list[tuple[int, int]]
+) -> None:
+    """Counters by the period in which they come; after the first the host stalls for some periods."""
     follower = Follower([])
-    for place in (1, 2, 5):
-        follower.bus.put(place * PERIOD_NS, SYNC)
-    assert [follower.pacer.next().cycle for _ in range(3)] == [0, 1, 4]
+    for period, counter in syncs.items():
+        follower.bus.put(period * PERIOD_NS, SYNC, *([] if counter is None else [counter]))
+    found = [follower.pacer.next()]
+    follower.stall(stall * PERIOD_NS)
+    found += [follower.pacer.next() for _ in ticks[1:]]
+    assert [(tick.cycle, tick.periods) for tick in found] == ticks
+    assert follower.pacer.overruns == sum(periods - 1 for _, periods in ticks)
 
 
 def test_frames_are_told_apart_by_the_sync_between_them() -> None:

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from desired_motion import Desired
+from long_cases import long_but
 
 from adacd_hil.control.reference import LOST_CYCLES
 from adacd_hil.records import JOINTS, Event, Reaction, SchemeState, Vector
@@ -131,15 +132,11 @@ def check(seed: int) -> set[int]:
 
 
 @pytest.mark.slow
-def test_every_motion_stays_within_position_speed_and_acceleration_limits() -> None:
-    too_fast = [check(seed) for seed in range(40)]
+@pytest.mark.parametrize("seeds", long_but(1, [range(40), range(1000, 3000)]))
+def test_every_motion_stays_within_position_speed_and_acceleration_limits(seeds: range) -> None:
+    """Also from a hundred thousand starts."""
+    too_fast = [check(seed) for seed in seeds]
     assert any(too_fast)  # some are thrown too near to a limit
-
-
-@pytest.mark.long
-def test_every_motion_stays_within_its_limits_from_a_hundred_thousand_starts() -> None:
-    for seed in range(1000, 3000):
-        check(seed)
 
 
 def planned(settings: Settings) -> list[Vector]:
@@ -155,16 +152,10 @@ def planned(settings: Settings) -> list[Vector]:
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_an_arm_that_ends_stays_between_where_it_has_been_and_its_corner(scheme: str) -> None:
+def test_an_arm_that_ends_goes_smoothly_and_stays_between_where_it_has_been_and_its_corner(scheme: str) -> None:
     settings = load_settings(scheme, "P")
     for course in planned(settings):
         assert np.all(np.abs(course[:, 0]) <= np.radians(settings.trajectory.amplitude_deg) * (1.0 + 1e-3))
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_way_to_the_corner_is_smooth(scheme: str) -> None:
-    settings = load_settings(scheme, "P")
-    for course in planned(settings):
         # A tenth of the acceleration limit; a brake begins with all of it.
         assert np.max(np.abs(np.diff(course[:, 2], axis=0))) < np.radians(70.0)
         np.testing.assert_allclose(np.diff(course[:, 0], axis=0), 1e-3 * course[1:, 1], atol=1e-5)

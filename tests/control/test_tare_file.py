@@ -81,29 +81,6 @@ def test_a_tare_is_read_as_it_was_written(tmp_path: Path) -> None:
         read_tare(tmp_path / "none.toml")
 
 
-def test_the_file_before_is_kept_and_nothing_else_is_left(tmp_path: Path) -> None:
-    folder = tmp_path / "new"
-    assert write_tare(TARE, folder / "tare.toml") is None
-    second = dataclasses.replace(TARE, offset_Nm=(0.1, 0.1))
-    assert write_tare(second, folder / "tare.toml") == folder / "tare.toml.1"
-    third = dataclasses.replace(TARE, offset_Nm=(0.2, 0.2))
-    write_tare(third, folder / "tare.toml")
-    assert read_tare(folder / "tare.toml") == third
-    assert read_tare(folder / "tare.toml.1") == second
-    assert sorted(path.name for path in folder.iterdir()) == ["tare.toml", "tare.toml.1"]
-
-
-def test_a_write_that_fails_leaves_the_file_as_it_was(tmp_path: Path) -> None:
-    stored(tmp_path, offset_Nm=(0.1, 0.1))
-    path = stored(tmp_path)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    broken = dataclasses.replace(TARE, user="\ud800")  # no UTF-8
-    with pytest.raises(UnicodeEncodeError):
-        write_tare(broken, path)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-    assert len(before) == 2
-
-
 @pytest.mark.parametrize(
     ("old", "new", "line"),
     [
@@ -152,12 +129,6 @@ def test_a_tare_knows_the_zero_less_well_as_it_ages(
     assert used.offset_std_Nm(SETTINGS.tare) == pytest.approx(expected_Nm)
     steady = dataclasses.replace(SETTINGS.tare, drift_Nm_K=0.0, drift_Nm_sqrt_s=0.0)
     assert used.offset_std_Nm(steady) == pytest.approx((math.hypot(0.005, 0.005), 0.001))  # at least 1 mNm
-
-
-def test_another_sign_than_the_one_it_was_measured_with_is_refused(tmp_path: Path) -> None:
-    arm = dataclasses.replace(SETTINGS.arm, sign=(1, -1))
-    with pytest.raises(ConfigError, match=r"measured with arm.sign = \[1, 1\], but the configuration has \[1, -1\]"):
-        use_tare(stored(tmp_path), dataclasses.replace(SETTINGS, arm=arm), DATE_NS)
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,8 @@ def test_a_reference_run_has_the_stored_bits(played: tuple[Reference, Reference]
 
 @pytest.mark.slow
 def test_the_frames_of_a_reference_run_come_to_the_states_of_the_arm_and_the_decisions(log: tuple[str, RunLog]) -> None:
-    source = LogSource(log[1].path)
+    """Taken in by pieces, where each cycle was taken in alone."""
+    source = LogSource(log[1].path, cycles_per_piece=333)
     (found,) = replay_source(source, [source.settings], script_of=ScriptedOperator, by_frames=True)
     assert found.mismatches == ()
     assert found.arms_compared == found.compared == len(log[1].scheme) > 0

@@ -150,11 +150,17 @@ MOVING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
 class ExcitedLoop:
     """The arm under PD control, and the certified pipeline that watches it; one call of `step` is one period.
 
-    It moves on the excitation wherever the arm moves, brakes where it reacts, and is led back from there.
+    It moves on the excitation wherever the arm moves, brakes where it reacts, and is led back from there. Its sensors
+    are off by `offset_Nm`; `events`: the pipeline's.
     """
 
     def __init__(
-        self, settings: Settings = SETTINGS, theta: np.ndarray = THETA["P"], seed: int = 1, motion: Motion | None = None
+        self,
+        settings: Settings = SETTINGS,
+        offset_Nm=(0.0, 0.0),
+        theta=THETA["P"],
+        seed=1,
+        motion: Motion | None = None,
     ):
         self.settings = settings
         self.pipeline = new_pipeline(settings)
@@ -166,19 +172,17 @@ class ExcitedLoop:
         self.q, self.dq = self.corner.copy(), np.zeros(2)
         self.tracked_q, self.tracked_dq = self.q.copy(), np.zeros(2)
         self.tau, self.tau_next, self.tau_ext = np.zeros(2), np.zeros(2), np.zeros(2)
-        self.away, self.offset_Nm = np.zeros(2), np.zeros(2)
+        self.away, self.offset_Nm = np.zeros(2), np.array(offset_Nm)
         self.cycle = self.motion_cycles = 0
         self.request = Request.NONE
         self.advance = advance
+        self.events: list[Event] = []
 
     def measure(self) -> ArmState:
         q, dq = self.q.copy(), self.tracked_dq.copy()
         tau_J = self.tau + TORQUE_NOISE_NM * self.random.standard_normal(2)
         quantise(q, dq, tau_J)
-        return ArmState(
-            self.cycle, self.cycle * 1_000_000, 1, q, dq, tau_J + self.offset_Nm, (0, 0), (0, 0), is_enabled=True,
-            is_complete=True, fault=FaultReason.NONE,
-        )  # fmt: skip
+        return arm_state(self.cycle, q, dq, tau_J + self.offset_Nm)
 
     def move(self, output: SchemeOutput) -> None:
         """Go on with the desired motion."""
@@ -205,6 +209,7 @@ class ExcitedLoop:
     def step(self) -> SchemeOutput:
         arm = self.measure()
         output = self.pipeline.step(arm, self.request)
+        self.events += self.pipeline.take_events()
         self.request = Request.NONE
         self.tau = self.tau_next
         self.tau_next = self.control(arm, output)
@@ -226,17 +231,7 @@ class ExcitedLoop:
 
 
 class TouchedLoop(ExcitedLoop):
-    """The arm on the excitation, with sensors that are off by `offset_Nm`; keeps the pipeline's events."""
-
-    def __init__(self, settings, offset_Nm=(0.0, 0.0), **options):
-        super().__init__(settings, **options)
-        self.offset_Nm = np.array(offset_Nm)
-        self.events: list[Event] = []
-
-    def step(self):
-        output = super().step()
-        self.events += self.pipeline.take_events()
-        return output
+    """The arm on the excitation, whom people touch and speak to."""
 
     def lean(self, joint, torque_Nm, seconds):
         self.tau_ext[joint] = torque_Nm

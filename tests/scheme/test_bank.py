@@ -47,17 +47,11 @@ def held_by_scipy(cutoff, samples):
 
 
 @pytest.mark.parametrize("c", range(3))
-def test_each_filter_of_the_torque_is_the_one_that_scipy_has(c):
-    Y_p, Y_h, tau_J = signals()
-    tau_f, _ = Bank().run(Y_p, Y_h, tau_J)
-    np.testing.assert_allclose(tau_f[:, c], held_by_scipy(CUTOFF[c], tau_J), rtol=1e-9, atol=1e-10)
-
-
-@pytest.mark.parametrize("c", range(3))
-def test_each_filter_of_the_regressor_differentiates_the_momentum(c):
+def test_each_filter_is_the_one_that_scipy_has_and_differentiates_the_momentum(c):
     """W_f = F (s Y_p + Y_h): a derivative of straight lines is constant in between."""
     Y_p, Y_h, tau_J = signals()
-    _, W_f = Bank().run(Y_p, Y_h, tau_J)
+    tau_f, W_f = Bank().run(Y_p, Y_h, tau_J)
+    np.testing.assert_allclose(tau_f[:, c], held_by_scipy(CUTOFF[c], tau_J), rtol=1e-9, atol=1e-10)
     decay = np.exp(-CUTOFF[c] * T)
     rate = np.concatenate([np.zeros((1, 2, COLUMNS)), np.diff(Y_p, axis=0) / T])
     derivative = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], rate, axis=0)

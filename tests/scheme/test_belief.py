@@ -112,14 +112,6 @@ def test_after_a_touch_the_ring_holds_what_was_seen_since():
     np.testing.assert_array_equal(m.ring.tau[:3], tau_f[100 + EVERY - 1 : 100 + 3 * EVERY : EVERY])
 
 
-def test_runs_of_other_periods_share_their_machine_code():
-    memories = [
-        certified_memory.new_memory(replace(SETTINGS, bus=replace(SETTINGS.bus, period_us=period_us)))
-        for period_us in (500, 1000, 5000)
-    ]
-    assert len({id(memory.dtype) for memory in memories}) == 1
-
-
 def test_a_payload_widens_the_belief_along_one_direction():
     P = np.zeros((COUNT, COUNT))
     direction = regressor.payload_direction((0.35, 0.30), COUNT, 0.0)
@@ -176,27 +168,6 @@ def test_a_lag_that_is_held_moves_no_more_and_the_others_are_learnt_as_if_it_wer
     information = np.linalg.inv(P0) + np.einsum("nij,nik->jk", W, W) / R
     theta = np.linalg.solve(information, np.linalg.solve(P0, theta0) + np.einsum("nij,ni->j", W, tau) / R)
     np.testing.assert_allclose(m.models.belief[OTHERS], theta, rtol=1e-6)
-
-
-def test_noise_of_the_torque_shrinks_a_lag_that_is_learnt_on_and_on_but_not_one_that_is_held():
-    """Its column is a derivative: where the torque hardly changes it is noise, which the torque itself doesn't show."""
-    random = np.random.default_rng(3)
-    count = 20_000
-    change, noise = random.standard_normal((2, count, 2))
-    W_f = np.zeros((count, 2, COUNT))
-    for i in range(2):
-        W_f[:, i, LAGS[i]] = change[:, i] + 2.0 * noise[:, i]
-    tau_f = 0.001 * change
-    lags = []
-    for is_held in (False, True):
-        m = prior()
-        m.models.belief[LAGS], m.models.P_belief[LAGS, LAGS] = 0.001, 0.01**2
-        if is_held:
-            belief.hold_lags(K, m)
-        teach(m, W_f, tau_f)
-        lags.append(m.models.belief[LAGS].tolist())
-    assert lags[0] == pytest.approx([0.0002] * 2, abs=5e-5)
-    assert lags[1] == [0.001] * 2
 
 
 def random_covariance(random, count=5):

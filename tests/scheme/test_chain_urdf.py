@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from serial_arms import SEVEN_JOINT_URDF, seven_joint_arm
+from serial_arms import SEVEN_JOINT_URDF
 
 from adacd_hil.lab.serial_arm.urdf import UrdfError, read_urdf
 
@@ -46,17 +46,6 @@ def test_a_continuous_joint_has_no_position_limits():
     spin = joint("spin", "continuous", "b", "c", '<limit lower="-1" upper="1" velocity="3" effort="4"/>')
     arm = read_urdf(robot(LINKS + TURN + spin))
     assert (arm.position_low[1], arm.position_high[1], arm.velocity_limit[1]) == (-np.inf, np.inf, 3.0)
-
-
-def test_a_joint_on_what_is_fixed_to_the_base_is_placed_from_the_base():
-    arm = seven_joint_arm()
-    np.testing.assert_allclose(arm.chain.translation[0], [0.0, 0.0, 0.33])
-    assert arm.places["base"][0] == -1
-
-
-def test_a_locked_joint_counts_as_fixed():
-    finger = robot(LINKS + TURN + joint("finger", "prismatic", "b", "c"))
-    assert read_urdf(finger, locked=("finger",)).joint_names == ("turn",)
 
 
 @pytest.mark.parametrize(

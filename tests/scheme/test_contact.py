@@ -19,29 +19,13 @@ def half_sine(size, duration_s, samples=1000, begin=100):
     return np.where(inside, size * np.sin(np.pi * t_s / duration_s), 0.0)
 
 
-def wide_of(tau_ext):
-    tau_ext = np.column_stack((tau_ext, -0.5 * tau_ext))
-    still = np.zeros_like(tau_ext)
-    return run_kernel(settings_with(), still, still, -tau_ext, np.zeros(7), 0)[:, PLACES["tau_ext_wide_hat"]]
-
-
-def test_a_torque_step_is_seen_in_full_after_five_samples():
-    wide = wide_of(np.where(np.arange(300) >= 100, 2.0, 0.0))
-    np.testing.assert_allclose(wide[106:], np.full((194, 2), (2.0, -1.0)), rtol=1e-9)
-
-
-@pytest.mark.parametrize("duration_s", [0.02, 0.05, 0.1])
-def test_the_peak_of_a_half_sine_is_right_within_four_percent(duration_s):
-    assert abs(np.max(wide_of(half_sine(3.0, duration_s))[:, 0]) / 3.0 - 1.0) < 0.04
-
-
-@pytest.mark.parametrize(("a", "b"), [(10.0, 2.0), (50.0, 50.0)])
-def test_the_strength_does_not_depend_on_the_filter(a, b):
-    tau_ext = np.column_stack((half_sine(3.0, 0.1),) * 2)
+@pytest.mark.parametrize(("a", "b"), [(10.0, 10.0), (10.0, 2.0), (50.0, 50.0)])
+def test_a_torque_step_is_seen_in_full_after_five_samples_whatever_the_filter(a, b):
+    tau_ext = np.outer(np.arange(300) >= 100, (2.0, -1.0))
     still = np.zeros_like(tau_ext)
     settings = settings_with(filter={"a_rad_s": a, "b_rad_s": b})
-    blocks = run_kernel(settings, still, still, -tau_ext, np.zeros(7), 0)
-    assert abs(np.max(blocks[:, PLACES["tau_ext_wide_hat"]]) / 3.0 - 1.0) < 0.04
+    wide = run_kernel(settings, still, still, -tau_ext, np.zeros(7), 0)[:, PLACES["tau_ext_wide_hat"]]
+    np.testing.assert_allclose(wide[106:], tau_ext[106:], rtol=1e-9)
 
 
 class Touch(PaperKernel):

@@ -36,27 +36,6 @@ def test_a_torque_step_is_detected_by_the_delay_law(size_Nm, delay_ms, sign, joi
     assert not np.any(over[:, 1 - joint])
 
 
-@pytest.mark.parametrize("size_Nm", [0.15, 0.149, 0.05])
-def test_a_torque_step_up_to_the_threshold_is_never_detected(size_Nm):
-    assert not np.any(alarms(step_at(0, size_Nm)))
-
-
-@pytest.mark.parametrize(("impulse_Nms", "is_detected"), [(0.0148, False), (0.0152, True)])
-def test_the_smallest_impulse_is_the_threshold_over_the_cutoff(impulse_Nms, is_detected):
-    """Within 0.5 %: the impulse takes two periods, in which the filter forgets as much."""
-    tau_ext = np.zeros((500, 2))
-    tau_ext[BEGIN, 0] = impulse_Nms / T
-    assert bool(np.any(alarms(tau_ext))) is is_detected
-
-
-def test_the_environment_pushing_toward_positive_q_is_a_positive_external_torque():
-    """An arm that is held still by its drives against a push toward +q needs a negative joint torque."""
-    tau_J = np.full((2000, 2), (-0.7, -0.3))
-    still = np.zeros_like(tau_J)
-    blocks = run_kernel(settings_with(), still, still, tau_J, np.zeros(7), 0)
-    np.testing.assert_allclose(blocks[-1, PLACES["tau_ext_hat"]], [0.7, 0.3], rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("tau_ext_hat", "joints"),
     [

@@ -1,6 +1,7 @@
 """Detectors on one stream, against scipy's filters and closed forms."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,15 +73,6 @@ def test_a_block_keeps_its_largest_statistic():
     np.testing.assert_array_equal(
         statistics(NOISE, block=150)["observer 25"], [every[:150].max(0), every[150:300].max(0), every[300:].max(0)]
     )
-
-
-def test_a_step_crosses_the_threshold_when_the_law_says():
-    step = np.zeros((300, 2))
-    step[100:, 0], step[100:, 1] = 0.3, -1.0
-    filtered = statistics(step)["first-order 10"]
-    late_ms = np.argmax(filtered > 0.15, axis=0) - 99
-    law_ms = [-math.log(1.0 - 0.15 / torque) / 10.0 * 1e3 for torque in (0.3, 1.0)]
-    assert np.all((late_ms >= law_ms) & (late_ms < np.array(law_ms) + 1.0))
 
 
 def test_cusum_adds_up_what_is_above_the_drift_and_forgets_it_at_zero():
@@ -190,42 +182,25 @@ def test_a_gap_and_a_change_of_theta_are_no_torque():
     )
 
 
-class Magnitude:
-    """The plainest detector: |z|."""
-
-    def __init__(self, period_s):
-        self.count = 0
-
-    def take(self, z, held_Nm):
-        return np.abs(z)
-
-
-class OfOneJoint(Magnitude):
-    def take(self, z, held_Nm):
-        return np.abs(z[:, 0])
-
-
-class NotANumber(Magnitude):
-    def take(self, z, held_Nm):
-        return np.where(np.arange(len(z))[:, None] == 7, np.nan, np.abs(z))
-
-
-class LooksAhead(Magnitude):
-    def take(self, z, held_Nm):
-        return np.abs(z) / np.abs(z).max()
-
-
 @pytest.mark.parametrize(
-    ("name", "make", "words"),
+    ("name", "take", "words"),
     [
-        ("paper", Magnitude, "there is a detector or channel paper already"),
-        ("observer 25", Magnitude, "there is a detector or channel observer 25 already"),
-        ("plain", OfOneJoint, r"detector plain gives statistics \(400,\) for samples \(400, 2\)"),
-        ("plain", NotANumber, "detector plain gives nan for sample 7 of joint 1"),
-        ("plain", LooksAhead, "detector plain gives sample 0 another statistic where the stream is cut at 137"),
+        ("paper", lambda x: x, "there is a detector or channel paper already"),
+        ("observer 25", lambda x: x, "there is a detector or channel observer 25 already"),
+        ("plain", lambda x: x[:, 0], r"detector plain gives statistics \(400,\) for samples \(400, 2\)"),
+        (
+            "plain",
+            lambda x: np.where(np.arange(len(x))[:, None] == 7, np.nan, x),
+            "detector plain gives nan for sample 7 of joint 1",
+        ),
+        (
+            "plain",
+            lambda x: x / x.max(),
+            "plain gives sample 0 another statistic where the stream is cut at 137",
+        ),
     ],
 )
-def test_a_detector_that_breaks_the_contract_is_refused_and_named(name, make, words):
+def test_a_detector_that_breaks_the_contract_is_refused_and_named(name, take, words):
     with pytest.raises(ValueError, match=words):
-        register(name, make)
+        register(name, lambda period_s: SimpleNamespace(take=lambda z, held_Nm: take(np.abs(z))))
     assert DetectorBankSettings().detectors.keys() == SETTINGS.detectors.keys()

@@ -56,14 +56,6 @@ def test_a_payload_that_nobody_announced_is_named_and_learnt_at_a_word(profile, 
     assert loop.error_of("a1") < 0.01
 
 
-@pytest.mark.long
-def test_a_payload_that_is_put_down_is_named_too():
-    loop = MonitoredLoop()
-    loop.theta = loop.theta - 0.05 * PAYLOAD_1KG
-    loop.run_until_taken_back()
-    assert "kg put down" in loop.said("revoked")[0]
-
-
 @pytest.mark.parametrize(
     ("hand", "named", "most"),
     [
@@ -117,23 +109,6 @@ def test_a_contact_that_never_ends_has_an_exit():
     assert loop.said("certificate")[1].endswith(f"; {BY_WORD}the certificate that was taken back")
 
 
-@pytest.mark.long
-def test_who_touches_the_arm_again_and_again_takes_nothing_back():
-    loop = MonitoredLoop()
-    random = np.random.default_rng(7)
-    contacts = 0
-    for _ in range(25):
-        loop.tau_ext[:] = random.uniform(0.3, 1.5) * random.choice([-1.0, 1.0]) * np.array([1.0, random.uniform(0, 1)])
-        for _ in range(int(random.uniform(50, 400))):
-            output = loop.step()
-            contacts += output.state is SchemeState.REACT and output.previous_state is SchemeState.MONITOR
-        loop.tau_ext[:] = 0.0
-        loop.recover()
-        loop.run(int(random.uniform(0, 1500)))
-    assert contacts > 15
-    assert loop.said("revoked") == []
-
-
 def sums(size, sigma=0.02, share=1.0, cause=PAYLOAD):
     """The sums of a contact that one cause explains to this share, with this sigma of its size."""
     correlated = 2.0 / (SETTINGS.certified.cutoffs_rad_s[filter_bank.LEARNT] * PERIOD_S)
@@ -175,11 +150,17 @@ def test_contacts_right_after_going_on_that_come_to_the_same_are_named_by_their_
 FRICTION = sums(0.3, cause=COULOMB1)
 
 
-@pytest.mark.parametrize(("contacts", "is_payload"), [([sums(0.5)] * 3, True), ([FRICTION] * 3, False)])
-def test_three_contacts_that_agree_are_named(contacts, is_payload):
+@pytest.mark.parametrize(
+    ("contacts", "named"),
+    [
+        ([sums(0.5)] * 3, "0.50 ± 0.03 kg picked up"),
+        ([sums(-0.5)] * 3, "0.50 ± 0.03 kg put down"),
+        ([FRICTION] * 3, "0.30 ± 0.03 Nm more Coulomb friction of joint 1"),
+    ],
+)
+def test_three_contacts_that_agree_are_named(contacts, named):
     verdict = verdict_of(contacts, ways=(1.0, 0.15))
-    assert verdict.is_payload is is_payload
-    named = "0.50 ± 0.03 kg picked up" if is_payload else "0.30 ± 0.03 Nm more Coulomb friction of joint 1"
+    assert verdict.is_payload is ("kg" in named)
     assert verdict.text.startswith(f"3 contacts look like {named}")
 
 
@@ -252,28 +233,12 @@ def test_who_leans_more_and_more_is_found_and_takes_the_certificate_back(torque_
         loop.step()
         if loop.said("revoked"):
             break
-    assert loop.said("revoked")
+    assert "a torque sensor that has moved" in loop.said("revoked")[0]
     assert loop.step().state is SchemeState.STOPPED
     loop.tau_ext[:] = 0.0
     loop.request = Request.ACKNOWLEDGE
     loop.recover()
     assert abs(loop.offset_error_Nm[0]) < 0.02
-
-
-def test_a_sensor_that_moves_takes_the_certificate_back_and_is_accepted_at_a_word():
-    loop = MonitoredLoop()
-    states = []
-    while SchemeState.STOPPED not in states[-1:]:
-        loop.offset_Nm[1] += 2e-3 * PERIOD_S
-        states.append(loop.step().state)
-        assert len(states) < 60_000
-    assert SchemeState.REACT in states
-    assert "a torque sensor that has moved" in loop.said("revoked")[0]
-    loop.request = Request.RELEARN
-    loop.run(3000)
-    loop.request = Request.ACCEPT
-    loop.recover()
-    assert abs(loop.offset_error_Nm[1]) < 0.02
 
 
 @pytest.mark.long

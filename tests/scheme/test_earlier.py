@@ -10,9 +10,9 @@ from long_cases import long_but
 from planar_arm import THETA
 
 from adacd_hil.records import FRICTION_SPEEDS_RAD_S, FaultReason, Request, SchemeState
-from adacd_hil.scheme.identify import anchor, certificate, earlier, evidence, fit_check
+from adacd_hil.scheme.identify import anchor, earlier, evidence, fit_check
 from adacd_hil.scheme.kernel import certified_memory
-from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD, CertificateWatch
+from adacd_hil.scheme.pipeline.certificate_watch import BY_FITS_THAT_AGREE, BY_WORD
 
 UNKNOWN = replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=None))
 BRAKED = replace(FREE, arm=replace(FREE.arm, holding_torque_Nm=(8.0, 8.0)))
@@ -65,15 +65,6 @@ def test_a_hand_that_helps_the_motion_after_a_reported_contact_gets_no_certifica
     )
 
 
-def test_a_touch_within_the_fit_that_no_threshold_saw_is_no_certificate():
-    """What was half learnt would hold its half: neither the arm nor the hand."""
-    loop = TouchedLoop(FREE)
-    loop.learn(0.55)
-    loop.hold(added(a1=0.04, a2=0.02, a3=0.016), 0.3)
-    loop.recover()
-    assert loop.error_of("a1") < 0.005
-
-
 @pytest.mark.parametrize("settings", long_but(1, [BRAKED, UNKNOWN]), ids=["brakes leave it open", "no anchor"])
 def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_the_offset_before(settings):
     """What was kept is not forgotten for the word of an anchor that bounds nothing."""
@@ -84,15 +75,6 @@ def test_without_an_anchor_a_lean_that_begins_while_the_arm_learns_is_known_by_t
     assert loop.said("touch")[0].startswith("torque offset of joint 1 is 0.50")
     loop.recover()
     assert abs(loop.offset_error_Nm[0]) < 0.03
-
-
-def test_what_was_learnt_under_a_lean_judges_nothing_once_the_lean_has_gone():
-    loop = TouchedLoop(FREE, theta=THETA["S"])
-    loop.run_until(SchemeState.ADAPT)
-    loop.lean(1, 0.44, 0.35)
-    released_at = loop.cycle
-    loop.recover()
-    assert (loop.cycle - released_at) * PERIOD_S < 6.5
 
 
 @pytest.mark.long
@@ -162,19 +144,6 @@ class Compared:
         unit = fit_check.unit_of(self.m.fit_check.fit_square, self.m.fit_check.fit_rows)
         evidence.fit(self.k, self.m, self.m.models.belief, self.m.models.P_belief, unit)
         return earlier.is_no_more(self.k, self.m)
-
-
-def test_friction_counts_both_ways_and_of_an_inertia_less_is_the_arms():
-    limit_Nm = evidence.BELIEF_SIGMAS * 0.01 * np.sqrt(2.0 * (1.0 + 0.2**2))
-    compared = Compared()
-    assert limit_Nm > earlier.FRICTION_NM
-    assert compared.agrees_with("F_c1", 0.99 * limit_Nm)
-    assert not compared.agrees_with("F_c1", 1.01 * limit_Nm)
-    assert compared.agrees_with("F_c1", -0.99 * limit_Nm)
-    assert not compared.agrees_with("F_c1", -1.01 * limit_Nm)
-    assert not compared.agrees_with("F_c2", np.nan)
-    assert compared.agrees_with("a1", -2.0 * limit_Nm)
-    assert not compared.agrees_with("a1", 2.0 * limit_Nm)
 
 
 @pytest.mark.parametrize(("name", "floor"), [("F_c2", 0.03), ("a3", 0.006), ("offset2", 0.03)])
@@ -311,15 +280,6 @@ def test_where_gravity_acts_later_samples_may_differ_by_what_they_do_not_know(sh
     assert is_whole(fit) is is_borne_out
 
 
-@pytest.mark.parametrize(("settings", "has_mounting"), [(FREE, False), (UPRIGHT, True)], ids=["flat", "upright"])
-def test_a_fit_that_no_model_explains_names_the_mounting_where_gravity_acts(settings, has_mounting):
-    constants, memory = certified_memory.constants_of(settings), certified_memory.new_memory(settings)
-    memory[0].certificate.withheld_by = certificate.CHANGED
-    said = CertificateWatch(constants[0], memory[0], "").refuse()
-    assert "no one model explains the whole fit" in said.message
-    assert ("arm.mounting_deg" in said.message) is has_mounting
-
-
 def test_a_fit_with_noise_may_differ_by_more():
     fit = Halves()
     unit = np.eye(len(NAMES))[1]
@@ -445,14 +405,3 @@ def test_a_kept_belief_that_was_leant_on_is_forgotten_and_the_others_go_on_judgi
     compared.keep(leant, 1e-5)
     assert not compared.agrees_with("F_c1", 0.04)
     assert np.isinf(compared.m.evidence.variance[evidence.KEPT : evidence.KEPT + 2, 0]).tolist() == [False, True]
-
-
-@pytest.mark.parametrize(("begins_s", "drag_Nm"), long_but(1, [(0.87, 0.14), (0.55, 0.27)]))
-def test_a_drag_that_the_first_fit_has_learnt_half_of_is_not_certified_by_the_second(begins_s, drag_Nm):
-    loop = TouchedLoop(FREE, theta=THETA["S"], seed=83115)
-    loop.learn(begins_s)
-    outputs = loop.hold(added(F_c2=drag_Nm), 6.0)
-    assert SchemeState.MONITOR not in states(outputs)
-    assert re.search(r"friction of joint 2 at [\d.]+ rad/s is 0\.\d\d\d Nm more than", loop.said("touch")[-1])
-    loop.recover()
-    assert loop.error_of("F_c2") < 0.02

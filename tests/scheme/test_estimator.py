@@ -36,14 +36,6 @@ def test_estimate_and_gain_are_those_of_regularised_least_squares(samples):
     np.testing.assert_allclose(P, np.linalg.inv(information), rtol=1e-9, atol=1e-13)
 
 
-def test_half_the_period_gives_the_same_adaptation():
-    """The gain is one of continuous time: twice the samples at half the period learn the same."""
-    columns, torque = random_motion(500)
-    theta_hat, _ = run(columns, torque)
-    doubled, _ = run(np.repeat(columns, 2, axis=0), np.repeat(torque, 2, axis=0), R=2.0 * R)
-    np.testing.assert_allclose(doubled, theta_hat, rtol=1e-9)
-
-
 def test_the_gain_stays_symmetric_and_positive_at_a_million_times_the_paper():
     columns, torque = random_motion()
     _, P = run(columns, torque, P0=P0 * 1e6)

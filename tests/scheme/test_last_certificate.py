@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import FREE, NAMES, TouchedLoop, added, kernel_of, learnt_s, states
+from excited_arm import FREE, NAMES, TouchedLoop, added, kernel_of, states
 from long_cases import long_but
 from planar_arm import PAYLOAD_1KG, THETA
 
@@ -35,15 +35,6 @@ def known(theta, settings=FREE):
     return replace(settings, history=history)
 
 
-@pytest.mark.parametrize("profile", long_but(1, ["P", "S", "M"]))
-def test_an_arm_that_nobody_touches_is_certified_as_ever_and_its_certificate_says_what_it_was_compared_with(profile):
-    loop = TouchedLoop(known(THETA[profile]), theta=THETA[profile])
-    outputs = loop.run_until(SchemeState.MONITOR)
-    assert learnt_s(outputs) == pytest.approx(2.0, abs=0.01)
-    assert loop.said("touch") == []
-    assert loop.said("certificate")[0].endswith(f"; friction and inertia: within what the certificate of {DATE} allows")
-
-
 @pytest.mark.parametrize(
     ("hand", "named"),
     long_but(
@@ -67,14 +58,6 @@ def test_a_hand_from_before_the_first_motion_is_more_than_the_last_certificate_s
         assert loop.error_of(name) < 0.02
 
 
-def test_without_a_last_certificate_the_same_hand_is_learnt_and_the_certificate_says_so():
-    loop = TouchedLoop(FREE)
-    loop.theta = THETA["P"] + added(F_c1=0.2)
-    loop.recover()
-    assert loop.error_of("F_c1") < 0.02
-    assert loop.said("certificate")[0].endswith(f"; {THIS_RUN_ONLY}")
-
-
 def test_an_arm_that_has_changed_is_certified_at_the_users_word_and_carries_it():
     loop = TouchedLoop(known(THETA["P"]))
     loop.theta = THETA["P"] + added(F_c1=0.3)  # a new seal
@@ -85,12 +68,6 @@ def test_an_arm_that_has_changed_is_certified_at_the_users_word_and_carries_it()
         f"the user says that nobody touches the arm: the certificate of {DATE} is not compared"
     )
     assert loop.said("certificate")[0].endswith(f"; {BY_WORD}the certificate of {DATE}")
-
-
-def test_less_is_the_arms():
-    loop = TouchedLoop(known(THETA["P"] + added(F_c1=0.3, F_v2=0.1, a1=0.1)))
-    loop.recover()
-    assert loop.said("touch") == []
 
 
 def test_a_payload_that_is_announced_is_not_compared():
@@ -117,20 +94,6 @@ def test_what_a_certificate_says_of_the_arm_is_the_model_at_the_quantities_that_
     np.testing.assert_allclose(certificate.friction_Nm, friction_of(np.array(certificate.parameters)))
     assert 0.0 < max(certificate.friction_std_Nm) < 0.05
     assert certificate.text == loop.said("certificate")[0]
-
-
-def test_a_certificate_that_is_taken_back_is_none():
-    loop = TouchedLoop(FREE)
-    loop.run_until(SchemeState.MONITOR)
-    loop.run(500)
-    loop.theta = loop.theta + added(F_c1=0.3)
-    for _ in range(9000):
-        if loop.said("revoked"):
-            break
-        if loop.step().state is SchemeState.STOPPED:
-            loop.request = Request.ACKNOWLEDGE
-    assert loop.said("revoked")
-    assert loop.pipeline.certificates == ()
 
 
 class Asked:

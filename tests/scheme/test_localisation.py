@@ -89,12 +89,6 @@ def test_a_lever_arm_off_the_link_is_said(lever_m, location):
     assert on_link2(*blow(20.0, lever_m, 0.3), SIGMA, LENGTHS).location is location
 
 
-def test_a_clamp_has_no_place():
-    one, q2 = blow(60.0, 0.28, 0.2)
-    other, _ = blow(-50.0, 0.05, 0.2)
-    assert on_link2(one + other, q2, SIGMA, LENGTHS).location is Location.INCONSISTENT
-
-
 def test_on_link1_the_smallest_force_with_the_moment_is_given():
     place = on_link1(-3.5, 0.07, L1)
     assert (place.location, place.force_N, place.force_sigma) == (Location.LINK_1, -10.0, pytest.approx(0.2))

@@ -11,8 +11,8 @@ from planar_arm import PAYLOAD_1KG, THETA
 from smooth_motion import PLACES, PaperKernel, settings_with, smooth_motion, torque_of
 
 from adacd_hil.control.motions import corner_to_corner
-from adacd_hil.records import ArmState, FaultReason, Request, SchemeState, scheme_layout
-from adacd_hil.scheme.kernel import certified_kernel, paper_kernel
+from adacd_hil.records import FaultReason, Request, SchemeState
+from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.model.regressor import is_positive_definite
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.supervisor import transitions
@@ -100,7 +100,8 @@ def test_a_push_is_detected_with_its_sign_and_link_and_the_arm_goes_on_after_an_
     assert abs(reports[1].tau_ext_peak[0] - torque[0]) < 0.2
     loop.run_until(SchemeState.STOPPED, 1500)
     loop.request = Request.ACKNOWLEDGE
-    assert loop.run_until(SchemeState.MONITOR, 1000)[-1].previous_state is SchemeState.STOPPED
+    goes_on = loop.run_until(SchemeState.MONITOR, 1000)[-1]
+    assert (goes_on.previous_state, goes_on.contact_joints) == (SchemeState.STOPPED, 0)
 
 
 @pytest.mark.slow
@@ -118,35 +119,6 @@ def test_without_motion_or_without_enough_information_the_adaptation_never_ends(
 @pytest.mark.slow
 def test_the_gradient_law_ends_its_adaptation_too():
     assert len(PaperLoop(settings_with(estimator={"law": "gradient"}, **NEVER_ALARM)).monitor()) < 8000
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_lost_frames_do_not_keep_the_adaptation_from_ending():
-    """Held values would: with one frame in ten lost the adaptation then doesn't end."""
-    loop = PaperLoop(settings_with(**NEVER_ALARM))
-    lost = np.random.default_rng(5)
-    whole, held, steps = loop.measure, None, 1
-
-    def measure():
-        nonlocal held, steps
-        fresh = whole()
-        if held is not None and lost.random() < 0.1:
-            steps += 1
-            return held._replace(cycle=fresh.cycle, t_ns=fresh.t_ns, is_complete=False, age_q=(1, 1), steps=0)
-        held, steps = fresh._replace(steps=steps), 1
-        return held
-
-    loop.measure = measure
-    assert len(loop.monitor()) < 8000
-    assert np.max(np.abs([output.tau_ext_hat for output in loop.run(5000)])) < 0.07
-
-
-def test_the_residual_runs_before_the_drives_are_enabled():
-    pipeline = new_pipeline(settings_with())
-    outputs = [pipeline.step(arm_state(k, tau_J=(0.3, 0.0), is_enabled=False)) for k in range(1000)]
-    assert outputs[-1].state is SchemeState.ENABLE
-    np.testing.assert_allclose(outputs[-1].tau_ext_hat, [-0.3, 0.0], rtol=1e-4)
 
 
 @pytest.mark.parametrize("scheme", ["paper", "certified"])
@@ -188,40 +160,13 @@ def test_an_arm_that_moves_or_is_loaded_is_not_commissioned(changes):
     assert states[-1] is SchemeState.COMMISSION
 
 
-EASY = {
-    "safety": {"commission_s": 0.01},
-    "termination": {"beta_Nm": 50.0, "hold_s": 0.1, "travel_deg": 0.0, "velocity_deg_s": 0.0, "excitation_Nm2s": 0.0},
-}
-"""Settings with which an arm at rest gets to MONITOR after 113 cycles, with theta_hat = 0."""
-
-
-class Standing:
-    """A pipeline of EASY settings around an arm that stands still."""
-
-    def __init__(self):
-        self.pipeline = new_pipeline(settings_with(**EASY))
-        self.cycle = 0
-
-    def step(self, cycles=1, request=Request.NONE, **changes):
-        outputs = []
-        for _ in range(cycles):
-            outputs.append(self.pipeline.step(arm_state(self.cycle, **changes), request))
-            self.cycle += 1
-        return outputs
-
-    def monitor(self):
-        assert self.step(120)[-1].state is SchemeState.MONITOR
-        return self
-
-
 def test_a_model_without_positive_definite_mass_is_not_fed_forward():
-    assert not Standing().monitor().step()[-1].is_model_valid
-
-
-def test_the_joints_over_their_threshold_are_named_until_the_push_is_over():
-    arm = Standing().monitor()
-    assert arm.step(300, tau_J=(0.0, -1.0))[-1].contact_joints == 0b10
-    assert arm.step(500)[-1].contact_joints == 0b00
+    """Of an arm at rest: theta_hat = 0."""
+    easy = {"hold_s": 0.1, "travel_deg": 0.0, "velocity_deg_s": 0.0, "excitation_Nm2s": 0.0}
+    pipeline = new_pipeline(settings_with(safety={"commission_s": 0.01}, termination=easy))
+    outputs = [pipeline.step(arm_state(k)) for k in range(120)]
+    assert outputs[-1].state is SchemeState.MONITOR
+    assert not outputs[-1].is_model_valid
 
 
 def test_an_adaptation_begins_without_the_evidence_of_the_last():
@@ -261,77 +206,3 @@ def test_an_adaptation_forgets_what_the_filters_held():
     begin = next(k for k, output in enumerate(outputs) if output.state is SchemeState.ADAPT)
     assert abs(outputs[begin].tau_ext_hat[0]) > 0.4
     assert outputs[begin + 1].tau_ext_hat[0] == 0.0
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_gravity_is_learnt_where_the_axes_are_not_vertical():
-    """2.7 Nm of gravity, all but a fiftieth of it known after 20 s."""
-    P0 = [8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5, 50.0, 50.0]
-    kernel = PaperKernel(settings_with(estimator={"gravity": True, "P0": P0}, arm={"cad_theta": []}))
-    q, dq, ddq = smooth_motion(np.arange(20_000) * 1e-3)
-    tau_J = torque_of(q, dq, ddq, np.append(THETA["M"] * [1, 1, 1, 1, 1, 0, 0], [2.0, 0.7]))
-    for k in range(len(q)):
-        kernel.step(paper_kernel.LEARN, q=q[k], dq=dq[k], tau_J=tau_J[k])
-    assert np.max(np.abs(kernel.out.tau_ext_hat)) < 0.05
-    np.testing.assert_allclose(kernel.out.theta_hat[7:], [2.0, 0.7], rtol=0.02)
-
-
-@pytest.mark.parametrize("scheme", ["paper", "certified"])
-def test_nothing_compiles_in_the_cycle(scheme):
-    """Whatever the memory order or the writability of the measured vectors, one machine code serves them all.
-
-    Equal records have one description: numba compares others field by field, at each call.
-    """
-    settings = replace(CERTIFIED, scheme=scheme)
-    pipeline = new_pipeline(settings)
-    pipeline.compile_cycle()
-    before = compiled_versions()
-    strided, frozen = np.zeros((2, 2))[:, 0], np.zeros(2)
-    frozen.flags.writeable = False
-    for k, vector in enumerate([np.zeros(2), strided, frozen]):
-        pipeline.step(arm_state(k)._replace(q=vector, dq=vector, tau_J=vector, is_complete=np.bool_(True)))
-    assert compiled_versions() == before
-    pairs = zip(pipeline.numbers, new_pipeline(settings).numbers, strict=True)
-    assert all(ours.dtype is theirs.dtype for ours, theirs in pairs)
-
-
-def compiled_versions():
-    kernels = (certified_kernel, paper_kernel)
-    functions = [function for kernel in kernels for function in (kernel.step, kernel.begin_adaptation)]
-    return [len(getattr(function, "signatures", ())) for function in functions]
-
-
-def residuals_at(lateness_ns, epoch_ns=0, sample_period="measured"):
-    """Run the pipeline over a motion whose SYNCs are late; return the CAD model's residual and the periods."""
-    theta = THETA["M"] * [1, 1, 1, 1, 1, 0, 0]
-    settings = settings_with(arm={"cad_theta": theta.tolist()}, realtime={"sample_period": sample_period})
-    pipeline = new_pipeline(settings)
-    t_ns = [cycle * 1_000_000 + late for cycle, late in enumerate(lateness_ns)]
-    q, dq, ddq = smooth_motion(np.array(t_ns) * 1e-9)
-    tau_J = torque_of(q, dq, ddq, theta)
-    blocks = []
-    for cycle, stamp_ns in enumerate(t_ns):
-        arm = ArmState(
-            cycle, epoch_ns + stamp_ns, 1, q[cycle], dq[cycle], tau_J[cycle], (0, 0), (0, 0), is_enabled=False,
-            is_complete=True, fault=FaultReason.NONE,
-        )  # fmt: skip
-        blocks.append(pipeline.step(arm).block)
-    places = scheme_layout(7).slices
-    return tuple(np.array(blocks)[:, places[name]] for name in ("tau_ext_hat_cad", "period_s"))
-
-
-LATENESS_NS = np.random.default_rng(5).integers(0, 300_000, 400).tolist()
-
-
-def test_the_interval_is_that_of_the_stamps():
-    residual, period_s = residuals_at(LATENESS_NS)
-    np.testing.assert_array_equal(period_s[1:, 0], (1_000_000 + np.diff(LATENESS_NS)) * 1e-9)
-    assert period_s[0] == 1e-3
-    assert np.max(np.abs(residual)) < 2e-5
-
-
-def test_an_arm_that_moves_by_whole_periods_is_counted_by_whole_periods():
-    residual, period_s = residuals_at(LATENESS_NS, sample_period="nominal")
-    assert np.all(period_s == 1e-3)
-    assert np.max(np.abs(residual)) > 1e-4  # this arm does not

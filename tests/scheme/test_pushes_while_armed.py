@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from excited_arm import PERIOD_S, SETTINGS, Record, play, record
+from excited_arm import PERIOD_S, SETTINGS, Record, kernel_of, play, record
 from planar_arm import THETA
 
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.detect.margin import WITHIN_S
+from adacd_hil.scheme.detect.margin import WITHIN_S, smallest_push
 from adacd_hil.scheme.supervisor import transitions
 from adacd_hil.score.smallest_push import PushGatherer
 
@@ -22,10 +22,10 @@ def test_a_push_as_large_as_at_the_worst_moment_is_found_where_it_is_hardest_and
     pushes = PushGatherer(SETTINGS)
     pushes.add_residuals(untouched.y[armed], untouched.h[armed])
     within = round(WITHIN_S / PERIOD_S)
-    alone = pushed_by(untouched, armed[:-within])
+    shown, early = kernel_of()[0].margin.shown, armed[:-within]
     for joint, figures in enumerate(pushes.smallest_push().push_Nm):
         assert 0.02 < figures["p50"] < figures["p99"] < figures["max"] < 1.0
-        own = alone[:, joint]
+        own = np.array([smallest_push(untouched.y[k], untouched.h[k], shown, joint) for k in early])
         hard = armed[np.argsort(own)[:: -max(own.size // 2000, 1)][:8]]
 
         def is_found(at, torque_Nm, joint=joint):
@@ -36,13 +36,3 @@ def test_a_push_as_large_as_at_the_worst_moment_is_found_where_it_is_hardest_and
 
         assert all(is_found(at, sign * figures["max"]) for at in hard for sign in (-1.0, 1.0))
         assert not all(is_found(at, sign * 0.4 * figures["max"]) for at in hard for sign in (-1.0, 1.0))
-
-
-def pushed_by(untouched, rows):
-    """Return what each of some samples says of the smallest push, Nm (k, 2)."""
-    gathered = []
-    for row in rows:
-        one = PushGatherer(SETTINGS)
-        one.add_residuals(untouched.y[row : row + 1], untouched.h[row : row + 1])
-        gathered.append([figures["max"] for figures in one.smallest_push().push_Nm])
-    return np.array(gathered)

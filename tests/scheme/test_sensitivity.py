@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import scipy.signal
 from excited_arm import NAMES, SETTINGS, kernel_of
 
 from adacd_hil.scheme.detect import external_torque, sensitivity
@@ -122,21 +121,6 @@ def test_a_joint_that_turns_round_between_two_samples_has_stood_still():
     np.testing.assert_allclose(stood([0.3, 0.3], [-0.3, 0.1]).sensitivity.still, expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("channel", range(5))
-def test_white_torque_noise_through_a_channel_is_as_large_as_its_constant_says(channel):
-    """Within an eighth: the formula is of continuous time."""
-    a, is_smooth = CHANNELS[channel]
-    numerator, denominator, _ = scipy.signal.cont2discrete(([a], [1.0, a]), T, method="foh")
-    impulse = np.zeros(4000)
-    impulse[0] = 1.0
-    response = scipy.signal.lfilter(numerator.ravel(), denominator, impulse)
-    if is_smooth:
-        fall = np.exp(-CERTIFIED.smoothing_rad_s * T)
-        response = scipy.signal.lfilter([1.0 - fall], [1.0, -fall], response)
-    std = CERTIFIED.noise_sigmas * CERTIFIED.torque_noise_Nm * np.sqrt(np.sum(response**2))
-    assert np.sqrt(K.noise.torque_variance[channel]) == pytest.approx(std, rel=0.125)
-
-
 def test_the_undone_filter_s_deviation_is_that_of_a_mean_of_five_samples():
     m = known_arm()
     m.sensitivity.doubt[:] = 0.3
@@ -172,25 +156,6 @@ def test_velocity_noise_is_seen_in_the_second_difference_and_motion_is_not():
     roughness = after_a_swing(noise).sensitivity.velocity_roughness
     assert 1.0 <= roughness[0] < 1.2
     assert roughness[1] == pytest.approx(6.0 * 8.0**2, rel=0.3)  # a second difference has 1 + 4 + 1 times the variance
-
-
-def test_a_coarse_encoder_raises_the_thresholds_of_all_that_its_joint_s_momentum_shows_in():
-    fine, coarse = known_arm(), known_arm()
-    for m in (fine, coarse):
-        m.filters.W_f[:] = 0.0
-        m.sensitivity.roughness[:] = 0.0
-    counts = 0.02 * np.round(np.sin(5.0 * T * np.arange(2000)) / 0.02)
-    coarse.sensitivity.velocity_roughness[:] = after_a_swing(
-        np.outer(counts, [0.0, 1.0])
-    ).sensitivity.velocity_roughness
-    fine.sensitivity.velocity_roughness[:] = 1.0
-    assert coarse.sensitivity.velocity_roughness[0] == 1.0
-    rise = thresholds_of(coarse) / thresholds_of(fine)
-    expected = np.sqrt(
-        coarse.regressor.M**2 @ coarse.sensitivity.velocity_roughness / np.sum(coarse.regressor.M**2, axis=1)
-    )
-    np.testing.assert_allclose(rise, np.tile(expected, (5, 1)), rtol=1e-10)
-    assert np.all(rise > 1.5)
 
 
 def test_what_an_encoder_has_shown_in_motion_is_kept_at_rest_and_goes_back_in_motion_that_shows_less():

@@ -30,12 +30,10 @@ def tested():
     loop = TouchedLoop(SETTINGS)
     loop.run_until(SchemeState.CERTIFY)
     y, h = [], []
-    m = loop.m
-    while loop.step().state is SchemeState.CERTIFY:
-        y.append(m.filters.y.copy())
-        h.append(m.sensitivity.h.copy())
-    y.append(m.filters.y.copy())
-    h.append(m.sensitivity.h.copy())
+    while loop.pipeline.state is SchemeState.CERTIFY:
+        loop.step()
+        y.append(loop.m.filters.y.copy())
+        h.append(loop.m.sensitivity.h.copy())
     return loop, np.array(y), np.array(h)
 
 
