@@ -86,6 +86,7 @@ def urdf(folder: Path, axis: str = "0 0 1", wrist: str = "fixed") -> Path:
         ((*NO_BUS, *MIXED, "--gear", "100", "100"), "--gear: profile stock-drive of joint 2 has its own `scale.gear_r"),
         ((*NO_BUS, *INT32, "--torque-count-nm", "1e-3", "1e-3"), "profile int32-sensor of joint 1 has its own"),
         (("--from", ".", "--length-m", "1", "1"), "leave out --length-m"),
+        ((*NO_BUS, "--torque-limit-nm", "4", "0"), "`arm.torque_limit_Nm[1]` = 0 Nm: joint 2 can't move"),
     ],
 )
 def test_options_that_are_missing_or_wrong_are_named_and_nothing_is_written(tmp_path, out, monkeypatch, options, line):
@@ -234,6 +235,37 @@ def test_crossed_axes_are_refused_and_a_bent_zero_is_doubted():
     low = text.replace('<origin xyz="0.13 0 0"/>', '<origin xyz="-0.13 0.001 0"/>')
     (doubt,) = planar_from_urdf(low.encode()).doubts
     assert "180 deg off the line of link 1" in doubt
+
+
+NO_EFFORT = 'lower="-1" upper="1" effort="0" velocity="3"'
+
+
+def limited(text: str, limits: str) -> str:
+    """A URDF whose joints all have these limits."""
+    return re.sub("<limit [^/]*/>", f"<limit {limits}/>", text)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        'lower="0" upper="0" effort="0" velocity="0"',
+        NO_EFFORT,
+        'lower="-1000" upper="1000" effort="1000000" velocity="10000"',
+        'lower="-0.001" upper="0.001" effort="0.0001" velocity="0.0001"',
+    ],
+    ids=["zero", "no effort", "huge", "tiny"],
+)
+def test_an_arm_with_limits_that_say_nothing_is_drafted_with_guesses(limits, tmp_path, out):
+    path = urdf(tmp_path)
+    path.write_text(limited(path.read_text(), limits))
+    assert init(out, *NO_BUS, "--urdf", str(path)).exit_code == 0
+    assert "arm.torque_limit_Nm" in written(out).assumed
+
+
+def test_a_limit_that_is_not_taken_is_named_with_its_bound():
+    text = limited(URDF.format(axis="0 0 1", wrist="fixed"), NO_EFFORT.replace("3", "10000"))
+    (doubt,) = planar_from_urdf(text.encode()).doubts
+    assert "arm.velocity_limit_deg_s[0]` = 572957.8 deg/s is above 3600 deg/s" in doubt
 
 
 def test_a_urdf_of_shapes_alone_says_how_the_masses_get_known(tmp_path, out):

@@ -203,11 +203,6 @@ def test_without_the_extra_there_is_one_line_and_status_2(monkeypatch, tmp_path,
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_monitor_needs_a_bus_or_a_url():
-    result = CliRunner().invoke(cli, ["monitor", "-i", "socketcan"])
-    assert (result.exit_code, result.stderr) == (2, "adacd-hil: give --interface and --channel, or --url\n")
-
-
 def test_no_escape_sequence_of_an_event_reaches_the_terminal():
     run = two_cycles()
     run.cycles[1].event = Event("warning", "\x1b[2Jname", "\x1b]0;owned\x07text\r\n")
