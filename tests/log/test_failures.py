@@ -27,10 +27,8 @@ pytestmark = pytest.mark.usefixtures("writer_process")
 
 CONTROL_PROCESS = """
 import sys
-import threading
 from pathlib import Path
 sys.path.insert(0, sys.argv[2])
-from made_log import flipped
 from recorded_run import feed, make_run, start
 run = make_run(400)
 recorder = start(Path(sys.argv[1]), run, blocking=sys.argv[3] == "lockstep")
@@ -306,17 +304,3 @@ def test_a_damaged_attachment_is_not_handed_out(whole, run, tmp_path):
     assert "run.toml" not in log.attachments
     assert log.attachments["arm.dbc"] == run.attachments["arm.dbc"]
     assert log.problem.startswith("damaged at byte ")
-
-
-def test_no_file_and_a_file_of_something_else_are_an_error_of_one_line(tmp_path):
-    path = tmp_path / "notes.txt"
-    with pytest.raises(LogError, match=f"^log {path} can't be read: No such file or directory$"):
-        read_log(path)
-    for text, what in (
-        ("hello, this is text\n" * 10, "not an MCAP file"),
-        ("\x89MCA", "cut after 4 bytes"),
-        ("", "empty"),
-    ):
-        path.write_text(text, encoding="latin-1")
-        with pytest.raises(LogError, match=f"^{path} is {what}$"):
-            read_log(path)
