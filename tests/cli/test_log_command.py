@@ -176,10 +176,9 @@ def test_a_stretch_that_makes_no_sense_is_wrong_usage(options, recorded, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("options", [(), ("--prefix",), ("--out", "both.mcap", "--json"), ("--help-me",)])
-def test_merge_names_its_successors_and_touches_nothing(options, tmp_path):
+def test_merge_names_its_successors_and_touches_nothing(tmp_path):
     path = write(tmp_path / "x.mcap")
-    code, text, err = call("merge", path, path, *options)
+    code, text, err = call("merge", path, path, "--out", "both.mcap", "--prefix")
     assert (code, text) == (2, "")
     assert "mcap merge" in err
     assert "log cut" in err

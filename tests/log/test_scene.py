@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from live_rig import PUSH
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
@@ -26,30 +27,10 @@ from adacd_hil.lab.live.scene import (
     residual_over_threshold,
     transforms_of,
 )
-from adacd_hil.records import ContactKind, ContactLevel, ContactReport, Location, Reaction, SchemeState
+from adacd_hil.records import ContactLevel, Location, SchemeState
 
 SHAPE = Shape((0.35, 0.30))
 TIME_NS = 1_700_000_000_123_456_789
-PUSH = ContactReport(
-    cycle=7,
-    link=2,
-    direction=(1, -1),
-    tau_ext_peak=(2.5, -1.5),
-    impulse=(0.25, 0.125),
-    is_final=True,
-    level=ContactLevel.COLLISION,
-    kind=ContactKind.PUSH,
-    reaction=Reaction.FLOAT,
-    location=Location.KNOWN,
-    is_two_sided=True,
-    tau_ext_peak_sigma=(0.1, 0.2),
-    impulse_sigma=(0.3, 0.4),
-    force_N=18.5,
-    force_sigma=0.5,
-    lever_m=0.2,
-    lever_sigma=0.01,
-    blind_rad=0.6,
-)
 
 
 def decode(kind: MessageType, payload: bytes):
