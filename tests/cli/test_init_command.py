@@ -19,7 +19,7 @@ from rig import Rig, SessionRig
 
 from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.device.device_files import load_profile
-from adacd_hil.lab.commission.arm_draft import planar_from_urdf, uniform_rods
+from adacd_hil.lab.commission.arm_draft import planar_from_urdf
 from adacd_hil.lab.commission.host_checks import Status, configuration_checks, diagnose
 from adacd_hil.lab.commission.profile_draft import DeviceRatings, draft_profile
 from adacd_hil.lab.serial_arm.urdf import UrdfError
@@ -194,16 +194,6 @@ def test_words_say_how_an_arm_without_a_urdf_is_mounted(out, options, mounting_d
     settings = written(out)
     assert settings.arm.mounting_deg == mounting_deg
     assert settings.estimator.gravity == (mounting_deg is not None)
-
-
-def test_rods_of_a_urdf_and_of_lengths_and_masses_are_the_same_arm():
-    text = URDF.format(axis="0 1 0", wrist="fixed").replace("0.2 0 0", "0.175 0 0").replace("0.13 0 0", "0.15 0 0")
-    for inertia, mass, length_m in (("0.04", 3.0, 0.35), ("0.015", 1.5, 0.3)):
-        text = text.replace(f'"{inertia}"', f'"{mass * length_m**2 / 12.0!r}"')
-    arm = planar_from_urdf(text.encode())
-    rods = uniform_rods((0.35, 0.3), (3.0, 1.5), (90.0, 90.0))
-    np.testing.assert_allclose(arm.cad_theta, rods.cad_theta, rtol=1e-5)
-    assert arm.link_length_m == rods.link_length_m
 
 
 @pytest.mark.parametrize(
@@ -518,7 +508,11 @@ def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out, monkeypa
     assert settings.arm.position_limit_deg == (60.0, 100.0)
     assert settings.arm.mounting_deg == (90.0, 180.0)
     assert "gravity ←: the arm points up" in result.stderr
-    assert settings.arm.cad_theta[0] == pytest.approx(2.0 * 0.16 / 3.0 + 0.16 + 0.0625 / 3.0, rel=1e-5)
+    friction = (0.0,) * 4
+    outer = (0.4 * 0.125, 0.0625 / 3.0)  # of 1 kg, 0.25 m long, at the end of 2 kg, 0.4 m long
+    weights = (9.80665 * (2.0 * 0.2 + 0.4), 9.80665 * 0.125)
+    theta = (2.0 * 0.16 / 3.0 + 0.16 + 0.0625 / 3.0, *outer, *friction, *weights)
+    assert settings.arm.cad_theta == pytest.approx(theta, rel=1e-4)
     assert "arm.rated_torque_Nm" in settings.assumed
     assert "arm.torque_limit_Nm" not in settings.assumed
 

@@ -28,7 +28,8 @@ def test_the_table_shows_nodes_messages_and_load():
     assert (feedback[0], feedback[4:6]) == ("0x181", ["-", "0"])
     assert 970.0 <= float(feedback[2]) <= 1000.0  # up to one slice of waiting is still in the queue
     assert feedback[6:9] == ["position", "-0.523597", "rad,"]
-    assert ["0x055", "unknown", "1.0"] in [line[:3] for line in lines]
+    (unknown,) = [line for line in lines if line[:3] == ["0x055", "unknown", "1.0"]]
+    assert unknown[-1] == "[abcd]"
     assert rig.sent == []
     of_one = monitor(rig, node_id=3)
     of_one.listen(0.5)

@@ -16,7 +16,6 @@ from recorded_run import (
     UNKNOWN_ID,
     by_others,
     fd_codec,
-    feed,
     make_run,
     plain_frames,
     record,
@@ -245,14 +244,6 @@ def test_in_real_time_the_log_has_wall_time_and_the_reader_gives_back_ours(tmp_p
     assert times == [cycle.t_ns + EPOCH_NS for cycle in run.cycles]
 
 
-def test_gravity_adds_two_parameters(tmp_path):
-    run = make_run(5, parameter_count=9)
-    record(tmp_path / "run.mcap", run)
-    log = read_log(tmp_path / "run.mcap")
-    assert log.scheme["theta_hat"].tobytes() == run.blocks[:, scheme_layout(9).slices["theta_hat"]].tobytes()
-    assert log.scheme["theta_hat"].shape == (5, 9)
-
-
 def test_the_truth_has_a_log_of_its_own(tmp_path):
     blocks = np.random.default_rng(3).normal(size=(300, TRUTH_LAYOUT.size))
     with Recorder(tmp_path / "truth.mcap", blocking=True, messages=(), channels=truth_channels()) as recorder:
@@ -321,13 +312,3 @@ def test_the_writer_of_a_real_time_process_is_scheduled_plainly(tmp_path):
     policy = os.sched_getscheduler(recorder.pid)
     recorder.close()
     assert policy == os.SCHED_OTHER
-
-
-def test_feeding_goes_on_after_other_logs_are_closed(tmp_path):
-    run = make_run(20)
-    first, second = start(tmp_path / "1.mcap", run), start(tmp_path / "2.mcap", run)
-    feed(first, run.cycles[:10])
-    assert first.close().is_complete
-    feed(second, run.cycles)
-    assert second.close().is_complete
-    assert read_log(tmp_path / "2.mcap").scheme.block.tobytes() == run.blocks.tobytes()

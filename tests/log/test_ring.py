@@ -22,15 +22,6 @@ def reader(ring):
     return RingReader(ring.descriptor)
 
 
-def test_what_is_put_comes_out_in_order(ring, reader):
-    packets = [bytes([number]) * number for number in range(50)]
-    assert all(ring.put_packet(packet) for packet in packets)
-    assert ring.waiting == reader.waiting == sum(map(padded_bytes, range(50)))
-    assert list(split(reader.take_packets(MOST))) == packets
-    assert reader.take_packets(MOST) == b""
-    assert ring.waiting == 0
-
-
 def test_packets_of_any_size_go_round_the_ring_often(ring, reader):
     generator = np.random.default_rng(3)
     sent, received = [], []
@@ -76,12 +67,6 @@ def test_the_reader_remembers_the_most_that_waited(ring, reader):
         assert all(ring.put_packet(bytes(12)) for _ in range(count))
         reader.take_packets(MOST)
     assert ring.peak == 7 * 16
-
-
-def test_what_is_on_the_disk_is_counted(ring, reader):
-    for count in (3, 4):
-        reader.count_written(count)
-    assert ring.written == 7
 
 
 def test_a_packet_that_was_not_finished_is_not_there(ring, reader):
