@@ -107,12 +107,6 @@ def tools(monkeypatch, tmp_path):
     assert importlib.metadata.entry_points(group="can.io.message_reader")
 
 
-def test_nothing_of_a_message_is_lost(messages, path):
-    read = list(McapReader(path))
-    assert [content(message) for message in read] == [content(message) for message in messages]
-    assert [message.t_ns for message in read] == [message.t_ns for message in messages]
-
-
 def test_pythons_float_is_the_one_nearest_to_the_time(path):
     errors_s = [Decimal(message.timestamp) - Decimal(message.t_ns) / 10**9 for message in McapReader(path)]
     assert max(map(abs, errors_s)) < Decimal("120e-9")

@@ -16,16 +16,13 @@ from adacd_hil.lab.live.scene import (
     RED,
     SCENE,
     SMALLEST_SPHERE_M,
-    TRANSFORMS,
     YELLOW,
     MessageType,
     Shape,
     draw_contact,
     draw_joints,
     pack_scene,
-    pack_transforms,
     residual_over_threshold,
-    transforms_of,
 )
 from adacd_hil.records import ContactLevel, Location, SchemeState
 
@@ -127,9 +124,3 @@ def test_arrows_stay_in_sight(force_N, length_m):
 def test_a_force_is_drawn_on_the_link(lever_m, drawn_m):
     (contact,) = drawn(draw_contact(SHAPE, PUSH._replace(lever_m=lever_m)))
     assert contact.arrows[0].pose.position.x == pytest.approx(drawn_m)
-
-
-def test_an_upright_arm_has_its_y_axis_up():
-    payload = pack_transforms(TIME_NS, transforms_of(Shape((0.35, 0.3), tilt_rad=math.pi / 2.0), np.zeros(2)))
-    rotation = decode(TRANSFORMS, payload).transforms[0].transform.rotation
-    assert (rotation.x, rotation.y, rotation.z, rotation.w) == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))
