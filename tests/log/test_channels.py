@@ -32,6 +32,7 @@ from adacd_hil.records import (
     FaultReason,
     Location,
     Reaction,
+    SchemeState,
 )
 
 CHANNELS = (*run_channels(9, tuple(CODEC.messages.values())), *truth_channels())
@@ -111,3 +112,10 @@ def test_arm_is_laid_out_as_its_type_says_with_the_age_of_its_sample(sampled_ns,
     assert (message.cycle, message.first_cycle, message.periods, message.steps) == (2**40, 17, 3, 7)
     assert (message.age_q, message.age_tau_j, message.sample_age_ns) == ([4, 5], [6, 2**33], age_ns)
     assert (message.is_enabled, message.is_complete, message.fault, message.is_late) == (True, False, 1, True)
+
+
+def test_states_are_named_before_the_field_that_holds_them():
+    text = next(channel.type.text for channel in CHANNELS if channel.id == ChannelId.SCHEME)
+    lines = text.splitlines()
+    state = next(index for index, line in enumerate(lines) if line.startswith("uint8 state "))
+    assert lines[state - len(SchemeState) : state] == [f"uint8 STATE_{s.name}={s.value}" for s in SchemeState]

@@ -16,6 +16,7 @@ from made_log import flipped
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
 from adacd_hil.log.log_files import LogError
+from adacd_hil.log.mcap.record_layout import MAGIC
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording import recorder as recorder_module
 from adacd_hil.log.recording.recorder import Recorder
@@ -255,7 +256,8 @@ def test_messages_that_have_no_topic_are_an_error_before_the_run_and_leave_no_fi
 
 def cuts(size):
     generator = np.random.default_rng(7)
-    return sorted({*range(60), *range(size - 60, size), *generator.integers(0, size, 250).tolist()})
+    first = len(MAGIC)  # a shorter file is refused
+    return sorted({*range(first, 60), *range(size - 60, size), *generator.integers(first, size, 250).tolist()})
 
 
 @pytest.mark.long
