@@ -168,11 +168,8 @@ def test_cut_takes_a_stretch_by_time_or_contact(recorded, tmp_path):
     assert (json.loads(text)["from_s"], json.loads(text)["until_s"]) == (None, None)
 
 
-@pytest.mark.parametrize(
-    "options", [("--contact", "1", "--from", "1"), ("--from", "2", "--until", "1"), ("--contact", "0")]
-)
-def test_a_stretch_that_makes_no_sense_is_wrong_usage(options, recorded, tmp_path):
-    assert call("cut", recorded, *options, "--out", tmp_path / "out.mcap")[0] == 2
+def test_a_stretch_that_makes_no_sense_is_wrong_usage(recorded, tmp_path):
+    assert call("cut", recorded, "--contact", "1", "--from", "1", "--out", tmp_path / "out.mcap")[0] == 2
     assert list(tmp_path.iterdir()) == []
 
 

@@ -45,15 +45,15 @@ def heard(bus):
     return list(iter(lambda: bus.recv(0), None))
 
 
-@pytest.fixture
-def log(tmp_path):
+@pytest.fixture(params=[0, 5_000_000_000])
+def log(request, tmp_path):
+    """A recording that begins at a time."""
     path = tmp_path / "bus.mcap"
     with path.open("wb") as file:
         writer = FrameWriter(file)
         for number, kind in enumerate(KINDS):
-            writer.write_frame(
-                RecordedFrame(**{"t_ns": 5_000_000_000 + 1_000_000 * number, "length": len(kind["data"]), **kind})
-            )
+            t_ns = request.param + 1_000_000 * number
+            writer.write_frame(RecordedFrame(**{"t_ns": t_ns, "length": len(kind["data"]), **kind}))
         writer.finish()
     return path
 

@@ -34,6 +34,7 @@ def test_packets_of_any_size_go_round_the_ring_often(ring, reader):
     while data := reader.take_packets(MOST):
         received += list(split(data))
     assert received == sent
+    assert ring.waiting == 0
 
 
 def test_a_packet_without_room_changes_nothing_and_there_is_room_again_once_others_are_taken(ring, reader):
@@ -67,6 +68,12 @@ def test_the_reader_remembers_the_most_that_waited(ring, reader):
         assert all(ring.put_packet(bytes(12)) for _ in range(count))
         reader.take_packets(MOST)
     assert ring.peak == 7 * 16
+
+
+def test_what_is_on_the_disk_is_counted(ring, reader):
+    for count in (3, 4):
+        reader.count_written(count)
+    assert ring.written == 7
 
 
 def test_a_packet_that_was_not_finished_is_not_there(ring, reader):
