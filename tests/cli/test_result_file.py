@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 from called import called
 
-from adacd_hil.cli.output import CommandError, print_and_write, writable_folder
-from adacd_hil.error_texts import is_disk_full
+from adacd_hil.cli.output import CommandError, writable_folder
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import ExcitationSettings
 from adacd_hil.settings.toml_files import parse_toml
@@ -50,17 +49,6 @@ def test_a_place_that_takes_no_file_is_said_before_the_search(out, reason, tmp_p
 def fill(path: Path, content: str) -> None:
     """Stand for `replace_file` on a disk that has become full."""
     raise OSError(errno.ENOSPC, "No space left on device", f".{path.name}.part")
-
-
-@pytest.mark.parametrize("has_all", [False, True])
-def test_what_was_found_is_told_where_it_can_not_be_written(has_all, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("adacd_hil.cli.output.replace_file", fill)
-    out = tmp_path / "x.toml"
-    with pytest.raises(CommandError) as raised:
-        print_and_write("the table", out, "a = 1\n", has_all)
-    assert str(raised.value).startswith(f"{out} can't be written: No space left on device")
-    assert is_disk_full(raised.value)
-    assert capsys.readouterr().out == ("the table\n" if has_all else "the table\n\na = 1\n")
 
 
 @pytest.mark.parametrize("words", [("excitation",), ("tune", "none.mcap"), ("thresholds", "none.mcap")])

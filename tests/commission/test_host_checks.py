@@ -93,25 +93,8 @@ def test_what_is_granted_is_told_and_what_is_not_with_its_remedy():
     assert outcome.remedy == "allow it; allow that"
 
 
-@pytest.mark.parametrize(
-    ("cpu", "isolated", "status", "text"),
-    [
-        ("any", "", Status.OK, "not asked for"),
-        ("any", "2-3", Status.WARNING, "isolated processors: 2, 3, not used"),
-        ("isolated", "", Status.WARNING, "isolated processors: none"),
-        ("isolated", "2-3", Status.OK, "isolated processors: 2, 3"),
-        ("3", "2-3", Status.OK, "`realtime.cpu` = 3"),
-        ("1", "2-3", Status.WARNING, "processor 1 is shared"),
-    ],
-)
-def test_a_processor_of_its_own_is_judged(tmp_path, cpu, isolated, status, text):
-    folder = tmp_path / "sys/devices/system/cpu"
-    folder.mkdir(parents=True)
-    (folder / "isolated").write_text(f"{isolated}\n")
-    outcome = RUN["isolation"](host(root=tmp_path, cpu=cpu))
-    assert outcome.status is status
-    assert text in outcome.reason
-    assert bool(outcome.remedy) is (status is Status.WARNING)
+def isolated(cpus: str) -> dict[str, str]:
+    return {"sys/devices/system/cpu/isolated": f"{cpus}\n"}
 
 
 def governors(*names: str) -> dict[str, str]:
@@ -126,6 +109,12 @@ def throttled(runtime_us: int) -> dict[str, str]:
 @pytest.mark.parametrize(
     ("files", "check", "status", "text"),
     [
+        (isolated(""), "isolation any", Status.OK, "not asked for"),
+        (isolated("2-3"), "isolation any", Status.WARNING, "isolated processors: 2, 3, not used"),
+        (isolated(""), "isolation isolated", Status.WARNING, "isolated processors: none"),
+        (isolated("2-3"), "isolation isolated", Status.OK, "isolated processors: 2, 3"),
+        (isolated("2-3"), "isolation 3", Status.OK, "`realtime.cpu` = 3"),
+        (isolated("2-3"), "isolation 1", Status.WARNING, "processor 1 is shared"),
         ({"proc/self/status": "Name:\tx\nCapEff:\t0000000000001000\n"}, "permissions", Status.OK, "CAP_NET_ADMIN"),
         ({"proc/self/status": "CapEff:\t0000000000002fff\n"}, "permissions", Status.WARNING, "without CAP_NET_ADMIN"),
         ({}, "permissions", Status.SKIPPED, "/proc"),
@@ -143,13 +132,16 @@ def throttled(runtime_us: int) -> dict[str, str]:
     ],
 )
 def test_the_machine_is_judged_by_its_files(tmp_path, files, check, status, text):
+    """The processor that is asked for stands behind the check."""
     for name, content in files.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(content)
-    outcome = RUN[check](host(root=tmp_path))
+    check, _, cpu = check.partition(" ")
+    outcome = RUN[check](host(root=tmp_path, cpu=cpu or "any"))
     assert outcome.status is status
     assert text in outcome.reason
+    assert bool(outcome.remedy) is (status is Status.WARNING)
 
 
 def test_a_link_is_read_from_iproute2():

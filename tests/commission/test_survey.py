@@ -64,12 +64,6 @@ def test_an_operational_node_without_heartbeat_is_told_by_its_pdos():
     assert {node.state_text for node in look(rig, 0.5).nodes} == {"operational (sends PDOs)"}
 
 
-def test_a_missing_node_is_named():
-    rig = Rig(is_wall=True)
-    rig.silence(3)
-    assert verdicts(rig, look(rig)) == {1: "", 2: "", 3: "missing: Sensor1 expected", 4: ""}
-
-
 def test_who_is_found_is_compared_with_who_is_expected():
     rig = Rig(is_wall=True)
     found, expected = look(rig), expected_nodes(rig.master.slaves)
@@ -110,14 +104,6 @@ def test_an_answer_that_is_too_short_is_none(data):
     rig = Rig(is_wall=True)
     rig.bus.deliver(0x58A, bytes.fromhex(data))
     assert [node.node_id for node in look(rig).nodes if node.answers] == [1, 2, 3, 4]
-
-
-def test_an_empty_bus_has_nobody():
-    rig = Rig(is_wall=True)
-    rig.tamper = lambda cycle, can_id, data: None
-    rig.forget()
-    found = look(rig, 0.2)
-    assert (found.nodes, found.others) == ([], [])
 
 
 @pytest.mark.parametrize(

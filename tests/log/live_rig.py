@@ -17,7 +17,7 @@ from adacd_hil.log.recording.packet import pack_cycle, pack_event, unpack
 from adacd_hil.log.recording.packet_writer import PacketWriter
 from adacd_hil.log.recording.processes import WriterSetup
 from adacd_hil.log.types.topics import run_channels
-from adacd_hil.records import Event
+from adacd_hil.records import ContactKind, ContactLevel, ContactReport, Event, Location, Reaction
 from adacd_hil.wire.message_table import plain_tables
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -25,6 +25,26 @@ URDF = '<robot name="a"/>'
 LINK_LENGTH_M = (0.35, 0.30)
 SETUP = LiveView("127.0.0.1", 0, robot_description=URDF, shape=Shape(LINK_LENGTH_M))
 LAST = Event("info", "test", "last")
+PUSH = ContactReport(
+    cycle=7,
+    link=2,
+    direction=(1, -1),
+    tau_ext_peak=(2.5, -1.5),
+    impulse=(0.25, 0.125),
+    is_final=True,
+    level=ContactLevel.COLLISION,
+    kind=ContactKind.PUSH,
+    reaction=Reaction.FLOAT,
+    location=Location.KNOWN,
+    is_two_sided=True,
+    tau_ext_peak_sigma=(0.1, 0.2),
+    impulse_sigma=(0.3, 0.4),
+    force_N=18.5,
+    force_sigma=0.5,
+    lever_m=0.2,
+    lever_sigma=0.01,
+    blind_rad=0.6,
+)
 
 
 def setup_of(live: LiveView | None, path: Path = Path("run.mcap"), parameter_count: int = 7) -> WriterSetup:

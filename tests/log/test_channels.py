@@ -12,7 +12,6 @@ from adacd_hil.log.types.message_types import (
     ENCAPSULATION,
     Member,
     number_type,
-    pack_fd_frame,
     payload_dtype,
     ros_field_name,
     ros_message_name,
@@ -21,29 +20,20 @@ from adacd_hil.log.types.topics import (
     ChannelId,
     pack_arm,
     pack_contact,
-    pack_control,
-    pack_cycle,
-    pack_scheme,
     run_channels,
 )
-from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT, pack_truth, truth_channels
+from adacd_hil.log.types.truth_topic import truth_channels
 from adacd_hil.log.types.unpacking import unpack_contact
 from adacd_hil.records import (
-    CONTROL_LAYOUT,
     ArmState,
     ContactKind,
     ContactLevel,
     ContactReport,
-    CycleRecord,
     FaultReason,
     Location,
     Reaction,
-    Request,
-    SchemeOutput,
     SchemeState,
-    scheme_layout,
 )
-from adacd_hil.wire.message_table import MessageTable
 
 CHANNELS = (*run_channels(9, tuple(CODEC.messages.values())), *truth_channels())
 STAMP = struct.pack("<II", 12, 34)
@@ -79,11 +69,6 @@ def test_two_fields_with_one_ros_name_are_refused():
         number_type("a/msg/B", (Member("P", "float64"), Member("p", "float64")))
 
 
-def test_a_dbc_message_may_not_take_the_name_of_our_own_type():
-    with pytest.raises(LogError, match="the type name adacd_hil_msgs/msg/Scheme is taken"):
-        run_channels(7, (MessageTable("Scheme", 1, 0, ()),))
-
-
 def test_the_layout_of_a_type_is_aligned_as_cdr_demands():
     text = number_type(
         "a/msg/B", (Member("u", "uint8"), Member("f", "float64", 2), Member("s", "int16"), Member("i", "int32"))
@@ -101,46 +86,6 @@ def test_the_layout_of_a_type_is_aligned_as_cdr_demands():
 def test_a_type_of_varying_size_has_no_layout(text):
     with pytest.raises(LogError):
         payload_dtype(text)
-
-
-def test_scheme_is_laid_out_as_its_type_says():
-    layout = scheme_layout(9)
-    block = np.arange(layout.size) + 0.5
-    output = SchemeOutput(
-        cycle=2**40,
-        state=SchemeState.STOPPED,
-        previous_state=SchemeState.REACT,
-        fault=FaultReason.LIMIT,
-        contact_joints=3,
-        is_model_valid=True,
-        theta_hat=block,
-        theta_ff=block,
-        tau_ext_hat=block,
-        contact=None,
-        block=block,
-    )
-    message = decode(ChannelId.SCHEME, pack_scheme(output, Request.PAYLOAD))
-    assert (message.stamp.sec, message.stamp.nanosec) == (12, 34)
-    head = (message.cycle, message.state, message.previous_state, message.fault, message.request)
-    assert head == (2**40, 6, 5, 4, 2)
-    assert (message.contact_joints, message.is_model_valid) == (3, True)
-    for name, place in layout.slices.items():
-        assert np.atleast_1d(getattr(message, name.lower())).tolist() == block[place].tolist()
-
-
-def test_numbers_are_laid_out_as_their_types_say():
-    control, truth = np.arange(CONTROL_LAYOUT.size) - 3.25, np.arange(TRUTH_LAYOUT.size) * 1.5
-    message = decode(ChannelId.CONTROL, pack_control(5, control, 0xA1, False, True))
-    assert (message.cycle, message.gate_flags, message.enable, message.quick_stop) == (5, 0xA1, False, True)
-    for name, place in CONTROL_LAYOUT.slices.items():
-        assert getattr(message, name.lower()) == control[place].tolist()
-    message = decode(ChannelId.TRUTH, pack_truth(77, truth))
-    assert message.cycle == 77
-    for name, place in TRUTH_LAYOUT.slices.items():
-        assert np.atleast_1d(getattr(message, name.lower())).tolist() == truth[place].tolist()
-    record = CycleRecord(1, -2, 3, 4, 5, -6, 7, 8, 9, 10, 11, 12, 13, 14)
-    message = decode(ChannelId.CYCLE, pack_cycle(record))
-    assert {name: getattr(message, name) for name in CycleRecord._fields} == record._asdict()
 
 
 def test_contact_is_laid_out_as_its_type_says_and_read_back():
@@ -174,15 +119,3 @@ def test_states_are_named_before_the_field_that_holds_them():
     lines = text.splitlines()
     state = next(index for index, line in enumerate(lines) if line.startswith("uint8 state "))
     assert lines[state - len(SchemeState) : state] == [f"uint8 STATE_{s.name}={s.value}" for s in SchemeState]
-
-
-def test_an_fd_frame_is_laid_out_as_written_by_hand():
-    stamp = bytes.fromhex("0100000002000000")
-    expected = (
-        "00010000"  # little-endian CDR
-        "01000000 02000000"  # stamp
-        "01000000 00 000000"  # frame_id "", aligned
-        "81010000 00 01 0c 00"  # id, is_extended, is_error, len, aligned
-        "0c000000 000102030405060708090a0b"  # data
-    )
-    assert pack_fd_frame(stamp, 0x181, bytes(range(12)), True) == bytes.fromhex(expected)

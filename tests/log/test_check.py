@@ -341,11 +341,6 @@ def test_a_folder_stands_for_its_logs_without_their_later_parts(tmp_path):
         find_logs(tmp_path / "empty")
 
 
-def test_a_file_that_does_not_exist_is_an_error_of_one_line(tmp_path):
-    with pytest.raises(LogError, match=f"^log {tmp_path / 'none.mcap'} can't be read: No such file or directory$"):
-        check_log(tmp_path / "none.mcap")
-
-
 def test_a_file_of_something_else_is_told_and_raises_nothing(tmp_path):
     for data in (b"", b"x", b"hello, this is text\n" * 1000, bytes(5000)):
         rules = {finding.rule for finding in check(tmp_path / "notes.txt", data).findings}

@@ -144,13 +144,9 @@ def test_a_damaged_log_is_recovered_first(spoil, reason, log_path, tmp_path):
     assert list(tmp_path.iterdir()) == [log_path]
 
 
-def test_a_log_that_lacks_only_what_is_made_anew_is_cut(log_path, tmp_path):
-    log_path.write_bytes(log_path.read_bytes()[:-1])
-    assert cut(log_path, tmp_path / "out.mcap", TimeWindow(-INFINITE, INFINITE)) == 2 * CYCLES
-
-
-def test_a_strangers_log_without_crcs_is_taken_as_it_is(log_path, tmp_path):
-    log_path.write_bytes(without_crc(log_path.read_bytes()))
+@pytest.mark.parametrize("spoil", [lambda data: data[:-1], without_crc])
+def test_a_log_that_lacks_only_what_is_made_anew_or_crcs_is_cut(spoil, log_path, tmp_path):
+    log_path.write_bytes(spoil(log_path.read_bytes()))
     assert cut(log_path, tmp_path / "out.mcap", TimeWindow(-INFINITE, INFINITE)) == 2 * CYCLES
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 from joint_state_bags import State, write_mcap
-from mcap.writer import Writer
 
 from adacd_hil.cli.main import cli
 
@@ -65,26 +64,3 @@ def test_each_choice_of_joints_has_a_table(tmp_path: Path, is_gripper_first: boo
     first, second = ("finger", "lift") if is_gripper_first else ("lift", "finger")
     assert f"effort_{first}" in found["joint_states"][0]
     assert f"effort_{second}" in found[f"joint_states_{second}_1"][0]
-
-
-def test_a_topic_is_chosen_by_its_name(tmp_path: Path) -> None:
-    left, right = (State(0.0, NAMES, (1.0, 2.0, 3.0), topic=topic) for topic in ("/left", "/right"))
-    path = write_mcap(tmp_path / "r.mcap", [left, right])
-    out = tmp_path / "out"
-    assert command("log", "export", str(path), "--format", "csv", "--topic", "right", "--out", str(out))[0] == 0
-    assert [each.name for each in out.iterdir()] == ["right.csv"]
-
-
-def test_topics_that_make_no_table_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "r.mcap"
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2", library="a test")
-        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
-        channel = writer.register_channel("/words", "cdr", schema)
-        writer.add_message(channel, 1, b"\0\1\0\0\3\0\0\0ab\0", 1)
-        writer.finish()
-    status, said = command("log", "export", str(path), "--format", "csv", "--out", str(tmp_path / "out"))
-    assert status == 1
-    assert said.strip().endswith("r.mcap makes no table: messages of varying size are not exported: /words")
-    assert not any((tmp_path / "out").iterdir())

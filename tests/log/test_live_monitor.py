@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from hang import HANG_S
-from live_rig import Feed, receive_until_last
+from live_rig import PUSH, Feed, receive_until_last
 from recorded_run import make_run
 
 from adacd_hil.cli.main import cli
@@ -23,27 +23,11 @@ from adacd_hil.log.types.message_types import payload_dtype
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import (
     PARAMETER_NAMES,
-    ContactKind,
     ContactLevel,
-    ContactReport,
     Event,
     FaultReason,
-    Location,
     SchemeState,
     scheme_layout,
-)
-
-PUSH = ContactReport(
-    5,
-    2,
-    (1, 1),
-    (1.0, 2.0),
-    (0.1, 0.2),
-    True,
-    kind=ContactKind.PUSH,
-    location=Location.KNOWN,
-    force_N=7.25,
-    lever_m=0.125,
 )
 
 
@@ -63,7 +47,7 @@ def two_cycles():
         cycle=41, state=SchemeState.MONITOR, fault=FaultReason.NONE, block=block, previous_state=SchemeState.CERTIFY
     )
     second.record = second.record._replace(lateness_ns=12_000, slack_ns=437_000, overruns=7, frames_missing=3)
-    second.contact = PUSH
+    second.contact = PUSH._replace(force_N=7.25, lever_m=0.125)
     second.event = Event("warning", "realtime", "late")
     return run
 
@@ -201,11 +185,6 @@ def test_without_the_extra_there_is_one_line_and_status_2(monkeypatch, tmp_path,
     assert result.exit_code == 2
     assert result.stderr == f"adacd-hil: {asked_for} needs the extra `live`: {install_command('live')}\n"
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_monitor_needs_a_bus_or_a_url():
-    result = CliRunner().invoke(cli, ["monitor", "-i", "socketcan"])
-    assert (result.exit_code, result.stderr) == (2, "adacd-hil: give --interface and --channel, or --url\n")
 
 
 def test_no_escape_sequence_of_an_event_reaches_the_terminal():

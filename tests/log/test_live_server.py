@@ -422,38 +422,6 @@ def test_nothing_that_a_peer_sends_reaches_the_runs_terminal():
 # -- the log ---------------------------------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def crowd(url, count):
-    """Clients that behave badly, see live_crowd.py."""
-    words = [sys.executable, Path(__file__).parent / "live_crowd.py", url.rsplit(":", 1)[1], str(count)]
-    clients = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    try:
-        assert clients.stdout.readline() == b"ready\n"
-        yield
-        clients.stdin.close()
-        assert clients.wait(HANG_S) == 0
-    finally:
-        clients.kill()
-        clients.wait()
-        clients.stdout.close()
-
-
-@pytest.mark.long
-@pytest.mark.slow
-@pytest.mark.parametrize("blocking", [True, False])
-def test_five_hundred_clients_that_behave_badly_cost_the_log_nothing(tmp_path, blocking):
-    run = make_run(1500, seed=8)
-    for name, live in (("crowded", live_setup(most_viewers=500)), ("alone", None)):
-        recorder = start(tmp_path / f"{name}.mcap", run, live=live, blocking=blocking)
-        with crowd(recorder.live_url, 500) if live else contextlib.nullcontext():
-            feed(recorder, run.cycles)
-            summary = recorder.close()
-        assert (summary.is_complete, summary.dropped) == (True, 0)
-        assert summary.messages > 10_000
-    if blocking:
-        assert (tmp_path / "crowded.mcap").read_bytes() == (tmp_path / "alone.mcap").read_bytes()
-
-
 def live_process_of(writer_pid):
     """Find the process of the live view among the writer's children."""
     (child,) = Path(f"/proc/{writer_pid}/task/{writer_pid}/children").read_text().split()

@@ -145,15 +145,6 @@ def test_each_message_of_the_dbc_is_decoded_as_cantools_does(contract):
         assert values == pytest.approx([theirs[name] for name in names], rel=1e-15), topic
 
 
-def test_a_frame_stamped_late_has_its_stamp_but_a_log_time_that_does_not_run_backwards():
-    rig = Rig()
-    rig.write(
-        pack_cycle(1000, 0, [], [(False, Frame(1, b"", 900)), (False, Frame(1, b"", 400)), (True, Frame(1, b"", 500))])
-    )
-    found = [(topic, log_ns, stamp_ns(payload)) for topic, log_ns, _, payload in rig.messages()]
-    assert found == [("/from_can_bus", 900, 900), ("/from_can_bus", 900, 400), ("/to_can_bus", 500, 500)]
-
-
 def test_an_event_reports_the_packets_that_are_missing_before_it():
     rig = Rig()
     rig.write(pack_cycle(1, 0, CYCLE, []), pack_cycle(2, 3, CYCLE, []), pack_cycle(3, 3, CYCLE, []))

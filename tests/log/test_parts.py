@@ -92,12 +92,6 @@ def test_a_part_ends_after_its_size_before_compression_with_a_chunk(recorded):
         assert 2**20 <= size < 2**20 + 600_000  # a quarter of a second more
 
 
-def test_two_runs_in_lockstep_give_the_same_parts(run, recorded, tmp_path):
-    record(tmp_path / "run.mcap", run, settings=BY_SIZE)
-    for number, part in find_parts(tmp_path / "run.mcap").items():
-        assert part.read_bytes() == part_path(recorded[0], number).read_bytes()
-
-
 def test_a_part_ends_by_log_time(run, whole, tmp_path):
     path = tmp_path / "run.mcap"
     record(path, run, settings=LogSettings(part_MiB=0, part_min=0.4 / 60.0))

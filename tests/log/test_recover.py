@@ -139,19 +139,18 @@ def test_metadata_that_may_be_wrong_are_said(tmp_path):
     assert (recovery.losses.is_any, recovery.losses.describe()) == (True, "metadata may be wrong")
 
 
-def test_a_damaged_attachment_is_left_out(tmp_path):
-    recovery, messages, attachments, _ = recovered(tmp_path, flipped(WHOLE, WHOLE.index(b"x = 1")))
+IN_ATTACHMENT = WHOLE.index(b"x = 1")
+
+
+@pytest.mark.parametrize(
+    "data",
+    [flipped(WHOLE, IN_ATTACHMENT), WHOLE[: IN_ATTACHMENT + 3] + bytes(7) + WHOLE[IN_ATTACHMENT + 10 :]],
+    ids=["flipped", "its CRC is zeroed with it"],  # a CRC of 0 says that there is none
+)
+def test_a_damaged_attachment_is_left_out(data, tmp_path):
+    recovery, messages, attachments, _ = recovered(tmp_path, data)
     assert attachments == {"arm.dbc": ATTACHMENTS["arm.dbc"]}
     assert (len(messages), recovery.losses.attachments) == (COUNT, 1)
-
-
-def test_an_attachment_whose_crc_was_zeroed_with_it_is_left_out(tmp_path):
-    """A CRC of 0 says that there is none."""
-    place = WHOLE.index(b"x = 1")
-    data = WHOLE[: place + 3] + bytes(7) + WHOLE[place + 10 :]
-    recovery, _, attachments, _ = recovered(tmp_path, data)
-    assert attachments == {"arm.dbc": ATTACHMENTS["arm.dbc"]}
-    assert recovery.losses.attachments == 1
 
 
 def test_what_no_crc_vouches_for_is_saved_only_while_the_whole_fits_its_own(tmp_path):

@@ -22,15 +22,6 @@ def reader(ring):
     return RingReader(ring.descriptor)
 
 
-def test_what_is_put_comes_out_in_order(ring, reader):
-    packets = [bytes([number]) * number for number in range(50)]
-    assert all(ring.put_packet(packet) for packet in packets)
-    assert ring.waiting == reader.waiting == sum(map(padded_bytes, range(50)))
-    assert list(split(reader.take_packets(MOST))) == packets
-    assert reader.take_packets(MOST) == b""
-    assert ring.waiting == 0
-
-
 def test_packets_of_any_size_go_round_the_ring_often(ring, reader):
     generator = np.random.default_rng(3)
     sent, received = [], []
@@ -43,6 +34,7 @@ def test_packets_of_any_size_go_round_the_ring_often(ring, reader):
     while data := reader.take_packets(MOST):
         received += list(split(data))
     assert received == sent
+    assert ring.waiting == 0
 
 
 def test_a_packet_without_room_changes_nothing_and_there_is_room_again_once_others_are_taken(ring, reader):

@@ -125,28 +125,30 @@ def test_a_log_of_a_killed_host_that_has_logged_something_is_no_start_that_faile
         Recorder(tmp_path / "run.mcap")
 
 
-def test_an_empty_file_of_another_program_is_not_moved(tmp_path):
-    with (tmp_path / "run.mcap").open("wb") as file:
+def empty_of_others(path):
+    with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
         writer.finish()
-    with pytest.raises(LogExistsError):
-        Recorder(tmp_path / "run.mcap")
 
 
-def test_a_log_without_cycles_whose_end_is_missing_is_not_taken_for_a_start_that_failed(tmp_path):
-    path = tmp_path / "run.mcap"
+def cut_start(path):
     failed_start(path)
     path.write_bytes(path.read_bytes()[:-100])
+
+
+def notes(path):
+    path.write_text("notes")
+
+
+@pytest.mark.parametrize("make", [empty_of_others, cut_start, notes])
+def test_what_is_not_surely_a_start_that_failed_is_not_moved(make, tmp_path):
+    path = tmp_path / "run.mcap"
+    make(path)
+    before = path.read_bytes()
     with pytest.raises(LogExistsError):
         Recorder(path)
-
-
-def test_a_log_that_is_none_is_not_moved(tmp_path):
-    (tmp_path / "run.mcap").write_text("notes")
-    with pytest.raises(LogExistsError):
-        Recorder(tmp_path / "run.mcap")
-    assert (tmp_path / "run.mcap").read_text() == "notes"
+    assert path.read_bytes() == before
 
 
 def test_a_folder_stands_for_the_log_in_it(tmp_path):

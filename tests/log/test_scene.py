@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from live_rig import PUSH
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
@@ -15,41 +16,18 @@ from adacd_hil.lab.live.scene import (
     RED,
     SCENE,
     SMALLEST_SPHERE_M,
-    TRANSFORMS,
     YELLOW,
     MessageType,
     Shape,
     draw_contact,
     draw_joints,
     pack_scene,
-    pack_transforms,
     residual_over_threshold,
-    transforms_of,
 )
-from adacd_hil.records import ContactKind, ContactLevel, ContactReport, Location, Reaction, SchemeState
+from adacd_hil.records import ContactLevel, Location, SchemeState
 
 SHAPE = Shape((0.35, 0.30))
 TIME_NS = 1_700_000_000_123_456_789
-PUSH = ContactReport(
-    cycle=7,
-    link=2,
-    direction=(1, -1),
-    tau_ext_peak=(2.5, -1.5),
-    impulse=(0.25, 0.125),
-    is_final=True,
-    level=ContactLevel.COLLISION,
-    kind=ContactKind.PUSH,
-    reaction=Reaction.FLOAT,
-    location=Location.KNOWN,
-    is_two_sided=True,
-    tau_ext_peak_sigma=(0.1, 0.2),
-    impulse_sigma=(0.3, 0.4),
-    force_N=18.5,
-    force_sigma=0.5,
-    lever_m=0.2,
-    lever_sigma=0.01,
-    blind_rad=0.6,
-)
 
 
 def decode(kind: MessageType, payload: bytes):
@@ -146,9 +124,3 @@ def test_arrows_stay_in_sight(force_N, length_m):
 def test_a_force_is_drawn_on_the_link(lever_m, drawn_m):
     (contact,) = drawn(draw_contact(SHAPE, PUSH._replace(lever_m=lever_m)))
     assert contact.arrows[0].pose.position.x == pytest.approx(drawn_m)
-
-
-def test_an_upright_arm_has_its_y_axis_up():
-    payload = pack_transforms(TIME_NS, transforms_of(Shape((0.35, 0.3), tilt_rad=math.pi / 2.0), np.zeros(2)))
-    rotation = decode(TRANSFORMS, payload).transforms[0].transform.rotation
-    assert (rotation.x, rotation.y, rotation.z, rotation.w) == pytest.approx((math.sqrt(0.5), 0, 0, math.sqrt(0.5)))

@@ -6,18 +6,6 @@ import resource
 from adacd_hil.log.recording.log_file import Sink
 
 
-def test_what_is_written_is_in_the_file_in_order(tmp_path):
-    path = tmp_path / "file"
-    sink = Sink(os.open(path, os.O_WRONLY | os.O_CREAT))
-    pieces = [bytes([number % 256]) * number for number in range(2000)]
-    for piece in pieces:
-        sink.write(piece)
-    assert sink.tell() == sum(map(len, pieces))
-    sink.close_file()
-    assert path.read_bytes() == b"".join(pieces)
-    assert sink.error == ""
-
-
 def test_a_settled_sink_knows_whether_writing_failed():
     sink = Sink(os.open("/dev/full", os.O_WRONLY))
     sink.write(b"data")
@@ -70,13 +58,3 @@ def test_the_next_file_takes_the_place_of_nothing(tmp_path):
     assert (sink.error, sink.take_lost()) == ("", 6)
     assert (tmp_path / "target").read_bytes() == b"kept"
     assert (tmp_path / "second").read_bytes() == b"data"
-
-
-def test_a_file_is_begun_again_from_its_start(tmp_path):
-    path = tmp_path / "file"
-    sink = Sink(os.open(path, os.O_WRONLY | os.O_CREAT), path)
-    sink.write(b"what came first")
-    sink.begin_file(path)
-    sink.write(b"again")
-    sink.close_file()
-    assert (sink.error, path.read_bytes()) == ("", b"again")

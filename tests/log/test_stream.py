@@ -22,7 +22,6 @@ from adacd_hil.log.log_files import FIELDS_KEY, find_parts, part_path
 from adacd_hil.log.reader import LogStream, read_log
 from adacd_hil.log.types.message_types import LOG, pack_log
 from adacd_hil.log.types.topics import run_channels
-from adacd_hil.log.types.unpacking import unpack_log
 from adacd_hil.records import Event
 from adacd_hil.settings.run_settings import LogSettings
 from adacd_hil.wire.dbc_decoder import load_decoder
@@ -90,18 +89,6 @@ def test_a_piece_never_splits_a_cycle_and_has_as_many_as_asked_for(path, run):
     pieces = [set.union(*times_of(piece)) for piece in LogStream(path, cycles_per_piece=64)]
     every = [cycle.t_ns for cycle in run.cycles]
     assert [sorted(piece) for piece in pieces] == [every[start : start + 64] for start in range(0, COUNT, 64)]
-
-
-def test_a_whole_log_is_what_the_stream_has(path):
-    log = read_log(path)
-    stream = LogStream(path, cycles_per_piece=500)
-    pieces = list(stream)
-    for topic in log.topics:
-        assert payloads(log.topics[topic]) == payloads_of(pieces, topic), topic
-    assert log.frames.tobytes() == b"".join(piece.frames.tobytes() for piece in pieces)
-    events = [unpack_log(payload) for piece in pieces for payload in piece.payloads["/events"]]
-    assert [event for _, event in log.events] == events
-    assert (log.summary, log.metadata, log.attachments) == (stream.summary, stream.metadata, stream.attachments)
 
 
 def test_what_a_log_was_made_with_is_known_at_once(path, run):
