@@ -328,13 +328,6 @@ def test_a_frame_carries_the_kernels_stamp_however_late_it_is_read(ends: tuple[S
     assert before_ns - STAMP_ERROR_NS <= frame.t_ns <= after_ns + STAMP_ERROR_NS
 
 
-def test_frames_handed_over_together_arrive_in_their_order(ends: tuple[SocketCanBus, SocketCanBus]) -> None:
-    near, far = ends
-    frames = [(0x100 + index, bytes([index]) * (index % 9)) for index in range(100)]
-    near.send_all(frames)
-    assert received(far, 100) == frames
-
-
 def test_frames_without_room_are_waited_for_and_a_queue_that_stays_full_has_a_remedy(
     ends: tuple[SocketCanBus, SocketCanBus],
 ) -> None:
@@ -391,34 +384,6 @@ def test_no_old_command_gets_out_after_a_recovery(ends: tuple[SocketCanBus, Sock
         rest = far.receive(0.05)
     assert frames == [(0x202, NEW_DATA)]
     assert rest is None
-
-
-@pytest.mark.slow
-def test_without_a_recovery_the_old_commands_do_get_out(ends: tuple[SocketCanBus, SocketCanBus]) -> None:
-    near, far = ends
-    with plugged(frames=64):
-        count = fill_queue(near)
-        near.close()  # nor does the end of the process that sent them stop them
-        later = open_end()
-        unplug()
-        later.send(0x202, NEW_DATA)
-        frames = received(far, count + 1)
-        later.close()
-    assert count == 64
-    assert frames == [(0x201, OLD_DATA)] * 64 + [(0x202, NEW_DATA)]
-
-
-@pytest.mark.slow
-def test_a_recovery_drops_what_another_process_left_in_the_queue() -> None:
-    with plugged(frames=64):
-        first = open_end()
-        fill_queue(first)
-        first.close()
-        second = open_end()
-        second.recover()
-        waiting = CanInterface(CHANNEL).waiting_frames()
-        second.close()
-    assert waiting == 0
 
 
 def test_a_recovery_drops_what_was_received_and_leaves_an_interface_alone_that_holds_nothing(

@@ -158,41 +158,6 @@ def test_the_largest_step_and_the_longest_silence_that_count_as_loss(profile: Pr
         assert receiver.check(sent[1]) is status
 
 
-@BOTH
-@pytest.mark.parametrize("lost", [1, 4])
-def test_a_short_burst_of_lost_frames_leaves_the_next_one_usable(profile: Profile, lost: int) -> None:
-    receiver = profile.receiver()
-    sent = frames(profile, 10)
-    receiver.check(sent[0])
-    assert [receiver.miss() for _ in range(lost)] == [E2eStatus.NO_NEW_DATA] * lost
-    assert receiver.check(sent[1 + lost]) is E2eStatus.OK_SOME_LOST
-    assert receiver.check(sent[2 + lost]) is E2eStatus.OK
-
-
-@BOTH
-@pytest.mark.parametrize("lost", [5, 16, 17, 40])
-def test_after_a_long_silence_the_third_frame_is_usable_again(profile: Profile, lost: int) -> None:
-    receiver = profile.receiver()
-    sent = frames(profile, 50)
-    receiver.check(sent[0])
-    for _ in range(lost):
-        receiver.miss()
-    assert [receiver.check(frame).is_valid for frame in sent[1 + lost : 5 + lost]] == [False, False, True, True]
-
-
-@BOTH
-@pytest.mark.parametrize("missed", range(5))
-def test_a_frame_from_the_past_is_not_used_after_a_burst(profile: Profile, missed: int) -> None:
-    sent = frames(profile, 12)
-    for age in range(1, 9):
-        receiver = profile.receiver()
-        for frame in sent:
-            receiver.check(frame)
-        for _ in range(missed):
-            receiver.miss()
-        assert receiver.check(sent[11 - age]) is E2eStatus.WRONG_SEQUENCE
-
-
 @pytest.mark.parametrize(
     "profile", [profile_2(6), *map(profile_5, (8, 12, 16, 24, 64))], ids=lambda p: f"{p.modulus}-{p.length}"
 )
@@ -226,18 +191,6 @@ def test_a_frame_of_another_length_is_not_taken(profile: Profile) -> None:
 def test_a_frame_of_another_message_is_not_taken(profile: Profile) -> None:
     other = profile.stranger()
     assert {other.check(frame) for frame in frames(profile, 40)} == {E2eStatus.WRONG_CRC}
-
-
-@BOTH
-def test_every_check_is_counted(profile: Profile) -> None:
-    receiver = profile.receiver()
-    sent = frames(profile, 12)
-    for frame in (sent[0], sent[1], sent[2], sent[4], sent[4], sent[11], bytes(profile.length), sent[0]):
-        receiver.check(frame)
-    receiver.miss()
-    receiver.miss()
-    assert receiver.counts == [3, 1, 1, 2, 1, 2, 0]
-    assert receiver.tally() == list(zip(E2eStatus, receiver.counts, strict=True))
 
 
 @BOTH
@@ -290,13 +243,6 @@ def test_without_protection_every_frame_is_ok_and_passes_as_it_is() -> None:
 def test_only_ok_frames_may_be_used(status: E2eStatus, number: int, is_valid: bool) -> None:
     assert int(status) == number
     assert status.is_valid is is_valid
-
-
-def test_the_header_takes_what_the_profile_says() -> None:
-    assert {protection: profile.header_bytes for protection, profile in PROFILES.items()} == {
-        Protection.PROFILE_2: 2,
-        Protection.PROFILE_5: 4,
-    }
 
 
 @BOTH
