@@ -129,19 +129,18 @@ def test_a_contract_that_says_otherwise_than_the_profiles_is_named(
         loaded_contract(parse(Settings, {"devices": {"contract": str(path), **devices}}))
 
 
-def test_two_messages_of_one_identifier_are_refused(tmp_path: Path) -> None:
-    text = DRIVE_PROFILE.read_text()
-    path = tmp_path / "clash.toml"
-    path.write_text(text.replace("cob_id = 0x280", "cob_id = 0x180"))
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (("cob_id = 0x280", "cob_id = 0x180"), "both have identifier 0x181"),
+        (("0x603F", "0x603E"), r"object 0x603E is not in /.*/drive\.eds"),
+    ],
+)
+def test_a_profile_that_no_contract_can_be_composed_of_is_named(
+    tmp_path: Path, change: tuple[str, str], line: str
+) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(DRIVE_PROFILE.read_text().replace(*change))
     settings = parse(Settings, {"devices": {"drive": [str(path), "adacd-drive"], "contract": ""}})
-    with pytest.raises(ConfigError, match="both have identifier 0x181"):
-        loaded_contract(settings)
-
-
-def test_an_object_that_the_eds_lacks_cant_be_mapped(tmp_path: Path) -> None:
-    text = DRIVE_PROFILE.read_text()
-    path = tmp_path / "wide.toml"
-    path.write_text(text.replace("0x603F", "0x603E"))
-    settings = parse(Settings, {"devices": {"drive": [str(path), "adacd-drive"], "contract": ""}})
-    with pytest.raises(ConfigError, match=r"object 0x603E is not in /.*/drive\.eds"):
+    with pytest.raises(ConfigError, match=line):
         loaded_contract(settings)
