@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 SHORT = "lasts_s = 0.4\n"
 LENGTHS = ("--no-bus", "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", "--flat", "--yes")
-RPM, INCREMENTS_PER_S = 0x00B44700, 0x00B50300
+RPM = 0x00B44700
 RECEIVED, SENT = ("1400", "1401", "1402", "1403"), ("1800", "1801", "1802", "1803")
 FIXED_COMMAND = (0x60400010, 0x60710010, 0x60600008)
 

@@ -182,14 +182,6 @@ def test_a_drive_whose_position_does_not_reach_the_arm_s_limit_is_named(tmp_path
     assert [line.partition(" carries ±118 deg")[0] for line in warnings] == ["Drive2Feedback"]
 
 
-def test_a_drive_with_its_maker_s_objects_follows_its_commands(tmp_path: Path) -> None:
-    written = CliRunner().invoke(cli, ["init", *describe_arm(tmp_path)])
-    assert written.exit_code == 0, written.stderr
-    (tmp_path / "short.toml").write_text("lasts_s = 1.0\nstart_deg = [-30.0, -60.0]\n")
-    status, lines = rehearse(tmp_path, "own")
-    assert status == 0, lines  # the host faults once the arm is 20 deg from where it should be
-
-
 def test_a_sensor_whose_frames_carry_next_to_nothing_is_named(tmp_path: Path) -> None:
     sensor = load_profile("int32-sensor", "sensor")
     (tmp_path / "int32_sensor.eds").write_bytes(sensor.eds.read_bytes())
