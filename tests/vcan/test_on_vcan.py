@@ -10,10 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiment_runs import BIN, Played, Witness, candump, demo, emulator, run_on_vcan
-from mcap.reader import make_reader
+from experiment_runs import BIN, Played, Witness, candump, contents, demo, emulator, run_on_vcan
 
-from adacd_hil.log.reader import read_log, topic_bytes
+from adacd_hil.log.reader import read_log
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.dbc_contract import contract_folder
 
@@ -144,14 +143,6 @@ def test_real_time_at_1_khz_detects_the_same_contacts(tmp_path: Path) -> None:
     assert [contact["link_detected"] for contact in contacts] == [1, 1]
     assert all(contact["direction_ok"] for contact in contacts)
     assert described["cycle"]["clock"] == "realtime"
-
-
-def contents(path: Path) -> dict[str, bytes]:
-    """Return what a log holds, stamps included, by topic."""
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    return {channel.topic: topic_bytes(path, channel.topic) for channel in summary.channels.values()}
 
 
 def longest_stall_cycles(path: Path) -> int:
