@@ -1,6 +1,5 @@
 """End-to-end protection: the CRCs against the standard's examples and cantools, and what the receivers accept."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import pytest
@@ -10,6 +9,7 @@ from hypothesis import strategies as st
 
 from adacd_hil.wire.e2e import (
     PROFILES,
+    E2eProfile,
     E2eReceiver,
     E2eSender,
     E2eStatus,
@@ -21,41 +21,35 @@ from adacd_hil.wire.e2e import (
 
 P02, P05 = PROFILES[Protection.PROFILE_2], PROFILES[Protection.PROFILE_5]
 DATA_IDS = bytes(range(10, 26))
-OTHER_DATA_IDS = bytes(range(100, 116))
 
 
 class Profile(NamedTuple):
     """One profile with frames of one length."""
 
-    sender: Callable[[], E2eSender]
-    receiver: Callable[[], E2eReceiver]
-    stranger: Callable[[], E2eReceiver]
-    """A receiver of another message of this length."""
+    profile: E2eProfile
+    data_ids: bytes
+    other_data_ids: bytes
+    """Of another message of this length."""
     length: int
     counter_byte: int
     modulus: int
 
+    def sender(self) -> E2eSender:
+        return E2eSender(self.profile, self.data_ids)
+
+    def receiver(self) -> E2eReceiver:
+        return ProtectedReceiver(self.profile, self.data_ids, self.length)
+
+    def stranger(self) -> E2eReceiver:
+        return ProtectedReceiver(self.profile, self.other_data_ids, self.length)
+
 
 def profile_2(length: int) -> Profile:
-    return Profile(
-        lambda: E2eSender(P02, DATA_IDS),
-        lambda: ProtectedReceiver(P02, DATA_IDS, length),
-        lambda: ProtectedReceiver(P02, OTHER_DATA_IDS, length),
-        length,
-        counter_byte=1,
-        modulus=16,
-    )
+    return Profile(P02, DATA_IDS, bytes(range(100, 116)), length, counter_byte=1, modulus=16)
 
 
 def profile_5(length: int) -> Profile:
-    return Profile(
-        lambda: E2eSender(P05, b"\x34\x12"),
-        lambda: ProtectedReceiver(P05, b"\x34\x12", length),
-        lambda: ProtectedReceiver(P05, b"\x34\x13", length),
-        length,
-        counter_byte=2,
-        modulus=256,
-    )
+    return Profile(P05, b"\x34\x12", b"\x34\x13", length, counter_byte=2, modulus=256)
 
 
 BOTH = pytest.mark.parametrize("profile", [profile_2(6), profile_5(24)], ids=["P02", "P05"])
