@@ -7,12 +7,11 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from called import called
 from eds_variants import EdsVariant
 from own_arm import LINKS, OWN_ARM, describe_arm, describe_geared_arm, touches
 
 from adacd_hil.cli.embedded_run import resolve
-from adacd_hil.cli.main import cli
 from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.device.device_files import load_profile
 from adacd_hil.lab.report.run_reading import read_run
@@ -38,7 +37,7 @@ def rehearse(folder: Path, name: str, *words: str, scenario: str = "short.toml")
     """Play a demo of the arm; return the exit status and the text on stderr."""
     command = ["demo", "--config", "my-arm.toml", "--scenario", scenario, "--out", name, *words]
     with contextlib.chdir(folder):
-        ran = CliRunner().invoke(cli, command)
+        ran = called(*command)
     return ran.exit_code, ran.stderr
 
 
@@ -47,7 +46,7 @@ def rehearse(folder: Path, name: str, *words: str, scenario: str = "short.toml")
 def test_an_arm_of_init_is_certified_and_all_its_touches_are_found(
     describe: Callable[[Path], list[str]], tmp_path: Path
 ) -> None:
-    written = CliRunner().invoke(cli, ["init", *describe(tmp_path)])
+    written = called("init", *describe(tmp_path))
     assert written.exit_code == 0, written.output
     (tmp_path / "touches.toml").write_text(touches(len(LINKS)))
     status, said = rehearse(tmp_path, "played", scenario="touches.toml")

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 from loaded import loaded_contract
 from rig import SessionRig, scripted
 from two_arms_rig import FIRST, SECOND, TwoArms
 
 from adacd_hil.cli.connection import received_ids
-from adacd_hil.cli.main import cli
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.pacing import make_pacer
@@ -143,7 +142,7 @@ def test_what_a_shared_bus_cannot_be_is_one_line(tmp_path: Path, bus: str, clock
     config = tmp_path / "two.toml"
     config.write_text(f"[bus]\n{bus}\n")
     arguments = ["-i", "virtual", "-c", "x", "--config", str(config), "--clock", clock, "--out", str(tmp_path / "out")]
-    ran = CliRunner().invoke(cli, ["run", *arguments])
+    ran = called("run", *arguments)
     assert ran.exit_code == 2
     (complaint,) = ran.stderr.splitlines()
     assert line in complaint

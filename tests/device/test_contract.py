@@ -96,11 +96,6 @@ def test_a_contract_without_a_file_gets_one_for_the_log_and_is_not_mistaken_for_
     assert write_contract(load_codec(), tmp_path) == load_codec().path  # it has a file
 
 
-def test_the_host_has_a_node_id_of_its_own() -> None:
-    with pytest.raises(ConfigError, match=r"`bus.host_node` = 3 is the node id of a device"):
-        parse(Settings, {"bus": {"host_node": 3}})
-
-
 def test_a_misspelt_contract_is_told_the_nearest() -> None:
     with pytest.raises(ConfigError, match="did you mean 'arm'"):
         loaded_contract(parse(Settings, {"devices": {"contract": "amr"}}))

@@ -2,10 +2,9 @@
 
 import can
 import pytest
+from called import called
 from can.interfaces import BACKENDS
-from click.testing import CliRunner
 
-from adacd_hil.cli.main import cli
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.open_bus import open_bus
@@ -40,7 +39,7 @@ def test_the_remedy_is_the_interface_s_own(interface, remedy):
 
 
 def test_a_command_ends_as_without_a_bus():
-    done = CliRunner().invoke(cli, ["scan", "-i", "kvaser", "-c", "0"])
+    done = called("scan", "-i", "kvaser", "-c", "0")
     assert done.exit_code == 5
     assert len(done.stderr.splitlines()) == 1
 
