@@ -73,40 +73,23 @@ def test_the_profile_5_crc_equals_cantools(payload: bytes, data_id: int) -> None
 
 
 @pytest.mark.parametrize(
-    ("covered", "crc"),
+    ("covered", "crc_2", "crc_5"),
     [
-        ("00000000", 0x12),
-        ("f20183", 0xC2),
-        ("0faa0055", 0xC6),
-        ("00ff5511", 0x77),
-        ("332255aabbccddeeff", 0x11),
-        ("926b55", 0x33),
-        ("ffffffff", 0x6C),
+        ("00000000", 0x12, 0x84C0),
+        ("f20183", 0xC2, 0xD374),
+        ("0faa0055", 0xC6, 0x2023),
+        ("00ff5511", 0x77, 0xB8F9),
+        ("332255aabbccddeeff", 0x11, 0xF53F),
+        ("926b55", 0x33, 0x0745),
+        ("ffffffff", 0x6C, 0x1D0F),
+        (b"123456789".hex(), 0xDF, 0x29B1),
     ],
 )
-def test_the_profile_2_crc_is_that_of_the_standard_crc_library(covered: str, crc: int) -> None:
-    # AUTOSAR SWS CRC Library, table of Crc_CalculateCRC8H2F: the last byte stands where the data id is
+def test_the_crcs_are_those_of_the_standard_crc_library(covered: str, crc_2: int, crc_5: int) -> None:
+    # AUTOSAR SWS CRC Library, tables of Crc_CalculateCRC8H2F and Crc_CalculateCRC16: the last bytes are the data id
     data = bytes.fromhex(covered)
-    assert crc8(b"\0" + data[:-1], 0, data[-1:]) == crc
-
-
-@pytest.mark.parametrize(
-    ("covered", "crc"),
-    [
-        ("00000000", 0x84C0),
-        ("f20183", 0xD374),
-        ("0faa0055", 0x2023),
-        ("00ff5511", 0xB8F9),
-        ("332255aabbccddeeff", 0xF53F),
-        ("926b55", 0x0745),
-        ("ffffffff", 0x1D0F),
-        (b"123456789".hex(), 0x29B1),
-    ],
-)
-def test_the_profile_5_crc_is_that_of_the_standard_crc_library(covered: str, crc: int) -> None:
-    # AUTOSAR SWS CRC Library, table of Crc_CalculateCRC16: the last two bytes stand where the data id is
-    data = bytes.fromhex(covered)
-    assert crc16(b"\0\0" + data[:-2], 0, data[-2:]) == crc
+    assert crc8(b"\0" + data[:-1], 0, data[-1:]) == crc_2
+    assert crc16(b"\0\0" + data[:-2], 0, data[-2:]) == crc_5
 
 
 def test_the_profile_5_example_of_the_standard_comes_out() -> None:
@@ -237,6 +220,13 @@ def test_without_protection_every_frame_is_ok_and_passes_as_it_is() -> None:
 def test_only_ok_frames_may_be_used(status: E2eStatus, number: int, is_valid: bool) -> None:
     assert int(status) == number
     assert status.is_valid is is_valid
+
+
+def test_the_header_takes_what_the_profile_says() -> None:
+    assert {protection: profile.header_bytes for protection, profile in PROFILES.items()} == {
+        Protection.PROFILE_2: 2,
+        Protection.PROFILE_5: 4,
+    }
 
 
 @BOTH
