@@ -121,18 +121,20 @@ def test_the_counter_begins_at_0_and_wraps(profile: Profile) -> None:
 
 
 @pytest.mark.parametrize(("profile", "largest"), [(profile_2(6), 3), (profile_5(24), 5)], ids=["P02", "P05"])
-def test_the_largest_step_and_the_longest_silence_that_count_as_loss(profile: Profile, largest: int) -> None:
+def test_the_largest_step_and_the_longest_silence_that_count_as_loss_and_what_confirms_a_sequence(
+    profile: Profile, largest: int
+) -> None:
     sent = frames(profile, 12)
     for step, status in ((largest, E2eStatus.OK_SOME_LOST), (largest + 1, E2eStatus.WRONG_SEQUENCE)):
         receiver = profile.receiver()
         receiver.check(sent[0])
         assert receiver.check(sent[step]) is status
-    for missed, status in ((4, E2eStatus.OK), (5, E2eStatus.SYNC)):
+    for missed, statuses in ((4, [E2eStatus.OK] * 3), (5, [E2eStatus.SYNC, E2eStatus.SYNC, E2eStatus.OK])):
         receiver = profile.receiver()
         receiver.check(sent[0])
         for _ in range(missed):
             receiver.miss()
-        assert receiver.check(sent[1]) is status
+        assert [receiver.check(frame) for frame in sent[1:4]] == statuses
 
 
 @pytest.mark.parametrize(
