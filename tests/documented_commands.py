@@ -508,10 +508,8 @@ def path_complaints(text: str, page: Path) -> Complaints:
     clean = text.rstrip("/")
     if any((ROOT / package / clean).exists() for package in PACKAGES) or (page.parent / clean).exists():
         return []
-    if "/" not in clean and any((ROOT / package).rglob(clean) for package in ("adacd_hil", "firmware_sim")):
-        found = [path for package in ("adacd_hil", "firmware_sim") for path in (ROOT / package).rglob(clean)]
-        return [] if found else [f"{text} does not exist"]
-    return [f"{text} does not exist"]
+    places = () if "/" in clean else (ROOT / "adacd_hil", ROOT / "firmware_sim")
+    return [] if any(True for place in places for _ in place.rglob(clean)) else [f"{text} does not exist"]
 
 
 def name_complaints(dotted: str) -> Complaints:

@@ -6,7 +6,7 @@ from typing import Self
 
 from adacd_hil.wire.dbc_contract import contract_folder
 
-UNSIGNED8, UNSIGNED32 = "0x0005", "0x0007"
+UNSIGNED32 = "0x0007"
 _LISTS = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
 
 
@@ -32,13 +32,13 @@ class EdsVariant:
             self.table[section][key] = str(value)
         return self
 
-    def with_object(self, section: str, value: int, data_type: str = UNSIGNED32, access: str = "rw") -> Self:
+    def with_object(self, section: str, value: int) -> Self:
         """Add an object, or a sub-index of one that is there."""
         self.table[section] = {
             "ParameterName": f"Object {section}",
             "ObjectType": "0x7",
-            "DataType": data_type,
-            "AccessType": access,
+            "DataType": UNSIGNED32,
+            "AccessType": "rw",
             "DefaultValue": str(value),
             "PDOMapping": "0",
         }

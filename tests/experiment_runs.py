@@ -17,6 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from hang import HANG_S
+from mcap.reader import make_reader
+
+from adacd_hil.log.reader import topic_bytes
 
 BIN = Path(sys.executable).parent
 PAPER = ("--config", "paper")
@@ -59,11 +62,17 @@ def demo(folder: Path, *arguments: str) -> Played:
     return adacd_hil(folder, "demo", *PAPER, "--out", str(folder), "--json", *arguments)
 
 
+class Emulating(subprocess.Popen[str]):
+    """A `firmware-sim`. `said`: what it printed since it was ready, once it has ended: stdout and stderr."""
+
+    said = ("", "")
+
+
 @contextlib.contextmanager
-def emulator(folder: Path, *arguments: str) -> Iterator["subprocess.Popen[str]"]:
-    """Run `firmware-sim` on vcan while the block lasts; it is ready when the block begins."""
-    command = [BIN / "firmware-sim", "run", "-i", "socketcan", "-c", "vcan0", "--out", str(folder), *arguments]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+def firmware_sim(*words: str | Path) -> Iterator[Emulating]:
+    """Run `firmware-sim` while the block lasts; it is ready when the block begins."""
+    command = [BIN / "firmware-sim", *words]
+    with Emulating(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
         try:
             assert process.stderr is not None
             for line in process.stderr:
@@ -72,7 +81,12 @@ def emulator(folder: Path, *arguments: str) -> Iterator["subprocess.Popen[str]"]
             yield process
         finally:
             process.terminate()
-            process.communicate(timeout=HANG_S)
+            process.said = process.communicate(timeout=HANG_S)
+
+
+def emulator(folder: Path, *arguments: str) -> contextlib.AbstractContextManager[Emulating]:
+    """Run an emulated arm on vcan while the block lasts."""
+    return firmware_sim("run", "-i", "socketcan", "-c", "vcan0", "--out", folder, *arguments)
 
 
 STANDARD_FRAMES = "vcan0,0:80000000"
@@ -142,6 +156,14 @@ def run_on_vcan(folder: Path, *arguments: str) -> Played:
     """Run the host on vcan0."""
     on_bus = ("run", "-i", "socketcan", "-c", "vcan0", *PAPER)
     return adacd_hil(folder, *on_bus, "--out", str(folder), "--json", *arguments)
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """Return what a log holds, stamps included, by topic."""
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return {channel.topic: topic_bytes(path, channel.topic) for channel in summary.channels.values()}
 
 
 def run_while_killing(folder: Path, victim: "subprocess.Popen[str]", *arguments: str) -> Played:

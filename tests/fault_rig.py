@@ -114,8 +114,8 @@ def _late(outcome: Outcome, expected: Expected) -> list[str]:
     return lines
 
 
-def scenario_of(rows: list[dict[str, Any]], seed: int = 1) -> Scenario:
-    return parse(Scenario, {"name": "faults", "start_deg": [-30.0, -60.0], "seed": seed, "faults": rows})
+def scenario_of(rows: list[dict[str, Any]]) -> Scenario:
+    return parse(Scenario, {"name": "faults", "start_deg": [-30.0, -60.0], "seed": 1, "faults": rows})
 
 
 class _Watched(Rig):
@@ -170,21 +170,19 @@ class _WatchedCycle(_Watched, CycleRig):
 
 
 def run_lockstep(
-    folder: Path, rows: list[dict[str, Any]], finish_s: float = 2.0, acknowledge_faults: int = 0, seed: int = 1
+    folder: Path, rows: list[dict[str, Any]], finish_s: float = 2.0, acknowledge_faults: int = 0
 ) -> Outcome:
     """Run a session in lockstep on the embedded bus."""
     settings = scripted("paper", finish_s, acknowledge_after_s=0.6, acknowledge_faults=acknowledge_faults)
-    rig = _WatchedSession(folder, settings, scenario_of(rows, seed), is_modelled=True)
+    rig = _WatchedSession(folder, settings, scenario_of(rows), is_modelled=True)
     summary, log = rig.run()
     return rig.outcome(summary.result.fault.name if summary.result is not None else "", summary.error, log)
 
 
-def run_realtime(
-    folder: Path, rows: list[dict[str, Any]], finish_s: float = 2.0, seed: int = 1, queue_frames: int = 10
-) -> Outcome:
+def run_realtime(folder: Path, rows: list[dict[str, Any]], finish_s: float = 2.0, queue_frames: int = 10) -> Outcome:
     """Run the real-time cycle in virtual time against a bench that goes by the clock, over a transmit queue."""
     settings = scripted("paper", finish_s, acknowledge_after_s=0.6)
-    rig = _WatchedCycle(folder, settings, scenario_of(rows, seed), queue_length=queue_frames, is_wall=True)
+    rig = _WatchedCycle(folder, settings, scenario_of(rows), is_wall=True)
     fault, error = FaultReason.NONE.name, ""
     try:
         fault = rig.run().fault.name

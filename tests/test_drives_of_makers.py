@@ -5,12 +5,12 @@ import re
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from called import called
+from click.testing import Result
 from eds_variants import EdsVariant
 
 from adacd_hil.api import load
 from adacd_hil.cli.embedded_run import resolve, run_embedded
-from adacd_hil.cli.main import cli
 from adacd_hil.cli.output import ExitCode, exit_code
 from adacd_hil.device.device_files import load_profile
 from adacd_hil.log.log_walk import attachment
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 SHORT = "lasts_s = 0.4\n"
 LENGTHS = ("--no-bus", "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", "--flat", "--yes")
-RPM, INCREMENTS_PER_S = 0x00B44700, 0x00B50300
+RPM = 0x00B44700
 RECEIVED, SENT = ("1400", "1401", "1402", "1403"), ("1800", "1801", "1802", "1803")
 FIXED_COMMAND = (0x60400010, 0x60710010, 0x60600008)
 
@@ -68,7 +68,7 @@ KINDS = {
 
 
 def init(folder: Path, *words: str) -> Result:
-    return CliRunner().invoke(cli, ["init", str(folder / "my-arm.toml"), *LENGTHS, *words])
+    return called("init", str(folder / "my-arm.toml"), *LENGTHS, *words)
 
 
 def rehearse(folder: Path) -> ExitCode:

@@ -8,7 +8,6 @@ import pytest
 from experiment_runs import Played, demo
 
 from adacd_hil.log.reader import read_log
-from adacd_hil.records import SchemeState
 
 pytestmark = [pytest.mark.slow, pytest.mark.long]
 
@@ -53,10 +52,6 @@ def test_every_contact_is_detected_in_time_with_its_link_and_direction_and_none_
     assert max(*residuals["B"]["identified"], *residuals["E"]["identified"]) <= 0.07
 
 
-def test_the_cad_model_is_far_off_with_a_payload(played: dict[str, Played]) -> None:
-    assert max(played["M"].json["frozen_residual_max_Nm"]["E"]["cad"]) >= 1.0
-
-
 def test_the_identified_inertia_follows_the_payload(played: dict[str, Played]) -> None:
     parameters = played["P"].json["parameters"]
     true, identified = zip(*[parameters["D"][name] for name in ("a1", "a2", "a3")], strict=True)
@@ -68,15 +63,6 @@ def test_the_experiment_ends_well_and_its_log_is_whole(played: dict[str, Played]
     assert played["P"].json["log"]["dropped"] == 0
     names = {path.name for path in played["P"].folder.iterdir()}
     assert names >= {"run.mcap", "truth.mcap", "report.html", "report.json"}
-
-
-def test_there_is_no_torque_on_the_wire_before_the_checks_have_passed(played: dict[str, Played]) -> None:
-    log = read_log(played["P"].log)
-    start_cycle = log.scheme["cycle"][np.argmax(log.scheme["state"] == SchemeState.ADAPT)]
-    start_ns = log.scheme.t_ns[start_cycle]
-    for name in ("Drive1Command", "Drive2Command"):
-        command = log.decoded[name]
-        assert np.count_nonzero(command["target_torque"][command.t_ns < start_ns]) == 0
 
 
 @pytest.mark.parametrize("seed", [SEED, "8"])

@@ -34,25 +34,6 @@ def test_the_truth_shows_a_fault_for_as_long_as_it_lasts(tmp_path: Path) -> None
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_the_same_faults_make_the_same_run_and_another_seed_another(tmp_path: Path) -> None:
-    rows = [{"kind": "corrupt", "node": "all", "frame": "torque", "probability": 0.05, "at_s": 0.1}]
-    runs = [run_lockstep(tmp_path / name, rows, 0.8, seed=seed) for name, seed in (("a", 1), ("b", 1), ("c", 2))]
-    first, same, other = (run.log.frames["data"].tobytes() for run in runs)
-    assert first == same
-    assert first != other
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_faults_that_never_begin_change_no_frame(tmp_path: Path) -> None:
-    rows = [{"kind": "lose", "node": "all", "frame": "torque", "at_s": 100.0}]
-    runs = [run_lockstep(tmp_path / name, faults, 0.8) for name, faults in (("none", []), ("later", rows))]
-    plain, waiting = (run.log.frames for run in runs)
-    assert plain.tobytes() == waiting.tobytes()
-
-
-@pytest.mark.long
-@pytest.mark.slow
 def test_a_sensor_that_is_well_again_can_be_acknowledged(tmp_path: Path) -> None:
     rows = [{"kind": "sensor_error", "node": "sensor1", "at_s": 0.8, "duration_s": 0.1}]
     outcome = run_lockstep(tmp_path, rows, finish_s=2.0, acknowledge_faults=1)

@@ -12,7 +12,7 @@ from pathlib import Path
 import first_hour
 import pytest
 from documents import ROOT
-from first_hour import Played, Step, Way, concepts, judge, logical_lines, play, read_way
+from first_hour import Played, Step, Way, judge, logical_lines, play, read_way
 from long_cases import long_but
 
 pytestmark = pytest.mark.slow
@@ -99,22 +99,9 @@ def test_a_question_is_answered_by_enter(tmp_path: Path) -> None:
     assert way.played[0].questions == 2
 
 
-def test_a_way_that_holds_too_much_is_a_complaint() -> None:
-    way = Way("x", [], 16_000, [str(number) for number in range(12)])
-    assert way.complaints == ["x: 12 concepts, 11 at most", "x: 80 min, 60 at most"]
-
-
 def test_a_block_is_typed_line_by_line_and_a_quote_keeps_lines_together() -> None:
     block = "# first\nfoo a \\\n  b   # else's\nsh -c '\n  foo # x\n  bar'\n\nbaz '#'\n"
     assert logical_lines(block) == ["foo a \\\n  b", "sh -c '\n  foo # x\n  bar'", "baz '#'"]
-
-
-def test_terms_are_found_in_prose_in_any_form_and_names_as_they_are_written() -> None:
-    assert concepts("Residuals of [x](certificate.md); you can sync. `tares` | PDOs") == [
-        "residual",
-        "tare",
-        "SDO, PDO",
-    ]
 
 
 @pytest.mark.parametrize(

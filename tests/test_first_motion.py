@@ -65,6 +65,10 @@ class Feed:
         self.state = run.state
         self.q, self.dq, self.tau_J, self.tau_c = (np.array(run[name]) for name in ("q", "dq", "tau_J", "tau_c"))
 
+    def scale(self, factor: float, joint: int, *names: str) -> None:
+        for name in names:
+            getattr(self, name)[:, joint - 1] *= factor
+
     def judged(self) -> FirstMotion:
         """Return who has judged it."""
         judge = FirstMotion(load_settings("certified"), SimpleNamespace(drives=(), gear_ratios=(1.0, 1.0)))  # type: ignore[arg-type]
@@ -161,7 +165,7 @@ def test_a_right_arm_whose_motion_tells_little_is_left_alone(feed: Feed, seed: i
 
 def test_a_joint_is_not_known_before_its_position_is_compared(feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(first_motion, "_LEAST_WAY_RAD", 1.8)  # both torques are known before
-    feed.q[:, 1] *= 0.6
+    feed.scale(0.6, 2, "q")
     check(feed.judged().line, POSITION, 2, 0.6)
 
 
@@ -175,6 +179,7 @@ def test_a_sensor_that_measures_nothing_is_not_taken_for_reversed(feed: Feed, jo
 
 TORQUE = r"joint (\d): its torque sensor measures ([+-][\d.]+) times the commanded torque"
 POSITION = r"joint (\d): its position moves ([+-][\d.]+) times as far as its velocity says"
+GEAR = r"joint (\d)(?: wrong, it)? turns about ([+-]?[\d.]+) times as far"
 
 
 def check(line: str, pattern: str, joint: int, value: float) -> None:
@@ -184,26 +189,33 @@ def check(line: str, pattern: str, joint: int, value: float) -> None:
     assert float(found[2]) == pytest.approx(value, rel=0.1)
 
 
-@pytest.mark.parametrize("joint", [1, 2])
-@pytest.mark.parametrize("factor", [-1.0, 2.0, 0.5])
-def test_a_wrong_sign_or_scale_of_a_torque_sensor_is_named(feed: Feed, joint: int, factor: float) -> None:
-    feed.tau_J[:, joint - 1] *= factor
-    line = feed.judged().line
-    if factor < 0.0:
-        assert "either " in line  # a turned encoder looks almost the same at first
-        assert f"torque sensor of joint {joint} reversed (devices.sensor_node[{joint - 1}])" in line
-        return
-    check(line, TORQUE, joint, factor)
-    assert f"devices.sensor[{joint - 1}]" in line
+WRONG = [  # what is recorded otherwise, how many times as large, what is measured then, the cause's place
+    (("tau_J",), 2.0, TORQUE, 2.0, "devices.sensor[{1}]"),
+    (("tau_J",), 0.5, TORQUE, 0.5, "devices.sensor[{1}]"),
+    (("tau_J",), -1.0, "either ", 0.0, "torque sensor of joint {0} reversed (devices.sensor_node[{1}])"),
+    (("tau_c",), -1.0, TORQUE, -1.0, "reverse the motor of devices.drive_node[{1}]"),
+    (("q",), 1.5, POSITION, 1.5, "devices.drive[{1}]"),
+    (("q",), -1.0, POSITION, -1.0, "devices.drive[{1}]"),
+    (("q", "dq"), 1.5, GEAR, 0.67, "devices.drive[{1}]"),
+    (("q", "dq"), 0.5, GEAR, 2.0, "devices.drive[{1}]"),
+    (("q", "dq"), -1.0, "either ", 0.0, "encoder of joint {0} reversed (devices.drive_node[{1}])"),
+]
+"""What can't be told from something else at first is one of two causes: a turned encoder from a turned sensor."""
 
 
 @pytest.mark.parametrize("joint", [1, 2])
-@pytest.mark.parametrize("factor", [1.5, 0.6, -1.0])
-def test_a_position_that_is_not_its_velocity_s_is_named(feed: Feed, joint: int, factor: float) -> None:
-    feed.q[:, joint - 1] *= factor
+@pytest.mark.parametrize(("names", "factor", "pattern", "value", "place"), WRONG)
+def test_a_wrong_scale_or_sign_is_named_with_what_is_measured_and_its_place(
+    feed: Feed, joint: int, names: tuple[str, ...], factor: float, pattern: str, value: float, place: str
+) -> None:
+    feed.scale(factor, joint, *names)
     line = feed.judged().line
-    check(line, POSITION, joint, factor)
-    assert f"devices.drive[{joint - 1}]" in line
+    if pattern == "either ":
+        assert pattern in line
+    else:
+        check(line, pattern, joint, value)
+        assert "either " not in line or pattern == GEAR
+    assert place.format(joint, joint - 1) in line
 
 
 @pytest.mark.parametrize(
@@ -225,8 +237,7 @@ def test_devices_at_each_other_s_joint_are_named(feed: Feed, exchanged: tuple[st
 
 
 def test_a_joint_that_is_reversed_as_a_whole_is_named_as_far_as_that_can_be_known(feed: Feed) -> None:
-    for name in ("q", "dq", "tau_c", "tau_J"):
-        getattr(feed, name)[:, 1] *= -1.0
+    feed.scale(-1.0, 2, "q", "dq", "tau_c", "tau_J")
     line = feed.judged().line
     assert (
         "joint 2 turns the other way than arm.sign = [1, 1] says, if joint 1 is right: arm.sign = [1, -1], or " in line
@@ -238,32 +249,6 @@ def test_an_arm_whose_joints_are_both_reversed_is_its_own_mirror_image(feed: Fee
     for name in ("q", "dq", "tau_c", "tau_J"):
         getattr(feed, name)[:] *= -1.0
     assert feed.judged().line == ""
-
-
-@pytest.mark.parametrize("joint", [1, 2])
-@pytest.mark.parametrize(("counted", "turns"), [(1.5, 0.67), (0.67, 1.5), (0.5, 2.0)])
-def test_a_gear_that_was_told_wrongly_is_named(feed: Feed, joint: int, counted: float, turns: float) -> None:
-    feed.q[:, joint - 1] *= counted
-    feed.dq[:, joint - 1] *= counted
-    line = feed.judged().line
-    check(line, r"joint (\d)(?: wrong, it)? turns about ([+-]?[\d.]+) times as far", joint, turns)
-    assert f"devices.drive[{joint - 1}]" in line
-
-
-@pytest.mark.parametrize("joint", [1, 2])
-def test_a_position_that_counts_against_the_torques_is_named(feed: Feed, joint: int) -> None:
-    feed.q[:, joint - 1] *= -1.0
-    feed.dq[:, joint - 1] *= -1.0
-    assert f"either encoder of joint {joint} reversed (devices.drive_node[{joint - 1}])" in feed.judged().line
-
-
-@pytest.mark.parametrize("joint", [1, 2])
-def test_a_motor_that_counts_the_other_way_is_certain_once_its_rivals_are_refuted(feed: Feed, joint: int) -> None:
-    feed.tau_c[:, joint - 1] *= -1.0
-    line = feed.judged().line
-    check(line, TORQUE, joint, -1.0)
-    assert f"reverse the motor of devices.drive_node[{joint - 1}]" in line
-    assert "either " not in line
 
 
 def test_sensors_that_both_measure_the_reaction_are_not_blamed_on_one_joint(feed: Feed) -> None:
@@ -292,7 +277,7 @@ def test_an_inertia_that_the_motion_leaves_open_refutes_nothing() -> None:
 
 
 def test_a_torque_constant_that_is_off_by_a_fifth_is_a_warning(feed: Feed) -> None:
-    feed.tau_c[:, 1] *= 1.2
+    feed.scale(1.2, 2, "tau_c")
     judge = feed.judged()
     assert judge.line == ""
     [warning] = [event.message for event in judge.take_events() if event.level == "warning"]
@@ -337,21 +322,9 @@ def test_an_arm_that_runs_away_in_its_first_motion_is_told_what_is_likely(tmp_pa
     assert RUN_AWAY[truth] in line
 
 
-UPRIGHT = """
-extends = "certified"
-
-[arm]
-link_length_m = [0.4, 0.25]
-rated_torque_Nm = [12.0, 12.0]
-torque_limit_Nm = [12.0, 6.0]
-position_limit_deg = [75.0, 120.0]
-velocity_limit_deg_s = [250.0, 300.0]
-cad_theta = [0.2875, 0.05, 0.0208333, 0.0, 0.0, 0.0, 0.0, 7.84532, 1.22583]
-mass_kg = [2.0, 1.0]
-
-[devices]
-contract = ""
-
+UPRIGHT = (
+    re.sub(r"cad_theta = .*", "cad_theta = []\nmass_kg = [2.0, 1.0]", ARM)
+    + """
 [estimator]
 gravity = true
 
@@ -365,13 +338,10 @@ half_period_s = [2.606, 10.42]
 [excitation]
 period_s = 5.559
 
-[controller]
-Kp = [402.4, 21.97]
-Kd = [20.12, 0.8239]
-
 [safety]
 rest_torque_Nm = 11.89
 """
+)
 
 
 def test_gravity_does_not_make_a_wrong_cause_certain(tmp_path: Path) -> None:

@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from click.testing import CliRunner
+from called import called
 from long_cases import long_but
 from played_outcome import outcome_of
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
-from adacd_hil.cli.main import cli
 from firmware_sim.scenario.scenario import ScenarioOutcome
 
 ARM = ("--no-bus", "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", "--yes")
@@ -48,7 +47,7 @@ class Played(NamedTuple):
 def play(folder: Path, mounting: tuple[str, ...], truth: str = "", text: str = TOUCHED) -> Played:
     """Draft an arm and play it. text: of the scenario; "": `paper`."""
     file, touched, truth_file = folder / "arm.toml", folder / "touched.toml", folder / "truth.toml"
-    drafted = CliRunner().invoke(cli, ["init", str(file), *ARM, *STRENGTH, *mounting])
+    drafted = called("init", str(file), *ARM, *STRENGTH, *mounting)
     assert drafted.exit_code == 0, drafted.stderr
     touched.write_text(text)
     truth_file.write_text(truth)

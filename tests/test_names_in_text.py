@@ -89,19 +89,3 @@ def test_a_name_in_a_text_is_one_of_the_code(sources: dict[Path, str], words: se
         if name not in ELSEWHERE
     ]
     assert not stale, "\n".join(stale)
-
-
-@pytest.mark.parametrize(
-    ("text", "stale"),
-    [
-        ("see `Arm.state`, `pair()` and `arm.py`", []),
-        ("see `Arm.gone`", ["Arm.gone"]),
-        ("lengths end with `_m`; columns are `q_1`", []),
-        ("they end with `_deg`", ["_deg"]),
-        ("see device/arm.py, gone.py", ["gone.py"]),
-        ("`adacd-hil run --tare FILE`, `q = 0`", []),
-    ],
-)
-def test_a_stale_name_is_found(text: str, stale: list[str]) -> None:
-    words = code_words('"""A gone thing."""\nclass Arm:\n    state = 1  # gone\ndef pair(length_m): ...\n')
-    assert list(stale_names(text, words, ["adacd_hil/device/arm.py"])) == stale

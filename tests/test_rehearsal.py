@@ -7,12 +7,11 @@ from importlib import resources
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from called import called
 from eds_variants import EdsVariant
 from own_arm import LINKS, OWN_ARM, describe_arm, describe_geared_arm, touches
 
 from adacd_hil.cli.embedded_run import resolve
-from adacd_hil.cli.main import cli
 from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.device.device_files import load_profile
 from adacd_hil.lab.report.run_reading import read_run
@@ -38,7 +37,7 @@ def rehearse(folder: Path, name: str, *words: str, scenario: str = "short.toml")
     """Play a demo of the arm; return the exit status and the text on stderr."""
     command = ["demo", "--config", "my-arm.toml", "--scenario", scenario, "--out", name, *words]
     with contextlib.chdir(folder):
-        ran = CliRunner().invoke(cli, command)
+        ran = called(*command)
     return ran.exit_code, ran.stderr
 
 
@@ -47,7 +46,7 @@ def rehearse(folder: Path, name: str, *words: str, scenario: str = "short.toml")
 def test_an_arm_of_init_is_certified_and_all_its_touches_are_found(
     describe: Callable[[Path], list[str]], tmp_path: Path
 ) -> None:
-    written = CliRunner().invoke(cli, ["init", *describe(tmp_path)])
+    written = called("init", *describe(tmp_path))
     assert written.exit_code == 0, written.output
     (tmp_path / "touches.toml").write_text(touches(len(LINKS)))
     status, said = rehearse(tmp_path, "played", scenario="touches.toml")
@@ -190,14 +189,6 @@ def test_a_drive_whose_torque_is_in_no_frame_is_named(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text(mine)
     warnings = [line for line in examine_configuration(str(tmp_path / "mine.toml")).warnings if "TORQUE" in line]
     assert [line.partition(":")[0] for line in warnings] == ["no frame of Drive2 carries `torque_actual`"]
-
-
-def test_a_drive_with_its_maker_s_objects_follows_its_commands(tmp_path: Path) -> None:
-    written = CliRunner().invoke(cli, ["init", *describe_arm(tmp_path)])
-    assert written.exit_code == 0, written.stderr
-    (tmp_path / "short.toml").write_text("lasts_s = 1.0\nstart_deg = [-30.0, -60.0]\n")
-    status, lines = rehearse(tmp_path, "own")
-    assert status == 0, lines  # the host faults once the arm is 20 deg from where it should be
 
 
 def test_a_sensor_whose_frames_carry_next_to_nothing_is_named(tmp_path: Path) -> None:

@@ -58,11 +58,6 @@ def test_awkward_text_survives_being_written(tmp_path: Path) -> None:
     assert load_scenario(str(path)).about == scenario.about
 
 
-def test_no_two_scenarios_are_about_the_same() -> None:
-    abouts = [load_scenario(name).about for name in NAMES]
-    assert len(set(abouts)) == len(abouts)
-
-
 def test_every_kind_of_fault_befalls_some_scenario() -> None:
     assert {row.kind for name in NAMES for row in load_scenario(name).faults} >= set(KINDS)
 

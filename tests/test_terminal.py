@@ -8,7 +8,6 @@ import select
 import signal
 import subprocess
 import sys
-import termios
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -214,18 +213,6 @@ def test_closed_streams_lend_their_numbers_to_no_file(tmp_path: Path) -> None:
     written = ["sh", "-c", '"$0" -c "$1" "$2" >&-', sys.executable, WRITE_BESIDE, tmp_path / "x"]
     assert subprocess.run(written, check=False).returncode == OK
     assert (tmp_path / "x").read_text() == ""
-
-
-def test_a_stopped_terminal_ends_with_ctrl_c() -> None:
-    ours, theirs = os.openpty()
-    termios.tcflow(theirs, termios.TCOOFF)
-    command = [sys.executable, "-c", WRITE_AND_EXIT]
-    with subprocess.Popen(command, stdout=theirs, stderr=subprocess.DEVNULL) as process:
-        wait_until_full(theirs, process)
-        process.send_signal(signal.SIGINT)
-        assert process.wait(HANG_S) in (-signal.SIGINT, 1, INTERRUPTED)
-    os.close(theirs)
-    os.close(ours)
 
 
 LOSE_INTERRUPT = """

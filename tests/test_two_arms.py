@@ -5,17 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from called import called
 from loaded import loaded_contract
-from two_arms_rig import FIRST, SECOND, TwoArms, first_beside
+from rig import SessionRig, scripted
+from two_arms_rig import FIRST, SECOND, TwoArms
 
 from adacd_hil.cli.connection import received_ids
-from adacd_hil.cli.main import cli
-from adacd_hil.clock import VirtualClock
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.pacing import make_pacer
-from adacd_hil.control.session import Session
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
@@ -24,35 +22,28 @@ from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 from adacd_hil.wire.bus import BusError, Tap
-from adacd_hil.wire.embedded_bus import EmbeddedBus
-from adacd_hil.wire.lockstep_bus import make_lockstep_bus
-from firmware_sim.bench.bench import Bench
-from firmware_sim.scenario.scenario import load_scenario
 
 pytestmark = pytest.mark.slow
 
 PERIOD_NS = 2_000_000
 
 
-def settings_of(arm: int, finish_s: float = 0.4) -> Settings:
-    """Configure one of two arms that share a bus at 2 ms."""
-    base = load_settings("paper")
-    second = dataclasses.replace(
+def second_settings() -> Settings:
+    """Configure the one of two arms that follows the other's SYNC, at 2 ms."""
+    base = scripted(finish_s=0.4)
+    return dataclasses.replace(
         base,
         bus=dataclasses.replace(base.bus, period_us=PERIOD_NS // 1000, arms=2, host_node=126, sync="follow"),
         devices=dataclasses.replace(base.devices, drive_node=(5, 6), sensor_node=(7, 8)),
-        operator=OperatorSettings(script=(RequestSettings(at_s=finish_s, request="finish"),)),
     )
-    return second if arm == SECOND else first_beside(second)
 
 
 class Rig:
     """The two arms, and the second one's host with its log. `dies_ns`: when the first host falls silent."""
 
-    def __init__(self, folder: Path, dies_ns: int = 1 << 62, finish_s: float = 0.4) -> None:
-        settings = settings_of(SECOND, finish_s)
+    def __init__(self, folder: Path, dies_ns: int = 1 << 62) -> None:
+        settings = second_settings()
         arms = TwoArms(settings, dies_ns=dies_ns)
         self.wire, self.first, self.end, clock = arms.wire, arms.first, arms.end, arms.clock
         self.tap = Tap(self.end, clock)
@@ -132,22 +123,10 @@ def test_without_sync_the_follower_ends_with_one_line(tmp_path: Path) -> None:
 
 def test_an_arm_at_other_node_ids_runs_in_lockstep_on_a_bus_of_its_own(tmp_path: Path) -> None:
     devices = dataclasses.replace(load_settings("paper").devices, drive_node=(5, 6), sensor_node=(7, 8))
-    script = OperatorSettings(script=(RequestSettings(at_s=0.1, request="finish"),))
-    settings = dataclasses.replace(load_settings("paper"), devices=devices, operator=script)
-    codec = loaded_contract(settings)
-    clock = VirtualClock()
-    embedded = EmbeddedBus(clock)
-    bench = Bench(load_scenario("idle", "P"), codec, embedded.deliver)
-    embedded.attach(bench.on_frame)
-    bench.boot()
-    bus = make_lockstep_bus(embedded, clock, codec, settings)
-    session = Session(
-        settings, codec, place_devices(settings), bus, clock, ScriptedOperator(script), tmp_path, "embedded"
-    )
-    summary = session.run()
-    assert (summary.error, summary.result and summary.result.fault) == ("", FaultReason.NONE)
-    frames = read_log(summary.log.path).frames
-    assert {0x185, 0x186, 0x187, 0x188} <= set(frames["can_id"].tolist())
+    settings = dataclasses.replace(scripted(finish_s=0.1), devices=devices)
+    result, log = SessionRig(tmp_path, settings, codec=loaded_contract(settings), is_modelled=True).play()
+    assert result.fault is FaultReason.NONE
+    assert {0x185, 0x186, 0x187, 0x188} <= set(log.frames["can_id"].tolist())
 
 
 @pytest.mark.parametrize(
@@ -163,14 +142,14 @@ def test_what_a_shared_bus_cannot_be_is_one_line(tmp_path: Path, bus: str, clock
     config = tmp_path / "two.toml"
     config.write_text(f"[bus]\n{bus}\n")
     arguments = ["-i", "virtual", "-c", "x", "--config", str(config), "--clock", clock, "--out", str(tmp_path / "out")]
-    ran = CliRunner().invoke(cli, ["run", *arguments])
+    ran = called("run", *arguments)
     assert ran.exit_code == 2
     (complaint,) = ran.stderr.splitlines()
     assert line in complaint
 
 
 def test_the_receive_filter_has_what_only_this_host_sends_and_nothing_of_the_neighbour() -> None:
-    settings = settings_of(SECOND)
+    settings = second_settings()
     heard = set(received_ids(loaded_contract(settings), settings, place_devices(settings)))
     assert heard >= {0x000, 0x080, 0x205, 0x206, 0x605, 0x608, 0x700 + settings.bus.host_node}
     assert {can_id & 0x7F for can_id in heard} - {0} == {5, 6, 7, 8, settings.bus.host_node}

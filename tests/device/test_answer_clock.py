@@ -4,7 +4,7 @@ import pytest
 
 from adacd_hil.device.answer_clock import USUAL_ANSWERS, AnswerClock
 
-USUAL_NS, PERIOD_NS = 300_000, 1_000_000
+USUAL_NS = 300_000
 
 
 def settled(is_counted: bool = False) -> AnswerClock:

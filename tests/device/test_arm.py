@@ -142,17 +142,6 @@ def test_a_joint_beyond_its_limits_is_described_with_value_and_bound() -> None:
     ]
 
 
-def test_a_position_of_more_than_a_revolution_asks_for_gear_and_zero() -> None:
-    devices = Devices()
-    devices.arm.synchronise(0, 0, 1)
-    devices.send("Drive1Feedback", 0.0, 0.0)
-    devices.send("Drive2Feedback", np.radians(-780.0), 0.0)
-    (line,) = describe_excess(devices.arm)
-    assert "joint 2: position -780.00 deg, ±120 deg allowed" in line
-    assert "scale.gear_ratio" in line
-    assert "devices.drive[1]" in line
-
-
 def test_signals_that_are_too_old_are_described_with_age_and_limit() -> None:
     said = []
     for age in (3, 4):

@@ -19,11 +19,7 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 
 DRIVE_PROFILE = Path(adacd_hil.__file__).parent / "device_profiles" / "adacd-drive.toml"
-WRITTEN = [
-    name
-    for name in ("paper", "fd", "fd_500us", "stock")
-    if (contract_folder() / f"{load_settings(name).devices.contract}.dbc").is_file()
-]
+CONFIGURATIONS = ("paper", "fd", "fd_500us", "stock")
 
 
 def layout(path_or_text: str) -> dict[str, object]:
@@ -43,7 +39,7 @@ def layout(path_or_text: str) -> dict[str, object]:
     }
 
 
-@pytest.mark.parametrize("name", WRITTEN)
+@pytest.mark.parametrize("name", CONFIGURATIONS)
 def test_profiles_compose_to_the_dbc_bit_for_bit(name: str) -> None:
     settings = load_settings(name)
     by_hand = load_codec(contract_folder() / f"{settings.devices.contract}.dbc")
@@ -68,7 +64,7 @@ def test_cantools_reads_a_composed_contract_without_a_warning() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("config", ["paper", "fd", "fd_500us", "stock"])
+@pytest.mark.parametrize("config", CONFIGURATIONS)
 def test_a_contract_moves_to_the_configured_node_ids_and_is_what_the_profiles_say(config: str) -> None:
     bus, devices = load_settings(config).bus, load_settings(config).devices
     bus = dataclasses.replace(bus, host_node=126)
@@ -94,11 +90,6 @@ def test_a_contract_without_a_file_gets_one_for_the_log_and_is_not_mistaken_for_
     assert write_contract(composed, tmp_path) == tmp_path / "contract.dbc"
     assert load_codec(tmp_path / "contract.dbc").layout_digest == load_codec().layout_digest
     assert write_contract(load_codec(), tmp_path) == load_codec().path  # it has a file
-
-
-def test_the_host_has_a_node_id_of_its_own() -> None:
-    with pytest.raises(ConfigError, match=r"`bus.host_node` = 3 is the node id of a device"):
-        parse(Settings, {"bus": {"host_node": 3}})
 
 
 def test_a_misspelt_contract_is_told_the_nearest() -> None:
@@ -129,19 +120,18 @@ def test_a_contract_that_says_otherwise_than_the_profiles_is_named(
         loaded_contract(parse(Settings, {"devices": {"contract": str(path), **devices}}))
 
 
-def test_two_messages_of_one_identifier_are_refused(tmp_path: Path) -> None:
-    text = DRIVE_PROFILE.read_text()
-    path = tmp_path / "clash.toml"
-    path.write_text(text.replace("cob_id = 0x280", "cob_id = 0x180"))
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (("cob_id = 0x280", "cob_id = 0x180"), "both have identifier 0x181"),
+        (("0x603F", "0x603E"), r"object 0x603E is not in /.*/drive\.eds"),
+    ],
+)
+def test_a_profile_that_no_contract_can_be_composed_of_is_named(
+    tmp_path: Path, change: tuple[str, str], line: str
+) -> None:
+    path = tmp_path / "own.toml"
+    path.write_text(DRIVE_PROFILE.read_text().replace(*change))
     settings = parse(Settings, {"devices": {"drive": [str(path), "adacd-drive"], "contract": ""}})
-    with pytest.raises(ConfigError, match="both have identifier 0x181"):
-        loaded_contract(settings)
-
-
-def test_an_object_that_the_eds_lacks_cant_be_mapped(tmp_path: Path) -> None:
-    text = DRIVE_PROFILE.read_text()
-    path = tmp_path / "wide.toml"
-    path.write_text(text.replace("0x603F", "0x603E"))
-    settings = parse(Settings, {"devices": {"drive": [str(path), "adacd-drive"], "contract": ""}})
-    with pytest.raises(ConfigError, match=r"object 0x603E is not in /.*/drive\.eds"):
+    with pytest.raises(ConfigError, match=line):
         loaded_contract(settings)

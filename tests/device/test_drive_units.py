@@ -1,6 +1,8 @@
 """What a drive's objects say of its counts at the joint."""
 
 import math
+import tomllib
+from importlib import resources
 
 import pytest
 
@@ -75,36 +77,23 @@ def test_rated_torque_at_the_joint_is_that_of_the_motor_by_unit_gear_and_efficie
     assert ScaleSettings().joint_torque_Nm == 1e-3
 
 
-def drive_table(**scale: float) -> dict[str, object]:
-    rows = {"Feedback": ("position", "velocity", "statusword"), "Command": ("controlword", "target_torque")}
-    pdo = [
-        {
-            "message": message,
-            "number": 1,
-            "cob_id": 0x180,
-            "signals": [{"object": "0x6064", "signal": name} for name in names],
-        }
-        for message, names in rows.items()
-    ]
-    known = {"increments_per_joint_rev": 4096, "velocity_rad_s": 1e-3}
-    return {"kind": "drive", "eds": "stock_drive.eds", "pdo": pdo, "scale": known | scale}
+STOCK = tomllib.loads((resources.files("adacd_hil") / "device_profiles" / "stock-drive.toml").read_text())
 
 
 def test_a_profile_of_one_increment_per_revolution_is_refused() -> None:
     with pytest.raises(ConfigError, match="increments_per_joint_rev = 1 is below 360"):
-        parse(ProfileSettings, drive_table(increments_per_joint_rev=1))
+        parse(ProfileSettings, STOCK | {"scale": STOCK["scale"] | {"increments_per_joint_rev": 1}})
 
 
 def test_a_profile_names_its_guesses_by_keys_that_exist() -> None:
-    known = parse(ProfileSettings, drive_table() | {"assumed": ["scale.gear_ratio"]})
+    known = parse(ProfileSettings, STOCK | {"assumed": ["scale.gear_ratio"]})
     assert known.assumed == ("scale.gear_ratio",)
     with pytest.raises(ConfigError, match=r"'scale.gear_rate' is no key of a profile; did you mean 'scale.gear_ratio'"):
-        parse(ProfileSettings, drive_table() | {"assumed": ["scale.gear_rate"]})
+        parse(ProfileSettings, STOCK | {"assumed": ["scale.gear_rate"]})
 
 
 def test_enabling_may_take_as_long_as_the_most_patient_profile_wants() -> None:
     settings = load_settings("certified")
     assert settings.safety.enable_timeout_s is None
-    assert (
-        enable_timeout_s(settings, place_devices(settings)) == 15.0
-    )  # 5 s to Operation enabled, 10 s more until the mode shows
+    # 5 s to Operation enabled, 10 s more until the mode shows
+    assert enable_timeout_s(settings, place_devices(settings)) == 15.0

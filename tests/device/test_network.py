@@ -8,7 +8,6 @@ from loaded import loaded_contract
 from rig import Rig
 
 from adacd_hil.device.arm_report import describe_faults
-from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
 from adacd_hil.records import ArmCommand, FaultReason
@@ -24,28 +23,13 @@ CONFIGURATIONS = ("paper", "fd", "fd_500us", "stock")
 
 
 class NetworkRig(Rig):
-    """Host and emulator in one process; `passed` is every frame on the bus. `table`: what the host believes."""
+    """Host and emulator in one process. `table`: what the host believes."""
 
     def __init__(self, table: dict[str, object] | None = None, config: str = "paper") -> None:
-        self.passed: list[tuple[int, bytes]] = []
         self.cycle = 0
         codec = loaded_contract(load_settings(config))
         super().__init__(parse(Settings, table) if table else config, codec=codec)
         self.period_ns = self.settings.bus.period_ns
-
-    def deliver(self, can_id: int, data: bytes) -> None:
-        self.passed.append((can_id, bytes(data)))
-        super().deliver(can_id, data)
-
-    def on_frame(self, frame: Frame) -> None:
-        self.passed.append((frame.can_id, frame.data))
-        super().on_frame(frame)
-
-    def start(self) -> None:
-        self.master.reset()
-        self.master.identify()
-        self.master.configure()
-        self.master.start()
 
     def accept(self, frame: Frame) -> None:
         if not self.arm.accept(frame):
@@ -79,13 +63,6 @@ def test_the_emulated_devices_of_every_contract_are_set_up_enabled_and_moved(con
     assert describe_faults(rig.arm) == rig.master.failed_heartbeats(rig.cycle * rig.period_ns) == []
 
 
-def test_devices_watch_the_host_for_two_and_a_half_periods() -> None:
-    rig = NetworkRig({"bus": {"heartbeat_ms": 40}})
-    rig.start()
-    watched = [read(rig, name, 0x1016, 1) for name in ("Drive1", "Drive2", "Sensor1", "Sensor2")]
-    assert watched == [127 << 16 | 100] * 4
-
-
 @pytest.mark.parametrize(("watch_host", "deadline_ms"), [(True, 10), (False, 0)])
 def test_devices_watch_the_host_and_its_commands_but_in_lockstep(watch_host: bool, deadline_ms: int) -> None:
     rig = NetworkRig(config="stock")
@@ -94,26 +71,6 @@ def test_devices_watch_the_host_and_its_commands_but_in_lockstep(watch_host: boo
     rig.start()
     assert read(rig, "Drive1", 0x1400, 5) == deadline_ms
     assert bool(read(rig, "Drive1", 0x1016, 1)) is watch_host
-
-
-def test_the_same_boot_twice_is_the_same_frames() -> None:
-    rigs = [NetworkRig(), NetworkRig()]
-    for rig in rigs:
-        rig.start()
-        for _ in range(50):
-            rig.step(enable=True)
-    assert rigs[0].passed == rigs[1].passed
-    assert len(rigs[0].passed) > 700
-
-
-def test_a_second_boot_of_running_nodes_leaves_them_configured() -> None:
-    rig = NetworkRig()
-    rig.start()
-    for _ in range(20):
-        rig.step(enable=True)
-    rig.start()
-    assert read(rig, "Drive1", 0x6061) == 10
-    assert read(rig, "Drive1", 0x1017) == 100
 
 
 @pytest.mark.parametrize(("line", "why"), [("AccessType=ro", "read-only"), ("AccessType=rw", "")])
@@ -137,11 +94,6 @@ def test_an_option_code_of_the_configuration_reaches_the_drives() -> None:
     rig = NetworkRig({"devices": {"quick_stop_option": 6}})
     rig.start()
     assert [read(rig, name, 0x605A) for name in ("Drive1", "Drive2")] == [6, 6]
-
-
-def test_a_node_id_that_the_dbc_does_not_have_is_refused() -> None:
-    with pytest.raises(DeviceError, match=r"no boot-up from Drive2 \(node 9\)"):
-        NetworkRig({"devices": {"drive_node": [1, 9]}}).start()
 
 
 def test_an_emergency_is_an_event_with_name_watchdog_and_time_and_stays_until_reset() -> None:

@@ -50,21 +50,6 @@ def test_a_profile_written_as_toml_reads_back_to_the_same(name: str) -> None:
         assert parse(ProfileSettings, parse_toml(write(profile))) == profile
 
 
-def test_profiles_for_each_contract_are_built_in() -> None:
-    assert profile_names() == [
-        "adacd-drive",
-        "adacd-drive-fd",
-        "adacd-drive-fd-500us",
-        "adacd-sensor",
-        "adacd-sensor-fd",
-        "adacd-sensor-fd-500us",
-        "int32-sensor",
-        "maxon-epos4",
-        "stock-drive",
-        "zeroerr-erob",
-    ]
-
-
 def test_a_users_file_is_a_profile_and_an_eds_beside_it_comes_first(tmp_path: Path) -> None:
     profile = load_profile(profile_file(tmp_path, SENSOR), "sensor")
     assert (profile.name, profile.eds.name, profile.settings.pdo[0].mapping_index) == (

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from called import called
+from click.testing import Result
 from own_arm import OWN_ARM, eds_of_two_channels
 
-from adacd_hil.cli.main import cli
 from adacd_hil.device.profile import ProfileSettings
 from adacd_hil.device.value_bounds import ValueBound
 from adacd_hil.log.reader import read_log
@@ -76,33 +76,37 @@ def sensor_with_a_temperature() -> tuple[dict[str, Any], str]:
     return profile, (contract_folder() / "torque_sensor.eds").read_text()
 
 
+def write_profile(folder: Path, name: str, profile: dict[str, Any], eds: str) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / f"{name}.eds").write_text(eds)
+    (folder / f"{name}.toml").write_text(to_toml(parse(ProfileSettings, profile)))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bounds")
-    for name, (profile, eds) in {"drive": drive_with_a_temperature(), "sensor": sensor_with_two_channels()}.items():
-        (folder / f"{name}.eds").write_text(eds)
-        (folder / f"{name}.toml").write_text(to_toml(parse(ProfileSettings, profile)))
-    profile, eds = sensor_with_a_temperature()
-    (folder / "warm").mkdir()
-    (folder / "warm" / "sensor.eds").write_text(eds)
-    (folder / "warm" / "sensor.toml").write_text(to_toml(parse(ProfileSettings, profile)))
     profile, eds = sensor_with_two_channels()
-    (folder / "narrow").mkdir()
-    (folder / "narrow" / "sensor.eds").write_text(with_16_bits(eds))
-    (folder / "narrow" / "sensor.toml").write_text(to_toml(parse(ProfileSettings, profile)))
-    (folder / "narrow-arm.toml").write_text(ARM.replace('"sensor.toml"', '"narrow/sensor.toml"'))
+    write_profile(folder, "drive", *drive_with_a_temperature())
+    write_profile(folder, "sensor", profile, eds)
+    write_profile(folder / "warm", "sensor", *sensor_with_a_temperature())
+    write_profile(folder / "narrow", "sensor", profile, with_16_bits(eds))
     (folder / "arm.toml").write_text(ARM)
-    (folder / "warm-arm.toml").write_text(ARM.replace('"sensor.toml"', '"warm/sensor.toml"'))
+    for kind in ("warm", "narrow"):
+        (folder / f"{kind}-arm.toml").write_text(ARM.replace('"sensor.toml"', f'"{kind}/sensor.toml"'))
     return folder
 
 
-def play(folder: Path, name: str, *faults: str, arm: str = "arm") -> tuple[FaultReason, int | None, str]:
-    """Play half a second of the arm with faults; return the fault, the ms from onset to it, and the text on stderr."""
+def demo(folder: Path, name: str, *faults: str, arm: str = "arm") -> Result:
+    """Play half a second of the arm with faults."""
     rows = "".join(f"[[faults]]\n{fault}\n".replace(", ", "\n") for fault in faults)
-    (folder / f"{name}-scenario.toml").write_text(f"lasts_s = 0.5\nstart_deg = [-30.0, -60.0]\n{rows}")
-    command = ["demo", "--config", f"{arm}.toml", "--scenario", f"{name}-scenario.toml", "--out", name]
+    (folder / f"{name}.toml").write_text(f"lasts_s = 0.5\nstart_deg = [-30.0, -60.0]\n{rows}")
     with contextlib.chdir(folder):
-        ran = CliRunner().invoke(cli, command)
+        return called("demo", "--config", f"{arm}.toml", "--scenario", f"{name}.toml", "--out", name)
+
+
+def play(folder: Path, name: str, *faults: str, arm: str = "arm") -> tuple[FaultReason, int | None, str]:
+    """Play; return the fault, the ms from onset to it, and the text on stderr."""
+    ran = demo(folder, name, *faults, arm=arm)
     scheme = read_log(folder / name / "run.mcap").scheme
     fault = FaultReason(int(scheme["fault"].max()))
     began = scheme["cycle"][np.flatnonzero(scheme["state"] == SchemeState.ADAPT)]
@@ -135,7 +139,7 @@ def test_a_value_outside_its_bounds_or_one_that_stays_away_stops_the_arm(
     assert -2 <= cycles <= latest  # the drives are enabled two cycles before the host moves
     assert line in said
     with contextlib.chdir(folder / name):  # the frames are decoded and judged again, by the profiles in the log
-        replayed = CliRunner().invoke(cli, ["replay", "--frames", "run.mcap"])
+        replayed = called("replay", "--frames", "run.mcap")
     assert replayed.exit_code == 0, replayed.output
 
 
@@ -164,19 +168,9 @@ def test_an_emulated_second_torque_ends_at_the_range_of_its_object(folder: Path)
     assert play(folder, "narrow", arm="narrow-arm")[0] is FaultReason.SENSOR  # 16 bits are 0.66 Nm
 
 
-def play_object(folder: Path, name: str, changes: str) -> Result:
-    (folder / f"{name}-scenario.toml").write_text(
-        f'lasts_s = 0.5\n[[faults]]\nkind = "object_value"\n{changes}\n'.replace(", ", "\n")
-    )
-    with contextlib.chdir(folder):
-        return CliRunner().invoke(
-            cli, ["demo", "--config", "arm.toml", "--scenario", f"{name}-scenario.toml", "--out", name]
-        )
-
-
 def test_an_object_of_the_communication_that_reads_back_another_value_ends_the_set_up(folder: Path) -> None:
     changes = 'node = "drive1", index = 0x1A00, sub = 1, raw = 0x60770010, since = "power_on", at_s = 0.0'
-    ran = play_object(folder, "mapped", changes)
+    ran = demo(folder, "mapped", f'kind = "object_value", {changes}')
     assert ran.exit_code == 5
     assert "0x1A00:1 = 0x60770010, 0x60640020 expected" in ran.stderr
 
@@ -189,7 +183,7 @@ def test_an_object_of_the_communication_that_reads_back_another_value_ends_the_s
     ],
 )
 def test_an_object_that_no_device_can_have_is_refused(folder: Path, changes: str, line: str) -> None:
-    ran = play_object(folder, "wrong", f"at_s = 0.1, {changes}")
+    ran = demo(folder, "wrong", f'kind = "object_value", at_s = 0.1, {changes}')
     assert ran.exit_code == 2
     assert line in ran.stderr
     assert not (folder / "wrong").exists()
@@ -242,7 +236,7 @@ def test_a_bound_that_no_value_can_reach_is_refused(
     profile["pdo"][at]["signals"][-1] = row | {key: bound}
     (tmp_path / f"{file}.toml").write_text(to_toml(parse(ProfileSettings, profile)))
     with contextlib.chdir(tmp_path):
-        checked = CliRunner().invoke(cli, ["config", "check", "arm.toml"])
+        checked = called("config", "check", "arm.toml")
     assert checked.exit_code == 2
     assert f"{key} = {bound:g} is outside its range" in checked.output
 

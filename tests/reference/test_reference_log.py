@@ -9,9 +9,7 @@ import json
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
-
-from adacd_hil.cli.main import cli
+from called import called
 
 LOG = Path(__file__).parent / "logs" / "recovery.mcap"
 STATES = [
@@ -33,7 +31,7 @@ STATES = [
 @pytest.mark.slow
 def test_a_log_of_today_replays_to_the_same_decisions() -> None:
     """Bit for bit where the numbers are computed as they were; else within the tolerance that `replay` chooses."""
-    done = CliRunner().invoke(cli, ["replay", str(LOG), "--json"])
+    done = called("replay", str(LOG), "--json")
     assert done.exit_code == 0, done.output
     (found,) = json.loads(done.stdout)
     assert (found["cycles"], found["compared"], found["attempts"]) == (655, 655, 2)

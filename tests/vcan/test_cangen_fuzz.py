@@ -23,8 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from experiment_runs import BIN, Played, run_on_vcan
-from hang import HANG_S
+from experiment_runs import Played, emulator, run_on_vcan
 
 from adacd_hil.log.reader import read_log, topic_bytes
 
@@ -64,22 +63,12 @@ SAFE_STATES = {
 @contextlib.contextmanager
 def emulated_arm(folder: Path, outcome: list[dict[str, object]]) -> Iterator["subprocess.Popen[str]"]:
     """Run the emulator; after the block `outcome` holds what it reported, and it has ended by itself with status 0."""
-    command = [BIN / "firmware-sim", "run", "-i", "socketcan", "-c", "vcan0", "--scenario", "idle", "--json"]
-    with subprocess.Popen(
-        [*command, "--out", str(folder)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stderr is not None
-        for line in process.stderr:
-            if line.strip() == "ready":
-                break
-        try:
-            yield process
-            assert process.poll() is None, "the emulator ended during the flood"
-        finally:
-            process.terminate()
-            stdout, stderr = process.communicate(timeout=HANG_S)
-        assert (process.returncode, "Traceback" in stderr) == (0, False), stderr
-        outcome.append(json.loads(stdout))
+    with emulator(folder, "--scenario", "idle", "--json") as process:
+        yield process
+        assert process.poll() is None, "the emulator ended during the flood"
+    stdout, stderr = process.said
+    assert (process.returncode, "Traceback" in stderr) == (0, False), stderr
+    outcome.append(json.loads(stdout))
 
 
 @contextlib.contextmanager

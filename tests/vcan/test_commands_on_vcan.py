@@ -107,20 +107,6 @@ def test_commtest_boots_cycles_judges_and_logs(arm: Path, tmp_path: Path) -> Non
     assert len(log.topics["/cycle"]["cycle"]) == result["cycles"]
 
 
-@pytest.mark.long
-@pytest.mark.wallclock
-def test_commtest_with_enabled_drives_commands_no_torque(arm: Path, tmp_path: Path) -> None:
-    config = tmp_path / "patient.toml"  # stalls of the machine are not what is tested
-    config.write_text("[bus]\ncommand_patience_cycles = 250\nmax_age_cycles = 100\n")
-    with listening() as frames:
-        tested = command(tmp_path, "commtest", "--seconds", "1", "--enable", "--config", str(config), "--json")
-    assert tested.status in (0, 1), tested.stderr
-    commands = [data for can_id, data in frames if can_id in (0x201, 0x202)]
-    assert {data[4:6] for data in commands} == {b"\x00\x00"}
-    assert b"\x0f\x00" in {data[CONTROLWORD] for data in commands}
-    assert commands[-1][CONTROLWORD] == b"\x00\x00"
-
-
 @pytest.mark.wallclock
 def test_doctor_passes_the_arm_and_leaves_it_pre_operational(arm: Path, tmp_path: Path) -> None:
     with listening() as frames:
@@ -154,24 +140,6 @@ def test_an_interrupted_doctor_leaves_the_nodes_pre_operational(arm: Path) -> No
     assert (process.returncode, stdout) == (130, "")
     assert stderr.splitlines()[-1] == "adacd-hil: interrupted"
     assert [data for can_id, data in frames if can_id == 0x000][-1] == b"\x80\x00"
-
-
-@pytest.mark.long
-def test_one_node_that_is_out_of_reach_is_named_by_scan_and_doctor(arm: Path, tmp_path: Path) -> None:
-    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as can:
-        can.bind(("vcan0",))
-        nmt = "00000000 02000000 {:02x}03000000000000"  # to node 3
-        can.send(bytes.fromhex(nmt.format(2)))  # stopped: no SDO, no PDO
-        scanned = command(tmp_path, "scan", "--json")
-        done = command(tmp_path, "doctor", "--json")
-        can.send(bytes.fromhex(nmt.format(128)))
-    verdicts = {node["node"]: node["verdict"] for node in scanned.json["nodes"]}
-    found = {check["name"]: check for check in done.json["checks"]}
-    assert (scanned.status, done.status) == (5, 1)
-    assert (verdicts[1], verdicts[2], verdicts[4]) == ("", "", "")
-    assert "Sensor1 expected" in verdicts[3]
-    assert "Sensor1 expected" in found["nodes"]["reason"]
-    assert found["boot"]["reason"] == "needs `nodes`, which failed"
 
 
 def test_monitor_shows_the_bus_and_sends_nothing(arm: Path, tmp_path: Path) -> None:

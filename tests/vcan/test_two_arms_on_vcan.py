@@ -4,12 +4,11 @@ import contextlib
 import shutil
 import signal
 import subprocess
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from experiment_runs import BIN, Played, Witness, adacd_hil, candump
+from experiment_runs import BIN, Played, Witness, adacd_hil, candump, firmware_sim
 from hang import HANG_S
 from test_on_vcan import longest_stall_cycles
 
@@ -50,22 +49,6 @@ ARMS = (
 )
 
 
-@contextlib.contextmanager
-def emulators(*arms: tuple[str, ...]) -> Iterator[None]:
-    """Run emulators while the block lasts; they are ready when it begins."""
-    with contextlib.ExitStack() as stack:
-        processes = []
-        for options in arms:
-            command = [BIN / "firmware-sim", "run", "-i", "socketcan", "--scenario", "idle", *options]
-            process = stack.enter_context(subprocess.Popen(command, stderr=subprocess.PIPE, text=True))
-            stack.callback(process.terminate)
-            processes.append(process)
-        for process in processes:
-            assert process.stderr is not None
-            assert any(line.strip() == "ready" for line in process.stderr)
-        yield
-
-
 @dataclass(frozen=True)
 class TwoArms:
     """What two hosts left behind."""
@@ -86,7 +69,8 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> TwoArms:
     with contextlib.ExitStack() as stack:
         if shutil.which("candump"):
             stack.enter_context(candump(folder / "candump.log"))
-        stack.enter_context(emulators(("-c", "vcan0"), ("-c", "vcan0", "--node-offset", "4", "--host-node", "126")))
+        for options in ((), ("--node-offset", "4", "--host-node", "126")):
+            stack.enter_context(firmware_sim("run", "-i", "socketcan", "-c", "vcan0", "--scenario", "idle", *options))
         on_bus = ("run", "-i", "socketcan", "-c", "vcan0", "--json", "--config")
         command = [BIN / "adacd-hil", *on_bus, configs[FIRST], "--out", folder / "first"]
         first = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

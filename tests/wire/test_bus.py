@@ -41,25 +41,6 @@ def test_an_interface_that_cant_serve_is_refused_in_one_line(interface: str, rea
         open_bus(interface, "x", MonotonicClock())
 
 
-def test_any_other_python_can_interface_carries_frames() -> None:
-    left = open_bus("virtual", "seam", MonotonicClock())
-    right = open_bus("virtual", "seam", MonotonicClock())
-    left.send(0x123, b"\x01\x02")
-    frame = right.receive(1.0)
-    left.close()
-    right.close()
-    assert frame is not None
-    assert (frame.can_id, frame.data) == (0x123, b"\x01\x02")
-
-
-def test_a_recovered_embedded_bus_has_nothing_old_to_read() -> None:
-    bus = EmbeddedBus(VirtualClock())
-    bus.deliver(0x181, b"old")
-    bus.recover()
-    bus.deliver(0x181, b"new")
-    assert bus.receive(0.0) == Frame(0x181, b"new", 0)
-
-
 def test_a_tap_recovers_the_bus_behind_it_and_keeps_what_has_passed() -> None:
     bus = EmbeddedBus(VirtualClock())
     tap = Tap(bus, VirtualClock())

@@ -49,10 +49,6 @@ def variables(path: Path) -> dict[tuple[int, int], configparser.SectionProxy]:
     return found
 
 
-def test_there_are_files() -> None:
-    assert {path.stem for path in FILES} >= {"drive", "drive_fd", "stock_drive", "torque_sensor", "int32_sensor"}
-
-
 @EVERY_FILE
 def test_eds_validate_has_no_complaint(path: Path) -> None:
     _, complaints = read_eds(str(path))

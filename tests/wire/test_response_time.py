@@ -43,13 +43,6 @@ def test_the_published_counter_example_the_second_instance_of_c_is_late() -> Non
     assert worst.time_ns > DEADLINE_OF_C
 
 
-def test_a_message_waits_for_all_above_it() -> None:
-    above = [Stream(65_000, MS), Stream(135_000, MS)]
-    assert response_time(Stream(115_000, MS), above, 125_000, 1000) == ResponseTime(
-        125_000 + 65_000 + 135_000 + 115_000
-    )
-
-
 def test_a_frame_queued_within_the_bit_in_which_arbitration_begins_still_wins() -> None:
     # At 100 µs the bus becomes free; the next frame of the higher message is queued half a bit later.
     higher = [Stream(50_000, 100_500)]
