@@ -11,6 +11,7 @@ from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, form
 from adacd_hil.file_access import write_new_file
 from adacd_hil.file_replacement import replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.log.log_files import failing_as
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
@@ -79,10 +80,11 @@ def identify(
         tested = read[len(recordings)] if test else None
         progress(f"fitting {sum(recording.duration_s for recording in fitted):.1f} s")
         found = run(described, fitted, tested, read[len(recordings) + bool(test) :])
-        if out is not None:
+    answer(as_json, found.by_key(), _as_text(found), *_next(found, map_path, recordings[0]))
+    if out is not None:
+        with Progress() as progress, failing_as(f"pictures in {out} can't be written"):
             _write(found, out)
             progress(f"pictures in {out}")
-    answer(as_json, found.by_key(), _as_text(found), *_next(found, map_path, recordings[0]))
     is_judged = found.is_explained and not any(watched.faults for watched in found.watched)
     return ExitCode.OK if is_judged else ExitCode.PARTIAL
 

@@ -133,7 +133,8 @@ def judge_fit(fit: Fitted) -> Verdict:
 def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[RecordingFinding]) -> list[RecordingFinding]:
     """Return findings, first the likeliest cause of an unexplained torque, or of parameters that no arm has.
 
-    columns: defects of columns as possible causes; remarks if the torque is explained.
+    columns: defects of columns as possible causes; remarks if the torque is explained, with a margin below 1 at least
+    `WHOLE` of it.
     """
     remarks = [found._replace(is_against=False) for found in columns]
     scale = list(_of_scale(fit, joints))
@@ -146,7 +147,7 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Recor
         return [*scale, *remarks]
     if not all(_is_noise(fit, joints)) and (readings := list(_of_readings(fit, joints, WHOLE if columns else 0.0))):
         return [*readings, *remarks]
-    if is_good:
+    if is_good and not (columns and min(joint.share for joint in joints) < WHOLE):
         return [*scale, *remarks]
     lack = list(_of_lack(fit, joints))
     causes = wrong or list(columns)
