@@ -203,8 +203,11 @@ def parse_changes(given: Sequence[str]) -> dict[str, str]:
 
 
 def parse_variations(given: Sequence[str]) -> list[dict[str, str]]:
-    """Return every combination of values of `key=a,b,c` texts; [{}] without texts. Raises ConfigError."""
-    lists = [[(key, value) for value in split_list(text)] for key, text in parse_changes(given).items()]
+    """Return every combination of values of `key=a,b,c` texts, of one key each; [{}] without. Raises ConfigError."""
+    varied = parse_changes(given)
+    if len(varied) < len(given):
+        raise ConfigError(f"a key is varied twice: name all its values in one, such as {next(iter(varied))}=1,2,3")
+    lists = [[(key, value) for value in split_list(text)] for key, text in varied.items()]
     return [dict(choice) for choice in itertools.product(*lists)]
 
 

@@ -510,9 +510,14 @@ def test_tune_notes_what_a_replay_notes_of_a_damaged_log(log, tmp_path):
     assert found["notes"][-len(replayed["notes"]) :] == [f"{cut}: {note}" for note in replayed["notes"]]
 
 
-def test_what_can_not_be_tuned_is_said_in_one_line(log):
+def test_what_can_not_be_tuned_is_said_in_one_line(log, tmp_path):
+    link, copy = tmp_path / "link.mcap", tmp_path / "copy.mcap"
+    link.symlink_to(log)
+    shutil.copy(log, copy)
     for words, code, said in (
         ((log, log), 2, "a log is given twice"),
+        ((log, link), 2, "a log is given twice"),
+        ((log, copy), 2, "a log is given twice"),
         ((log, "--config", "paper"), 1, "with the settings to start from"),
     ):
         done = tune(*words)

@@ -66,6 +66,11 @@ def test_several_lists_of_values_give_every_combination():
     ]
 
 
+def test_a_key_that_is_varied_twice_drops_no_value():
+    with pytest.raises(ConfigError, match="a key is varied twice"):
+        parse_variations(["filter.a_rad_s=10,20", "filter.a_rad_s=30"])
+
+
 def test_commas_in_brackets_and_quotes_part_nothing():
     assert split_list("""[1, 2], {a = 1, b = 2}, "x, y", 'z,', 5""") == [
         "[1, 2]", "{a = 1, b = 2}", '"x, y"', "'z,'", "5",

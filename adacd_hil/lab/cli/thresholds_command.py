@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from adacd_hil.cli.output import format_table
+from adacd_hil.lab.cli.given_logs import different_logs
 from adacd_hil.lab.score.rates import CONFIDENCE_TEXT
 from adacd_hil.lab.thresholds.detector_comparison import Comparison, compare_detectors
 from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
-from adacd_hil.log.log_parts import log_in
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.plain_values import json_text
 from adacd_hil.progress_lines import Progress
@@ -17,9 +17,9 @@ def find(
 ) -> tuple[Thresholds, Comparison | None]:
     """Find the thresholds of all detectors for a rate of false alarms, from contact-free motion in logs.
 
-    Return them, and a comparison of the detectors if is_compared, else None. Raises LogError.
+    Return them, and a comparison of the detectors if is_compared, else None. Raises LogError, CommandError.
     """
-    paths = [log_in(given) for given in logs]
+    paths = different_logs(logs)
     with Progress() as progress:
         thresholds, statistics = thresholds_of_logs(paths, rate_per_h, stretch, progress)
     return thresholds, compare_detectors(statistics, rate_per_h) if is_compared else None

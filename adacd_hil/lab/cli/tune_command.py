@@ -8,7 +8,6 @@ import click
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
 from adacd_hil.cli.output import (
-    CommandError,
     ExitCode,
     explained,
     format_table,
@@ -19,8 +18,8 @@ from adacd_hil.cli.output import (
     writable_folder,
 )
 from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.lab.cli.given_logs import different_logs
 from adacd_hil.lab.stated_bounds import LEAST_RATE_PER_H, MOST_RATE_PER_H
-from adacd_hil.log.log_parts import log_in
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
@@ -73,9 +72,7 @@ def tune(
     from adacd_hil.lab.tune.tune_roc import tuning_by_key
     from adacd_hil.replay.log_source import LogSource
 
-    paths = [log_in(given) for given in logs]
-    if len(set(paths)) < len(paths):
-        raise CommandError("a log is given twice: a choice can't be checked on the log it was made on", ExitCode.USAGE)
+    paths = different_logs(logs)
     with writable_folder(out):
         base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
         with Progress() as progress:
