@@ -189,6 +189,8 @@ class Cycle:
             text = f"{why}: the drives are disabled where the arm is"
             recorder.event(tick.t_ns, Event("warning", "run", text))
             self._progress(text)
+        if self._interrupts and output is not None:
+            recorder.event(tick.t_ns, Event("warning", "interrupted", "the run was interrupted"))
         self._disable(recorder, quick_stop=fault is not FaultReason.NONE or self._interrupts > 1)
         return RunResult(
             self._arm.cycle + 1,

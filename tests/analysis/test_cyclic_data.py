@@ -168,3 +168,9 @@ def test_what_broke_a_run_off_makes_it_unclean():
     metrics = evaluate(make_run(events=(said(9000, "run", "can0 went away"), said(0, "run", "hello", "info"))))
     assert metrics.verdict.startswith("The run was broken off: can0 went away; no contact")
     assert metrics.is_clean is False
+
+
+@pytest.mark.parametrize(("metadata", "is_clean"), [({}, True), ({"scenario": "paper"}, False)])
+def test_an_interruption_breaks_off_what_has_a_script(metadata, is_clean):
+    events = (said(9000, "interrupted", "the run was interrupted", "warning"),)
+    assert evaluate(make_run(events=events, metadata=metadata)).is_clean is is_clean

@@ -88,6 +88,7 @@ def test_an_interrupt_parks_the_arm_before_the_drives_are_disabled(tmp_path: Pat
     rig.before_sync[TROUBLE_CYCLE] = rig.session.interrupt
     result, log = rig.play()
     assert result.is_interrupted
+    assert messages(log, "interrupted") == ["the run was interrupted"]
     assert set(controlwords(log)[300:-20].tolist()) == {ENABLE_OPERATION}
     np.testing.assert_allclose(np.degrees(log.scheme["q"][-1]), [-30.0, -60.0], atol=1.0)
 

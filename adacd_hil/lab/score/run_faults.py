@@ -55,9 +55,15 @@ def _cause(run: Run, t_ns: int) -> str:
 
 
 def find_causes(run: Run) -> tuple[str, ...]:
-    """Return the logged causes that ended attempts, or the log, without a fault, each once."""
+    """Return the logged causes that ended attempts, or the log, without a fault, each once.
+
+    An interruption is one if a scenario played: the rest of its script is missing.
+    """
+    is_scripted = "scenario" in run.metadata
     said = [
-        logged.event.message for logged in run.events if logged.event.name == _RUN and logged.event.level == "error"
+        event.message
+        for event in (logged.event for logged in run.events)
+        if (event.name == _RUN and event.level == "error") or (event.name == "interrupted" and is_scripted)
     ]
     if run.broken_off:
         said.append(run.broken_off)
