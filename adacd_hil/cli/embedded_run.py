@@ -23,6 +23,7 @@ from adacd_hil.settings.configuration_files import configuration_layers, load_se
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import RequestSettings
 from adacd_hil.settings.toml_text import to_toml
+from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench
@@ -99,6 +100,8 @@ def run_embedded(
     check_shared("lockstep", settings)  # an arm in this process is alone on its bus
     devices = place_devices(settings)
     codec = load_contract(settings, devices)
+    if excess := describe_excess(codec, settings):
+        progress(f"the bus is too slow for this arm: {excess}")
     contract = cast.contract or playable_contract(codec)
     clock = make_clock(clock_name)
     embedded = EmbeddedBus(clock)

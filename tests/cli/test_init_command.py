@@ -370,6 +370,13 @@ def test_two_eds_of_a_kind_are_of_joint_1_and_2_and_more_or_namesakes_are_refuse
     assert not (tmp_path / "another").exists()
 
 
+@pytest.mark.parametrize(("outer_kg", "is_warned"), [("1", False), ("4", True)])
+def test_gains_that_are_too_fast_for_a_heavy_outer_link_are_named(out, outer_kg, is_warned):
+    done = init(out, *NO_BUS, "--flat", "--length-m", "0.3", "0.3", "--mass-kg", "0.4", outer_kg)
+    assert done.exit_code == 0, done.stderr
+    assert ("the arm may vibrate" in done.stdout) is is_warned
+
+
 def test_the_guessed_worth_of_a_count_lets_16_bits_carry_a_joint_s_torque(tmp_path, out):
     assert init(out, *NO_BUS, "--eds", str(write_sensor_eds(tmp_path))).exit_code == 0
     assert "devices.sensor" in written(out).assumed

@@ -300,6 +300,8 @@ def _short(value: float) -> float:
 _MODEL = load_settings("certified", "P")
 _MODEL_INERTIA = _MODEL.arm.cad_theta[0], _MODEL.arm.cad_theta[2]
 """a1 and a3 of P's CAD model, kg m², for which its gains were measured."""
+_MOST_DAMPING_RAD_S = 300.0
+"""Kd over that inertia. P's: 142 and 113; an arm with 340 missed touches, one with 1190 vibrated until it stopped."""
 _KP, _KD = _MODEL.controller.Kp, _MODEL.controller.Kd
 _MODEL_TORQUE_NM = _MODEL.arm.rated_torque_Nm
 _RATE_PER_NM = _MODEL.arm.torque_rate_limit_Nm_s[1] / _MODEL_TORQUE_NM[1]
@@ -475,9 +477,28 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
         gain = tuple(_round(model[i] * inertia[i] / _MODEL_INERTIA[i]) for i in range(JOINTS))
         basis = "the inertia" if has_masses else "the rated torque, as the masses are not known"
         yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {basis}", not has_masses)
+    if has_masses:  # the last gain is Kd
+        warnings += _fast_damping(gain, facts.geometry.cad_theta)
     if facts.geometry.has_gravity:
         yield _rest_torque(facts)
     yield from _certified(facts)
+
+
+def _fast_damping(Kd: Sequence[float], cad_theta: Sequence[float]) -> Iterator[str]:
+    """Yield a warning for each joint that its damping stops too fast at q2 = 0 while the other joint turns freely.
+
+    Kd in Nm s/rad. The joint's inertia is then smaller than its element of M, with a heavy outer link far smaller.
+    """
+    a1, a2, a3 = cad_theta[:3]
+    diagonal, coupling = (a1 + 2.0 * a2, a3), a3 + a2
+    for i in range(JOINTS):
+        free = max(diagonal[i] - coupling**2 / diagonal[1 - i], 1e-9)
+        if Kd[i] > _MOST_DAMPING_RAD_S * free:
+            yield (
+                f"`controller.Kd[{i}]` = {Kd[i]:.3g} Nm s/rad on {free:.2g} kg m², joint {i + 1}'s inertia while the "
+                f"other is free: {Kd[i] / free:.3g} rad/s, {_MOST_DAMPING_RAD_S:g} at most; the arm may vibrate, "
+                "rehearse it"
+            )
 
 
 def _rest_torque(facts: ArmFacts) -> Entry:

@@ -64,7 +64,8 @@ def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
         ),
         (
             (any(metrics.adaptation_s.values()) and bool(metrics.false_alarms)) or is_margin_below_1(metrics.evidence),
-            NextStep("Nobody touched the arm, and a threshold was crossed. Find thresholds from untouched motion.",
+            NextStep("Nobody touched the arm, and a threshold was crossed. If a load was picked up or put down, "
+                     "announce it by `payload`; else find thresholds from untouched motion.",
                      f"adacd-hil thresholds {log}"),
         ),
         (
