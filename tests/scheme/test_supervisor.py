@@ -61,7 +61,7 @@ def test_the_hand_written_table_covers_all_states_and_events():
     assert covered == set(itertools.product((state.name for state in SchemeState), named))
 
 
-def test_events_are_numbered_in_order_of_precedence():
+def test_events_keep_their_numbers_which_logs_have():
     assert [(event.name, event.value) for event in SchemeEvent] == [
         (name, number) for number, name in enumerate(["NONE", *EVENTS.split()])
     ]

@@ -49,7 +49,8 @@ class Interview:
             parts = (explanation, f"{option} answers it, too", origin, "Ctrl-C ends")
             return self._prompt(question, read, proposal, "; ".join(filter(None, parts)))
         if value is None:
-            raise CommandError(f"stdin is not a terminal: give {option} ({question})", ExitCode.USAGE)
+            reason = "--yes has no proposal for it" if self.takes_proposals else "stdin is not a terminal"
+            raise CommandError(f"{reason}: give {option} ({question})", ExitCode.USAGE)
         if not self.takes_proposals:
             raise CommandError(
                 f"stdin is not a terminal: give {option} ({question}), or --yes for {as_typed(value)}",

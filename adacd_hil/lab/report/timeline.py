@@ -160,7 +160,7 @@ def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[list[Stay]]:
         yield group
 
 
-def _gravity(stay: Stay) -> int:
+def _rank(stay: Stay) -> int:
     """Return the rank of a stay's state: of stays drawn as one, the highest gives the colour."""
     order = list(STATE_COLOURS)
     return 1 + order.index(stay.state) if stay.state in order else 0
@@ -168,7 +168,7 @@ def _gravity(stay: Stay) -> int:
 
 def _state_marks(stays: list[Stay], scale: _Scale) -> Iterator[Mark]:
     for drawn in _drawn_stays(stays, scale):
-        stay = Stay(max(drawn, key=_gravity).state, drawn[0].start_s, drawn[-1].end_s)
+        stay = Stay(max(drawn, key=_rank).state, drawn[0].start_s, drawn[-1].end_s)
         left, right = _x(scale, stay.start_s), _x(scale, stay.end_s)
         name, width = STATE_WORDS[stay.state], max(right - left, _NARROWEST)
         label = name if width > _LETTER * len(name) + 8 else ""
