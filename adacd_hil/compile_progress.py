@@ -20,7 +20,7 @@ _listeners: list[Listener] = []
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Call `listener` with the progress of compiling while the block lasts, in the thread that compiles."""
+    """Call `listener`, besides earlier ones, while the block lasts; any thread that compiles calls it."""
     _listeners.append(listener)
     try:
         yield

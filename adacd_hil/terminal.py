@@ -201,7 +201,10 @@ class Terminal(io.TextIOBase):
             self._lock.release()
 
     def hurry(self) -> None:
-        """From now on, wait half a second at most for an output that blocks. Safe in a signal handler."""
+        """Let each write wait for a blocked output half a second in all, counting time before this call.
+
+        After a write that gives up, drop all later output. Safe in a signal handler.
+        """
         self._patience = _PATIENCE_POLLS
 
     def _acquire(self) -> bool:

@@ -148,7 +148,10 @@ class _TruthRows:
         self._model = tuple(column[-1:].copy() for column in columns)
 
     def _add_spell(self, rows: NDArray[Any]) -> None:
-        """Keep consecutive rows of one contact. Of rows without a contact, keep the first one after a contact."""
+        """Add the next rows of one contact: keep its beginning and end whole, and the extreme rows between them.
+
+        Of rows without a contact, keep the first one after a contact.
+        """
         key = int(rows["attempt"][0]), float(rows["contact_index"][0])
         if self._key not in (None, key):
             self._thin()

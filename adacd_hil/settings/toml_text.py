@@ -26,9 +26,10 @@ def is_default(field: "dataclasses.Field[Any]", value: Any) -> bool:
 
 
 def _write_section(section: Any, prefix: str, lines: list[str], is_short: bool = False) -> None:
-    """Append a section's settings to `lines`, then each section within it under its dotted name.
+    """Append a section's settings that aren't None, without its own heading, then each section within it with heading.
 
-    is_short: leave out defaults, and give each row of a list a line.
+    prefix: the section's dotted name and a dot, "" at the top. is_short: leave out defaults, give each row of a list a
+    line.
     """
     nested = []
     for field in dataclasses.fields(section):

@@ -72,7 +72,7 @@ class Application:
         """Act on SYNCs with too many odd ones among them to serve as a time base."""
 
     def note_error(self) -> None:
-        """Act on a possible change of the error register, 0x1001."""
+        """Follow a possible change of the error register, 0x1001; empty here."""
 
     def restart_node(self, is_node_reset: bool) -> None:
         """Reset the application's state; `is_node_reset`: False at a reset of the communication only."""

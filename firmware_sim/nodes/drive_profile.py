@@ -217,7 +217,7 @@ class TorqueLimits:
 
     @property
     def is_limiting(self) -> bool:
-        """Whether a limit is in force, statusword bit 11."""
+        """Whether target plus offset lies beyond a torque limit, one cause of statusword bit 11."""
         return not self._low <= self.target + self._offset <= self._high
 
     def _set_target(self, permille: int) -> None:

@@ -260,7 +260,7 @@ class Drafting:
                 )
 
     def _profile(self, kind: str, name: str, joint: int) -> ProfileSettings:
-        """Return a joint's profile: its draft, else the built-in one of this name, or the file of it."""
+        """Return a joint's profile: its draft, else the built-in one, else the file, from the output's folder."""
         draft = self._drafts.get((kind, joint))
         if draft is not None:
             return draft.settings

@@ -264,7 +264,10 @@ def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[Recording
 
 
 def _spikes(column: Vector) -> NDArray[np.int64]:
-    """Return the rows of a column (k,) at which a single sample is far from its neighbours; empty if they are many."""
+    """Return the rows of a column (k,) that are far from the median of the five around each.
+
+    Empty if over 0.5 % are, so always below 200 rows. The two rows at each end aren't checked.
+    """
     if len(column) < _SPIKE_WINDOW:
         return np.zeros(0, np.int64)
     windows = np.lib.stride_tricks.sliding_window_view(column, _SPIKE_WINDOW)

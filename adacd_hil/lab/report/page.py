@@ -149,7 +149,7 @@ def went_wrong(contact: ReportedContact) -> bool:
 
 
 def left_out_text(metrics: Metrics, most: int) -> str:
-    """Return a sentence on the contacts that `shown_contacts` leaves out; "" if none."""
+    """Return a sentence that says which of all contacts `shown_contacts` lists; "" if it lists all."""
     count, shown = len(metrics.contacts), len(shown_contacts(metrics, most))
     if shown == count:
         return ""
