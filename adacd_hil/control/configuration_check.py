@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from adacd_hil.control.motions import motion_problems
 from adacd_hil.device.contract import load_contract
-from adacd_hil.device.device_files import load_profile, place_devices, profile_names
+from adacd_hil.device.device_files import load_profile, place_devices
 from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
@@ -196,11 +196,10 @@ def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
 
 
 def _unseen(devices: Sequence[PlacedDevice]) -> Iterator[str]:
-    """Yield a warning for each drive of an own profile without its actual torque in a frame: no fault TORQUE then."""
-    shipped = profile_names()
+    """Yield a warning for each drive whose actual torque is in no frame, so that the fault TORQUE can't be found."""
     for device in devices:
         sent = {signal.signal for pdo in device.settings.pdo for signal in pdo.signals}
-        if device.settings.kind == "drive" and "torque_actual" not in sent and device.profile.name not in shipped:
+        if device.settings.kind == "drive" and "torque_actual" not in sent:
             yield f"no frame of {device.name} carries `torque_actual`: nothing watches for the fault TORQUE"
 
 

@@ -47,9 +47,14 @@ def test_each_value_is_told_with_where_it_is_from(own_arm):
 
 
 @pytest.mark.parametrize("name", builtin_names())
-def test_what_comes_with_the_package_has_no_error_and_no_warning(name):
+def test_what_comes_with_the_package_has_no_error_and_no_unknown_warning(name):
+    drives = ("Drive1", "Drive2") if name == "fd_500us" else ()  # what the loop needs, and no more
+    warned = [
+        f"{name}: warning: no frame of {drive} carries `torque_actual`: nothing watches for the fault TORQUE"
+        for drive in drives
+    ]
     result = config("check", name)
-    assert (result.exit_code, result.stdout) == (0, f"{name}: 0 errors, 0 warnings\n")
+    assert (result.exit_code, result.stdout.splitlines()) == (0, [*warned, f"{name}: 0 errors, {len(warned)} warnings"])
 
 
 def test_all_errors_are_told_at_once(tmp_path):
