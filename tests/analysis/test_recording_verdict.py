@@ -483,6 +483,17 @@ def test_a_position_that_stays_while_its_velocity_does_not_is_a_dead_encoder(tmp
     assert not verdict.is_explained
 
 
+def test_a_threshold_that_is_wide_for_want_of_motion_explains_no_dead_encoder(tmp_path):
+    motion = record(urdf_text(2, LEVEL), seconds=9.0, amplitude_rad=np.array([0.7, 0.0]))
+    further = 0.15 * np.sin(5.0 * motion.t)[:, None]
+    turned = replace(motion, q=np.degrees(motion.q) + np.array([0.0, 60.0]), tau=motion.tau + further)
+    verdict = judged(tmp_path, turned, LEVEL, more='[units]\nq = "deg"\n').verdict
+    assert all(joint.is_explained for joint in verdict.joints)
+    assert min(joint.share for joint in verdict.joints) < 0.8
+    assert "a dead encoder" in verdict.reasons[0]
+    assert not verdict.is_explained
+
+
 def test_noise_of_velocities_that_hides_contacts_is_a_remark(tmp_path, upright):
     noisy = replace(upright, dq=upright.dq + 1.0 * np.random.default_rng(5).standard_normal(upright.dq.shape))
     verdict = judged(tmp_path, noisy, has_dq=True).verdict
