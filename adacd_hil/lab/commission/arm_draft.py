@@ -301,7 +301,7 @@ _MODEL = load_settings("certified", "P")
 _MODEL_INERTIA = _MODEL.arm.cad_theta[0], _MODEL.arm.cad_theta[2]
 """a1 and a3 of P's CAD model, kg m², for which its gains were measured."""
 _MOST_DAMPING_RAD_S = 300.0
-"""Kd over that inertia. P's: 142 and 113; an arm with 340 missed touches, one with 1190 vibrated until it stopped."""
+"""Kd over that inertia. P's: 142 and 113. An arm with 340 lost its certificate, one with 1180 vibrated to a FAULT."""
 _KP, _KD = _MODEL.controller.Kp, _MODEL.controller.Kd
 _MODEL_TORQUE_NM = _MODEL.arm.rated_torque_Nm
 _RATE_PER_NM = _MODEL.arm.torque_rate_limit_Nm_s[1] / _MODEL_TORQUE_NM[1]
@@ -477,8 +477,8 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
         gain = tuple(_round(model[i] * inertia[i] / _MODEL_INERTIA[i]) for i in range(JOINTS))
         basis = "the inertia" if has_masses else "the rated torque, as the masses are not known"
         yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {basis}", not has_masses)
-    if has_masses:  # the last gain is Kd
-        warnings += _fast_damping(gain, facts.geometry.cad_theta)
+        if name == "Kd" and has_masses:
+            warnings += _fast_damping(gain, facts.geometry.cad_theta)
     if facts.geometry.has_gravity:
         yield _rest_torque(facts)
     yield from _certified(facts)
