@@ -183,6 +183,10 @@ def rows(joints: str, count: int = 60) -> str:
             HEAD + "\n" + "1,2,3,4,5,0\n" * 60,
             "has 1 row, 50 are the least; 59 rows with the time of the row before left out (row 3: 0 s once more)",
         ),
+        (
+            HEAD + "\n" + "".join(f"{k},{k},3,4,5,0\n{k},{k + 20},3,4,5,0\n" for k in range(60)),
+            "row 3: 0 s once more; 60 rows with the time of the row before have other values, column 'j1_deg' by 20",
+        ),
         (HEAD + "\n" + rows("1e300,3"), "column 'j1_deg' is 1e+300 at 0 s, more than 1e+06 rad"),
         (HEAD + "\n" + rows("1,3") + "100,1,-2e12,4,5,0\n", "column 'j2_deg' is -2e+12 at 0.099 s"),
         (HEAD + "\n" + rows("inf,3"), "0 rows with all values, 50 needed"),

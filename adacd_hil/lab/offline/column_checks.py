@@ -1,10 +1,11 @@
-"""Checks of a recording's columns before any fit: constant, stuck, clipped, noise, wrong unit or sign.
+"""Checks of a recording's columns before any fit: constant, stuck, clipped, noise, two sources, wrong unit or sign.
 
 A dead sensor, or a column that was never filled in, always has the same value. A stuck one has the same value for a
 while in which its joint moves. A clipped one stays at its largest value far longer than just below it. Velocities are
 compared with the slope of the positions, positions and torques with the limits of the URDF.
 """
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
@@ -42,13 +43,18 @@ _NOISE_STEP: Final = 0.5
 at 50 Hz."""
 _NOISE_PERIOD_S: Final = 0.02
 """Longest period for that check: at longer ones a fast motion has such steps, too."""
+_JUMP_RAD, _JUMP_TIMES = 0.05, 10.0
+"""Least step of a position that is a jump, and its ratio to the steps just before and after: no joint starts and stops
+within two samples."""
+_TO_AND_FRO_TIMES: Final = 3.0
+"""Ratio of the usual step to the next row to that to the row after it: 1 for noise, less for motion."""
 _TURNS_THOUGH_STILL_RAD: Final = 0.3
 """Travel by the velocities, for a joint at rest by its positions, that velocity noise and offset can't explain."""
 _WELL_CORRELATED: Final = 0.8
 _SAME_SLOPE: Final = (0.8, 1.25)
 _BEYOND_LIMITS: Final = 3.0
 """Factor on the limits of a joint: no arm goes there, but degrees read as radians are 57 times too large."""
-_BEYOND_EFFORT: Final = 30.0
+BEYOND_EFFORT: Final = 30.0
 """Factor on the effort of the URDF: mNm read as Nm are 1000 times too large."""
 
 CORRECT_UNITS: Final = "correct `units` and `scale` of positions and torques"
@@ -106,8 +112,10 @@ def column_faults(described: RecordingMap, recordings: Sequence[ForeignRecording
     times = [stretch.start_s + period_s * np.arange(len(stretch.record.q)) for stretch in stretches]
     q, dq, tau_J = (samples(recordings, name) for name in ("q", "dq", "tau_J"))
     columns = _Columns(np.concatenate(times), q, dq, tau_J, period_s)
+    yield from _of_sources(described, recordings)
     yield from _of_torques(described, columns)
     yield from _of_positions(described, columns)
+    yield from _of_jumps(described, recordings)
     yield from _of_spikes(described, columns)
 
 
@@ -125,6 +133,26 @@ def column_name(described: RecordingMap, key: str, joint: int) -> str:
     """
     name, columns = described.urdf.joint_names[joint], getattr(described.columns, key)
     return f"{name} ({columns[joint]})" if columns and columns[joint] != name else name
+
+
+def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
+    """Report the first column whose rows as recorded alternate between two series, torques before positions."""
+    n = described.joints
+    for recording in recordings:
+        rows = recording.own_rows
+        if len(rows) < 3:
+            continue
+        next_row, row_after = (np.median(np.abs(rows[step:] - rows[:-step]), axis=0) for step in (1, 2))
+        is_double = next_row > _TO_AND_FRO_TIMES * row_after
+        for key, what, unit, first in (("tau_J", "torque", "Nm", n), ("q", "position", "rad", 0)):
+            for joint in np.flatnonzero(is_double[first : first + n])[:1].tolist():
+                yield RecordingFinding(
+                    f"the {what} of {column_name(described, key, joint)} goes to and fro from row to row, by "
+                    f"{next_row[first + joint]:.3g} {unit}: two sources in one column, or a loop that oscillates",
+                    "record one source alone, or stop the oscillation",
+                    is_wrong=True,
+                )
+                return
 
 
 def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
@@ -169,7 +197,7 @@ def torques_and_limits(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
 def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     """Report the torque that is farthest beyond the URDF's effort, if it is by far; of currents, none."""
     largest, effort = torques_and_limits(columns.tau_J, described.urdf)
-    is_over = largest > _BEYOND_EFFORT * effort
+    is_over = largest > BEYOND_EFFORT * effort
     if "A" in described.units.tau_J or not is_over.any():
         return
     joint = int(np.argmax(largest / effort))
@@ -261,6 +289,26 @@ def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[Recording
                     f"{columns.time_s[rows[0]]:.4g} s",
                     "empty these cells: a missing value parts the recording, and does no harm",
                 )
+
+
+def _of_jumps(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
+    """Report the first jump of a position from which it does not return, as of an encoder that is set to zero anew."""
+    revolute = np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist()
+    for joint, recording in itertools.product(revolute, recordings):
+        for stretch in recording.stretches:
+            q = stretch.record.q[:, joint]
+            # Over two samples: the row of a jump may lie between two samples.
+            steps = q[2:] - q[:-2]
+            size, before, after = np.abs(steps[2:-2]), np.abs(steps[:-4]), np.abs(steps[4:])
+            is_jump = (size > _JUMP_RAD) & (size > _JUMP_TIMES * np.maximum(before, after))
+            for row in np.flatnonzero(is_jump)[:1].tolist():
+                yield RecordingFinding(
+                    f"the position of {column_name(described, 'q', joint)} jumps by {steps[row + 2]:.3g} rad at "
+                    f"{stretch.start_s + (row + 4) * recording.period_s:.4g} s: its zero has changed",
+                    "use the part before it or the part after it, with --from and --until, and check that encoder",
+                    is_wrong=True,
+                )
+                return
 
 
 def _spikes(column: Vector) -> NDArray[np.int64]:

@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from adacd_hil.lab.offline.column_checks import BEYOND_EFFORT, torques_and_limits
 from adacd_hil.lab.offline.recording_map import RecordingMap
 from adacd_hil.lab.serial_arm import offline
 from adacd_hil.lab.serial_arm.offline import ArmModel, OfflineSettings, Record
@@ -104,11 +105,12 @@ def find_readings(
     fitted, tested = _thinned(fitted, settings), _thinned(tested, settings)
     step = _step(settings)
     settings = replace(settings, period_s=step * settings.period_s, fit_every=max(1, round(settings.fit_every / step)))
+    units = [] if described.joints == 1 else list(_other_units(described, tested))
     tried: list[Reading] = []
     for motion in _motions(described, model):
         fit, test = (_equations(part, settings, motion) for part in (fitted, tested))
         if fit is not None and test is not None:
-            for torques in _torques(described, most_turned=1 if motion.text else model.joints):
+            for torques in _torques(described, 1, []) if motion.text else _torques(described, model.joints, units):
                 tried.append(_judge(described, fit, test, motion, torques, fitted))
     of_map = next((each for each in tried if each.weight == 0), None)
     if of_map is None:
@@ -203,7 +205,7 @@ def _judge(
     ]
     unexplained = float(np.max(np.maximum(left, 0.0) / (factors**2 * test.spread[places])))
     turned = list(torques.turned)
-    differences = bool(motion.text) + min(len(turned), 2) + (places != list(joints))
+    differences = bool(motion.text) + (min(len(turned), 2) or bool(torques.text))
     texts, remedies = [motion.text, torques.text], [motion.remedy, torques.remedy]
     if turned == [motion.turned]:
         texts = [f"{described.urdf.joint_names[turned[0]]} counts the other way round, position and torque"]
@@ -215,10 +217,19 @@ def _judge(
     return Reading(text, remedy, differences, unexplained, is_right)
 
 
-def _torques(described: RecordingMap, most_turned: int) -> Iterator[_Torques]:
-    """Yield readings of torques: some or all with the other sign, two exchanged, all in reverse order.
+def _other_units(described: RecordingMap, tested: list[Record]) -> Iterator[tuple[int, float]]:
+    """Yield each joint with the factors 0.001 and 1000 by which no torque is far beyond the URDF's efforts."""
+    largest, effort = torques_and_limits(np.concatenate([record.tau_J for record in tested]), described.urdf)
+    for joint, factor in itertools.product(range(described.joints), (1e-3, 1e3)):
+        scaled = np.where(np.arange(described.joints) == joint, factor * largest, largest)
+        if np.all(scaled <= BEYOND_EFFORT * effort):
+            yield joint, factor
 
-    most_turned: most torques that have the other sign, unless all have.
+
+def _torques(described: RecordingMap, most_turned: int, units: list[tuple[int, float]]) -> Iterator[_Torques]:
+    """Yield readings of torques: some or all with the other sign, one in another unit, two exchanged, all in reverse.
+
+    most_turned: most torques that have the other sign, unless all have. units: joints and factors on their torques.
     """
     n, names = described.joints, described.urdf.joint_names
     straight, ones = tuple(range(n)), np.ones(n)
@@ -231,6 +242,10 @@ def _torques(described: RecordingMap, most_turned: int) -> Iterator[_Torques]:
         elif len(turned) in (*range(most_turned + 1), n):
             some = "all torques have" if len(turned) == n > 1 else f"the torque of {_both(names, turned)} has"
             yield _Torques(signs, straight, f"{some} the other sign", described.scaled("tau_J", signs), turned)
+    for i, factor in units:
+        factors = np.where(np.arange(n) == i, factor, 1.0)
+        much = "1000 times too large" if factor < 1.0 else "1000 times too small"
+        yield _Torques(factors, straight, f"the torque of {names[i]} is {much}", described.scaled("tau_J", factors))
     for pair in itertools.combinations(range(n), 2):
         text = f"the torques of {_both(names, pair)} are exchanged"
         places = _exchanged(n, *pair)

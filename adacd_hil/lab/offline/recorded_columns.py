@@ -32,6 +32,8 @@ _SPARE_S = 1.0
 _FEW_ROWS, _FEW_SHARE = 3, 0.01
 """Rows, or share of all rows, that may be unusable; with more, the file doesn't match the map."""
 
+_OTHER_TIMES: Final = 3.0
+"""Ratio of the mean difference of rows with one time to that of successive rows: two samples of one source have 1."""
 _DOUBLED = "with the time of the row before"
 
 
@@ -67,6 +69,7 @@ class RecordedRows:
         self._kept: list[Vector] = []
         self._drops: Counter[str] = Counter()
         self._first_drops: dict[str, str] = {}
+        self._doubled: list[Vector] = []  # differences of rows that have the time of the row before, from that row
         self._begin_s = self._latest_s = -np.inf
         self._is_long = False  # only the span is kept
 
@@ -110,6 +113,7 @@ class RecordedRows:
                 f"{dropped}"
             )
         has_dq = len(names) > 2 * described.joints
+        self._check_sources(table[:, 2 : 2 + len(names)], names)
         units = np.array((*described.q_rad, *described.tau_J_Nm, *(described.dq_rad_s if has_dq else ())))
         time_s, given = table[:, 1] * self._unit_s, table[:, 2 : 2 + len(units)]
         with np.errstate(over="ignore"):
@@ -133,6 +137,7 @@ class RecordedRows:
             self._begin_s = float(time_s[np.isfinite(time_s)][0])
         before_s = np.fmax.accumulate(np.concatenate(([self._latest_s], time_s)))
         self._count_wrong_rows(table, time_s == before_s[:-1], _DOUBLED, "{time} once more")
+        self._doubled.append(_differences(table[:, 2:])[np.diff(time_s) == 0.0])
         self._count_wrong_rows(table, time_s < before_s[:-1], "out of order", "time goes back to {time}")
         self._count_wrong_rows(table, ~np.isfinite(time_s), "without a time", "it has no time")
         is_later = np.isfinite(time_s) & (time_s > before_s[:-1])
@@ -175,6 +180,21 @@ class RecordedRows:
             first = self._first_drops[kind]
             raise LogError(f"recording {self._path}, {first}; {number_of(most, 'row')} {kind} are too many")
 
+    def _check_sources(self, values: Vector, names: list[str]) -> None:
+        """Raise LogError if rows with one time differ more than successive rows do. values: as recorded (k, c)."""
+        apart = np.concatenate(self._doubled)[:, : len(names)]
+        is_other = np.any(apart > 0.0, axis=1)
+        count = int(np.count_nonzero(is_other))
+        if count <= max(_FEW_ROWS, _FEW_SHARE * len(values)):
+            return
+        usual, other = (np.nansum(each, axis=0) / len(each) for each in (_differences(values), apart))
+        for column in np.flatnonzero(other > _OTHER_TIMES * usual)[:1].tolist():
+            raise LogError(
+                f"recording {self._path}, {self._first_drops[_DOUBLED]}; {number_of(count, 'row')} with the time of "
+                f"the row before have other values, column {names[column]!r} by {other[column]:.3g}, against "
+                f"{usual[column]:.3g} from one time to the next: two sources in one table; record one of them"
+            )
+
     def _check_values(self, given: Vector, values: Vector, time_s: Vector, names: list[str]) -> None:
         """Raise LogError for a value above `LARGEST`. given: as recorded, values: in SI units, (k, c)."""
         too_large = np.argwhere(np.isfinite(given) & ~(np.abs(values) <= LARGEST))
@@ -184,3 +204,8 @@ class RecordedRows:
                 f"recording {self._path}: column {names[column]!r} is {given[row, column]:g} at {time_s[row]:.9g} s, "
                 f"more than {LARGEST:g} rad, rad/s or Nm"
             )
+
+
+def _differences(rows: Vector) -> Vector:
+    """Return the size of each row's differences from the row before (k - 1, c), NaN where a value is not finite."""
+    return np.abs(np.diff(np.where(np.isfinite(rows), rows, np.nan), axis=0))

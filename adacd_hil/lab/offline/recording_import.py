@@ -81,6 +81,17 @@ class ForeignRecording:
         """The samples of the stretches."""
         return [stretch.record for stretch in self.stretches]
 
+    @property
+    def own_rows(self) -> Vector:
+        """The rows as recorded that have all values, from the first stretch to the end of the last (k, c)."""
+        if not self.stretches:
+            return self.columns.values[:0]
+        last = self.stretches[-1]
+        bounds = (self.stretches[0].start_s, last.start_s + len(last.record.q) * self.period_s)
+        first, end = np.searchsorted(self.columns.time_s - self.columns.begin_s, bounds)
+        rows = self.columns.values[first:end]
+        return rows[np.isfinite(rows).all(axis=1)]
+
     def between(self, start_s: float, end_s: float) -> "ForeignRecording":
         """Return the part from one time to another, s since the recording's first row, without stretches too short."""
         parts = [_cut(stretch, self.period_s, start_s, end_s) for stretch in self.stretches]
