@@ -5,6 +5,7 @@ import math
 import os
 import runpy
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from scheme.smooth_motion import torque_of
 
 from adacd_hil.lab.detectors.detectors import DetectorBankSettings, register, unregister
 from adacd_hil.lab.thresholds import free_motion as module
+from adacd_hil.lab.thresholds import recorded_thresholds
 from adacd_hil.lab.thresholds.detector_comparison import (
     STEPS_NM,
     Comparison,
@@ -22,11 +24,18 @@ from adacd_hil.lab.thresholds.detector_comparison import (
     step_shape,
     write_comparison,
 )
+from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.lab.thresholds.free_motion import read_motion, sample_of
-from adacd_hil.lab.thresholds.recorded_thresholds import compute_thresholds, find_lag, run_detectors
+from adacd_hil.lab.thresholds.recorded_thresholds import (
+    compute_thresholds,
+    find_lag,
+    run_detectors,
+    thresholds_of_logs,
+)
 from adacd_hil.log.log_files import LogError
 from adacd_hil.plain_values import plain_values
 from adacd_hil.records import SchemeState
+from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import read_toml
 
 INTERPRETED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
@@ -153,6 +162,25 @@ def test_what_is_near_a_contact_a_gap_or_another_state_does_not_count(changes, b
 def test_logs_that_can_not_be_used_are_named(changes, words):
     with pytest.raises(LogError, match=words):
         statistics_of({"a.mcap": log_of(2.0), "b.mcap": log_of(2.0, **changes)})
+
+
+def arm_with(**changes) -> Settings:
+    return replace(Settings(), arm=replace(Settings().arm, **changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"link_length_m": (0.5, 0.3)}, LogError, r"a.mcap and b.mcap are of two arms: arm.link_length_m is .*0.5"),
+        ({"zero_deg": (3.0, 0.0), "torque_offset_Nm": (0.1, 0.0)}, TooLittleMotionError, "too few"),
+    ],
+    ids=["another arm", "another tare"],
+)
+def test_logs_of_two_arms_are_refused(monkeypatch, changes, error, words):
+    found = {"a.mcap": Settings(), "b.mcap": arm_with(**changes)}
+    monkeypatch.setattr(recorded_thresholds, "logged_settings", lambda path: found[path.name])
+    with logs_of({name: log_of(2.0) for name in found}) as paths, pytest.raises(error, match=words):
+        thresholds_of_logs(paths, 1.0)
 
 
 @pytest.mark.long

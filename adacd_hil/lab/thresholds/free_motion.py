@@ -24,6 +24,7 @@ from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import PARAMETER_NAMES, Vector
 from adacd_hil.scheme.kernel.kernel_samples import LONGEST_SHARE, SHORTEST_SHARE
+from adacd_hil.settings.configuration import Settings
 
 APART_S: Final = 0.6
 """Distance from contacts and gaps: six time constants of the slowest filter."""
@@ -133,14 +134,15 @@ def read_motion(
     is_free = ~_spread(~np.concatenate(parts), round(APART_S / period_s))
     if not is_free.any():
         raise LogError(f"log {path} has no motion in MONITOR that is free of contact{where}")
-    level_rad = _level_rad(path) if parameters > len(PARAMETER_NAMES) else 0.0
+    settings = logged_settings(path) if parameters > len(PARAMETER_NAMES) else None
+    level_rad = 0.0 if settings is None else settings.level_rad
     return LoggedMotion(path, period_s, parameters, is_free, bounds_ns, level_rad)
 
 
-def _level_rad(path: Path) -> float:
-    """Return q1 at which link 1 is level, by the configuration in a log; 0 without one."""
+def logged_settings(path: Path) -> Settings | None:
+    """Return the settings in a log, None if it has none. Raises LogError."""
     text = attachment(path, CONFIG_NAME)
-    return 0.0 if text is None else settings_of(path, {CONFIG_NAME: text}).level_rad
+    return None if text is None else settings_of(path, {CONFIG_NAME: text})
 
 
 def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:

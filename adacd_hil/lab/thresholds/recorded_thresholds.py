@@ -13,6 +13,7 @@ from typing import Final
 
 import numpy as np
 
+from adacd_hil.control.tare_file import TARED
 from adacd_hil.lab.detectors import detectors
 from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
 from adacd_hil.lab.thresholds.false_alarms import (
@@ -28,16 +29,27 @@ from adacd_hil.lab.thresholds.false_alarms import (
     largest_ratio,
     mean_square,
 )
-from adacd_hil.lab.thresholds.free_motion import LoggedMotion, Mask, Motion, read_motion, sample_of, torque_streams
+from adacd_hil.lab.thresholds.free_motion import (
+    LoggedMotion,
+    Mask,
+    Motion,
+    logged_settings,
+    read_motion,
+    sample_of,
+    torque_streams,
+)
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Milestones, Progress
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.model.regressor import mass_matrix
+from adacd_hil.settings.setting_keys import changed_keys
 
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0
 """Corner frequency below which the model's errors exceed the noise."""
+_OF_ONE_ARM: Final = frozenset({*TARED, "arm.zero_deg"})
+"""Settings of `arm` that may differ between the runs of one arm."""
 _CHECKED_ALARMS: Final = 20.0  # alarms in the held-out half that are enough to compare with the prediction
 
 
@@ -306,12 +318,25 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
     return limits
 
 
+def _check_one_arm(logs: Sequence[LoggedMotion]) -> None:
+    """Raise LogError if a log is of another arm than the first; a tare and a zero make no other arm."""
+    known = [(log.path, settings) for log in logs if (settings := logged_settings(log.path)) is not None]
+    for path, settings in known[1:]:
+        differing = changed_keys(known[0][1], settings)
+        if keys := [key for key in differing if key.startswith("arm.") and key not in _OF_ONE_ARM]:
+            raise LogError(
+                f"logs {known[0][0]} and {path} are of two arms: {keys[0]} is {' and '.join(differing[keys[0]])}; find "
+                "their thresholds apart"
+            )
+
+
 def thresholds_of_logs(
     paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None
 ) -> tuple[Thresholds, Statistics]:
     """Return all detectors' thresholds from the contact-free motion of logs, or of a stretch of each, and statistics.
 
-    Raises LogError for a log that can't be used, TooLittleMotionError if all together are too short.
+    Raises LogError for a log that can't be used or is of another arm than the first, TooLittleMotionError if all
+    together are too short.
     """
     logs = []
     for path in paths:
@@ -319,5 +344,6 @@ def thresholds_of_logs(
         if log.parameters < len(PARAMETER_NAMES):
             raise LogError(f"log {path} has {log.parameters} parameters")
         logs.append(log)
+    _check_one_arm(logs)
     statistics = run_detectors(logs, detectors.DetectorBankSettings(), progress)
     return compute_thresholds(statistics, rate_per_h, [str(path) for path in paths]), statistics
