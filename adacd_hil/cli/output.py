@@ -248,10 +248,10 @@ def writable_folder(out: Path | None) -> Iterator[None]:
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
             Replacement(out).discard()
-        except FileExistsError as error:
-            raise CommandError(f"{out} can't be written: {error.filename} is no folder") from error
         except OSError as error:
-            raise CommandError(f"{out} can't be written: {error.strerror}") from error
+            is_parent = isinstance(error, FileExistsError) and error.filename != str(out)
+            reason = f"{error.filename} is no folder" if is_parent else error.strerror
+            raise CommandError(f"{out} can't be written: {reason}") from error
         yield
 
 

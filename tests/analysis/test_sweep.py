@@ -1,5 +1,6 @@
 """A sweep computes every row once, tries again what failed by accident, and goes on where it was stopped."""
 
+import errno
 import json
 import os
 import signal
@@ -158,6 +159,18 @@ def test_tasks_are_of_one_subject_and_of_so_many_rows_at_most():
     plan = plan_of(range(1, 3), [{"filter.a_rad_s": str(value)} for value in range(10, 17)])
     tasks = list(plan.tasks(frozenset(), 3))
     assert [(task.subject.seed, len(task.rows)) for task in tasks] == [(1, 3), (1, 3), (1, 1), (2, 3), (2, 3), (2, 1)]
+
+
+def test_a_part_that_can_not_be_written_is_named_with_the_reason(tmp_path, client, monkeypatch):
+    """pyarrow's error names no file."""
+
+    def full(*_arguments, **_keywords):
+        raise OSError(errno.ENOSPC, "Error writing bytes to file")
+
+    monkeypatch.setattr(parquet, "write_table", full)
+    with pytest.raises(LogError, match=r"parts/000000.parquet can't be written: No space left on device; the same"):
+        sweep(tmp_path / "out", client, Work(tmp_path))
+    assert not list((tmp_path / "out").rglob("*.parquet"))
 
 
 def test_a_part_that_is_damaged_is_named(tmp_path, client):

@@ -37,11 +37,13 @@ def test_a_place_is_tried_and_left_as_it_was(tmp_path):
     [
         ("file/x.toml", ".*file is no folder"),
         ("", "it is a folder"),
+        ("run.mcap", "it is a log"),
         ("/proc/none/x.toml", "No such file or directory"),
     ],
 )
 def test_a_place_that_takes_no_file_is_said_before_the_search(out, reason, tmp_path):
     (tmp_path / "file").touch()
+    (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n")
     with pytest.raises(CommandError, match=rf"can't be written: {reason}"), writable_folder(tmp_path / out):
         raise AssertionError("searched")
 

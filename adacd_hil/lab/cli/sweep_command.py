@@ -26,8 +26,8 @@ _SIMULATED_CONFIG = "certified"
 
 @click.command(
     epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` has the reason, or a log is "
-    "damaged, see `notes`; 1 the cluster is lost, or the folder can't be written; 2 wrong usage or configuration; 130 "
-    "interrupted: the same command continues."
+    "damaged, see `notes`, or the disk is full; 1 the cluster is lost, or the folder can't be written; 2 wrong usage "
+    "or configuration; 130 interrupted: the same command continues."
 )
 @click.argument("logs", nargs=-1, type=GivenPath(), shell_complete=complete_run)
 @click.option(

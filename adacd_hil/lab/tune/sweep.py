@@ -16,6 +16,7 @@ log that has changed, other settings, and another version of the package or of t
 
 import hashlib
 import json
+import os
 import statistics
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -257,7 +258,7 @@ class SweepStore:
         return frozenset(keys)
 
     def write_part(self, rows: Iterable[Values]) -> None:
-        """Write rows as the next part of the folder."""
+        """Write rows as the next part of the folder. Raises LogError."""
         path = self._parts / f"{self._next:06d}.parquet"
         self._next += 1
         _write(self._parquet, path, _table(list(rows)))
@@ -266,6 +267,7 @@ class SweepStore:
         """Write the table of the rows with these keys, in this order, and the plan `about`; return the table's path.
 
         Of several results of a row, the last good one counts, else the last. Keys without a result are left out.
+        Raises LogError.
         """
         rows: dict[str, Values] = {}
         for path in self._paths():
@@ -311,8 +313,13 @@ def _table(rows: list[Values]) -> Any:
 
 
 def _write(parquet: Any, path: Path, table: Any) -> None:
-    with replacing(path) as beside:
-        parquet.write_table(table, beside, compression="zstd")
+    """Write a table to `path`. Raises LogError."""
+    try:
+        with replacing(path) as beside:
+            parquet.write_table(table, beside, compression="zstd")
+    except OSError as error:  # pyarrow's names no file
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise LogError(f"{path} can't be written: {reason}; the same command continues") from error
 
 
 ROWS_PER_TASK = 20
@@ -342,7 +349,7 @@ def run_sweep(
 ) -> SweepOutcome:
     """Compute the rows of a plan that the store lacks, and write them to it every few seconds.
 
-    Raises LogError if the cluster is lost.
+    Raises LogError if the cluster is lost or a part can't be written.
     """
     clock = MonotonicClock()
     begin_ns = written_ns = clock.now_ns()
