@@ -381,7 +381,7 @@ def why_frames(source: ReplaySource, variants: Sequence[Settings]) -> str:
     if source.is_recording:
         return ""
     if not source.has_arms:
-        return "the log has no /arm, as those of earlier versions: its frames are decoded, which takes longer"
+        return "the log has no /arm, as an older one or one without a cycle: its frames are decoded, which takes longer"
     own = _decoding_key(source.settings)
     if all(_decoding_key(settings) == own for settings in variants):
         return ""

@@ -81,6 +81,8 @@ def urdf(folder: Path, axis: str = "0 0 1", wrist: str = "fixed") -> Path:
         ((*NO_BUS, "--drive-node", "3", "4"), "node ids 3, 4, 3, 4 of drives and sensors must differ"),
         ((*NO_BUS, "--mounting", "flor"), "'flor' must be flat, floor"),
         ((*NO_BUS, "--mounting", "100"), "0 to 90 deg"),
+        ((*NO_BUS, "--mounting", "floor", "--flat"), "give one of them"),
+        ((*NO_BUS, "--at-zero", "up"), "--at-zero is of an arm that gravity reaches"),
         ((*NO_BUS, "--eds", "float.eds"), "its 0x6130:1 is a float, which no frame of a cycle can hold"),
         ((*NO_BUS, "--gear", "3", "3"), "profile adacd-drive of joint 1 has its own `scale.gear_ratio` = 1;"),
         ((*NO_BUS, *MIXED, "--gear", "100", "100"), "--gear: profile stock-drive of joint 2 has its own `scale.gear_r"),

@@ -642,7 +642,11 @@ class Drafting:
         """Ask for tilt of the plane of motion, and q1 at which link 1 hangs down, deg; return both and their source."""
         options, interview = self.options, self.interview
         given = options.mounting
-        if options.is_upright is not None and given is None:
+        if options.is_upright is not None:
+            if given is not None:
+                raise CommandError(
+                    "--mounting and --upright or --flat state the same: give one of them", ExitCode.USAGE
+                )
             given = "wall" if options.is_upright else "flat"
         (mounting, tilt_deg), source = interview.ask(
             "--mounting or --flat",
@@ -653,6 +657,12 @@ class Drafting:
             "on floor, wall and ceiling the joint axes are level and all of gravity acts; a tilt of 0 is flat",
         )
         if tilt_deg <= SLIGHT_TILT_DEG:
+            if options.at_zero is not None:
+                raise CommandError(
+                    "--at-zero is of an arm that gravity reaches: give --mounting floor, wall, ceiling, or a tilt above "
+                    f"{SLIGHT_TILT_DEG:g} deg, too",
+                    ExitCode.USAGE,
+                )
             return LEVEL_DEG, source
         usual = _USUAL_POSES.get(mounting)
         hangs_deg, at_zero_source = interview.ask(
