@@ -109,6 +109,7 @@ def _device_problems(settings: Settings) -> list[str]:
 
 _BOUNDS = (
     ("arm.torque_limit_Nm", "arm.rated_torque_Nm", "Nm", ""),
+    ("detector.threshold_Nm", "arm.rated_torque_Nm", "Nm", "; the paper's scheme detects no weaker contact"),
     ("reaction.velocity_limit_deg_s", "arm.velocity_limit_deg_s", "deg/s", "; a withdrawal keeps to the smaller one"),
 )
 """Pairs of keys: the first must not exceed the second; then the consequence."""

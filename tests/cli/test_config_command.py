@@ -92,6 +92,11 @@ LENGTHS = "[arm]\nlink_length_m = [0.4, 0.3]"
             0,
             "`arm.torque_limit_Nm[1]` = 7 Nm exceeds `arm.rated_torque_Nm[1]` = 6 Nm",
         ),
+        (
+            "[detector]\nthreshold_Nm = [1, 7]",
+            0,
+            "`detector.threshold_Nm[1]` = 7 Nm exceeds `arm.rated_torque_Nm[1]` = 6 Nm",
+        ),
         ("[reaction]\nvelocity_limit_deg_s = [300, 300]", 0, "`reaction.velocity_limit_deg_s[0]` = 300 deg/s exceeds"),
         (LENGTHS, 0, "`arm.cad_theta` is that of an emulated arm, from paper [profiles.P]"),
         (LENGTHS, 0, "`controller.Kp` is that of an emulated arm"),

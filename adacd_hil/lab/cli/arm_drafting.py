@@ -659,8 +659,8 @@ class Drafting:
         if tilt_deg <= SLIGHT_TILT_DEG:
             if options.at_zero is not None:
                 raise CommandError(
-                    "--at-zero is of an arm that gravity reaches: give --mounting floor, wall, ceiling, or a tilt above "
-                    f"{SLIGHT_TILT_DEG:g} deg, too",
+                    "--at-zero is of an arm that gravity reaches: give --mounting floor, wall, ceiling, or a tilt "
+                    f"above {SLIGHT_TILT_DEG:g} deg, too",
                     ExitCode.USAGE,
                 )
             return LEVEL_DEG, source
