@@ -14,6 +14,7 @@ from called import called
 from foreign_arms import AXES, Motion, record, rigid_torque, urdf_text, write_recording
 from scipy.integrate import solve_ivp
 
+from adacd_hil.lab.offline.column_checks import CORRECT_UNITS
 from adacd_hil.lab.offline.recording_identification import Identified, identify
 from adacd_hil.lab.offline.recording_import import read_recording
 from adacd_hil.lab.offline.recording_map import read_map
@@ -435,6 +436,13 @@ def test_torques_of_an_unknown_unit_are_not_said_to_be_what_the_map_has(tmp_path
     verdict = judged(tmp_path, times(tau=1e6)(upright), more='[units]\ntau_J = "mNm"\n', has_masses=False).verdict
     assert "reaches" in verdict.reasons[0]
     assert "mNm" not in verdict.remedy
+
+
+def test_torques_in_the_columns_of_positions_are_no_jumps_and_no_degrees_where_the_map_has_degrees(tmp_path, upright):
+    exchanged_both = replace(upright, q=1e3 * upright.tau, tau=upright.q)
+    verdict = judged(tmp_path, exchanged_both, more='[units]\nq = "deg"\n').verdict
+    assert "beyond the" in verdict.reasons[0]
+    assert verdict.remedy == CORRECT_UNITS
 
 
 def test_what_is_named_makes_the_recording_explained(tmp_path, upright):

@@ -5,7 +5,6 @@ while in which its joint moves. A clipped one stays at its largest value far lon
 compared with the slope of the positions, positions and torques with the limits of the URDF.
 """
 
-import itertools
 import math
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
@@ -43,9 +42,9 @@ _NOISE_STEP: Final = 0.5
 at 50 Hz."""
 _NOISE_PERIOD_S: Final = 0.02
 """Longest period for that check: at longer ones a fast motion has such steps, too."""
-_JUMP_RAD, _JUMP_TIMES = 0.05, 10.0
-"""Least step of a position that is a jump, and its ratio to the steps just before and after: no joint starts and stops
-within two samples."""
+_JUMP_RAD, _JUMP_TIMES, _MOST_JUMPS = 0.05, 10.0, 3
+"""Least step of a position that is a jump, its ratio to the steps just before and after (no joint starts and stops
+within two samples), and most jumps of an encoder."""
 _TO_AND_FRO_TIMES: Final = 3.0
 """Ratio of the usual step to the next row to that to the row after it: 1 for noise, less for motion."""
 _TURNS_THOUGH_STILL_RAD: Final = 0.3
@@ -57,7 +56,7 @@ _BEYOND_LIMITS: Final = 3.0
 BEYOND_EFFORT: Final = 30.0
 """Factor on the effort of the URDF: mNm read as Nm are 1000 times too large."""
 
-CORRECT_UNITS: Final = "correct `units` and `scale` of positions and torques"
+CORRECT_UNITS: Final = "correct `columns`, `units` and `scale` of positions and torques"
 CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 
 
@@ -269,7 +268,9 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Record
         most = f"{bound[joint]:.3g} rad" if goes_far[joint] else f"{limit[joint]:g} rad/s"
         yield RecordingFinding(
             f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
-            f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', math.pi / 180.0, is_beyond)}",
+            CORRECT_UNITS
+            if described.units.q == "deg"
+            else f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', math.pi / 180.0, is_beyond)}",
         )
 
 
@@ -292,23 +293,32 @@ def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[Recording
 
 
 def _of_jumps(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
-    """Report the first jump of a position from which it does not return, as of an encoder that is set to zero anew."""
-    revolute = np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist()
-    for joint, recording in itertools.product(revolute, recordings):
-        for stretch in recording.stretches:
-            q = stretch.record.q[:, joint]
-            # Over two samples: the row of a jump may lie between two samples.
-            steps = q[2:] - q[:-2]
-            size, before, after = np.abs(steps[2:-2]), np.abs(steps[:-4]), np.abs(steps[4:])
-            is_jump = (size > _JUMP_RAD) & (size > _JUMP_TIMES * np.maximum(before, after))
-            for row in np.flatnonzero(is_jump)[:1].tolist():
-                yield RecordingFinding(
-                    f"the position of {column_name(described, 'q', joint)} jumps by {steps[row + 2]:.3g} rad at "
-                    f"{stretch.start_s + (row + 4) * recording.period_s:.4g} s: its zero has changed",
-                    "use the part before it or the part after it, with --from and --until, and check that encoder",
-                    is_wrong=True,
-                )
-                return
+    """Report the joint whose position jumps and does not return, as of an encoder that is set to zero anew.
+
+    A column with more than `_MOST_JUMPS` is no position: other checks report it.
+    """
+    for joint in np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist():
+        jumps = [jump for recording in recordings for jump in _jumps(recording, joint)]
+        if 0 < len(jumps) <= _MOST_JUMPS:
+            step, time_s = jumps[0]
+            yield RecordingFinding(
+                f"the position of {column_name(described, 'q', joint)} jumps by {step:.3g} rad at {time_s:.4g} s: its "
+                "zero has changed",
+                "use the part before it or the part after it, with --from and --until, and check that encoder",
+                is_wrong=True,
+            )
+            return
+
+
+def _jumps(recording: ForeignRecording, joint: int) -> Iterator[tuple[float, float]]:
+    """Yield the jumps of a joint's position: size, and time since the recording's first row, s."""
+    for stretch in recording.stretches:
+        q = stretch.record.q[:, joint]
+        steps = q[2:] - q[:-2]  # over two samples: the row of a jump may lie between two samples
+        size, before, after = np.abs(steps[2:-2]), np.abs(steps[:-4]), np.abs(steps[4:])
+        rows = np.flatnonzero((size > _JUMP_RAD) & (size > _JUMP_TIMES * np.maximum(before, after)))
+        for row in rows[np.diff(rows, prepend=-3) > 2].tolist():
+            yield float(steps[row + 2]), stretch.start_s + (row + 4) * recording.period_s
 
 
 def _spikes(column: Vector) -> NDArray[np.int64]:
