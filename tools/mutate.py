@@ -509,7 +509,7 @@ class Pool:
 
 
 def _expand(globs: Sequence[str]) -> list[str]:
-    tests = [str(path) for glob in globs for path in sorted(ROOT.glob(glob))]
+    tests = [str(path) for one in globs for path in sorted(ROOT.glob(os.path.relpath(ROOT / one, ROOT)))]
     if not tests:
         raise UsageError(f"no tests match {', '.join(globs)}")
     return tests
