@@ -66,7 +66,7 @@ def cut(
             copy.add_messages(item, (times >= first_ns) & (times < end_ns))
         if losses := log.losses.describe():
             what = log.losses.notes[0] if log.losses.notes else f"{path} lacks {losses}"
-            raise LogError(f"{what}: recover the log first")
+            raise LogError(f"{what}: recover the log first, or wait until its run has ended")
         if unknown := sorted(set(topics) - known):
             raise LogError(f"log {path} has no topic {', '.join(unknown)}; it has {', '.join(sorted(known))}")
         if not copy.messages:
