@@ -131,6 +131,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("excitation --out gone/new.toml", USAGE, (GONE,)),
     ("log export x.mcap --format csv --out gone", USAGE, (GONE,)),
     (f"{RUN} --history gone/new.toml", USAGE, (GONE,)),
+    (f"{RUN} --config paper --history new.toml", USAGE, ("--history: scheme 'paper' has no certificates",)),
     ("excitation --out notes.txt/new.toml", FAILURE, ("notes.txt/new.toml can't be written: notes.txt is no folder",)),
     ("tune none.mcap --out notes.txt/new.toml", FAILURE, ("can't be written: notes.txt is no folder",)),
     ("thresholds none.mcap --out notes.txt/new.toml", FAILURE, ("can't be written: notes.txt is no folder",)),
