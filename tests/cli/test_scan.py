@@ -1,6 +1,5 @@
 """What `scan` prints, for people and machines."""
 
-
 from rig import CODEC, Rig
 
 from adacd_hil.lab.cli.scan_command import as_text, describe
