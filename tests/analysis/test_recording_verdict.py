@@ -296,7 +296,7 @@ def summed(motion: Motion) -> Motion:
     return replace(motion, q=motion.q @ SUMS.T, dq=motion.dq @ SUMS.T)
 
 
-MISTAKES: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
+MISTAKES: dict[str, tuple[Callable[[Motion], Motion] | str, str, str]] = {
     "mNm": (times(tau=1e3), "they are mNm", '`units.tau_J` = "mNm"'),
     "degrees": (times(q=1 / DEGREE, dq=1 / DEGREE), "the positions are degrees", '`units.q` = "deg"'),
     "a torque that is turned": (
@@ -347,14 +347,25 @@ MISTAKES: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
         "geared motors, which turn their rotors too",
         "`arm.has_rotors` = true",
     ),
+    "mNm that are none": ('[units]\ntau_J = "mNm"\n', "they are Nm", '`units.tau_J` = "Nm"'),
+    "degrees that are none": ('[units]\nq = "deg"\n', "the positions are radians", '`units.q` = "rad"'),
+    "a torque that the map turns": (
+        "[scale]\ntau_J = [1, -1]\n",
+        "joint2 has the other sign",
+        "`scale.tau_J` = [1, 1]",
+    ),
 }
+"""What is wrong with the recording, or keys of the map that are; what is said, and the remedy."""
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_common_mistake_is_named_with_its_key(tmp_path, upright, mistake):
     spoil, said, remedy = MISTAKES[mistake]
     has_dq = list(MISTAKES).index(mistake) % 2 == 0
-    verdict = judged(tmp_path, spoil(upright), has_dq=has_dq).verdict
+    if isinstance(spoil, str):
+        verdict = judged(tmp_path, upright, has_dq=has_dq, more=spoil).verdict
+    else:
+        verdict = judged(tmp_path, spoil(upright), has_dq=has_dq).verdict
     assert not verdict.is_explained
     assert said in verdict.reasons[0]
     assert verdict.remedy.startswith("in the map: ")
@@ -368,22 +379,6 @@ def test_exchanged_columns_leave_the_scale_to_the_joint(tmp_path, upright, mista
     verdict = judged(tmp_path, spoil(other), more="[scale]\nq = [1.0, -1.0]\ntau_J = [1.0, -0.5]\n").verdict
     assert said in verdict.reasons[0]
     assert verdict.remedy == f"in the map: exchange them in {remedy}"
-
-
-@pytest.mark.parametrize(
-    ("keys", "said", "remedy"),
-    [
-        ('[units]\ntau_J = "mNm"\n', "they are Nm", '`units.tau_J` = "Nm"'),
-        ('[units]\nq = "deg"\n', "the positions are radians", '`units.q` = "rad"'),
-        ("[scale]\ntau_J = [1.0, -1.0]\n", "the torque of joint2 has the other sign", "`scale.tau_J` = [1, 1]"),
-    ],
-    ids=["mNm that are none", "degrees that are none", "a torque that the map turns"],
-)
-def test_a_mistake_of_the_map_is_named_with_its_key(tmp_path, upright, keys, said, remedy):
-    verdict = judged(tmp_path, upright, more=keys).verdict
-    assert not verdict.is_explained
-    assert said in verdict.reasons[0]
-    assert verdict.remedy == f"in the map: {remedy}"
 
 
 @pytest.mark.parametrize(

@@ -5,23 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_run import A, M, make_run, react, touch, touched_run, with_motion, without_cycles
+from hand_made_run import A, make_run, react, touch, touched_run, with_motion
 
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.run_page import CARDS, Push, contact_cards, draw_arm
-from adacd_hil.lab.report.timeline import notices_of, state_key, stays_of, timeline_of
+from adacd_hil.lab.report.timeline import notices_of, state_key, timeline_of
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, Location, SchemeState
-
-
-def test_stays_follow_one_another_without_a_gap():
-    stays = stays_of(make_run((A, 100), (M, 200), (A, 50)))
-    assert [(stay.state.name, stay.start_s, stay.end_s) for stay in stays] == [
-        ("ADAPT", 0.0, 0.1),
-        ("MONITOR", 0.1, pytest.approx(0.3)),
-        ("ADAPT", pytest.approx(0.3), pytest.approx(0.349)),
-    ]
 
 
 def drawn(run):
@@ -63,11 +54,6 @@ def test_many_warnings_do_not_crowd_out_a_fault():
     run = replace(run, events=tuple(LoggedEvent(int(t), Event("warning", "bus", "slow")) for t in run.t_ns[:400]))
     notices = notices_of(run, evaluate(run))
     assert (len(notices), notices[-1].text) == (300, "fault")
-
-
-def test_a_run_without_cycles_has_no_timeline():
-    run = make_run((A, 1))
-    assert timeline_of(without_cycles(run), evaluate(run)) is None
 
 
 LENGTHS = (0.4, 0.3)

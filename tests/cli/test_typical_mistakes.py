@@ -19,6 +19,7 @@ from adacd_hil.wire.dbc_contract import contract_folder
 
 FAILURE, USAGE, BUS_MISSING = 1, 2, 5
 
+ARM = (contract_folder() / "arm.dbc").read_text()
 FILES = {
     "my-arm.toml": "",
     "rad.toml": "[arm]\nposition_limit_deg = [0.9, 0.8]\n",
@@ -31,6 +32,11 @@ FILES = {
     "cut.mcap": "",
     "bad.dbc": "hello",
     "bus.log": "",
+    "forty.dbc": 40 * ARM,
+    "names.dbc": ARM.replace(" Drive2Emcy:", " Drive1Emcy:"),
+    "identifiers.dbc": ARM.replace("BO_ 130 Drive2Emcy", "BO_ 129 Drive2Emcy"),
+    "many.dbc": ARM
+    + "".join(f'\nBO_ {1 << 31 | k} M{k}: 1 Host\n SG_ a : 0|8@1+ (1,0) [0|0] "" X\n' for k in range(1000)),
     "float.eds": (contract_folder() / "int32_sensor.eds").read_text().replace("9130", "6130"),
 }
 RUN = "run -i virtual -c x"
@@ -50,6 +56,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("report ''", USAGE, ("Invalid value for 'LOGS...': the name is empty",)),
     ("identify --init bus.log", USAGE, ("--init takes one recording and one URDF",)),
     ("identify bus.log", USAGE, ("--map is missing", "identify --init RECORDING URDF` writes one")),
+    ("identify bus.log --map none.toml --from 5 --until 4", USAGE, ("--from 5 s is not before --until 4 s",)),
     ("sweep --out new", USAGE, ("a sweep is of LOGS or of --scenario",)),
     ("sweep --scenario paper --seeds 9:1 --out new", USAGE, ("--seeds '9:1'",)),
     ("log merge log.mcap log.mcap --out new.mcap", USAGE, ("mcap merge", "log cut")),
@@ -89,6 +96,10 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("budget --dbc ''", USAGE, ("contract '' is neither in dbc/ nor a file; known: ",)),
     (f"{RUN} --dbc none.dbc", USAGE, ("DBC none.dbc: No such file",)),
     (f"{RUN} --dbc bad.dbc", USAGE, ("DBC bad.dbc can't be read", "Invalid syntax at line 1")),
+    ("budget --dbc forty.dbc", USAGE, ("DBC forty.dbc: ", "message Nmt is defined more than once")),
+    ("budget --dbc names.dbc", USAGE, ("message Drive1Emcy is defined more than once",)),
+    ("budget --dbc identifiers.dbc", USAGE, ("Drive1Emcy and Drive2Emcy have the same identifier",)),
+    ("budget --dbc many.dbc", USAGE, ("1029 messages are more than 1000",)),
     ("budget --dbc arm_fdd", USAGE, ("contract 'arm_fdd' is neither in dbc/ nor a file", "did you mean 'arm_fd'?")),
     (f"{INIT} --urdf arm.urdf", USAGE, ("3 joints move (joint1, joint2, joint3), an arm has 2 here", "with --lock")),
     (f"{INIT} --length-m 350 300", USAGE, ("350.0 m is above 5 m", "350 mm are 0.35 m")),
