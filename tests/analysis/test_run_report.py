@@ -125,13 +125,6 @@ def table_of(run):
     return report_json(evaluate(run), run.metadata, SOURCE)
 
 
-def test_a_value_that_is_not_finite_becomes_null():
-    run = make_run((A, 100), (M, 100))
-    run.tau_ext_hat[150, 0] = float("nan")
-    table = table_of(run)
-    assert table["frozen_residual_max_Nm"]["B"]["identified"] == [None, 0.0]
-
-
 def test_the_text_says_what_went_wrong_what_to_do_and_where_the_page_is(report):
     lines = report.as_text().splitlines()
     assert lines[0].startswith("NOT GOOD: 2 of 3 contacts detected within 5 ms, 1 missed")
