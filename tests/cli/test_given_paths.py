@@ -1,4 +1,4 @@
-"""Paths that can't be meant are refused before any work: empty names, links that lead nowhere."""
+"""Links that lead nowhere are named, and every path of a command is looked at for them."""
 
 import click
 import pytest
