@@ -121,6 +121,11 @@ def drift(motion: Motion) -> Motion:
     return replace(motion, tau=np.cumsum(noise(motion.tau.shape), axis=0))
 
 
+def times(**factors: Any) -> Callable[[Motion], Motion]:
+    """Scale columns of a recording."""
+    return lambda motion: replace(motion, **{name: getattr(motion, name) * by for name, by in factors.items()})
+
+
 UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
     "a dead sensor": (
         lambda m: replace(m, tau=m.tau * [1.0, 0.0] + [0.0, 0.31]),
@@ -161,6 +166,16 @@ UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
         "check that encoder",
     ),
     "an arm at rest": (lambda m: still(m, 0, 1), "the arm does not move", "motion of every joint"),
+    "mNm at one joint": (
+        times(tau=[1, 1e3]),
+        "the torque of joint2 (tau2) reaches",
+        "if the torques are mNm: `scale.tau_J` = [1, 0.001]",
+    ),
+    "degrees at one joint": (
+        times(q=[1, 57.29578]),
+        "joint2 (q2) goes to",
+        "if the positions are degrees: `scale.q` = [1, 0.0174533]",
+    ),
     "too short": (short, "too short: 0.9 s fitted and 0.6 s tested", "record more"),
 }
 
@@ -281,11 +296,6 @@ def gravity_torque(motion: Motion, *gravity_m_s2: tuple[float, float, float]) ->
     return rigid_torque(arm, np.array([motion.q, 0.0 * motion.q, 0.0 * motion.q]))
 
 
-def times(**factors: Any) -> Callable[[Motion], Motion]:
-    """Scale columns of a recording."""
-    return lambda motion: replace(motion, **{name: getattr(motion, name) * by for name, by in factors.items()})
-
-
 def exchanged(*names: str) -> Callable[[Motion], Motion]:
     """Write columns of joint 2 for those of joint 1."""
     return lambda motion: replace(motion, **{name: getattr(motion, name)[:, ::-1] for name in names})
@@ -379,21 +389,6 @@ def test_exchanged_columns_leave_the_scale_to_the_joint(tmp_path, upright, mista
     verdict = judged(tmp_path, spoil(other), more="[scale]\nq = [1.0, -1.0]\ntau_J = [1.0, -0.5]\n").verdict
     assert said in verdict.reasons[0]
     assert verdict.remedy == f"in the map: exchange them in {remedy}"
-
-
-@pytest.mark.parametrize(
-    ("spoil", "said", "remedy"),
-    [
-        (times(tau=[1, 1e3]), "the torque of joint2 (tau2) reaches", "torques are mNm: `scale.tau_J` = [1, 0.001]"),
-        (times(q=[1, 57.29578]), "joint2 (q2) goes to", "positions are degrees: `scale.q` = [1, 0.0174533]"),
-    ],
-    ids=["mNm", "degrees"],
-)
-def test_the_unit_of_one_joint_alone_is_its_scale(tmp_path, upright, spoil, said, remedy):
-    verdict = judged(tmp_path, spoil(upright)).verdict
-    assert not verdict.is_explained
-    assert verdict.reasons[0].startswith(said)
-    assert verdict.remedy == f"if the {remedy}"
 
 
 def test_torques_of_an_unknown_unit_are_not_said_to_be_what_the_map_has(tmp_path, upright):
