@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.lab.score.run_arrays import CertifiedStream, CycleColumns, PaperStream, Run, columns_of_records
+from adacd_hil.lab.score.run_arrays import (
+    CertifiedStream,
+    CycleColumns,
+    MeasuredMotion,
+    PaperStream,
+    Run,
+    columns_of_records,
+)
 from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.types.topics import ChannelId, pack_contact, pack_cycle, pack_scheme
@@ -180,6 +187,12 @@ def touched_run() -> Run:
 def with_columns(run: Run, **columns: NDArray[np.int64]) -> Run:
     """Give the run other columns of /cycle."""
     return replace(run, timing=replace(run.timing, columns={**run.timing.columns, **columns}))
+
+
+def with_motion(run: Run) -> Run:
+    """Give the run measured motion: both joints rest at 0.25 rad."""
+    q = np.full((len(run.cycle), 2), 0.25)
+    return replace(run, motion=MeasuredMotion(q, 0.0 * q, 0.0 * q))
 
 
 def like_an_old_log(run: Run) -> Run:

@@ -9,7 +9,7 @@ from hand_made_run import EPOCH_NS, A, M, make_certified_run, make_run, with_col
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.report_wording import percent_text
 from adacd_hil.lab.score.run_arrays import CheckCounts, CycleColumns
-from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_faults
+from adacd_hil.lab.score.run_faults import find_faults
 from adacd_hil.lab.score.verdict import data_text
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, SchemeState
@@ -55,17 +55,6 @@ def test_the_worst_second_tells_whether_too_much_was_missing(stays, rows, worst)
     assert data.worst_incomplete == pytest.approx(worst)
     text = f"incomplete cycles: {100 * worst:.2g} % of the cycles of a second, 10 % allowed"
     assert data.excesses == ((text,) if worst > 0.1 else ())
-
-
-@pytest.mark.parametrize("size", [1, 333])
-def test_pieces_come_to_the_same_as_the_whole(size):
-    run = make_run((A, 700), (SchemeState.FAULT, 50), (A, 900), (M, 1700))
-    run = missing_frames(run, np.random.default_rng(1).random(len(run.cycle)) < 0.05, age=1)
-    gatherer = CyclicDataGatherer(run.settings)
-    for start in range(0, len(run.cycle), size):
-        rows = np.arange(start, min(start + size, len(run.cycle)))
-        gatherer.add_columns(run.timing.rows(rows), run.cycle[rows], run.state[rows])
-    assert gatherer.data(run) == gather_data(run)
 
 
 def test_a_log_that_lacks_the_counts_is_not_called_free_of_losses():

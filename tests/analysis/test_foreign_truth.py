@@ -111,11 +111,6 @@ def test_a_report_without_the_truth_of_another_run_says_so(tmp_path):
     assert "truth.mcap is of another run: its scenario is idle, the log's paper" in report.as_text()
 
 
-@pytest.mark.slow
-def test_host_and_emulator_write_logs_of_one_run(log):
-    assert foreign_truth(log, log.with_name("truth.mcap")) == ""
-
-
 def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end():
     nothing = np.zeros(1, np.int64)
     truth = Truth(

@@ -96,27 +96,21 @@ WRONG = {
 }
 
 
-@pytest.mark.parametrize("line", WRONG)
-def test_arrays_that_can_not_be_used_are_one_line(arm, arrays, line):
-    with pytest.raises(ArrayError, match=f"^{re.escape(line)}$"):
-        detect(WRONG[line](arrays), arm)
+OPTIONS = {
+    "fit_s = (105, 101) s ends before it begins": {"fit_s": (105.0, 101.0)},
+    "too little free motion to fit from 200 to 300 s: 100 samples in a row are the least": {"fit_s": (200.0, 300.0)},
+    "noise_Nm has 2 values, the arm 1 joints": {"noise_Nm": (0.1, 0.1)},
+    "`deviations` = 0.0 is below 1": {"deviations": 0.0},
+    "unknown key `deviation`; did you mean `deviations`?": {"deviation": 5.0},
+    "velocity_lag_s = -1 s is not within 0 to 0.05 s": {"velocity_lag_s": -1.0},
+}
 
 
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        ({"fit_s": (105.0, 101.0)}, "fit_s = (105, 101) s ends before it begins"),
-        ({"fit_s": (200.0, 300.0)}, "too little free motion to fit from 200 to 300 s: 100 samples "
-         "in a row are the least"),
-        ({"noise_Nm": (0.1, 0.1)}, "noise_Nm has 2 values, the arm 1 joints"),
-        ({"deviations": 0.0}, "`deviations` = 0.0 is below 1"),
-        ({"deviation": 5.0}, "unknown key `deviation`; did you mean `deviations`?"),
-        ({"velocity_lag_s": -1.0}, "velocity_lag_s = -1 s is not within 0 to 0.05 s"),
-    ],
-)  # fmt: skip
-def test_options_that_can_not_be_are_one_line(arm, arrays, options, line):
+@pytest.mark.parametrize("line", [*WRONG, *OPTIONS])
+def test_arrays_and_options_that_can_not_be_used_are_one_line(arm, arrays, line):
+    change, options = WRONG.get(line, dict), OPTIONS.get(line, {})
     with pytest.raises(ArrayError, match=f"^{re.escape(line)}$"):
-        detect(arrays, arm, **options)
+        detect(change(arrays), arm, **options)
 
 
 def test_a_log_is_arrays_with_a_row_for_each_cycle(log):

@@ -68,12 +68,6 @@ def paths(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return write(folder / "a"), write(folder / "b", 25, change, other)
 
 
-def test_a_log_is_the_same_as_itself(paths):
-    found = compare_logs(paths[0], paths[0])
-    assert found.is_same
-    assert (found.cycles, found.fields, found.settings, found.notes) == (40, (), {}, ())
-
-
 def test_what_differs_is_named_with_its_first_cycle_and_by_how_much(paths):
     found = compare_logs(*paths)
     missing, q = found.fields

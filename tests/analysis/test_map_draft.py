@@ -202,14 +202,3 @@ def test_the_command_writes_a_map_that_identifies_the_arm_and_replaces_none(tmp_
     refused = identify("--init", recording, urdf)
     assert (refused.exit_code, described.read_text()) == (2, "# my own\n")
     assert "--map names a file for this one" in refused.stderr
-
-
-def test_init_takes_a_recording_and_a_urdf_and_identify_a_map(tmp_path):
-    (tmp_path / "r.csv").write_text("")
-    for arguments, said in (
-        (["--init", str(tmp_path / "r.csv")], "--init takes one recording and one URDF"),
-        ([str(tmp_path / "r.csv")], "--map is missing"),
-    ):
-        played = called("identify", *arguments)
-        assert played.exit_code == 2
-        assert said in played.stderr

@@ -7,9 +7,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from hand_made_run import make_certified_run, react, touch, touched_run
+from hand_made_run import make_certified_run, react, touch, touched_run, with_motion
 from jinja2 import UndefinedError
 from parsed_page import Page
 
@@ -22,7 +21,7 @@ from adacd_hil.lab.runs.run_summary import BROKEN, CERTIFIED, GOOD, CertificateS
 from adacd_hil.lab.runs.run_trend import trends
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
-from adacd_hil.lab.score.run_arrays import MeasuredMotion, Run
+from adacd_hil.lab.score.run_arrays import Run
 
 pytestmark = pytest.mark.slow
 
@@ -62,8 +61,7 @@ def certified_run() -> Run:
     run = make_certified_run()
     touch(run, 3000, 250, (5.0, 1.0), link=2)
     run = react(run, 3005, link=2, force_N=-9.0, force_sigma=0.5, lever_m=0.2, lever_sigma=0.01)
-    still = np.full((len(run.cycle), 2), 0.25)
-    return replace(run, motion=MeasuredMotion(still, still, still), log_start_ns=0)
+    return replace(with_motion(run), log_start_ns=0)
 
 
 def page_of(run: Run) -> str:

@@ -134,6 +134,11 @@ def drift(motion: Motion) -> Motion:
     return replace(motion, tau=np.cumsum(noise(motion.tau.shape), axis=0))
 
 
+def times(**factors: Any) -> Callable[[Motion], Motion]:
+    """Scale columns of a recording."""
+    return lambda motion: replace(motion, **{name: getattr(motion, name) * by for name, by in factors.items()})
+
+
 UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
     "a dead sensor": (
         lambda m: replace(m, tau=m.tau * [1.0, 0.0] + [0.0, 0.31]),
@@ -184,6 +189,16 @@ UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
         "check that encoder",
     ),
     "an arm at rest": (lambda m: still(m, 0, 1), "the arm does not move", "motion of every joint"),
+    "mNm at one joint": (
+        times(tau=[1, 1e3]),
+        "the torque of joint2 is 1000 times too large: so",
+        "in the map: `scale.tau_J` = [1, 0.001]",
+    ),
+    "degrees at one joint": (
+        times(q=[1, 57.29578]),
+        "joint2 (q2) goes to",
+        "if the positions are degrees: `scale.q` = [1, 0.0174533]",
+    ),
     "too short": (short, "too short: 0.9 s fitted and 0.6 s tested", "record more"),
 }
 
@@ -304,11 +319,6 @@ def gravity_torque(motion: Motion, *gravity_m_s2: tuple[float, float, float]) ->
     return rigid_torque(arm, np.array([motion.q, 0.0 * motion.q, 0.0 * motion.q]))
 
 
-def times(**factors: Any) -> Callable[[Motion], Motion]:
-    """Scale columns of a recording."""
-    return lambda motion: replace(motion, **{name: getattr(motion, name) * by for name, by in factors.items()})
-
-
 def exchanged(*names: str) -> Callable[[Motion], Motion]:
     """Write columns of joint 2 for those of joint 1."""
     return lambda motion: replace(motion, **{name: getattr(motion, name)[:, ::-1] for name in names})
@@ -319,7 +329,7 @@ def summed(motion: Motion) -> Motion:
     return replace(motion, q=motion.q @ SUMS.T, dq=motion.dq @ SUMS.T)
 
 
-MISTAKES: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
+MISTAKES: dict[str, tuple[Callable[[Motion], Motion] | str, str, str]] = {
     "mNm": (times(tau=1e3), "they are mNm", '`units.tau_J` = "mNm"'),
     "degrees": (times(q=1 / DEGREE, dq=1 / DEGREE), "the positions are degrees", '`units.q` = "deg"'),
     "a torque that is turned": (
@@ -370,14 +380,25 @@ MISTAKES: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
         "geared motors, which turn their rotors too",
         "`arm.has_rotors` = true",
     ),
+    "mNm that are none": ('[units]\ntau_J = "mNm"\n', "they are Nm", '`units.tau_J` = "Nm"'),
+    "degrees that are none": ('[units]\nq = "deg"\n', "the positions are radians", '`units.q` = "rad"'),
+    "a torque that the map turns": (
+        "[scale]\ntau_J = [1, -1]\n",
+        "joint2 has the other sign",
+        "`scale.tau_J` = [1, 1]",
+    ),
 }
+"""What is wrong with the recording, or keys of the map that are; what is said, and the remedy."""
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_a_common_mistake_is_named_with_its_key(tmp_path, upright, mistake):
     spoil, said, remedy = MISTAKES[mistake]
     has_dq = list(MISTAKES).index(mistake) % 2 == 0
-    verdict = judged(tmp_path, spoil(upright), has_dq=has_dq).verdict
+    if isinstance(spoil, str):
+        verdict = judged(tmp_path, upright, has_dq=has_dq, more=spoil).verdict
+    else:
+        verdict = judged(tmp_path, spoil(upright), has_dq=has_dq).verdict
     assert not verdict.is_explained
     assert said in verdict.reasons[0]
     assert verdict.remedy.startswith("in the map: ")
@@ -391,45 +412,6 @@ def test_exchanged_columns_leave_the_scale_to_the_joint(tmp_path, upright, mista
     verdict = judged(tmp_path, spoil(other), more="[scale]\nq = [1.0, -1.0]\ntau_J = [1.0, -0.5]\n").verdict
     assert said in verdict.reasons[0]
     assert verdict.remedy == f"in the map: exchange them in {remedy}"
-
-
-@pytest.mark.parametrize(
-    ("keys", "said", "remedy"),
-    [
-        ('[units]\ntau_J = "mNm"\n', "they are Nm", '`units.tau_J` = "Nm"'),
-        ('[units]\nq = "deg"\n', "the positions are radians", '`units.q` = "rad"'),
-        ("[scale]\ntau_J = [1.0, -1.0]\n", "the torque of joint2 has the other sign", "`scale.tau_J` = [1, 1]"),
-    ],
-    ids=["mNm that are none", "degrees that are none", "a torque that the map turns"],
-)
-def test_a_mistake_of_the_map_is_named_with_its_key(tmp_path, upright, keys, said, remedy):
-    verdict = judged(tmp_path, upright, more=keys).verdict
-    assert not verdict.is_explained
-    assert said in verdict.reasons[0]
-    assert verdict.remedy == f"in the map: {remedy}"
-
-
-@pytest.mark.parametrize(
-    ("spoil", "said", "remedy"),
-    [
-        (
-            times(tau=[1, 1e3]),
-            "the torque of joint2 is 1000 times too large: so",
-            "in the map: `scale.tau_J` = [1, 0.001]",
-        ),
-        (
-            times(q=[1, 57.29578]),
-            "joint2 (q2) goes to",
-            "if the positions are degrees: `scale.q` = [1, 0.0174533]",
-        ),
-    ],
-    ids=["mNm", "degrees"],
-)
-def test_the_unit_of_one_joint_alone_is_its_scale(tmp_path, upright, spoil, said, remedy):
-    verdict = judged(tmp_path, spoil(upright)).verdict
-    assert not verdict.is_explained
-    assert verdict.reasons[0].startswith(said)
-    assert verdict.remedy == remedy
 
 
 def test_torques_of_an_unknown_unit_are_not_said_to_be_what_the_map_has(tmp_path, upright):

@@ -1,6 +1,5 @@
 """A log is replayed: the same bits come out, and what isn't the same, or isn't there, is named."""
 
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,14 +79,6 @@ def test_the_frames_are_read_by_the_devices_of_the_run_whatever_became_of_their_
         (found,) = replay_source(source, [source.settings], script_of=ScriptedOperator, by_frames=True)
         assert (found.mismatch_count, found.arms_compared) == (0, found.cycles)
         assert found.cycles > 1000
-
-
-@pytest.mark.parametrize("by_frames", [False, True])
-def test_a_replay_needs_no_temporary_folder(log, monkeypatch, tmp_path, by_frames):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "absent"))
-    source = LogSource(log)
-    (found,) = replay_source(source, [source.settings], script_of=ScriptedOperator, by_frames=by_frames)
-    assert found.mismatch_count == 0
 
 
 def test_without_the_states_of_the_arm_a_proof_by_frames_is_not_whole(log, whole):

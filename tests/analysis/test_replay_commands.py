@@ -5,7 +5,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from analysis.replay_rig import write_candump
 from called import called, complaints
 from log.made_log import flipped as bit_flipped
 from log.made_log import kinds, put_together, rechunk, take_apart
@@ -120,13 +119,6 @@ def test_settings_that_cant_be_used_end_with_status_2(log, arguments, line):
     done = called("replay", log, *arguments)
     assert done.exit_code == USAGE
     assert line in done.stderr
-
-
-def test_a_recording_alone_needs_a_configuration(log, tmp_path):
-    write_candump(log, tmp_path / "bus.log")
-    done = called("replay", tmp_path / "bus.log")
-    assert done.exit_code == USAGE
-    assert "--against the log of its run, or --config" in done.stderr
 
 
 def test_two_logs_compare_with_status_0_if_the_same_3_as_far_as_whole_else_1(log, flipped, tmp_path):

@@ -49,11 +49,6 @@ def test_every_run_of_a_folder_is_reported_and_one_that_cannot_be_keeps_none_bac
     assert set(tables[2]) == {"folder", "problem"}
 
 
-def test_a_folder_without_a_run_is_one_line(tmp_path):
-    found = report(tmp_path)
-    assert (found.exit_code, found.stderr) == (1, f"adacd-hil: {tmp_path} has no run.mcap, nor has any folder in it\n")
-
-
 @pytest.mark.long
 def test_a_folder_with_a_run_is_that_run_and_several_are_reported_in_folders_of_their_names(folder, tmp_path):
     one = report(folder / "b" / "deep", "--out", tmp_path / "one")

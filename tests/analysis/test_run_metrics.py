@@ -19,7 +19,6 @@ from hand_made_run import (
     react,
     touch,
     touched_run,
-    without_cycles,
 )
 
 from adacd_hil.lab.score.evaluation import evaluate
@@ -409,8 +408,3 @@ def test_the_verdict_says_how_it_went_and_a_run_is_clean_if_nothing_went_wrong(r
     metrics = evaluate(run)
     assert [part for part in parts if part not in metrics.verdict] == []
     assert metrics.is_clean is is_clean
-
-
-def test_a_log_without_cycles_has_no_sections():
-    metrics = evaluate(without_cycles(make_run((A, 1))))
-    assert (metrics.sections, metrics.cycle["count"]) == ((), 0)

@@ -121,24 +121,8 @@ def test_the_table_says_what_happened(table, path, value):
     assert at(table, path) == value
 
 
-def test_the_table_in_the_file_is_the_reports(report, table):
-    assert table == report.content
-
-
 def table_of(run):
     return report_json(evaluate(run), run.metadata, SOURCE)
-
-
-def test_a_value_that_is_not_finite_becomes_null():
-    run = make_run((A, 100), (M, 100))
-    run.tau_ext_hat[150, 0] = float("nan")
-    table = table_of(run)
-    assert table["frozen_residual_max_Nm"]["B"]["identified"] == [None, 0.0]
-
-
-def test_a_fault_is_in_the_table():
-    run = make_run((A, 100), (SchemeState.FAULT, 5), reason=FaultReason.DATA_AGE)
-    assert table_of(run)["fault"] == {"reason": "DATA_AGE", "at_s": 0.1}
 
 
 def test_the_text_says_what_went_wrong_what_to_do_and_where_the_page_is(report):

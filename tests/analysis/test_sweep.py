@@ -182,24 +182,6 @@ def test_a_part_that_is_damaged_is_named(tmp_path, client):
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        ((), "a sweep is of LOGS or of --scenario"),
-        (("--scenario", "papr"), "did you mean 'paper'?"),
-        (("--scenario", "paper", "--seeds", "9:1"), "--seeds '9:1'"),
-        (("--scenario", "paper", "--vary", "detector.treshold_Nm=1"), "did you mean `detector.threshold_Nm`?"),
-        (("none.mcap",), "log none.mcap does not exist"),
-    ],
-)
-def test_a_wrong_plan_is_one_line_before_anything_runs(tmp_path, arguments, line):
-    played = called("sweep", *arguments, "--out", tmp_path / "out")
-    assert played.exit_code in (1, 2)
-    assert line in played.stderr
-    assert len(played.stderr.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_row_of_a_log_says_what_its_replay_came_to(log, whole):
     variants = [{}, {"detector.threshold_Nm": "9.0"}, {"detector.threshold_Nm": "-1"}]
     (task,) = plan_logs([log], variants, "", "", "1").tasks(frozenset(), 10)

@@ -7,37 +7,26 @@ from pathlib import Path
 import pytest
 from called import called
 from hang import HANG_S
-from made_certificates import self_signed
 
 distributed = pytest.importorskip("distributed")
 parquet = pytest.importorskip("pyarrow.parquet")
 
 
 @pytest.fixture(scope="module")
-def signed(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    return self_signed(tmp_path_factory.mktemp("tls"), "lab")
+def security():
+    """A certificate that is its own authority, and its key, for scheduler, workers and clients."""
+    return distributed.Security.temporary()
 
 
-@pytest.fixture(scope="module")
-def cluster(signed):
-    """A scheduler and a worker at tls://, that trust the certificate of the lab."""
-    certificate, key = map(str, signed)
-    of_all = {
-        f"tls_{who}_{what}": value
-        for who in ("client", "scheduler", "worker")
-        for what, value in (("cert", certificate), ("key", key))
-    }
-    security = distributed.Security(require_encryption=True, tls_ca_file=certificate, **of_all)
-    with distributed.LocalCluster(
-        n_workers=1,
-        threads_per_worker=1,
-        processes=False,
-        protocol="tls",
-        dashboard_address=None,
-        silence_logs=50,
-        security=security,
-    ) as cluster:
-        yield cluster
+def pem_files(folder: Path, security) -> list[object]:
+    """Write them, and name them to the command."""
+    words: list[object] = []
+    for option in ("--tls-ca-file", "--tls-cert", "--tls-key"):
+        content = security.tls_client_key if option == "--tls-key" else security.tls_ca_file
+        path = folder / f"{option[2:]}.pem"
+        path.write_text(content)
+        words += [option, path]
+    return words
 
 
 def sweep(folder: Path, log: Path, *more: object) -> "subprocess.CompletedProcess[str]":
@@ -47,14 +36,12 @@ def sweep(folder: Path, log: Path, *more: object) -> "subprocess.CompletedProces
     return subprocess.run(command, capture_output=True, text=True, timeout=HANG_S, check=False, cwd=folder)
 
 
-def files(signed: tuple[Path, Path]) -> list[object]:
-    certificate, key = signed
-    return ["--tls-ca-file", certificate, "--tls-cert", certificate, "--tls-key", key]
-
-
 @pytest.mark.long
-def test_a_small_sweep_over_tls(tmp_path, log, cluster, signed):
-    played = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *files(signed))
+def test_a_small_sweep_over_tls(tmp_path, log, security):
+    quiet = {"dashboard_address": None, "silence_logs": 50}
+    one = {"n_workers": 1, "threads_per_worker": 1, "processes": False}
+    with distributed.LocalCluster(protocol="tls", security=security, **one, **quiet) as cluster:
+        played = sweep(tmp_path, log, "--scheduler", cluster.scheduler_address, *pem_files(tmp_path, security))
     assert (played.returncode, "is open" in played.stderr) == (0, False)
     rows = parquet.read_table(tmp_path / "out/sweep.parquet").to_pylist()
     assert [(row["set.detector.threshold_Nm"], row["status"]) for row in rows] == [("0.1", "ok"), ("0.4", "ok")]
@@ -73,10 +60,12 @@ def test_a_small_sweep_over_tls(tmp_path, log, cluster, signed):
         ({"--scheduler": "tcp://127.0.0.1:1"}, "are for tls:// addresses, not tcp://127.0.0.1:1"),
     ],
 )
-def test_certificates_that_cant_be_used_are_one_line_and_status_2(tmp_path, log, signed, monkeypatch, changes, reason):
+def test_certificates_that_cant_be_used_are_one_line_and_status_2(
+    tmp_path, log, security, monkeypatch, changes, reason
+):
     (tmp_path / "text.pem").write_text("no certificate\n")
-    self_signed(tmp_path, "other")[1].rename(tmp_path / "other.pem")
-    given = files(signed)
+    (tmp_path / "other.pem").write_text(distributed.Security.temporary().tls_client_key)
+    given = pem_files(tmp_path, security)
     words: dict[object, object] = {
         "--scheduler": "tls://127.0.0.1:1",
         **dict(zip(given[::2], given[1::2], strict=True)),

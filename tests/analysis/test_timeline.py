@@ -5,24 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_run import A, M, make_run, react, touch, touched_run, without_cycles
+from hand_made_run import A, make_run, react, touch, touched_run, with_motion
 
 from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.run_page import CARDS, Push, contact_cards, draw_arm
-from adacd_hil.lab.report.timeline import notices_of, state_key, stays_of, timeline_of
+from adacd_hil.lab.report.timeline import notices_of, state_key, timeline_of
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.lab.score.run_arrays import MeasuredMotion
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, Location, SchemeState
-
-
-def test_stays_follow_one_another_without_a_gap():
-    stays = stays_of(make_run((A, 100), (M, 200), (A, 50)))
-    assert [(stay.state.name, stay.start_s, stay.end_s) for stay in stays] == [
-        ("ADAPT", 0.0, 0.1),
-        ("MONITOR", 0.1, pytest.approx(0.3)),
-        ("ADAPT", pytest.approx(0.3), pytest.approx(0.349)),
-    ]
 
 
 def drawn(run):
@@ -66,11 +56,6 @@ def test_many_warnings_do_not_crowd_out_a_fault():
     assert (len(notices), notices[-1].text) == (300, "fault")
 
 
-def test_a_run_without_cycles_has_no_timeline():
-    run = make_run((A, 1))
-    assert timeline_of(without_cycles(run), evaluate(run)) is None
-
-
 LENGTHS = (0.4, 0.3)
 
 
@@ -105,13 +90,8 @@ def carded(run):
     return render("contact_cards.html.j2", cards=contact_cards(metrics, run), metrics=metrics)
 
 
-def moved(run):
-    still = np.zeros((len(run.cycle), 2))
-    return replace(run, motion=MeasuredMotion(still + 0.25, still, still))
-
-
 def test_each_contact_has_a_card_with_the_arm_at_its_moment():
-    run = moved(touched_run())
+    run = with_motion(touched_run())
     run.motion.q[2005] = (1.0, -1.5)
     html = carded(run)
     assert "Arm at contact 1, joints at 1.00 and -1.50 rad, link 1 touched" in html
@@ -130,7 +110,7 @@ def test_a_card_marks_the_wrong_link_but_not_a_contact_that_detection_was_off_fo
 
 
 def test_a_known_force_is_drawn_where_the_report_has_it():
-    run = moved(make_run())
+    run = with_motion(make_run())
     touch(run, 2000, 250, (5.0, 1.0), link=2)
     told = {"location": Location.KNOWN, "force_N": -9.0, "force_sigma": 0.5, "lever_m": 0.2, "lever_sigma": 0.01}
     html = carded(react(run, 2005, link=2, **told))

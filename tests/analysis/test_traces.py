@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hand_made_run import make_certified_run, make_run, react, touch
+from hand_made_run import make_certified_run, make_run, react, touch, with_motion
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -17,7 +17,6 @@ from adacd_hil.lab.report.page import render
 from adacd_hil.lab.report.timeline import traces_of
 from adacd_hil.lab.report.traces import pack, panels_of, step_of
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.lab.score.run_arrays import MeasuredMotion
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event
 
@@ -61,17 +60,10 @@ def test_a_step_is_half_the_noise_and_no_finer_than_asked_for():
     assert step_of(gaps, 1e-3) == 1e-3
 
 
-def moved(run):
-    """Give a run measured motion."""
-    rows = np.arange(len(run.cycle), dtype=np.float64)
-    q = np.column_stack((np.sin(rows / 400.0), np.cos(rows / 300.0)))
-    return replace(run, motion=MeasuredMotion(q, 2.0 * q, 3.0 * q))
-
-
 def test_a_run_has_a_panel_for_what_it_measured():
     residuals, parameters = ["residual1", "residual2"], ["theta-a1", "theta-F_v1", "theta-F_c1"]
     for run, measured in (
-        (moved(make_run()), ["q", "dq", "tau_J"]),
+        (with_motion(make_run()), ["q", "dq", "tau_J"]),
         (make_run(), []),
         (make_certified_run(), ["channels1", "channels2", "share"]),
     ):
@@ -131,7 +123,7 @@ def plan_of(html):
 @pytest.fixture(scope="module")
 def shown():
     """Give a run with a contact and a fault, and its section of traces."""
-    run = moved(make_run())
+    run = with_motion(make_run())
     touch(run, 2000, 250, (5.0, 0.0))
     run = react(run, 2005)
     run.state[9300:] = 8

@@ -45,8 +45,6 @@ def test_a_list_a_number_a_quoted_and_a_bare_word_are_taken():
     [
         ("detector.treshold_Nm", "0.1", "unknown key `detector.treshold_Nm`; did you mean `detector.threshold_Nm`?"),
         ("threshold_Nm", "0.1", "did you mean `detector.threshold_Nm`?"),
-        ("detectr.threshold_Nm", "0.1", "did you mean `detector.threshold_Nm`?"),
-        ("detector", "0.1", "`detector` is a section; its keys are detector.threshold_Nm"),
         ("filter.a_rad_s", "-1", "`filter.a_rad_s` = -1.0 rad/s is below 0.1 rad/s"),
         ("filter.a_rad_s", "fast", "`filter.a_rad_s` = 'fast' must be of type float"),
         ("filter.a_rad_s", "[1", "`filter.a_rad_s` = [1 is not a TOML value"),

@@ -46,14 +46,6 @@ def test_a_configuration_without_a_script_gets_the_demo_s_user(tmp_path):
     assert resolve(str(mine), "paper", None, None).settings.operator == load_settings(str(mine)).operator
 
 
-def test_on_what_may_be_hardware_no_scenario_s_user_acknowledges():
-    result = called("run", "-i", "slcan", "-c", "/dev/null", "--scenario", "paper")
-    assert result.exit_code == ExitCode.USAGE
-    assert result.stderr.splitlines() == [
-        "adacd-hil: --scenario paper plays the user of an emulated arm; slcan /dev/null may be hardware: leave it out"
-    ]
-
-
 def test_an_emulated_arm_says_what_its_motors_hold_unless_the_configuration_does(tmp_path):
     assert resolve("certified", "idle", None, None).settings.arm.holding_torque_Nm == (0.0, 0.0)
     geared = resolve("certified", "motor-side-friction", None, None)

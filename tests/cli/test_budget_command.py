@@ -108,32 +108,3 @@ def test_without_a_dbc_it_is_the_contract_of_the_configured_devices(tmp_path, de
     found = json.loads(budget("--config", str(config), "--json").stdout)
     assert found["contract"].startswith(name)
     assert found["worst_bits"] == bits
-
-
-ARM = (Path(__file__).parents[2] / "dbc" / "arm.dbc").read_text()
-
-
-MANY = "".join(
-    f'\nBO_ {1 << 31 | number} M{number}: 1 Host\n SG_ a : 0|8@1+ (1,0) [0|0] "" X\n' for number in range(1000)
-)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("text", "line"),
-    [
-        (40 * ARM, "message Nmt is defined more than once"),
-        (ARM.replace(" Drive2Emcy:", " Drive1Emcy:"), "message Drive1Emcy is defined more than once"),
-        (ARM.replace("BO_ 130 Drive2Emcy", "BO_ 129 Drive2Emcy"), "Drive1Emcy and Drive2Emcy have the same identifier"),
-        (ARM + MANY, "1029 messages are more than 1000"),
-    ],
-    ids=["40 times", "a name", "an identifier", "too many"],
-)
-def test_messages_that_are_defined_twice_or_too_many_are_one_line(text, line, tmp_path):
-    path = tmp_path / "x.dbc"
-    path.write_text(text)
-    done = budget("--dbc", str(path))
-    assert (done.exit_code, done.stdout) == (USAGE, "")
-    (complaint,) = done.stderr.splitlines()
-    assert complaint.startswith(f"adacd-hil: DBC {path}: ")
-    assert line in complaint

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bus_lab import BUS_MISSING, SHORT_RUN, USAGE, Lab, answered
+from bus_lab import BUS_MISSING, USAGE, Lab, answered
 from called import called, complaints
 
 from adacd_hil.cli.commands.run_command import ask_first_run
@@ -119,13 +119,6 @@ def test_a_certificate_is_not_added_to_what_another_arm_has_made_meanwhile(lab, 
     with pytest.raises(ConfigError, match=r"serial number 101 is not the 1 of history .*: it is another arm's"):
         used.add_certificates((), mine, Origin("2026-11-22T10:00:00Z", "run.mcap", "P", "1"))
     assert path.read_text() == first_history
-
-
-def test_a_scheme_without_certificates_has_no_history(lab):
-    lab.settings_file.write_text(SHORT_RUN)
-    result = lab.run("--history", str(lab.folder / "arm.toml"))
-    assert result.exit_code == USAGE
-    assert complaints(result)[0].startswith("adacd-hil: --history: scheme 'paper'")
 
 
 def test_the_picture_replaces_an_earlier_one_and_nothing_else(file, first_history):

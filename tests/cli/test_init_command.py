@@ -46,10 +46,6 @@ URDF = """<robot name="lab">
 </robot>"""
 
 
-INT32 = ("--sensor", "int32-sensor", "int32-sensor")
-MIXED = ("--drive", "maxon-epos4", "stock-drive")
-
-
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
     return tmp_path / "lab" / "my-arm.toml"
@@ -71,33 +67,6 @@ def urdf(folder: Path, axis: str = "0 0 1", wrist: str = "fixed") -> Path:
     path = folder / "lab.urdf"
     path.write_text(URDF.format(axis=axis, wrist=wrist))
     return path
-
-
-@pytest.mark.parametrize(
-    ("options", "line"),
-    [
-        ((), "give --channel or --no-bus"),
-        (("--no-bus",), "or --yes for 0.35 0.3"),
-        ((*NO_BUS, "--drive-node", "3", "4"), "node ids 3, 4, 3, 4 of drives and sensors must differ"),
-        ((*NO_BUS, "--mounting", "flor"), "'flor' must be flat, floor"),
-        ((*NO_BUS, "--mounting", "100"), "0 to 90 deg"),
-        ((*NO_BUS, "--mounting", "floor", "--flat"), "give one of them"),
-        ((*NO_BUS, "--at-zero", "up"), "--at-zero is of an arm that gravity reaches"),
-        ((*NO_BUS, "--eds", "float.eds"), "its 0x6130:1 is a float, which no frame of a cycle can hold"),
-        ((*NO_BUS, "--gear", "3", "3"), "profile adacd-drive of joint 1 has its own `scale.gear_ratio` = 1;"),
-        ((*NO_BUS, *MIXED, "--gear", "100", "100"), "--gear: profile stock-drive of joint 2 has its own `scale.gear_r"),
-        ((*NO_BUS, *INT32, "--torque-count-nm", "1e-3", "1e-3"), "profile int32-sensor of joint 1 has its own"),
-        (("--from", ".", "--length-m", "1", "1"), "leave out --length-m"),
-        ((*NO_BUS, "--torque-limit-nm", "4", "0"), "`arm.torque_limit_Nm[1]` = 0 Nm: joint 2 can't move"),
-    ],
-)
-def test_options_that_are_missing_or_wrong_are_named_and_nothing_is_written(tmp_path, out, monkeypatch, options, line):
-    monkeypatch.chdir(tmp_path)
-    Path("float.eds").write_text((contract_folder() / "int32_sensor.eds").read_text().replace("9130", "6130"))
-    result = init(out, *options)
-    assert result.exit_code == USAGE
-    assert line in result.stderr.splitlines()[-1]
-    assert not out.parent.exists()
 
 
 def test_guesses_are_listed_and_doctor_asks_for_each(out):

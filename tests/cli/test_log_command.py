@@ -140,13 +140,6 @@ def test_events_of_a_log_stay_within_their_line(tmp_path):
     assert line == "  error: arm: fell\\u000aproblem: none"
 
 
-@pytest.mark.parametrize(("text", "what"), [("", "empty"), ("(1.000000) can0 123#11\n" * 100, "not an MCAP file")])
-def test_info_of_another_file_is_an_error(tmp_path, text, what):
-    (tmp_path / "x.mcap").write_text(text)
-    code, out, err = call("info", tmp_path / "x.mcap")
-    assert (code, out, err) == (1, "", f"adacd-hil: {tmp_path / 'x.mcap'} is {what}\n")
-
-
 @pytest.mark.parametrize(("end", "status"), [(None, 0), (-30, 3)])
 def test_info_of_a_log_without_its_beginning_shows_what_is_there(end, status, recorded, tmp_path):
     (tmp_path / "x.mcap").write_bytes(b"spoilt.." + recorded.read_bytes()[8:end])
@@ -166,17 +159,3 @@ def test_cut_takes_a_stretch_by_time_or_contact(recorded, tmp_path):
     assert (info["cycles"], info["contacts"]) == (20, 1)  # the second is of cycle 70
     code, text, _ = call("cut", recorded, "--out", out, "--json")
     assert (json.loads(text)["from_s"], json.loads(text)["until_s"]) == (None, None)
-
-
-def test_a_stretch_that_makes_no_sense_is_wrong_usage(recorded, tmp_path):
-    assert call("cut", recorded, "--contact", "1", "--from", "1", "--out", tmp_path / "out.mcap")[0] == 2
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_merge_names_its_successors_and_touches_nothing(tmp_path):
-    path = write(tmp_path / "x.mcap")
-    code, text, err = call("merge", path, path, "--out", "both.mcap", "--prefix")
-    assert (code, text) == (2, "")
-    assert "mcap merge" in err
-    assert "log cut" in err
-    assert list(tmp_path.iterdir()) == [path]

@@ -6,7 +6,7 @@ from called import called
 from rig import CODEC, Rig
 
 from adacd_hil.cli.connection import Connection
-from adacd_hil.lab.cli.monitor_command import Monitor, Screen, as_text
+from adacd_hil.lab.cli.monitor_command import Monitor, as_text
 from adacd_hil.wire.bus import Frame
 
 
@@ -74,14 +74,6 @@ def test_a_full_bus_ends_in_time_and_misses_nothing():
     watched.listen(0.2)
     assert 0.2 <= (rig.clock.now_ns() - begin_ns) * 1e-9 < 0.215  # a batch later at most
     assert watched.describe()["frames"] in range(4000, 4300)
-
-
-def test_without_a_terminal_lines_are_plain():
-    written: list[str] = []
-    screen = Screen(False, written.append)
-    screen.draw_table("a\nb")
-    assert written == ["a\nb\n\n"]
-    assert (screen.redraw_s, Screen(True, written.append).redraw_s) == (1.0, 0.2)
 
 
 def test_a_silent_bus_is_said_to_be_and_json_is_one_snapshot():

@@ -101,11 +101,6 @@ def test_a_real_bus_gets_what_devices_send_and_commands_when_asked_for(log, list
     assert len(heard(listener)) == 6
 
 
-def test_what_is_no_recording_is_said_before_the_bus_is_opened(tmp_path):
-    done = CliRunner().invoke(play, [str(tmp_path / "x.mcap"), "-i", "socketcan", "-c", "none"])
-    assert (done.exit_code, "x.mcap can't be read: No such file" in done.stderr) == (1, True)
-
-
 def test_a_damaged_recording_is_played_up_to_its_damage_and_partial(log, listener):
     log.write_bytes(log.read_bytes()[:-20])
     done = run(log)

@@ -53,15 +53,6 @@ def fill(path: Path, content: str) -> None:
     raise OSError(errno.ENOSPC, "No space left on device", f".{path.name}.part")
 
 
-@pytest.mark.parametrize("words", [("excitation",), ("tune", "none.mcap"), ("thresholds", "none.mcap")])
-def test_each_search_tries_its_place(words, tmp_path):
-    (tmp_path / "file").touch()
-    done = called(*words, "--out", tmp_path / "file" / "x.toml")
-    assert (done.exit_code, done.stdout) == (FAILURE, "")
-    (complaint,) = done.stderr.splitlines()
-    assert f"x.toml can't be written: {tmp_path / 'file'} is no folder" in complaint
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("json_words", [(), ("--json",)], ids=["text", "json"])
 def test_an_excitation_that_has_no_room_is_not_lost(json_words, tmp_path, monkeypatch):

@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 import pytest
-from bus_lab import BUS_MISSING, SHORT_RUN, Lab, answered
-from called import called, complaints
+from bus_lab import SHORT_RUN, Lab, answered
+from called import complaints
 
 from adacd_hil.cli.commands.run_command import as_text, ask_without_anchor, next_of_run, summarise
 from adacd_hil.cli.embedded_run import resolve, run_embedded
@@ -67,11 +67,23 @@ def test_off_a_terminal_an_arm_without_an_anchor_is_refused_unless_that_is_told(
     assert lab.run("--without-anchor").exit_code == 0
 
 
-@pytest.mark.parametrize("interface", ["socketcan", "sockercan", "udp_multicast"])
-def test_an_interface_that_cannot_be_used_is_named_before_any_question(interface):
-    result = called("run", "-i", interface, "-c", "can77", "--config", "certified")
-    assert result.exit_code == BUS_MISSING
-    assert "torque offset" not in result.stderr
+@pytest.mark.parametrize(
+    ("assumed", "line"),
+    [
+        ([], None),
+        (["arm.sign"], "`arm.sign`; `adacd-hil doctor` asks for each"),
+        (
+            ["arm.sign", "arm.joint", "arm.link_length_m", "arm.rated_torque_Nm", "devices.drive1.node", "bus.bitrate"],
+            "`arm.sign`, `arm.joint`, `arm.link_length_m`, `arm.rated_torque_Nm` and 2 more; "
+            "`adacd-hil config check` names all",
+        ),
+    ],
+)
+def test_a_run_names_at_once_what_nobody_has_confirmed(assumed, line, tmp_path, monkeypatch):
+    lab = Lab(tmp_path, monkeypatch)
+    lab.settings_file.write_text(f"assumed = {assumed}\n{SHORT_RUN}")
+    first = lab.run().stderr.splitlines()[0]
+    assert first == f"warning: unconfirmed guesses: {line}" if line else "unconfirmed" not in first
 
 
 @pytest.mark.slow

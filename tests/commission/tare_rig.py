@@ -11,7 +11,7 @@ from adacd_hil.device.device_files import place_devices
 from adacd_hil.lab.commission.tare_session import TareSession
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from firmware_sim.scenario.scenario import load_scenario
+from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 FEEDBACK_IDS, TORQUE_IDS = (0x181, 0x182), (0x183, 0x184)
 WINDOW_S = 0.3
@@ -30,43 +30,20 @@ def tare_settings(estimator: dict[str, Any] | None = None, arm: dict[str, Any] |
     )
 
 
-class TareRig(Rig):
-    """A tare session with the emulator. Angles in rad, joint torques in Nm, all in device direction.
+class HandledRig(Rig):
+    """An arm that somebody handles. Angles in rad, joint torques in Nm, all in device direction.
 
     `hand`: pose offset (2,) by cycle, added to what the encoders say. `push`: torque (2,) by cycle and pose, added to
     what the sensors say.
     """
 
-    def __init__(
-        self,
-        settings: Settings | None = None,
-        is_auto_zeroing: bool = False,
-        old_offset_Nm: tuple[float, float] = (0.0, 0.0),
-        **scenario: Any,
-    ) -> None:
-        self.lines: list[str] = []
-        self.on_line: Callable[[str], None] = lambda line: None
+    def __init__(self, settings: Settings | str = "paper", scenario: Scenario | None = None, **parts: Any) -> None:
         self.hand: Callable[[int], np.ndarray] = lambda cycle: np.zeros(2)
         self.push: Callable[[int, np.ndarray], np.ndarray] = lambda cycle, q: np.zeros(2)
         self._senders = [CODEC.message(f"Sensor{joint}Torque").sender() for joint in (1, 2)]
-        played = dataclasses.replace(load_scenario("idle", "P"), **scenario)
+        played = scenario or load_scenario("idle", "P")
         self.start_rad = played.start_rad
-        super().__init__(settings or tare_settings(), played)
-        self.session = TareSession(
-            self.settings,
-            CODEC,
-            place_devices(self.settings),
-            self.bus,
-            self.clock,
-            "embedded",
-            old_offset_Nm,
-            is_auto_zeroing,
-            self._progress,
-        )
-
-    def _progress(self, line: str) -> None:
-        self.lines.append(line)
-        self.on_line(line)
+        super().__init__(settings, played, **parts)
 
     def deliver(self, can_id: int, data: bytes) -> None:
         """Pass on what a device sends, as the hand and the push make it."""
@@ -89,6 +66,28 @@ class TareRig(Rig):
         frame = message.encode(torque + self.push(cycle, self.start_rad + self.hand(cycle))[joint])
         frame[1] = data[1] & 0xF0
         return self._senders[joint].protect(frame)
+
+
+class TareRig(HandledRig):
+    """A tare session with the emulator."""
+
+    def __init__(
+        self,
+        settings: Settings | None = None,
+        is_auto_zeroing: bool = False,
+        old_offset_Nm: tuple[float, float] = (0.0, 0.0),
+        **scenario: Any,
+    ) -> None:
+        self.lines: list[str] = []
+        self.on_line: Callable[[str], None] = lambda line: None
+        super().__init__(settings or tare_settings(), dataclasses.replace(load_scenario("idle", "P"), **scenario))
+        devices = place_devices(self.settings)
+        parts = (self.settings, CODEC, devices, self.bus, self.clock, "embedded")
+        self.session = TareSession(*parts, old_offset_Nm, is_auto_zeroing, self._progress)
+
+    def _progress(self, line: str) -> None:
+        self.lines.append(line)
+        self.on_line(line)
 
 
 class Hand:

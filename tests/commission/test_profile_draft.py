@@ -39,18 +39,17 @@ def guessed(drafted: ProfileDraft) -> set[str]:
 
 @pytest.mark.parametrize(
     ("unit", "rad_s"),
-    [(RPM, math.pi / 30.0), (MILLI_RPM, math.pi / 30_000.0), (DEGREES_PER_S, math.pi / 180.0)],
+    [
+        (RPM, math.pi / 30.0),
+        (MILLI_RPM, math.pi / 30_000.0),
+        (DEGREES_PER_S, math.pi / 180.0),
+        (None, math.tau / 65536),  # a count is guessed to be an increment per second
+    ],
 )
 def test_the_unit_of_velocity_is_that_of_the_motor(eds, unit, rad_s):
-    drafted = draft(eds, EdsVariant().with_object("60A9", unit))
+    drafted = draft(eds, EdsVariant() if unit is None else EdsVariant().with_object("60A9", unit))
     assert drafted.settings.scale.velocity_rad_s == pytest.approx(rad_s / GEAR)
-    assert "velocity_rad_s" not in guessed(drafted)
-
-
-def test_without_a_unit_of_velocity_a_count_is_guessed_to_be_an_increment_per_second(eds):
-    drafted = draft(eds, EdsVariant())
-    assert drafted.settings.scale.velocity_rad_s == pytest.approx(math.tau / 65536 / GEAR)
-    assert "velocity_rad_s" in guessed(drafted)
+    assert ("velocity_rad_s" in guessed(drafted)) is (unit is None)
 
 
 def test_an_answer_is_no_guess(eds):

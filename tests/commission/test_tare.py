@@ -116,7 +116,6 @@ def test_an_offset_or_a_spread_over_its_bound_is_refused(torques, words):
         solve_tare([exact_pose((20.0 * n, 0.0), np.array(each)) for n, each in enumerate(torques)], tare_settings())
 
 
-@pytest.mark.slow
 def test_gravity_is_estimated_with_the_offsets():
     solution = solve_tare(gravity_poses(SPREAD_POSES), tare_settings(NINE, {"cad_theta": ()}))
     np.testing.assert_allclose(solution.gravity_Nm, [A4, A5], rtol=1e-9)

@@ -34,25 +34,16 @@ def certified(**sections):
         ({"friction_terms": ["stribek"]}, r"friction_terms\[0\]` = 'stribek' .*did you mean 'stribeck'"),
         ({"hold_back_s": -0.01}, "`certified.hold_back_s` = -0.01 s is below 0 s"),
         ({"cutoff_rad_s": [10.0]}, "did you mean `certified.cutoffs_rad_s`"),
-    ],
-)
-def test_settings_that_the_scheme_cannot_work_with_are_refused(values, message):
-    with pytest.raises(ConfigError, match=message):
-        certified(certified=values)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
         ({"sine": [[0.0], [0.002]], "cosine": [[0.0], [0.0]]}, "excitation of joint 2 does not begin at rest"),
         (AT_REST, "excitation of joint 1 does not begin at rest: .*of n² cosine_n = 0.1, each within 0.001"),
         ({"cosine": [[], [0.0]]}, "joint 2 has 1 values in `excitation.cosine`, 0 in `excitation.sine`"),
         ({"period_s": -1.0}, "`excitation.period_s` = -1.0 s is below 0 s"),
     ],
 )
-def test_an_excitation_that_does_not_begin_at_rest_is_refused(values, message):
+def test_settings_that_the_scheme_cannot_work_with_are_refused(values, message):
+    section = "excitation" if "excitation" in message else "certified"
     with pytest.raises(ConfigError, match=message):
-        certified(excitation=values)
+        certified(**{section: values})
 
 
 def test_an_excitation_whose_harmonics_cancel_at_the_start_is_taken():
