@@ -5,7 +5,6 @@ What each row does to a frame is tested in tests/firmware_sim. The host tolerate
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 from experiment_runs import Played, contents, emulator, run_on_vcan
 from rig import SessionRig
@@ -64,20 +63,6 @@ def embedded(played: Played, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_host_goes_on_through_all_of_them(played: Played) -> None:
     assert (played.status, played.error_lines) == (0, [])
-
-
-def test_each_fault_is_labelled_in_the_truth_with_the_times_of_its_first_and_first_healthy_cycle(
-    played: Played,
-) -> None:
-    log = read_log(played.folder / TRUTH_NAME)
-    cycles, masks = log.truth["cycle"].astype(int), log.truth["faults"].astype(np.int64)
-    stamps = dict(zip(cycles.tolist(), log.truth.t_ns, strict=True))
-    expected = []
-    for place in range(len(ROWS)):
-        active = cycles[masks >> place & 1 == 1]
-        expected.append((stamps[active[0]], f"fault {place}", "begins"))
-        expected.append((stamps[active[-1] + 1], f"fault {place}", "ends"))
-    assert [(e.t_ns, e.event.name, e.event.message.split(":")[0]) for e in log.events] == expected
 
 
 @pytest.mark.parametrize("name", ["run.mcap", TRUTH_NAME])

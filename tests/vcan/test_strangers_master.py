@@ -23,19 +23,9 @@ pytestmark = [pytest.mark.vcan, pytest.mark.slow, pytest.mark.wallclock]
 PERIOD_S = 0.01
 OVERFLOW = 240
 SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, DISABLE_VOLTAGE, FAULT_RESET = 0x06, 0x07, 0x0F, 0x02, 0x00, 0x80
-TORQUE_MODE, ENABLED, DISABLED = "CYCLIC SYNCHRONOUS TORQUE", "OPERATION ENABLED", "SWITCH ON DISABLED"
+TORQUE_MODE = "CYCLIC SYNCHRONOUS TORQUE"
 NMT_RESET_NODE = 129
 CONTRACTS = {"arm": "drive.eds", "arm_stock": "stock_drive.eds"}
-MAKERS = {"stock-drive": "stock_drive.eds", "maxon-epos4": "maxon_epos4.eds", "zeroerr-erob": "zeroerr_erob.eds"}
-ARM = """
-extends = "certified"
-[arm]
-link_length_m = [0.4, 0.25]
-[devices]
-drive = ["{0}", "{0}"]
-sensor = ["int32-sensor", "int32-sensor"]
-contract = ""
-"""
 
 
 @contextlib.contextmanager
@@ -56,16 +46,14 @@ Mapping = tuple[canopen.pdo.PdoMap, tuple[int, ...], int]
 """A PDO, the objects that are mapped into it, and its transmission type."""
 
 
-def remap(node: BaseNode402, *mappings: Mapping, has_predefined_ids: bool) -> None:
-    """Change PDOs, which else keep the identifiers that the node has."""
+def remap(node: BaseNode402, *mappings: Mapping) -> None:
     node.pdo.read()
     for pdo, objects, kind in mappings:
         pdo.clear()
         for index in objects:
             pdo.add_variable(index)
         pdo.trans_type = kind
-        if has_predefined_ids:
-            pdo.cob_id = pdo.predefined_cob_id
+        pdo.cob_id = pdo.predefined_cob_id
         pdo.enabled = True
         pdo.save()
 
@@ -119,7 +107,7 @@ class Stranger:
             # the command in RPDO1, state and mode in TPDO1, position and velocity in TPDO2, all on SYNC
             states, motion = (0x6041, 0x6061, 0x6077), (0x6064, 0x606C)
             mappings = (node.rpdo[1], (0x6040, 0x6071), 1), (node.tpdo[1], states, 1), (node.tpdo[2], motion, 1)
-            remap(node, *mappings, has_predefined_ids=True)
+            remap(node, *mappings)
             node.sdo[0x1006].raw = 0
             node.sdo[0x1019].raw = OVERFLOW
             node.sdo[0x1006].raw = round(PERIOD_S * 1e6)
@@ -163,21 +151,12 @@ class Stranger:
 
 @pytest.fixture(scope="module")
 def eds(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The EDS of the drives of the arm on vcan0, which is of one of our contracts, or has drives of a maker.
-
-    The time of ours is SYNC's: no watchdog takes a stalled machine for a dead master.
-    """
-    folder, name = tmp_path_factory.mktemp("arm"), request.param
-    options = ["--contract", name]
-    if name in MAKERS:
-        (folder / "arm.toml").write_text(ARM.format(name))
-        options = ["--clock", "wall", "--config", str(folder / "arm.toml")]
-    with emulator(folder, "--scenario", "idle", *options):
-        yield contract_folder() / (MAKERS | CONTRACTS)[name]
+    """The EDS of the drives of the arm on vcan0. Its time is SYNC's: no watchdog takes a stall for a dead master."""
+    with emulator(tmp_path_factory.mktemp("arm"), "--scenario", "idle", "--contract", request.param):
+        yield contract_folder() / CONTRACTS[request.param]
 
 
 ours = pytest.mark.parametrize("eds", CONTRACTS, indirect=True)
-of_makers = pytest.mark.parametrize("eds", MAKERS, indirect=True)
 
 
 @pytest.fixture
@@ -242,95 +221,3 @@ def test_a_fault_by_missing_commands_is_latched_until_fault_reset(stranger: Stra
     stranger.rhythm.words[1] = FAULT_RESET
     stranger.wait_for("SWITCH ON DISABLED", first)
     stranger.enable()
-
-
-# Drives of the shelf by the clock: p402's own setters lead them, and nobody tells them the period of SYNC.
-
-
-@contextlib.contextmanager
-def syncs(network: canopen.Network, is_counted: bool) -> Iterator[None]:
-    """Send SYNC every 10 ms from a thread."""
-    end = threading.Event()
-
-    def send() -> None:
-        count = 0
-        while not end.wait(PERIOD_S):
-            network.sync.transmit(count % OVERFLOW + 1 if is_counted else None)
-            count += 1
-
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
-        yield
-    finally:
-        end.set()
-        thread.join()
-
-
-def add_drive(network: canopen.Network, node_id: int, eds: Path) -> BaseNode402:
-    """Add a drive with patience for a machine that stalls."""
-    node = network.add_node(BaseNode402(node_id, str(eds)))
-    node.sdo.RESPONSE_TIMEOUT = HANG_S
-    for name in ("SWITCH_OP_MODE", "SWITCH_STATE_FINAL", "SWITCH_STATE_SINGLE", "CHECK_TPDO"):
-        setattr(node, f"TIMEOUT_{name}", HANG_S)
-    node.nmt.state = "PRE-OPERATIONAL"
-    return node
-
-
-def map_state_and_command(node: BaseNode402, state_kind: int = 1) -> None:
-    """Put state and mode into TPDO1, and the command into RPDO1."""
-    mappings = (node.tpdo[1], (0x6041, 0x6061), state_kind), (node.rpdo[1], (0x6040, 0x6071), 255)
-    remap(node, *mappings, has_predefined_ids=False)
-
-
-@of_makers
-@pytest.mark.parametrize("is_counted", [False, True])
-def test_a_stranger_drives_it_through_torque_mode(eds: Path, is_counted: bool) -> None:
-    with connection() as network:
-        drives = [add_drive(network, node_id, eds) for node_id in (1, 2)]
-        for node in drives:
-            map_state_and_command(node)
-            if is_counted and 0x1019 in node.object_dictionary:
-                node.sdo[0x1019].raw = OVERFLOW
-            node.setup_402_state_machine()
-        with syncs(network, is_counted):
-            network.nmt.state = "OPERATIONAL"
-            for node in drives:
-                node.op_mode = TORQUE_MODE
-                node.state = ENABLED
-                assert (node.op_mode, node.state) == (TORQUE_MODE, ENABLED)
-            first = drives[0]
-            began = first.sdo[0x6064].raw
-            first.rpdo[1][0x6071].raw = 50
-            first.rpdo[1].transmit()
-            for _ in range(20):
-                first.tpdo[1].wait_for_reception(HANG_S)
-            assert first.sdo[0x6077].raw == 50
-            assert first.sdo[0x6064].raw > began + 10
-            for node in drives:
-                node.state = DISABLED
-                assert node.state == DISABLED
-
-
-@of_makers
-def test_a_statusword_by_event_is_sent_on_change(eds: Path) -> None:
-    with connection() as network:
-        node = add_drive(network, 1, eds)
-        map_state_and_command(node, 255)
-        heard: list[int] = []
-        news = threading.Condition()
-
-        def hear(_: int, data: bytearray, __: float) -> None:
-            with news:
-                heard.append(int.from_bytes(data, "little") & 0x6F)
-                news.notify()
-
-        network.subscribe(node.tpdo[1].cob_id, hear)
-        with syncs(network, False):
-            network.nmt.state = "OPERATIONAL"
-            for word, state in ((6, 0x21), (7, 0x23), (6, 0x21), (0, 0x40)):
-                with news:
-                    heard.clear()
-                    node.rpdo[1][0x6040].raw = word
-                    node.rpdo[1].transmit()
-                    assert news.wait_for(lambda wanted=state: wanted in heard, HANG_S), (hex(word), heard)
