@@ -56,10 +56,6 @@ def test_the_data_ids_of_all_fd_contracts_differ() -> None:
     assert len(set(ids)) == len(ids)
 
 
-def test_the_layout_digest_of_the_classic_contract_is_that_of_wire_version_1() -> None:
-    assert (CLASSIC.wire_version, CLASSIC.layout_digest) == (1, 0xF80FDAE0)
-
-
 @pytest.mark.parametrize("length", [0, 8, 9, 12, 13, 63, 64])
 def test_only_lengths_with_a_data_length_code_are_taken(tmp_path: Path, length: int) -> None:
     signals = "".join(f' SG_ b{index} : {8 * index}|8@1+ (1,0) [0|255] "" HOST\n' for index in range(length))
