@@ -1,12 +1,15 @@
-"""Rows of faults one after the other in one lockstep run on vcan: the logs are those of the embedded bus.
+"""Rows of faults one after the other in a lockstep run on vcan: the logs are those of the embedded bus, and candump's.
 
 What each row does to a frame is tested in tests/firmware_sim. The host tolerates all of them, so the run ends as asked.
 """
 
+import contextlib
+import shutil
+from collections import Counter
 from pathlib import Path
 
 import pytest
-from experiment_runs import Played, contents, emulator, run_on_vcan
+from experiment_runs import Played, Witness, candump, contents, emulator, run_on_vcan
 from rig import SessionRig
 
 from adacd_hil.log.log_files import TRUTH_NAME
@@ -45,7 +48,10 @@ def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
     folder = tmp_path_factory.mktemp("faults")
     (folder / "scenario.toml").write_text(scenario_text())
     (folder / "settings.toml").write_text(SETTINGS)
-    with emulator(folder, "--scenario", str(folder / "scenario.toml")):
+    with contextlib.ExitStack() as stack:
+        if shutil.which("candump"):
+            stack.enter_context(candump(folder / "candump.log"))
+        stack.enter_context(emulator(folder, "--scenario", str(folder / "scenario.toml")))
         return run_on_vcan(folder, "--clock", "lockstep", "--config", str(folder / "settings.toml"))
 
 
@@ -70,3 +76,16 @@ def test_the_logs_are_those_of_the_embedded_bus_bit_for_bit(played: Played, embe
     ours, theirs = contents(embedded / name), contents(played.folder / name)
     assert [topic for topic in ours if ours[topic] != theirs.get(topic)] == []
     assert len(read_log(embedded / name).events) >= (2 * len(ROWS) if name == TRUTH_NAME else 3)
+
+
+def test_candump_sees_all_that_the_log_holds(played: Played) -> None:
+    if not shutil.which("candump"):
+        pytest.skip("candump (Debian package can-utils) is not installed")
+    witness = Witness(played.folder / "candump.log")
+    seen = Counter(line.split()[2] for line in witness.lines)
+    frames = read_log(played.log).frames
+    logged = Counter(
+        f"{frame['can_id']:03X}#{bytes(frame['data'][: frame['length']]).hex().upper()}" for frame in frames
+    )
+    assert logged.total() > 3_000
+    assert (logged - seen).total() <= witness.dropped  # what candump had no room for, the kernel has counted
