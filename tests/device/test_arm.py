@@ -142,21 +142,6 @@ def test_a_joint_beyond_its_limits_is_described_with_value_and_bound() -> None:
     ]
 
 
-def test_signals_that_are_too_old_are_described_with_age_and_limit() -> None:
-    said = []
-    for age in (3, 4):
-        devices = Devices()
-        devices.arm.synchronise(0, 0, 1)
-        devices.answer()
-        devices.arm.synchronise(age, 0, age)
-        devices.answer(without=("Drive2Feedback", "Sensor1Torque"))
-        said.append(describe_faults(devices.arm))
-    assert said == [
-        [],
-        ["Drive2: position, velocity 4 cycles old, 3 allowed", "Sensor1: torque 4 cycles old, 3 allowed"],
-    ]
-
-
 def test_a_frame_with_the_same_counter_is_counted_as_repeated_and_answers_nothing() -> None:
     devices = Devices()
     can_id, sender = CODEC.message("Sensor1Torque").can_id, CODEC.message("Sensor1Torque").sender()
@@ -166,18 +151,6 @@ def test_a_frame_with_the_same_counter_is_counted_as_repeated_and_answers_nothin
         devices.arm.accept(Frame(can_id, data, 0))
     assert devices.arm.repeats == [0, 0, 2, 0]
     assert devices.arm.sensors[0].sample_cycle == 0
-
-
-@pytest.mark.parametrize(("cycle", "fault"), [(250, FaultReason.NONE), (251, FaultReason.DATA_AGE)])
-def test_a_status_that_stays_away_from_an_enabled_drive_is_a_fault(cycle: int, fault: FaultReason) -> None:
-    devices = Devices()
-    devices.arm.synchronise(0, 0, 1)
-    devices.enable()
-    devices.arm.synchronise(cycle, 0, 1)
-    devices.answer()
-    assert devices.arm.state().fault is fault
-    said = [f"Drive{joint}: statusword {cycle} cycles old, 250 allowed" for joint in (1, 2)]
-    assert describe_faults(devices.arm) == (said if cycle > 250 else [])
 
 
 def test_a_cycle_without_a_frame_is_counted_once_as_no_new_data() -> None:

@@ -51,11 +51,6 @@ def test_no_receiver_takes_the_frame_of_another_message(codec: Codec) -> None:
             assert mine.receiver().check(frame).is_valid is (mine is other)
 
 
-def test_the_data_ids_of_all_fd_contracts_differ() -> None:
-    ids = [codec.message(name).data_ids for codec in (FD, HALF_MS) for name in PROTECTED]
-    assert len(set(ids)) == len(ids)
-
-
 @pytest.mark.parametrize("length", [0, 8, 9, 12, 13, 63, 64])
 def test_only_lengths_with_a_data_length_code_are_taken(tmp_path: Path, length: int) -> None:
     signals = "".join(f' SG_ b{index} : {8 * index}|8@1+ (1,0) [0|255] "" HOST\n' for index in range(length))
