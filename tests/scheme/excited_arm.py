@@ -10,7 +10,7 @@ from played_record import PlayedRecord, play_record
 
 from adacd_hil.compiled import compiled
 from adacd_hil.control.motions import Excitation
-from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
+from adacd_hil.records import FRICTION_SPEEDS_RAD_S, ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration import Settings
@@ -25,6 +25,28 @@ FREE = replace(
     SETTINGS, arm=replace(SETTINGS.arm, holding_torque_Nm=(0.0, 0.0)), safety=replace(SETTINGS.safety, commission_s=0.1)
 )
 """Of an arm without brakes: its reading at rest anchors the sensors' offsets."""
+
+
+DATE = "2026-11-22T10:00:00Z"
+
+
+def friction_of(theta):
+    return [theta[5 + i] + v * theta[3 + i] for i in range(2) for v in FRICTION_SPEEDS_RAD_S]
+
+
+def known(theta, settings=FREE, offset_Nm=(0.0, 0.0)):
+    """Return settings with a last certificate that says this of the arm and of its sensors' zeros."""
+    history = replace(
+        settings.history,
+        date_utc=DATE,
+        friction_Nm=tuple(friction_of(theta)),
+        friction_std_Nm=(0.005,) * 6,
+        inertia_kgm2=tuple(theta[:3]),
+        inertia_std_kgm2=(0.001,) * 3,
+        offset_Nm=offset_Nm,
+        offset_std_Nm=(0.01, 0.01),
+    )
+    return replace(settings, history=history)
 
 
 class Record(NamedTuple):
