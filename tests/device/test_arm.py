@@ -142,6 +142,21 @@ def test_a_joint_beyond_its_limits_is_described_with_value_and_bound() -> None:
     ]
 
 
+def test_signals_that_are_too_old_are_described_with_age_and_limit() -> None:
+    said = []
+    for age in (3, 4):
+        devices = Devices()
+        devices.arm.synchronise(0, 0, 1)
+        devices.answer()
+        devices.arm.synchronise(age, 0, age)
+        devices.answer(without=("Drive2Feedback", "Sensor1Torque"))
+        said.append(describe_faults(devices.arm))
+    assert said == [
+        [],
+        ["Drive2: position, velocity 4 cycles old, 3 allowed", "Sensor1: torque 4 cycles old, 3 allowed"],
+    ]
+
+
 def test_a_frame_with_the_same_counter_is_counted_as_repeated_and_answers_nothing() -> None:
     devices = Devices()
     can_id, sender = CODEC.message("Sensor1Torque").can_id, CODEC.message("Sensor1Torque").sender()
