@@ -198,15 +198,6 @@ def is_emergency(frame: Witnessed, code: int) -> bool:
     return 0x081 <= frame.can_id <= 0x084 and int.from_bytes(frame.data[:2], "little") == code
 
 
-def assert_torque_ends_with(played: Scene, can_id: int) -> None:
-    """Check that the host went on to command zero torque within the age budget after the last frame of this kind."""
-    frames = played.frames()
-    (*_, last) = (index for index, frame in enumerate(frames) if frame.can_id == can_id)
-    commands = [frame for frame in frames[last:] if frame.can_id == 0x201]
-    assert len(commands) > AGE_CYCLES + 10
-    assert [frame for frame in commands[AGE_CYCLES + 2 :] if torque_of(frame)] == []
-
-
 def assert_drives_stop_by_themselves(played: Scene, number: signal.Signals) -> Witnessed:
     """Take the host away from a moving arm; return the frame by which a drive says that it is off."""
     played.wait_until_moving()
@@ -262,7 +253,11 @@ def test_the_host_sends_no_torque_to_an_arm_that_went_away(tmp_path: Path) -> No
         played.wait_until_moving()
         os.kill(played.emulator.pid, signal.SIGKILL)
         assert played.finish() == 4
-        assert_torque_ends_with(played, 0x181)
+        frames = played.frames()
+        (*_, last) = (index for index, frame in enumerate(frames) if frame.can_id == 0x181)
+        commands = [frame for frame in frames[last:] if frame.can_id == 0x201]
+        assert len(commands) > AGE_CYCLES + 10
+        assert [frame for frame in commands[AGE_CYCLES + 2 :] if torque_of(frame)] == []
         assert any("DATA_AGE" in line for line in played.said)
         log = read_log(tmp_path / "run.mcap")
         assert log.is_complete

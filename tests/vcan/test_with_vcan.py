@@ -83,16 +83,13 @@ def test_the_exit_status_and_every_byte_of_both_outputs_pass_through(passed: tup
 
 
 @pytest.mark.slow
-def test_a_timeout_ends_everything(endless_run: subprocess.Popen[bytes], tmp_path: Path) -> None:
-    assert endless_run.wait(HANG_S) == STATUS_TIMEOUT
-    assert find_processes(str(tmp_path)) == []
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.slow
-def test_a_terminated_launcher_leaves_nothing_behind(endless_run: subprocess.Popen[bytes], tmp_path: Path) -> None:
-    endless_run.terminate()
-    assert endless_run.wait(HANG_S) == 128 + signal.SIGTERM
+@pytest.mark.parametrize(("is_terminated", "status"), [(False, STATUS_TIMEOUT), (True, 128 + signal.SIGTERM)])
+def test_a_timeout_and_a_signal_end_everything(
+    endless_run: subprocess.Popen[bytes], tmp_path: Path, is_terminated: bool, status: int
+) -> None:
+    if is_terminated:
+        endless_run.terminate()
+    assert endless_run.wait(HANG_S) == status
     assert find_processes(str(tmp_path)) == []
     assert list(tmp_path.iterdir()) == []
 
