@@ -95,3 +95,13 @@ def test_smoothed_channels_come_first_and_all_but_the_slowest_are_there_bare_too
     smoothed = scipy.signal.lfilter([1.0 - smoothing], [1.0, -smoothing], r, axis=0)
     np.testing.assert_allclose(np.array(got)[:, :3], smoothed, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(np.array(got)[:, 3:], r[:, 1:])
+
+
+def test_a_gap_leaves_every_residual_where_it_was_whatever_the_parameters():
+    Y_p, Y_h, tau_J = signals()
+    filtered = Bank()
+    filtered.run(Y_p, Y_h, tau_J)
+    before = filtered.tau_f.copy(), filtered.W_f.copy()
+    filtered.take(Y_p[0] + 7.0, Y_h[0] - 5.0, tau_J[0] + 3.0, is_seen=False)
+    np.testing.assert_array_equal(filtered.tau_f, before[0])
+    np.testing.assert_array_equal(filtered.W_f, before[1])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from excited_arm import NAMES, kernel_of
 
-from adacd_hil.records import FRICTION_SPEEDS_RAD_S
+from adacd_hil.records import FRICTION_AT, FRICTION_AT_RAD_S, FRICTION_SPEEDS_RAD_S, JOINTS
 from adacd_hil.scheme.identify import evidence
 from adacd_hil.scheme.identify.evidence import FRICTIONS, KEPT, LAST, OFFSETS, QUANTITIES, REFUSED, VISCOUS
 
@@ -86,3 +86,8 @@ def test_the_prior_s_part_of_a_variance_is_not_scaled():
     assert evidence.split(0.25, 0.25, 0.1) == pytest.approx(0.25)
     assert evidence.split(0.01, 1e9, 0.1) == pytest.approx(0.001)
     assert 0.001 < evidence.split(0.01, 0.02, 0.1) < 0.01
+
+
+def test_the_friction_that_people_are_shown_is_that_at_the_named_speed():
+    assert FRICTION_AT_RAD_S in FRICTION_SPEEDS_RAD_S
+    assert (FRICTION_SPEEDS_RAD_S * JOINTS)[FRICTION_AT] == (FRICTION_AT_RAD_S,) * JOINTS

@@ -102,3 +102,16 @@ def test_an_interval_near_the_nominal_one_is_integrated_over(interval_s):
     blocks = run_kernel(settings_with(), q, dq, tau_J, SMOOTH, 0, period_s=period_s)
     expected = -np.expm1(-10.0 * t_s)[:, None] * tau_ext
     np.testing.assert_allclose(tau_ext_hat_of(blocks), expected, atol=2.0 * LEFT_NM)
+
+
+def test_another_interval_throughout_is_the_same_as_another_period():
+    t_s = np.arange(3000) * 1.3e-3
+    q, dq, ddq = smooth_motion(t_s)
+    tau_J = torque_of(q, dq, ddq, SMOOTH)
+    measured = run_kernel(
+        settings_with(), q, dq, tau_J, np.zeros(7), paper_kernel.LEARN, period_s=np.full(3000, 1.3e-3)
+    )
+    slower = run_kernel(settings_with(bus={"period_us": 1300}), q, dq, tau_J, np.zeros(7), paper_kernel.LEARN)
+    for name in ("tau_f", "tau_f_hat", "tau_ext_hat", "theta_hat", "excitation"):
+        np.testing.assert_allclose(measured[:, PLACES[name]], slower[:, PLACES[name]], rtol=1e-12, atol=1e-15)
+    assert slower[-1, PLACES["excitation"]] > 0.0
