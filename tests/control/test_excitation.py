@@ -1,11 +1,11 @@
 """The excitation: where it begins, that it is one motion, and what it keeps to."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from adacd_hil.control.motions import Excitation
-from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.settings.parsing import parse
 
 SETTINGS = load_settings("certified", "P")
 PERIOD_S = SETTINGS.excitation.period_s
@@ -48,18 +48,9 @@ def test_it_keeps_to_the_trajectory_s_corners_and_to_the_speeds_it_was_made_for(
 
 
 def test_it_grows_with_the_trajectory():
-    wide = parse(
-        Settings,
-        {
-            "arm": {"position_limit_deg": [75.0, 120.0]},
-            "trajectory": {"amplitude_deg": [15.0, 120.0]},
-            "excitation": {
-                "period_s": PERIOD_S,
-                "cosine": [list(row) for row in SETTINGS.excitation.cosine],
-                "sine": [list(row) for row in SETTINGS.excitation.sine],
-            },
-        },
-    )
+    arm = replace(SETTINGS.arm, position_limit_deg=(75.0, 120.0))
+    trajectory = replace(SETTINGS.trajectory, amplitude_deg=(15.0, 120.0))
+    wide = replace(SETTINGS, arm=arm, trajectory=trajectory)
     t_s = np.linspace(0.0, 1.0, 7)
     np.testing.assert_allclose(motion(t_s, wide)[0], motion(t_s)[0] * [0.5, 2.0], rtol=1e-12)
 

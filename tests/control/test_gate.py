@@ -75,12 +75,6 @@ def test_the_change_from_anywhere_is_clipped_exactly_at_its_limit(joint: int, st
         assert (reached, flags) == (at_joint(joint, max(lowest, min(highest, clipped))), expected_flags)
 
 
-@pytest.mark.parametrize(("joint", "sign"), JOINTS_AND_SIGNS)
-def test_the_other_joint_passes_bit_for_bit_while_one_is_clipped(joint: int, sign: float) -> None:
-    reached, _ = limited(Gate(SETTINGS, PERIOD_S), at_joint(joint, sign * 100.0, other=0.1234567890123))
-    assert reached[1 - joint] == 0.1234567890123
-
-
 ANY_TORQUE = st.one_of(
     st.floats(-30.0, 30.0),
     st.floats(allow_nan=True, allow_infinity=True),
@@ -120,13 +114,6 @@ def test_a_torque_that_is_not_finite_zeroes_both_joints(joint: int, bad: float, 
     gate = gate_at((1.0, 0.5))
     wanted = at_joint(joint, bad, other=0.4)
     assert limited(gate, wanted, is_open) == ((0.0, 0.0), GateFlag.NOT_A_NUMBER)
-
-
-@pytest.mark.parametrize("closing", [((math.nan, 0.0), True), ((12.0, 6.0), False)])
-def test_after_a_zero_torque_rises_from_zero_again(closing: tuple[tuple[float, float], bool]) -> None:
-    gate = gate_at((12.0, 6.0))
-    limited(gate, *closing)
-    assert limited(gate, (12.0, 6.0)) == (STEP_NM, GateFlag.RATE)
 
 
 def test_in_every_sequence_of_open_and_closed_torque_counts_the_cycles_since_the_gate_opened() -> None:

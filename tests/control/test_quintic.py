@@ -69,11 +69,3 @@ def test_a_move_uses_its_speed_or_its_acceleration_limit_and_no_more() -> None:
         assert share <= 1.0 + 1e-9
         used.append(1.0 if move.duration_s == 0.01 else share)
     assert min(used) > 0.99
-
-
-def test_a_move_leads_from_rest_to_rest_and_stays_between_its_ends() -> None:
-    for _, start, end, motion in moves():
-        np.testing.assert_allclose(motion[0], [start, np.zeros(2), np.zeros(2)], atol=1e-12)
-        np.testing.assert_allclose(motion[-1], [end, np.zeros(2), np.zeros(2)], atol=1e-12)
-        assert np.all(motion[:, 0] >= np.minimum(start, end) - 1e-12)
-        assert np.all(motion[:, 0] <= np.maximum(start, end) + 1e-12)

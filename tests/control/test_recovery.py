@@ -1,18 +1,15 @@
 """After a fault: latched until it is acknowledged, then everything from the beginning, at the present position."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from rig import TROUBLE_CYCLE, SessionRig, messages, scripted, torques_from
+from rig import TROUBLE_CYCLE, SessionRig, messages, torques_from
 
 from adacd_hil.control.session import SessionSummary
-from adacd_hil.device.device_files import load_profile
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import FaultReason, SchemeState
-from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.bus import Frame
 
 pytestmark = pytest.mark.slow
@@ -69,22 +66,6 @@ def test_an_acknowledged_fault_begins_again_with_the_first_check(recovered: Reco
     (acknowledged,) = [entry.t_ns for entry in log.events if entry.event.message == "fault acknowledged"]
     gap = int(np.argmax(np.diff(log.cycle.t_ns)))
     assert log.cycle.t_ns[gap] < acknowledged <= log.cycle.t_ns[gap + 1]
-
-
-def test_a_profile_that_is_changed_while_a_fault_is_latched_counts_from_the_next_run_on(tmp_path: Path) -> None:
-    profile = load_profile("adacd-drive", "drive")
-    (tmp_path / "drive.toml").write_text(to_toml(replace(profile.settings, eds=str(profile.eds))))
-    settings = scripted(finish_s=1.0, acknowledge_faults=1)
-    drives = str(tmp_path / "drive.toml"), str(tmp_path / "drive.toml")
-    rig = SessionRig(tmp_path, replace(settings, devices=replace(settings.devices, drive=drives)))
-
-    def trouble() -> None:
-        (tmp_path / "drive.toml").write_text("no profile")
-        rig.bench.on_frame(NMT_PRE_OPERATIONAL_DRIVE_1)
-
-    rig.before_sync[TROUBLE_CYCLE] = trouble
-    summary, _ = rig.run()
-    assert (summary.error, summary.recoveries) == ("", 1)
 
 
 def test_a_fault_that_nobody_acknowledges_ends_the_run(tmp_path: Path) -> None:

@@ -180,18 +180,6 @@ def test_a_status_that_stays_away_from_an_enabled_drive_is_a_fault(cycle: int, f
     assert describe_faults(devices.arm) == (said if cycle > 250 else [])
 
 
-def test_a_cycle_without_a_frame_is_counted_once_as_no_new_data() -> None:
-    devices = Devices()
-    for cycle in range(3):
-        devices.arm.synchronise(cycle, 0, 1)
-        devices.answer(without=("Sensor1Torque", "Drive1Feedback") if cycle == 1 else ())
-    checks = describe_checks(devices.arm)
-    assert checks[0] == "Drive1: unprotected, 0 implausible, 1 NO_NEW_DATA"
-    assert checks[1] == "Drive2: unprotected, 0 implausible, 0 NO_NEW_DATA"
-    assert "1 NO_NEW_DATA" in checks[2]
-    assert "0 NO_NEW_DATA" in checks[3]
-
-
 def test_a_late_frame_is_of_the_cycle_before_skipped_periods_and_leaves_the_present_one_open() -> None:
     devices = Devices()
     devices.arm.synchronise(0, 0, 1)

@@ -34,14 +34,10 @@ def test_our_devices_say_which_watchdog_tripped_and_when(number: int, name: str)
     assert describe_emergency(0x8250, data, has_watchdog=True) == expected
 
 
-def test_a_strangers_manufacturer_bytes_are_shown_as_they_are() -> None:
-    text = describe_emergency(0x3210, bytes((2, 0, 0, 0, 9)), has_watchdog=False)
-    assert text == "EMCY 0x3210: DC link over-voltage, manufacturer bytes 02 00 00 00 09"
-
-
-def test_an_unknown_watchdog_is_no_watchdog() -> None:
-    text = describe_emergency(0x8250, bytes((9, 0, 0, 0, 0)), has_watchdog=True)
-    assert text == "EMCY 0x8250: RPDO timeout, manufacturer bytes 09 00 00 00 00"
+@pytest.mark.parametrize(("number", "has_watchdog"), [(2, False), (9, True)], ids=["a stranger's", "unknown"])
+def test_bytes_that_name_no_watchdog_are_shown_as_they_are(number: int, has_watchdog: bool) -> None:
+    text = describe_emergency(0x8250, bytes((number, 0, 0, 0, 9)), has_watchdog)
+    assert text == f"EMCY 0x8250: RPDO timeout, manufacturer bytes 0{number} 00 00 00 09"
 
 
 def test_an_error_reset_says_so() -> None:

@@ -90,12 +90,6 @@ def test_a_heartbeat_whose_period_the_host_cant_set_is_named_and_not_watched(
     assert failures == []  # an emulated drive to which nobody writes 0x1017 sends none
 
 
-def test_an_option_code_of_the_configuration_reaches_the_drives() -> None:
-    rig = NetworkRig({"devices": {"quick_stop_option": 6}})
-    rig.start()
-    assert [read(rig, name, 0x605A) for name in ("Drive1", "Drive2")] == [6, 6]
-
-
 def test_an_emergency_is_an_event_with_name_watchdog_and_time_and_stays_until_reset() -> None:
     rig = NetworkRig()
     rig.start()

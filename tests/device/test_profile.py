@@ -249,12 +249,6 @@ def test_a_frame_of_an_extending_profile_that_cant_be_is_one_line(tmp_path: Path
         load_profile(profile_file(tmp_path, 'extends = "stock-drive"\n' + frames), "drive")
 
 
-def test_a_profile_extends_a_built_in_one_by_its_name(tmp_path: Path) -> None:
-    mine = profile_file(tmp_path, 'extends = "stock-drive"\n[patience]\npause_ms = 15\n')
-    profile = load_profile(mine, "drive")
-    assert (profile.eds.name, profile.settings.patience.pause_ms) == ("stock_drive.eds", 15.0)
-
-
 def test_profiles_that_extend_each_other_are_one_line(tmp_path: Path) -> None:
     (tmp_path / "other.toml").write_text('extends = "mine.toml"\n')
     with pytest.raises(ConfigError, match="at most 8 in a row"):

@@ -7,7 +7,6 @@ from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.dbc_contract import load_codec
-from adacd_hil.wire.e2e import E2eStatus
 
 CODEC = load_codec()
 STOCK = compose(load_settings("stock"), place_devices(load_settings("stock")))
@@ -50,15 +49,6 @@ def test_a_sensor_that_repeats_its_frame_ages() -> None:
     taken = [rig.sensor.accept_cyclic(frame, cycle) for cycle in range(5)]
     assert taken == [True, False, False, False, False]
     assert (rig.sensor.sample_cycle, rig.sensor.status) == (0, 0)
-
-
-def test_a_silent_sensor_is_counted_as_no_new_data() -> None:
-    rig = Protected()
-    rig.sensor.accept_cyclic(rig.frame(1.5), 0)
-    rig.sensor.miss()
-    rig.sensor.miss()
-    assert rig.sensor.end_to_end.counts[E2eStatus.NO_NEW_DATA] == 2
-    assert (rig.sensor.values[0], rig.sensor.sample_cycle) == (1.5, 0)
 
 
 def test_a_jump_of_unprotected_torque_changes_nothing() -> None:

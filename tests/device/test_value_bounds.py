@@ -168,13 +168,6 @@ def test_an_emulated_second_torque_ends_at_the_range_of_its_object(folder: Path)
     assert play(folder, "narrow", arm="narrow-arm")[0] is FaultReason.SENSOR  # 16 bits are 0.66 Nm
 
 
-def test_an_object_of_the_communication_that_reads_back_another_value_ends_the_set_up(folder: Path) -> None:
-    changes = 'node = "drive1", index = 0x1A00, sub = 1, raw = 0x60770010, since = "power_on", at_s = 0.0'
-    ran = demo(folder, "mapped", f'kind = "object_value", {changes}')
-    assert ran.exit_code == 5
-    assert "0x1A00:1 = 0x60770010, 0x60640020 expected" in ran.stderr
-
-
 @pytest.mark.parametrize(
     ("changes", "line"),
     [

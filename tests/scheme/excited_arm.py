@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 from planar_arm import ENCODER_LSB_RAD, THETA, TORQUE_LSB_NM, TORQUE_NOISE_NM, VELOCITY_LSB_RAD_S, advance
-from played_record import play_record
+from played_record import PlayedRecord, play_record
 
 from adacd_hil.compiled import compiled
 from adacd_hil.control.motions import Excitation
-from adacd_hil.records import ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
+from adacd_hil.records import FRICTION_SPEEDS_RAD_S, ArmState, Event, FaultReason, Request, SchemeOutput, SchemeState
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.settings.configuration import Settings
@@ -27,6 +27,28 @@ FREE = replace(
 """Of an arm without brakes: its reading at rest anchors the sensors' offsets."""
 
 
+DATE = "2026-11-22T10:00:00Z"
+
+
+def friction_of(theta):
+    return [theta[5 + i] + v * theta[3 + i] for i in range(2) for v in FRICTION_SPEEDS_RAD_S]
+
+
+def known(theta, settings=FREE, offset_Nm=(0.0, 0.0)):
+    """Return settings with a last certificate that says this of the arm and of its sensors' zeros."""
+    history = replace(
+        settings.history,
+        date_utc=DATE,
+        friction_Nm=tuple(friction_of(theta)),
+        friction_std_Nm=(0.005,) * 6,
+        inertia_kgm2=tuple(theta[:3]),
+        inertia_std_kgm2=(0.001,) * 3,
+        offset_Nm=offset_Nm,
+        offset_std_Nm=(0.01, 0.01),
+    )
+    return replace(settings, history=history)
+
+
 class Record(NamedTuple):
     """What was measured (n, 2)."""
 
@@ -35,38 +57,27 @@ class Record(NamedTuple):
     tau_J: np.ndarray
 
 
-class Played(NamedTuple):
-    """What `played_record` has made of a record."""
-
-    state: np.ndarray
-    observation: np.ndarray
-    y: np.ndarray
-    h: np.ndarray
-    theta: np.ndarray
-    constants: np.ndarray
-    memory: np.ndarray
-    block: np.ndarray
-
-    def begin_of(self, state: SchemeState, after: int = 0) -> int:
-        """Return the first sample from `after` on in this state."""
-        places = np.flatnonzero(self.state[after:] == state)
-        assert places.size, f"never in {state.name}"
-        return after + int(places[0])
+@compiled
+def quantise(q, dq, tau_J):
+    """Round to what the encoder, the drive and the sensor can say, in place."""
+    for i in range(2):
+        q[i] = np.round(q[i] / ENCODER_LSB_RAD) * ENCODER_LSB_RAD
+        dq[i] = np.round(dq[i] / VELOCITY_LSB_RAD_S) * VELOCITY_LSB_RAD_S
+        tau_J[i] = np.round(tau_J[i] / TORQUE_LSB_NM) * TORQUE_LSB_NM
 
 
 @compiled
-def follow(theta, q_d, dq_d, Kp, Kd, tau_ext, noise, q, dq, tau_J):
-    """Let the arm with parameters theta (n, 7) follow q_d under PD control; fill the measured q, dq, tau_J (n, 2)."""
+def follow(theta, q_d, dq_d, Kp, Kd, noise, q, dq, tau_J):
+    """Let the arm with parameters theta (7,) follow q_d under PD control; fill the measured q, dq, tau_J (n, 2)."""
     at, speed = q_d[0].copy(), dq_d[0].copy()
     tracked_q, tracked_dq = at.copy(), speed.copy()
     tau, tau_next = np.zeros(2), np.zeros(2)
     for k in range(q.shape[0]):
-        q[k] = np.round(at / ENCODER_LSB_RAD) * ENCODER_LSB_RAD
-        dq[k] = np.round(tracked_dq / VELOCITY_LSB_RAD_S) * VELOCITY_LSB_RAD_S
-        tau_J[k] = np.round((tau + noise[k]) / TORQUE_LSB_NM) * TORQUE_LSB_NM
+        q[k], dq[k], tau_J[k] = at, tracked_dq, tau + noise[k]
+        quantise(q[k], dq[k], tau_J[k])
         tau[:] = tau_next
         tau_next[:] = Kp * (q_d[k] - q[k]) + Kd * (dq_d[k] - dq[k])
-        advance(at, speed, tracked_q, tracked_dq, tau + tau_ext[k], theta[k], PERIOD_S)
+        advance(at, speed, tracked_q, tracked_dq, tau, theta, PERIOD_S)
 
 
 def added(**parameters) -> np.ndarray:
@@ -77,24 +88,19 @@ def added(**parameters) -> np.ndarray:
     return theta
 
 
-def record(theta, seconds, tau_ext=None, added=None, added_at_s=0.0, motion=None, seed=1) -> Record:
-    """Record the arm; added (7,): what a payload adds to its parameters from added_at_s on."""
-    q_d, dq_d = excitation_of(SETTINGS, seconds) if motion is None else motion
-    count = len(q_d)
-    thetas = np.tile(theta, (count, 1))
-    if added is not None:
-        thetas[round(added_at_s / PERIOD_S) :] += added
-    noise = TORQUE_NOISE_NM * np.random.default_rng(seed).standard_normal((count, 2))
-    q, dq, tau_J = (np.zeros((count, 2)) for _ in range(3))
-    Kp, Kd = np.array(SETTINGS.controller.Kp), np.array(SETTINGS.controller.Kd)
-    follow(thetas, q_d, dq_d, Kp, Kd, np.zeros((count, 2)) if tau_ext is None else tau_ext, noise, q, dq, tau_J)
-    return Record(q, dq, tau_J)
+def record(theta, seconds, seed=1) -> Record:
+    """Record the arm on the excitation."""
+    motion = motion_of(SETTINGS.trajectory, SETTINGS.excitation)
+    q_d, dq_d, _ = np.array([motion.at(k) for k in range(round(seconds / PERIOD_S))]).transpose(1, 0, 2).copy()
+    noise = TORQUE_NOISE_NM * np.random.default_rng(seed).standard_normal(q_d.shape)
+    measured = Record(*(np.zeros(q_d.shape) for _ in range(3)))
+    follow(theta, q_d, dq_d, np.array(SETTINGS.controller.Kp), np.array(SETTINGS.controller.Kd), noise, *measured)
+    return measured
 
 
-def play(measured: Record, payload_at: int = -1, settings: Settings = SETTINGS, at_rest: int = 0) -> Played:
-    """Play a record through the compiled step, after samples at rest where it begins."""
-    *arrays, numbers = play_record(settings, *measured, payload_at, at_rest)
-    return Played(*arrays, *numbers[:3])
+def play(measured: Record) -> PlayedRecord:
+    """Play a record through the compiled step."""
+    return play_record(SETTINGS, *measured)
 
 
 class Motion:
@@ -116,22 +122,6 @@ class Motion:
 @cache
 def motion_of(trajectory, excitation) -> Motion:
     return Motion(replace(SETTINGS, trajectory=trajectory, excitation=excitation))
-
-
-def excitation_of(settings: Settings, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return q_d, dq_d (n, 2) of the excitation."""
-    motion = motion_of(settings.trajectory, settings.excitation)
-    rows = np.array([motion.at(k) for k in range(round(seconds / PERIOD_S))])
-    return rows[:, 0].copy(), rows[:, 1].copy()
-
-
-@compiled
-def quantise(q, dq, tau_J):
-    """Round to what the encoder, the drive and the sensor can say, in place."""
-    for i in range(2):
-        q[i] = np.round(q[i] / ENCODER_LSB_RAD) * ENCODER_LSB_RAD
-        dq[i] = np.round(dq[i] / VELOCITY_LSB_RAD_S) * VELOCITY_LSB_RAD_S
-        tau_J[i] = np.round(tau_J[i] / TORQUE_LSB_NM) * TORQUE_LSB_NM
 
 
 @compiled

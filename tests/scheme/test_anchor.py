@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import FREE, NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop, arm_state, kernel_of, states
+from excited_arm import FREE, NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop, arm_state, kernel_of, known, states
 from long_cases import long_but
 
 from adacd_hil.records import FaultReason, Request, SchemeState
@@ -39,17 +39,7 @@ UNKNOWN = settings_with()
 
 def with_last(settings, offset_Nm=(0.0, 0.0)):
     """Return settings with a last certificate that knows the sensors' zeros, and any friction and inertia."""
-    history = replace(
-        settings.history,
-        date_utc="2026-11-22T10:00:00Z",
-        friction_Nm=(10.0,) * 6,
-        friction_std_Nm=(0.1,) * 6,
-        inertia_kgm2=(10.0,) * 3,
-        inertia_std_kgm2=(0.1,) * 3,
-        offset_Nm=offset_Nm,
-        offset_std_Nm=(0.005, 0.005),
-    )
-    return replace(settings, history=history)
+    return known(np.full(7, 10.0), settings, offset_Nm)
 
 
 @pytest.mark.parametrize(

@@ -5,34 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from excited_arm import FREE, NAMES, TouchedLoop, added, kernel_of, states
+from excited_arm import DATE, FREE, NAMES, TouchedLoop, added, friction_of, kernel_of, known, states
 from long_cases import long_but
 from planar_arm import PAYLOAD_1KG, THETA
 
-from adacd_hil.records import FRICTION_SPEEDS_RAD_S, Request, SchemeState
+from adacd_hil.records import Request, SchemeState
 from adacd_hil.scheme.identify import certificate, evidence, fit_check
 from adacd_hil.scheme.pipeline.certificate_watch import BY_WORD, THIS_RUN_ONLY
-
-DATE = "2026-11-22T10:00:00Z"
-
-
-def friction_of(theta):
-    return [theta[5 + i] + v * theta[3 + i] for i in range(2) for v in FRICTION_SPEEDS_RAD_S]
-
-
-def known(theta, settings=FREE):
-    """Return settings with a last certificate that says this of the arm."""
-    history = replace(
-        settings.history,
-        date_utc=DATE,
-        friction_Nm=tuple(friction_of(theta)),
-        friction_std_Nm=(0.005,) * 6,
-        inertia_kgm2=tuple(theta[:3]),
-        inertia_std_kgm2=(0.001,) * 3,
-        offset_Nm=(0.0, 0.0),
-        offset_std_Nm=(0.01, 0.01),
-    )
-    return replace(settings, history=history)
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,17 @@
 """The pipeline: the paper's scheme in closed loop with an arm, and both schemes cycle by cycle."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from excited_arm import SETTINGS as CERTIFIED
 from excited_arm import ExcitedLoop, arm_state
-from planar_arm import PAYLOAD_1KG, THETA
+from planar_arm import THETA
 from smooth_motion import PLACES, PaperKernel, settings_with, smooth_motion, torque_of
 
 from adacd_hil.control.motions import corner_to_corner
 from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.scheme.kernel import paper_kernel
-from adacd_hil.scheme.model.regressor import is_positive_definite
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.supervisor import transitions
 from adacd_hil.settings.configuration_files import load_settings
@@ -52,56 +50,6 @@ class PaperLoop(ExcitedLoop):
         self.theta = self.theta + added
         self.request = Request.PAYLOAD_CHANGED
         self.run_until(SchemeState.ADAPT)
-
-
-@pytest.mark.slow
-def test_an_arm_adapts_freezes_its_parameters_and_feeds_them_forward():
-    outputs = PaperLoop().monitor()
-    states = [state.name for state, _ in itertools.groupby(output.state for output in outputs)]
-    assert states == ["COMMISSION", "ENABLE", "ADAPT", "MONITOR"]
-    learning = [output for output in outputs if output.state is not SchemeState.MONITOR]
-    assert not any(output.is_model_valid or np.any(output.theta_ff) for output in learning)
-    for output in outputs[-300:]:
-        np.testing.assert_array_equal(output.theta_hat, outputs[-1].theta_hat)
-    np.testing.assert_array_equal(outputs[-1].theta_ff, outputs[-1].theta_hat)
-    assert outputs[-1].is_model_valid
-    assert is_positive_definite(outputs[-1].theta_ff)
-    blocks = np.array([output.block for output in outputs[-300:]])
-    identified, cad = (np.max(np.abs(blocks[:, PLACES[name]])) for name in ("tau_ext_hat", "tau_ext_hat_cad"))
-    assert identified < 0.5 * cad
-
-
-@pytest.mark.slow
-def test_the_old_model_is_fed_forward_while_the_new_payload_is_learnt_from_the_old_estimate():
-    loop = PaperLoop(settings_with(**NEVER_ALARM))
-    before = loop.monitor()[-1]
-    loop.change_payload(PAYLOAD_1KG)
-    np.testing.assert_array_equal(loop.step().theta_hat, before.theta_hat)
-    learning = loop.run(3000)
-    assert all(output.state is SchemeState.ADAPT and output.is_model_valid for output in learning)
-    np.testing.assert_array_equal(learning[-1].theta_ff, before.theta_ff)
-    assert learning[-1].theta_hat[0] > before.theta_ff[0] + 0.5 * PAYLOAD_1KG[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("torque", "link"), [((1.0, 0.0), 1), ((-1.0, -0.7), 2)])
-def test_a_push_is_detected_with_its_sign_and_link_and_the_arm_goes_on_after_an_acknowledgement(torque, link):
-    loop = PaperLoop()
-    loop.monitor()
-    loop.tau_ext[:] = torque
-    outputs = loop.run_until(SchemeState.REACT, 50) + loop.run(60)
-    loop.tau_ext[:] = 0.0
-    detected = next(output for output in outputs if output.state is SchemeState.REACT)
-    assert np.sign(detected.tau_ext_hat[0]) == np.sign(torque[0])
-    assert detected.contact_joints & 0b01
-    reports = [output.contact for output in outputs if output.contact is not None]
-    assert [report.is_final for report in reports] == [False, True]
-    assert (reports[0].cycle, reports[1].link) == (detected.cycle, link)
-    assert abs(reports[1].tau_ext_peak[0] - torque[0]) < 0.2
-    loop.run_until(SchemeState.STOPPED, 1500)
-    loop.request = Request.ACKNOWLEDGE
-    goes_on = loop.run_until(SchemeState.MONITOR, 1000)[-1]
-    assert (goes_on.previous_state, goes_on.contact_joints) == (SchemeState.STOPPED, 0)
 
 
 @pytest.mark.slow

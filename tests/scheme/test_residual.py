@@ -80,23 +80,6 @@ def test_one_bad_number_does_not_stay_in_the_filters(motion, signal, value):
     assert np.max(np.abs(tau_ext_hat_of(blocks))) < LEFT_NM
 
 
-def late_samples(most_late_s, count=3000):
-    """Sample the motion, and its torque, where SYNC is late by up to this; return q, dq, tau_J and the intervals."""
-    t_s = np.arange(count) * T + np.random.default_rng(3).uniform(0.0, most_late_s, count)
-    q, dq, ddq = smooth_motion(t_s)
-    return q, dq, torque_of(q, dq, ddq, SMOOTH), np.diff(t_s, prepend=t_s[0] - T)
-
-
-def test_a_sync_that_is_late_leaves_nothing_where_the_interval_is_measured():
-    q, dq, tau_J, period_s = late_samples(0.3e-3)
-    left = [
-        np.max(np.abs(tau_ext_hat_of(run_kernel(settings_with(), q, dq, tau_J, SMOOTH, 0, period_s=intervals))))
-        for intervals in (period_s, None)
-    ]
-    assert left[0] < 2.0 * LEFT_NM
-    assert left[1] > 2e-3  # at 2 Nm, 0.3 ms of b tau would be 6 mNm
-
-
 @pytest.mark.parametrize("interval_s", [0.499e-3, 1.501e-3, -1e-3, np.nan])
 def test_an_interval_far_from_the_nominal_one_is_a_gap(motion, interval_s):
     _, q, dq, ddq = motion

@@ -72,27 +72,24 @@ def test_an_arm_that_slows_down_goes_on_until_somebody_must_acknowledge():
     assert not contact.response.goes_on
 
 
-def test_a_withdrawal_from_what_lets_go_goes_on():
-    contact = Contact(ContactLevel.COLLISION, 2)
-    contact.step(cycles=30)
-    assert contact.step(tau=0.0 * PUSH, cycles=300) is Reaction.WITHDRAW
-    assert not contact.response.m.is_two_sided
+WITHDRAWN, FLOATING, STOPPED = Reaction.WITHDRAW, Reaction.FLOAT, Reaction.STOP
 
 
-def test_a_withdrawal_that_pushes_something_on_the_other_side_floats():
-    contact = Contact(ContactLevel.COLLISION, 2)
-    contact.step(cycles=BLIND)
-    assert contact.step(tau=-PUSH, cycles=TURNED_CYCLES - 1) is Reaction.WITHDRAW
-    assert contact.step(tau=-PUSH) is Reaction.FLOAT
-    assert contact.response.m.is_two_sided
-
-
-def test_what_a_blow_leaves_in_the_estimate_is_no_second_contact():
-    contact = Contact(ContactLevel.COLLISION, 2)
-    contact.step(tau=-PUSH, cycles=BLIND)
-    contact.step(tau=-0.2 * PUSH, cycles=100)
-    contact.step(tau=-PUSH, cycles=TURNED_CYCLES - 1)
-    assert contact.step(tau=0.0 * PUSH) is Reaction.WITHDRAW
+@pytest.mark.parametrize(
+    ("pushes", "reactions", "is_model_valid"),
+    [
+        ([(1.0, 30), (0.0, 300)], [WITHDRAWN], True),
+        ([(1.0, BLIND), (-1.0, TURNED_CYCLES - 1), (-1.0, 1)], [WITHDRAWN, FLOATING], True),
+        ([(-1.0, BLIND), (-0.2, 100), (-1.0, TURNED_CYCLES - 1), (0.0, 1)], [WITHDRAWN], True),
+        ([(1.0, BLIND), (-1.0, TURNED_CYCLES)], [STOPPED], False),
+    ],
+    ids=["what lets go", "the other side", "what a blow leaves in the estimate", "no model to float by"],
+)
+def test_a_withdrawal_that_pushes_something_on_the_other_side_floats(pushes, reactions, is_model_valid):
+    contact = Contact(ContactLevel.COLLISION, 2, is_model_valid)
+    found = [contact.step(tau=share * PUSH, cycles=cycles) for share, cycles in pushes]
+    assert found[-len(reactions) :] == reactions
+    assert bool(contact.response.m.is_two_sided) is (reactions != [WITHDRAWN])
 
 
 def test_a_withdrawal_given_up_is_not_begun_again():
@@ -100,12 +97,6 @@ def test_a_withdrawal_given_up_is_not_begun_again():
     contact.step(cycles=BLIND)
     contact.step(tau=-PUSH, cycles=TURNED_CYCLES)
     assert contact.step(link=1, cycles=10) is Reaction.FLOAT
-
-
-def test_without_a_model_an_arm_stops_instead_of_floating():
-    contact = Contact(ContactLevel.COLLISION, 2, is_model_valid=False)
-    contact.step(cycles=BLIND)
-    assert contact.step(tau=-PUSH, cycles=TURNED_CYCLES) is Reaction.STOP
 
 
 def test_a_late_host_stops_the_arm_and_the_end_of_it_asks_for_nothing():

@@ -151,12 +151,3 @@ def test_what_has_raised_the_thresholds_is_named(change, cause):
         record[name][:] = value
     (line,) = margin.describe_dim(m)
     assert cause in line
-
-
-def test_the_rate_under_a_gaussian_tail_is_that_of_the_floor():
-    """A threshold of m(T) times the largest residual of T seconds is exceeded RATE times a second."""
-    for nu_Hz, seen_s in ((3.2, 50.0), (64.0, 600.0)):
-        share = 1.0 / margin.tail_factor(nu_Hz, seen_s)
-        assert margin.rate_per_h(nu_Hz, seen_s, share) == pytest.approx(3600.0 * margin.RATE_HZ)
-        assert margin.rate_per_h(nu_Hz, seen_s, 0.5 * share) < 1e-6
-    assert margin.rate_per_h(3.2, 50.0, 0.0) == 0.0

@@ -7,28 +7,11 @@ from cantools.autosar.end_to_end import compute_profile2_crc, compute_profile5_c
 
 from adacd_hil.wire.codec import Codec, CodecError
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
-from adacd_hil.wire.e2e import E2eReceiver, E2eSender, Protection
 
 FD = load_codec(contract_folder() / "arm_fd.dbc")
 HALF_MS = load_codec(contract_folder() / "arm_fd_500us.dbc")
 CLASSIC = load_codec()
 PROTECTED = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque", "Drive1Command", "Drive2Command")
-
-
-@pytest.mark.parametrize(
-    ("codec", "protection", "header_bytes", "is_fd"),
-    [(CLASSIC, Protection.PROFILE_2, 2, False), (FD, Protection.PROFILE_5, 4, True)],
-    ids=["arm", "arm_fd"],
-)
-def test_a_message_says_how_it_is_protected(
-    codec: Codec, protection: Protection, header_bytes: int, is_fd: bool
-) -> None:
-    command, sync = codec.message("Drive1Command"), codec.message("Sync")
-    assert (command.protection, command.header_bytes, command.is_fd) == (protection, header_bytes, is_fd)
-    assert (sync.protection, sync.header_bytes, sync.is_fd) == (Protection.NONE, 0, False)
-    assert codec.is_fd is is_fd
-    assert type(sync.sender()) is E2eSender
-    assert type(sync.receiver()) is E2eReceiver
 
 
 @pytest.mark.parametrize("codec", [FD, HALF_MS], ids=["arm_fd", "arm_fd_500us"])
@@ -49,15 +32,6 @@ def test_no_receiver_takes_the_frame_of_another_message(codec: Codec) -> None:
         for other in protected:
             frame = other.sender().protect(bytearray(other.length))
             assert mine.receiver().check(frame).is_valid is (mine is other)
-
-
-def test_the_data_ids_of_all_fd_contracts_differ() -> None:
-    ids = [codec.message(name).data_ids for codec in (FD, HALF_MS) for name in PROTECTED]
-    assert len(set(ids)) == len(ids)
-
-
-def test_the_layout_digest_of_the_classic_contract_is_that_of_wire_version_1() -> None:
-    assert (CLASSIC.wire_version, CLASSIC.layout_digest) == (1, 0xF80FDAE0)
 
 
 @pytest.mark.parametrize("length", [0, 8, 9, 12, 13, 63, 64])

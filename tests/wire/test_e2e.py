@@ -72,26 +72,6 @@ def test_the_profile_5_crc_equals_cantools(payload: bytes, data_id: int) -> None
     assert crc16(payload, 0, data_id.to_bytes(2, "little")) == compute_profile5_crc(payload, data_id)
 
 
-@pytest.mark.parametrize(
-    ("covered", "crc_2", "crc_5"),
-    [
-        ("00000000", 0x12, 0x84C0),
-        ("f20183", 0xC2, 0xD374),
-        ("0faa0055", 0xC6, 0x2023),
-        ("00ff5511", 0x77, 0xB8F9),
-        ("332255aabbccddeeff", 0x11, 0xF53F),
-        ("926b55", 0x33, 0x0745),
-        ("ffffffff", 0x6C, 0x1D0F),
-        (b"123456789".hex(), 0xDF, 0x29B1),
-    ],
-)
-def test_the_crcs_are_those_of_the_standard_crc_library(covered: str, crc_2: int, crc_5: int) -> None:
-    # AUTOSAR SWS CRC Library, tables of Crc_CalculateCRC8H2F and Crc_CalculateCRC16: the last bytes are the data id
-    data = bytes.fromhex(covered)
-    assert crc8(b"\0" + data[:-1], 0, data[-1:]) == crc_2
-    assert crc16(b"\0\0" + data[:-2], 0, data[-2:]) == crc_5
-
-
 def test_the_profile_5_example_of_the_standard_comes_out() -> None:
     # AUTOSAR FO PRS E2E Protocol, Profile 5 protocol examples, "short": data id 0x1234, counter 0, 8 bytes of zero
     assert E2eSender(P05, b"\x34\x12").protect(bytearray(8)).hex() == "1cca000000000000"

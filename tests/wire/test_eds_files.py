@@ -11,8 +11,6 @@ from adacd_hil.wire.dbc_contract import contract_folder
 
 FILES = sorted(contract_folder().glob("*.eds"))
 EVERY_FILE = pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-LISTS = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
-MANDATORY = {0x1000, 0x1001, 0x1018}
 BITS = {0x1: 1, 0x2: 8, 0x3: 16, 0x4: 32, 0x5: 8, 0x6: 16, 0x7: 32, 0x15: 64, 0x1B: 64}  # by DataType
 SIGNED = {0x2, 0x3, 0x4, 0x15}
 ACCESS = {"ro", "wo", "rw", "rwr", "rww", "const"}
@@ -57,26 +55,6 @@ def test_eds_validate_has_no_complaint(path: Path) -> None:
 
 
 @EVERY_FILE
-def test_the_three_lists_name_every_object_once_and_nothing_else(path: Path) -> None:
-    parser = sections_of(path)
-    listed: dict[int, str] = {}
-    for name in LISTS:
-        count = int(parser[name]["SupportedObjects"])
-        assert count > 0 or (name == "ManufacturerObjects" and path.stem in SERIES)
-        assert set(parser[name]) == {"SupportedObjects", *map(str, range(1, count + 1))}
-        for place in range(1, count + 1):
-            index = int(parser[name][str(place)], 16)
-            assert index not in listed
-            listed[index] = name
-    objects = {int(name, 16) for name in parser.sections() if re.fullmatch(r"[0-9A-F]{4}", name)}
-    assert set(listed) == objects
-    for index, name in listed.items():
-        is_own = 0x2000 <= index < 0x6000
-        expected = "MandatoryObjects" if index in MANDATORY else "ManufacturerObjects" if is_own else "OptionalObjects"
-        assert (hex(index), name) == (hex(index), expected)
-
-
-@EVERY_FILE
 def test_an_array_or_record_has_as_many_sub_indices_as_it_says(path: Path) -> None:
     parser = sections_of(path)
     for name in parser.sections():
@@ -105,24 +83,6 @@ def test_every_default_and_limit_fits_its_type(path: Path) -> None:
         values = [number(row[key]) for key in ("LowLimit", "DefaultValue", "HighLimit") if key in row]
         assert all(low <= value <= high for value in values), (hex(index), sub)
         assert values == sorted(values), (hex(index), sub)
-
-
-@EVERY_FILE
-def test_a_mapping_names_objects_that_can_be_mapped_in_its_direction(path: Path) -> None:
-    found = variables(path)
-    for (index, sub), row in found.items():
-        if index >> 8 not in (0x16, 0x17, 0x1A, 0x1B) or sub == 0:
-            continue
-        assert re.fullmatch(r"0x[0-9A-F]{8}", row["DefaultValue"]), (hex(index), sub)
-        entry = int(row["DefaultValue"], 16)
-        count = number(found[index, 0]["DefaultValue"])
-        assert (sub <= count) == (entry != 0)
-        if entry == 0:
-            continue
-        mapped = found[entry >> 16, entry >> 8 & 0xFF]
-        allowed = ("rw", "rww", "wo") if index < 0x1A00 else ("ro", "rw", "rwr", "const")
-        assert (mapped["PDOMapping"], mapped["AccessType"] in allowed) == ("1", True), hex(entry)
-        assert BITS[number(mapped["DataType"])] == entry & 0xFF
 
 
 @pytest.mark.parametrize("path", DRIVES, ids=lambda path: path.stem)

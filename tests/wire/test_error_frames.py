@@ -51,36 +51,6 @@ def test_a_report_is_read_as_the_header_says(
     assert decode_error(Frame(error_class, bytes.fromhex(data), 0, is_error=True)) == (TroubleKind[kind], text)
 
 
-@pytest.mark.parametrize(
-    ("place", "text"),
-    [
-        (0x02, "identifier bits 10-3"),
-        (0x03, "start of frame"),
-        (0x04, "remote request bit"),
-        (0x05, "identifier extension bit"),
-        (0x06, "identifier bits 2-0"),
-        (0x07, "identifier bits 17-13"),
-        (0x08, "CRC sequence"),
-        (0x09, "reserved bit 0"),
-        (0x0A, "data"),
-        (0x0B, "data length code"),
-        (0x0C, "remote request bit"),
-        (0x0D, "reserved bit 1"),
-        (0x0E, "identifier bits 4-0"),
-        (0x0F, "identifier bits 12-5"),
-        (0x12, "intermission"),
-        (0x18, "CRC delimiter"),
-        (0x19, "acknowledge slot"),
-        (0x1A, "end of frame"),
-        (0x1B, "acknowledge delimiter"),
-        (0x55, "unspecified"),
-    ],
-)
-def test_the_place_of_a_protocol_error_is_named(place: int, text: str) -> None:
-    _, said = decode_error(Frame(0x008, bytes((0, 0, 0, place, 0, 0, 0, 0)), 0, is_error=True))
-    assert f"protocol error ({text})" in said
-
-
 def test_no_frame_of_any_class_is_without_a_line() -> None:
     for error_class in range(0x400):
         text = decode_error(Frame(error_class, b"\xff" * 8, 0, is_error=True))[1]

@@ -42,14 +42,6 @@ def test_a_moved_contract_is_the_one_that_cantools_moves_with_attributes_comment
         assert ours.comment == theirs.comment
 
 
-def test_protection_moves_with_the_frame() -> None:
-    codec, moved = contract("arm"), move_contract(contract("arm"), 4)
-    frame = codec.message("Drive1Command").sender().protect(codec.message("Drive1Command").encode(15, 100))
-    again = moved.message("Drive1Command").sender().protect(moved.message("Drive1Command").encode(15, 100))
-    assert moved.message("Drive1Command").can_id == 0x205
-    assert bytes(frame) == bytes(again)
-
-
 def test_a_contract_that_stays_is_the_file_itself() -> None:
     codec = contract("arm")
     assert move_contract(codec, 0, 127) is codec
