@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -14,10 +15,13 @@ from hang import HANG_S
 from served_bench import MS, START_ALL, ScriptedBus, enabling_script, serve
 
 from adacd_hil.clock import VirtualClock
+from adacd_hil.log.log_files import SCENARIO_NAME
 from adacd_hil.log.reader import read_log
 from adacd_hil.scheduling import RealtimeGrant
+from adacd_hil.settings.parsing import parse
 from firmware_sim.cli.emulator_main import main
 from firmware_sim.cli.service import StopRequest
+from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 SOCKETCAN = ("run", "-i", "socketcan", "-c", "no_such_can0")
 
@@ -92,6 +96,11 @@ node = "sensor1"
 frame = "torque"
 at_s = 0.01
 duration_s = 0.02
+[[faults]]
+kind = "silence"
+node = "sensor2"
+since = "power_on"
+at_s = 9.0
 """
 
 
@@ -117,7 +126,11 @@ def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, 
         (log.truth.t_ns[edges[0]], "begins"),
         (log.truth.t_ns[edges[1]], "ends"),
     ]
-    assert log.metadata["fault_0"].startswith("lose torque of sensor1")
+    assert [log.metadata[f"fault_{index}"] for index in range(2)] == [
+        "lose torque of sensor1, duration_s 0.02, at 0.01 s since enabled",
+        "silence of sensor2, at 9 s since power on",
+    ]
+    assert parse(Scenario, tomllib.loads(log.attachments[SCENARIO_NAME].decode())) == load_scenario(str(scenario))
 
 
 def test_frames_that_waited_since_before_power_on_are_dropped():
