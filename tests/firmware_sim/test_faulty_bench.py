@@ -1,26 +1,7 @@
 """What a bench sends while a scenario's faults act: SYNCs that nobody hears, and floods."""
 
 import pytest
-from bench_host import BenchHost, Word, quiet_scenario
-
-from adacd_hil.wire.time_marks import HOST_MARK, MarkKind, pack_mark
-
-
-def enabled_host(fault: dict[str, object]) -> BenchHost:
-    """Return a host in lockstep whose arm is enabled, 5 ms before a fault."""
-    host = BenchHost(quiet_scenario(faults=[{"at_s": 0.0, **fault}]))
-    host.put(HOST_MARK, pack_mark(MarkKind.ADVANCE, 0))
-    host.enable()
-    while not host.bench.is_scenario_started:
-        host.step(Word.ENABLE)
-    host.take()
-    return host
-
-
-def answer(host: BenchHost) -> list[int]:
-    """Return the identifiers of what a SYNC brings, in their order."""
-    host.step(Word.ENABLE)
-    return [can_id for can_id, _ in host.take()]
+from bench_host import PERIOD_NS, BenchHost, Word, quiet_scenario
 
 
 def test_by_the_clock_a_drive_that_hears_no_sync_has_nothing_to_count() -> None:
@@ -46,9 +27,10 @@ def test_held_back_frames_go_out_although_a_sync_is_lost() -> None:
     host.enable()
     while not host.bench.is_scenario_started:
         host.step(Word.ENABLE)
+    host.step(Word.ENABLE)
     host.take()
-    answer(host)
-    assert answer(host) == [0x183]
+    host.step(Word.ENABLE)
+    assert [can_id for can_id, _ in host.take()] == [0x183]
 
 
 @pytest.mark.parametrize("clock_mode", ["sync", "wall"])
@@ -57,4 +39,16 @@ def test_a_node_babbles_without_any_sync(clock_mode: str) -> None:
     host = BenchHost(quiet_scenario(faults=[{**flood, "at_s": 0.01, "duration_s": 0.02}]), clock_mode)
     for t_ns in range(0, 50_000_000, 250_000):
         host.bench.advance_to(t_ns)
+    assert len(host.taken(0x7F0)) == 40
+
+
+@pytest.mark.parametrize("clock_mode", ["sync", "wall"])
+def test_a_node_babbles_on_between_syncs(clock_mode: str) -> None:
+    flood = {"kind": "babble", "node": "drive1", "can_id": 0x7F0, "rate_Hz": 4000.0}
+    host = BenchHost(quiet_scenario(faults=[{**flood, "at_s": 0.005, "duration_s": 0.01}]), clock_mode)
+    host.enable()
+    for _ in range(40):
+        host.step(Word.ENABLE)
+        if clock_mode == "wall":
+            host.bench.advance_to(host.t_ns + PERIOD_NS - 1)
     assert len(host.taken(0x7F0)) == 40
