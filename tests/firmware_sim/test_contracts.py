@@ -1,17 +1,14 @@
 """The contracts that the emulator plays: DBC and EDS describe the same frames, and the devices send them."""
 
-import dataclasses
 import struct
 from pathlib import Path
 
 import canopen
 import cantools
 import pytest
-from bench_host import ENABLING, PERIOD_NS, BenchHost, Nmt, quiet_scenario, remap
+from bench_host import ENABLING, PERIOD_NS, BenchHost, Nmt, State, remap
 from canopen.objectdictionary.datatypes import SIGNED_TYPES
-from loaded import loaded_contract
 
-from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
 from firmware_sim.canopen.object_dictionary import CONTRACTS, playable_contract
@@ -81,31 +78,21 @@ def test_mappings_by_default_and_what_is_to_be_mapped_on_stock_drives_are_the_db
     assert seen == cyclic
 
 
-def stock_host(**scenario) -> BenchHost:
-    host = BenchHost(quiet_scenario(**scenario), contract="arm_stock")
+def test_a_stock_drive_watches_its_commands_by_the_event_timer_only():
+    host = BenchHost(contract="arm_stock")
     for node in (*DRIVE_NODES, *SENSOR_NODES):
         host.write(node, 0x1019, 0, 240)
         host.write(node, 0x1006, 0, 1000)
+    base, kind, entries = STOCK[0x1400]
     for node in DRIVE_NODES:
-        for record, (base, kind, entries) in STOCK.items():
-            timer_ms = 100 if record == 0x1801 else 0
-            remap(host, node, record, entries, can_id=base + node, kind=kind, timer_ms=timer_ms)
+        remap(host, node, 0x1400, entries, can_id=base + node, kind=kind, timer_ms=5 if node == 1 else 0)
         host.write(node, 0x6060, 0, 10)
     host.nmt(Nmt.START)
-    return host
-
-
-def step(host: BenchHost, word: int, torque: int = 0) -> None:
-    for node in DRIVE_NODES:
-        host.put(0x200 + node, struct.pack("<Hh", word, torque))
-    host.sync()
-
-
-def test_a_stock_drive_watches_its_commands_by_the_event_timer_only():
-    host = stock_host()
-    host.write(1, 0x1400, 5, 5)
     for word in ENABLING:
-        step(host, word)
+        for node in DRIVE_NODES:
+            host.put(base + node, struct.pack("<Hh", word, 0))
+        host.sync()
+    assert [host.state_bits(joint) for joint in (1, 2)] == [State.ENABLED] * 2
     host.sync(times=5)
     assert host.read(1, 0x603F) == 0x8250
     assert host.read(2, 0x603F) == 0
@@ -145,21 +132,6 @@ def test_a_stock_sensors_mapping_is_fixed(sub):
     host = BenchHost(contract="arm_stock")
     assert host.abort_code(lambda: host.write(3, 0x1A00, sub, 0)) == 0x06010002
     assert host.abort_code(lambda: host.write(3, 0x1800, 1, 0x80000183)) == 0x06010002
-
-
-@pytest.mark.parametrize(
-    ("config", "name", "nodes"),
-    [
-        ("paper", "arm", {"drive_node": (9, 10), "sensor_node": (11, 12)}),
-        ("fd", "arm_fd", {}),
-        ("stock", "arm_stock", {"drive_node": (9, 10), "sensor_node": (11, 12)}),
-    ],
-)
-def test_a_composed_contract_is_played_by_the_devices_that_have_its_frames(config, name, nodes) -> None:
-    settings = load_settings(config)
-    devices = dataclasses.replace(settings.devices, contract="", **nodes)
-    composed = loaded_contract(dataclasses.replace(settings, devices=devices))
-    assert playable_contract(composed) == CONTRACTS[name]
 
 
 def test_frames_that_no_device_has_are_not_played_by_another() -> None:

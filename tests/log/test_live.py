@@ -31,7 +31,6 @@ from websockets.sync.client import connect
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.lab.live.client import LiveClient, live_client
-from adacd_hil.lab.live.feed import Decimator
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.server import BACKLOG, BACKLOG_BYTES
 from adacd_hil.log.log_files import LogError
@@ -72,23 +71,6 @@ def watched(run):
         messages = receive_until_last(client)
         topics = client.topics
     return messages, topics, fed.file()
-
-
-@pytest.mark.parametrize(
-    ("rate_Hz", "batches", "shown"),
-    [
-        (50, [[0, 1, 19], [20, 21, 40]], [[1, 0, 0], [1, 0, 1]]),
-        (50, [[5, 19], [19, 20]], [[1, 0], [0, 1]]),
-        (50, [[5, 5], [5, 6]], [[1, 1], [1, 0]]),  # frames of one cycle stay together, across batches too
-        (50, [[5, 95, 99, 100]], [[1, 1, 0, 1]]),  # a pause moves no slot
-        (10, [[0, 99, 100]], [[1, 0, 1]]),
-        (0, [[5, 5], [6]], [[1, 1], [1]]),
-    ],
-)
-def test_of_each_slot_the_first_cycle_is_shown(rate_Hz, batches, shown):
-    decimator = Decimator(rate_Hz)
-    found = [[decimator.takes(cycle * 1_000_000) for cycle in batch] for batch in batches]
-    assert found == [[bool(value) for value in batch] for batch in shown]
 
 
 def test_a_viewer_receives_every_topic_at_its_rate_as_the_file_has_it(watched):
