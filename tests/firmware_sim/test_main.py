@@ -12,24 +12,17 @@ import numpy as np
 import pytest
 from bench_host import Nmt
 from hang import HANG_S
-from served_bench import MS, START_ALL, ScriptedBus, enabling_script, serve
+from served_bench import MS, START_ALL, ScriptedBus, enabling_script, run_main, serve
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.log.log_files import SCENARIO_NAME
 from adacd_hil.log.reader import read_log
 from adacd_hil.scheduling import RealtimeGrant
 from adacd_hil.settings.parsing import parse
-from firmware_sim.cli.emulator_main import main
 from firmware_sim.cli.service import StopRequest
 from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 SOCKETCAN = ("run", "-i", "socketcan", "-c", "no_such_can0")
-
-
-def run_main(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    return int(ended.value.code)
 
 
 @pytest.mark.parametrize(

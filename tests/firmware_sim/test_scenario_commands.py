@@ -4,15 +4,9 @@ import json
 import tomllib
 
 import pytest
+from served_bench import run_main
 
-from firmware_sim.cli.emulator_main import main
 from firmware_sim.scenario.scenario import builtin_scenarios, load_scenario
-
-
-def run_main(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    return int(ended.value.code)
 
 
 def test_list_has_a_line_for_each_scenario_and_json_says_what_happens_and_is_expected(capsys):
