@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import struct
-import threading
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ from live_rig import (
     SETUP,
     URDF,
     Feed,
+    ThreadedWriter,
     by_topic,
     first_cycles_of_slots,
     receive_until_last,
@@ -34,12 +34,9 @@ from adacd_hil.lab.live.client import LiveClient, live_client
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.server import BACKLOG, BACKLOG_BYTES
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.log_file import Sink
 from adacd_hil.log.recording.packet import pack_cycle, pack_event
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.recording.ring import Ring, RingReader
-from adacd_hil.log.recording.writer import WriterProcess
 from adacd_hil.records import Event
 
 STATED_HZ = {
@@ -250,25 +247,19 @@ class OtherEnd:
 def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_waits_for_nobody(tmp_path):
     run = make_run(1)
     run.cycles[0].event = LAST
-    clock, ring = VirtualClock(), Ring(2**20)
+    path, clock = tmp_path / "run.mcap", VirtualClock()
     clock.sleep_until_ns(3_000_000_000)
-    reader = RingReader(ring.descriptor)
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    sink = Sink(os.open(tmp_path / "run.mcap", os.O_WRONLY | os.O_CREAT), waits=False)
-    process = WriterProcess(theirs, reader, sink, setup_of(SETUP, tmp_path / "run.mcap"), clock)
-    thread = threading.Thread(target=process.run, daemon=True)  # a failure must not keep it waiting
-    thread.start()
-    with live_client(process.live.url) as client:
+    sink = Sink(os.open(path, os.O_WRONLY | os.O_CREAT), waits=False)
+    writer = ThreadedWriter(setup_of(SETUP, path), sink, clock)
+    live = writer.process.live
+    with live_client(live.url) as client:
         assert client.receive(HANG_S)[:2] == ("/robot_description", EPOCH_NS + 3_000_000_000)
-        ring.put_packet(pack_cycle(run.cycles[0].t_ns, 0, run.cycles[0].messages(), []))
-        ring.put_packet(pack_event(run.cycles[0].t_ns, 0, LAST))
+        writer.ring.put_packet(pack_cycle(run.cycles[0].t_ns, 0, run.cycles[0].messages(), []))
+        writer.ring.put_packet(pack_event(run.cycles[0].t_ns, 0, LAST))
         assert "/scheme" in by_topic(receive_until_last(client))
-        ours.send(processes.END)
-        thread.join()
-    process.live.process.wait(HANG_S)
+        writer.end()
+    live.process.wait(HANG_S)
     assert clock.now_ns() == 3_000_000_000
-    for end in (ours, theirs, ring):
-        end.close()
 
 
 @pytest.mark.parametrize(
