@@ -247,15 +247,6 @@ def test_a_frame_that_the_contract_has_not_is_refused(kind, frame, contract, mes
 # Chance
 
 
-@pytest.mark.parametrize("probability", [0.0, 0.3, 1.0])
-def test_as_many_frames_are_lost_as_their_probability_says(probability):
-    plan = active(frame_row("lose", probability=probability))
-    count = 5_000
-    lost = sum(not plan.transmit(SENSOR1, 0x183, TORQUE) for _ in range(count))
-    sigma = (count * probability * (1 - probability)) ** 0.5
-    assert abs(lost - count * probability) <= 3.5 * sigma
-
-
 def lost_frames(plan: FaultPlan, node: int = SENSOR1, can_id: int = 0x183) -> list[bool]:
     return [not plan.transmit(node, can_id, TORQUE) for _ in range(200)]
 
