@@ -60,15 +60,6 @@ def test_the_layout_of_a_type_is_aligned_as_cdr_demands():
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["float64 x\n", "builtin_interfaces/Time stamp\nstring s\n", "builtin_interfaces/Time stamp\nfloat64[] x\n", ""],
-)
-def test_a_type_of_varying_size_has_no_layout(text):
-    with pytest.raises(LogError):
-        payload_dtype(text)
-
-
-@pytest.mark.parametrize(
     ("sampled_ns", "age_ns"),
     [(6_500_000, 2_500_000), (9_000_001, -1), (None, 0)],
     ids=["own", "clock set back", "none"],
