@@ -74,10 +74,10 @@ def test_rosbags_reads_every_message_of_every_topic(log_path):
     assert theirs == by_mcap(log_path)
 
 
-def test_only_a_copy_of_our_own_log_claims_the_profile(tmp_path):
-    """Also of one from before the profile, as `make_log` writes them."""
-    for library, profile in (("somebody 1.0", ""), (LIBRARY, "ros2")):
-        (tmp_path / "run.mcap").write_bytes(make_log(library=library))
+def test_a_copy_keeps_the_profile_and_only_one_of_our_own_log_claims_it(tmp_path):
+    """Also of one from before the profile."""
+    for library, given, profile in (("somebody", "", ""), (LIBRARY, "", "ros2"), ("somebody", "ros2", "ros2")):
+        (tmp_path / "run.mcap").write_bytes(make_log(library=library, profile=given))
         cut(tmp_path / "run.mcap", tmp_path / "cut.mcap", TimeWindow(0.0, 1.0))
         recover(tmp_path / "run.mcap", tmp_path / "recovered.mcap")
         assert [header_of(tmp_path / f"{name}.mcap").profile for name in ("cut", "recovered")] == [profile] * 2
