@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Sequence
 
+import pytest
 from bench_host import CODEC, BenchHost, Nmt, quiet_scenario
 
 from adacd_hil.clock import VirtualClock
@@ -10,6 +11,7 @@ from adacd_hil.wire.bus import Bus, Frame
 from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.bench_time import OnTruth
 from firmware_sim.bench.injector import Departure
+from firmware_sim.cli.emulator_main import main
 from firmware_sim.cli.service import Service, StopRequest
 
 MS = 1_000_000
@@ -17,6 +19,13 @@ START_ALL = (0x000, bytes([Nmt.START, 0]))
 HOST_BEAT = (0x77F, b"\x05")
 Script = Sequence[tuple[int, int, bytes]]
 """Time in ms, identifier, data."""
+
+
+def run_main(*arguments: str) -> int:
+    """Call `firmware-sim` in this process; return its exit status."""
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    return int(ended.value.code)
 
 
 class ScriptedBus(Bus):

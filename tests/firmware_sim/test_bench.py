@@ -49,26 +49,6 @@ def test_by_sync_the_arm_moves_one_period_per_sync_however_long_it_takes():
     assert quick.bench.now_ns == 302 * PERIOD_NS
 
 
-def test_a_lost_sync_keeps_the_arms_time():
-    whole, holed = BenchHost(), BenchHost()
-    for host in (whole, holed):
-        play(host, 100)
-        host.step(Word.ENABLE, 50)
-    whole.sync(times=3)
-    holed.cycle += 2
-    holed.sync()
-    assert holed.bench.cycle == whole.bench.cycle
-    assert np.array_equal(holed.truths[-1][2], whole.truths[-1][2])
-    assert holed.bench.now_ns == whole.bench.now_ns
-
-
-def test_the_counter_is_unwrapped_over_its_overflow():
-    host = BenchHost()
-    host.cycle = 7  # the first counter may be any
-    host.sync(times=500)
-    assert host.bench.cycle == 506
-
-
 @pytest.mark.parametrize("command", [Nmt.PRE_OPERATIONAL, Nmt.RESET_COMMUNICATION, Nmt.RESET_NODE])
 def test_another_period_can_be_written_again_once_the_nodes_have_left_operational(command):
     host = BenchHost()
@@ -98,32 +78,6 @@ def test_another_period_can_be_written_again_once_the_nodes_have_left_operationa
     now_ns = host.bench.now_ns
     host.sync()
     assert host.bench.now_ns == now_ns + PERIOD_NS
-
-
-@pytest.mark.parametrize("command", [Nmt.RESET_COMMUNICATION, Nmt.RESET_NODE])
-def test_a_reset_node_begins_the_sequences_of_its_protected_frames_anew(command):
-    host = BenchHost()
-
-    def started() -> list[bytes]:
-        host.cycle = 0
-        host.start()
-        host.sync(times=7)
-        return host.taken(0x183)
-
-    first = started()
-    host.nmt(command)
-    assert len(set(first)) > 3
-    assert started() == first
-
-
-def test_by_wall_clock_lost_syncs_do_not_move_the_arm_twice():
-    host = BenchHost(clock_mode="wall")
-    host.enable()
-    host.cycle += 2
-    host.t_ns += 2 * PERIOD_NS
-    host.step(Word.ENABLE)
-    assert host.bench.now_ns == host.t_ns
-    assert host.bench.cycle == 5
 
 
 def test_error_frames_and_strangers_frames_are_ignored():

@@ -36,18 +36,3 @@ def test_the_truth_of_a_sync_that_no_device_heard_is_that_of_its_own_period():
     assert np.count_nonzero(host.history("faults")) == 1
     q, dq = host.history("q")[5:], host.history("dq")[5:]
     assert np.diff(q, axis=0) == pytest.approx(0.5e-3 * (dq[1:] + dq[:-1]), rel=0.02)
-
-
-def test_drives_without_sync_brake_from_the_same_instant_in_both_clocks():
-    by_sync, by_wall = moving_host(), moving_host(clock_mode="wall")
-    assert by_sync.true("q").tolist() == by_wall.true("q").tolist()
-    by_sync.bench.outlive_host()
-    by_wall.bench.advance_to(by_wall.bench.now_ns + 8 * PERIOD_NS)
-    died = by_sync.cycle - 1
-    found = []
-    for host in (by_sync, by_wall):
-        cycles = [cycle for cycle, _, _ in host.truths]
-        found.append(dict(zip(cycles, np.hstack([host.history("q"), host.history("tau_m")]), strict=True)))
-    for cycle in range(died + 4, died + 9):
-        assert found[1][cycle] == pytest.approx(found[0][cycle], abs=1e-12)
-    assert found[0][died + 2][3] < 0.0 < found[0][died + 1][3]

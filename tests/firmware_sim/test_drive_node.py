@@ -64,14 +64,6 @@ def host() -> BenchHost:
     return BenchHost()
 
 
-def test_target_torque_is_per_mille_of_rated_torque_in_the_motors_direction(host):
-    host.enable()
-    host.step(Word.ENABLE, -250, times=10)
-    assert host.true("tau_J").tolist() == pytest.approx([-3.0, -1.5], abs=1e-9)
-    assert host.true("dq")[1] < 0.0
-    assert host.read(1, 0x6077) == -250
-
-
 def test_a_command_with_any_one_bit_flipped_changes_nothing(host):
     host.enable()
     for bit in range(48):
@@ -84,17 +76,6 @@ def test_a_command_with_any_one_bit_flipped_changes_nothing(host):
         assert host.bench.drives[0].torque_Nm == pytest.approx(1.2)
         assert host.state_bits() == State.ENABLED
         assert host.bench.drives[0].rejected_commands == bit + 1
-
-
-def test_a_repeated_command_counts_as_none(host):
-    host.enable()
-    frame = host.command_frame(1, Word.ENABLE, 100)
-    for _ in range(4):
-        host.put(0x201, frame)
-        host.command(Word.ENABLE, 0, joints=(2,))
-        host.sync()
-    assert host.state_bits(1) == State.REACTION
-    assert host.state_bits(2) == State.ENABLED
 
 
 def test_two_syncs_without_command_are_forgiven_and_hold_the_torque_and_the_third_faults(host):

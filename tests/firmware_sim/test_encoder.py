@@ -71,18 +71,6 @@ def test_the_noise_has_its_rms_in_the_encoders_own_counts():
     assert abs(np.corrcoef(np.array(rows).T)[0, 1]) < 0.05
 
 
-def test_encoder_noise_shakes_the_velocity_of_a_resting_arm_and_not_the_arm():
-    body = arm(encoder_noise_counts=[5.0, 0.0])
-    velocities = []
-    for _ in range(300):
-        body.advance((0.0, 0.0), OFF)
-        velocities.append(body.sample().dq)
-    deviations = np.array(velocities).std(axis=0)
-    assert deviations[0] > 5e-3
-    assert deviations[1] == 0.0
-    assert not truth_of(body)["dq"].any()
-
-
 @pytest.mark.parametrize("ticks", [1, NOISE_TICKS - 1, NOISE_TICKS + 1, 257])
 def test_encoder_noise_does_not_depend_on_how_the_ticks_are_asked_for(ticks):
     """A braking drive answers the noise of its velocity with torque, so the arm remembers all of it."""

@@ -68,13 +68,6 @@ def test_the_mask_has_a_bit_for_each_row_that_is_active():
     assert masks == [0b000, 0b001, 0b011, 0b111, 0b110, 0b100, 0b100]
 
 
-@pytest.mark.parametrize("kind", ["wrong_node_id", "duplicate_node_id"])
-def test_a_wrong_id_is_there_from_power_on_and_disturbs_nothing_else(kind):
-    plan = plan_of(example(kind))
-    assert plan.advance(-1, 0)[0].begins
-    assert (plan.mask, plan.is_quiet, plan.wait_ns) == (1, True, NEVER_NS)
-
-
 def test_it_says_how_long_nothing_will_change():
     plan = plan_of(
         example("silence", at_s=1.0, duration_s=0.25), example("emcy_storm", at_s=2.0, rate_Hz=4.0, duration_s=1.0)
@@ -131,13 +124,6 @@ def test_what_the_host_sends_is_lost_on_its_way_to_whom_the_row_says(frame, node
 def test_all_is_every_node_with_such_a_frame(frame, first_id, nodes):
     plan = active({"kind": "lose", "node": "all", "frame": frame})
     assert [node for node in range(4) if not plan.transmit(node, first_id + node, b"\0")] == nodes
-
-
-def test_any_frame_of_a_node_is_lost_whatever_else_is_said_of_one_of_them():
-    plan = active({"kind": "lose", "node": "drive1", "frame": "any"}, example("duplicate"))
-    assert plan.transmit(DRIVE1, 0x181, FEEDBACK) == []
-    assert plan.transmit(DRIVE1, 0x7A1, b"") == []
-    assert plan.receive(DRIVE1, 0x201, TORQUE) == [(0, TORQUE)]
 
 
 LATE, MASK = frame_row("delay", delay_us=1.0), frame_row("corrupt", mask="ff")
@@ -259,15 +245,6 @@ def test_a_frame_that_the_contract_has_not_is_refused(kind, frame, contract, mes
 
 
 # Chance
-
-
-@pytest.mark.parametrize("probability", [0.0, 0.3, 1.0])
-def test_as_many_frames_are_lost_as_their_probability_says(probability):
-    plan = active(frame_row("lose", probability=probability))
-    count = 5_000
-    lost = sum(not plan.transmit(SENSOR1, 0x183, TORQUE) for _ in range(count))
-    sigma = (count * probability * (1 - probability)) ** 0.5
-    assert abs(lost - count * probability) <= 3.5 * sigma
 
 
 def lost_frames(plan: FaultPlan, node: int = SENSOR1, can_id: int = 0x183) -> list[bool]:

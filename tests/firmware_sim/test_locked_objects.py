@@ -45,18 +45,6 @@ def test_a_drive_without_power_refuses_nothing_for_being_at_work(bits):
     assert set(refusals(in_state(bits), 1).values()) == {0}
 
 
-def test_what_was_refused_stays_as_it_was():
-    host = in_state(State.ENABLED)
-    for index, sub, value in ((0x1006, 0, 2000), (0x1016, 1, 0), (0x1400, 5, 10_000), (0x2200, 0, 255), (0x605A, 0, 0),
-                              (0x6060, 0, 0), (0x6071, 0, 500), (0x6072, 0, 2000)):  # fmt: skip
-        before = host.read(1, index, sub)
-        assert before != value
-        assert host.abort_code(lambda at=(index, sub, value): host.write(1, *at)) == DEVICE_STATE
-        host.step(Word.ENABLE)
-        assert host.read(1, index, sub) == before
-        assert (host.state_bits(), host.bench.drives[0].torque_Nm) == (State.ENABLED, 0.0)
-
-
 def test_a_download_in_segments_is_refused_as_well():
     host = in_state(State.ENABLED)
     host.take()

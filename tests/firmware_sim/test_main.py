@@ -5,27 +5,24 @@ import json
 import signal
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from bench_host import Nmt
 from hang import HANG_S
-from served_bench import MS, START_ALL, ScriptedBus, enabling_script, serve
+from served_bench import MS, START_ALL, ScriptedBus, enabling_script, run_main, serve
 
 from adacd_hil.clock import VirtualClock
+from adacd_hil.log.log_files import SCENARIO_NAME
 from adacd_hil.log.reader import read_log
 from adacd_hil.scheduling import RealtimeGrant
-from firmware_sim.cli.emulator_main import main
+from adacd_hil.settings.parsing import parse
 from firmware_sim.cli.service import StopRequest
+from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 SOCKETCAN = ("run", "-i", "socketcan", "-c", "no_such_can0")
-
-
-def run_main(*arguments: str) -> int:
-    with pytest.raises(SystemExit) as ended:
-        main(arguments)
-    return int(ended.value.code)
 
 
 @pytest.mark.parametrize(
@@ -92,6 +89,11 @@ node = "sensor1"
 frame = "torque"
 at_s = 0.01
 duration_s = 0.02
+[[faults]]
+kind = "silence"
+node = "sensor2"
+since = "power_on"
+at_s = 9.0
 """
 
 
@@ -117,7 +119,11 @@ def test_the_truth_log_says_at_which_cycle_a_fault_began_and_ended(monkeypatch, 
         (log.truth.t_ns[edges[0]], "begins"),
         (log.truth.t_ns[edges[1]], "ends"),
     ]
-    assert log.metadata["fault_0"].startswith("lose torque of sensor1")
+    assert [log.metadata[f"fault_{index}"] for index in range(2)] == [
+        "lose torque of sensor1, duration_s 0.02, at 0.01 s since enabled",
+        "silence of sensor2, at 9 s since power on",
+    ]
+    assert parse(Scenario, tomllib.loads(log.attachments[SCENARIO_NAME].decode())) == load_scenario(str(scenario))
 
 
 def test_frames_that_waited_since_before_power_on_are_dropped():
@@ -126,22 +132,21 @@ def test_frames_that_waited_since_before_power_on_are_dropped():
     assert not bench.is_operational
 
 
-@pytest.mark.parametrize("command", [Nmt.STOP, Nmt.RESET_COMMUNICATION])
-def test_once_ends_when_the_host_stops_or_resets_the_nodes(command):
-    script = [(100, 0x000, bytes([Nmt.RESET_COMMUNICATION, 0])), (3000, *START_ALL), (3500, 0x000, bytes([command, 0]))]
+STOP, RESET = ((0x000, bytes([command, 0])) for command in (Nmt.STOP, Nmt.RESET_COMMUNICATION))
+
+
+@pytest.mark.parametrize(
+    ("script", "end_ms"),
+    [
+        ([(100, *RESET), (3000, *START_ALL), (3500, *STOP)], 3500),
+        ([(100, *RESET), (3000, *START_ALL), (3500, *RESET)], 3500),
+        ([(100, *START_ALL), (101, 0x080, b"\x01"), (102, *STOP)], 102),  # without a pause
+        ([(3000, *START_ALL), (4000, 0x080, b"\x01")], 6000),  # 2 s after the last word of a host that started them
+    ],
+)
+def test_once_ends_when_the_host_that_started_the_nodes_stops_or_resets_them_or_is_silent(script, end_ms):
     _, _, clock = serve(script, 60_000, is_once=True)
-    assert 3500 * MS <= clock.now_ns() <= 3520 * MS
-
-
-def test_once_notices_a_host_that_starts_and_stops_without_a_pause():
-    script = [(100, *START_ALL), (101, 0x080, b"\x01"), (102, 0x000, bytes([Nmt.STOP, 0]))]
-    _, _, clock = serve(script, 60_000, is_once=True)
-    assert clock.now_ns() <= 120 * MS
-
-
-def test_once_ends_two_seconds_after_the_last_word_of_a_host_that_started_the_nodes():
-    _, _, clock = serve([(3000, *START_ALL), (4000, 0x080, b"\x01")], 60_000, is_once=True)
-    assert 6000 * MS < clock.now_ns() <= 6020 * MS
+    assert end_ms * MS <= clock.now_ns() <= (end_ms + 20) * MS
 
 
 def spawn(folder: Path, *arguments: str) -> subprocess.Popen[str]:

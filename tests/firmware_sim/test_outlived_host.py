@@ -88,6 +88,7 @@ def test_by_the_clock_a_lost_sync_or_two_leave_a_gap_as_ever():
         host.bench.advance_to(host.t_ns)
         host.step(Word.ENABLE)
     assert [cycle for cycle, _, _ in host.truths[begun:]] == [begun + 1, begun + 4]
+    assert host.bench.now_ns == host.t_ns
 
 
 HEARTBEAT_250 = bytes([0x23, 0x16, 0x10, 1, 250, 0, 127, 0])

@@ -3,11 +3,10 @@
 import struct
 
 import pytest
-from bench_host import CODEC, Nmt
+from bench_host import CODEC, BenchHost, Nmt
 
 from adacd_hil.lab.logs.frame_writer import FrameWriter
 from adacd_hil.log.frames.mcap_frames import RecordedFrame
-from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mark, unpack_mark
 from firmware_sim.bench.recorded_bench import RecordedBench, RecordedCycles
 from firmware_sim.scenario.scenario import load_scenario
@@ -78,28 +77,23 @@ def test_an_attempt_that_the_host_ends_early_is_left_out_to_its_end(tmp_path):
     assert cycles.take(0) == answers(3)
 
 
-class Host:
-    """Sends frames to a bench and keeps what comes back."""
+class Host(BenchHost):
+    """A host of a bench around a recorded arm."""
 
     def __init__(self, cycles):
-        self.frames = []
+        super().__init__()
         self.bench = RecordedBench(load_scenario("idle"), CODEC, lambda *frame: self.frames.append(frame), cycles)
         self.bench.boot()
 
-    def put(self, can_id, data):
+    def answer(self, can_id, data):
         """Send a frame; return what came back at once."""
-        before = len(self.frames)
-        self.bench.on_frame(Frame(can_id, data, 0))
-        return self.frames[before:]
+        self.take()
+        self.put(can_id, data)
+        return self.take()
 
     def cyclic(self, counter):
         """Send SYNC; return what came back of the frames that follow each."""
-        return tuple(frame for frame in self.put(*sync(counter)) if frame[0] in (*FEEDBACKS, *TORQUES))
-
-    def read(self, node, index):
-        """Read an object of four bytes by SDO."""
-        ((_, data),) = self.put(0x600 + node, struct.pack("<BHB4x", 0x40, index, 0))
-        return struct.unpack("<i", data[4:])[0]
+        return tuple(frame for frame in self.answer(*sync(counter)) if frame[0] in (*FEEDBACKS, *TORQUES))
 
 
 @pytest.fixture
@@ -136,15 +130,15 @@ def test_objects_read_as_the_recording_shows_the_arm(host):
 
 def test_a_host_in_lockstep_hears_that_a_cycle_lacks_frames(host):
     host.put(HOST_MARK, pack_mark(MarkKind.ADVANCE, 0))
-    assert DEVICE_MARK not in [can_id for can_id, _ in host.put(*sync(2))]
-    assert DEVICE_MARK in [can_id for can_id, _ in host.put(*sync(4))]
-    (*_, (last_id, last)) = host.put(*sync(5))
+    assert DEVICE_MARK not in [can_id for can_id, _ in host.answer(*sync(2))]
+    assert DEVICE_MARK in [can_id for can_id, _ in host.answer(*sync(4))]
+    (*_, (last_id, last)) = host.answer(*sync(5))
     assert (last_id, unpack_mark(last)[0]) == (DEVICE_MARK, MarkKind.END)
 
 
 def test_without_cycles_all_but_sync_is_answered():
     host = Host(None)
-    assert [data for _, data in host.put(*RESET)] == [b"\0"] * 4
+    assert [data for _, data in host.answer(*RESET)] == [b"\0"] * 4
     host.put(NMT, bytes([Nmt.START, 0]))
     assert host.cyclic(1) == ()
     assert host.read(1, 0x6064) == 0

@@ -84,11 +84,6 @@ def test_a_scenario_that_cannot_be_is_refused_in_one_line_with_its_key(tmp_path,
     assert "\n" not in str(refusal.value)
 
 
-def test_a_misspelt_scenario_is_answered_with_the_nearest_name():
-    with pytest.raises(ConfigError, match="scenario 'papr' is neither built in nor a file; did you mean 'paper'"):
-        load_scenario("papr")
-
-
 def test_contacts_that_follow_each_other_without_a_gap_are_accepted(tmp_path):
     path = tmp_path / "two.toml"
     path.write_text(f"contacts = [{CONTACT}, {OVERLAPPING.replace('1.05', '1.1')}]", encoding="utf-8")

@@ -71,54 +71,40 @@ def test_a_request_that_can_not_be_served_is_aborted_with_its_reason_and_changes
     assert before is None or sdo.upload(index, sub) == before
 
 
-@pytest.mark.parametrize("command", [0xE0, 0xFF, 0xA0, 0xC0, 0xC6])
-def test_an_unknown_command_or_a_block_transfer_is_aborted_by_name(host, command):
-    assert ask(host, frame(command, 0x1008)) == aborted(0x1008, 0, UNKNOWN_COMMAND)
+def in_segments(*segments: bytes, size: int | None = None) -> list[bytes]:
+    """Requests that write the controlword in segments, its size announced or not."""
+    head = frame(0x20, 0x6040) if size is None else frame(0x21, 0x6040, 0, struct.pack("<I", size))
+    return [head, *segments]
 
 
-@pytest.mark.parametrize("command", [0x60, 0x70, 0x00, 0x01])
-def test_a_segment_that_belongs_to_no_transfer_is_aborted(host, command):
-    host.nodes[1].sdo.upload(0x1000, 0)
-    assert ask(host, bytes([command])) == aborted(0x1000, 0, UNKNOWN_COMMAND)
+UPLOAD = frame(0x40, 0x1008)
+BROKEN = [
+    *[([frame(command, 0x1008)], 0x1008, UNKNOWN_COMMAND) for command in (0xE0, 0xFF, 0xA0, 0xC0, 0xC6)],
+    *[([frame(0x40, 0x1000), bytes([command])], 0x1000, UNKNOWN_COMMAND) for command in (0x60, 0x70, 0x00, 0x01)],
+    ([UPLOAD, b"\x60", b"\x60"], 0x1008, TOGGLE),
+    ([UPLOAD, b"\x60", b"\x60", b"\x70"], 0x1008, UNKNOWN_COMMAND),
+    ([frame(0x20, 0x1006), bytes([0x0A, 0xE8, 0x03]), bytes([0x0B, 0x00, 0x00])], 0x1006, TOGGLE),
+    (in_segments(size=3), 0x6040, LONG),
+    (in_segments(size=1), 0x6040, SHORT),
+    (in_segments(bytes([0x09, 1, 2, 3]), size=2), 0x6040, LONG),
+    (in_segments(bytes([0x0D, 1]), size=2), 0x6040, SHORT),
+    (in_segments(bytes([0x0D, 1])), 0x6040, WRONG_LENGTH),
+    (in_segments(bytes([0x00, 1, 2, 3, 4, 5, 6, 7])), 0x6040, LONG),  # and more would follow
+]
+"""Requests of which the last is aborted, the object, and why: unknown commands, segments of no transfer, lengths."""
 
 
-def test_a_toggle_bit_that_stands_still_ends_the_upload(host):
-    ask(host, frame(0x40, 0x1008))
-    ask(host, b"\x60")
-    assert ask(host, b"\x60") == aborted(0x1008, 0, TOGGLE)
-    assert ask(host, b"\x70") == aborted(0x1008, 0, UNKNOWN_COMMAND)
+@pytest.mark.parametrize(("requests", "index", "code"), BROKEN)
+def test_a_transfer_that_goes_wrong_is_aborted_with_its_reason_and_writes_nothing(host, requests, index, code):
+    before = {each: host.read(1, each) for each in (0x1006, 0x6040)}
+    *_, answer = [ask(host, request) for request in requests]
+    assert answer == aborted(index, 0, code)
+    assert {each: host.read(1, each) for each in before} == before
 
 
 def test_a_number_may_be_written_in_segments(host):
-    assert ask(host, frame(0x21, 0x6040, 0, struct.pack("<I", 2)))[0] == 0x60
-    assert ask(host, bytes([0x0B, 0x06, 0x00]))[0] == 0x20
+    assert [ask(host, request)[0] for request in in_segments(bytes([0x0B, 0x06, 0x00]), size=2)] == [0x60, 0x20]
     assert host.read(1, 0x6040) == 6
-
-
-def test_a_toggle_bit_that_stands_still_ends_the_download(host):
-    ask(host, frame(0x20, 0x1006))
-    ask(host, bytes([0x0A, 0xE8, 0x03]))
-    assert ask(host, bytes([0x0B, 0x00, 0x00])) == aborted(0x1006, 0, TOGGLE)
-    assert host.read(1, 0x1006) == 1000
-
-
-@pytest.mark.parametrize(("size", "code"), [(3, LONG), (1, SHORT)])
-def test_an_announced_size_that_is_not_the_objects_is_aborted_at_once(host, size, code):
-    assert ask(host, frame(0x21, 0x6040, 0, struct.pack("<I", size))) == aborted(0x6040, 0, code)
-
-
-@pytest.mark.parametrize(("segment", "code"), [(bytes([0x09, 1, 2, 3]), LONG), (bytes([0x0D, 1]), SHORT)])
-def test_segments_that_are_not_as_long_as_announced_are_aborted(host, segment, code):
-    ask(host, frame(0x21, 0x6040, 0, struct.pack("<I", 2)))
-    assert ask(host, segment) == aborted(0x6040, 0, code)
-    assert host.read(1, 0x6040) == 0
-
-
-def test_segments_of_an_unannounced_size_must_fit_the_object(host):
-    ask(host, frame(0x20, 0x6040))
-    assert ask(host, bytes([0x0D, 1])) == aborted(0x6040, 0, WRONG_LENGTH)
-    ask(host, frame(0x20, 0x6040))
-    assert ask(host, bytes([0x00, 1, 2, 3, 4, 5, 6, 7])) == aborted(0x6040, 0, LONG)  # and more would follow
 
 
 def test_an_expedited_write_without_a_size_takes_the_objects_length(host):

@@ -12,15 +12,8 @@ from general_arm import TORQUE
 from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.settings.parsing import parse
 from firmware_sim.arm.sensing import (
-    POSITION_LSB_RAD,
-    VELOCITY_LSB_RAD_S,
     DriveMode,
-    TorqueNoise,
-    to_counts,
-    torque_counts,
-    track,
 )
-from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.body.body import Body
 from firmware_sim.scenario.scenario import Scenario
 
@@ -76,34 +69,6 @@ def run(seed: int | None, cycles: int = 150, seed_of_file: int = 1, **changes) -
 
 def run_with_everything(seed: int, cycles: int = 150) -> np.ndarray:
     return run(seed, cycles, sensors=EVERY_SENSOR_ERROR, drives=EVERY_DRIVE_ERROR)
-
-
-def test_an_arm_without_errors_measures_what_is_true_to_the_last_count():
-    """Position, velocity and torque from the truth of every tick, and the noise in the order of its seed."""
-    body = Body(parse(Scenario, {"profile": "M", "torque_offset_Nm": [0.3, -0.1]}), seed=11)
-    noise = TorqueNoise(11, 0.02)
-    block = np.zeros(TRUTH_LAYOUT.size)
-    encoder_rad, estimate_rad, velocity_rad_s = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
-    for tick in range(3_000):
-        if tick % 10 == 0:
-            body.truth(block)
-            noise_Nm = noise.draw()
-            measured = body.sample()
-            for joint in range(2):
-                tau_Nm = block[TRUTH_LAYOUT.slices["tau_J"]][joint]
-                expected = torque_counts(tau_Nm + (0.3, -0.1)[joint] + noise_Nm[joint])
-                assert measured.torque_counts[joint] == expected
-                assert measured.position_counts[joint] == round(encoder_rad[joint] / POSITION_LSB_RAD)
-                assert measured.velocity_counts[joint] == to_counts(velocity_rad_s[joint], VELOCITY_LSB_RAD_S)
-        body.advance((2.0 * np.sin(3e-3 * tick), 0.9 * np.cos(5e-3 * tick)), TORQUE, 1)
-        body.truth(block)
-        for joint in range(2):
-            now_rad = to_counts(block[TRUTH_LAYOUT.slices["q"]][joint], POSITION_LSB_RAD) * POSITION_LSB_RAD
-            estimate_rad[joint], velocity_rad_s[joint] = track(
-                encoder_rad[joint], now_rad, estimate_rad[joint], velocity_rad_s[joint], TICK_S
-            )
-            encoder_rad[joint] = now_rad
-    assert abs(velocity_rad_s[0]) > 0.2
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,6 @@ from firmware_sim.arm.touch_settings import (
     TICK_S,
     BodySettings,
     ContactSettings,
-    contact_table,
-    contact_torque,
 )
 from firmware_sim.body.body import largest_rate_rad_s, touch_table
 
@@ -103,7 +101,7 @@ def test_a_body_pushes_the_arm_off_and_never_pulls_it(side, damping_N_s_m):
 
 @pytest.mark.parametrize("link", [1, 2])
 @pytest.mark.parametrize("side", [1, -1])
-def test_a_bodys_torque_is_that_of_a_prescribed_force_of_its_size(link, side):
+def test_a_bodys_torque_is_that_of_its_springs_force(link, side):
     generator = np.random.default_rng(5)
     for _ in range(30):
         q = generator.uniform(-2.5, 2.5, 2)
@@ -115,16 +113,12 @@ def test_a_bodys_torque_is_that_of_a_prescribed_force_of_its_size(link, side):
         turn = 2.0 * side * depth_m / point_m
         bent = (q[0] + turn, q[1]) if link == 1 else (q[0], q[1] + turn)
         found = touch(arm.things, 0.0, *bent, 0.0, 0.0, arm.touch_state, np.zeros_like(arm.touch_state))
+        normal = side * normal_of(link, bent)
         off = np.array([body.x_m, body.y_m]) - point_of(link, 0.0, bent)
-        along = np.array([normal_of(link, bent)[1], -normal_of(link, bent)[0]])
-        deep_m = 0.02 - side * off @ normal_of(link, bent)
-        push = ContactSettings(
-            at_s=0.0, link=link, point_m=float(off @ along), force_N=10.0, duration_s=1.0, angle_deg=-90.0 * side
-        )
+        deep_m, place_m = 0.02 - off @ normal, side * off @ np.array([normal[1], -normal[0]])
         assert deep_m > 0.0
-        assert found == pytest.approx(
-            contact_torque(contact_table((push,))[0], 25_000.0 * deep_m, 0.35, *bent, 0.0, 0.0), rel=1e-9, abs=1e-9
-        )
+        torque_Nm = arm.jacobian(link, place_m, bent).T @ (-25_000.0 * deep_m * normal)
+        assert found == pytest.approx(tuple(torque_Nm), rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("region", ["hand_finger", "chest"])

@@ -1,6 +1,9 @@
 """A live view, fed with the packets of a run; what it sends is compared with what the file holds."""
 
 import io
+import json
+import socket
+import threading
 from pathlib import Path
 
 from hang import HANG_S
@@ -8,14 +11,18 @@ from made_log import MemorySink
 from mcap.reader import make_reader
 from recorded_run import CODEC, Run
 
+from adacd_hil.clock import Clock
 from adacd_hil.lab.live.client import LiveClient, LiveMessage
 from adacd_hil.lab.live.feed import LiveFeed
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.scene import Shape
-from adacd_hil.log.recording.log_file import McapFile
+from adacd_hil.log.recording import processes
+from adacd_hil.log.recording.log_file import McapFile, Sink
 from adacd_hil.log.recording.packet import pack_cycle, pack_event, unpack
 from adacd_hil.log.recording.packet_writer import PacketWriter
 from adacd_hil.log.recording.processes import WriterSetup
+from adacd_hil.log.recording.ring import Ring, RingReader
+from adacd_hil.log.recording.writer import WriterProcess
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.records import ContactKind, ContactLevel, ContactReport, Event, Location, Reaction
 from adacd_hil.wire.message_table import plain_tables
@@ -61,6 +68,26 @@ def setup_of(live: LiveView | None, path: Path = Path("run.mcap"), parameter_cou
         metadata={},
         live=live,
     )
+
+
+class ThreadedWriter:
+    """The writer in a thread of this process, fed through its ring as by a control process in real time."""
+
+    def __init__(self, setup: WriterSetup, sink: Sink, clock: Clock) -> None:
+        self.ring = Ring(4 * 2**20)
+        self._ours, self._theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.process = WriterProcess(self._theirs, RingReader(self.ring.descriptor), sink, setup, clock)
+        self._thread = threading.Thread(target=self.process.run, daemon=True)  # a failure must not keep it waiting
+        self._thread.start()
+
+    def end(self) -> dict[str, str]:
+        """Let it end; return what it says of the log."""
+        self._ours.send(processes.END)
+        self._thread.join()
+        word: dict[str, str] = json.loads(self._ours.recv(processes.MOST_BYTES))
+        for end in (self.ring, self._ours, self._theirs):
+            end.close()
+        return word
 
 
 class Feed:

@@ -19,10 +19,14 @@ from adacd_hil.log.types.topics import ChannelId, pack_arm, pack_contact, pack_c
 from adacd_hil.records import (
     CONTROL_LAYOUT,
     ArmState,
+    ContactKind,
+    ContactLevel,
     ContactReport,
     CycleRecord,
     Event,
     FaultReason,
+    Location,
+    Reaction,
     Request,
     SchemeOutput,
     SchemeState,
@@ -44,6 +48,7 @@ CYCLIC = (
     "Sensor1Torque",
     "Sensor2Torque",
 )
+CONTACT = (ContactLevel.COLLISION, ContactKind.HIT, Reaction.FLOAT, Location.SINGULAR, True)
 UNKNOWN_ID = 0x7A5
 LONG_ID = 0x3A5
 
@@ -143,7 +148,8 @@ def make_run(count, seed=1, parameter_count=7, start_ns=5_000_000_123, has_fd=Fa
         if has_fd:
             cycle.frames[3:3] = _long_frames(generator, t_ns, number)
         if number % 50 == 20:
-            cycle.contact = ContactReport(number, 2, (-1, 1), (1.5, -2.5), (0.25, number), number % 100 == 20)
+            head = (number, 2, (-1, 1), (1.5, -2.5), (0.25, number), number % 100 == 20)
+            cycle.contact = ContactReport(*head, *CONTACT, (0.1, 0.2), (0.3, 0.4), 10.0, 0.5, 0.2, 0.01, 0.05)
         if number % 40 == 10:
             level = ("info", "warning", "error")[number // 40 % 3]
             cycle.event = Event(level, f"name{number}", f"Nachricht {number}: θ̂ ok")

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import can
 import can.logconvert
-import numpy as np
 import pytest
 from made_log import flipped
 from mcap.reader import make_reader
@@ -165,21 +164,6 @@ def test_names_of_channels_are_kept(tmp_path):
     write(tmp_path / "x.mcap", [can.Message(timestamp=1.0, channel=name) for name in names])
     assert [message.channel for message in McapReader(tmp_path / "x.mcap")] == names
     assert read_frames(tmp_path / "x.mcap").channels == ("vcan0", "/dev/ttyUSB0", "3", "")
-
-
-def test_frames_of_a_log_that_is_cut_are_read_up_to_the_cut(messages, path, tmp_path):
-    whole = path.read_bytes()
-    cut = tmp_path / "cut.mcap"
-    counts = []
-    for size in np.linspace(8, len(whole) - 1, 40).astype(int).tolist():
-        cut.write_bytes(whole[:size])
-        reader = McapReader(cut)
-        read = list(reader)
-        assert [content(message) for message in read] == [content(message) for message in messages[: len(read)]]
-        assert reader.problem
-        counts.append(len(read))
-    assert counts == sorted(counts)
-    assert len(set(counts)) > 2
 
 
 def test_a_flipped_bit_outside_the_chunks_is_said(path, tmp_path):

@@ -19,19 +19,12 @@ from adacd_hil.log.types.message_types import (
 from adacd_hil.log.types.topics import (
     ChannelId,
     pack_arm,
-    pack_contact,
     run_channels,
 )
 from adacd_hil.log.types.truth_topic import truth_channels
-from adacd_hil.log.types.unpacking import unpack_contact
 from adacd_hil.records import (
     ArmState,
-    ContactKind,
-    ContactLevel,
-    ContactReport,
     FaultReason,
-    Location,
-    Reaction,
     SchemeState,
 )
 
@@ -42,19 +35,6 @@ STAMP = struct.pack("<II", 12, 34)
 def decode(channel_id, body):
     channel = next(channel for channel in CHANNELS if channel.id == channel_id)
     return generate_dynamic(channel.type.name, channel.type.text)[channel.type.name](ENCAPSULATION + STAMP + body)
-
-
-@pytest.mark.parametrize("channel", CHANNELS, ids=lambda channel: channel.topic)
-def test_a_parser_of_others_reads_every_type(channel):
-    assert channel.type.name in generate_dynamic(channel.type.name, channel.type.text)
-
-
-def test_every_dbc_message_has_a_topic_of_its_own_number_with_its_signals():
-    run_ids = [channel.id for channel in run_channels(7, tuple(CODEC.messages.values()))]
-    assert len(set(run_ids)) == len(run_ids)
-    topics = {channel.topic: channel.type.fields for channel in CHANNELS}
-    for name, message in CODEC.messages.items():
-        assert topics[f"/decoded/{name}"] == tuple(signal.name for signal in message.signals)
 
 
 def test_fields_and_messages_are_spelled_as_ros_demands():
@@ -77,26 +57,6 @@ def test_the_layout_of_a_type_is_aligned_as_cdr_demands():
     offsets = {name: layout.fields[name][1] for name in layout.names}
     assert offsets == {"sec": 4, "nanosec": 8, "u": 12, "f": 20, "s": 36, "i": 40}
     assert layout.itemsize == 44
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["float64 x\n", "builtin_interfaces/Time stamp\nstring s\n", "builtin_interfaces/Time stamp\nfloat64[] x\n", ""],
-)
-def test_a_type_of_varying_size_has_no_layout(text):
-    with pytest.raises(LogError):
-        payload_dtype(text)
-
-
-def test_contact_is_laid_out_as_its_type_says_and_read_back():
-    head = (9, 2, (-1, 1), (1.5, -2.5), (0.25, 0.75), True)
-    rest = (ContactLevel.CONTACT, ContactKind.HIT, Reaction.FLOAT, Location.SINGULAR, True, (0.1, 0.2), (0.3, 0.4))
-    report = ContactReport(*head, *rest, 10.0, 0.5, 0.2, 0.01, 0.05)
-    assert unpack_contact(pack_contact(report)) == report
-    message = decode(ChannelId.CONTACT, pack_contact(report))
-    for name, value in report._asdict().items():
-        logged = getattr(message, ros_field_name(name))
-        assert logged == (list(value) if isinstance(value, tuple) else value)
 
 
 @pytest.mark.parametrize(

@@ -150,13 +150,6 @@ def test_a_log_that_lacks_only_what_is_made_anew_or_crcs_is_cut(spoil, log_path,
     assert cut(log_path, tmp_path / "out.mcap", TimeWindow(-INFINITE, INFINITE)) == 2 * CYCLES
 
 
-def test_a_log_is_not_overwritten_by_what_is_made_of_it(log_path):
-    before = log_path.read_bytes()
-    with pytest.raises(LogError, match="is the log itself"):
-        cut(log_path, log_path, TimeWindow(-INFINITE, INFINITE))
-    assert log_path.read_bytes() == before
-
-
 def report(cycle, is_final):
     return cycle * MILLISECOND, ContactReport(cycle, 2, (1, 1), (0.0, 0.0), (0.0, 0.0), is_final)
 

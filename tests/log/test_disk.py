@@ -1,23 +1,20 @@
 """A slow disk and a full one: the ring is emptied all the same, memory is bounded, and what is lost is counted."""
 
-import json
+import dataclasses
 import os
 import re
 import resource
-import socket
 import threading
 
 import pytest
+from live_rig import ThreadedWriter, setup_of
 from recorded_run import make_run
 
 from adacd_hil.log.log_files import find_parts
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.log_file import Sink
 from adacd_hil.log.recording.packet import pack_cycle, pack_event
-from adacd_hil.log.recording.processes import WriterSetup
-from adacd_hil.log.recording.ring import Ring, RingReader
-from adacd_hil.log.recording.writer import FLUSH_PERIOD_NS, RETRY_PERIOD_NS, WriterProcess
+from adacd_hil.log.recording.writer import FLUSH_PERIOD_NS, RETRY_PERIOD_NS
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.wire.bus import Frame
 
@@ -38,33 +35,17 @@ class HastyClock:
         return self.now
 
 
-class Writer:
-    """The writer in a thread of this process, fed through its ring as by a control process in real time."""
+class Writer(ThreadedWriter):
+    """Its sink holds little, and its clock makes haste."""
 
     def __init__(self, path, descriptor, part_bytes=0):
-        self.ring = Ring(4 * 2**20)
         self.dropped = 0
         self.clock = HastyClock()
         self.sink = Sink(descriptor, path, waits=False, most_waiting=MOST_WAITING)
         self.told = []
         self.sink.say = self.told.append
-        self._reader = RingReader(self.ring.descriptor)
-        self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        setup = WriterSetup(
-            path=path,
-            is_blocking=False,
-            channels=run_channels(7),
-            messages=(),
-            epoch_ns=0,
-            part_bytes=part_bytes,
-            part_ns=0,
-            attachments={},
-            metadata={},
-        )
-        process = WriterProcess(theirs, self._reader, self.sink, setup, self.clock)
-        self._theirs = theirs
-        self._thread = threading.Thread(target=process.run)
-        self._thread.start()
+        setup = dataclasses.replace(setup_of(None, path), channels=run_channels(7), messages=(), part_bytes=part_bytes)
+        super().__init__(setup, self.sink, self.clock)
 
     def feed(self, cycles):
         for cycle in cycles:
@@ -84,15 +65,6 @@ class Writer:
         self.wait(lambda: not self.ring.waiting)
         seen = self.clock.now
         self.wait(lambda: self.clock.now > seen + STEP_NS)
-
-    def end(self):
-        self._socket.send(processes.END)
-        self._thread.join()
-        word = json.loads(self._socket.recv(processes.MOST_BYTES))
-        self.ring.close()
-        self._socket.close()
-        self._theirs.close()
-        return word
 
 
 def packets_of(cycles):

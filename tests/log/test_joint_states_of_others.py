@@ -4,10 +4,8 @@ import csv
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner
+from called import called
 from joint_state_bags import State, write_mcap
-
-from adacd_hil.cli.main import cli
 
 NAMES = ("lift", "pan", "elbow")
 
@@ -16,22 +14,16 @@ def states(effort=(5.0, 6.0, 7.0)) -> list[State]:
     return [State(0.01 * k, NAMES, (k, k + 1.0, k + 2.0), (), effort) for k in range(60)]
 
 
-def command(*arguments: str) -> tuple[int, str]:
-    played = CliRunner().invoke(cli, arguments)
-    return played.exit_code, played.stdout + played.stderr
-
-
 def tables(path: Path, out: Path) -> dict[str, list[dict[str, str]]]:
-    status, said = command("log", "export", str(path), "--format", "csv", "--out", str(out))
-    assert status == 0, said
+    exported = called("log", "export", path, "--format", "csv", "--out", out)
+    assert exported.exit_code == 0, exported.stderr
     return {each.stem: list(csv.DictReader(each.read_text().splitlines())) for each in sorted(out.glob("*.csv"))}
 
 
 def test_the_check_takes_them_for_what_they_are(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "r.mcap", states())
-    status, said = command("log", "check", str(path))
-    assert status == 0
-    assert "60 messages" in said
+    checked = called("log", "check", path)
+    assert (checked.exit_code, "60 messages" in checked.stdout) == (0, True)
 
 
 def test_the_check_finds_one_that_is_none(tmp_path: Path) -> None:
@@ -39,10 +31,10 @@ def test_the_check_finds_one_that_is_none(tmp_path: Path) -> None:
     data = path.read_bytes()
     place = data.index(b"lift\0") - 4
     path.write_bytes(data[:place] + b"\xff\xff\xff\x00" + data[place + 4 :])
-    status, said = command("log", "check", str(path))
-    assert status == 1
-    assert "1 messages" in said
-    assert "/joint_states (cdr)" in said
+    checked = called("log", "check", path)
+    assert checked.exit_code == 1
+    assert "1 messages" in checked.stdout
+    assert "/joint_states (cdr)" in checked.stdout
 
 
 def test_a_table_of_them_has_the_joints_names(tmp_path: Path) -> None:

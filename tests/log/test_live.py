@@ -7,7 +7,6 @@ import os
 import signal
 import socket
 import struct
-import threading
 from pathlib import Path
 
 import pytest
@@ -19,6 +18,7 @@ from live_rig import (
     SETUP,
     URDF,
     Feed,
+    ThreadedWriter,
     by_topic,
     first_cycles_of_slots,
     receive_until_last,
@@ -31,16 +31,12 @@ from websockets.sync.client import connect
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.lab.live.client import LiveClient, live_client
-from adacd_hil.lab.live.feed import Decimator
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.live.server import BACKLOG, BACKLOG_BYTES
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.log_file import Sink
 from adacd_hil.log.recording.packet import pack_cycle, pack_event
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.recording.ring import Ring, RingReader
-from adacd_hil.log.recording.writer import WriterProcess
 from adacd_hil.records import Event
 
 STATED_HZ = {
@@ -74,23 +70,6 @@ def watched(run):
     return messages, topics, fed.file()
 
 
-@pytest.mark.parametrize(
-    ("rate_Hz", "batches", "shown"),
-    [
-        (50, [[0, 1, 19], [20, 21, 40]], [[1, 0, 0], [1, 0, 1]]),
-        (50, [[5, 19], [19, 20]], [[1, 0], [0, 1]]),
-        (50, [[5, 5], [5, 6]], [[1, 1], [1, 0]]),  # frames of one cycle stay together, across batches too
-        (50, [[5, 95, 99, 100]], [[1, 1, 0, 1]]),  # a pause moves no slot
-        (10, [[0, 99, 100]], [[1, 0, 1]]),
-        (0, [[5, 5], [6]], [[1, 1], [1]]),
-    ],
-)
-def test_of_each_slot_the_first_cycle_is_shown(rate_Hz, batches, shown):
-    decimator = Decimator(rate_Hz)
-    found = [[decimator.takes(cycle * 1_000_000) for cycle in batch] for batch in batches]
-    assert found == [[bool(value) for value in batch] for batch in shown]
-
-
 def test_a_viewer_receives_every_topic_at_its_rate_as_the_file_has_it(watched):
     messages, _, file = watched
     expected = first_cycles_of_slots(file, STATED_HZ)
@@ -98,21 +77,6 @@ def test_a_viewer_receives_every_topic_at_its_rate_as_the_file_has_it(watched):
     assert {topic for topic in received if topic not in expected} == {"/tf", "/scene", "/robot_description"}
     assert {topic: received.get(topic) for topic in expected} == expected
     assert len(received["/robot_description"]) == 1
-
-
-def test_the_schemas_decode_what_is_received(watched):
-    messages, topics, _ = watched
-    decoded = {topic: decode(topics[topic], payload) for topic, _, payload in messages}
-    assert decoded["/robot_description"].data == URDF
-    assert (decoded["/events"].name, decoded["/events"].message) == (LAST.name, LAST.message)
-    assert set(decoded) == set(topics) - {"/to_can_bus_fd", "/from_can_bus_fd", "/frame_checks"} - silent(
-        topics, messages
-    )
-
-
-def silent(topics, messages):
-    """Topics of messages that are not in the run."""
-    return {topic for topic in topics if topic.startswith("/decoded/")} - {message.topic for message in messages}
 
 
 def decode(topic, payload):
@@ -123,6 +87,7 @@ def decode(topic, payload):
 def test_the_transforms_put_the_links_where_the_joints_are(watched):
     messages, topics, _ = watched
     received = by_topic(messages)
+    assert decode(topics["/robot_description"], received["/robot_description"][0][1]).data == URDF
     assert [log_ns for log_ns, _ in received["/tf"]] == [log_ns for log_ns, _ in received["/joint_states"]]
     q = decode(topics["/joint_states"], received["/joint_states"][-1][1]).position
     log_ns, payload = received["/tf"][-1]
@@ -282,25 +247,19 @@ class OtherEnd:
 def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_waits_for_nobody(tmp_path):
     run = make_run(1)
     run.cycles[0].event = LAST
-    clock, ring = VirtualClock(), Ring(2**20)
+    path, clock = tmp_path / "run.mcap", VirtualClock()
     clock.sleep_until_ns(3_000_000_000)
-    reader = RingReader(ring.descriptor)
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    sink = Sink(os.open(tmp_path / "run.mcap", os.O_WRONLY | os.O_CREAT), waits=False)
-    process = WriterProcess(theirs, reader, sink, setup_of(SETUP, tmp_path / "run.mcap"), clock)
-    thread = threading.Thread(target=process.run, daemon=True)  # a failure must not keep it waiting
-    thread.start()
-    with live_client(process.live.url) as client:
+    sink = Sink(os.open(path, os.O_WRONLY | os.O_CREAT), waits=False)
+    writer = ThreadedWriter(setup_of(SETUP, path), sink, clock)
+    live = writer.process.live
+    with live_client(live.url) as client:
         assert client.receive(HANG_S)[:2] == ("/robot_description", EPOCH_NS + 3_000_000_000)
-        ring.put_packet(pack_cycle(run.cycles[0].t_ns, 0, run.cycles[0].messages(), []))
-        ring.put_packet(pack_event(run.cycles[0].t_ns, 0, LAST))
+        writer.ring.put_packet(pack_cycle(run.cycles[0].t_ns, 0, run.cycles[0].messages(), []))
+        writer.ring.put_packet(pack_event(run.cycles[0].t_ns, 0, LAST))
         assert "/scheme" in by_topic(receive_until_last(client))
-        ours.send(processes.END)
-        thread.join()
-    process.live.process.wait(HANG_S)
+        writer.end()
+    live.process.wait(HANG_S)
     assert clock.now_ns() == 3_000_000_000
-    for end in (ours, theirs, ring):
-        end.close()
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from mcap.records import Attachment, Chunk, DataEnd, Header, MessageIndex, Metad
 from mcap.stream_reader import StreamReader
 from recorded_run import (
     LONG_ID,
-    PERIOD_NS,
     UNKNOWN_ID,
     by_others,
     fd_codec,
@@ -24,11 +23,9 @@ from recorded_run import (
 
 from adacd_hil import __version__
 from adacd_hil.log.reader import read_log, topic_bytes
-from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.log.types.topics import ChannelId, run_channels
-from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT, pack_truth, truth_channels
+from adacd_hil.log.types.topics import run_channels
 from adacd_hil.log.viewer_layout import viewer_layout
-from adacd_hil.records import CONTROL_LAYOUT, Event, scheme_layout
+from adacd_hil.records import scheme_layout
 from adacd_hil.wire.frame_lengths import FD_LENGTHS
 
 pytestmark = pytest.mark.slow  # each log starts a process
@@ -244,25 +241,6 @@ def test_in_real_time_the_log_has_wall_time_and_the_reader_gives_back_ours(tmp_p
     assert times == [cycle.t_ns + EPOCH_NS for cycle in run.cycles]
 
 
-def test_the_truth_has_a_log_of_its_own(tmp_path):
-    blocks = np.random.default_rng(3).normal(size=(300, TRUTH_LAYOUT.size))
-    with Recorder(tmp_path / "truth.mcap", blocking=True, messages=(), channels=truth_channels()) as recorder:
-        for number, block in enumerate(blocks):
-            recorder.cycle(number * PERIOD_NS, [(ChannelId.TRUTH, pack_truth(number, block))])
-        recorder.event(5, Event("info", "contact", "begins"))
-    assert recorder.close().messages == 301
-    log = read_log(tmp_path / "truth.mcap")
-    assert log.truth.block.tobytes() == blocks.tobytes()
-    assert log.truth["cycle"].tolist() == list(range(300))
-    assert log.truth["contact_force"].tobytes() == blocks[:, TRUTH_LAYOUT.slices["contact_force"]].tobytes()
-    assert log.events == [(5, Event("info", "contact", "begins"))]
-    theirs = [decoded for _, decoded in by_others(tmp_path / "truth.mcap")["/truth"]]
-    for name, place in TRUTH_LAYOUT.slices.items():
-        values = np.array([getattr(decoded, name.lower()) for decoded in theirs])
-        np.testing.assert_array_equal(values.reshape(300, -1), blocks[:, place])
-    assert len(log.scheme) == len(log.decoded) == 0
-
-
 def test_a_run_without_a_cycle_is_a_complete_log_and_is_closed_once(tmp_path):
     recorder = start(tmp_path / "run.mcap", make_run(0))
     summary = recorder.close()
@@ -273,17 +251,6 @@ def test_a_run_without_a_cycle_is_a_complete_log_and_is_closed_once(tmp_path):
     assert log.scheme.block.shape[0] == 0
     assert log.frames.shape == (0,)
     assert log.attachments["run.toml"] == b'name = "x"\n'
-
-
-def test_lockstep_chunks_hold_at_most_a_quarter_second(tmp_path):
-    recorder = start(tmp_path / "run.mcap", make_run(0))
-    block = np.zeros(CONTROL_LAYOUT.size)
-    for number in range(100):
-        recorder.cycle(number * 10 * PERIOD_NS, [(ChannelId.TRUTH - 3, bytes(17) + bytes(7) + block.tobytes())])
-    recorder.close()
-    chunks = [r for r in records_of(tmp_path / "run.mcap") if isinstance(r, Chunk)]
-    assert len(chunks) == 4
-    assert max(chunk.message_end_time - chunk.message_start_time for chunk in chunks) < 250_000_000
 
 
 @pytest.mark.usefixtures("writer_process")

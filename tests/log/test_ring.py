@@ -63,13 +63,6 @@ def test_no_more_is_taken_than_asked_for_but_one_packet(ring, reader):
     assert list(split(reader.take_packets(30))) == packets[3:]
 
 
-def test_the_reader_remembers_the_most_that_waited(ring, reader):
-    for count in (3, 7, 2):
-        assert all(ring.put_packet(bytes(12)) for _ in range(count))
-        reader.take_packets(MOST)
-    assert ring.peak == 7 * 16
-
-
 def test_what_is_on_the_disk_is_counted(ring, reader):
     for count in (3, 4):
         reader.count_written(count)

@@ -5,18 +5,17 @@ import dataclasses
 
 import numpy as np
 import pytest
-from made_log import kinds, make_log, new, put_together, take_apart
+from made_log import kinds, make_log, take_apart
 from mcap.opcode import Opcode
 from mcap.records import Header
 from recorded_run import by_others, fd_codec, make_run, record
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
 
-from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.lab.logs.cut import TimeWindow, cut
 from adacd_hil.lab.logs.frame_writer import FrameWriter
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.frames.mcap_frames import RecordedFrame
-from adacd_hil.log.reader import read_log
+from adacd_hil.log.mcap.chunked_file import LIBRARY
 
 CYCLES = 120
 
@@ -30,15 +29,6 @@ def log_path(tmp_path_factory):
 
 def header_of(path):
     return kinds(take_apart(path.read_bytes()), Opcode.HEADER)[0].read(Header)
-
-
-def without_profile(path, out, **changes):
-    """Write a log as earlier versions did: its header names no profile. changes: of the header besides."""
-    parts = take_apart(path.read_bytes())
-    header = dataclasses.replace(parts[0].read(Header), **{"profile": "", **changes})
-    parts[0].body = new(header).body
-    out.write_bytes(put_together(parts))
-    return out
 
 
 def plain(value):
@@ -84,32 +74,13 @@ def test_rosbags_reads_every_message_of_every_topic(log_path):
     assert theirs == by_mcap(log_path)
 
 
-@pytest.mark.slow
-def test_a_log_of_before_the_profile_is_read_as_ever_and_a_copy_of_it_opens_in_rosbags(log_path, tmp_path):
-    old = without_profile(log_path, tmp_path / "run.mcap")
-    with pytest.raises(AnyReaderError, match="Profile is not ros2"), AnyReader([old]):
-        pass
-    before, now = read_log(old), read_log(log_path)
-    assert before.frames.tobytes() == now.frames.tobytes()
-    assert before.contacts == now.contacts
-    assert [finding for finding in check_log(old).findings if finding.rule == "profile"] == []
-    copies = [tmp_path / name for name in ("cut.mcap", "recovered.mcap")]
-    cut(old, copies[0], TimeWindow(0.02, 0.05))
-    recover(old, copies[1])
-    assert [header_of(copy).profile for copy in copies] == ["ros2"] * 2
-    assert len(by_rosbags(copies[0])["/scheme"]) == 30
-    assert by_rosbags(copies[1]) == by_mcap(log_path)
-
-
-def test_a_copy_of_somebody_elses_log_does_not_claim_the_profile(tmp_path):
-    theirs = tmp_path / "theirs.mcap"
-    theirs.write_bytes(make_log(library="somebody 1.0"))
-    ours = tmp_path / "ours.mcap"
-    ours.write_bytes(make_log())
-    cut(theirs, tmp_path / "cut.mcap", TimeWindow(0.0, 1.0))
-    cut(ours, tmp_path / "own.mcap", TimeWindow(0.0, 1.0))
-    profiles = [header_of(tmp_path / f"{name}.mcap").profile for name in ("cut", "own")]
-    assert profiles == ["", "ros2"]
+def test_a_copy_keeps_the_profile_and_only_one_of_our_own_log_claims_it(tmp_path):
+    """Also of one from before the profile."""
+    for library, given, profile in (("somebody", "", ""), (LIBRARY, "", "ros2"), ("somebody", "ros2", "ros2")):
+        (tmp_path / "run.mcap").write_bytes(make_log(library=library, profile=given))
+        cut(tmp_path / "run.mcap", tmp_path / "cut.mcap", TimeWindow(0.0, 1.0))
+        recover(tmp_path / "run.mcap", tmp_path / "recovered.mcap")
+        assert [header_of(tmp_path / f"{name}.mcap").profile for name in ("cut", "recovered")] == [profile] * 2
 
 
 def test_frames_that_python_can_records_open_in_rosbags(tmp_path):

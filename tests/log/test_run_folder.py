@@ -10,8 +10,7 @@ from hang import HANG_S
 from mcap.writer import Writer
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
-from adacd_hil.log.log_files import LogError, LogExistsError, part_path
-from adacd_hil.log.log_parts import log_in
+from adacd_hil.log.log_files import LogExistsError, part_path
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free
@@ -149,14 +148,3 @@ def test_what_is_not_surely_a_start_that_failed_is_not_moved(make, tmp_path):
     with pytest.raises(LogExistsError):
         Recorder(path)
     assert path.read_bytes() == before
-
-
-def test_a_folder_stands_for_the_log_in_it(tmp_path):
-    run = make_run(3)
-    record(tmp_path / "run.mcap", run)
-    (tmp_path / "latest").symlink_to(tmp_path)
-    assert log_in(str(tmp_path)) == tmp_path / "run.mcap"
-    for given in (tmp_path, str(tmp_path), tmp_path / "latest", tmp_path / "run.mcap", str(tmp_path / "run.mcap")):
-        assert read_log(given).scheme.block.tobytes() == run.blocks.tobytes()
-    with pytest.raises(LogError):
-        read_log(tmp_path.parent)

@@ -77,50 +77,30 @@ def test_without_a_threshold_there_is_no_share(threshold):
     assert math.isnan(residual_over_threshold(0.1, threshold))
 
 
-def test_a_force_whose_place_is_known_is_an_arrow_that_ends_there():
-    (contact,) = drawn(draw_contact(SHAPE, PUSH))
+OTHER = {"force_N": -18.5, "level": ContactLevel.CONTACT}
+ARROWS = [
+    ({}, "link2", 0.2, -0.185, RED, "COLLISION link 2: 18.5 N at 0.20 m"),
+    (OTHER, "link2", 0.2, 0.185, YELLOW, "CONTACT link 2: 18.5 N at 0.20 m"),
+    ({"link": 1, "location": Location.LINK_1, "force_N": 4.0}, "link1", 0.35, -0.05, RED, "COLLISION link 1: ≥ 4.0 N"),
+    # the paper's scheme seeks no place: the torque gives the force
+    ({"location": Location.NOT_SOUGHT, "force_N": 0.0}, "link2", 0.3, 0.05, RED, "COLLISION link 2: ≥ 5.0 N"),
+    # arrows stay in sight, and on the link
+    ({"force_N": 0.0}, "link2", 0.2, 0.05, RED, "COLLISION link 2: 0.0 N at 0.20 m"),
+    ({"force_N": 1000.0}, "link2", 0.2, -0.6, RED, "COLLISION link 2: 1000.0 N at 0.20 m"),
+    ({"lever_m": -0.05}, "link2", 0.0, -0.185, RED, "COLLISION link 2: 18.5 N at -0.05 m"),
+    ({"lever_m": 0.5}, "link2", 0.3, -0.185, RED, "COLLISION link 2: 18.5 N at 0.50 m"),
+]
+
+
+@pytest.mark.parametrize(("changes", "frame_id", "x_m", "tail_m", "color", "text"), ARROWS)
+def test_a_force_is_an_arrow_that_ends_on_its_link(changes, frame_id, x_m, tail_m, color, text):
+    (contact,) = drawn(draw_contact(SHAPE, PUSH._replace(**changes)))
     (arrow,) = contact.arrows
-    assert (contact.id, contact.frame_id) == ("contact", "link2")
+    assert (contact.id, contact.frame_id, contact.texts[0].text) == ("contact", frame_id, text)
     assert contact.lifetime.sec * 1_000_000_000 + contact.lifetime.nanosec == ARROW_LIFETIME_NS
-    assert (arrow.pose.position.x, arrow.pose.position.y) == pytest.approx((0.2, -0.185))
-    assert arrow.shaft_length + arrow.head_length == pytest.approx(0.185)
-    half = 0.5 * math.atan2(1.0, 0.0)
-    assert (arrow.pose.orientation.z, arrow.pose.orientation.w) == pytest.approx((math.sin(half), math.cos(half)))
-    assert rgba(arrow) == RED
-    assert contact.texts[0].text == "COLLISION link 2: 18.5 N at 0.20 m"
-
-
-def test_a_force_from_the_other_side_points_the_other_way():
-    (contact,) = drawn(draw_contact(SHAPE, PUSH._replace(force_N=-18.5, level=ContactLevel.CONTACT)))
-    (arrow,) = contact.arrows
-    assert arrow.pose.position.y == pytest.approx(0.185)
-    assert arrow.pose.orientation.z == pytest.approx(-math.sqrt(0.5))
-    assert rgba(arrow) == YELLOW
-
-
-def test_on_link_1_the_smallest_force_is_drawn_at_its_end():
-    report = PUSH._replace(link=1, location=Location.LINK_1, force_N=4.0, lever_m=0.0)
-    (contact,) = drawn(draw_contact(SHAPE, report))
-    assert (contact.frame_id, contact.arrows[0].pose.position.x) == ("link1", 0.35)
-    assert contact.texts[0].text == "COLLISION link 1: ≥ 4.0 N"
-
-
-def test_of_the_papers_scheme_which_seeks_no_place_the_torque_gives_the_force():
-    report = PUSH._replace(location=Location.NOT_SOUGHT, force_N=0.0)
-    (contact,) = drawn(draw_contact(SHAPE, report))
-    assert contact.texts[0].text == "COLLISION link 2: ≥ 5.0 N"
-    assert contact.arrows[0].pose.position.y == pytest.approx(0.05)  # pushes toward -y
-
-
-@pytest.mark.parametrize(("force_N", "length_m"), [(0.0, 0.05), (1000.0, 0.6)])
-def test_arrows_stay_in_sight(force_N, length_m):
-    (contact,) = drawn(draw_contact(SHAPE, PUSH._replace(force_N=force_N)))
-    (arrow,) = contact.arrows
-    assert arrow.shaft_length + arrow.head_length == pytest.approx(length_m)
-    assert arrow.shaft_length >= 0.6 * length_m - 1e-12
-
-
-@pytest.mark.parametrize(("lever_m", "drawn_m"), [(-0.05, 0.0), (0.1, 0.1), (0.5, 0.30)])
-def test_a_force_is_drawn_on_the_link(lever_m, drawn_m):
-    (contact,) = drawn(draw_contact(SHAPE, PUSH._replace(lever_m=lever_m)))
-    assert contact.arrows[0].pose.position.x == pytest.approx(drawn_m)
+    assert (arrow.pose.position.x, arrow.pose.position.y) == pytest.approx((x_m, tail_m))
+    assert arrow.shaft_length + arrow.head_length == pytest.approx(abs(tail_m))
+    assert arrow.shaft_length >= 0.6 * abs(tail_m) - 1e-12
+    turned = -math.copysign(math.sqrt(0.5), tail_m)
+    assert (arrow.pose.orientation.z, arrow.pose.orientation.w) == pytest.approx((turned, math.sqrt(0.5)))
+    assert rgba(arrow) == color

@@ -41,20 +41,3 @@ def test_a_failure_ends_the_file_at_the_last_whole_write_though_there_is_room_ag
     sink.close_file()
     assert sink.error == "File too large after 100 bytes"
     assert path.read_bytes() == b"a" * 100
-
-
-def test_the_next_file_takes_the_place_of_nothing(tmp_path):
-    (tmp_path / "target").write_bytes(b"kept")
-    (tmp_path / "link").symlink_to("target")
-    sink = Sink(os.open(tmp_path / "first", os.O_WRONLY | os.O_CREAT), tmp_path / "first")
-    for name in ("target", "link"):
-        sink.begin_file(tmp_path / name)
-        sink.write(b"data", packets=3)
-        sink.settle()
-        assert (sink.error, sink.path) == (f"{name}: File exists after 0 bytes", None)
-    sink.begin_file(tmp_path / "second")
-    sink.write(b"data")
-    sink.close_file()
-    assert (sink.error, sink.take_lost()) == ("", 6)
-    assert (tmp_path / "target").read_bytes() == b"kept"
-    assert (tmp_path / "second").read_bytes() == b"data"

@@ -1,6 +1,5 @@
 """A log read piece by piece: the pieces together are the log, as mcap's own reader and what was recorded have it."""
 
-import functools
 import os
 import shutil
 import subprocess
@@ -17,7 +16,6 @@ from mcap.writer import CompressionType, Writer
 from recorded_run import by_others, make_run, payloads, plain_frames, record
 
 from adacd_hil.lab.logs.signal_tables import export_tables
-from adacd_hil.log import log_walk
 from adacd_hil.log.log_files import FIELDS_KEY, find_parts, part_path
 from adacd_hil.log.reader import LogStream, read_log
 from adacd_hil.log.types.message_types import LOG, pack_log
@@ -123,13 +121,6 @@ def test_what_lies_beyond_the_data_is_zero_whatever_the_memory_held(path, monkey
     beyond = np.arange(64) >= log.frames["length"][:, np.newaxis]
     assert beyond.any()
     assert not log.frames["data"][beyond].any()
-
-
-def test_blocks_of_one_chunk_change_nothing(path, monkeypatch):
-    whole = [piece.frames.tobytes() for piece in LogStream(path, ("/scheme", *FRAMES), 100)]
-    read_blocks = functools.partial(log_walk.read_blocks, block_bytes=1)
-    monkeypatch.setattr(log_walk, "read_blocks", read_blocks)
-    assert [piece.frames.tobytes() for piece in LogStream(path, ("/scheme", *FRAMES), 100)] == whole
 
 
 def test_a_stream_that_is_left_leaves_no_thread(path):

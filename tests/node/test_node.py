@@ -85,33 +85,3 @@ def test_numbers_decode_to_the_same_values(report, log_path):
             np.testing.assert_array_equal(theirs, series[name][-1].astype(float), err_msg=name)
             compared += 1
     assert compared > 40
-
-
-def test_texts_and_frames_decode_to_the_same_values(report, log_path):
-    log = read_log(log_path)
-    event = log.events[-1].event
-    assert report["topics"]["/events"]["last"]["message"] == event.message
-    assert report["topics"]["/events"]["last"]["name"] == event.name
-    for topic, length_field, is_long in (("/from_can_bus", "dlc", False), ("/from_can_bus_fd", "len", True)):
-        frames = log.frames[~log.frames["is_tx"] & ((log.frames["length"] > 8) == is_long)]
-        frame, last = frames[-1], report["topics"][topic]["last"]
-        sent = frame["data"].tolist()[: frame["length"] if is_long else 8]
-        assert [int(value) for value in last["data"]] == sent
-        assert (int(last["id"]), int(last[length_field])) == (int(frame["can_id"]), int(frame["length"]))
-    joints = report["topics"]["/joint_states"]["last"]
-    assert joints["name"] == ["joint1", "joint2"]
-    assert [float(value) for value in joints["effort"]] == log.scheme["tau_J"][-1].tolist()
-
-
-def test_attachments_and_metadata_are_there(report):
-    assert report["attachments"] == ["arm.dbc", "run.toml"]
-    assert report["metadata"] == ["run", "summary"]
-    assert int(report["chunks"]) >= 3
-
-
-def test_a_flipped_bit_fails_the_check(checker, log_path, tmp_path):
-    damaged = bytearray(log_path.read_bytes())
-    damaged[len(damaged) // 2] ^= 1
-    (tmp_path / "damaged.mcap").write_bytes(damaged)
-    result = subprocess.run([*checker, str(tmp_path / "damaged.mcap")], capture_output=True, text=True, check=False)
-    assert result.returncode != 0
