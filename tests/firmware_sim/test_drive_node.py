@@ -78,6 +78,17 @@ def test_a_command_with_any_one_bit_flipped_changes_nothing(host):
         assert host.bench.drives[0].rejected_commands == bit + 1
 
 
+def test_a_repeated_command_counts_as_none(host):
+    host.enable()
+    frame = host.command_frame(1, Word.ENABLE, 100)
+    for _ in range(4):
+        host.put(0x201, frame)
+        host.command(Word.ENABLE, 0, joints=(2,))
+        host.sync()
+    assert host.state_bits(1) == State.REACTION
+    assert host.state_bits(2) == State.ENABLED
+
+
 def test_two_syncs_without_command_are_forgiven_and_hold_the_torque_and_the_third_faults(host):
     host.enable()
     host.step(Word.ENABLE, 10)
