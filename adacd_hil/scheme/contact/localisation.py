@@ -48,7 +48,10 @@ _INCONSISTENT = int(Location.INCONSISTENT)
 
 
 class Place(NamedTuple):
-    """Force at right angles to the link and its lever arm, with standard deviations; these are inf where not known."""
+    """Force at right angles to the touched link, and its lever arm from that link's joint, with standard deviations.
+
+    location: how far they are known. A standard deviation is inf if its value is unknown.
+    """
 
     location: Location
     force_N: float = 0.0
@@ -65,9 +68,10 @@ def on_link1(tau_1: float, sigma_1: float, length1_m: float) -> Place:
 def on_link2(
     tau_ext_wide_hat: Vector, q2: Vector, sigma: Vector, length_m: tuple[float, float], tip_margin_m: float = 0.03
 ) -> Place:
-    """Return the peak force and the lever arm of a contact on link 2, as of one touch without friction.
+    """Return the peak force and the lever arm of a contact on link 2, on the assumption of one touch without friction.
 
-    tip_margin_m: distance past the tip up to which a touch, of the load for instance, counts as one of the link's end.
+    length_m: of both links. tip_margin_m: distance past the tip up to which a touch, of the load for instance, counts
+    as one of the link's end.
     """
     location, *values = _fit(tau_ext_wide_hat, q2, sigma, length_m[0], length_m[1], tip_margin_m)
     return Place(Location(location), *values)
@@ -85,7 +89,8 @@ def blind_angle(force_N: float, lever_m: float, threshold_2: float) -> float:
 def blind_angle_of_link1(tau_1: float, q2: float, length_m: tuple[float, float], threshold_2: float) -> float:
     """Return the half-angle, rad, about link 2's axis within which a force at its end looks like a force on link 1.
 
-    tau_1: torque of joint 1, Nm, which that force would have caused; threshold_2: of joint 2, Nm.
+    tau_1: torque of joint 1, Nm, which that force would have caused; threshold_2: of joint 2, Nm. 0 if the links are in
+    line: a force along link 2 has no torque then.
     """
     across = abs(math.sin(q2))
     return blind_angle(abs(tau_1) / (length_m[0] * across), length_m[1], threshold_2) if across > 0.0 else 0.0

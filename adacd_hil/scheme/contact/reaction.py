@@ -21,7 +21,7 @@ from adacd_hil.settings.configuration import Settings
 
 
 class JointWay(NamedTuple):
-    """One joint's motion: three parts of constant acceleration, each with its length in s, then rest at the target."""
+    """One joint's motion from `position` and `velocity`: parts of constant acceleration, then rest at the target."""
 
     position: float
     velocity: float
@@ -29,7 +29,10 @@ class JointWay(NamedTuple):
     target: float
 
     def at(self, elapsed_s: float) -> tuple[float, float, float]:
-        """Return position, velocity and acceleration this long after the start; before it, those of the start."""
+        """Return position, velocity and acceleration this long after the start.
+
+        Before the start they are those of the start; after the last part the target, 0 and 0.
+        """
         position, velocity = self.position, self.velocity
         remaining_s = max(elapsed_s, 0.0)
         for acceleration, duration_s in self.parts:
@@ -46,7 +49,7 @@ class JointWay(NamedTuple):
 
     @property
     def duration_s(self) -> float:
-        """Return the time from the start until rest."""
+        """Time from the start until rest."""
         return sum(duration_s for _, duration_s in self.parts)
 
 
@@ -76,7 +79,8 @@ class Withdrawal:
     ) -> None:
         """Plan from the present desired motion; without an external torque plan a stop.
 
-        start: positions where the withdrawal began, if it is planned anew on the way; subtract the distance since then.
+        start: joint positions at which the withdrawal began, if it is planned anew on the way; the distance moved since
+        then shortens it.
         """
         distance = np.radians(settings.reaction.distance_deg)
         velocity_limit = np.minimum(
@@ -104,7 +108,7 @@ class Withdrawal:
 
     @property
     def duration_s(self) -> float:
-        """Return the time from the plan's start until all joints are at rest."""
+        """Time from the plan's start until all joints are at rest."""
         return max(profile.duration_s for profile in self._profiles)
 
     def evaluate(self, elapsed_s: float, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:

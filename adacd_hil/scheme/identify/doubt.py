@@ -110,7 +110,7 @@ def clear(m: Memory) -> None:
 
 @compiled
 def begin(k: Constants, m: Memory) -> None:
-    """Clear the sums, and add the samples from before the contact that wait in the ring, but for joints at rest."""
+    """Clear the sums, and add the samples from before the contact that wait in the ring, except of joints at rest."""
     clear(m)
     _follow_peak(m)
     for s in range(int(m.ring.used)):
@@ -121,7 +121,7 @@ def begin(k: Constants, m: Memory) -> None:
 
 @compiled
 def weigh(k: Constants, m: Memory) -> None:
-    """Add one sample of a contact to the sums, but for joints at rest, whose friction explains any torque."""
+    """Add one sample of a contact to the sums, except of joints at rest, whose friction explains any torque."""
     _follow_peak(m)
     for i in range(m.filters.tau_f.shape[1]):
         still = m.sensitivity.still_smooth[filter_bank.LEARNT, i]
@@ -163,10 +163,10 @@ class CommonCause(NamedTuple):
 
 
 class _Weighed(NamedTuple):
-    """One contact's sums (h,). waited_s: from going on to its beginning; ended_s: time of its end.
+    """One contact's sums over its samples, as `_weighed` returns them. rw, ww (h,): Σ r w and Σ w² by cause; rr: Σ r².
 
-    peak: largest residual over its threshold; 0 without a residual. load_ww (2,): evidence for a payload, by direction
-    of pull.
+    load_ww (2,): evidence for a payload, by direction of pull. peak: largest residual over its threshold; 0 without a
+    residual. waited_s: from going on to the contact's beginning; ended_s: time of its end.
     """
 
     rw: Vector
@@ -245,7 +245,10 @@ class Doubt:
         )
 
     def _payload(self) -> CommonCause | None:
-        """Return the payload that explains the last contacts, or None: a few of strong evidence, or many that agree."""
+        """Return the payload that explains the last FEWEST_LOADED or more contacts; None without one.
+
+        There must be evidence for it in both directions of its pull.
+        """
         for count in range(FEWEST_LOADED, len(self._contacts) + 1):
             last = list(self._contacts)[-count:]
             if self._common(last, LOAD, SPREAD_LOADED) is None:
@@ -260,7 +263,10 @@ class Doubt:
         return None
 
     def _alike(self) -> CommonCause | None:
-        """Return the error in which contacts agree, each so soon after going on that it is weak evidence, or None."""
+        """Return the error that explains each of the last ALIKE contacts with about the same size, or None.
+
+        None also unless each of them came within HELD_S of going on.
+        """
         last = list(self._contacts)[-ALIKE:]
         if len(last) < ALIKE or max(contact.waited_s for contact in last) > HELD_S:
             return None
@@ -310,7 +316,10 @@ class Doubt:
         )
 
     def _can_be(self, h: int, size: float) -> bool:
-        """Return whether friction h can be `size` more than the model's: not negative, nor implausibly large."""
+        """Return whether friction h can be `size` more than the model's.
+
+        The sum may not be clearly negative, nor over PLAUSIBLE deviations of the prior.
+        """
         cause = self._k.causes[h]
         total = float(cause @ self._m.models.theta) + size
         return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._k.prior_std)

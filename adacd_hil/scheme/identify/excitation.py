@@ -53,7 +53,7 @@ def widen(value: Vector, low: Vector, high: Vector) -> None:
 
 @compiled
 def has_moved(motion: Motion, travel_rad: float, velocity_rad_s: float) -> bool:
-    """Return whether each joint's range is at least `travel_rad`, and its speed at least `velocity_rad_s` both ways."""
+    """Return whether each joint has covered at least `travel_rad`, and reached `velocity_rad_s` in both directions."""
     for i in range(motion.q_low.shape[0]):
         if not (motion.q_high[i] - motion.q_low[i] >= travel_rad):
             return False
@@ -64,7 +64,7 @@ def has_moved(motion: Motion, travel_rad: float, velocity_rad_s: float) -> bool:
 
 @compiled
 def add_information(W_f: Vector, period_s: float, information: Vector) -> None:
-    """Add T W_f' W_f to the lower triangle of `information` (p, p) in place."""
+    """Add T W_f' W_f to the lower triangle of `information` (p, p) in place; T: period_s."""
     for j in range(W_f.shape[1]):
         for k in range(j + 1):
             for i in range(W_f.shape[0]):
@@ -83,9 +83,10 @@ def gather(motion: Motion, q: Vector, dq: Vector, W_f: Vector, period_s: float) 
 
 @compiled
 def eigenvalue_range(information: Vector, scale: Vector, scratch: Vector) -> tuple[float, float]:
-    """Return the smallest and the largest eigenvalue of D I D, D = diag(scale), from the lower triangle of I (p, p).
+    """Return the smallest and the largest eigenvalue of D I D, D = diag(scale), each at least 0.
 
-    By Jacobi's cyclic rotations on `scratch` (p, p): the same bits on every machine, which LAPACK does not promise.
+    I (p, p): `information`, of which only the lower triangle is read; it is kept. `scratch` (p, p) is overwritten, by
+    Jacobi's cyclic rotations: they give the same bits on every machine, which LAPACK does not promise.
     """
     count = scale.shape[0]
     trace = 0.0

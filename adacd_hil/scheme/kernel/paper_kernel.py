@@ -58,7 +58,11 @@ line is within 2.1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
 
 
 class PaperMemory:
-    """The memory of the paper's scheme. mode: that of a step beside another scheme."""
+    """The memory of the paper's scheme. mode: LEARN, then ARMED, of a step beside another scheme.
+
+    motion: evidence of the excitation. quiet_cycles: cycles in a row within beta, eq. (15). standstill, integral, peak:
+    see `external_torque`. last, between: q, dq, tau_J of the sample before, and of an interpolated one.
+    """
 
     has_gap: float
     mode: float
@@ -156,7 +160,7 @@ def new_block(parameter_count: int) -> Structured:
 
 
 def numbers_of(settings: Settings) -> Numbers:
-    """Return the kernel's arrays for one run, before the first sample."""
+    """Return new arrays of the kernel for one run, as they are before the first sample."""
     count = len(settings.estimator.parameter_names)
     block = new_block(count)
     return Numbers(constants_of(settings), new_memory(count), block, block.view(np.float64))
@@ -263,7 +267,7 @@ def _advance(
 
 @compiled
 def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: SchemeBlock) -> None:
-    """Fill the torques predicted by the estimate and by the CAD model, and the external torque by each."""
+    """Fill the torques predicted by the estimate and by the CAD model, and the external torques by these."""
     external_torque.follow_standstill(dq, c.standstill_rad_s, decay, m.standstill)
     external_torque.predict(m.W_f, out.theta_hat, out.tau_f_hat)
     external_torque.predict(m.W_f, c.theta_cad, out.tau_f_cad)
