@@ -44,7 +44,11 @@ _TOUCHED_LINK = TRUTH_LAYOUT.slices["contact_link"].start
 
 
 class Cast(NamedTuple):
-    """Host and emulated arm of a run, resolved."""
+    """Host and emulated arm of a run, resolved.
+
+    contract: of the emulator if it plays an arm of one's own, else None. assumed: values that it had to assume, as
+    texts.
+    """
 
     settings: Settings
     scenario: Scenario
@@ -94,7 +98,8 @@ def run_embedded(
 ) -> tuple[SessionSummary, Path]:
     """Run host and emulated arm in this process, with both logs in `out`; return the summary and the path of the truth.
 
-    Raises ConfigError, CodecError, LogError, OSError, CommandError for a configuration of several arms.
+    Raises ConfigError, CodecError or LogError for invalid settings or logs, OSError if a file can't be written,
+    CommandError for a configuration of several arms. After an error the truth's log is discarded.
     """
     settings, scenario = cast.settings, cast.scenario
     check_shared("lockstep", settings)  # an arm in this process is alone on its bus
