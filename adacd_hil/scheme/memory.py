@@ -174,7 +174,12 @@ class Fit:
 
 
 class Sensitivity:
-    """Noise, standstill, friction at rest, missing samples, and the thresholds by them: written by `sensitivity`."""
+    """Noise, standstill, friction at rest, missing samples, and the thresholds by them: written by `sensitivity`.
+
+    still, still_smooth, low_speed: shares of standstill and of low speed in a filter's memory. h: thresholds; h_model:
+    without standstill and the tail's floor. roughness, velocity_roughness: noise over that of the settings, squared.
+    unit, strain: factors on variances and on thresholds. wide: of the torque with a filter undone.
+    """
 
     still: EachFilter
     still_smooth: EachFilter
@@ -208,7 +213,11 @@ class Sensitivity:
 
 
 class Margin:
-    """Largest residuals of free motion, and smallest detectable push: written by `margin`."""
+    """Largest residuals of free motion, and smallest detectable push: written by `margin`.
+
+    peak, peak_now, peak_last: by sign, kept, of the present block, of the one before. tail_Nm: floors of thresholds by
+    them. seen, seen_: counts and worst values of the test. sum_, mean_push_Nm, dim_s: of monitoring.
+    """
 
     peak: Annotated[Vector, "2 channels n"]
     peak_now: Annotated[Vector, "2 channels n"]
@@ -240,7 +249,10 @@ class Evidence:
 
 
 class Anchor:
-    """Anchors of the torque offsets, and the fit's largest torque by place: written by `anchor`."""
+    """Anchors of the torque offsets, and the fit's largest torque that depends on the position: written by `anchor`.
+
+    rest_count: samples in the reading at rest. anchor_Nm, anchor_std: by kind of anchor, inf for a missing one.
+    """
 
     rest_count: float
     anchor_Nm: Annotated[Vector, "kinds n"]
@@ -304,7 +316,11 @@ class Doubt:
 
 
 class MissingTorque:
-    """Evidence for torque that the model lacks: written by `missing_torque`."""
+    """Evidence for torque that the model lacks: sums of `missing_torque`, which writes them.
+
+    X_f, X_learnt: filtered columns by position. basic, full: coefficients of the fits without and with these. M, row,
+    scale: scratch. samples, wanted: learnt since the last check, and before the next.
+    """
 
     X_old: PlaceColumns
     X_f: PlaceColumns
@@ -415,7 +431,7 @@ class EvidenceConstants:
 
 @dataclass(frozen=True)
 class MarginConstants:
-    """Constants of `margin`: excursions of white noise (2 C - 1,), and each channel's response to a step of torque."""
+    """Constants of `margin`, see its `constants_of`; excursions_Hz, shown: by channel (2 C - 1,)."""
 
     excursions_Hz: Vector
     block_cycles: float

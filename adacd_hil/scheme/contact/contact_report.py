@@ -80,7 +80,7 @@ def last_rows(rows: Vector, kept: int, count: int) -> Vector:
 
 @compiled
 def _peak(tau: Vector, sigma: float) -> float:
-    """Return the signed peak torque of (n,) samples: their largest moving mean, less the bias of a noisy maximum.
+    """Return a joint's signed peak torque, Nm, of (n,) samples: the largest moving mean, less a noisy maximum's bias.
 
     sigma: standard deviation of a sample. The mean is longer in a longer contact. A blow's top is short. When the arm
     begins to react, the torque of its drive jumps, and through the lag the estimate rings for some ten samples around

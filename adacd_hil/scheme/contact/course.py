@@ -151,7 +151,10 @@ def follow(
 
 @compiled
 def _leave(k: CourseConstants, m: CourseMemory, state: int) -> None:
-    """Clear the contact, and the reaction unless `is_kept`; cancel its due reports only in state FAULT."""
+    """If the contact is in progress, end it, and its reaction unless `is_kept`.
+
+    A report that is still due stays due, except in state FAULT.
+    """
     if m.is_reacting != 0:
         m.is_reacting, m.link = 0, 0
         if k.is_kept == 0:
@@ -185,8 +188,8 @@ def _reconsider(
 ) -> None:
     """Choose the reaction anew if the contact has a higher level or another link, unless a withdrawal was given up.
 
-    Stop an arm that goes on along its path if the supervisor has latched a contact that is no collision. Judge a
-    withdrawal in force.
+    Stop an arm that goes on along its path if the supervisor has latched the contact without a collision. Check whether
+    a withdrawal in force must be given up, see `_judge`.
     """
     level = max(level, m.level)
     is_other = level != m.level or m.link != m.cause_link

@@ -61,7 +61,10 @@ class Place(NamedTuple):
 
 
 def on_link1(tau_1: float, sigma_1: float, length1_m: float) -> Place:
-    """Return the smallest force on link 1 that has the moment `tau_1` about joint 1, with an unknown lever arm."""
+    """Return the smallest force on link 1 that has the moment `tau_1`, Nm, about joint 1, with an unknown lever arm.
+
+    sigma_1: standard deviation of tau_1, Nm.
+    """
     return Place(Location.LINK_1, tau_1 / length1_m, sigma_1 / length1_m)
 
 
@@ -98,7 +101,10 @@ def blind_angle_of_link1(tau_1: float, q2: float, length_m: tuple[float, float],
 
 @compiled
 def _top(forces: Vector) -> float:
-    """Return the moving median of forces (n,) that is largest in size, with its sign; window: n / TOP_PARTS forces."""
+    """Return the moving median of forces (n,) that is largest in size, with its sign; 0 without forces.
+
+    Each median is over n / TOP_PARTS forces.
+    """
     count = forces.shape[0]
     width = max(count // TOP_PARTS, 1)
     step = max((count - width) // TOP_PLACES, 1)

@@ -56,7 +56,10 @@ class JointWay(NamedTuple):
 def time_optimal(
     position: float, velocity: float, target: float, velocity_limit: float, acceleration_limit: float
 ) -> JointWay:
-    """Return a joint's fastest motion to rest at `target` within the limits; brake a velocity over its limit first."""
+    """Return a joint's fastest motion to rest at `target` within the limits.
+
+    A velocity over its limit is braked first. A joint too fast to stop at the target goes past it and comes back.
+    """
     stop = position + velocity * abs(velocity) / (2.0 * acceleration_limit)
     sign = math.copysign(1.0, target - stop)
     distance = sign * (target - position)
@@ -72,7 +75,7 @@ def time_optimal(
 
 
 class Withdrawal:
-    """The motion of all joints from one collision to rest. Made when REACT is entered, then sampled per period."""
+    """The motion of all joints away from one collision, to rest: planned when made, then sampled by `evaluate`."""
 
     def __init__(
         self, settings: Settings, q_d: Vector, dq_d: Vector, tau_ext_hat: Vector, start: Vector | None = None
@@ -118,7 +121,7 @@ class Withdrawal:
 
     @property
     def beyond_limits(self) -> list[int]:
-        """Indices, from 0, of the joints that can't stop within their position limit.
+        """Indices, from 0, of the joints that can't stop within their position limit: [] if all can.
 
         They brake at the acceleration limit from their position and velocity at the start of the withdrawal.
         """

@@ -84,7 +84,7 @@ def begin_tail(m: Memory) -> None:
 
 @compiled
 def discard_tail(m: Memory) -> None:
-    """Discard the residuals of the last block and the present one: a contact is near."""
+    """Drop the residuals of the last block and the present one, as a contact is near; keep the largest ones."""
     m.margin.peak_now[:] = 0.0
     m.margin.peak_last[:] = 0.0
     m.margin.block_used = 0.0
@@ -92,10 +92,9 @@ def discard_tail(m: Memory) -> None:
 
 @compiled
 def follow_tail(k: Constants, m: Memory) -> None:
-    """Add the residuals of one contact-free sample to the present block.
+    """Add the residuals of one contact-free sample to the present block, except of joints that stood still lately.
 
-    At the end of a block renew the largest residuals and the floors `tail_Nm`. The largest ones take in the block
-    before, not this one. A joint that stood still lately adds none.
+    At the end of a block renew the largest residuals, by the block before this one, and the floors `tail_Nm`.
     """
     own = m.margin
     filters = m.filters.r.shape[0]

@@ -195,7 +195,7 @@ def follow_velocity_noise(k: Constants, m: Memory, dq: Vector, is_steady: bool) 
 
 @compiled
 def keep_velocity_noise(k: Constants, m: Memory) -> None:
-    """Raise `roughness_kept` (n,) to the velocity's roughness in a sample without contact; let it decay in motion.
+    """Raise `roughness_kept` (n,) to the velocity's roughness in a sample without contact; it decays in motion.
 
     At rest an encoder without counts shows no noise, but shows it again with the first count.
     """
@@ -209,7 +209,7 @@ def keep_velocity_noise(k: Constants, m: Memory) -> None:
 
 @compiled
 def raise_strain(m: Memory, largest: float) -> None:
-    """Double the strain, up to `largest`, of each joint that is over a threshold in any channel.
+    """Double the strain of each joint that is over a threshold in any channel, up to `largest`; lower none.
 
     A contact while learning may be the model's failure. One contact may be a hand; repeated ones come from an error
     that no parameter explains, such as backlash. Then the arm is armed with higher thresholds rather than never.

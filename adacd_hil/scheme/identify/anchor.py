@@ -149,9 +149,10 @@ def is_rest_refused(k: Constants, m: Memory) -> bool:
 
 @compiled
 def is_within(k: Constants, m: Memory, theta: Vector, P: Vector) -> bool:
-    """Return whether the torque offsets of a model are within the bounds of all anchors; store the bounds as evidence.
+    """Return whether the torque offsets of a model are within the bounds of all anchors.
 
-    theta (p,), P (p, p): the model. The last certificate is used only for a joint without a bound of `beta_Nm`.
+    Store the comparison as evidence. theta (p,), P (p, p): the model. A missing anchor bounds nothing. The last
+    certificate is used only for a joint without a bound of `beta_Nm`.
     """
     first_coulomb, is_within = int(k.first_coulomb), True
     evidence.fit(k, m, theta, P, min(np.max(m.sensitivity.unit), 1.0))
@@ -320,7 +321,10 @@ def describe_place(k: Constants, m: Memory) -> str:
 
 
 def describe_place_refused(k: Constants, m: Memory) -> list[str]:
-    """Return a line for each joint whose torque by place exceeds `arm.position_torque_Nm`, with the torque."""
+    """Return a line for each joint whose last checked torque by place is over `arm.position_torque_Nm`, with it.
+
+    Torque by place: it depends on the joint's position. [] if all joints keep to the bound.
+    """
     limit = float(k.position_torque_Nm)
     return [
         f"joint {i + 1} has a torque of up to {torque:.3f} Nm that depends on where the arm is, bound {limit:g} Nm"

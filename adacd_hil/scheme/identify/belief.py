@@ -120,7 +120,7 @@ def is_free(k: Constants, m: Memory, is_touched: bool) -> bool:
 
 @compiled
 def learn_and_use(k: Constants, m: Memory) -> bool:
-    """Learn from a sample as `learn` does; if the belief has changed, use it as the model, and return True."""
+    """Learn from a sample as `learn` does, and return its result; if it is True, use the belief as the model."""
     has_learnt = learn(k, m)
     if has_learnt:
         _use(m)
@@ -221,7 +221,10 @@ def hold_lags(k: Constants, m: Memory) -> None:
 
 @compiled
 def _take_out_lags(k: Constants, m: Memory, place: int) -> None:
-    """Subtract the torque of the believed lags from the ring's sample at `place`, and set its columns of lags to 0."""
+    """Subtract the torque of the believed lags from the sample at index `place` of the ring.
+
+    Set its columns of lags to 0.
+    """
     joints = m.ring.tau.shape[1]
     first = int(k.first_offset) + joints
     for i in range(joints):

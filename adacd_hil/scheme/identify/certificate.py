@@ -102,8 +102,8 @@ def withhold(m: Memory, cause: int) -> None:
 def contradicted_by(k: Constants, m: Memory) -> int:
     """Return the first contradiction of the fit, one of ANCHOR to TOO_MUCH_BY_PLACE, or NOTHING.
 
-    In order: anchors, the fit's own samples and steps, kept beliefs, bound on torque by place, last certificate. If the
-    fit contradicts itself, keep its steps from before the change.
+    In order: with the anchors, within the fit's own samples and steps (then the beliefs of its steps from before the
+    change are kept), with kept beliefs, with the bound on torque by position, with the last certificate.
     """
     if not anchor.is_within(k, m, m.models.belief, m.models.P_belief):
         return ANCHOR

@@ -156,7 +156,10 @@ def _add(k: Constants, m: Memory, i: int, w: Vector, tau: float, still: float, R
 
 
 class CommonCause(NamedTuple):
-    """The common cause of contacts. text: its description; is_payload: an object was picked up, or put down."""
+    """The common cause of contacts. text: its description; is_payload: an object was picked up, or put down.
+
+    Also a contradiction of the certificate, which ends it as a common cause does.
+    """
 
     text: str
     is_payload: bool
@@ -203,9 +206,9 @@ class Doubt:
     def begin_contact(self, cycle: int, is_touched: bool, contradiction: CommonCause | None = None) -> None:
         """Store how long the arm has monitored before it reacts in this cycle, and lower the odds of a wrong model.
 
-        is_touched: it reacts to a contact; if that follows at once, raise the thresholds of its joints. Else the cause
-        is another, such as a late host, and the sums are cleared. contradiction: of the certificate, if the arm reacts
-        to that; `end_contact` returns it.
+        is_touched: it reacts to a contact. If that follows within AT_REST_S of going on, raise the thresholds of its
+        joints. False: the cause is another, such as a late host, and the sums are cleared. contradiction: of the
+        certificate, if the arm reacts to that; `end_contact` returns it.
         """
         self._contradiction = contradiction
         self._waited_s = cycle * self._period_s - self._monitored_s
@@ -218,9 +221,10 @@ class Doubt:
             sensitivity.raise_strain(self._m, MOST_STRAIN)
 
     def end_contact(self, cycle: int) -> CommonCause | None:
-        """Store the contact that ends in this cycle; return the common cause of the last contacts, or None.
+        """Store the contact that ends in this cycle; return the common cause of the last contacts, None without one.
 
-        After a contradiction of the certificate store nothing and return the contradiction.
+        After a contradiction of the certificate store nothing and return the contradiction. Drop contacts that ended
+        more than WITHIN_S ago.
         """
         if self._contradiction is not None:
             return self._contradiction
@@ -235,7 +239,7 @@ class Doubt:
         return self._payload() or self._other() or self._alike() or self._unexplained()
 
     def describe_again(self) -> str | None:
-        """Return a warning if the last contact came within HELD_S after the arm went on from another, or None."""
+        """Return a warning if the last contact came within HELD_S of going on from another one; else None."""
         if len(self._contacts) < 2 or self._contacts[-1].waited_s > HELD_S:
             return None
         waited_s = self._contacts[-1].waited_s
@@ -298,9 +302,10 @@ class Doubt:
         return None
 
     def _unexplained(self) -> CommonCause | None:
-        """Return a cause without a name if a person is unlikely to touch as often or as lightly, or None.
+        """Return a cause without a name if a person is unlikely to touch as often or as lightly, else None.
 
-        So often: MANY contacts, each within HELD_S of going on. So lightly: weak contacts with odds over ODDS.
+        As often: MANY contacts, each but the first within HELD_S of going on. As lightly: weak contacts with odds over
+        ODDS.
         """
         last = list(self._contacts)[-MANY:]
         text = ""
@@ -325,9 +330,10 @@ class Doubt:
         return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._k.prior_std)
 
     def _common(self, contacts: list[_Weighed], h: int, spread: float) -> float | None:
-        """Return the size of cause h over all contacts; None if it doesn't explain each of them with about that size.
+        """Return the size of cause h over all contacts, in its unit.
 
-        spread: largest difference of a contact's own size, as a part of the common one, beside 2 sigma.
+        None if it doesn't explain each of them with that size. A contact's own size may differ by `spread` of the
+        common one, and 2 sigma.
         """
         ww = sum(contact.ww[h] for contact in contacts)
         if not ww > 0.0:

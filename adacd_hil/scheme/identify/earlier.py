@@ -120,7 +120,8 @@ def keep_steps(k: Constants, m: Memory, last: int) -> None:
 def keep_belief(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float, age_s: float) -> None:
     """Keep a belief as the next source of evidence; leave the source empty if a friction is clearly negative.
 
-    unit: scale of its variances, see `fit_check.unit_of`. age_s: time since the belief was held.
+    unit: scale of its variances, see `fit_check.unit_of`. age_s: time since the belief was held. An empty source counts
+    as kept, too, in `kept_count`.
     """
     s = KEPT + int(m.earlier.kept_count)
     if not _fill_source(k, m, s, theta, P, unit):
@@ -149,8 +150,8 @@ def _fill_source(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit
 def is_no_more(k: Constants, m: Memory) -> bool:
     """Return whether the fit agrees with the kept beliefs: same friction and unanchored offsets, no more inertia.
 
-    Drop a kept belief whose offset contradicts an anchor: it comes from a lean. True also if the kept beliefs lapse;
-    this drops all of them and sets `has_lapsed`.
+    Drop a kept belief whose offset contradicts an anchor: it comes from a lean. If enough fits in a row agree against
+    the kept beliefs, drop all of these, set `has_lapsed` and return True. True also without kept beliefs.
     """
     is_no_more = True
     for s in range(KEPT, KEPT + int(m.earlier.kept_count)):

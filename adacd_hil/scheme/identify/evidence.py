@@ -140,7 +140,7 @@ def fit(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float) -> None:
 
 @compiled
 def put_fitted(m: Memory, q: int, value: float, variance: float) -> None:
-    """Set the fitted value and variance of one quantity."""
+    """Store the fitted value and variance of quantity `q`, for `weigh`."""
     m.evidence.fitted[q] = value
     m.evidence.fitted_variance[q] = variance
 
@@ -198,9 +198,9 @@ def largest_excess(m: Memory, first: int, last: int, q: int) -> int:
 
 
 def named(excesses: Vector) -> list[tuple[int, str, str]]:
-    """Return index, name and unit of each quantity with an excess (Q,) over 1; for a joint's friction only the largest.
+    """Return index, name and unit of each quantity with an excess (Q,) over 1; of a joint's frictions only the largest.
 
-    A viscous friction is named after the others.
+    Order: frictions, inertias, offsets, viscous frictions.
     """
     speeds = len(FRICTION_SPEEDS_RAD_S)
     found = []

@@ -45,7 +45,7 @@ def begin_speeds(motion: Motion) -> None:
 
 @compiled
 def widen(value: Vector, low: Vector, high: Vector) -> None:
-    """Widen the range low .. high (2,) in place so that it holds `value` (2,)."""
+    """Widen the range low .. high (2,) in place, so that it contains `value` (2,)."""
     for i in range(value.shape[0]):
         low[i] = min(low[i], value[i])
         high[i] = max(high[i], value[i])
@@ -73,7 +73,10 @@ def add_information(W_f: Vector, period_s: float, information: Vector) -> None:
 
 @compiled
 def gather(motion: Motion, q: Vector, dq: Vector, W_f: Vector, period_s: float) -> bool:
-    """Add a sample to the ranges of motion and the information matrix; return True every EXCITATION_EVERY samples."""
+    """Add a sample to the ranges of motion and the information matrix.
+
+    Return True at every EXCITATION_EVERY-th sample.
+    """
     widen(q, motion.q_low, motion.q_high)
     widen(dq, motion.dq_low, motion.dq_high)
     add_information(W_f, period_s, motion.information)

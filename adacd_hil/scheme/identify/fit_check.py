@@ -301,8 +301,7 @@ def distance(m: Memory, s: int) -> float:
 def find_later(m: Memory, s: int) -> bool:
     """Fill `later` (p,): parameters of the samples after step s less those of the fit.
 
-    Return False if they are undefined. Undefined: the `distance` is inf. s: slot of the step. Overwrites `factor` and
-    `apart`.
+    Return False, and keep `later`, if the `distance` is inf. s: slot of the step. Overwrites `factor` and `apart`.
     """
     own = m.fit_check
     if not distance(m, s) < np.inf:

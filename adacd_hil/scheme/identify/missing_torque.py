@@ -79,10 +79,10 @@ def rest(m: Memory) -> None:
 
 @compiled
 def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
-    """Filter the columns X (n, PLACE_TERMS) over one period as the filter that is learnt from filters its regressor.
+    """Advance the filtered columns X (n, PLACE_TERMS) over one period, by the filter `LEARNT` and the pole behind it.
 
-    is_seen: False after a gap, when the filter keeps its values. rates (3,): the filter's coefficients for one period,
-    see `torque_filter.FirstOrderHold`; smoothing: of the pole behind it.
+    is_seen: False after a gap, when that filter keeps its values. rates (3,): its coefficients for one period, see
+    `torque_filter.FirstOrderHold`; smoothing: of the pole.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]
     X, X_old, X_f, X_learnt = m.regressor.X, m.missing_torque.X_old, m.missing_torque.X_f, m.missing_torque.X_learnt
@@ -96,15 +96,15 @@ def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
 
 @compiled
 def keep_columns(m: Memory, slot: int) -> None:
-    """Put the columns of this sample into a slot of the ring, where they wait with the row of the regressor."""
+    """Put the filtered columns of this sample into a slot of the ring, where they wait with the sample's regressor."""
     m.missing_torque.ring_X[slot] = m.missing_torque.X_learnt
 
 
 @compiled
 def clear(k: Constants, m: Memory) -> None:
-    """Set the sums and the torque found before to 0, and begin with the first check anew.
+    """Set the sums and the torque found before to 0, and let the next check be the first one.
 
-    For another arm or payload, or with a new certificate.
+    Call it for another arm or payload, or with a new certificate.
     """
     _clear_sums(m)
     m.missing_torque.last_found[:] = 0.0

@@ -58,7 +58,7 @@ def follow(k: Constants, m: Memory, q: Vector, dq: Vector, W_f: Vector) -> bool:
 
 @compiled
 def begin_test(k: Constants, m: Memory, square: float) -> None:
-    """Begin the test of a frozen model: clear its count and the joints' speeds, and set the largest residual allowed.
+    """Begin the test of a frozen model: set its count to 0, clear the joints' speeds, and set `test_limit_Nm`.
 
     square: mean square of the fit's residuals over that of the settings.
     """

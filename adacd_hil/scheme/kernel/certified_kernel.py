@@ -92,7 +92,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
 
 @compiled
 def begin_test(constants: Structured, memory: Structured) -> None:
-    """Freeze the belief, without negative friction, as the model in use, and reset the counts of its test."""
+    """Use the belief, without negative friction, as the model, and begin its test, with all counts at 0."""
     k, m = constants[0], memory[0]
     belief.freeze(k, m)
     margin.begin_sight(m)
@@ -150,7 +150,8 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
 def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
     """Advance the bank to this sample, missing samples interpolated, and fill the torques of the block.
 
-    steps: periods since the fresh sample before. Return False after a gap: the filters resume from the sample.
+    steps: periods since the fresh sample before. Return False after a gap, when the filters resume from the sample; a
+    moving arm then doesn't learn for `settle_cycles`.
     """
     nominal_s: float = k.period_s
     period_s: float = out.period_s
@@ -303,7 +304,8 @@ def _test(k: Constants, m: Memory, dq: Vector) -> int:
 def _refine(k: Constants, m: Memory) -> int:
     """Learn on beside the model in use, and replace it by a better tested candidate.
 
-    Return WITHHELD if something contradicts the certificate, with the cause in `withheld_by`, else 0.
+    Return WITHHELD if later evidence contradicts the certificate, else 0; set `withheld_by` to the contradiction, or
+    NOTHING.
     """
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_share, True)
     sensitivity.decay_strain(k, m)

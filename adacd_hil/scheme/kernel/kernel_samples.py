@@ -60,7 +60,10 @@ def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
 
 @compiled
 def put_sample(block: Structured, sample: Sample, period_s: float) -> None:
-    """Write q, dq, tau_J of a sample, and the interval before it, into the block for the kernel's next step."""
+    """Write q, dq, tau_J of a sample, and the interval before it, into the block for the kernel's next step.
+
+    period_s: 0: not measured.
+    """
     out: SchemeBlock = block[0]
     for i in range(out.q.shape[0]):
         out.q[i] = sample.q[i]
@@ -119,7 +122,7 @@ def is_filled(steps: int, period_s: float, nominal_s: float, most: int) -> bool:
 
 @compiled
 def put_between(last: Vector, q: Vector, dq: Vector, tau_J: Vector, share: float, between: Vector) -> None:
-    """Fill `between` (3, n) with the sample at a share of the way from `last` (3, n) to q, dq, tau_J (n,)."""
+    """Fill `between` (3, n) with the sample at a share, 0 to 1, of the way from `last` (3, n) to q, dq, tau_J (n,)."""
     for i in range(between.shape[1]):
         between[0, i] = last[0, i] + share * (q[i] - last[0, i])
         between[1, i] = last[1, i] + share * (dq[i] - last[1, i])

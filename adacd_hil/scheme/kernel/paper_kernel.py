@@ -278,7 +278,10 @@ def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: S
 
 @compiled
 def _learn(c: PaperConstants, m: PaperMemory, out: SchemeBlock, period_s: float) -> int:
-    """Test the estimate by eq. (15) on this sample, then correct it; return ADAPTED if the adaptation is over, or 0."""
+    """Test the estimate by eq. (15) on this sample, then correct it; return ADAPTED if the adaptation is over, or 0.
+
+    It is if eq. (15) has held for `hold_cycles` in a row, with enough excitation and motion.
+    """
     if excitation.gather(m.motion, out.q, out.dq, m.W_f, period_s):
         out.excitation = excitation.eigenvalue_range(m.motion.information, c.scale, m.motion.scratch)[0]
     m.quiet_cycles = m.quiet_cycles + 1.0 if termination.is_quiet(out.tau_ext_hat, c.beta_Nm) else 0.0
@@ -300,7 +303,8 @@ def _watch(
     """Fill the thresholds and compare the torques with them; return bits of an observation, or 0 without a contact.
 
     The bits: CONTACT and COLLISION, which this scheme doesn't tell apart, and from CONTACT_SHIFT on one per joint.
-    is_reporting: a report is open, so the contact's impulse and peak are kept.
+    is_fresh: False adds nothing to the contact's impulse and peak. is_reporting: a report is due, so they don't begin
+    anew.
     """
     F_c = out.theta_hat[regressor.F_C1 : regressor.F_C2 + 1]
     external_torque.fill_threshold(c.threshold_Nm, m.standstill, F_c, out.threshold)

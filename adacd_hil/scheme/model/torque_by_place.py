@@ -14,7 +14,7 @@ PLACE_TERMS = len(POSITION_TERMS)
 
 @compiled
 def fill_position(q: Vector, X: Vector) -> None:
-    """Fill X (n, PLACE_TERMS) with the columns of torque by place at q (n,), in the order of `POSITION_TERMS`."""
+    """Fill X (n, PLACE_TERMS) with the columns of torque by position at q (n,), in the order of `POSITION_TERMS`."""
     total = np.sum(q)
     sin_sum, cos_sum = np.sin(total), np.cos(total)
     for i in range(q.shape[0]):

@@ -119,7 +119,10 @@ class CertificateWatch:
         return "; ".join([*texts, *[known_by] * known_by.startswith((BY_WORD, BY_FITS_THAT_AGREE))])
 
     def _known_by(self) -> str:
-        """Return the evidence on which the fit's friction and inertia rest, as text."""
+        """Return the evidence for the fit's friction and inertia as text.
+
+        That is the user's word, fits that agree, the last certificate, or this run only.
+        """
         if self._vouched_against:
             return BY_WORD + self._vouched_against
         if self._m.earlier.has_lapsed:
@@ -236,7 +239,7 @@ class CertificateWatch:
         return Event("warning", _CONTRADICTIONS[refusal.cause][0], text)
 
     def describe(self) -> list[str]:
-        """Return the lines of the present refusal: causes, number of refused fits, remedy; empty without a refusal."""
+        """Return the lines of the present refusal: causes, number of refused fits, remedy; [] without a refusal."""
         if self._refusal is None:
             return []
         is_reading = self._refusal.cause == certificate.READING

@@ -204,9 +204,9 @@ class CertifiedPipeline(Pipeline):
             self._feed_forward()
 
     def _begin_adaptation(self, previous: SchemeState) -> None:
-        """Begin an adaptation: of a payload if the arm is certified, of the whole arm if not, or if a test was failed.
+        """Begin an adaptation: of a payload if the arm is certified, of the whole arm if not, or after a failed test.
 
-        Revoke the certificate first if that is the cause.
+        If the user has taken the certificate back, revoke it first.
         """
         cause = self._course.supervisor.cause
         if cause == SchemeEvent.REVOKED:
@@ -222,11 +222,9 @@ class CertifiedPipeline(Pipeline):
     def _learn_anew(self, is_first: bool) -> None:
         """Begin to learn from the prior, or from the certified arm with a payload; drop the present fit.
 
-        is_first: the adaptation begins; False: it begins again.
-
-        Runs, too, once a contact that interrupted an adaptation has been reported: the adaptation may have learnt the
-        contact's beginning. Or the arm is free of contact now, and the adaptation had learnt an earlier one. Then the
-        arm goes on only with a model that claims no knowledge.
+        is_first: the adaptation begins; False: it begins again, also after the last report of a contact that
+        interrupted it. It may have learnt the beginning of that contact, or an earlier one that has ended. The arm goes
+        on only with a model that claims no knowledge.
         """
         certified_kernel.begin_adaptation(*self.numbers[:2], self._is_payload, is_first)
 

@@ -261,7 +261,7 @@ def _is_pending(m: SupervisorMemory, request: int) -> bool:
 def _has_grown(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> bool:
     """Return whether a contact that clears itself must be acknowledged from this cycle on.
 
-    So after a collision, a late host, `patience_cycles`, or a payload to which the user has attributed the contact.
+    It must after a collision, a late host, or `patience_cycles`, or if the user has attributed it to a changed payload.
     """
     is_over = observation & COLLISION != 0 or arm.is_late != 0 or m.phase_periods >= k.patience_cycles
     return bool(is_over or _is_payload_announced(k, m))
@@ -278,8 +278,8 @@ def _is_announced(m: SupervisorMemory) -> bool:
 def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
     """Return whether the user has announced a changed payload to which the contact is attributed.
 
-    So if the model is in doubt; with gravity also if the payload was being changed, and the user announced its weight
-    since the contact began: an earlier announcement cannot exclude a person's touch.
+    It is if the model is in doubt; with gravity also if the payload was being changed, and the user announced its
+    weight since the contact began: an earlier announcement cannot exclude a person's touch.
     """
     is_weight = k.has_gravity != 0 and m.origin == SchemeState.PAYLOAD and m.is_weight_announced != 0
     return bool((m.is_doubted != 0 or is_weight) and _is_pending(m, Request.PAYLOAD_CHANGED))
@@ -287,7 +287,10 @@ def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
 
 @compiled
 def _enter(m: SupervisorMemory, state: int, event: int) -> None:
-    """Enter another state by `event`, reset its counts, and drop the requests that don't wait there."""
+    """Enter another state by `event`, reset its counts, and drop the requests that don't wait there.
+
+    Do nothing if `state` is the present one.
+    """
     if state == m.state:
         return
     if state == SchemeState.REACT:
@@ -334,7 +337,10 @@ def _event(
 
 @compiled
 def _touch(m: SupervisorMemory, arm: Sample, observation: int) -> int:
-    """Return COLLISION or CONTACT if this state reacts to it, else 0; an arm without torque can't react."""
+    """Return COLLISION or CONTACT if a joint is over its threshold and this state reacts to it; else NONE.
+
+    NONE also while the drives aren't enabled: an arm without torque can't react.
+    """
     if observation & ANY_CONTACT == 0 or arm.is_enabled == 0:
         return SchemeEvent.NONE
     event = SchemeEvent.COLLISION if observation & COLLISION else SchemeEvent.CONTACT
@@ -370,7 +376,11 @@ def _progress(
 
 @compiled
 def _released(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_still: bool) -> int:
-    """Return the event by which the user's request ends STOPPED in this cycle, or 0."""
+    """Return the event by which the user's request ends STOPPED in this cycle, or NONE.
+
+    No request does while the host is late. A changed payload and RELEARN need an arm at rest, an acknowledgement joints
+    below their thresholds.
+    """
     event: int = SchemeEvent.NONE
     is_late = arm.is_late != 0
     if _is_payload_announced(k, m):
