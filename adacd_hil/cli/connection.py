@@ -118,7 +118,7 @@ def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) 
 
 
 def received_ids(codec: Codec, settings: Settings, devices: Iterable[PlacedDevice]) -> list[int]:
-    """Return the CAN identifiers that the host reads: the contract's, and those that only the host may send.
+    """Return the CAN identifiers that the host reads, ascending: the contract's, and those that only the host may send.
 
     A frame of the second kind shows another host.
     """
@@ -155,7 +155,10 @@ class Connection:
         return " ".join(f"{option} {shlex.quote(str(value))}" for option, value in given if value is not None)
 
     def settings(self) -> Settings:
-        """Return the settings of the configuration; --dbc, if given, becomes its contract. Raises ConfigError."""
+        """Return the settings of the configuration; --dbc, if given, becomes its contract.
+
+        Raises ConfigError if it is invalid.
+        """
         return self.with_contract(load_settings(self.config, self.profile))
 
     def with_contract(self, settings: Settings) -> Settings:

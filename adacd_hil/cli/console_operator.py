@@ -30,9 +30,10 @@ _MOST_LETTERS = 40
 
 
 class ConsoleOperator:
-    """The user of a run at a terminal: reads words, a line each, on a thread of its own; else asks as the script.
+    """The user of a run at a terminal: the requests of typed words, else those of a script.
 
-    tell: prints a line for the user: which word a state waits for, and that a word is unknown.
+    A thread of its own reads the words, a line each. tell: prints a line for the user: which word a state waits for,
+    and that a word is unknown.
     """
 
     def __init__(
@@ -47,7 +48,7 @@ class ConsoleOperator:
         self._thread.start()
 
     def join(self, timeout_s: float) -> None:
-        """Wait until the terminal's stream has ended, at most `timeout_s`; return without telling which."""
+        """Wait until the terminal's stream has ended, at most `timeout_s`; return in both cases."""
         self._thread.join(timeout_s)
 
     def _listen(self) -> None:

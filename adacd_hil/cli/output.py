@@ -59,7 +59,7 @@ EPILOG = (
 
 
 def tell(line: str) -> None:
-    """Print a line on standard error; for lines that are neither question nor result."""
+    """Print a line on standard error, control characters escaped; for lines that are neither question nor result."""
     print(in_line(line), file=sys.stderr, flush=True)
 
 
@@ -130,7 +130,7 @@ def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
 
 
 def _code_of(error: BaseException) -> ExitCode | None:
-    """Return the exit status of an error that a command reports in one line; None for any other."""
+    """Return the exit status of an expected error, which a command reports in one line; None for any other error."""
     return next((code for kind, code in _expected() if isinstance(error, kind)), None)
 
 
@@ -146,7 +146,7 @@ def _is_forbidden(error: BaseException) -> bool:
 def complain(error: BaseException) -> ExitCode:
     """Print an expected error, or an interrupt, in one line and return its exit status; raise any other error again.
 
-    PARTIAL if the disk is full; a CommandError has its own.
+    The status is PARTIAL if the disk is full; a CommandError has its own.
     """
     if isinstance(error, KeyboardInterrupt):
         print("adacd-hil: interrupted", file=sys.stderr)
@@ -338,7 +338,10 @@ def run_folder(out: Path | None, log_names: tuple[str, ...], name: str) -> Itera
 
 
 def _make_dated() -> Path:
-    """Make a new folder in `runs`, named by the date, with a number if that is taken; return it. Raises OSError."""
+    """Make a new folder in `runs`, named by the date, with a number if that is taken; return it.
+
+    Raises OSError if it can't be made.
+    """
     RUNS.mkdir(parents=True, exist_ok=True)
     date = datetime.fromtimestamp(wall_ns() // 1_000_000_000).strftime(_DATE)
     for number in itertools.count(1):

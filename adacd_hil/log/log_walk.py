@@ -54,7 +54,10 @@ class Extras:
         self.metadata: dict[str, dict[str, str]] = {}
 
     def add_record(self, record: RawRecord) -> None:
-        """Keep the attachment or metadata in a record; ignore other records. Raises LogError for a damaged one."""
+        """Keep the attachment or metadata in a record; ignore other records.
+
+        Raises LogError for a record that can't be parsed, or an attachment that fails its CRC.
+        """
         if record.opcode == Opcode.ATTACHMENT:
             attachment: Attachment = parse(record.opcode, record.body)
             if not attachment_crc_fits(record):
@@ -180,7 +183,10 @@ class LogWalk:
         self.attachments = {**head.attachments, **self.attachments}
 
     def _missing(self, start: int, stop: int) -> list[str]:
-        """Return a line that names the missing parts from start to stop - 1, in a list; [] if there are none."""
+        """Return one line that names the first and the last missing part of those from start to stop - 1.
+
+        [] if there are none.
+        """
         names = [part_path(self.path, number).name for number in sorted({start, stop - 1})] if start < stop else []
         return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []
 
@@ -227,7 +233,7 @@ class LogWalk:
 
 
 class _PartWalk:
-    """The walk over one file."""
+    """The walk over one file; keeps its attachments, metadata and first problem."""
 
     def __init__(
         self, path: Path, builder: PieceBuilder, layout: PayloadLayout, wanted: Collection[str] | None

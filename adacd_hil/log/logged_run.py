@@ -80,7 +80,7 @@ def host_span(span: EmulatorSpan, begins: Cycles) -> Span:
 
 
 def cycle_offsets(begins: Cycles) -> Cycles:
-    """Return per attempt the host's cycle numbers minus the emulator's (k,).
+    """Return per attempt the host's cycle numbers minus the emulator's (k,): whole rounds of the counter of SYNC.
 
     begins: the host's number of the first cycle of each attempt (k,).
     """

@@ -63,7 +63,7 @@ _NOT_FIELDS = ("record_length", "log_time", "publish_time", "sec", "nanosec")
 
 
 class LoggedEvent(NamedTuple):
-    """An event and when it happened."""
+    """An event and when it was logged, ns on the clock of the run."""
 
     t_ns: int
     event: Event
@@ -100,7 +100,7 @@ class Series:
         return np.asarray(stamp_ns - self._epoch_ns, np.int64)
 
     def part(self, rows: slice | NDArray[np.bool_]) -> "Series":
-        """Return the messages of some rows: of a slice, or where a mask is True."""
+        """Return the messages in a slice, or those where a mask (n,) is True."""
         return Series(self.records[rows], self._epoch_ns)
 
     def between(self, first_ns: int, end_ns: int) -> "Series":
@@ -143,12 +143,12 @@ class RunLog:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the file is whole, no packet was dropped on the way to it, and nothing was lost before a recovery."""
+        """Whether the file is whole, no packet was dropped on the way to it, and a recovered log had lost nothing."""
         return _is_complete(self.problem, self.summary)
 
     @property
     def epoch_ns(self) -> int:
-        """Offset of the times in the file from t_ns."""
+        """Offset of the times in the file from t_ns, ns; 0 if the metadata don't name it."""
         return _number(self.metadata, EPOCH_KEY, 0)
 
     @property
@@ -252,9 +252,10 @@ def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
 def _series_of(
     rows: Mapping[str, NDArray[np.uint8]], topics: Mapping[str, Topic], own: Mapping[str, Topic], epoch_ns: int
 ) -> dict[str, Series]:
-    """Return a series for each topic of fixed size: each of our own, even if it is empty, and the others present.
+    """Return a series for each topic of fixed size: each of ours, even if it is empty, and all others of the log.
 
-    rows: the records of topics (n, size). topics: those of the log; own: ours.
+    rows: the records of topics (n, size). topics: those of the log; own: ours. One of ours that has another type in the
+    log is empty.
     """
     series = {}
     for name, topic in {**topics, **own}.items():

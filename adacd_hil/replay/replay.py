@@ -155,7 +155,10 @@ class _Player:
         part: Part,
         events: Sequence[Event],
     ) -> None:
-        """Compare a stretch with the log; do nothing if the log lacks its decisions, or cycles before it."""
+        """Compare a stretch with the log; do nothing if the log lacks its decisions, or earlier cycles of the attempt.
+
+        asked: requests of the script (n,); None: each logged one that is a Request is believed.
+        """
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
         ticks = stretch.ticks
@@ -386,7 +389,10 @@ class _ArmReader:
 
 
 def why_frames(source: ReplaySource, variants: Sequence[Settings]) -> str:
-    """Return the reason why frames must be decoded, which takes longer, in one line; "" if the log's states serve."""
+    """Return the reason why frames must be decoded, which takes longer, in one line; "" if the log's states serve.
+
+    "" also for a recording, which has only frames.
+    """
     if source.is_recording:
         return ""
     if not source.has_arms:

@@ -117,7 +117,10 @@ class OutcomeGatherer:
         self.state = SchemeState(batch.state[-1])
 
     def _keep(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Keep the cycles between which true contacts begin and end, and the first and the last one."""
+        """Keep the host's cycles next to the begin and end of each true contact, and the first and the last one.
+
+        Do nothing if the truth is unknown.
+        """
         if self._truth is None:
             return
         instants = [(contact.onset, contact.end) for contact in self._contacts]
@@ -266,7 +269,10 @@ class Replay:
         return tuple(adaptation.took_s for adaptation in self.adaptations)
 
     def time_s(self, t_ns: int) -> float:
-        """Return a time in s since the first ADAPT, from ns of the run's clock; without an ADAPT since its 0."""
+        """Return a time in s since the first ADAPT, from ns of the run's clock.
+
+        Without an ADAPT, return it in s of that clock.
+        """
         return (t_ns - self.zero_ns) * 1e-9
 
 

@@ -122,9 +122,9 @@ class SchemeComparison:
         return np.asarray(is_near | (logged == replayed) | (np.isnan(logged) & np.isnan(replayed)))
 
     def compare_arms(self, logged: ArmBatch, decoded: ArmBatch, ticks: Ticks) -> None:
-        """Compare the logged states of n cycles with those decoded from frames, to the bit; keep mismatches.
+        """Compare the logged states of n cycles, to the bit, with those decoded from frames.
 
-        Count them, too.
+        Count and keep the mismatches.
         """
         self.arms += len(ticks.cycle)
         for name in ArmBatch._fields:
@@ -191,7 +191,10 @@ class SchemeComparison:
                     self.add_mismatch(Mismatch(CONTACT.name, field, place, *where, _text(there), _text(here)))
 
     def _is_same(self, logged: float, replayed: float) -> bool:
-        """Return whether two values have the same bits, or are finite reals within the tolerance of each other."""
+        """Return whether two values have the same bits, or are finite reals within the tolerance of each other.
+
+        The tolerance is a share of the logged value, at least of 1.
+        """
         if struct.pack("<d", logged) == struct.pack("<d", replayed):
             return True
         is_real = isinstance(logged, float) and math.isfinite(logged) and math.isfinite(replayed)
@@ -248,7 +251,7 @@ def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...
 
 
 def _names_of(name: str, size: int, named: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return the names of a field's values: those in `named`, else by size none, joints, or channels and joints."""
+    """Return the names of a field's values: those in `named`, else "" for one value, joints, or channels and joints."""
     if name in named:
         return tuple(named[name])
     if size == 1:
@@ -293,7 +296,7 @@ class Asking:
         self._kept = KeptRequest()
 
     def begin_attempt(self) -> None:
-        """Begin another attempt: the drives are not enabled yet; a request not served yet is asked once more."""
+        """Begin another attempt: the drives are not enabled yet; a request not served yet will be made again."""
         self._enabled = None
         self._was_stopped = False
         self._kept = KeptRequest(self._kept.request)
@@ -308,9 +311,9 @@ class Asking:
         return carried or self._script.request(elapsed_s, state)
 
     def note_request(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:
-        """Keep a request that the scheme hasn't served, and note in which cycle the drives were enabled.
+        """Keep a request that the scheme hasn't served; store the cycle in which the drives were enabled.
 
-        previous, state: states before and after the cycle.
+        Call it after each `ask`. previous, state: states before and after the cycle.
         """
         self._kept.ask(request, previous)
         self._kept.serve((state,))
@@ -342,7 +345,10 @@ class Asking:
         return asked
 
     def _rows(self, ticks: Ticks, batch: SchemeBatch, first: int) -> list[int]:
-        """Return the rows from `first` on in which the script could make a request, or its wait begins anew."""
+        """Return the indices of the cycles from `first` on in which the script could make a request.
+
+        Also those in which its wait begins anew.
+        """
         assert self._enabled is not None
         is_due = np.zeros(len(ticks.cycle), np.bool_)
         is_due[first : first + 1] = True  # a request left by the attempt before, in the first cycle of an enabled arm

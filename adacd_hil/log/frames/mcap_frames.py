@@ -171,7 +171,10 @@ class McapFrames:
         )
 
     def _frames(self, contents: Contents) -> NDArray[Any]:
-        """Return the frames of a chunk in the order of the file. Raises ValueError for an invalid frame."""
+        """Return the frames of a chunk in the order of the file, (0,) without any.
+
+        Raises ValueError for a frame that is shorter than its type.
+        """
         places, found = [], []
         for number in np.unique(contents.channels).tolist():
             source = self._sources.get(number)

@@ -103,7 +103,8 @@ def decompress(compression: str, data: bytes, most_bytes: int = MOST_BYTES) -> b
 def _decompress(compression: str, data: bytes, most_bytes: int) -> bytes:
     """Return decompressed data, of zstd and lz4 at most one byte more than `most_bytes`.
 
-    Raises ChunkError for cut or too much data, and the errors of the two libraries.
+    Raises ChunkError for lz4 data that are cut, or zstd data that state more bytes, and the errors of the two
+    libraries.
     """
     if compression == "":
         return data
@@ -343,7 +344,10 @@ def _finished(item: Future[Block] | RawRecord | Problem) -> Item:
 
 
 def _pack(file: IO[bytes], name: str, block_bytes: int) -> Iterator[list[_Packed] | RawRecord | Problem]:
-    """Yield lists of chunks that are still compressed, and the other records of a file that are passed on."""
+    """Yield lists of chunks, still compressed, and attachments, metadata and problems one by one.
+
+    The chunks of a list have at most `block_bytes` when opened, unless it is one chunk.
+    """
     packed: list[_Packed] = []
     size, crc = 0, crc32(MAGIC)
     opening = Opening()
@@ -385,7 +389,10 @@ def _look_at(record: RawRecord | Problem, opening: Opening, crc: int) -> _Packed
 
 
 def _packed(record: RawRecord, opening: Opening) -> _Packed | Problem:
-    """Return a chunk, still compressed, or a message or definition outside chunks; a Problem for a bad chunk."""
+    """Return a chunk, still compressed, or a message or definition outside chunks.
+
+    Return a Problem for a chunk that can't be parsed, or is too large when decompressed.
+    """
     position = record.offset + HEAD.size
     if record.opcode != Opcode.CHUNK:
         whole = HEAD.pack(record.opcode, len(record.body)) + record.body

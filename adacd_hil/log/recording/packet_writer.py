@@ -72,7 +72,8 @@ class PacketWriter:
     def write_packet(self, packet: Packet) -> bool:
         """Write the content of a packet; return False, and write none of it, if the file can't hold all of it.
 
-        So for a message without a channel, a /scheme message that is too short, or a time beyond a stamp's range.
+        It can't hold a message without a channel, a /scheme message that is too short, or a time beyond a stamp's
+        range.
         """
         if not self._fits(packet):
             return False
@@ -107,7 +108,10 @@ class PacketWriter:
         return 0 <= t_ns + self._epoch_ns < END_OF_TIME_NS
 
     def _add_frame(self, is_tx: bool, frame: Frame, publish_ns: int) -> None:
-        """Add a frame, and its decoded message if the DBC has it."""
+        """Add a frame, and its decoded message if the DBC has its identifier with this length.
+
+        Error frames are not decoded.
+        """
         self.frames += 1
         can_id, data, t_ns, is_error = frame
         t_ns += self._epoch_ns

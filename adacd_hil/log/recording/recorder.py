@@ -214,7 +214,10 @@ class Recorder:
         self._ring.close()
 
     def _summarise(self, word: dict[str, str] | None) -> LogSummary:
-        """Return the summary, by the writer's last message if there is one, after the end of its process."""
+        """Return the summary, after the end of the writer's process.
+
+        word: its last message, None if it died or is silent.
+        """
         error = ""
         if word is None:
             error = self._end_writer()
@@ -229,7 +232,7 @@ class Recorder:
         return LogSummary(self.path, 0, 0, self.dropped, False, error, max(1, len(find_parts(self.path))), peak)
 
     def _end_writer(self) -> str:
-        """Wait for the end of a writer that doesn't answer, or kill it; return the error in words."""
+        """Wait DEATH_TIMEOUT_S for the end of a writer that doesn't answer, then kill it; return the error in words."""
         try:
             return f"the writer died (exit status {self._process.wait(DEATH_TIMEOUT_S)})"
         except subprocess.TimeoutExpired:

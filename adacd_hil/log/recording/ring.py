@@ -127,7 +127,10 @@ class RingReader(_SharedRing):
         self._counts[_WRITTEN] += packets
 
     def take_packets(self, most: int) -> bytes:
-        """Remove and return whole packets, at most `most` bytes, or a longer one alone; b"" if the ring is empty."""
+        """Remove and return whole packets, at most `most` bytes, or a longer one alone; b"" if the ring is empty.
+
+        Pass the result to `split`. Also raises `peak`.
+        """
         tail = self._counts[_TAIL]
         waiting = self._counts[_HEAD] - tail
         self._counts[_PEAK] = max(self._counts[_PEAK], waiting)

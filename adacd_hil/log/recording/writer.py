@@ -171,7 +171,10 @@ class WriterProcess:
         return McapFile(self._sink, setup.channels, setup.attachments, metadata)
 
     def _finish(self, ending: str) -> dict[str, str]:
-        """End the part in progress; return the summary of all parts so far."""
+        """End the part in progress with a summary in the file; return the counts of all parts so far.
+
+        ending: the reason, for the summary.
+        """
         self._note_lost()
         dropped = self._ring.dropped if ending != CONTINUED else self._packets.dropped
         dropped += self._lost
