@@ -36,9 +36,9 @@ complete_truth = _complete_toml("firmware_sim", "truths")
 
 
 def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return the groups of settings that begin with `incomplete`; their keys if it has a dot, or no group begins so.
+    """Return the groups that begin with `incomplete`, and the keys that do if it has a dot or no group does so.
 
-    For an option KEY=VALUE return `KEY=` of each key, or behind the `=` the setting's choices.
+    For an option KEY=VALUE return `KEY=` of each such key, or behind the `=` the setting's choices.
     """
     from adacd_hil.settings.setting_keys import known_keys, sections
 

@@ -124,9 +124,9 @@ class Series:
 
 @dataclass(frozen=True)
 class RunLog:
-    """A log, all its parts as one.
+    """A log, all its parts as one. `topics`: those of fixed size, each of ours, empty if the log lacks it.
 
-    `topics` has each topic of ours, empty if the log lacks it, except those of bus frames.
+    Bus frames, events and contacts have fields of their own.
     """
 
     path: Path

@@ -36,7 +36,7 @@ class Certificate(NamedTuple):
 
     parameters: a1 … F_c2, and those of gravity where there are any (p,); friction_Nm (6,): joint 1 at
     `records.FRICTION_SPEEDS_RAD_S`, then joint 2; inertia_kgm2 (3,): a1, a2, a3; offset_Nm (n,): of the torque sensors,
-    the configuration's included; is_payload: learnt from an earlier certificate with a payload; text: of the event.
+    the configuration's included; is_payload: a payload was learnt on top of an earlier certificate; text: of the event.
     """
 
     parameters: tuple[float, ...]
