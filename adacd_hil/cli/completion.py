@@ -17,7 +17,7 @@ _MOST_RUNS = 30
 
 
 def _complete_toml(package: str, folder: str) -> Callable[[Context, Parameter, str], list[CompletionItem]]:
-    """Return a completion function: TOML files in a package's folder by name, and others by path."""
+    """Return a completion function for the TOML files in a package's folder by name, and for others by path."""
 
     def complete(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
         from importlib import resources
@@ -36,7 +36,10 @@ complete_truth = _complete_toml("firmware_sim", "truths")
 
 
 def complete_setting(_ctx: Context, param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return the groups that begin with `incomplete`, else the keys; for an option KEY=VALUE, `KEY=` or its choices."""
+    """Return the groups that begin with `incomplete`, and the keys that do if it has a dot or no group does so.
+
+    For an option KEY=VALUE return `KEY=` of each such key, or behind the `=` the setting's choices.
+    """
     from adacd_hil.settings.setting_keys import known_keys, sections
 
     known = {key: row for key, row in known_keys().items() if not row.is_in_row}
@@ -60,7 +63,10 @@ def complete_interface(_ctx: Context, _param: Parameter, incomplete: str) -> lis
 
 
 def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return this machine's CAN interfaces that begin with `incomplete`; [] if --interface is not SocketCAN."""
+    """Return this machine's CAN interfaces that begin with `incomplete`.
+
+    [] if --interface is given and not socketcan.
+    """
     if ctx.params.get("interface") not in (None, "socketcan"):
         return []
     from adacd_hil.wire.can_interface import can_interfaces
@@ -69,7 +75,7 @@ def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[C
 
 
 def complete_run(_ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
-    """Return those of the 30 last folders in `runs` with a log that begin with `incomplete`; the shell adds files.
+    """Return the last 30 folders in `runs` with a log, as far as they begin with `incomplete`; the shell adds files.
 
     The links come first, then the newest dates.
     """

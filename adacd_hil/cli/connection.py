@@ -46,7 +46,7 @@ def check_clock(name: str, interface: str, channel: str) -> None:
 
 
 def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
-    """Raise CommandError for a scripted user on a channel that may be hardware, where a person must acknowledge."""
+    """Raise CommandError if the channel may be hardware: there a person must acknowledge, not a scenario's user."""
     if may_be_hardware(interface, channel):
         raise CommandError(
             f"--scenario {in_line(scenario)} plays the user of an emulated arm; {interface} {channel} may be hardware: "
@@ -56,7 +56,10 @@ def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
 
 
 def may_be_hardware(interface: str, channel: str) -> bool:
-    """Return whether an arm may be on a channel: it exists, and isn't vcan, vxcan or python-can's own virtual bus."""
+    """Return whether an arm may be on a channel: the channel exists, and isn't virtual.
+
+    Virtual: vcan, vxcan, and python-can's own virtual bus.
+    """
     from adacd_hil.wire.python_can import is_usable
 
     is_there = channel in can_interfaces() if interface == "socketcan" else is_usable(interface)
@@ -66,7 +69,8 @@ def may_be_hardware(interface: str, channel: str) -> bool:
 def check_autonomy(settings: Settings, interface: str, channel: str) -> None:
     """Raise CommandError if settings let a real arm move without data, or acknowledge stops without a user.
 
-    Any channel but vcan, vxcan and python-can's own virtual bus counts as a real arm.
+    Any channel but vcan, vxcan and python-can's own virtual bus counts as a real arm. Without data: for more than
+    MOST_BLIND_CYCLES.
     """
     if is_virtual(interface, channel):
         return
@@ -103,7 +107,10 @@ def check_shared(name: str, settings: Settings) -> None:
 
 
 def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> Bus:
-    """Return the bus wrapped for lockstep: only modelled time passes on it. Raises CodecError."""
+    """Return the bus wrapped for lockstep: only modelled time passes on it.
+
+    Raises CodecError if the contract has no message Sync.
+    """
     # Imported here: it belongs to lockstep and isn't needed in real time.
     from adacd_hil.wire.lockstep_bus import make_lockstep_bus
 
@@ -111,7 +118,7 @@ def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) 
 
 
 def received_ids(codec: Codec, settings: Settings, devices: Iterable[PlacedDevice]) -> list[int]:
-    """Return the CAN identifiers that the host reads: the contract's, and those that only the host may send.
+    """Return the CAN identifiers that the host reads, ascending: the contract's, and those that only the host may send.
 
     A frame of the second kind shows another host.
     """
@@ -122,7 +129,10 @@ def received_ids(codec: Codec, settings: Settings, devices: Iterable[PlacedDevic
 
 @dataclass(frozen=True)
 class Connection:
-    """The options of a command that reaches an arm: interface, channel, bit rate, configuration, profile, DBC."""
+    """The options of a command that reaches an arm: interface, channel, bit rate, configuration, profile, DBC.
+
+    bitrate, profile, dbc: None if not given. config: name or file.
+    """
 
     interface: str
     channel: str
@@ -145,7 +155,10 @@ class Connection:
         return " ".join(f"{option} {shlex.quote(str(value))}" for option, value in given if value is not None)
 
     def settings(self) -> Settings:
-        """Return the settings of the configuration; --dbc, if given, becomes its contract. Raises ConfigError."""
+        """Return the settings of the configuration; --dbc, if given, becomes its contract.
+
+        Raises ConfigError if it is invalid.
+        """
         return self.with_contract(load_settings(self.config, self.profile))
 
     def with_contract(self, settings: Settings) -> Settings:
@@ -155,7 +168,10 @@ class Connection:
         return dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, contract=str(self.dbc)))
 
     def load(self) -> tuple[Settings, Codec, list[PlacedDevice]]:
-        """Return the settings, the codec of their contract, and the devices. Raises ConfigError, CodecError."""
+        """Return the settings, the codec of their contract, and the devices.
+
+        Raises ConfigError for invalid settings or devices, CodecError for an invalid contract.
+        """
         settings = self.settings()
         devices = place_devices(settings)
         return settings, load_contract(settings, devices), devices
@@ -163,7 +179,7 @@ class Connection:
     def load_decoder(self) -> Codec | DbcDecoder:
         """Return the frame decoder for a command that only listens: of any DBC that --dbc names, else of the contract.
 
-        Raises ConfigError, CodecError.
+        Raises ConfigError for invalid settings or devices, CodecError for an invalid DBC.
         """
         if self.dbc is not None:
             decoder = load_decoder(self.dbc)
@@ -174,7 +190,8 @@ class Connection:
     def open(self, clock: Clock, codec: Codec, settings: Settings, devices: Iterable[PlacedDevice]) -> Bus:
         """Open the bus for a run and return it; in real time it receives only the identifiers of `received_ids`.
 
-        A VirtualClock means lockstep: the bus then models the time. Raises BusMissingError, CodecError.
+        A VirtualClock means lockstep: the bus then models the time. Raises BusMissingError if it can't be opened, in
+        lockstep CodecError if the contract has no message Sync.
         """
         can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings, devices)
         bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)
@@ -182,9 +199,10 @@ class Connection:
 
     @contextmanager
     def bus(self, clock: Clock, is_fd: bool) -> Iterator[Bus]:
-        """Open the bus without a filter, and close it after the block. Raises BusMissingError.
+        """Open the bus without a filter, yield it, and close it after the block.
 
-        A BusError in the block becomes a CommandError with the exit status BUS_MISSING: no drive has been enabled.
+        Raises BusMissingError if it can't be opened. A BusError in the block becomes a CommandError with the exit
+        status BUS_MISSING: no drive has been enabled.
         """
         bus = open_bus(self.interface, self.channel, clock, None, self.bitrate, is_fd)
         try:
@@ -204,9 +222,10 @@ def raise_interrupt() -> NoReturn:
 
 @contextmanager
 def never_stopped() -> Iterator[None]:
-    """Ignore SIGTTIN and SIGTTOU in the block: a terminal stops background processes with them that read or write it.
+    """Ignore SIGTTIN and SIGTTOU in the block, by which a terminal stops a background process that reads or writes it.
 
-    A stopped process would send no commands to a moving arm. Reading such a terminal raises OSError instead.
+    A stopped process would send no commands to a moving arm. Reading such a terminal raises OSError instead. Restore
+    the handlers after the block.
     """
     previous = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTTIN, signal.SIGTTOU)}
     try:
@@ -220,7 +239,7 @@ def never_stopped() -> Iterator[None]:
 def on_interrupt(interrupt: Callable[[], None], *further: signal.Signals) -> Iterator[None]:
     """Call a function on SIGINT, SIGTERM and SIGHUP while the block runs; then restore the handlers.
 
-    Outside the main thread, change nothing. SIGHUP stays ignored if it was. further: signals that call it, too.
+    further: signals that call it, too. SIGHUP stays ignored if it was. Outside the main thread, change nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

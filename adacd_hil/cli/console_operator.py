@@ -30,9 +30,10 @@ _MOST_LETTERS = 40
 
 
 class ConsoleOperator:
-    """Reads words from a terminal, a line each, on a thread of its own, and passes on the requests of a script.
+    """The user of a run at a terminal: the requests of typed words, else those of a script.
 
-    tell: prints a line for the user: which word a state waits for, and that a word is unknown.
+    A thread of its own reads the words, a line each. tell: prints a line for the user: which word a state waits for,
+    and that a word is unknown.
     """
 
     def __init__(
@@ -47,7 +48,7 @@ class ConsoleOperator:
         self._thread.start()
 
     def join(self, timeout_s: float) -> None:
-        """Wait until the terminal's stream has ended, at most `timeout_s`."""
+        """Wait until the terminal's stream has ended, at most `timeout_s`; return in both cases."""
         self._thread.join(timeout_s)
 
     def _listen(self) -> None:
@@ -63,10 +64,10 @@ class ConsoleOperator:
                     self._tell(_unknown(word))
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return the next request that the user typed, else the script's; print which word a new state waits for.
+        """Return the next request that the user typed, else the script's, or NONE.
 
-        Print that the state drops the request, if it does. In FAULT, typed requests stay for `answer_fault`.
-        elapsed_s: since the drives were enabled, None before.
+        Print which word a new state waits for, or that the state drops the request. In FAULT, typed requests stay for
+        `answer_fault`. state: that of the cycle before. elapsed_s: since the drives were enabled, None before.
         """
         if state is not self._state:
             self._enter(state)
@@ -77,9 +78,10 @@ class ConsoleOperator:
         return self._script.request(elapsed_s, state)
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Return RECOVER if the user has typed `ack` since the fault, END for `finish`, else WAIT; drop other requests.
+        """Return RECOVER if the user has typed `ack` since the fault, END for `finish`, the first of both; else WAIT.
 
-        After the terminal's end, if neither was typed, return the script's answer. elapsed_s: since the fault.
+        Drop other requests. After the terminal's end, if neither was typed, return the script's answer. elapsed_s:
+        since the fault.
         """
         if self._state is not SchemeState.FAULT:  # the bus or the boot failed, without a cycle in FAULT
             self._enter(SchemeState.FAULT)
@@ -94,7 +96,10 @@ class ConsoleOperator:
         return FaultAnswer.WAIT if self._thread.is_alive() else self._script.answer_fault(elapsed_s)
 
     def _enter(self, state: SchemeState) -> None:
-        """Store a new state. A fault drops what was typed before it, which can't acknowledge it, except for FINISH."""
+        """Store a new state, and print which word it waits for.
+
+        In FAULT drop all requests typed before except FINISH: they can't acknowledge it.
+        """
         self._state = state
         if state is SchemeState.FAULT:
             for request in [self._asked.popleft() for _ in range(len(self._asked))]:
@@ -104,7 +109,7 @@ class ConsoleOperator:
             self._tell(_AWAITED[state])
 
     def _tell_if_dropped(self, request: Request) -> None:
-        """Print that the present state drops a request; of a reaction that is known in one case to the scheme only."""
+        """Print that the present state drops a request; not if only the scheme knows: `changed` in a reaction."""
         is_open = request is Request.PAYLOAD_CHANGED and self._state in REACTING
         if request not in KEPT_IN or self._state in KEPT_IN[request] or is_open:
             return

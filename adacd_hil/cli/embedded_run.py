@@ -44,7 +44,11 @@ _TOUCHED_LINK = TRUTH_LAYOUT.slices["contact_link"].start
 
 
 class Cast(NamedTuple):
-    """Host and emulated arm of a run, resolved."""
+    """Host and emulated arm of a run, resolved.
+
+    contract: of the emulator if it plays an arm of one's own, else None. assumed: values that it had to assume, as
+    texts.
+    """
 
     settings: Settings
     scenario: Scenario
@@ -53,12 +57,13 @@ class Cast(NamedTuple):
 
 
 def resolve(config: str, scenario_name: str, profile: str | None, seed: int | None, truth: str | None = None) -> Cast:
-    """Return host settings and emulated arm of a run, by configuration and scenario. Raises ConfigError, CodecError.
+    """Return host settings and emulated arm of a run, by configuration and scenario.
 
     If the configuration describes an arm of one's own, the emulator plays that arm, unless a profile is given.
     Otherwise the profile is the given one, else the scenario's, else the configuration's. truth: name or file of the
-    emulated arm's true values. A configuration without a script gets the demo's user, since somebody must acknowledge.
-    A built-in arm gets its motors' holding torque from its data sheet; an arm of one's own keeps the value of its file.
+    emulated arm's true values. seed: None: the scenario's. A configuration without a script gets the demo's user, since
+    somebody must acknowledge. A built-in arm gets its motors' holding torque from its data sheet; an arm of one's own
+    keeps the value of its file. Raises ConfigError or CodecError if configuration, scenario or contract can't be used.
     """
     contract: EmulatedContract | None = None
     assumed: list[str] = []
@@ -94,7 +99,8 @@ def run_embedded(
 ) -> tuple[SessionSummary, Path]:
     """Run host and emulated arm in this process, with both logs in `out`; return the summary and the path of the truth.
 
-    Raises ConfigError, CodecError, LogError, OSError, CommandError for a configuration of several arms.
+    Raises ConfigError, CodecError or LogError for invalid settings or logs, OSError if a file can't be written,
+    CommandError for a configuration of several arms. After an error the truth's log is discarded.
     """
     settings, scenario = cast.settings, cast.scenario
     check_shared("lockstep", settings)  # an arm in this process is alone on its bus

@@ -109,7 +109,7 @@ for command in (config, replay, *further_commands()):
 
 
 def _misused(error: click.ClickException) -> str:
-    """Return one line that describes a wrong command line and names the command that shows its help."""
+    """Return one line on a wrong command line, with the command that shows its help, if there is one."""
     text = " ".join(error.format_message().split())
     context = error.ctx if isinstance(error, click.UsageError) else None
     return text if context is None else f"{text} see `{context.command_path} --help`"
@@ -142,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _missing(error: ImportError) -> Exception:
-    """Return an error that names a missing third-party package and the command to install it; else the error itself.
+    """Return a CommandError with a missing third-party package and the command to install it; else `error` itself.
 
     `run`, `replay` and `config` need fewer packages than the commands of the lab.
     """

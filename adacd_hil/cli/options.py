@@ -115,14 +115,14 @@ def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
 
 
 def on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Return a command with the options of a bus, which receives a `Connection` as its first argument."""
+    """Return a command with the options of a bus, as `explained`; it receives a `Connection` as its first argument."""
     return _connected(command, is_required=True)
 
 
 def on_bus_or_url(help_text: str) -> Callable[[Callable[..., ExitCode]], Callable[..., None]]:
-    """Return a decorator that adds the options of a bus and --url; a command receives a `Connection` or the URL first.
+    """Return a decorator that adds the options of a bus and --url to a command.
 
-    help_text: of --url.
+    The command receives the URL as its first argument, or without --url a `Connection`. help_text: of --url.
     """
     url_option = click.option("--url", help=help_text)
     return lambda command: url_option(_connected(command, is_required=False))
@@ -192,7 +192,10 @@ _OPTIONS = (  # last first: click lists them the other way round
 
 
 def require_extra(asked_for: str, *modules: str) -> None:
-    """Raise CommandError if a module of the extra `live` is not installed; asked_for: the option that needs it."""
+    """Raise CommandError if one of `modules` is not installed, with the command that installs the extra `live`.
+
+    asked_for: the option that needs them.
+    """
     missing = [module for module in modules if find_spec(module) is None]
     if missing:
         raise CommandError(f"{asked_for} needs the extra `live`: {install_command('live')}", ExitCode.USAGE)
@@ -224,7 +227,7 @@ def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
 def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int) -> "LiveView":
     """Return the live view of an installed package.
 
-    Raises CommandError if there is no such package, an origin is wrong, or the port can't be listened on.
+    Raises CommandError if no or more than one package serves one, an origin is wrong, or the port can't be listened on.
     """
     require_extra("--live", "websockets")
     try:
@@ -240,7 +243,10 @@ def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str,
 
 
 def _check_port(host: str, port: int) -> None:
-    """Raise CommandError if the port can't be listened on, such as one in use, before time is spent on compiling."""
+    """Raise CommandError if the port can't be listened on, such as one in use; 0 always passes.
+
+    Call it before time is spent on compiling.
+    """
     try:
         places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM) if port else ()
         for family, kind, protocol, _, address in places:

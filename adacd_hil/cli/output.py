@@ -59,7 +59,7 @@ EPILOG = (
 
 
 def tell(line: str) -> None:
-    """Print a line on standard error; for lines that are neither question nor result."""
+    """Print a line on standard error, control characters escaped; for lines that are neither question nor result."""
     print(in_line(line), file=sys.stderr, flush=True)
 
 
@@ -74,7 +74,8 @@ class CommandError(Exception):
 def exit_code(summary: "SessionSummary") -> ExitCode:
     """Return the exit status of a run; the first that applies.
 
-    BUS_MISSING: not started. SAFETY_STOP: broken off, or faulted. PARTIAL: the log is incomplete. INTERRUPTED. OK.
+    BUS_MISSING: it didn't start. SAFETY_STOP: it broke off, or ended in a fault. PARTIAL: the log is incomplete.
+    INTERRUPTED: the user interrupted it. Else OK.
     """
     from adacd_hil.records import FaultReason
 
@@ -112,7 +113,10 @@ def _expected() -> tuple[tuple[type[BaseException], ExitCode], ...]:
 
 
 def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Return a command wrapped: it ends the process with its exit status, and prints an error in one line."""
+    """Return a command wrapped: it ends the process with its exit status; of an expected error it prints one line.
+
+    Other errors pass through, see `complain`.
+    """
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
@@ -126,7 +130,7 @@ def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
 
 
 def _code_of(error: BaseException) -> ExitCode | None:
-    """Return the exit status of an error that a command reports in one line; None for any other."""
+    """Return the exit status of an expected error, which a command reports in one line; None for any other error."""
     return next((code for kind, code in _expected() if isinstance(error, kind)), None)
 
 
@@ -134,13 +138,16 @@ _REMEDY = "; give another place, or let its owner change the rights"
 
 
 def _is_forbidden(error: BaseException) -> bool:
-    """Return whether the system denied this user access to a file."""
+    """Return whether an error, or its cause, is the system's refusal to let this user access a file."""
     causes = (error, error.__cause__)
     return any(isinstance(one, OSError) and one.errno in (errno.EACCES, errno.EPERM, errno.EROFS) for one in causes)
 
 
 def complain(error: BaseException) -> ExitCode:
-    """Print an error in one line and return its exit status; raise an error again that no command should end with."""
+    """Print an expected error, or an interrupt, in one line and return its exit status; raise any other error again.
+
+    The status is PARTIAL if the disk is full; a CommandError has its own.
+    """
     if isinstance(error, KeyboardInterrupt):
         print("adacd-hil: interrupted", file=sys.stderr)
         return ExitCode.INTERRUPTED
@@ -155,9 +162,9 @@ def complain(error: BaseException) -> ExitCode:
 
 
 def one_by_one(given: Iterable[Given], work: Callable[[Given], Done]) -> tuple[list[Done], list[Exception]]:
-    """Return the results of `work` on each of the given ones, and the errors of those that it can't be done on.
+    """Return the results of `work` on each of the given ones, and the expected errors of those that it failed on.
 
-    One that is refused doesn't stop the others. Raises errors that no command should end with.
+    A failure doesn't stop the others. Raises any error that is not expected, see `complain`.
     """
     done: list[Done] = []
     refused: list[Exception] = []
@@ -172,7 +179,10 @@ def one_by_one(given: Iterable[Given], work: Callable[[Given], Done]) -> tuple[l
 
 
 def complain_of(refused: Iterable[Exception]) -> ExitCode:
-    """Print each error of `one_by_one` in a line, equal ones once; return the exit status of the first, OK of none."""
+    """Print each error of `one_by_one` in a line, equal ones once.
+
+    Return the exit status of the first, OK without any.
+    """
     codes = [complain(error) for error in {str(error): error for error in refused}.values()]
     return codes[0] if codes else ExitCode.OK
 
@@ -180,10 +190,11 @@ def complain_of(refused: Iterable[Exception]) -> ExitCode:
 def format_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = (), is_cut: bool = False, names: int = 1
 ) -> str:
-    """Return rows aligned under a head, as text that fits the terminal on standard output. An empty head is left out.
+    """Return rows aligned under a head, as text that fits the terminal on standard output. A head of "" is left out.
 
-    right: columns, from 0, that are aligned to the right. is_cut: cut cells, so that each row is one line. names: how
-    many columns, from the left, identify a row: they are repeated where a wide table is split.
+    right: columns, from 0, that are aligned to the right. is_cut: cut cells to one line; else a cell that is too long
+    takes several lines. names: number of columns, from the left, that identify a row: they are repeated where a wide
+    table is split.
     """
     lines = [tuple(head), *map(tuple, rows)] if any(head) else [*map(tuple, rows)]
     return "\n".join(fit_table(lines, right, terminal_columns(), is_cut, names))
@@ -196,7 +207,10 @@ def show(text: str, *next_commands: str) -> None:
 
 
 def answer(as_json: bool, described: Any, text: str, *next_commands: str) -> None:
-    """Print a result: `described` as JSON for machines, or the text for people with suggested commands."""
+    """Print a result on standard output: `described` as JSON if as_json, else `text`.
+
+    With the text, suggest the next commands on standard error.
+    """
     if as_json:
         print(json_text(described))
     else:
@@ -213,7 +227,10 @@ def suggest(*next_commands: str) -> None:
 
 
 def _as_typed(line: str) -> str:
-    """Return a command folded to the terminal's width, with backslashes that a shell accepts; not if it has quotes."""
+    """Return a line with a command folded to the terminal's width, with backslashes that a shell accepts.
+
+    A command with quotes is not folded; a comment behind it gets a line of its own.
+    """
     columns = terminal_columns(sys.stderr)
     command, mark, comment = line.partition("   # ")
     if columns is None or len(line) <= columns:
@@ -226,7 +243,7 @@ _GOES_ON = " \\"
 
 
 def counted(count: int, noun: str) -> str:
-    """Return a count and its noun, such as "2 cycles"; the noun is singular for one."""
+    """Return a count and its noun, such as "2 cycles"; the noun, given in the singular, gets an s unless count is 1."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
@@ -237,9 +254,9 @@ def quoted(path: Path) -> str:
 
 @contextmanager
 def writable_folder(out: Path | None) -> Iterator[None]:
-    """Before the block, make the folder of a result and test that a file can be written in it; None: do nothing.
+    """Make the folder of a result before the block, and test that the file `out` can be written; do nothing for None.
 
-    A folder that was made and is empty at the end is removed. Raises CommandError.
+    A folder that was made and is empty at the end is removed. Raises CommandError if it can't be written.
     """
     if out is None:
         yield
@@ -256,9 +273,9 @@ def writable_folder(out: Path | None) -> Iterator[None]:
 
 
 def print_and_write(text: str, out: Path | None, content: str, has_all: bool) -> None:
-    """Print a result's text, and write `content` to the file `out`; None: to no file.
+    """Print a result's text, and write `content` to the file `out`, unless that is None.
 
-    If the file can't be written, `content` is printed, too, unless the printed result contains it (`has_all`). Raises
+    has_all: the text contains `content`. If the file can't be written, print `content` too, unless has_all, and raise
     CommandError.
     """
     failure = None
@@ -299,11 +316,11 @@ class RunFolder:
 
 @contextmanager
 def run_folder(out: Path | None, log_names: tuple[str, ...], name: str) -> Iterator[RunFolder]:
-    """Choose the folder of a run: `out`, or a new one by date below `runs` if that is None.
+    """Choose the folder of a run and yield it: `out`, or a new one by date below `runs` if that is None.
 
     log_names: file names of the logs that will be made. name: of the command, and of the link to its last run. When the
-    block ends, a folder that was made and is empty is removed. Raises LogExistsError if `out` has such a log, LogError,
-    OSError.
+    block ends, a folder that was made and is empty is removed. Raises LogExistsError if `out` has such a log, LogError
+    if that can't be examined, OSError if the new folder can't be made.
     """
     if out is not None:
         for log_name in log_names:
@@ -321,7 +338,10 @@ def run_folder(out: Path | None, log_names: tuple[str, ...], name: str) -> Itera
 
 
 def _make_dated() -> Path:
-    """Make a new folder in `runs`, named by the date, with a number if that is taken; return it. Raises OSError."""
+    """Make a new folder in `runs`, named by the date, with a number if that is taken; return it.
+
+    Raises OSError if it can't be made.
+    """
     RUNS.mkdir(parents=True, exist_ok=True)
     date = datetime.fromtimestamp(wall_ns() // 1_000_000_000).strftime(_DATE)
     for number in itertools.count(1):
@@ -333,7 +353,10 @@ def _make_dated() -> Path:
 
 
 def _lead(link: Path, path: Path) -> None:
-    """Set or replace a symbolic link to `path`, in one step. Raises OSError."""
+    """Set or replace a symbolic link to `path`, in one step.
+
+    Raises FileExistsError if a file or folder has its name, OSError if it can't be set.
+    """
     if is_there(link) and not link.is_symlink():
         raise FileExistsError(0, f"there is a {'folder' if link.is_dir() else 'file'} of that name")
     beside = link.with_name(f".{link.name}.{os.getpid()}")

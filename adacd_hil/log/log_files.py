@@ -64,13 +64,16 @@ def part_path(path: Path, number: int) -> Path:
 
 
 def is_part_name(path: Path) -> bool:
-    """Return whether the name is that of a further part, such as run_001.mcap, of a log in the same folder."""
+    """Return whether a path is named as a further part, such as run_001.mcap, of a log in the same folder."""
     match = re.fullmatch(rf"(.+)_\d{{{_DIGITS},{_MOST_DIGITS}}}", path.stem)
     return match is not None and path.with_name(f"{match[1]}{path.suffix}").exists()
 
 
 def find_parts(path: Path) -> dict[int, Path]:
-    """Return the paths of the existing parts of the log `path`, by number and in order. Raises OSError."""
+    """Return the paths of the existing parts of the log `path`, by number and in order; {} without any.
+
+    Raises OSError if the folder can't be listed.
+    """
     pattern = re.compile(rf"{re.escape(path.stem)}_(\d{{{_DIGITS},{_MOST_DIGITS}}}){re.escape(path.suffix)}")
     matches = (pattern.fullmatch(entry.name) for entry in path.parent.iterdir())
     numbers = {int(match[1]) for match in matches if match}
@@ -81,7 +84,10 @@ def find_parts(path: Path) -> dict[int, Path]:
 
 
 def arithmetic() -> dict[str, str]:
-    """Return machine, Python and libraries by name, for a log's metadata: equal descriptions compute equal bits."""
+    """Return machine, Python and library versions by name, for a log's metadata.
+
+    Two machines with the same ones compute the same bits.
+    """
     from importlib.metadata import version  # costs 20 ms, and most importers don't need it
 
     return {

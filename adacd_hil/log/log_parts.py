@@ -21,9 +21,9 @@ DROPPED_KEY = "dropped"
 
 
 def log_in(given: str | Path) -> Path:
-    """Return the path of a log: the given path, or for a folder run.mcap in it.
+    """Return the given path of a log; for a folder the path of run.mcap in it.
 
-    Raises LogError for a folder without it.
+    Raises LogError for a folder without run.mcap; a path that doesn't exist is returned as it is.
     """
     path = Path(given)
     if not path.is_dir():
@@ -34,7 +34,7 @@ def log_in(given: str | Path) -> Path:
 
 
 def parts_of(path: Path) -> dict[int, Path]:
-    """Return the existing parts of the log `path` by number; without any, {0: path}, which fails when it is opened."""
+    """Return the existing parts of the log `path` by number; without any {0: path}, which can't be opened."""
     try:
         return find_parts(path) or {0: path}
     except OSError:
@@ -42,9 +42,10 @@ def parts_of(path: Path) -> dict[int, Path]:
 
 
 def missing_parts(path: Path, parts: Collection[int], ending: str = "") -> list[Path]:
-    """Return the paths of missing parts of the log `path`: in between, and behind a last one that says "continued".
+    """Return the paths of missing parts of the log `path`, [] if it is whole.
 
-    parts: the numbers found. ending: of the last one, from its summary.
+    Those before its last part; also the next one if `ending` is "continued". parts: the numbers of those that exist.
+    ending: of the last one, from its summary.
     """
     last = max(parts)
     missing = [number for number in range(last) if number not in parts]

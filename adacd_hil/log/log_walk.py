@@ -47,14 +47,17 @@ _NOT_OF_HEAD = set(Opcode) - {Opcode.ATTACHMENT, Opcode.METADATA}
 
 
 class Extras:
-    """Attachments and metadata of a file."""
+    """Attachments and metadata of a file, by name; a later one replaces an earlier one of the same name."""
 
     def __init__(self) -> None:
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, dict[str, str]] = {}
 
     def add_record(self, record: RawRecord) -> None:
-        """Keep the attachment or metadata in a record; ignore other records. Raises LogError for a damaged one."""
+        """Keep the attachment or metadata in a record; ignore other records.
+
+        Raises LogError for a record that can't be parsed, or an attachment that fails its CRC.
+        """
         if record.opcode == Opcode.ATTACHMENT:
             attachment: Attachment = parse(record.opcode, record.body)
             if not attachment_crc_fits(record):
@@ -82,14 +85,17 @@ def read_head(path: Path) -> Extras:
 
 
 def attachment(path: Path, name: str) -> bytes | None:
-    """Return an attachment of an MCAP file by its name; None if the head of the file lacks it or can't be read."""
+    """Return an attachment of an MCAP file by its name; None if the head of the file lacks it or can't be read.
+
+    Raises no error.
+    """
     with contextlib.suppress(LogError):  # the reader of the log reports damage
         return read_head(path).attachments.get(name)
     return None
 
 
 def run_metadata(path: Path) -> dict[str, str]:
-    """Return the metadata of the run in an MCAP file; empty if the head of the file lacks them or can't be read."""
+    """Return the metadata of the run in an MCAP file; {} if the head of the file lacks them or can't be read."""
     with contextlib.suppress(LogError):
         return read_head(path).metadata.get(RUN_METADATA, {})
     return {}
@@ -105,7 +111,10 @@ def _read_items(path: Path, is_ahead: bool = True) -> Iterator[Item]:
 
 
 class LogWalk:
-    """The content of a log. `problem` names missing parts in one line, "" for a whole log."""
+    """The content of a log with all its parts: attachments, metadata and summary of the run, topics, messages.
+
+    The constructor reads the heads of the parts; `pieces` reads the rest.
+    """
 
     def __init__(self, path: Path, topics: Collection[str] | None = None) -> None:
         """Find the parts of the log whose first part is `path`.
@@ -127,7 +136,7 @@ class LogWalk:
 
     @property
     def problem(self) -> str:
-        """Damaged and missing parts in one line, as far as has been walked; "" for a whole log."""
+        """Missing and damaged parts in one line, as far as `pieces` has walked; "" for a whole log, and before."""
         return "; ".join(self._problems)
 
     def layout(self, channel: Channel, schema: Schema) -> "np.dtype[Any] | None":  # noqa: ARG002 (a subclass's)
@@ -135,9 +144,9 @@ class LogWalk:
         return None
 
     def _find_parts(self) -> None:
-        """Plan the walk: the readable parts in order, and a problem for each missing, damaged or foreign one.
+        """Plan the walk: the readable parts in order, and a problem for each missing, unreadable or foreign one.
 
-        Raises LogError when no part can be read.
+        Raises the first part's LogError if no part can be read.
         """
         parts = parts_of(self.path)
         self._is_alone = list(parts) == [0]
@@ -156,7 +165,10 @@ class LogWalk:
         self._last = max(parts)
 
     def _plan_part(self, head: Extras, path: Path, number: int) -> None:
-        """Add a part to the plan, with its attachments; a part of another log is a problem. number: by its name."""
+        """Add a part to the plan, and its metadata and attachments to the log's.
+
+        A part of another log is a problem instead. number: by its name.
+        """
         metadata = head.metadata.get(RUN_METADATA, {})
         said = metadata.pop(PART_KEY, str(number))
         is_foreign = bool(self.metadata and metadata) and metadata != self.metadata
@@ -171,14 +183,18 @@ class LogWalk:
         self.attachments = {**head.attachments, **self.attachments}
 
     def _missing(self, start: int, stop: int) -> list[str]:
-        """Return a line that names the missing parts from start to stop - 1, in a list; [] if there are none."""
+        """Return one line that names the first and the last missing part of those from start to stop - 1.
+
+        [] if there are none.
+        """
         names = [part_path(self.path, number).name for number in sorted({start, stop - 1})] if start < stop else []
         return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []
 
     def pieces(self, cycles: int, epoch_ns: int, is_ahead: bool = True) -> Iterator[RawPiece]:
         """Yield the messages of all parts in pieces of `cycles` cycles; topics, summary and problem grow meanwhile.
 
-        epoch_ns: offset of the times in the file from those of frames. is_ahead: a thread opens chunks in advance.
+        epoch_ns: offset of the times in the file from those of frames. is_ahead: a thread opens chunks in advance. Each
+        call begins with the first part and clears summary and problem.
         """
         builder = PieceBuilder(cycles, epoch_ns)
         self._problems, self.summary, self.parts = [], {}, 0
@@ -205,9 +221,9 @@ class LogWalk:
             yield builder.take_piece()
 
     def _sum_up(self, summary: dict[str, str]) -> None:
-        """Add a part's summary to the log's: counts are added up, other entries replaced.
+        """Add a part's summary to the log's: add up counts, replace other entries.
 
-        A part without a summary has no ending.
+        A part without a summary removes the log's ending.
         """
         both = self.summary.keys() & summary.keys() & _COUNTS
         sums = {key: str(summary_count(self.summary, key) + summary_count(summary, key)) for key in both}
@@ -217,7 +233,7 @@ class LogWalk:
 
 
 class _PartWalk:
-    """The walk over one file."""
+    """The walk over one file; keeps its attachments, metadata and first problem."""
 
     def __init__(
         self, path: Path, builder: PieceBuilder, layout: PayloadLayout, wanted: Collection[str] | None
@@ -273,7 +289,10 @@ class _PartWalk:
             self._note("a message is not as long as its schema says")
 
     def _take_messages(self, block: Block, messages: slice) -> Iterator[RawPiece]:
-        """Gather some messages of a block; yield full pieces. Of an unknown channel, search the definition first."""
+        """Gather the messages of a block in a slice; yield full pieces.
+
+        Of a channel that isn't defined yet, search the definition in the file's summary first.
+        """
         channels = block.contents.channels[messages]
         slots = self._slots[channels]
         if UNKNOWN in slots:
@@ -283,7 +302,10 @@ class _PartWalk:
         yield from self._builder.add_messages(block.contents, messages, slots)
 
     def _define(self, record: RawRecord | None) -> None:
-        """Keep a schema, or a channel with its slot. Raises LogError for an invalid record and for None."""
+        """Keep a schema, or a channel with its slot.
+
+        Raises LogError for an invalid record, and for None, which stands for one.
+        """
         if record is None:
             raise LogError("no record")
         definition = self._definitions.add_record(record)
@@ -291,7 +313,11 @@ class _PartWalk:
             self._slots[definition.id] = self._slot_of(definition)
 
     def _slot_of(self, channel: Channel) -> int:
-        """Return the slot that gathers a channel's messages, a new one for a new topic; UNWANTED: they are skipped."""
+        """Return the slot that gathers a channel's messages, a new one for a new topic; UNWANTED: they are skipped.
+
+        They are skipped if the topic isn't wanted, or if it has another type than before, which is kept in
+        `other_types`.
+        """
         if self._wanted is not None and channel.topic not in self._wanted:
             return UNWANTED
         schema = self._definitions.schemas.get(channel.schema_id, Schema(0, b"", "", ""))

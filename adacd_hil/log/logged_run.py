@@ -34,7 +34,7 @@ Progress = Callable[[str], None]
 
 
 class Milestones:
-    """Calls `tell` with a count whenever `step` more have been reached, or `PROGRESS_CYCLES`."""
+    """Calls `tell` with a count whenever the count has grown by `step`; a step of 0 is PROGRESS_CYCLES."""
 
     def __init__(self, tell: Callable[[int], None], step: int = 0) -> None:
         self._tell, self._step, self._told = tell, step or PROGRESS_CYCLES, 0
@@ -80,7 +80,7 @@ def host_span(span: EmulatorSpan, begins: Cycles) -> Span:
 
 
 def cycle_offsets(begins: Cycles) -> Cycles:
-    """Return per attempt the host's cycle numbers minus the emulator's (k,).
+    """Return per attempt the host's cycle numbers minus the emulator's (k,): whole rounds of the counter of SYNC.
 
     begins: the host's number of the first cycle of each attempt (k,).
     """
@@ -92,10 +92,10 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Truth:
-    """The emulator's truth on its own cycles (m,): external torque (m, 2), contact, payload, parameters (m, 7).
+    """The emulator's truth on its own cycles (m,): external torque (m, 2), Nm, contact, payload, parameters (m, 7).
 
-    Of a long run it has the cycles of contacts and the one after each. Payload and parameters then have cycles of their
-    own, `model_cycle` (k,): those from which on they are as they are.
+    contact_link, contact_index: of the contact in a cycle. Of a long run it has the cycles of contacts and the one
+    after each. Payload and parameters then have cycles of their own, `model_cycle` (k,): those from which on they hold.
     """
 
     cycle: Cycles
@@ -113,11 +113,14 @@ class Truth:
     """Cycles that the emulator recorded, whichever are kept; None: all."""
 
     def covers(self, cycle: int) -> bool:
-        """Return whether the emulator recorded a cycle of the host."""
+        """Return whether the emulator recorded a cycle of the host; True without a span."""
         return self.span is None or bool(self.span.covers(np.array(cycle)))
 
     def model_row(self, cycle: int) -> int | None:
-        """Return the index, in `payload_kg` and `theta`, of the values that hold in a cycle; None if there are none."""
+        """Return the index, in `payload_kg` and `theta`, of the values that hold in a cycle.
+
+        None if the truth is empty. 0 for a cycle before the first.
+        """
         cycles = self.cycle if self.model_cycle is None else self.model_cycle
         return max(int(np.searchsorted(cycles, cycle, side="right")) - 1, 0) if cycles.size else None
 
@@ -133,7 +136,10 @@ def is_interrupted(state: NDArray[np.uint8]) -> Mask:
 
 
 def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:
-    """Return the settings of a run from the attachment config.toml of its log `path`. Raises LogError."""
+    """Return the settings of a run from the attachment config.toml of its log.
+
+    Raises LogError, which names the log's `path`, if the attachment is missing or has no valid settings.
+    """
     if CONFIG_NAME not in attachments:
         raise LogError(f"log {path} has no attachment {CONFIG_NAME}: its settings are not known")
     try:
@@ -152,14 +158,17 @@ def begins_alarm(
 ) -> NDArray[np.bool_]:
     """Return for each cycle (n,) whether an alarm begins: a reaction to a contact, not to a host that is late.
 
-    is_over (n,): some joint is over its threshold, or it is not known. is_reported (n,): a report of a contact that
-    began in this cycle.
+    previous, state (n,): before and after the cycle. is_over (n,): a joint is over its threshold, or it is not known
+    whether one is. is_reported (n,): a report of a contact that began in this cycle.
     """
     return enters_react(previous, state) & np.asarray(is_over | is_reported)
 
 
 class Mismatch(NamedTuple):
-    """A value that isn't the logged one. `place`: joint, parameter or channel of the field, "" for a plain one."""
+    """A replayed value that isn't the logged one.
+
+    `place`: joint, parameter or channel in the field, "" for a plain field.
+    """
 
     topic: str
     field: str

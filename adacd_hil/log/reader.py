@@ -63,14 +63,17 @@ _NOT_FIELDS = ("record_length", "log_time", "publish_time", "sec", "nanosec")
 
 
 class LoggedEvent(NamedTuple):
-    """An event and when it happened."""
+    """An event and when it was logged, ns on the clock of the run."""
 
     t_ns: int
     event: Event
 
 
 class Series:
-    """The messages of one topic: `series["tau_J"]` is float64 (n, 2), a copy of its own; a scalar field is (n,)."""
+    """The messages of one topic: `series["tau_J"]` is float64 (n, 2), a copy; a field of one number is (n,).
+
+    `series[name]` raises KeyError for an unknown field.
+    """
 
     def __init__(self, records: NDArray[Any], epoch_ns: int) -> None:
         self.records = records
@@ -92,12 +95,12 @@ class Series:
 
     @property
     def t_ns(self) -> NDArray[np.int64]:
-        """Time of each message (n,), ns, of the clock of the run."""
+        """Time of each message (n,), ns, on the clock of the run."""
         stamp_ns = self.records["sec"].astype(np.int64) * 1_000_000_000 + self.records["nanosec"]
         return np.asarray(stamp_ns - self._epoch_ns, np.int64)
 
     def part(self, rows: slice | NDArray[np.bool_]) -> "Series":
-        """Return the messages of some rows: of a slice, or where a mask is True."""
+        """Return the messages in a slice, or those where a mask (n,) is True."""
         return Series(self.records[rows], self._epoch_ns)
 
     def between(self, first_ns: int, end_ns: int) -> "Series":
@@ -107,7 +110,10 @@ class Series:
 
     @property
     def block(self) -> Vector:
-        """All float64 values of each message (n, k), in order: for our own topics the block as it was logged."""
+        """Float64 values of each message (n, k), from the first float64 field on: in our own topics the logged block.
+
+        (n, 0) for a topic without float64 fields.
+        """
         fields: Mapping[str, Any] = self.records.dtype.fields or {}
         offsets = [int(fields[name][1]) for name in self.fields if fields[name][0].base == np.dtype("<f8")]
         if not offsets:
@@ -118,7 +124,10 @@ class Series:
 
 @dataclass(frozen=True)
 class RunLog:
-    """A log, all its parts as one. Topics of ours that it lacks are empty; `frames` has the bus frames."""
+    """A log, all its parts as one. `topics`: those of fixed size, each of ours, empty if the log lacks it.
+
+    Bus frames, events and contacts have fields of their own.
+    """
 
     path: Path
     problem: str  # the missing parts, one line; "" for a whole file
@@ -134,17 +143,17 @@ class RunLog:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the file is whole, no packet was dropped on the way to it, and nothing was lost before a recovery."""
+        """Whether the file is whole, no packet was dropped on the way to it, and a recovered log had lost nothing."""
         return _is_complete(self.problem, self.summary)
 
     @property
     def epoch_ns(self) -> int:
-        """Offset of the times in the file from t_ns."""
+        """Offset of the times in the file from t_ns, ns; 0 if the metadata don't name it."""
         return _number(self.metadata, EPOCH_KEY, 0)
 
     @property
     def scheme(self) -> Series:
-        """Decisions of the scheme, records.scheme_layout."""
+        """Decisions of the scheme in each cycle, records.scheme_layout or certified_layout."""
         return self.topics[SCHEME.name]
 
     @property
@@ -168,9 +177,10 @@ def _is_complete(problem: str, summary: Mapping[str, str]) -> bool:
 
 
 def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
-    """Read the log whose first part is `path`, with all its parts. topics: those whose messages are read; None: all.
+    """Read the log whose first part is `path`, with all its parts, into memory.
 
-    A folder stands for the run's log in it, `run.mcap`. Raises LogError when the file doesn't exist or isn't MCAP.
+    topics: those whose messages are read; None: all. A folder stands for the run's log in it, `run.mcap`. Damage is
+    named in `problem`. Raises LogError if no part can be read, or a contact's report has an unknown value.
     """
     stream = LogStream(path, topics, _EVERY_CYCLE)
     empty = stream.empty()
@@ -195,7 +205,7 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
 def topic_bytes(path: str | Path, topic: str) -> bytes:
     """Return the payloads of a topic, one after the other: equal for two logs that hold the same, bit for bit.
 
-    path: as for `read_log`. Raises LogError when the file can't be read or lacks the topic.
+    path: as for `read_log`. Raises LogError if no part can be read, or if the log lacks the topic.
     """
     walk = LogWalk(log_in(path), (topic,))
     found = [payload for piece in walk.pieces(_EVERY_CYCLE, 0) for payload in piece.payloads.get(topic, ())]
@@ -205,7 +215,7 @@ def topic_bytes(path: str | Path, topic: str) -> bytes:
 
 
 def _own_layout(message_type: MessageType) -> "np.dtype[Any] | None":
-    """Return the numpy type of payloads as we write them; None where their size varies."""
+    """Return the numpy type of the payloads of a message type of ours or of bus frames; None if their size varies."""
     if message_type.name in _KNOWN:
         return _KNOWN[message_type.name]
     try:
@@ -215,7 +225,10 @@ def _own_layout(message_type: MessageType) -> "np.dtype[Any] | None":
 
 
 def _number(metadata: Mapping[str, str], key: str, default: int) -> int:
-    """Return the integer under a key of a log's metadata. Raises LogError for another text."""
+    """Return the integer under a key of a log's metadata, `default` without the key.
+
+    Raises LogError for a text that is no integer.
+    """
     try:
         return int(metadata.get(key, default))
     except ValueError:
@@ -223,7 +236,10 @@ def _number(metadata: Mapping[str, str], key: str, default: int) -> int:
 
 
 def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
-    """Return our own topics but those of bus frames, by name, for a log with such metadata. Raises LogError."""
+    """Return our own topics except those of bus frames and of varying size, by name, for a log with such metadata.
+
+    Raises LogError if the number of parameters in the metadata is no integer.
+    """
     parameter_count = _number(metadata, "parameter_count", len(PARAMETER_NAMES))
     topics = {}
     for channel in (*run_channels(parameter_count), *truth_channels()):
@@ -236,9 +252,10 @@ def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
 def _series_of(
     rows: Mapping[str, NDArray[np.uint8]], topics: Mapping[str, Topic], own: Mapping[str, Topic], epoch_ns: int
 ) -> dict[str, Series]:
-    """Return a series for each topic of fixed size: each of our own, even if it is empty, and the others present.
+    """Return a series for each topic of fixed size: each of ours, even if it is empty, and all others of the log.
 
-    rows: the records of topics (n, size). topics: those of the log; own: ours.
+    rows: the records of topics (n, size). topics: those of the log; own: ours. One of ours that has another type in the
+    log is empty.
     """
     series = {}
     for name, topic in {**topics, **own}.items():
@@ -266,9 +283,9 @@ def check_states(scheme: Series) -> None:
 
 
 def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
-    """Return when each report of /contact was made, ns, and the report.
+    """Return for each report of /contact, in order, when it was made, ns on the clock of the run, and the report.
 
-    Raises LogError for an unknown level, kind, reaction or place.
+    Raises LogError for an unknown level, kind, reaction or location.
     """
     contacts = []
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
@@ -286,7 +303,7 @@ Time = TypeVar("Time", int, float)
 def each_once(reports: Iterable[tuple[Time, ContactReport]]) -> list[tuple[Time, ContactReport]]:
     """Return each contact once, as the time of its first report and the content of its last report.
 
-    All reports of a contact name the cycle in which it began.
+    Reports that name the same cycle of detection are of one contact.
     """
     found: dict[int, tuple[Time, ContactReport]] = {}
     for time, report in reports:
@@ -311,7 +328,7 @@ class Piece(NamedTuple):
 
 
 class LogStream(LogWalk):
-    """A log read once from front to back in constant memory, all parts as one.
+    """A log read from front to back in constant memory, all parts as one: iterate for its pieces.
 
     Damaged and missing parts are left out; `problem` names them.
     """
@@ -326,7 +343,7 @@ class LogStream(LogWalk):
         """Open the log whose first part is `path`. topics: those whose messages are read; None: all.
 
         A folder stands for the run's log in it. is_ahead: a thread opens chunks ahead, for a caller without a thread of
-        its own for the reading. Raises LogError when no part of it can be read.
+        its own for the reading. Raises LogError if no part of it can be read.
         """
         super().__init__(log_in(path), topics)
         self.epoch_ns = _number(self.metadata, EPOCH_KEY, 0)
@@ -334,7 +351,7 @@ class LogStream(LogWalk):
         self._is_ahead = is_ahead
 
     def layout(self, channel: Channel, schema: Schema) -> "np.dtype[Any] | None":
-        """Return the numpy type of a channel's payloads; None where their size varies."""
+        """Return the numpy type of a channel's payloads; None if their size varies, or their schema can't be read."""
         if schema.name == JOINT_STATE.name and not self.metadata:
             return None  # others have any number of joints
         try:
@@ -349,7 +366,7 @@ class LogStream(LogWalk):
 
     @property
     def is_complete(self) -> bool:
-        """Whether all that was read is whole, no packet was dropped, and nothing was lost before a recovery."""
+        """Whether all that was read so far is whole, no packet was dropped, and a recovered log had lost nothing."""
         return _is_complete(self.problem, self.summary)
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
@@ -361,7 +378,7 @@ class LogStream(LogWalk):
         return [LoggedEvent(log_time_ns(payload) - self.epoch_ns, unpack_log(payload)) for payload in payloads]
 
     def joint_states(self, piece: Piece) -> dict[str, list[bytes]]:
-        """Return the payloads of joint states that another program recorded, by topic."""
+        """Return the payloads of joint states that another program recorded, by topic; {} in a log of ours."""
         found = self.topics
         return {name: each for name, each in piece.payloads.items() if found[name].type_name == JOINT_STATE.name}
 
@@ -377,9 +394,9 @@ class LogStream(LogWalk):
 
 
 def start_of_log(path: Path) -> int | None:
-    """Return the time of the first message of a log of ours, ns of the run's clock; None without one. Raises LogError.
+    """Return the time of the first message of a log of ours, ns of the run's clock; None without a message.
 
-    The host's first frames come before its first decisions.
+    Raises LogError if the log can't be read. The host's first frames come before its first decisions.
     """
     stream = LogStream(path, cycles_per_piece=1)
     for piece in stream:
@@ -393,7 +410,10 @@ def start_of_log(path: Path) -> int | None:
 
 
 def begin_of_log(path: Path) -> int:
-    """Return the time of a log's first message, ns, as `start_of_log` does. Raises LogError also without a message."""
+    """Return the time of a log's first message, ns of the run's clock.
+
+    Raises LogError if it can't be read or has none.
+    """
     start_ns = start_of_log(path)
     if start_ns is None:
         raise LogError(f"log {path} has no message")

@@ -46,9 +46,10 @@ class LinkBody(NamedTuple):
 def bodies_of(
     theta: Sequence[float], length1_m: float, gravity_m_s2: float = GRAVITY_M_S2
 ) -> tuple[LinkBody, LinkBody]:
-    """Return two rigid links with the parameters `theta` (p,), p = 7 or 9. Raises ValueError if no links have them.
+    """Return two rigid links with the parameters `theta` (p,), p = 7 or with gravity 9.
 
-    theta: in the order of `records.PARAMETER_NAMES`. gravity_m_s2: in the plane of motion.
+    Raises ValueError if no rigid links have them. theta: in the order of `records.PARAMETER_NAMES`. gravity_m_s2: in
+    the plane of motion.
     """
     alpha, beta, gamma = theta[_A1] - theta[_A3], theta[_A2], theta[_A3]
     if not (gamma > 0.0 and alpha * gamma > beta * beta):
@@ -82,7 +83,10 @@ _COLORS = {"link": "0.35 0.45 0.6 1", "joint": "0.25 0.27 0.3 1"}
 
 
 def robot_description(settings: Settings) -> str:
-    """Return the URDF of the configured arm: lengths, limits, shapes, and the CAD model's masses and friction."""
+    """Return the URDF of the configured arm: lengths, limits, shapes, and the CAD model's masses and friction.
+
+    Without a CAD model, or with one that no rigid links have, it has no masses, and a comment with the reason.
+    """
     arm, tilt_rad = settings.arm, settings.tilt_rad
     robot = Element("robot", name="adacd")
     bodies: tuple[LinkBody, ...] = ()

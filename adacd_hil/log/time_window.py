@@ -24,13 +24,16 @@ class TimeWindow(NamedTuple):
         return " ".join(f"{word} {bound_s:g} s" for word, bound_s in words if math.isfinite(bound_s))
 
     def bounds_ns(self, start_ns: int) -> tuple[int, int]:
-        """Return begin and end of the window, ns; start_ns: the log's first message on the same clock."""
+        """Return begin and end of the window, ns; start_ns: the time of the log's first message, on the same clock.
+
+        An infinite bound is 3.2e9 s away.
+        """
         first_ns, end_ns = (start_ns + round(min(max(bound_s, -_CENTURY_S), _CENTURY_S) * 1e9) for bound_s in self)
         return first_ns, end_ns
 
     @property
     def named_bounds(self) -> dict[str, float]:
-        """Begin and end of the window as `from_s` and `until_s`, the names in results; infinite where not bounded."""
+        """Begin and end of the window, s, as `from_s` and `until_s`, the names in results; infinite without a bound."""
         return {"from_s": self.start_s, "until_s": self.end_s}
 
 

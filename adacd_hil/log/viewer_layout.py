@@ -68,7 +68,7 @@ def viewer_files(settings: Settings) -> dict[str, bytes]:
 
 
 def viewer_layout(robot: bytes = b"") -> bytes:
-    """Return the layout as JSON: torques and thresholds, motion, states, parameters, contacts, timing, queues, events.
+    """Return the viewers' layout as JSON: plots of torques, motion, parameters, timing, queues; state, contact, events.
 
     robot: the arm's URDF; if empty, there is no 3-D panel.
     """

@@ -43,9 +43,9 @@ _NOWHERE: Final = np.int64(2**62)
 class CanRecording(NamedTuple):
     """A recording in the order in which the host met it.
 
-    frames (m,); owner (m,): the cycle in which the host met each, increasing, and below the first one before that;
-    since (m,), offset_ns (m,): the cycle of the SYNC that came before it on the bus, and the time since then. number
-    (n,), t_ns (n,): cycle and time of each SYNC.
+    frames (m,); owner (m,): number of the cycle in which the host met each, ascending, and below the first one before
+    that; since (m,), offset_ns (m,): number of the cycle whose SYNC came before it on the bus, and the time since then.
+    number (n,), t_ns (n,): of each SYNC, the cycle and the time. is_realtime: the SYNCs keep the period within 10 %.
     """
 
     frames: NDArray[Any]
@@ -58,10 +58,10 @@ class CanRecording(NamedTuple):
     problem: str
 
     def in_time(self, number: Places, t_ns: Places, part: slice) -> NDArray[Any]:
-        """Return copies of some frames with t_ns and cycle_t_ns on the clock of given cycles.
+        """Return copies of the frames in the slice `part`, with t_ns and cycle_t_ns on the clock of given cycles.
 
-        number, t_ns (n,): these cycles and their times. part: which frames. A frame of a cycle that isn't given gets a
-        time between its neighbours.
+        number, t_ns (n,): these cycles and their times. A frame of a cycle that isn't given gets a time between its
+        neighbours.
         """
         frames = self.frames[part].copy()
         frames["t_ns"] = _time_of(self.since[part], number, t_ns) + self.offset_ns[part]
@@ -83,7 +83,8 @@ def _time_of(wanted: Places, number: Places, t_ns: Places) -> Places:
 def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording:
     """Read a recording, and put its frames in the order in which the host would have read them.
 
-    Of several CAN channels, only the one with the most SYNCs counts. Raises LogError, also without a SYNC.
+    Of several CAN channels, only the one with the most SYNCs counts. Raises LogError if it can't be read, or has no
+    SYNC with a counter.
     """
     found = read_frames(path)
     sync_id = codec.message("Sync").can_id
@@ -124,7 +125,8 @@ def _of_busiest_channel(frames: NDArray[Any], sync_id: int) -> NDArray[Any]:
 def _unwrap(counter: Places, t_ns: Places, period_ns: int) -> Places:
     """Return cycle numbers (n,) from the counters 1…240 of the cycles' SYNCs.
 
-    Their times give the number of turns in a gap; period_ns 0: they don't, as in lockstep.
+    Equal ones in a row count as one cycle apart. Their times, t_ns, give the turns of the counter in a gap; period_ns
+    0: they don't, as in lockstep.
     """
     steps = np.diff(counter) % SYNC_OVERFLOW
     if period_ns:
@@ -156,7 +158,8 @@ class RecordingAgainstLog(LogSource):
     def __init__(self, path: Path, against: Path) -> None:
         """Open a recording and the log of its run, and number the recording's cycles as the run's.
 
-        Raises LogError, ConfigError, CodecError.
+        Raises LogError if one of them can't be read or has no SYNC, or the log has no valid settings or no DBC;
+        CodecError for an invalid DBC.
         """
         super().__init__(against)
         self._recording = load_recording(path, self.settings, self.codec)
@@ -169,7 +172,10 @@ class RecordingAgainstLog(LogSource):
         return super()._open(with_frames=False)
 
     def _piece(self, piece: Piece) -> Piece:
-        """Return a piece of the log with the recording's frames, without the cycles that the recording lacks."""
+        """Return a piece of the log with the recording's frames, without the cycles that the recording lacks.
+
+        Those are counted. Call it for all pieces, in order.
+        """
         cycles = piece.series[self._partner]
         number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
         recording = self._recording
@@ -196,7 +202,7 @@ class RecordingAgainstLog(LogSource):
         )
 
     def notes(self) -> list[str]:
-        """Return the parts that can't be replayed or compared, a line each."""
+        """Return the gaps and defects of log and recording that can't be replayed or compared, a line each."""
         notes = super().notes()
         if self._missing:
             notes.insert(0, f"{self._missing} cycles of the run are not in {self._recorded.name}")
@@ -208,7 +214,7 @@ class RecordingAgainstLog(LogSource):
 def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
     """Return the run's number of a recording's first cycle: there the devices' answers are equal, bit for bit.
 
-    The counter gives the cycle but for multiples of 240. If no cycle fits, return the one nearest to the run's first.
+    The counter gives the cycle except for multiples of 240. If no cycle fits, return the recording's own first number.
     """
     wanted = _answers(recording.frames[recording.owner == recording.number[0]], codec)
     first = int(recording.number[0])
@@ -223,7 +229,7 @@ def _find_cycle(recording: CanRecording, codec: Codec, against: Path) -> int:
 
 
 def _answers(frames: NDArray[Any], codec: Codec) -> dict[int, bytes]:
-    """Return the data of the first cyclic frame of each device, by identifier."""
+    """Return the data of the first cyclic frame of each device, by identifier; a device without one is left out."""
     answers: dict[int, bytes] = {}
     for can_id in (codec.message(name).can_id for name in ANSWERS):
         mine = frames[(frames["can_id"] == can_id) & ~frames["is_error"]]
@@ -239,7 +245,10 @@ class RecordingAlone:
     is_recording = True
 
     def __init__(self, path: Path, settings: Settings, codec: Codec) -> None:
-        """Read the recording. Raises LogError."""
+        """Read the recording. In a recording of a bus in lockstep, samples get the nominal period.
+
+        Raises LogError if it can't be read, or has no SYNC with a counter.
+        """
         self._recording = load_recording(path, settings, codec)
         self._path = path
         self.codec = codec
@@ -251,7 +260,7 @@ class RecordingAlone:
 
     @property
     def start_ns(self) -> int:
-        """Time of the first SYNC, ns of the clock of the cycles."""
+        """Time of the first SYNC, ns; where the bus was in lockstep, by its cycle's number."""
         return int(self._t_ns()[0])
 
     def _t_ns(self) -> Places:
@@ -260,7 +269,7 @@ class RecordingAlone:
         return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
 
     def devices(self, settings: Settings) -> list[PlacedDevice]:
-        """Return the devices that some settings name. Raises ConfigError."""
+        """Return the devices that the settings name. Raises ConfigError if one can't be loaded."""
         return place_devices(settings)
 
     def parts(self, with_frames: bool) -> Iterator[Part]:  # noqa: ARG002 (there are only frames)
@@ -297,7 +306,7 @@ class RecordingAlone:
                 )
 
     def notes(self) -> list[str]:
-        """Return the parts that can't be replayed, a line each."""
+        """Return the defects of the recording that can't be replayed, a line each; call it after `parts`."""
         notes = [self._recording.problem] if self._recording.problem else []
         if self._is_headless:
             notes.append(f"{self._path.name} begins in the middle of a run: the scheme begins with INIT there")

@@ -36,9 +36,9 @@ Places = NDArray[np.int64]
 class CycleStretch(NamedTuple):
     """Cycles of one attempt that follow each other without a gap in the log.
 
-    `attempt`: its number in the run, from 0; `is_begin`: it begins with this. `is_exact`: no part of it is missing so
-    far, so that a replay must give the same. arms (n,): as the log has them, None if it lacks them. requests (n,)
-    of Request, None if unknown; scheme: the records of /scheme (n,).
+    `attempt`: its number in the run, from 0; `is_begin`: it begins with this stretch. `is_exact`: the log has all of
+    the attempt up to here, so that a replay must give the same. arms (n,): as the log has them, None if it lacks them.
+    requests (n,) of Request, None if unknown; scheme: the records of /scheme (n,), None for a recording without a log.
     """
 
     attempt: int
@@ -52,7 +52,7 @@ class CycleStretch(NamedTuple):
 
     @property
     def follows_gap(self) -> bool:
-        """Whether the log lacks cycles of the attempt before it."""
+        """Whether the log lacks cycles of its attempt before it; False for a recording without a log."""
         return self.scheme is not None and not self.is_exact
 
 
@@ -100,7 +100,10 @@ class AttemptSplitter:
             yield from self._stretches(t_ns, scheme, other, frames, dict(begins))
 
     def _pair(self, piece: Piece) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return the records of /scheme and /arm, or of an older log /cycle, of the same cycles; count the others."""
+        """Return the records of the same cycles of /scheme and /arm, in a log without /arm of /scheme and /cycle.
+
+        Records without the other one of their cycle are left out and counted in `unpaired`.
+        """
         self._has_arms = ARM.name in piece.series
         scheme = piece.series[SCHEME.name].records
         other = piece.series[ARM.name if self._has_arms else CYCLE.name].records
@@ -114,9 +117,9 @@ class AttemptSplitter:
     def _begins(
         self, t_ns: Places, scheme: NDArray[Any], other: NDArray[Any], frames: NDArray[Any]
     ) -> list[tuple[int, int]]:
-        """Return for each attempt that begins in a piece the row of its first cycle, and the index of its first frame.
+        """Return for each attempt that begins in a piece the indices of its first cycle and its first frame, ascending.
 
-        A row behind the last one means that its first cycle comes with the next piece.
+        An index behind the last cycle: its first cycle comes with the next piece.
         """
         begins: dict[int, int] = {}
         resets = find_resets(frames)
@@ -131,7 +134,7 @@ class AttemptSplitter:
         return sorted(begins.items())
 
     def _named_begins(self, arm: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return whether each cycle belongs to another attempt than the one before (n,)."""
+        """Return by /arm whether each cycle belongs to another attempt than the one before (n,)."""
         first = arm["first_cycle"].astype(np.int64)
         is_new = np.diff(first, prepend=self._first_cycle) != 0
         if len(first):
@@ -140,7 +143,7 @@ class AttemptSplitter:
         return np.asarray(is_new)
 
     def _shown_begins(self, scheme: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return whether the scheme begins anew in each cycle, after a fault or with the log (n,)."""
+        """Return whether the scheme, by its states, begins anew in each cycle, after a fault or with the log (n,)."""
         before = np.concatenate(([self._state], scheme["state"][:-1])) if len(scheme) else scheme["state"]
         is_anew = (scheme["previous_state"] == SchemeState.INIT) & (scheme["state"] <= SchemeState.COMMISSION)
         is_after_fault = before == SchemeState.FAULT
@@ -159,7 +162,7 @@ class AttemptSplitter:
         """Yield the stretches of a piece; count gaps, and leave out and count cycles before the first attempt.
 
         t_ns, scheme, other (n,): time and records of each cycle. begins: index of the first frame of each attempt that
-        begins here, by the row of its first cycle.
+        begins here, by the index of its first cycle.
         """
         is_begin = np.zeros(len(t_ns), np.bool_)
         is_begin[list(begins)] = True
@@ -199,7 +202,7 @@ class AttemptSplitter:
             )
 
     def _read_periods(self, number: Places, arm: NDArray[Any], is_begin: NDArray[np.bool_]) -> tuple[Places, Places]:
-        """Return each cycle's periods by /arm, and the number of cycles before it that the log lacks."""
+        """Return each cycle's periods by /arm (n,), and the number of cycles before it that the log lacks (n,)."""
         periods = np.asarray(arm["periods"], np.int64)
         steps = np.diff(number, prepend=self._last_cycle)
         missing = np.where(is_begin, number - arm["first_cycle"].astype(np.int64), steps - periods)
@@ -218,7 +221,7 @@ class AttemptSplitter:
         begins: dict[int, int],
         is_begin: NDArray[np.bool_],
     ) -> tuple[Places, Places]:
-        """Return each cycle's periods by its overruns, and the number of cycles before it that the log lacks.
+        """Return each cycle's periods by its overruns (n,), and the number of cycles before it that the log lacks (n,).
 
         The periods of an attempt's first cycle depend on the counters of SYNC, too.
         """
@@ -247,7 +250,7 @@ def _sync_counters(frames: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _skipped(counters: NDArray[np.uint8], last: int) -> int:
-    """Return the number of periods skipped between a cycle and the last of the SYNCs after it.
+    """Return the number of periods skipped between a cycle and the last of the SYNCs after it; 0 without a SYNC.
 
     last: number of that cycle. counters: those of the SYNCs.
     """
@@ -271,7 +274,11 @@ _SAID: Final = _SAID_BEFORE_ANCHORS | CERTIFICATE_EVENTS
 
 
 class Part(NamedTuple):
-    """The content of one piece of a log. contacts: logged reports by time, ns; events: of the names in `said`."""
+    """The content of one piece of a log.
+
+    contacts: fields of each logged report, by its time, ns; events: the logged events with a name in `said`, names of
+    the events that the scheme itself reports.
+    """
 
     stretches: Iterable[CycleStretch]
     contacts: Mapping[int, Mapping[str, Any]]
@@ -280,12 +287,15 @@ class Part(NamedTuple):
 
 
 class LogSource:
-    """A log of ours."""
+    """The cycles and decisions of a log of ours, with its settings and codec."""
 
     is_recording = False
 
     def __init__(self, path: Path, cycles_per_piece: int = CYCLES_PER_PIECE) -> None:
-        """Open the log, to be read in pieces of `cycles_per_piece` cycles. Raises LogError, ConfigError, CodecError."""
+        """Open the log, to be read in pieces of `cycles_per_piece` cycles.
+
+        Raises LogError if it can't be read or has no valid settings or no DBC, CodecError for an invalid DBC.
+        """
         self.has_arms = has_arms(path)
         self._partner = ARM.name if self.has_arms else CYCLE.name
         self._path = path
@@ -302,16 +312,16 @@ class LogSource:
         return LogStream(self._path, topics, self._cycles_per_piece, is_ahead=False)  # replay reads in a thread
 
     def devices(self, settings: Settings) -> list[PlacedDevice]:
-        """Return the devices of some settings: those attached to the log, if the settings name the run's.
+        """Return the devices of some settings: those attached to the log, if the settings name the same as the run's.
 
-        Raises ConfigError.
+        Raises ConfigError if one can't be loaded.
         """
         is_own = settings.devices == self.settings.devices
         own = logged_devices(settings, self._stream.attachments) if is_own else None
         return place_devices(settings) if own is None else own
 
     def parts(self, with_frames: bool) -> Iterator[Part]:
-        """Yield the content of the log in parts, in order.
+        """Yield the content of the log in parts, in order; each call begins with the first.
 
         with_frames: read the frames, too; else stretches have none.
         """
@@ -323,15 +333,18 @@ class LogSource:
 
     @property
     def start_ns(self) -> int:
-        """Time of the log's first message, ns of the run's clock. Raises LogError."""
+        """Time of the log's first message, ns of the run's clock. Raises LogError if the log has no message."""
         return begin_of_log(self._path)
 
     def _piece(self, piece: Piece) -> Piece:
-        """Return the part of a piece to replay: all of it."""
+        """Return the content of a piece that is replayed: all of it. A subclass may choose."""
         return piece
 
     def notes(self) -> list[str]:
-        """Return the parts of the log that can't be replayed or compared, a line each; complete after the last part."""
+        """Return the gaps and defects of the log that can't be replayed or compared, a line each.
+
+        Complete after the last of `parts`.
+        """
         splitter = self._splitter
         notes = [f"the log is not whole: {self._stream.problem}"] if self._stream.problem else []
         dropped = self._stream.summary.get("dropped", "0")
@@ -356,14 +369,17 @@ class LogSource:
 
 
 def codec_of(path: Path, attachments: Mapping[str, bytes]) -> Codec:
-    """Return the codec of a run's DBC, from the attachment arm.dbc of its log `path`. Raises LogError, CodecError."""
+    """Return the codec of a run's DBC, from the attachment arm.dbc of its log.
+
+    Raises LogError, which names the log's `path`, without the attachment, CodecError for an invalid one.
+    """
     if DBC_NAME not in attachments:
         raise LogError(f"log {path} has no {DBC_NAME} attached: its frames can't be decoded")
     return parse_codec(attachments[DBC_NAME], path.with_name(DBC_NAME))
 
 
 def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
-    """Return whether the version that made the log knew anchors, by a setting that came with them."""
+    """Return whether the log's configuration has the tare's `drift_Nm_sqrt_s`: its version knew anchors then."""
     tare = parse_toml(attachments[CONFIG_NAME]).get("tare")
     return isinstance(tare, dict) and "drift_Nm_sqrt_s" in tare
 

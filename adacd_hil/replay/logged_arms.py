@@ -16,9 +16,9 @@ _FIELDS: Final = frozenset(member.name for member in ARM.head)
 
 
 def has_arms(path: Path) -> bool:
-    """Return whether a log has the arm's states, all fields of /arm; False without a cycle. Raises LogError.
+    """Return whether a log has the arm's states, all fields of /arm, in its first cycle; False without a cycle.
 
-    Logs of earlier versions lack them.
+    Logs of earlier versions lack them. Raises LogError if the log can't be read.
     """
     for piece in LogStream(path, (ARM.name, SCHEME.name), cycles_per_piece=1, is_ahead=False):
         if len(piece.series[SCHEME.name]):
@@ -55,7 +55,7 @@ def logged_arms(scheme: NDArray[Any], arm: NDArray[Any], ticks: Ticks) -> ArmBat
 
 
 def arm_at(arms: ArmBatch, row: int) -> ArmState:
-    """Return one row as an ArmState; its vectors are views."""
+    """Return the state of one cycle of a batch, by its index `row`; its vectors are views."""
     age_q, age_tau_J = arms.age_q[row].tolist(), arms.age_tau_J[row].tolist()
     return ArmState(
         cycle=int(arms.cycle[row]),

@@ -64,9 +64,10 @@ def replay(
 ) -> Replay:
     """Replay a log with its own settings, or with others, and return the outcome.
 
-    Raises LogError, ConfigError, CodecError. tolerance: of the comparison; None: exact, or `TOLERANCE` where the log's
-    numbers were computed on another kind of machine. script_of: plays the user of a configuration; with it, the
-    requests of a run without typed requests are compared.
+    With its own settings, each decision is compared with the log. tolerance: of the comparison; None: exact, or
+    `TOLERANCE` where the log's numbers were computed on another kind of machine. script_of: plays the user of a
+    configuration; with it, the requests of a run without typed requests are compared. Raises LogError, ConfigError or
+    CodecError if the log, its attachments or a device can't be read.
     """
     source = LogSource(path)
     return replay_source(
@@ -84,7 +85,8 @@ def replay_many(
 ) -> list[Replay]:
     """Replay a log, or a stretch of it, once for each of the settings; the log is read and decoded once.
 
-    watch: called with the decisions of each variant. Raises LogError, ConfigError, CodecError.
+    watch: called with the decisions of each variant. Raises LogError, ConfigError or CodecError if the log, its
+    attachments or a device can't be read; LogError also if no cycle of the stretch can be replayed.
     """
     return replay_source(
         LogSource(path), variants, contacts_beside(path, progress), progress, watch=watch, stretch=stretch
@@ -96,7 +98,11 @@ _DecodedPart = tuple[Part, list[list[ArmBatch]]]
 
 
 class _Player:
-    """One variant on its way through the log. checks_arms: its states were decoded, and are compared with the log's."""
+    """The replay of one variant, stretch by stretch. asking: plays the script, None without one.
+
+    comparison: with the log, None if it isn't compared. checks_arms: its states were decoded, and are compared with the
+    log's, too.
+    """
 
     def __init__(
         self,
@@ -122,7 +128,7 @@ class _Player:
     def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool = True) -> SchemeBatch:
         """Run the scheme on a stretch of a part; gather and return its decisions.
 
-        is_told: compare and count them, too.
+        is_told: the stretch is reported: compare and count its cycles, too.
         """
         ticks = stretch.ticks
         if stretch.is_begin:
@@ -149,7 +155,10 @@ class _Player:
         part: Part,
         events: Sequence[Event],
     ) -> None:
-        """Compare a stretch with the log; do nothing if the log lacks its decisions, or cycles before it."""
+        """Compare a stretch with the log; do nothing if the log lacks its decisions, or earlier cycles of the attempt.
+
+        asked: requests of the script (n,); None: each logged one that is a Request is believed.
+        """
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
         ticks = stretch.ticks
@@ -175,7 +184,10 @@ class _Player:
             self._asking.begin_attempt()
 
     def _run(self, stretch: CycleStretch, arms: ArmBatch) -> SchemeBatch:
-        """Run the scheme on a stretch and return its decisions; the script makes requests that are unknown."""
+        """Run the scheme on a stretch and return its decisions, with the logged requests.
+
+        If the requests are unknown, the script makes them, or without a script there are none.
+        """
         if stretch.requests is not None:
             return self._pipeline.run(arms, _known(stretch.requests))
         outputs = []
@@ -230,9 +242,9 @@ def replay_source(
 ) -> list[Replay]:
     """Replay a source, once for each of the settings; shown: mismatches that are kept.
 
-    stretch: the part that is compared and reported; watch sees all from the beginning of the log on. by_frames: decode
-    the frames and compare each state with the log's. Raises LogError, also when no cycle of the stretch can be
-    replayed, ConfigError, CodecError.
+    truth: the true contacts, None if unknown. stretch: the part that is compared and reported; watch sees all from the
+    beginning of the log on. by_frames: decode the frames and compare each state with the log's. Raises LogError if the
+    source can't be read, or no cycle of the stretch can be replayed; ConfigError if a device can't be loaded.
     """
     bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
@@ -260,7 +272,7 @@ def replay_source(
 
 
 def _decoded(source: ReplaySource, reader: "_ArmReader", end_ns: int) -> Generator[_DecodedPart]:
-    """Yield the parts of a source with the arm's states, up to the stretch in which the reported part ends."""
+    """Yield the parts of a source with the arm's states, up to the stretch that reaches end_ns."""
     for part in source.parts(reader.needs_frames):
         stretches: list[CycleStretch] = []
         arms: list[list[ArmBatch]] = []
@@ -294,7 +306,7 @@ def _replay_part(
     bounds_ns: tuple[int, int],
     watch: Watch | None,
 ) -> int:
-    """Replay a part with each player; return its number of cycles."""
+    """Replay a part with each player; return its number of cycles. bounds_ns: time of the reported cycles."""
     exact: list[tuple[int, int]] = []
     cycles, (part, arms_of_part) = 0, decoded
     for stretch, all_arms in zip(part.stretches, arms_of_part, strict=True):
@@ -317,15 +329,15 @@ def _known(requests: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _arms_of(arms: ArmBatch, rows: slice) -> ArmBatch:
-    """Return the arm's states in some rows."""
+    """Return the arm's states in the cycles of a slice."""
     columns: tuple[NDArray[Any], ...] = arms
     return ArmBatch(*(column[rows] for column in columns))
 
 
 def _split(stretch: CycleStretch, bounds_ns: tuple[int, int]) -> Iterator[tuple[CycleStretch, slice, bool]]:
-    """Split a stretch at the beginning of the reported part; yield each part, its rows, and whether it is reported.
+    """Split a stretch at the beginning of the reported time; yield each part, its slice, and whether it is reported.
 
-    Rows after the end of the reported part are left out. Each part keeps all frames of the stretch.
+    Cycles after the end of the reported time are left out. Each part keeps all frames of the stretch.
     """
     first, end = np.searchsorted(stretch.ticks.t_ns, bounds_ns).tolist()
     for rows, is_told in ((slice(0, first), False), (slice(first, end), True)):
@@ -334,7 +346,7 @@ def _split(stretch: CycleStretch, bounds_ns: tuple[int, int]) -> Iterator[tuple[
 
 
 def _rows_of(stretch: CycleStretch, rows: slice) -> CycleStretch:
-    """Return some cycles of a stretch, with all its frames; only a part from row 0 on may begin the attempt."""
+    """Return the cycles of a stretch in a slice, with all its frames. They begin the attempt only from index 0 on."""
     scheme, requests = stretch.scheme, stretch.requests
     return stretch._replace(
         is_begin=stretch.is_begin and rows.start == 0,
@@ -346,9 +358,9 @@ def _rows_of(stretch: CycleStretch, rows: slice) -> CycleStretch:
 
 
 class _ArmReader:
-    """Gives the arm's states: the log's, or those of frames, decoded once for all settings with equal decoding.
+    """Gives the arm's states: the log's, or decoded from frames, once for all settings that decode alike.
 
-    needs_frames: whether any are decoded.
+    needs_frames: whether frames are decoded for any of them.
     """
 
     def __init__(self, source: ReplaySource, variants: Sequence[Settings], by_frames: bool) -> None:
@@ -364,7 +376,7 @@ class _ArmReader:
         self._arms: dict[Any, RecordedArm] = {}
 
     def read(self, stretch: CycleStretch) -> list[ArmBatch]:
-        """Return the arm's states in a stretch, for each of the variants."""
+        """Return the arm's states in a stretch, for each of the variants. Call it for all stretches in order."""
         if stretch.is_begin:
             self._arms = {
                 key: RecordedArm(settings, self._source.codec, self._devices[key])
@@ -377,7 +389,10 @@ class _ArmReader:
 
 
 def why_frames(source: ReplaySource, variants: Sequence[Settings]) -> str:
-    """Return the reason why frames must be decoded, which takes longer, in one line; "" if the log's states serve."""
+    """Return the reason why frames must be decoded, which takes longer, in one line; "" if the log's states serve.
+
+    "" also for a recording, which has only frames.
+    """
     if source.is_recording:
         return ""
     if not source.has_arms:
@@ -398,7 +413,7 @@ def _decoding_key(settings: Settings) -> Any:
 def _result(
     player: _Player, source: ReplaySource, source_notes: Sequence[str], tolerance: float, first_ns: int
 ) -> Replay:
-    """Return a player's outcome; first_ns: contacts and changes of state before it are left out."""
+    """Return a player's outcome; contacts, changes of state and adaptations before first_ns are left out."""
     gatherer, comparison, notes = player.gatherer, player.comparison, list(source_notes)
     gatherer.end_attempt()
     score = gatherer.score()

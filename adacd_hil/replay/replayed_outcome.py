@@ -39,7 +39,7 @@ class StateChange(NamedTuple):
 
 
 class Adaptation(NamedTuple):
-    """An adaptation: its beginning, the time until MONITOR, None if it never got there, and its parameter estimate."""
+    """An adaptation: its beginning, the time until MONITOR, None if it never got there, and its last estimate."""
 
     t_ns: int
     took_s: float | None
@@ -49,7 +49,7 @@ class Adaptation(NamedTuple):
 class OutcomeGatherer:
     """Gathers the outcome of one replay from its decisions: states, reports, alarms, adaptations, sensitivity, score.
 
-    `truth`: the true contacts, None if unknown.
+    `truth`: the true contacts, None if unknown. behind_gap_ns, detections_ns: times of alarms, ns.
     """
 
     def __init__(self, settings: Settings, truth: KnownContacts | None) -> None:
@@ -117,7 +117,10 @@ class OutcomeGatherer:
         self.state = SchemeState(batch.state[-1])
 
     def _keep(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Keep the cycles between which true contacts begin and end, and the first and the last one."""
+        """Keep the host's cycles next to the begin and end of each true contact, and the first and the last one.
+
+        Do nothing if the truth is unknown.
+        """
         if self._truth is None:
             return
         instants = [(contact.onset, contact.end) for contact in self._contacts]
@@ -138,7 +141,11 @@ class OutcomeGatherer:
             kept.add_values(block[:, self._threshold][:, joint])
 
     def sensitivity_Nm(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Return, per joint, the medians in MONITOR of the threshold and of the smallest push found: see `Replay`."""
+        """Return, per joint, the medians of the threshold and of the smallest push found: see `Replay`.
+
+        They are over the cycles in MONITOR without contact. Thresholds are nan where the joint was never monitored;
+        pushes are () in the paper's scheme, or then.
+        """
         pushes = None if self._push is None else self._push.smallest_push()
         if pushes is None:
             return tuple(kept.percentiles().get("p50", math.nan) for kept in self._thresholds), ()
@@ -159,7 +166,7 @@ class OutcomeGatherer:
             self._give_up()
 
     def _give_up(self) -> None:
-        """Record an adaptation in progress as one that never reached MONITOR."""
+        """Record an adaptation in progress, if there is one, as one that never reached MONITOR."""
         if self._began is not None:
             self.adaptations.append(Adaptation(self._began[1], None, self.theta_hat))
             self._began = None
@@ -179,7 +186,7 @@ class OutcomeGatherer:
     def end_attempt(self) -> None:
         """Record an unfinished adaptation, and place the true contacts of the attempt on the host's clock.
 
-        Call it at the end of the log, too.
+        Call it at the end of the log, too, before `score`.
         """
         self._give_up()
         if self._kept:
@@ -189,11 +196,14 @@ class OutcomeGatherer:
 
     @property
     def detections_ns(self) -> list[int]:
-        """Times of all alarms."""
+        """Times of all alarms, ns, the ones behind gaps included."""
         return [alarm.t_ns for _, alarm in self._alarms]
 
     def score(self) -> Score | None:
-        """Return which true contacts were detected and which alarms were false; None if the truth is not known."""
+        """Return which true contacts were detected and which alarms were false; None if the truth is not known.
+
+        An alarm behind a gap, or in a cycle that the emulator didn't record, is not judged.
+        """
         if self._truth is None:
             return None
         span = host_span(self._truth[1], np.array(self._begins or [0]))
@@ -209,15 +219,15 @@ class OutcomeGatherer:
 class Replay:
     """The outcome of one replay.
 
-    cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 where the settings
-    are not the log's. arms_compared: cycles whose state, made of the frames, was compared with the log's. monitored_s:
-    in MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`.
-    contacts: reports with their times, ns. parameters: of the end. score: of contacts and alarms that begin in the
-    stretch, None where the truth is not known. adaptations: that begin in it. zero_ns: of the first ADAPT of the log, 0
-    without one. ending: the last change of state, which may be before the stretch. threshold_Nm: median in MONITOR of
-    each joint's lowest threshold of all channels, nan where it never monitored; push_Nm: of the smallest push found
-    within `PUSH_WITHIN`, an estimate, () of the paper's scheme. attempts, threshold_Nm, push_Nm: from the log's
-    beginning.
+    cycles: replayed in the stretch, of which `compared` were compared with the log; compared is 0 if the settings are
+    not the log's. arms_compared: cycles whose state, decoded from frames, was compared with the log's. monitored_s: in
+    MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`. contacts:
+    reports with their times, ns. parameters: the estimate of the last cycle. score: of contacts and alarms that begin
+    in the stretch, None if the truth is not known. adaptations: that begin in it. zero_ns: time of the first ADAPT of
+    the log, 0 without one. ending: the last change of state, which may be before the stretch, None without one.
+    threshold_Nm: median in MONITOR of each joint's lowest threshold of all channels, nan if it never monitored;
+    push_Nm: of the smallest push found within `PUSH_WITHIN`, an estimate, () in the paper's scheme. attempts,
+    threshold_Nm, push_Nm: from the log's beginning.
     """
 
     settings: Settings
@@ -245,21 +255,24 @@ class Replay:
 
     @property
     def is_identical(self) -> bool:
-        """Whether a decision was compared and every compared one was the same."""
+        """Whether at least one cycle was compared and no value differed."""
         return self.compared > 0 and self.mismatch_count == 0
 
     @property
     def is_whole(self) -> bool:
-        """Whether all that the log should have could be compared and judged."""
+        """Whether there are no `notes`: all that the log should have could be compared and judged."""
         return not self.notes
 
     @property
     def adaptation_s(self) -> tuple[float | None, ...]:
-        """Duration of each adaptation; None if it never reached MONITOR."""
+        """Duration of each adaptation, s; None if it never reached MONITOR."""
         return tuple(adaptation.took_s for adaptation in self.adaptations)
 
     def time_s(self, t_ns: int) -> float:
-        """Return a time in s since motion start, from ns of the run's clock."""
+        """Return a time in s since the first ADAPT, from ns of the run's clock.
+
+        Without an ADAPT, return it in s of that clock.
+        """
         return (t_ns - self.zero_ns) * 1e-9
 
 
@@ -272,7 +285,7 @@ Row = tuple[str, ...]
 
 
 def side_by_side(replays: Sequence[Replay]) -> list[Row]:
-    """Return a row per quantity: its name, then its value in each replay."""
+    """Return a table of the replays, a row per quantity: its name, then its value in each replay, as texts."""
     rows = [("watched, s", *(f"{each.monitored_s:.2f}" for each in replays))]
     rows.append(("contacts detected", *map(_detected, replays)))
     if any(each.score is None for each in replays):
@@ -368,7 +381,10 @@ def _end(found: Replay) -> str:
 
 
 def as_json(found: Replay) -> dict[str, Any]:
-    """Return a replay's outcome in plain values for JSON; times in s since motion start."""
+    """Return a replay's outcome in plain values for JSON; times in s since the first ADAPT, see `Replay.time_s`.
+
+    Contacts, false alarms and missed contacts are None if the truth is not known.
+    """
     return {
         "cycles": found.cycles,
         "attempts": found.attempts,

@@ -38,9 +38,9 @@ _HEAD: Final = ("cycle", "state", "previous_state", "fault", "contact_joints", "
 
 
 def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:
-    """Return the parts of the computing environment that differ from a log's, as texts; [] if all bits must be equal.
+    """Return the items of `arithmetic` that differ from a log's metadata, as texts; [] if all bits must be equal.
 
-    A part that the log doesn't name counts as equal. Of the machine, only the architecture counts.
+    An item that the log doesn't name counts as equal. Of the machine, only the architecture counts.
     """
     different = []
     for key, here in arithmetic().items():
@@ -53,7 +53,8 @@ def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:
 class SchemeComparison:
     """Compares a replay with its log, stretch by stretch.
 
-    `count`: of all mismatches; `fields`: of those in each field.
+    tolerance: as a share, 0: bit by bit. `count`: number of all mismatches; `fields`: number in each field;
+    `mismatches`: the kept ones, `shown` after `first`.
     """
 
     def __init__(self, settings: Settings, tolerance: float = 0.0, shown: int = SHOWN) -> None:
@@ -70,7 +71,11 @@ class SchemeComparison:
         self._scales: dict[str, Vector] = {}
 
     def compare(self, scheme: Series, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Compare the decisions of n cycles with the records of /scheme (n,); count and keep the mismatches."""
+        """Compare the decisions of n cycles with the records of /scheme (n,); count and keep the mismatches.
+
+        Fields of the block that the records lack are named in `missing_fields`. Raises LogError if a field has another
+        number of values.
+        """
         records = scheme.records
         self.cycles += len(records)
         self._compare_whole("stamp_ns", scheme.t_ns, ticks.t_ns, ticks)
@@ -117,7 +122,10 @@ class SchemeComparison:
         return np.asarray(is_near | (logged == replayed) | (np.isnan(logged) & np.isnan(replayed)))
 
     def compare_arms(self, logged: ArmBatch, decoded: ArmBatch, ticks: Ticks) -> None:
-        """Compare the logged states of n cycles with those decoded from frames; count and keep the mismatches."""
+        """Compare the logged states of n cycles, to the bit, with those decoded from frames.
+
+        Count and keep the mismatches.
+        """
         self.arms += len(ticks.cycle)
         for name in ArmBatch._fields:
             theirs: NDArray[Any] = getattr(logged, name)
@@ -153,13 +161,13 @@ class SchemeComparison:
         self._keep(mismatch)
 
     def _keep(self, mismatch: Mismatch) -> None:
-        """Keep a mismatch; when there are many, drop all but the earliest."""
+        """Keep a mismatch; of more than twice `shown`, only the `shown` earliest stay."""
         self.mismatches.append(mismatch)
         if len(self.mismatches) > 2 * self._shown:
             self.first()
 
     def first(self) -> tuple[Mismatch, ...]:
-        """Return the earliest mismatches, by cycle; drop the others."""
+        """Return the `shown` earliest mismatches, by cycle; drop the others."""
         self.mismatches = sorted(self.mismatches, key=lambda mismatch: mismatch.cycle)[: self._shown]
         return tuple(self.mismatches)
 
@@ -168,7 +176,8 @@ class SchemeComparison:
     ) -> None:
         """Compare contact reports, each by the time at which it was made, ns; count and keep the mismatches.
 
-        cycles: number of the cycle at each of these times.
+        A report without a counterpart is one. cycles: number of the cycle at each of these times; -1 stands for an
+        unknown one.
         """
         for t_ns in sorted({*logged, *replayed}):
             where = (cycles.get(t_ns, -1), t_ns)
@@ -182,7 +191,10 @@ class SchemeComparison:
                     self.add_mismatch(Mismatch(CONTACT.name, field, place, *where, _text(there), _text(here)))
 
     def _is_same(self, logged: float, replayed: float) -> bool:
-        """Return whether two values have the same bits, or are finite reals within the tolerance of each other."""
+        """Return whether two values have the same bits, or are finite reals within the tolerance of each other.
+
+        The tolerance is a share of the logged value, at least of 1.
+        """
         if struct.pack("<d", logged) == struct.pack("<d", replayed):
             return True
         is_real = isinstance(logged, float) and math.isfinite(logged) and math.isfinite(replayed)
@@ -191,7 +203,7 @@ class SchemeComparison:
     def compare_events(self, logged: Sequence[LoggedEvent], replayed: Sequence[Event], cycle: int) -> None:
         """Compare, in order, the scheme's own events of a stretch; count and keep the mismatches.
 
-        cycle: the stretch's first.
+        An event without a counterpart is one. cycle: the stretch's first.
         """
         for theirs, ours in itertools.zip_longest(logged, replayed):
             if theirs is not None and theirs.event == ours:
@@ -239,7 +251,7 @@ def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...
 
 
 def _names_of(name: str, size: int, named: Mapping[str, Sequence[str]]) -> tuple[str, ...]:
-    """Return the names of a field's values: those in `named`, else by size none, joints, or channels and joints."""
+    """Return the names of a field's values: those in `named`, else "" for one value, joints, or channels and joints."""
     if name in named:
         return tuple(named[name])
     if size == 1:
@@ -253,7 +265,10 @@ class Script(Protocol):
     """The user that the configuration plays."""
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return the script's request in a cycle. `elapsed_s`: since the drives were enabled, None before."""
+        """Return the script's request in a cycle, or NONE.
+
+        `elapsed_s`: since the drives were enabled, None before. state: that of the cycle before.
+        """
 
 
 _OWN_CHECKS = (
@@ -268,7 +283,7 @@ ScriptOf = Callable[[OperatorSettings], Script]
 
 
 class Asking:
-    """Plays the script along a replay: cycle by cycle, or in the cycles in which it could make a request."""
+    """Plays the script along a replay: cycle by cycle (`ask`, `note_request`), or a stretch at a time (`requests`)."""
 
     def __init__(self, settings: Settings, script_of: ScriptOf) -> None:
         operator = settings.operator
@@ -281,13 +296,13 @@ class Asking:
         self._kept = KeptRequest()
 
     def begin_attempt(self) -> None:
-        """Begin another attempt: the drives are not enabled yet; a request that is still open is kept."""
+        """Begin another attempt: the drives are not enabled yet; a request not served yet will be made again."""
         self._enabled = None
         self._was_stopped = False
         self._kept = KeptRequest(self._kept.request)
 
     def ask(self, cycle: int, state: SchemeState) -> Request:
-        """Return the user's request in a cycle: one left open by the attempt before, else the script's.
+        """Return the user's request in a cycle: one left open by the attempt before, else the script's, or NONE.
 
         state: that of the cycle before.
         """
@@ -296,9 +311,9 @@ class Asking:
         return carried or self._script.request(elapsed_s, state)
 
     def note_request(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:
-        """Keep a request that the scheme hasn't served, and note in which cycle the drives were enabled.
+        """Keep a request that the scheme hasn't served; store the cycle in which the drives were enabled.
 
-        previous, state: states before and after the cycle.
+        Call it after each `ask`. previous, state: states before and after the cycle.
         """
         self._kept.ask(request, previous)
         self._kept.serve((state,))
@@ -306,7 +321,10 @@ class Asking:
             self._enabled = cycle
 
     def requests(self, ticks: Ticks, batch: SchemeBatch) -> NDArray[np.uint8]:
-        """Return the script's requests in a stretch (n,), given the scheme's states in it."""
+        """Return the script's requests in a stretch (n,), given the scheme's states in it.
+
+        NONE until the drives are enabled. Call it for all stretches of an attempt, in order.
+        """
         asked = np.zeros(len(ticks.cycle), np.uint8)
         if self._enabled is None:
             enabled = np.flatnonzero(batch.state == SchemeState.ADAPT)
@@ -327,7 +345,10 @@ class Asking:
         return asked
 
     def _rows(self, ticks: Ticks, batch: SchemeBatch, first: int) -> list[int]:
-        """Return the rows from `first` on in which the script could make a request, or its wait begins anew."""
+        """Return the indices of the cycles from `first` on in which the script could make a request.
+
+        Also those in which its wait begins anew.
+        """
         assert self._enabled is not None
         is_due = np.zeros(len(ticks.cycle), np.bool_)
         is_due[first : first + 1] = True  # a request left by the attempt before, in the first cycle of an enabled arm
@@ -343,9 +364,9 @@ class Asking:
 
 
 class RequestCheck:
-    """Compares the logged requests with the script's. One FINISH that isn't in the script may be an interrupt.
+    """Compares the logged requests with the script's. The first FINISH that isn't in the script may be an interrupt.
 
-    If the script asks for FINISH later, in a cycle where the log doesn't, the first one was no interrupt.
+    If the script asks for FINISH later, in a cycle where the log doesn't, it was no interrupt.
     """
 
     def __init__(self) -> None:
@@ -353,10 +374,10 @@ class RequestCheck:
         self.unexplained: list[tuple[int, int, int, int]] = []  # cycle, time, logged, of the script
 
     def compare(self, ticks: Ticks, logged: NDArray[np.uint8], asked: NDArray[np.uint8]) -> None:
-        """Compare logged requests of a stretch (n,) with the script's; keep the differences.
+        """Compare logged requests of a stretch (n,) with the script's (n,); keep the differences.
 
-        A first request to finish goes to `interrupts`, any other difference to `unexplained`; those of the host's own
-        checks are no difference.
+        The first request to finish goes to `interrupts`, any other difference to `unexplained`. Faults that the host's
+        own checks requested are no difference. A later FINISH of the script moves the interrupt to `unexplained`.
         """
         for row in np.flatnonzero(logged != asked).tolist():
             cycle, t_ns = int(ticks.cycle[row]), int(ticks.t_ns[row])

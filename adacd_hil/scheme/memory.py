@@ -20,7 +20,10 @@ EachTerm = Annotated[Vector, "f"]
 
 
 class Sample:
-    """Inputs of a cycle: an ArmState, `age` that of its oldest value, and the request in this cycle."""
+    """Inputs of a cycle: an ArmState, `age` that of its oldest value, and the request in this cycle.
+
+    sampled_ns: time of the SYNC on which it was sampled, or of the cycle.
+    """
 
     cycle: int
     periods: int
@@ -51,7 +54,11 @@ class Gaps:
 
 
 class Regressor:
-    """The regressor of a sample: written by `regressor`."""
+    """The regressor of a sample: written by `regressor`.
+
+    Y_p, Y_h: see `torque_filter`. M: mass matrix of the model in use. X: columns of torque by position. bent: of the
+    bristles, see `further_friction`.
+    """
 
     Y_p: Columns
     Y_h: Columns
@@ -61,7 +68,11 @@ class Regressor:
 
 
 class Filters:
-    """The filter bank, and each filter's external torque, bare and smoothed: written by `filter_bank`."""
+    """The filter bank, and each filter's external torque, bare and smoothed: written by `filter_bank`.
+
+    r: bare; y: by channel. rates: the filters' coefficients of the present period. W_learnt, tau_learnt: smoothed, for
+    learning.
+    """
 
     input_old: Annotated[Vector, "filters n p"]
     S: Annotated[Vector, "filters n p"]
@@ -82,7 +93,12 @@ class Wide:
 
 
 class Models:
-    """Model in use, certified model and belief: written by `belief`."""
+    """Model in use (theta, P), certified model and belief: written by `belief`.
+
+    v, K: scratch. promotions: refined models since the certificate. since_learnt: samples since the last one that was
+    put into the ring. recovering_cycles: left without learning. is_payload: a payload is learnt on top of the certified
+    model.
+    """
 
     theta: PerParameter
     certified: PerParameter
@@ -100,7 +116,11 @@ class Models:
 
 
 class Candidate:
-    """A candidate for the certified model, and its test: written by `refinement`."""
+    """A candidate for the certified model, and its test: written by `refinement`.
+
+    cycles: of the test. square, frozen_square: sums of squared residuals of the candidate, and of the model in use.
+    worst: the candidate's largest residual over its threshold.
+    """
 
     theta: PerParameter
     P: Square
@@ -113,7 +133,8 @@ class Candidate:
 class Ring:
     """Samples to be learnt, which wait until no contact can have bent them: written by `belief`.
 
-    It may have more places than samples wait.
+    used: number of samples that wait; next: place of the oldest, once it is full. It may have more places than samples
+    wait.
     """
 
     W: Annotated[Vector, "places_in_ring n p"]
@@ -125,9 +146,9 @@ class Ring:
 
 
 class Motion:
-    """Ranges of position and velocity of the joints in a fit, and the information from them.
+    """Ranges of position and velocity of the joints in a fit, and its information matrix: written by `excitation`.
 
-    Written by `excitation`.
+    samples: their number.
     """
 
     q_low: PerJoint
@@ -140,7 +161,11 @@ class Motion:
 
 
 class Fit:
-    """Progress of a fit and its test: written by `termination`."""
+    """Progress of a fit and its test: written by `termination`.
+
+    tested: samples of the test. excitation, condition: smallest eigenvalue of the scaled information matrix, and the
+    largest over it.
+    """
 
     tested: float
     test_limit_Nm: float
@@ -149,7 +174,12 @@ class Fit:
 
 
 class Sensitivity:
-    """Noise, standstill, friction at rest, missing samples, and the thresholds by them: written by `sensitivity`."""
+    """Noise, standstill, friction at rest, missing samples, and the thresholds by them: written by `sensitivity`.
+
+    still, still_smooth, low_speed: shares of standstill and of low speed in a filter's memory. h: thresholds; h_model:
+    without standstill and the tail's floor. roughness, velocity_roughness: noise over that of the settings, squared.
+    unit, strain: factors on variances and on thresholds. wide: of the torque with a filter undone.
+    """
 
     still: EachFilter
     still_smooth: EachFilter
@@ -183,7 +213,11 @@ class Sensitivity:
 
 
 class Margin:
-    """Largest residuals of free motion, and smallest detectable push: written by `margin`."""
+    """Largest residuals of free motion, and smallest detectable push: written by `margin`.
+
+    peak, peak_now, peak_last: by sign, kept, of the present block, of the one before. tail_Nm: floors of thresholds by
+    them. seen, seen_: counts and worst values of the test. sum_, mean_push_Nm, dim_s: of monitoring.
+    """
 
     peak: Annotated[Vector, "2 channels n"]
     peak_now: Annotated[Vector, "2 channels n"]
@@ -215,7 +249,10 @@ class Evidence:
 
 
 class Anchor:
-    """Anchors of the torque offsets, and the fit's largest torque by place: written by `anchor`."""
+    """Anchors of the torque offsets, and the fit's largest torque that depends on the position: written by `anchor`.
+
+    rest_count: samples in the reading at rest. anchor_Nm, anchor_std: by kind of anchor, inf for a missing one.
+    """
 
     rest_count: float
     anchor_Nm: Annotated[Vector, "kinds n"]
@@ -224,7 +261,11 @@ class Anchor:
 
 
 class FitCheck:
-    """Steps and kept samples of a fit, which the fit must explain at its end: written by `fit_check`."""
+    """Steps and kept samples of a fit, which the fit must explain at its end: written by `fit_check`.
+
+    fit_square, fit_rows: sum of squared residuals over their variances, and their number. steps_used: number of steps
+    so far. samples_every: learnt samples for each one that is kept. factor, apart, later: scratch.
+    """
 
     fit_square: float
     fit_rows: float
@@ -259,7 +300,11 @@ class Certificate:
 
 
 class Doubt:
-    """Evidence on the cause of a certified model's contacts: written by `doubt`."""
+    """Evidence on the cause of a certified model's contacts: sums of `doubt`, which writes them.
+
+    row: scratch. load_ww: evidence for a payload by direction of its pull. rr, rows: Σ r², number of rows. peak:
+    largest residual over its threshold.
+    """
 
     L: Annotated[Vector, "causes_n causes_n"]
     b: Annotated[Vector, "causes_n"]
@@ -271,7 +316,11 @@ class Doubt:
 
 
 class MissingTorque:
-    """Evidence for torque that the model lacks: written by `missing_torque`."""
+    """Evidence for torque that the model lacks: sums of `missing_torque`, which writes them.
+
+    X_f, X_learnt: filtered columns by position. basic, full: coefficients of the fits without and with these. M, row,
+    scale: scratch. samples, wanted: learnt since the last check, and before the next.
+    """
 
     X_old: PlaceColumns
     X_f: PlaceColumns
@@ -333,7 +382,8 @@ class Memory:
 class NoiseConstants:
     """Constants of `sensitivity`: variances by channel (2 C - 1,), and the weight of a sample in each mean (`_share`).
 
-    torque_variance: (k_tau sigma_tau)², Nm². velocity_variance: nu², rad²/s⁴.
+    torque_variance: (k_tau sigma_tau)², Nm²; torque_gain: the same for a noise of 1 Nm. velocity_variance: nu²,
+    rad²/s⁴.
     """
 
     torque_variance: Vector
@@ -350,7 +400,11 @@ class NoiseConstants:
 
 @dataclass(frozen=True)
 class AnchorConstants:
-    """Constants of `anchor`: torque offsets and their uncertainties (n,), inf where unknown."""
+    """Constants of `anchor`: torque offsets and their standard deviations (n,), inf where unknown.
+
+    zero: of the configuration; last_zero: of the last certificate. holding_Nm: torque that a motor without power can
+    hold. zero_drift_Nm2_s: growth of the variance.
+    """
 
     zero_Nm: Vector
     last_zero_Nm: Vector
@@ -363,7 +417,7 @@ class AnchorConstants:
 
 @dataclass(frozen=True)
 class EvidenceConstants:
-    """Constants of `evidence`.
+    """Constants of `evidence`: see its `constants_of`.
 
     Columns (Q, p), prior variances, largest torques (Q,), sigmas (S,), less_counts (S, Q).
     """
@@ -377,7 +431,7 @@ class EvidenceConstants:
 
 @dataclass(frozen=True)
 class MarginConstants:
-    """Constants of `margin`: excursions of white noise (2 C - 1,), and each channel's response to a step of torque."""
+    """Constants of `margin`, see its `constants_of`; excursions_Hz, shown: by channel (2 C - 1,)."""
 
     excursions_Hz: Vector
     block_cycles: float
@@ -387,7 +441,10 @@ class MarginConstants:
 
 @dataclass(frozen=True)
 class TermConstants:
-    """Constants of `missing_torque`: prior deviations (f,), and counts of learnt samples."""
+    """Constants of `missing_torque`: prior deviations (f,), and numbers of learnt samples.
+
+    first: before the first check; longest: before each later one at most.
+    """
 
     prior_std: Vector
     first: float

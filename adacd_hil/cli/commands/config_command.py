@@ -57,7 +57,7 @@ def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tupl
     """Return a row per setting: key, effective value and default as of `in_words`, and origin.
 
     given: changes as KEY=VALUE, which override the configuration. keys: keys or groups of the settings to return; ():
-    all. Raises ConfigError, CommandError.
+    all. Raises ConfigError for an invalid configuration or change, CommandError for an unknown key or group.
     """
     from adacd_hil.control.configuration_check import origins_of
     from adacd_hil.settings.configuration import Settings
@@ -136,7 +136,10 @@ def _list_groups(as_json: bool) -> None:
 
 
 def _chosen(keys: tuple[str, ...]) -> "list[KnownKey]":
-    """Return the settings that are named by their key or their group; without names, all. Raises CommandError."""
+    """Return the settings that are named by their key or their group, each once; without names, all.
+
+    Raises CommandError for an unknown name.
+    """
     from adacd_hil.remedies import nearest_name
     from adacd_hil.settings.setting_keys import explain_unknown, known_keys, sections
 

@@ -111,7 +111,10 @@ def replay(
 
 
 def _next(given: Path, own: "Replay", has_changes: bool) -> tuple[str, ...]:
-    """Return the commands to suggest after a replay; () if no cycle was replayed."""
+    """Return the commands to suggest after a replay; () if no cycle was replayed.
+
+    given: the log. has_changes: other settings were replayed, too.
+    """
     if not own.cycles:
         return ()
     if has_changes:
@@ -138,7 +141,8 @@ def _replay_one(
 ) -> _Result:
     """Replay one log or recording with its own settings, and with each variant that the options ask for.
 
-    configured: --config, --profile and --dbc. Raises CommandError, ConfigError, CodecError, LogError.
+    configured: --config, --profile and --dbc. Raises CommandError, ConfigError, CodecError or LogError for a wrong
+    option, or a file that can't be read.
     """
     from adacd_hil.control.operator import ScriptedOperator
     from adacd_hil.replay.replay import replay_source
@@ -176,7 +180,10 @@ def _replay_one(
 def _open(
     given: Path, configured: tuple[str | None, str | None, Path | None], against: Path | None
 ) -> "tuple[ReplaySource, bool]":
-    """Return a log or a recording, and whether it is a recording without log. Raises CommandError without settings."""
+    """Return a log or a recording, and whether it is a recording without a log.
+
+    Raises CommandError for a recording without a log and without --config; errors of reading it.
+    """
     from adacd_hil.device.contract import load_contract
     from adacd_hil.device.device_files import place_devices
     from adacd_hil.replay.can_recording import RecordingAgainstLog, RecordingAlone
@@ -213,7 +220,7 @@ def _code(replays: "list[Replay]") -> ExitCode:
 
 
 def _verdict(own: "Replay") -> str:
-    """Return in words whether a replay with the log's own settings equals the log."""
+    """Return in words whether a replay with the log's own settings equals the log, or why it can't be compared."""
     if own.mismatch_count:
         return f"{own.mismatch_count} values differ from the log's"
     if not own.cycles:

@@ -47,9 +47,9 @@ from adacd_hil.wire.can_interface import CanInterface
 
 
 def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
-    """Return the settings of a connection with a scenario's user, as `demo` does; the arm is emulated.
+    """Return the settings of a connection with the user of a scenario, as `demo` does; the arm is emulated.
 
-    Raises CommandError if the channel may be hardware, ConfigError, CodecError.
+    Raises CommandError if the channel may be hardware, ConfigError or CodecError for invalid settings or scenario.
     """
     from adacd_hil.cli.embedded_run import resolve
 
@@ -60,7 +60,7 @@ def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
 def drop_old_frames(bus: Bus, interface: str) -> None:
     """Recover a SocketCAN bus if frames of an earlier process wait to be sent, so that they are dropped.
 
-    Raises BusError. On a shared bus that carries frames, they leave by themselves.
+    Raises BusError if it can't be recovered. On a shared bus that carries frames, they leave by themselves.
     """
     if interface == "socketcan" and CanInterface(bus.channel).waiting_frames():
         bus.recover()
@@ -81,8 +81,8 @@ def run_on_bus(
     out: folder of the log; None: a new one by date. tare_path, history_path: files with the offsets of a tare, and with
     the arm's certificates; this run's are added. scenario: name of an emulated arm's scenario, whose user makes the
     requests. without_anchor: the user accepts that no anchor bounds the torque offsets.
-
-    Raises ConfigError, CodecError, BusMissingError, LogError, CommandError, OSError.
+    Raises CommandError for options that don't fit the bus, or if the user declines; ConfigError or CodecError for
+    settings or files that can't be used, BusMissingError for the bus, LogError or OSError for the folder and log.
     """
     interface, channel = connection.interface, connection.channel
     check_clock(clock_name, interface, channel)
@@ -151,7 +151,7 @@ def run_on_bus(
 
 
 def ask_first_run(history: UsedHistory) -> None:
-    """Ask on the terminal whether an arm without history is free. Raises CommandError if it is not.
+    """Ask on the terminal whether an arm without history is free, and raise CommandError if the user says no.
 
     Do nothing if the arm has a history, or without a terminal.
     """
@@ -224,7 +224,7 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
 
 
 def next_of_run(result: dict[str, Any]) -> tuple[str, ...]:
-    """Return the commands to suggest after a run; () after a run that didn't start, whose error has a remedy."""
+    """Return the commands to suggest after a run; () if it didn't start: its error has a remedy."""
     if not {"cycles", "broke_off"} & set(result):
         return ()
     return (
@@ -234,7 +234,7 @@ def next_of_run(result: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _verdict(result: dict[str, Any]) -> str:
-    """Return a sentence that says how a run ended."""
+    """Return a sentence on how a run ended: not started, broken off, by a fault, or without one."""
     if "broke_off" in result:
         certified = len(result["certificates"])
         known = f" and {certified} certificate{'s' * (certified > 1)}" if certified else ""

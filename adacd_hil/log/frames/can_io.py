@@ -31,7 +31,10 @@ from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 
 def time_ns(message: can.Message) -> int:
-    """Return the time of a message, ns: its exact `t_ns` if it has one that equals `timestamp`, else `timestamp`."""
+    """Return the time of a message, ns: its exact `t_ns` if that is equal to `timestamp`, else `timestamp`.
+
+    0 without one.
+    """
     seconds = message.timestamp or 0.0
     t_ns = getattr(message, "t_ns", None)
     if t_ns is not None and t_ns / 1_000_000_000 == seconds:
@@ -45,9 +48,10 @@ def channel_name(channel: object) -> str:
 
 
 def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
-    """Convert a python-can message to a frame; `start_ns` is added to its time.
+    """Convert a python-can message to a frame, and add `start_ns` to its time.
 
-    Raises ValueError for data, an identifier or a time that no frame has.
+    Raises ValueError for more data than its kind of frame has, an identifier of more than 29 bits, or a time beyond
+    2116 or NaN.
     """
     most = MAX_DATA if message.is_fd else CLASSIC_BYTES
     data = bytes(message.data)
@@ -77,7 +81,10 @@ def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
 
 
 class _BlfReader(can.BLFReader):
-    """python-can's BLF reader; fails at an object of no size, where the original hangs; it warns of skipped frames."""
+    """python-can's BLF reader, which fails at an object of no size, where the original hangs.
+
+    It fails at a container of more than MOST_BYTES, too, and warns of frames that python-can skips.
+    """
 
     def _parse_container(self, data: bytes) -> Iterator[can.Message]:
         if len(data) > MOST_BYTES:
@@ -119,8 +126,7 @@ _ASC_FRAME = re.compile(r"-?\d+[.,]\d+\s+(CANFD\s+)?\d+\s+\S+\s+(Rx|Tx|TxRq)\s",
 def _asc_lines(lines: Iterable[str], is_relative: bool) -> Iterator[str]:
     """Yield the lines of an ASC with times since its beginning, without requests to send (TxRq).
 
-    is_relative: the times of the file count from the line before. Log a warning for each frame that python-can will
-    skip.
+    is_relative: the file gives each time since the line before. Log a warning for each frame that python-can will skip.
     """
     time_s = Decimal(0)
     for number, text in enumerate(lines, 1):
@@ -141,7 +147,7 @@ _ERROR_FLAG = 0x20000000
 
 
 class _CandumpReader(can.CanutilsLogReader):
-    """python-can's candump reader; it skips lines without a frame, and error frames keep their class.
+    """python-can's candump reader, which warns of lines without a frame, and keeps the class of error frames.
 
     Of an error frame python-can makes data of a 29-bit identifier, or drops all but the time.
     """
@@ -167,7 +173,10 @@ class _CandumpReader(can.CanutilsLogReader):
                 return
 
     def _lines(self, file: Iterable[str]) -> Iterator[str]:
-        """Yield the lines in python-can's form, and note whether each has an error frame, whose flag is removed."""
+        """Yield the lines in python-can's form; store each line, its number, and whether it has an error frame.
+
+        An error frame's flag is removed from its identifier.
+        """
         for self._line in file:
             self._number += 1
             error = re.search(r" ([23][0-9A-Fa-f]{7})#", self._line)
@@ -177,7 +186,10 @@ class _CandumpReader(can.CanutilsLogReader):
 
 
 class _PassedOver(logging.Handler):
-    """Counts the records that are not read, and keeps the first one's error; python-can's warnings count, too."""
+    """Counts the records of a file that are not read, and keeps the first one's reason.
+
+    From python-can's warnings, too.
+    """
 
     first = ""
     count = 0
@@ -211,10 +223,13 @@ _FORMS = {
 
 
 class PythonCanFrames:
-    """The frames of a file that python-can reads: iterate once; `channels` and `problem` grow meanwhile."""
+    """The frames of a file that python-can reads: iterate once; `channels` and `problem` are complete after it.
+
+    problem: records that were not read, or that there is no frame; "" without one. epoch_ns: 0.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Check that the file can be opened. Raises LogError when it can't be read."""
+        """Check that the file can be opened; read nothing. Raises LogError if it can't."""
         self.channels: list[str] = []
         self.epoch_ns = 0
         self.problem = ""
@@ -225,7 +240,7 @@ class PythonCanFrames:
     def __iter__(self) -> Iterator[NDArray[Any]]:
         """Yield the frames in arrays (n,) of RECORDED_FRAME_DTYPE; drop other records, and set `problem` at the end.
 
-        Raises LogError when the file has records, but no frame.
+        Raises LogError if the file has records, but none of them is a frame.
         """
         passed_over = _PassedOver()
         rows: list[tuple[Any, ...]] = []
@@ -255,7 +270,10 @@ class PythonCanFrames:
             yield np.array(rows, RECORDED_FRAME_DTYPE)
 
     def _messages(self, passed_over: _PassedOver) -> Iterator[tuple[can.Message, int]]:
-        """Yield the messages up to the first error of python-can, each with a start time to add, ns."""
+        """Yield the messages up to the first error of python-can, each with a start time to add, ns.
+
+        The error counts as a record that was not read, in `passed_over`.
+        """
         suffix = self._path.suffix.lower()
         kind = _READERS.get(suffix) or MESSAGE_READERS[suffix]
         count = 0
@@ -291,7 +309,10 @@ class PythonCanFrames:
 
 
 def _take_start(reader: Any) -> int:
-    """Set a reader's start time to 0, since it would add it to each time as a float; return the start time, ns."""
+    """Set a reader's start time to 0, since it would add it to each time as a float; return the start time, ns.
+
+    0 for a reader without one. It is rounded to ms.
+    """
     for name in ("start_timestamp", "_start_timestamp"):
         if isinstance(start_s := getattr(reader, name, None), float):
             setattr(reader, name, 0.0)

@@ -29,10 +29,10 @@ SUFFIXES = (".mcap", ".log", ".blf", ".asc", ".mf4", ".trc", ".csv")
 
 
 def open_frames(path: Path) -> "McapFrames | PythonCanFrames":
-    """Open a recording of CAN frames; its suffix gives its format. Iterate once, for arrays of frames.
+    """Open a recording of CAN frames, whose format is that of its suffix. Iterate once, for arrays of frames.
 
-    `channels`, `epoch_ns` and `problem` are complete after the iteration. Raises LogError when it can't be read, also
-    from the iteration.
+    `channels`, `epoch_ns` and `problem` are complete after the iteration. Raises LogError for an unknown suffix, a
+    missing package, or a file that can't be read, the last also from the iteration.
     """
     suffix = path.suffix.lower()
     if suffix == ".mcap":
@@ -52,7 +52,10 @@ def open_frames(path: Path) -> "McapFrames | PythonCanFrames":
 
 
 def read_frames(path: Path) -> FrameLog:
-    """Return all frames of a recording, with the names of its channels. Raises LogError when it can't be read."""
+    """Return all frames of a recording, the names of its channels, its epoch, and its problem, "" without one.
+
+    Raises LogError as `open_frames` and its iteration.
+    """
     source = open_frames(path)
     pieces = [np.zeros(0, RECORDED_FRAME_DTYPE), *source]
     return FrameLog(tuple(source.channels), np.concatenate(pieces), source.epoch_ns, source.problem)

@@ -48,7 +48,7 @@ _NO_FRAMES = np.zeros(0, RECORDED_FRAME_DTYPE)
 
 
 class _Source(NamedTuple):
-    """Properties of an MCAP channel that all its frames share."""
+    """Properties of an MCAP channel that all its frames share. channel: index of the CAN channel in `channels`."""
 
     is_fd: bool
     is_tx: bool
@@ -58,12 +58,15 @@ class _Source(NamedTuple):
 
 
 class McapFrames:
-    """The frames of a log with all its parts: iterate once; `channels`, `epoch_ns` and `problem` grow meanwhile."""
+    """The frames of a log with all its parts: iterate once; `channels`, `epoch_ns` and `problem` are complete after it.
+
+    problem: the first damage or file that can't be read; "" without one. It raises no error in the iteration.
+    """
 
     def __init__(self, source: Path | IO[bytes]) -> None:
         """Open a log with all its parts, or an open file as the only part.
 
-        Raises LogError when it can't be read or doesn't begin as MCAP.
+        Raises LogError if the first part can't be read or doesn't begin as MCAP.
         """
         self.channels: list[str] = []
         self.epoch_ns = 0
@@ -82,7 +85,7 @@ class McapFrames:
                 first.seek(0)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Yield the frames of each chunk, (n,) of RECORDED_FRAME_DTYPE."""
+        """Yield the frames of each chunk that has some, in an array (n,) of RECORDED_FRAME_DTYPE."""
         for source in self._files:
             if not isinstance(source, Path):
                 yield from self._read(source, "the file")
@@ -97,7 +100,10 @@ class McapFrames:
         self.problem = self.problem or problem
 
     def _read(self, file: IO[bytes], name: str) -> Iterator[NDArray[Any]]:
-        """Yield the frames of one file of the log in blocks; keep the first damage in `problem`."""
+        """Yield the frames of one file of the log, an array for each chunk; keep the first damage in `problem`.
+
+        name: of the file, for `problem`.
+        """
         self._definitions, self._sources = Definitions(), {}
         summary = summary_of(file)  # for the case that the chunk that defines channels is damaged
         for item in read_blocks(file, name, block_bytes=1):
@@ -118,9 +124,10 @@ class McapFrames:
                 yield frames
 
     def _take(self, item: Block | RawRecord) -> NDArray[Any]:
-        """Return the frames in a chunk, or none of a record outside chunks; keep definitions and metadata of the run.
+        """Return the frames in a chunk, none for a record outside chunks.
 
-        Raises LogError, ValueError.
+        Keep definitions, and name and epoch of the run. Raises LogError for a damaged chunk or definition, ValueError
+        for a frame that is shorter than its type.
         """
         if isinstance(item, Block):
             if item.problem or item.contents.breaks:
@@ -144,7 +151,10 @@ class McapFrames:
                 self._sources[definition.id] = self._source(definition)
 
     def _source(self, channel: Channel) -> _Source | None:
-        """Return the properties of an MCAP channel's frames, and add their CAN channel; None for other messages."""
+        """Return the properties of an MCAP channel's frames, and add their CAN channel to `channels`.
+
+        None for a channel of other messages.
+        """
         schema = self._definitions.schemas.get(channel.schema_id)
         if schema is None or schema.name not in (CAN_FRAME.name, FD_FRAME.name):
             return None
@@ -161,7 +171,10 @@ class McapFrames:
         )
 
     def _frames(self, contents: Contents) -> NDArray[Any]:
-        """Return the frames of a chunk in the order of the file. Raises ValueError for an invalid frame."""
+        """Return the frames of a chunk in the order of the file, (0,) without any.
+
+        Raises ValueError for a frame that is shorter than its type.
+        """
         places, found = [], []
         for number in np.unique(contents.channels).tolist():
             source = self._sources.get(number)

@@ -29,11 +29,17 @@ class Target(Protocol):
     """The target that a file is written to."""
 
     def write(self, data: bytes, packets: int = 0) -> int:
-        """Write a part of the file; return its length. packets: number of log packets that are whole with it."""
+        """Write the next bytes of the file; return their number.
+
+        packets: number of log packets that are complete with them.
+        """
 
 
 class ChunkedFile:
-    """One MCAP file over a target."""
+    """One MCAP file that is written to a target, chunk by chunk. messages: their number so far.
+
+    Nothing of a message is written before its chunk: call `complete` at the end.
+    """
 
     def __init__(self, target: Target, profile: str = "", library: str = LIBRARY) -> None:
         self.messages = 0
@@ -59,7 +65,10 @@ class ChunkedFile:
         self._pass_on()
 
     def define_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Define a schema, in the chunk in progress; return its number in the file."""
+        """Define a schema in the chunk in progress.
+
+        Return its number in the file, that of an equal one if there is one.
+        """
         number: int = self._writer.register_schema(name, encoding, data)
         return number
 
@@ -74,13 +83,13 @@ class ChunkedFile:
         self.record_bytes += MESSAGE_HEAD + len(payload)
 
     def end_packet(self) -> None:
-        """Count a packet as complete, and write the chunk in progress if it is full."""
+        """Count a packet as complete; write the chunk in progress if its messages have CHUNK_BYTES."""
         self._packets += 1
         if self.record_bytes >= self._chunk_full:
             self.flush()
 
     def flush(self) -> None:
-        """Write the chunk in progress, if it holds a message."""
+        """Write the chunk in progress, if it holds a message, with the number of packets that it completes."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         if self._pass_on(self._packets):
             self._packets = 0
@@ -93,7 +102,10 @@ class ChunkedFile:
         self._pass_on()
 
     def _pass_on(self, packets: int = 0) -> bool:
-        """Hand over everything that mcap's writer has written since the last call; return whether that is anything."""
+        """Write to the target all bytes that mcap's writer has made since the last call.
+
+        Return False if there are none.
+        """
         data = self._stream.take()
         if data:
             self._target.write(data, packets)

@@ -43,15 +43,16 @@ class ChunkError(ValueError):
 
 
 class Opening:
-    """Counts the decompressed bytes of a file. One for each reading of it."""
+    """Counts the bytes of a file's chunks, packed and decompressed. Use one for each reading of a file."""
 
     def __init__(self) -> None:
         self._packed = self._opened = 0
 
     def add_chunk(self, packed: int, size: int) -> None:
-        """Add a chunk to the file's counts: its `packed` bytes in the file, and its `size` in bytes when decompressed.
+        """Add a chunk to the file's counts: `packed`, its bytes in the file, and `size`, its bytes when decompressed.
 
-        Raises ChunkError if the chunk is too large, or if the file grows to too many times its size.
+        Raises ChunkError if the chunk has more than MOST_BYTES, or all chunks more than FREE_BYTES and MOST_RATIO times
+        their bytes in the file.
         """
         if size > MOST_BYTES:
             raise ChunkError(f"opens to {size} bytes, more than {MOST_BYTES}")
@@ -61,9 +62,10 @@ class Opening:
             raise ChunkError(f"opens to more than {MOST_RATIO} times the file before it")
 
     def open_chunk(self, chunk: Chunk) -> bytes:
-        """Return the decompressed records of a chunk.
+        """Decompress a chunk, add it to the counts, and return its records.
 
-        Raises ChunkError for too many bytes, another size or another CRC.
+        Raises ChunkError as `decompress` and `add_chunk`, and for another CRC, or without a CRC for another size than
+        stated.
         """
         data = decompress(chunk.compression, chunk.data)
         self.add_chunk(len(chunk.data), len(data))
@@ -71,7 +73,10 @@ class Opening:
 
 
 def _checked(chunk: Chunk, data: bytes, is_size_certain: bool) -> bytes:
-    """Return the decompressed data of a chunk. Raises ChunkError for another CRC, or size unless `is_size_certain`."""
+    """Return the decompressed data of a chunk. Raises ChunkError if they fail its CRC; a CRC of 0 isn't checked.
+
+    Raises it for another size than the chunk states, too, unless `is_size_certain`.
+    """
     if chunk.uncompressed_crc and crc32(data) != chunk.uncompressed_crc:
         raise ChunkError("fails its CRC")
     if not is_size_certain and len(data) != chunk.uncompressed_size:
@@ -80,7 +85,10 @@ def _checked(chunk: Chunk, data: bytes, is_size_certain: bool) -> bytes:
 
 
 def decompress(compression: str, data: bytes, most_bytes: int = MOST_BYTES) -> bytes:
-    """Return the decompressed records of a chunk. Raises ChunkError when that fails, and for more than `most_bytes`."""
+    """Return the decompressed records of a chunk. compression: "", "zstd" or "lz4".
+
+    Raises ChunkError for another compression, data that can't be decompressed, and more than `most_bytes`.
+    """
     if compression not in _KINDS:
         raise ChunkError(f"unknown compression {compression[:20]!r}")
     try:
@@ -95,7 +103,8 @@ def decompress(compression: str, data: bytes, most_bytes: int = MOST_BYTES) -> b
 def _decompress(compression: str, data: bytes, most_bytes: int) -> bytes:
     """Return decompressed data, of zstd and lz4 at most one byte more than `most_bytes`.
 
-    Raises ChunkError for cut or too much data, and the errors of the two libraries.
+    Raises ChunkError for lz4 data that are cut, or zstd data that state more bytes, and the errors of the two
+    libraries.
     """
     if compression == "":
         return data
@@ -113,7 +122,10 @@ def _decompressor() -> zstandard.ZstdDecompressor:
 
 
 def _unzstd(data: bytes, most_bytes: int) -> bytes:
-    """Return zstd data decompressed, at most `most_bytes` + 1. Raises ChunkError for data that claim a larger size."""
+    """Return zstd data decompressed, at most `most_bytes` + 1 if their size isn't stated.
+
+    Raises ChunkError if they state a larger one.
+    """
     size = zstandard.frame_content_size(data)
     decompressor = _decompressor()
     if size > most_bytes:
@@ -144,7 +156,10 @@ PADDING = 128
 
 @dataclass
 class Contents:
-    """The records of chunks. Messages as columns (n,), which are read at their first use."""
+    """The records of chunks. Messages as columns (n,), which are computed at their first use.
+
+    data: the chunks' bytes, one after the other; starts: offset of each message in them.
+    """
 
     data: bytes
     starts: NDArray[np.int64]
@@ -160,7 +175,7 @@ class Contents:
 
     @cached_property
     def ends(self) -> NDArray[np.int64]:
-        """Ends of the messages in `data` (n,)."""
+        """Offsets in `data` at which the messages end (n,)."""
         return np.asarray(self.starts + self.heads["length"] + HEAD.size)
 
     @cached_property
@@ -180,7 +195,7 @@ class Contents:
 
     @property
     def entries(self) -> NDArray[Any]:
-        """Message index entries that these messages must have."""
+        """Entries of a message index that these messages must have (n,): log times, and offsets in `data`."""
         entries = np.empty(len(self.starts), INDEX_ENTRY)
         entries["log_time"] = self.log_times
         entries["offset"] = self.starts
@@ -203,15 +218,19 @@ def read_contents(data: bytes) -> Contents:
 def read_chunks(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents:
     """Find the records of decompressed chunks that follow each other in `data`, and return them.
 
-    ends: offset at which each chunk ends; PADDING bytes of no meaning follow the last. indexes: the entries of all
-    message indexes of each chunk; without them, and where they are wrong, the records are found one by one.
+    ends: offset at which each chunk ends; PADDING bytes of no meaning follow the last. indexes: by chunk, the entries
+    of all its message indexes. Without them, or where they don't fit the chunks exactly, each record is found by the
+    length of the one before.
     """
     indexed = _indexed(data, ends, indexes)
     return _walk_through(data, ends) if indexed is None else indexed
 
 
 def _indexed(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents | None:
-    """Return the contents, with the beginnings of messages from the indexes; None if these leave out any record."""
+    """Return the contents, with the beginnings of messages from the indexes.
+
+    None if the indexes are missing, or don't fill the chunks exactly with messages.
+    """
     if not indexes or not all(index and len(index) % INDEX_ENTRY.itemsize == 0 for index in indexes):
         return None
     pairs = zip(indexes, (0, *ends[:-1]), strict=True)
@@ -276,7 +295,7 @@ _OTHERS = (Opcode.ATTACHMENT, Opcode.METADATA)
 
 
 class Block(NamedTuple):
-    """Records of chunks, one chunk after the other; a message or a definition outside chunks is one by itself."""
+    """Decompressed chunks, one after the other; a message or a definition outside chunks is a chunk by itself."""
 
     contents: Contents
     position: int  # in the file, of the first of them
@@ -287,7 +306,7 @@ Item: TypeAlias = Block | RawRecord | Problem
 
 
 class _Packed(NamedTuple):
-    """A chunk as it is in the file, or a record outside chunks."""
+    """A chunk as it is in the file, still compressed; or the bytes of a message or definition outside chunks."""
 
     chunk: Chunk | bytes
     size: int  # when opened
@@ -298,8 +317,8 @@ class _Packed(NamedTuple):
 def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES, is_ahead: bool = True) -> Iterator[Item]:
     """Yield the contents of an MCAP file from front to end: blocks of chunks, attachments, metadata, and problems.
 
-    block_bytes: most bytes of the chunks that make a block; 1: each chunk is a block. is_ahead: a thread decompresses
-    chunks in advance. Raises LogError if the file isn't MCAP.
+    name: of the file, for errors. block_bytes: most decompressed bytes of the chunks in a block; 1: each chunk is a
+    block. is_ahead: a thread decompresses chunks in advance. Raises LogError if the file isn't MCAP.
     """
     if not is_ahead:
         for item in _pack(file, name, block_bytes):
@@ -325,7 +344,10 @@ def _finished(item: Future[Block] | RawRecord | Problem) -> Item:
 
 
 def _pack(file: IO[bytes], name: str, block_bytes: int) -> Iterator[list[_Packed] | RawRecord | Problem]:
-    """Yield lists of chunks that are still compressed, and the other records of a file that are passed on."""
+    """Yield lists of chunks, still compressed, and attachments, metadata and problems one by one.
+
+    The chunks of a list have at most `block_bytes` when opened, unless it is one chunk.
+    """
     packed: list[_Packed] = []
     size, crc = 0, crc32(MAGIC)
     opening = Opening()
@@ -355,7 +377,7 @@ def _pack(file: IO[bytes], name: str, block_bytes: int) -> Iterator[list[_Packed
 def _look_at(record: RawRecord | Problem, opening: Opening, crc: int) -> _Packed | RawRecord | Problem | None:
     """Return a record in the form in which it is passed on; None: it is skipped.
 
-    crc: of all bytes before it, to compare with that of a DataEnd.
+    A DataEnd becomes a Problem if its CRC is neither 0 nor `crc`, that of all bytes before it.
     """
     if isinstance(record, Problem) or record.opcode in _OTHERS:
         return record
@@ -367,7 +389,10 @@ def _look_at(record: RawRecord | Problem, opening: Opening, crc: int) -> _Packed
 
 
 def _packed(record: RawRecord, opening: Opening) -> _Packed | Problem:
-    """Return a chunk, still compressed, or a message or definition outside chunks; a Problem for a bad chunk."""
+    """Return a chunk, still compressed, or a message or definition outside chunks.
+
+    Return a Problem for a chunk that can't be parsed, or is too large when decompressed.
+    """
     position = record.offset + HEAD.size
     if record.opcode != Opcode.CHUNK:
         whole = HEAD.pack(record.opcode, len(record.body)) + record.body
@@ -381,7 +406,7 @@ def _packed(record: RawRecord, opening: Opening) -> _Packed | Problem:
 
 
 def _open(packed: list[_Packed]) -> Block:
-    """Decompress chunks, and return their records as a block; damaged chunks are left out, the first is its problem."""
+    """Decompress chunks and return their records as a block; leave out damaged ones; the first is its problem."""
     opened: list[bytes] = []
     ends: list[int] = []
     indexes, problem, end = [], "", 0
@@ -401,6 +426,9 @@ def _open(packed: list[_Packed]) -> Block:
 
 
 def _open_sized(chunk: Chunk) -> bytes:
-    """Decompress a chunk whose size has been allowed. Raises ChunkError if its size or CRC differs."""
+    """Return the decompressed records of a chunk whose stated size has been allowed.
+
+    Raises ChunkError if it can't be decompressed, or its size or CRC differs.
+    """
     data = decompress(chunk.compression, chunk.data, chunk.uncompressed_size)
     return _checked(chunk, data, is_size_certain=False)

@@ -67,8 +67,8 @@ def has_shape(opcode: int) -> bool:
 def fits(opcode: int, length: int, read: Callable[[int, int], bytes]) -> bool:
     """Return whether the lengths in a record add up to `length`, the size of its body.
 
-    read: returns bytes of the body, by offset and count. A message fits from LEAST_MESSAGE bytes on; an unknown kind
-    never fits.
+    read: a function that returns bytes of the body, by offset and count. A message fits from LEAST_MESSAGE bytes on; a
+    record of an unknown kind never fits.
     """
     if opcode not in _SHAPES:
         return opcode == Opcode.MESSAGE and length >= LEAST_MESSAGE
@@ -113,7 +113,7 @@ _READERS: dict[int, Any] = {
 
 
 class RawRecord(NamedTuple):
-    """A record as it is in the file."""
+    """A record as it is in the file. offset: where it begins; body: its bytes after opcode and length."""
 
     offset: int
     opcode: int
@@ -126,14 +126,14 @@ class RawRecord(NamedTuple):
 
 
 class IndexRun(NamedTuple):
-    """Message indexes that follow each other."""
+    """Message indexes that follow each other in a file."""
 
     data: bytes  # their records
     entries: list[bytes]  # of each
 
 
 class Problem(NamedTuple):
-    """A defect of a file, in words. `is_damage`: the words follow "the file is"."""
+    """A defect of a file, in words. `is_damage`: the words complete "the file is", such as "cut after 5 bytes"."""
 
     text: str
     is_damage: bool = False
@@ -147,7 +147,10 @@ def name_of(opcode: int) -> str:
 
 
 def parse(opcode: int, body: bytes) -> Any:
-    """Parse a record's body to mcap's class for its kind. Raises LogError when it makes no sense."""
+    """Parse a record's body to mcap's class for its kind.
+
+    Raises LogError for a body that isn't one of that kind; KeyError for a kind without a class.
+    """
     try:
         return _READERS[opcode](ReadDataStream(io.BytesIO(body)))
     except (McapError, struct.error, ValueError, OverflowError, MemoryError) as error:
@@ -155,14 +158,17 @@ def parse(opcode: int, body: bytes) -> Any:
 
 
 def check_magic(begin: bytes, name: str) -> None:
-    """Raise LogError, which begins with `name`, unless a file that begins with these bytes is MCAP."""
+    """Raise LogError unless `begin`, the first bytes of a file, are those of MCAP.
+
+    name: with which the message begins.
+    """
     if begin != MAGIC:
         cut = f"cut after {len(begin)} bytes" if begin else "empty"
         raise LogError(f"{name} is {cut if MAGIC.startswith(begin) else 'not an MCAP file'}")
 
 
 def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[RawRecord | IndexRun | Problem]:
-    """Yield the records of a file up to its end, or to bytes that can't be a record.
+    """Yield the records of a file up to its footer, or to bytes that can't be a record.
 
     Message indexes that follow each other come as one IndexRun. A cut file or an overlong record ends with a Problem.
     passed: kinds of records that come without their body. Raises LogError, which begins with `name`, if the file isn't
@@ -204,7 +210,7 @@ def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[R
 
 
 def _index_run(data: bytes) -> IndexRun:
-    """Return the message indexes at the beginning of `data`, of which the first is whole."""
+    """Return the whole message indexes at the beginning of `data`; empty if the first is cut."""
     position, size, entries = 0, len(data), []
     unpack, index, head = HEAD.unpack_from, int(Opcode.MESSAGE_INDEX), HEAD.size
     while position + head <= size:
@@ -219,7 +225,7 @@ def _index_run(data: bytes) -> IndexRun:
 
 
 def attachment_crc_fits(record: RawRecord, can_lack: bool = True) -> bool:
-    """Return whether an attachment fits its CRC; can_lack: a CRC of 0, which means absent, fits."""
+    """Return whether an attachment fits its CRC. can_lack: a stored CRC of 0, which stands for no CRC, fits, too."""
     stored = int.from_bytes(record.body[-4:], "little")
     return stored == crc32(record.body[:-4]) or (stored == 0 and can_lack)
 
@@ -229,7 +235,7 @@ _DATA_END = HEAD.size + 4
 
 
 class FileEnd(NamedTuple):
-    """Position and CRC of the data section, and the summary, by the end of the file."""
+    """Position and CRC of the data section, and the summary, as the end of the file has them."""
 
     data_end: int  # where the DataEnd begins
     data_crc: int  # stored there; 0: no CRC
@@ -237,7 +243,10 @@ class FileEnd(NamedTuple):
 
 
 def read_end(file: IO[bytes]) -> FileEnd | None:
-    """Return the end of a file: its data section's end and CRC, and its summary; None if the file has no such end."""
+    """Return the end of a file: its data section's end and CRC, and its summary.
+
+    None if the file has no footer, or no DataEnd before its summary.
+    """
     found = _find(file)
     if found is None:
         return None
@@ -261,7 +270,7 @@ def _has_shape(record: RawRecord) -> bool:
 
 
 def summary_of(file: IO[bytes]) -> list[RawRecord]:
-    """Return the records of a file's summary, whether or not its CRC fits; empty without a summary."""
+    """Return the records of a file's summary, whether or not its CRC fits; [] if the file has no footer."""
     found = _find(file)
     if found is None or found[0] - found[1] > MOST_RECORD_BYTES:
         return []
@@ -270,7 +279,10 @@ def summary_of(file: IO[bytes]) -> list[RawRecord]:
 
 
 def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
-    """Return where the footer is, where the summary begins, and the footer; None for a file without an end."""
+    """Return the offset of the footer, that of the summary, and the footer.
+
+    None for a file that ends without a footer.
+    """
     size = file.seek(0, os.SEEK_END)
     place = size - len(MAGIC) - _FOOTER
     tail = read_bytes(file, max(0, place), _FOOTER + len(MAGIC))
@@ -282,7 +294,10 @@ def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
 
 
 def _split(data: bytes, offset: int) -> list[RawRecord]:
-    """Return the records that follow each other in `data`; the last may be cut. offset: of the data in the file."""
+    """Return the records that follow each other in `data`; the body of the last may be cut.
+
+    offset: position of `data` in the file.
+    """
     records = []
     position = 0
     while position + HEAD.size <= len(data):
@@ -294,7 +309,7 @@ def _split(data: bytes, offset: int) -> list[RawRecord]:
 
 
 def read_record(file: IO[bytes], offset: int) -> RawRecord:
-    """Read the record that begins at `offset`. Raises LogError when there is none."""
+    """Return the record that begins at `offset`. Raises LogError if the file ends within it, or it is overlong."""
     head = read_bytes(file, offset, HEAD.size)
     if len(head) < HEAD.size:
         raise LogError(f"no record at byte {offset}")
@@ -315,7 +330,7 @@ def crc_of(file: IO[bytes], start: int, end: int, crc: int = 0) -> int:
 
 
 def read_bytes(file: IO[bytes], place: int, count: int) -> bytes:
-    """Return up to `count` bytes of a file from an offset on."""
+    """Return up to `count` bytes of a file from an offset on, fewer at its end."""
     file.seek(place)
     return file.read(count)
 
@@ -328,9 +343,9 @@ class Definitions:
         self.channels: dict[int, Channel] = {}
 
     def add_record(self, record: RawRecord) -> Schema | Channel:
-        """Add the schema or channel in a record and return it.
+        """Add the schema or channel in a record and return it; adding an equal one again changes nothing.
 
-        Raises LogError for one that makes no sense or contradicts an earlier one.
+        Raises LogError for a record that can't be parsed, or that gives a known number another meaning.
         """
         definition: Schema | Channel = parse(record.opcode, record.body)
         known: dict[int, Any] = self.schemas if isinstance(definition, Schema) else self.channels

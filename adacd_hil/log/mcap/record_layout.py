@@ -20,7 +20,10 @@ INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
 
 def record_dtype(payload: "np.dtype[Any]") -> "np.dtype[Any]":
-    """Return the numpy type of a whole message record whose payload has the type `payload`."""
+    """Return the numpy type of a whole message record: length, times, fields of its payload.
+
+    payload: the type of the payload.
+    """
     assert payload.names is not None
     assert payload.fields is not None
     fields = [payload.fields[name] for name in payload.names]

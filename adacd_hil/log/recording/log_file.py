@@ -69,7 +69,10 @@ class Sink:
         self._thread.start()
 
     def write(self, data: bytes, packets: int = 0) -> int:
-        """Queue `data` for the disk; packets: number of packets that end with it. Return the length of the data."""
+        """Queue `data` for the disk; return their length. packets: number of packets that end with them.
+
+        Block while too many bytes wait, if the sink `waits`.
+        """
         self._position += len(data)
         if data:
             with self._changed:
@@ -80,14 +83,14 @@ class Sink:
         return len(data)
 
     def begin_file(self, path: Path) -> None:
-        """Switch to a new file, or restart the present one, once all earlier data are written or have failed."""
+        """Switch to a new file, or empty and restart the present one, once earlier data are written or have failed."""
         self._position = 0
         with self._changed:
             self._tasks.append(path)
             self._changed.notify_all()
 
     def tell(self) -> int:
-        """Return the number of bytes of the file that have been handed over."""
+        """Return the number of bytes of the present file that have been queued."""
         return self._position
 
     @property
@@ -97,12 +100,12 @@ class Sink:
 
     @property
     def is_behind(self) -> bool:
-        """Whether so many bytes wait for the disk that no more should be added."""
+        """Whether too many bytes wait for the disk: more than `most_waiting`, and then until half of it is written."""
         self._is_behind = self._waiting > (self._most_waiting // 2 if self._is_behind else self._most_waiting)
         return self._is_behind
 
     def take_lost(self) -> int:
-        """Return the number of packets dropped since the last call."""
+        """Return the number of packets dropped since the last call, because their file had failed."""
         with self._changed:
             lost, self._lost = self._lost, 0
         return lost
@@ -156,7 +159,7 @@ class Sink:
             self._lost += packets if self.error else 0
 
     def _open(self, path: Path) -> None:
-        """Create a file and switch to it; the present one is emptied instead."""
+        """Create a file and switch to it; if it is the present one, empty it. A failure is kept as the file's error."""
         is_new = path != self.path or self._descriptor < 0
         if is_new:
             self._close()
@@ -183,7 +186,7 @@ class Sink:
         self._descriptor = -1
 
     def _fail(self, error: OSError) -> None:
-        """Keep the file's first error; print it unless one is printed already."""
+        """Keep the file's first error; report it unless a failure was reported since packets were last written."""
         if not self._has_told:
             self._has_told = True
             what = "the log ends here" if self._waits else "packets are dropped until there is room"

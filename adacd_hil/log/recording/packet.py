@@ -60,13 +60,16 @@ def pack_cycle(
 
 
 def pack_event(t_ns: int, dropped: int, event: Event) -> bytes:
-    """Return the packet of an event; longer texts are cut at 4 KiB. dropped: number of packets lost so far."""
+    """Return the packet of an event; each of its texts is cut at 4 KiB. dropped: number of packets lost so far."""
     texts = [text.encode("utf-8", "replace")[:_MAX_TEXT] for text in event]
     return _EVENT.pack(EVENT, dropped, t_ns, *map(len, texts)) + b"".join(texts)
 
 
 class Packet(NamedTuple):
-    """The content of a packet: of a cycle its frames and messages as `pack_cycle` takes them, or an event."""
+    """The content of a packet: of a cycle its frames and messages as `pack_cycle` takes them, or an event.
+
+    dropped: number of packets lost before it, since the log began.
+    """
 
     t_ns: int
     dropped: int
@@ -85,7 +88,10 @@ def unpack(data: bytes) -> Packet | None:
 
 
 def _unpack_cycle(data: bytes) -> tuple[Packet, int]:
-    """Return the content of a cycle's packet, and where it ends."""
+    """Return the content of a cycle's packet, and the offset of its end.
+
+    Raises struct.error for a packet that is cut within its table, ValueError for a frame of more than MAX_DATA bytes.
+    """
     _, message_count, frame_count, dropped, t_ns = _HEAD.unpack_from(data)
     table = _table(frame_count, message_count)
     values = table.unpack_from(data)
@@ -110,7 +116,10 @@ def _unpack_cycle(data: bytes) -> tuple[Packet, int]:
 
 
 def _unpack_event(data: bytes) -> tuple[Packet, int]:
-    """Return the content of an event's packet, and where it ends."""
+    """Return the content of an event's packet, and the offset of its end.
+
+    Raises struct.error for a packet that is cut, ValueError for another kind of packet.
+    """
     kind, dropped, t_ns, *sizes = _EVENT.unpack_from(data)
     if kind != EVENT:
         raise ValueError(f"{kind} is no kind of packet")

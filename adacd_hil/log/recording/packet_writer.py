@@ -66,11 +66,15 @@ class PacketWriter:
         self._file = file
 
     def lose(self, count: int) -> None:
-        """Count packets that can't be written; an event before the next packet reports them."""
+        """Count packets that can't be written; an event before the next packet reports their number."""
         self._lost += count
 
     def write_packet(self, packet: Packet) -> bool:
-        """Write the content of a packet; return False, and write none of it, if the file can't hold all of it."""
+        """Write the content of a packet; return False, and write none of it, if the file can't hold all of it.
+
+        It can't hold a message without a channel, a /scheme message that is too short, or a time beyond a stamp's
+        range.
+        """
         if not self._fits(packet):
             return False
         time_ns = packet.t_ns + self._epoch_ns
@@ -93,7 +97,7 @@ class PacketWriter:
         return True
 
     def _fits(self, packet: Packet) -> bool:
-        """Return whether the file has a channel for each message, and a stamp for each time."""
+        """Return whether the file has a channel for each message, /scheme is long enough, and times fit a stamp."""
         for channel, body in packet.messages:
             if channel not in self._file.ids or (channel == ChannelId.SCHEME and len(body) < self._least_scheme):
                 return False
@@ -104,7 +108,10 @@ class PacketWriter:
         return 0 <= t_ns + self._epoch_ns < END_OF_TIME_NS
 
     def _add_frame(self, is_tx: bool, frame: Frame, publish_ns: int) -> None:
-        """Add a frame, and its decoded message if the DBC has it."""
+        """Add a frame, and its decoded message if the DBC has its identifier with this length.
+
+        Error frames are not decoded.
+        """
         self.frames += 1
         can_id, data, t_ns, is_error = frame
         t_ns += self._epoch_ns
@@ -125,7 +132,7 @@ class PacketWriter:
         self._add(ChannelId.EVENTS, time_ns, time_ns, pack_log(_stamp(time_ns), event))
 
     def _add(self, channel: int, t_ns: int, publish_ns: int, payload: bytes) -> None:
-        """Add a message; raise a log time that would run backwards in its topic, which readers don't expect."""
+        """Add a message; raise its log time to the topic's last one if earlier: readers expect ascending times."""
         log_ns = self._latest_ns[channel]
         if t_ns > log_ns:
             log_ns = self._latest_ns[channel] = t_ns
@@ -136,5 +143,5 @@ class PacketWriter:
 
 
 def _stamp(time_ns: int) -> bytes:
-    """Return a time as builtin_interfaces/Time."""
+    """Return a time as the 8 bytes of a builtin_interfaces/Time."""
     return _STAMP.pack(*divmod(time_ns, 1_000_000_000))

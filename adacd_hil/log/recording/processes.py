@@ -19,7 +19,7 @@ from adacd_hil.wire.message_table import MessageTable
 
 
 class LoggedMessage(NamedTuple):
-    """A message of the log. channel: the file's number; log_ns, publish_ns: its times."""
+    """A message of the log. channel: its id in the file; log_ns, publish_ns: its times in the file."""
 
     channel: int
     log_ns: int
@@ -36,10 +36,10 @@ class LiveFeed(Protocol):
     def is_watched(self) -> bool: ...  # noqa: D102
 
     def show(self, messages: Sequence[LoggedMessage]) -> None:
-        """Send consecutive messages to viewers."""
+        """Send messages, consecutive in the log, to the viewers."""
 
     def end_view(self) -> None:
-        """End the view without waiting for viewers."""
+        """End the view; don't wait for viewers."""
 
 
 LiveService = Callable[["WriterSetup", dict[int, int], int], LiveFeed]
@@ -53,8 +53,8 @@ It takes the log's setup, the file's id of each channel, and a log time before t
 class WriterSetup:
     """Setup of the writer. `channels`: of the file; `messages`: of the DBC, whose frames are decoded.
 
-    `path`: absolute, of the first part. A part ends after `part_bytes` before compression or `part_ns` of log time;
-    0: no limit. `live`: the view to open, or None.
+    `path`: absolute, of the first part. is_blocking: lockstep. epoch_ns: added to the packets' times. A part ends after
+    `part_bytes` before compression or `part_ns` of log time; 0: no limit. `live`: the view to open, or None.
     """
 
     path: Path
@@ -72,7 +72,7 @@ class WriterSetup:
 def start_module(
     module: str, descriptors: Sequence[int], setup: object, stderr: int | None = None
 ) -> "subprocess.Popen[bytes]":
-    """Start a process that runs a module of ours, and return it. Raises OSError.
+    """Start a process that runs a module of ours, and return it. Raises OSError if it can't be started.
 
     Its arguments are the descriptors; it reads `setup`, pickled, from its standard input. It runs in a session of its
     own, so that Ctrl-C reaches only the control process, and imports this package from its own folder, not from the

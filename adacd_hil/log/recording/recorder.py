@@ -39,7 +39,10 @@ _FORMAT_VERSION = "1"
 
 
 class LogSummary(NamedTuple):
-    """Result of a log. `frames` and `messages` are 0 if the writer died; `error`: in one line, or empty."""
+    """Result of a log. `frames` and `messages` are 0 if the writer died; `error`: in one line, or "".
+
+    is_complete: no error, and no packet dropped. parts: number of files.
+    """
 
     path: Path  # of the first part
     frames: int
@@ -52,7 +55,10 @@ class LogSummary(NamedTuple):
 
 
 class Recorder:
-    """Writes one log. Start it before the process pins itself to a processor, since the writer inherits that."""
+    """Writes one log by a process of its own; close it at the end.
+
+    Start it before the control process pins itself to a processor, since the writer inherits that.
+    """
 
     def __init__(
         self,
@@ -73,7 +79,8 @@ class Recorder:
         """Create the file, which must not exist (see run_folder.py), and start the writer.
 
         messages: of the DBC, by default the package's. epoch_ns: added to t_ns for the log's times; 0 in lockstep.
-        channels: of a log that is no run's. live: live view to open. Raises LogExistsError, LogError.
+        blocking: lockstep. channels: of a log that is no run's. live: live view to open. Raises LogExistsError if a log
+        is there already, LogError if the file or the writer can't be made.
         """
         settings = settings or LogSettings()
         own = {
@@ -143,20 +150,23 @@ class Recorder:
 
     @property
     def waiting_bytes(self) -> int:
-        """Bytes waiting for the writer; 0 in lockstep, where they depend on chance. Costs no system call."""
+        """Bytes in the ring that the writer hasn't taken; 0 in lockstep, where they depend on chance.
+
+        Costs no system call.
+        """
         return 0 if self._is_blocking else self._ring.waiting
 
     def cycle(
         self, t_ns: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]] = ()
     ) -> None:
-        """Hand a cycle to the writer: messages as (ChannelId, body), and its frames, oldest first, True for sent.
+        """Hand a cycle to the writer. messages: (ChannelId, body); frames: oldest first, each with True if it was sent.
 
         If the ring is full, wait in lockstep; in real time drop the cycle and count it in `dropped`.
         """
         self._put(packet.pack_cycle(t_ns, self.dropped, messages, frames))
 
     def event(self, t_ns: int, event: Event) -> None:
-        """Hand an event to the writer; a full ring is treated as by `cycle`."""
+        """Hand an event to the writer; with a full ring wait or drop it as `cycle` does."""
         self._put(packet.pack_event(t_ns, self.dropped, event))
 
     def flush(self) -> None:
@@ -176,7 +186,10 @@ class Recorder:
                 self.flush()
 
     def _put_patiently(self, data: bytes) -> bool:
-        """Add a packet as soon as there is room; return False if the writer is dead or the ring is too small."""
+        """Add a packet as soon as there is room, and return True.
+
+        False if the writer is dead or the ring is too small for it.
+        """
         is_put = False
         with contextlib.suppress(OSError):  # the writer is dead
             while not is_put and padded_bytes(len(data)) <= self._ring.capacity:
@@ -201,7 +214,10 @@ class Recorder:
         self._ring.close()
 
     def _summarise(self, word: dict[str, str] | None) -> LogSummary:
-        """Return the summary, by the writer's last message if there is one, after the end of its process."""
+        """Return the summary, after the end of the writer's process.
+
+        word: its last message, None if it died or is silent.
+        """
         error = ""
         if word is None:
             error = self._end_writer()
@@ -216,7 +232,7 @@ class Recorder:
         return LogSummary(self.path, 0, 0, self.dropped, False, error, max(1, len(find_parts(self.path))), peak)
 
     def _end_writer(self) -> str:
-        """Wait for the end of a writer that doesn't answer, or kill it; return the error in words."""
+        """Wait DEATH_TIMEOUT_S for the end of a writer that doesn't answer, then kill it; return the error in words."""
         try:
             return f"the writer died (exit status {self._process.wait(DEATH_TIMEOUT_S)})"
         except subprocess.TimeoutExpired:
@@ -224,7 +240,7 @@ class Recorder:
             return f"the writer did not end within {END_TIMEOUT_S:g} s"
 
     def _hear(self, timeout_s: float) -> dict[str, str] | None:
-        """Return the next message of the writer; None if it died or stays silent."""
+        """Return the next message of the writer; None if it died, or sends none within timeout_s."""
         self._socket.settimeout(timeout_s)
         try:
             received = self._socket.recv(processes.MOST_BYTES)
@@ -241,7 +257,10 @@ class Recorder:
 
 
 def _create(path: Path, is_run: bool) -> int:
-    """Create the first part of a log; return its file descriptor. Raises LogExistsError, LogError."""
+    """Create the first part of a log; return its file descriptor. is_run: move the log of a failed start aside first.
+
+    Raises LogExistsError if a log is there already, LogError if the file can't be created.
+    """
     if is_run:
         make_room(path)
     else:

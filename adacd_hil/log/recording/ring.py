@@ -47,7 +47,7 @@ class _SharedRing:
         return self._counts[_PEAK]
 
     def _copy(self, start: int, size: int) -> bytes:
-        """Return `size` bytes of the ring, across its end if need be. start: a count such as TAIL."""
+        """Return `size` bytes of the ring from a count such as TAIL on, across its end if need be."""
         place = start % self.capacity
         data = self._memory[_COUNTS_BYTES + place : _COUNTS_BYTES + min(place + size, self.capacity)]
         return data if len(data) == size else data + self._memory[_COUNTS_BYTES : _COUNTS_BYTES + size - len(data)]
@@ -97,7 +97,7 @@ class Ring(_SharedRing):
         return True
 
     def count_dropped(self, dropped: int) -> None:
-        """Store for the reader the number of packets that were not put so far."""
+        """Share with the reader the number of packets that were not put since the beginning."""
         self._counts[_DROPPED] = dropped
 
     @property
@@ -119,7 +119,7 @@ class RingReader(_SharedRing):
 
     @property
     def dropped(self) -> int:
-        """Number of packets that were not put."""
+        """Number of packets that the writing side could not put since the beginning."""
         return self._counts[_DROPPED]
 
     def count_written(self, packets: int) -> None:
@@ -127,7 +127,10 @@ class RingReader(_SharedRing):
         self._counts[_WRITTEN] += packets
 
     def take_packets(self, most: int) -> bytes:
-        """Remove and return whole packets, at most `most` bytes, or a longer one alone; b"" if the ring is empty."""
+        """Remove and return whole packets, at most `most` bytes, or a longer one alone; b"" if the ring is empty.
+
+        Pass the result to `split`. Also raises `peak`.
+        """
         tail = self._counts[_TAIL]
         waiting = self._counts[_HEAD] - tail
         self._counts[_PEAK] = max(self._counts[_PEAK], waiting)
@@ -143,7 +146,7 @@ class RingReader(_SharedRing):
 
 
 def split(data: bytes) -> Iterator[bytes]:
-    """Yield each packet in data that `RingReader.take_packets` returned."""
+    """Yield the bytes of each packet in data that `RingReader.take_packets` returned."""
     place = 0
     while place < len(data):
         (size,) = _SIZE.unpack_from(data, place)

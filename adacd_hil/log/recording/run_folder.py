@@ -24,15 +24,18 @@ _FAILED_NAME = "failed-start-{}.mcap"
 
 
 def check_free(path: Path) -> None:
-    """Raise LogExistsError if a log `path` exists, unless its start failed; LogError if that can't be examined."""
+    """Raise LogExistsError if a log `path`, or a part of it, exists; not if it is the log of a start that failed.
+
+    Raise LogError if that can't be examined. Changes no file.
+    """
     if is_taken(path) and not _is_failed_start(path):
         raise _refusal(path)
 
 
 def make_room(path: Path) -> None:
-    """Rename the log of a start that failed, so that `path` is free.
+    """Rename the log of a start that failed, so that `path` is free; do nothing if it is free already.
 
-    Raises LogExistsError for any other log, LogError.
+    Raises LogExistsError for any other log at `path`, LogError if it can't be renamed or examined.
     """
     check_free(path)
     if not is_taken(path):
@@ -46,7 +49,7 @@ def make_room(path: Path) -> None:
 def is_taken(path: Path) -> bool:
     """Return whether any file, a dangling link included, has the name of a log or one of its parts.
 
-    Raises LogExistsError if a folder of the path is a file, LogError.
+    Raises LogExistsError if a folder of the path is a file, LogError if the folder can't be read.
     """
     try:
         return is_there(path) or bool(find_parts(path))
@@ -71,9 +74,9 @@ def _refusal(path: Path) -> LogExistsError:
 
 
 def _is_failed_start(path: Path) -> bool:
-    """Return whether a log is empty, or has ended properly without a cycle.
+    """Return whether a log has one part only, which has no message, or has ended properly without a cycle.
 
-    Raises LogExistsError if it is being written.
+    False for a log that can't be read. Raises LogExistsError if it is being written.
     """
     try:
         check_unused(path)
@@ -89,7 +92,10 @@ def _is_failed_start(path: Path) -> bool:
 
 
 def _has_no_cycle(file: IO[bytes]) -> bool:
-    """Return whether a run's log has ended properly without a cycle, or has no message at all. Raises LogError."""
+    """Return whether a run's log has ended properly without a cycle, or has no message at all.
+
+    False for a file without a summary, or one that is no run's. Raises LogError for an invalid record.
+    """
     # Only needed for an existing log, and slow to import.
     from adacd_hil.log.mcap.mcap_records import parse, read_end, read_record
     from adacd_hil.log.types.topics import CYCLE

@@ -61,12 +61,12 @@ class WriterProcess:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("ll", 0, POLL_PERIOD_US))
 
     def _open(self, live: LiveService) -> LiveFeed:
-        """Open the live view of the log, and return it. Raises LogError."""
+        """Open the live view of the log, and return it. Raises LogError if it can't be opened."""
         start_ns = self._setup.epoch_ns + (0 if self._setup.is_blocking else self._clock.now_ns())
         return live(self._setup, self._file.ids, start_ns)
 
     def run(self) -> None:
-        """Write packets until the control process ends the log or dies, then send it the summary."""
+        """Write packets until the control process ends the log or dies; then close the file and send the summary."""
         while True:
             word = self._hear()
             if word == processes.ROOM:
@@ -79,7 +79,7 @@ class WriterProcess:
         self._end(self._finish("closed" if word == processes.END else "control process died"))
 
     def _end(self, summary: dict[str, str]) -> None:
-        """Close the last file and send the summary."""
+        """Close the last file, remove it if it has no chunk because of an error, and send the summary."""
         self._sink.close_file()
         path = part_path(self._setup.path, self._part)
         if self._part and self._sink.error and self._sink.path == path and not self._has_chunks:
@@ -110,7 +110,7 @@ class WriterProcess:
                 return
 
     def _look_at_clock(self) -> None:
-        """Flush if it is time, and retry a disk that has failed."""
+        """Each FLUSH_PERIOD_NS write the chunk in progress, and try a disk again that failed long enough ago."""
         now_ns = self._clock.now_ns()
         if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
             self._flush(now_ns)
@@ -121,7 +121,7 @@ class WriterProcess:
         return self.live is not None and self.live.is_watched
 
     def _look_at_disk(self, now_ns: int) -> None:
-        """Begin another part if the disk failed long enough ago."""
+        """Begin another part each RETRY_PERIOD_NS after the disk failed; the present part again if it has no chunk."""
         if not self._sink.error:
             self._failed_ns = None
         elif self._failed_ns is None:
@@ -136,7 +136,7 @@ class WriterProcess:
         return self._sink.written > self._file.head_bytes
 
     def _flush(self, now_ns: int) -> None:
-        """End the chunk in progress, and the part if it is due."""
+        """Write the chunk in progress; if the part is full, end it and begin the next."""
         self._file.flush()
         self._flushed_ns = now_ns
         if self._is_part_full() and not self._sink.error and not self._sink.is_behind:
@@ -171,7 +171,10 @@ class WriterProcess:
         return McapFile(self._sink, setup.channels, setup.attachments, metadata)
 
     def _finish(self, ending: str) -> dict[str, str]:
-        """End the part in progress; return the summary of all parts so far."""
+        """End the part in progress with a summary in the file; return the counts of all parts so far.
+
+        ending: the reason, for the summary.
+        """
         self._note_lost()
         dropped = self._ring.dropped if ending != CONTINUED else self._packets.dropped
         dropped += self._lost
@@ -189,7 +192,10 @@ class WriterProcess:
         }
 
     def _write(self, taken: bytes) -> None:
-        """Write packets from the ring; in lockstep end chunks by log time."""
+        """Write packets from the ring; count them as lost if the disk has failed, or in real time is too slow.
+
+        In lockstep end chunks by log time.
+        """
         if self._sink.error or (not self._setup.is_blocking and self._sink.is_behind):
             self._lose(sum(1 for _ in split(taken)))
             return
@@ -235,7 +241,10 @@ def _schedule_plainly() -> None:
 
 
 def write_log(connection: socket.socket, file_descriptor: int, ring_descriptor: int, setup: WriterSetup) -> None:
-    """Report readiness, write packets until the end of the log, send the summary."""
+    """Report to the control process that the writer is ready, or an error; write packets until the log's end.
+
+    After an error write none.
+    """
     error = url = ""
     try:
         ring = RingReader(ring_descriptor)

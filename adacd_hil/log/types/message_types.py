@@ -57,7 +57,8 @@ _FIELD_LINE = re.compile(r"(?P<type>[a-z0-9]+)(\[(?P<size>[0-9]{1,9})\])?\s+(?P<
 class Member(NamedTuple):
     """One field of a message: `size` numbers of the ROS type `kind`.
 
-    values: names of the values that it can take, constants of the schema that begin with `prefix`, else with its name.
+    values: the numbers that the field can take; the schema names them by constants that begin with `prefix`, without
+    one with the field's name in capitals.
     """
 
     name: str
@@ -74,7 +75,11 @@ class Member(NamedTuple):
         return tuple((f"{self.prefix or self.name.upper()}_{value.name}", int(value)) for value in self.values or ())
 
     def value_of(self, number: Any) -> Any:
-        """Convert a record's number to the field's value. Raises ValueError, OverflowError if it doesn't fit."""
+        """Convert a record's number to the field's value: a member of `values` if there are any.
+
+        Several numbers become a tuple, unchecked. Raises ValueError for a number that `values` lack, or for NaN as an
+        integer; OverflowError for inf as an integer.
+        """
         if self.size > 1:
             return tuple(number)
         if self.values is not None:
@@ -96,7 +101,10 @@ def ros_message_name(name: str) -> str:
 
 @dataclass(frozen=True)
 class MessageType:
-    """A message type: its name, the `.msg` text with everything it depends on, and our names of its fields."""
+    """A message type. name: "package/msg/Type"; text: its `.msg` text with all types that it contains.
+
+    fields: our names of its fields, in order; () if they are those of the text.
+    """
 
     name: str
     text: str
@@ -104,18 +112,24 @@ class MessageType:
 
     @cached_property
     def dtype(self) -> "np.dtype[Any]":
-        """The numpy type of one payload; raises LogError where its size isn't fixed."""
+        """Numpy type of one payload. Raises LogError for fields other than a stamp and numbers of fixed count."""
         return payload_dtype(self.text, self.fields)
 
 
 def foreign_type(name: str) -> MessageType:
-    """Return a type of another package: its `.msg` file lies in `messages` under the last part of its name."""
+    """Return a type of another package, as "package/msg/Type", by the file `messages/Type.msg`, whatever the package.
+
+    Raises FileNotFoundError without that file.
+    """
     file = resources.files("adacd_hil.log.types").joinpath("messages", f"{name.rpartition('/')[2]}.msg")
     return MessageType(name, file.read_text(encoding="utf-8"))
 
 
 def number_type(name: str, members: Iterable[Member]) -> MessageType:
-    """Return a message type of a stamp and numbers. Raises LogError when two fields share a name."""
+    """Return a message type of a stamp and the members, numbers, in order. name: "package/msg/Type".
+
+    Raises LogError if two fields have the same name in ROS, or one is named stamp.
+    """
     lines = ["# Written by adacd-hil.", "builtin_interfaces/Time stamp"]
     names = []
     for member in members:
@@ -133,7 +147,10 @@ def number_type(name: str, members: Iterable[Member]) -> MessageType:
 
 
 def body_struct(members: Iterable[Member], has_block: bool = False) -> struct.Struct:
-    """Return the struct that packs the members behind the stamp; has_block: padded up to a float64 block."""
+    """Return the struct that packs the members behind the stamp.
+
+    has_block: it pads up to a float64 block that follows.
+    """
     pattern = "<"
     position = _STAMP_END
     for member in members:
@@ -176,7 +193,10 @@ def payload_dtype(text: str, fields: tuple[str, ...] = ()) -> "np.dtype[Any]":
 
 
 def _field_lines(text: str) -> Iterator[tuple[str, int, str]]:
-    """Yield (type, count, name) of the fields after the stamp."""
+    """Yield (type, count, name) of the fields after the stamp, without constants.
+
+    Raises LogError for a text that doesn't begin with a stamp, or a field that isn't a number.
+    """
     own_lines = text.split(SEPARATOR, maxsplit=1)[0].splitlines()
     lines = [line.strip() for line in own_lines if line.strip() and not line.strip().startswith("#")]
     if not lines or lines[0] != "builtin_interfaces/Time stamp":
@@ -235,8 +255,8 @@ def pack_can_frame(
 ) -> bytes:
     """Return a frame as a payload of can_msgs/Frame.
 
-    stamp: a packed builtin_interfaces/Time. data: up to 8 bytes, of which `dlc` count. Without `is_extended`,
-    identifiers above 0x7FF are 29-bit ones.
+    stamp: a packed builtin_interfaces/Time. data: up to 8 bytes, of which `dlc` count. is_extended: it has a 29-bit
+    identifier; None: if it is above 0x7FF.
     """
     is_extended = can_id > MAX_STANDARD_ID if is_extended is None else is_extended
     body = _CAN_FRAME_BODY.pack(can_id, is_remote, is_extended, is_error, dlc, data)
@@ -246,8 +266,8 @@ def pack_can_frame(
 def pack_fd_frame(stamp: bytes, can_id: int, data: bytes, is_error: bool, is_extended: bool | None = None) -> bytes:
     """Return an FD frame as a payload of ros2_socketcan_msgs/FdFrame.
 
-    stamp: a packed builtin_interfaces/Time. data: up to 64 bytes. Without `is_extended`, identifiers above 0x7FF are
-    29-bit ones.
+    stamp: a packed builtin_interfaces/Time. data: up to 64 bytes. is_extended: it has a 29-bit identifier; None: if it
+    is above 0x7FF.
     """
     length = len(data)
     is_extended = can_id > MAX_STANDARD_ID if is_extended is None else is_extended
@@ -281,12 +301,15 @@ JOINT_STATE_DTYPE = np.dtype(
 
 
 def pack_joint_state(stamp: bytes, q: bytes, dq: bytes, tau_J: bytes) -> bytes:
-    """Return a payload of sensor_msgs/JointState; `q`, `dq`, `tau_J` are the bytes of float64 (2,)."""
+    """Return a payload of sensor_msgs/JointState. stamp: a packed builtin_interfaces/Time.
+
+    `q`, `dq`, `tau_J`: the bytes of float64 (2,), little endian.
+    """
     return b"".join((ENCAPSULATION, stamp, _JOINT_STATE_HEAD, q, _COUNT, dq, _COUNT, tau_J))
 
 
 def pack_log(stamp: bytes, event: Event) -> bytes:
-    """Return an event as a payload of foxglove_msgs/Log; an unknown level counts as an error."""
+    """Return an event as a payload of foxglove_msgs/Log; an unknown level becomes "error"."""
     payload = ENCAPSULATION + stamp + bytes((LEVELS.get(event.level, LEVELS["error"]),))
     for text in (event.message, event.name, ""):
         encoded = text.encode("utf-8", "replace") + b"\0"

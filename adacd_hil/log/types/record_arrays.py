@@ -37,7 +37,10 @@ class Topic(NamedTuple):
 
     @property
     def has_tail(self) -> bool:
-        """Whether payloads end after so many bytes of `data` as `count` says. Their records are padded with zeros."""
+        """Whether a payload ends after the number of bytes of `data` in its `count`.
+
+        Records of it are padded with zeros.
+        """
         return self.type_name == FD_FRAME.name
 
 
@@ -75,12 +78,15 @@ def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
 
 
 def is_of_frames(topic: Topic) -> bool:
-    """Return whether a topic is one of ours with bus frames."""
+    """Return whether a topic has the name and the type of one of ours with bus frames."""
     return FRAME_TOPICS.get(topic.name) == topic.type_name
 
 
 def frames_of(records: NDArray[Any], topic: Topic, epoch_ns: int) -> NDArray[Any]:
-    """Convert the records of a topic of bus frames to frames (n,); epoch_ns: subtracted from the file's times."""
+    """Convert the records of a topic of bus frames to frames (n,) of FRAME_DTYPE, or LONG_FRAME_DTYPE for FD frames.
+
+    epoch_ns: subtracted from the file's times.
+    """
     frames = np.empty(len(records), LONG_FRAME_DTYPE if topic.has_tail else FRAME_DTYPE)
     fill_times(frames, records, epoch_ns)
     frames["is_tx"] = SENT in topic.name
@@ -99,7 +105,7 @@ def fill_times(frames: NDArray[Any], records: NDArray[Any], epoch_ns: int) -> No
 
 
 def joined_frames(pieces: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return frames joined in the given order, of LONG_FRAME_DTYPE if a piece is."""
+    """Return frames joined in the given order, of LONG_FRAME_DTYPE if any of the arrays is, else of FRAME_DTYPE."""
     is_long = any(piece.dtype == LONG_FRAME_DTYPE for piece in pieces)
     dtype = LONG_FRAME_DTYPE if is_long else FRAME_DTYPE
     whole = [_lengthened(piece) if is_long else piece for piece in pieces]
@@ -160,7 +166,8 @@ class FrameLog(NamedTuple):
 def is_plain(frames: NDArray[Any]) -> NDArray[np.bool_]:
     """Return for each frame (n,) whether a `Bus` receives it.
 
-    It receives all but remote frames and 29-bit ones with identifiers up to 0x7FF; error frames with any identifier.
+    It does not receive remote frames, nor frames with a 29-bit identifier up to 0x7FF. It receives error frames with
+    any identifier.
     """
     is_as_wide = (frames["can_id"] > MAX_STANDARD_ID) == frames["is_extended"]
     return np.asarray(~frames["is_remote"] & (is_as_wide | frames["is_error"]))
@@ -188,7 +195,7 @@ Numbers = NDArray[np.int64]
 
 
 class RawPiece(NamedTuple):
-    """Contents of a piece of a log, by topic."""
+    """Messages of a stretch of a log that ends with whole cycles, by topic. payloads: of the topics of varying size."""
 
     records: dict[str, NDArray[np.uint8]]  # (n, size of a record): numpy would not copy bytes outside of fields
     frames: NDArray[Any]  # (n,) of FRAME_DTYPE, or of LONG_FRAME_DTYPE where a frame is FD
@@ -196,7 +203,7 @@ class RawPiece(NamedTuple):
 
 
 class PieceBuilder:
-    """Gathers messages; a topic's place in `topics` is its slot."""
+    """Gathers messages by topic, until a piece has enough cycles. The slot of a topic is its index in `topics`."""
 
     def __init__(self, cycles: int, epoch_ns: int) -> None:
         """Gather pieces of at most `cycles` cycles; epoch_ns: subtracted from the file's times of frames."""
@@ -245,7 +252,7 @@ class PieceBuilder:
         self._cycles = int(cycles[-1])
 
     def take_piece(self) -> RawPiece:
-        """Return the gathered records and payloads, and start a new piece."""
+        """Return the records, frames and payloads gathered since the last piece, and begin a new piece."""
         records, payloads = {}, {}
         for topic, rows, texts in zip(self.topics, self._rows, self._payloads, strict=True):
             if topic.dtype is None:
@@ -259,7 +266,10 @@ class PieceBuilder:
         return piece
 
     def _gather(self, contents: "Contents", first: int, slots: NDArray[np.int32]) -> None:
-        """Sort consecutive messages into their topics; first: the index of the first one in `contents`."""
+        """Sort consecutive messages into their topics, and count in `wrong` those of another length than their type.
+
+        first: the index of the first one in `contents`. slots (n,): as for `add_messages`.
+        """
         small = slots.astype(np.int16) if len(self.topics) < _MOST_SMALL else slots
         order = np.argsort(small, kind="stable")  # of 16 bits a radix sort
         messages = order + first
@@ -297,7 +307,7 @@ class PieceBuilder:
 def _rows_of(
     contents: "Contents", starts: Numbers, sizes: Numbers, topic: Topic
 ) -> tuple[NDArray[np.bool_] | None, NDArray[np.uint8]]:
-    """Return the records of a topic's messages of the right length, and which messages these are; None: all."""
+    """Return which of a topic's messages have the right length (n,), None: all; and the records of these (k, size)."""
     assert topic.dtype is not None
     most = topic.dtype.itemsize
     is_right = sizes == most

@@ -89,7 +89,7 @@ class ChannelId(IntEnum):
 
 @dataclass(frozen=True)
 class LogChannel:
-    """One topic of a file."""
+    """One topic of a file. id: our number of it, `ChannelId`; the file's may differ."""
 
     id: int
     topic: str
@@ -113,9 +113,10 @@ class OwnTopic:
     rate_Hz: int = 0
 
     def channel(self, parameter_count: int = 0, further_count: int = 0, channel_count: int = 0) -> LogChannel:
-        """Return the topic as a channel of a file, with its message type. Raises LogError when two fields share a name.
+        """Return the topic as a channel of a file, with its message type.
 
-        The counts size the block of /scheme: see `records.certified_layout`.
+        The counts size the block of /scheme: see `records.certified_layout`. Raises LogError if two fields have one
+        name in ROS.
         """
         if isinstance(self.type, MessageType):
             return LogChannel(self.id, self.name, self.type)
@@ -125,7 +126,7 @@ class OwnTopic:
 
     @cached_property
     def body(self) -> struct.Struct:
-        """The struct that packs a message's head as it follows the stamp, up to a block if one follows."""
+        """The struct that packs a message's head behind the stamp, with padding up to a block if one follows."""
         return body_struct(self.head, has_block=self.block is not None)
 
     @cached_property
@@ -133,9 +134,10 @@ class OwnTopic:
         return any(member.size > 1 for member in self.head)
 
     def pack(self, *values: Any, block: Vector | None = None) -> bytes:
-        """Return a message as bytes, without the stamp that the writer adds. Raises struct.error or ValueError.
+        """Return a message as bytes, without the stamp that the writer adds.
 
-        values: fields of the head, in its order. block: the float64 values that follow it.
+        values: fields of the head, in its order. block: the float64 values that follow it. Raises struct.error for a
+        wrong number or type of values; in a topic with array fields ValueError for a wrong number.
         """
         if self._has_arrays:
             pairs = zip(self.head, values, strict=True)
@@ -298,7 +300,7 @@ def run_channels(
     """Return the topics of a run as channels of a file, for `parameter_count` parameters and the DBC's messages.
 
     further_count, channel_count: of the certified scheme, see `records.certified_layout`; 0 for the paper's. Raises
-    LogError when two types share a name.
+    LogError if two types share a name, or two fields of one.
     """
     own = tuple(topic.channel(parameter_count, further_count, channel_count) for topic in RUN_TOPICS)
     decoded = tuple(

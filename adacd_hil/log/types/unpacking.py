@@ -14,16 +14,19 @@ _LEVEL_NAMES = {number: name for name, number in LEVELS.items()} | {0: "info", 1
 
 
 def contact_report(record: Any) -> ContactReport:
-    """Convert a record of /contact to a report; records of older logs have fewer fields.
+    """Convert a record of /contact to a report; a field that an older log lacks gets its default.
 
-    Raises ValueError or OverflowError for a value that has no name.
+    Raises ValueError or OverflowError for a value that its field can't have, such as an unknown level.
     """
     members = [member for member in CONTACT.head if member.name in (record.dtype.names or ())]
     return ContactReport(**{member.name: member.value_of(record[member.name].tolist()) for member in members})
 
 
 def unpack_contact(body: bytes) -> ContactReport:
-    """Return the report in the bytes of `pack_contact`. Raises ValueError if cut, or for a value without a name."""
+    """Return the report in the bytes of `pack_contact`.
+
+    Raises ValueError if they are cut, ValueError or OverflowError for a value that its field can't have.
+    """
     head = bytes(_CONTACT_DTYPE.itemsize - CONTACT.body.size)
     return contact_report(np.frombuffer(head + body, _CONTACT_DTYPE)[0])
 
@@ -38,13 +41,19 @@ def is_log(payload: bytes) -> bool:
 
 
 def log_time_ns(payload: bytes) -> int:
-    """Return when an event was logged, ns of the log. Raises struct.error when the payload is cut."""
+    """Return the stamp of an event's payload, ns, in the file's time.
+
+    Raises struct.error if the payload is cut before it.
+    """
     sec, nanosec = struct.unpack_from("<II", payload, 4)
     return int(sec) * 1_000_000_000 + int(nanosec)
 
 
 def unpack_log(payload: bytes) -> Event:
-    """Return the event in a payload of foxglove_msgs/Log. Raises struct.error or IndexError when it is cut."""
+    """Return the event in a payload of foxglove_msgs/Log; an unknown level becomes "error".
+
+    Raises struct.error or IndexError if the payload is cut.
+    """
     level = _LEVEL_NAMES.get(payload[12], "error")
     position = 13
     texts = []

@@ -22,10 +22,10 @@ to 100 ms left at most 0.142, the 301 pushes that rise in 0.2 to 1 s at least 0.
 
 
 def classify(tau_ext_wide_hat: Vector, sigma: Vector, period_s: float) -> ContactKind:
-    """Return PUSH if at least LEFT of the largest torque remains at the end of the samples, else HIT.
+    """Return PUSH if the mean torque of the last END_S is at least LEFT times the largest torque, else HIT.
 
-    tau_ext_wide_hat: external torque (n, 2), Nm, with the filter undone, from the contact's beginning to the end of
-    its window; sigma: its standard deviation (2,), Nm.
+    tau_ext_wide_hat: external torque (n, 2), Nm, with the filter undone, from the contact's beginning to the end of its
+    window; sigma: its standard deviation (2,), Nm.
     """
     share = share_left(tau_ext_wide_hat, sigma, max(1, round(END_S / period_s)))
     return ContactKind.PUSH if share >= LEFT else ContactKind.HIT
@@ -35,7 +35,8 @@ def classify(tau_ext_wide_hat: Vector, sigma: Vector, period_s: float) -> Contac
 def share_left(tau: Vector, sigma: Vector, end_samples: int) -> float:
     """Return the ratio of the mean torque of the last `end_samples` to the largest torque; 0 without any torque.
 
-    tau (n, 2), sigma (2,): the joints' torques are added in units of their standard deviations.
+    tau (n, 2), sigma (2,): a torque is the root of the sum of the joints' squares, each in units of its standard
+    deviation.
     """
     count = tau.shape[0]
     largest = 0.0

@@ -54,7 +54,8 @@ _COLUMNS = 7
 def put_row(rows: Vector, kept: int, q: Vector, tau: Vector, sigma: Vector, threshold: Vector) -> None:
     """Write the row of one cycle: q2, and tau, sigma, threshold (2,) of the external torque, filter undone.
 
-    kept: number of rows before it. rows (2 m, 7): the last m cycles, each twice, so that any window is contiguous.
+    kept: number of rows written before it. rows (2 m, 7): the last m cycles, each twice, so that any window is
+    contiguous.
     """
     half = rows.shape[0] // 2
     place = kept % half
@@ -67,7 +68,10 @@ def put_row(rows: Vector, kept: int, q: Vector, tau: Vector, sigma: Vector, thre
 
 
 def last_rows(rows: Vector, kept: int, count: int) -> Vector:
-    """Return up to `count` rows, newest last; a view, valid until the next cycle. kept: rows written so far."""
+    """Return the newest `count` rows, newest last, or as many as there are; a view, valid until the next cycle.
+
+    kept: number of rows written so far.
+    """
     half = rows.shape[0] // 2
     count = min(count, kept, half)
     end = half + (kept - 1) % half + 1
@@ -76,7 +80,7 @@ def last_rows(rows: Vector, kept: int, count: int) -> Vector:
 
 @compiled
 def _peak(tau: Vector, sigma: float) -> float:
-    """Return the signed peak torque of (n,) samples: their largest moving mean, less the bias of a noisy maximum.
+    """Return a joint's signed peak torque, Nm, of (n,) samples: the largest moving mean, less a noisy maximum's bias.
 
     sigma: standard deviation of a sample. The mean is longer in a longer contact. A blow's top is short. When the arm
     begins to react, the torque of its drive jumps, and through the lag the estimate rings for some ten samples around
@@ -94,7 +98,10 @@ def _peak(tau: Vector, sigma: float) -> float:
 
 
 def _report(m: CourseMemory, link: int, direction: tuple[int, int], **evidence: Any) -> ContactReport:
-    """Return the report of a contact, and store `link` in `m`. evidence: the report's fields that `m` doesn't have."""
+    """Return the report of a contact, final if `m` isn't open, and store `link` in `m`.
+
+    evidence: the report's fields that `m` doesn't have.
+    """
     m.link = link
     return ContactReport(
         cycle=int(m.detected_cycle),
@@ -111,8 +118,8 @@ def _report(m: CourseMemory, link: int, direction: tuple[int, int], **evidence: 
 def integrated_report(m: CourseMemory, y: Vector, integral: Vector, peak: Vector, a_rad_s: float) -> ContactReport:
     """Return the report of a contact in the paper's scheme, and store its link in `m`.
 
-    y, integral, peak (2,): filtered external torque, its integral and its peak since the contact began. The impulse is
-    y / a + integral.
+    Link 2 if joint 2 has crossed its threshold, else 1. y, integral, peak (2,): filtered external torque, its integral
+    and its peak since the contact began. The impulse is y / a + integral.
     """
     direction = int(m.direction[0]), int(m.direction[1])
     link = 2 if direction[1] else 1
@@ -151,7 +158,8 @@ def _early_rows(rows: Vector) -> int:
 def recalled_report(settings: Settings, m: CourseMemory, every_row: Vector, cycle: int) -> ContactReport:
     """Return the report of a contact in the certified scheme, from its rows so far; store link and `early_rows` in `m`.
 
-    every_row: memory that `put_row` writes. cycle: the present one.
+    every_row: memory that `put_row` writes. cycle: the present one; in that of the detection `early_rows` is set. The
+    kind is UNKNOWN while `m` is open, in all reports but the last.
     """
     period_s, length_m = settings.bus.period_s, settings.arm.link_length_m
     elapsed, kept = cycle - int(m.detected_cycle), int(m.kept_rows)
@@ -184,7 +192,10 @@ def recalled_report(settings: Settings, m: CourseMemory, every_row: Vector, cycl
 
 
 def _link(rows: Vector) -> int:
-    """Return the touched link: 2 if the mean torque of joint 2 over the rows of a contact is certain, else 1."""
+    """Return the touched link, 1 or 2, from the rows of a contact.
+
+    2 if joint 2's mean torque is over CERTAIN sigmas of noise plus CROSS_SHARE of joint 1's mean torque.
+    """
     mean = np.abs(np.mean(rows[:, TAU], axis=0))
     sigma = float(rows[-1, SIGMA][1]) * np.sqrt(CORRELATED_SAMPLES / rows.shape[0])
     return 2 if mean[1] > CERTAIN * sigma + CROSS_SHARE * mean[0] else 1

@@ -37,10 +37,12 @@ _CONTACT, _COLLISION = (int(level) for level in ContactLevel)
 
 
 class CourseConstants:
-    """Constants of the choice of reactions.
+    """Constants of the choice of reactions; a reaction is a number of `Reaction`.
 
-    reactions: by level, the lower first, and link. is_kept: a reaction stays in force until the next contact.
-    due_cycles: cycles from the detection to each report, the final one last.
+    reactions: by level, the lower first, and link. two_sided: the reaction to a push from the other side of a
+    withdrawal. is_kept: a reaction stays in force after REACT until the next contact. blind_cycles: first cycles of a
+    withdrawal that aren't judged. due_cycles: cycles from the detection to each report, the final one last.
+    collision_Nm: the upper thresholds.
     """
 
     reactions: Annotated[NDArray[np.int64], "levels n"]
@@ -54,11 +56,12 @@ class CourseConstants:
 class CourseMemory:
     """State of the present contact.
 
-    link: touched link, 0 for none. is_open: a report has been made that is not final yet. level: the highest of this
-    contact. cause_link: link for which the reaction was chosen. is_given_up: a withdrawal was given up for the
-    `two_sided` reaction. cycles: of the withdrawal in force. kept_rows: rows written so far in the history for reports.
-    early_rows: those of the contact before its detection. way: direction of a withdrawal, a unit vector; zeros without
-    one.
+    link: touched link, 0 for none. is_open: a report has been made that is not final yet. direction: sign of each
+    joint's torque when it crossed its threshold, 0 before. level: the highest of this contact. cause_link: link for
+    which the reaction was chosen. is_given_up: a withdrawal was given up for the `two_sided` reaction. cycles: of the
+    withdrawal in force; turned_cycles: the last ones in a row with the torque turned against it. kept_rows: rows
+    written so far in the history for reports. early_rows: those of the contact before its detection. way: direction of
+    a withdrawal, a unit vector; zeros without one.
     """
 
     is_reacting: int
@@ -95,7 +98,7 @@ def fill_constants(settings: Settings, k: CourseConstants) -> None:
 
 
 def begin(m: CourseMemory) -> None:
-    """Set the level to CONTACT before the first cycle; all else begins with 0."""
+    """Set the level to CONTACT. Call it before the first cycle, with all other fields 0."""
     m.level = ContactLevel.CONTACT
 
 
@@ -118,8 +121,8 @@ def follow(
 ) -> bool:
     """Choose the reaction to a contact in this cycle; return whether a report of the contact is due.
 
-    Clear the contact when the supervisor has left the state of reaction.
-
+    Outside the states of reaction clear the contact and return False. If the reaction begins with no joint over its
+    threshold, as for a late host, stop the arm without a report.
     supervisor: its memory, after its step. observation: bit COLLISION, and from bit CONTACT_SHIFT on one bit per joint
     over its threshold. is_valid: there is a model to float with. tau_ext_hat: filtered, for the reaction; tau_ext:
     gives the direction of a joint when it crosses its threshold.
@@ -148,7 +151,10 @@ def follow(
 
 @compiled
 def _leave(k: CourseConstants, m: CourseMemory, state: int) -> None:
-    """Clear the contact, and the reaction unless `is_kept`; cancel its due reports only in state FAULT."""
+    """If the contact is in progress, end it, and its reaction unless `is_kept`.
+
+    A report that is still due stays due, except in state FAULT.
+    """
     if m.is_reacting != 0:
         m.is_reacting, m.link = 0, 0
         if k.is_kept == 0:
@@ -182,8 +188,8 @@ def _reconsider(
 ) -> None:
     """Choose the reaction anew if the contact has a higher level or another link, unless a withdrawal was given up.
 
-    Stop an arm that goes on along its path if the supervisor has latched a contact that is no collision. Judge a
-    withdrawal in force.
+    Stop an arm that goes on along its path if the supervisor has latched the contact without a collision. Check whether
+    a withdrawal in force must be given up, see `_judge`.
     """
     level = max(level, m.level)
     is_other = level != m.level or m.link != m.cause_link
@@ -227,7 +233,8 @@ def _react(m: CourseMemory, reaction: int, tau_ext_hat: Vector, is_pushed: bool)
 def _judge(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: bool) -> None:
     """Count a cycle of a withdrawal; change to the `two_sided` reaction if the torque has turned against it.
 
-    The torque must be turned for TURNED_CYCLES in a row, the first `blind_cycles` not counted.
+    It has if for TURNED_CYCLES in a row, after the first `blind_cycles`, the torque against the withdrawal was over the
+    upper thresholds in that direction.
     """
     m.cycles += 1
     if m.cycles <= k.blind_cycles:

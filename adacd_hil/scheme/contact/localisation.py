@@ -48,7 +48,10 @@ _INCONSISTENT = int(Location.INCONSISTENT)
 
 
 class Place(NamedTuple):
-    """Force at right angles to the link and its lever arm, with standard deviations; these are inf where not known."""
+    """Force at right angles to the touched link, and its lever arm from that link's joint, with standard deviations.
+
+    location: how far they are known. A standard deviation is inf if its value is unknown.
+    """
 
     location: Location
     force_N: float = 0.0
@@ -58,16 +61,20 @@ class Place(NamedTuple):
 
 
 def on_link1(tau_1: float, sigma_1: float, length1_m: float) -> Place:
-    """Return the smallest force on link 1 that has the moment `tau_1` about joint 1, with an unknown lever arm."""
+    """Return the smallest force on link 1 that has the moment `tau_1`, Nm, about joint 1, with an unknown lever arm.
+
+    sigma_1: standard deviation of tau_1, Nm.
+    """
     return Place(Location.LINK_1, tau_1 / length1_m, sigma_1 / length1_m)
 
 
 def on_link2(
     tau_ext_wide_hat: Vector, q2: Vector, sigma: Vector, length_m: tuple[float, float], tip_margin_m: float = 0.03
 ) -> Place:
-    """Return the peak force and the lever arm of a contact on link 2, as of one touch without friction.
+    """Return the peak force and the lever arm of a contact on link 2, on the assumption of one touch without friction.
 
-    tip_margin_m: distance past the tip up to which a touch, of the load for instance, counts as one of the link's end.
+    length_m: of both links. tip_margin_m: distance past the tip up to which a touch, of the load for instance, counts
+    as one of the link's end.
     """
     location, *values = _fit(tau_ext_wide_hat, q2, sigma, length_m[0], length_m[1], tip_margin_m)
     return Place(Location(location), *values)
@@ -85,7 +92,8 @@ def blind_angle(force_N: float, lever_m: float, threshold_2: float) -> float:
 def blind_angle_of_link1(tau_1: float, q2: float, length_m: tuple[float, float], threshold_2: float) -> float:
     """Return the half-angle, rad, about link 2's axis within which a force at its end looks like a force on link 1.
 
-    tau_1: torque of joint 1, Nm, which that force would have caused; threshold_2: of joint 2, Nm.
+    tau_1: torque of joint 1, Nm, which that force would have caused; threshold_2: of joint 2, Nm. 0 if the links are in
+    line: a force along link 2 has no torque then.
     """
     across = abs(math.sin(q2))
     return blind_angle(abs(tau_1) / (length_m[0] * across), length_m[1], threshold_2) if across > 0.0 else 0.0
@@ -93,7 +101,10 @@ def blind_angle_of_link1(tau_1: float, q2: float, length_m: tuple[float, float],
 
 @compiled
 def _top(forces: Vector) -> float:
-    """Return the moving median of forces (n,) that is largest in size, with its sign; window: n / TOP_PARTS forces."""
+    """Return the moving median of forces (n,) that is largest in size, with its sign; 0 without forces.
+
+    Each median is over n / TOP_PARTS forces.
+    """
     count = forces.shape[0]
     width = max(count // TOP_PARTS, 1)
     step = max((count - width) // TOP_PLACES, 1)

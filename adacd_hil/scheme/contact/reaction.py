@@ -21,7 +21,7 @@ from adacd_hil.settings.configuration import Settings
 
 
 class JointWay(NamedTuple):
-    """One joint's motion: three parts of constant acceleration, each with its length in s, then rest at the target."""
+    """One joint's motion from `position` and `velocity`: parts of constant acceleration, then rest at the target."""
 
     position: float
     velocity: float
@@ -29,7 +29,10 @@ class JointWay(NamedTuple):
     target: float
 
     def at(self, elapsed_s: float) -> tuple[float, float, float]:
-        """Return position, velocity and acceleration this long after the start; before it, those of the start."""
+        """Return position, velocity and acceleration this long after the start.
+
+        Before the start they are those of the start; after the last part the target, 0 and 0.
+        """
         position, velocity = self.position, self.velocity
         remaining_s = max(elapsed_s, 0.0)
         for acceleration, duration_s in self.parts:
@@ -46,14 +49,17 @@ class JointWay(NamedTuple):
 
     @property
     def duration_s(self) -> float:
-        """Return the time from the start until rest."""
+        """Time from the start until rest."""
         return sum(duration_s for _, duration_s in self.parts)
 
 
 def time_optimal(
     position: float, velocity: float, target: float, velocity_limit: float, acceleration_limit: float
 ) -> JointWay:
-    """Return a joint's fastest motion to rest at `target` within the limits; brake a velocity over its limit first."""
+    """Return a joint's fastest motion to rest at `target` within the limits.
+
+    A velocity over its limit is braked first. A joint too fast to stop at the target goes past it and comes back.
+    """
     stop = position + velocity * abs(velocity) / (2.0 * acceleration_limit)
     sign = math.copysign(1.0, target - stop)
     distance = sign * (target - position)
@@ -69,14 +75,15 @@ def time_optimal(
 
 
 class Withdrawal:
-    """The motion of all joints from one collision to rest. Made when REACT is entered, then sampled per period."""
+    """The motion of all joints away from one collision, to rest: planned when made, then sampled by `evaluate`."""
 
     def __init__(
         self, settings: Settings, q_d: Vector, dq_d: Vector, tau_ext_hat: Vector, start: Vector | None = None
     ) -> None:
         """Plan from the present desired motion; without an external torque plan a stop.
 
-        start: positions where the withdrawal began, if it is planned anew on the way; subtract the distance since then.
+        start: joint positions at which the withdrawal began, if it is planned anew on the way; the distance moved since
+        then shortens it.
         """
         distance = np.radians(settings.reaction.distance_deg)
         velocity_limit = np.minimum(
@@ -104,7 +111,7 @@ class Withdrawal:
 
     @property
     def duration_s(self) -> float:
-        """Return the time from the plan's start until all joints are at rest."""
+        """Time from the plan's start until all joints are at rest."""
         return max(profile.duration_s for profile in self._profiles)
 
     def evaluate(self, elapsed_s: float, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
@@ -114,7 +121,7 @@ class Withdrawal:
 
     @property
     def beyond_limits(self) -> list[int]:
-        """Indices, from 0, of the joints that can't stop within their position limit.
+        """Indices, from 0, of the joints that can't stop within their position limit: [] if all can.
 
         They brake at the acceleration limit from their position and velocity at the start of the withdrawal.
         """

@@ -41,7 +41,10 @@ def predict(W_f: Vector, theta: Vector, tau_f_hat: Vector) -> None:
 
 @compiled
 def estimate_external(tau_f: Vector, tau_f_hat: Vector, dc_gain: float, tau_ext_hat: Vector) -> None:
-    """Fill tau_ext_hat (2,), eq. (13) with our sign and the filter's DC gain taken out, Nm."""
+    """Fill tau_ext_hat (2,), Nm, with -(tau_f - tau_f_hat) / dc_gain, eq.
+
+    (13) with our sign; dc_gain: b / a of the filter.
+    """
     for i in range(tau_f.shape[0]):
         tau_ext_hat[i] = -(tau_f[i] - tau_f_hat[i]) / dc_gain
 
@@ -50,7 +53,7 @@ def estimate_external(tau_f: Vector, tau_f_hat: Vector, dc_gain: float, tau_ext_
 def follow_standstill(dq: Vector, standstill_rad_s: float, decay: float, standstill: Vector) -> None:
     """Update `standstill` (2,) in place: each joint's share of standstill in the filter's memory, 0 to 1.
 
-    decay: the filter's factor for one period.
+    A joint slower than standstill_rad_s stands still. decay: the filter's factor for one period.
     """
     for i in range(dq.shape[0]):
         target = 1.0 if abs(dq[i]) < standstill_rad_s else 0.0
@@ -59,7 +62,7 @@ def follow_standstill(dq: Vector, standstill_rad_s: float, decay: float, standst
 
 @compiled
 def fill_threshold(threshold_Nm: Vector, standstill: Vector, F_c: Vector, threshold: Vector) -> None:
-    """Fill `threshold` (2,), Nm: threshold_Nm plus `standstill`, 0 to 1, times Coulomb friction F_c, at least 0."""
+    """Fill `threshold` (2,), Nm: threshold_Nm plus `standstill`, 0 to 1, times Coulomb friction F_c, if positive."""
     for i in range(threshold.shape[0]):
         threshold[i] = threshold_Nm[i] + standstill[i] * max(F_c[i], 0.0)
 
@@ -84,7 +87,7 @@ ONSET_FRACTION = 0.5
 
 @compiled
 def forget(wide: Wide) -> None:
-    """Set the samples in `history` to 0, from which `undo_filter` forms its mean."""
+    """Set `history` to 0: the samples from which `undo_filter` forms its mean."""
     wide.history[:] = 0.0
 
 
@@ -116,8 +119,8 @@ def follow_contact(
 ) -> None:
     """Update the integral (2,) Nm s and the peak (2,) Nm of each joint's contact in place.
 
-    Below ONSET_FRACTION of its threshold a joint is untouched: both begin with 0 again. is_reporting: keep them, as a
-    report is open, by whose end the contact may be over.
+    They begin with 0 again while a joint's torque is below ONSET_FRACTION of its threshold. is_reporting: a report is
+    still due, so they go on below it, too.
     """
     for i in range(tau_ext_hat.shape[0]):
         if abs(tau_ext_hat[i]) <= ONSET_FRACTION * threshold[i] and not is_reporting:

@@ -57,7 +57,11 @@ BLOCK_S = 0.064
 
 
 def constants_of(settings: Settings) -> MarginConstants:
-    """Return, by channel (2 C - 1,), `excursions_Hz` and `shown`; and `block_cycles`, `mean_cycles`."""
+    """Return the margin's constants; `excursions_Hz` and `shown` have a value per channel (2 C - 1,).
+
+    excursions_Hz: independent excursions per second. shown: response to a step of 1 after WITHIN_S. block_cycles,
+    mean_cycles: length of a block of the tail, and of a mean of the smallest push.
+    """
     a = np.array(settings.certified.cutoffs_rad_s)
     return MarginConstants(
         excursions_Hz=np.concatenate([a, a[1:]]) / np.pi,
@@ -71,7 +75,7 @@ def constants_of(settings: Settings) -> MarginConstants:
 
 @compiled
 def begin_tail(m: Memory) -> None:
-    """Empty the records of the largest residuals, as for a new model."""
+    """Set the largest residuals, their floors `tail_Nm` and the time seen to 0, as for a new model."""
     m.margin.peak[:] = 0.0
     m.margin.tail_Nm[:] = 0.0
     m.margin.tail_s = 0.0
@@ -80,7 +84,7 @@ def begin_tail(m: Memory) -> None:
 
 @compiled
 def discard_tail(m: Memory) -> None:
-    """Discard the residuals of the last block and the present one: a contact is near."""
+    """Drop the residuals of the last block and the present one, as a contact is near; keep the largest ones."""
     m.margin.peak_now[:] = 0.0
     m.margin.peak_last[:] = 0.0
     m.margin.block_used = 0.0
@@ -88,7 +92,10 @@ def discard_tail(m: Memory) -> None:
 
 @compiled
 def follow_tail(k: Constants, m: Memory) -> None:
-    """Add the residuals of one contact-free sample to the largest ones; at the end of a block, fill `tail_Nm`."""
+    """Add the residuals of one contact-free sample to the present block, except of joints that stood still lately.
+
+    At the end of a block renew the largest residuals, by the block before this one, and the floors `tail_Nm`.
+    """
     own = m.margin
     filters = m.filters.r.shape[0]
     for c in range(m.filters.y.shape[0]):
@@ -129,7 +136,7 @@ def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> flo
 
 
 def largest_share(m: Memory) -> float:
-    """Return the largest ratio of a residual without contact to its present threshold, of all channels and joints."""
+    """Return the largest ratio of a kept residual (`peak`) to its present threshold, of all channels and joints."""
     return float(
         np.max(m.margin.peak.max(axis=0) / np.maximum(np.maximum(m.sensitivity.h_model, m.margin.tail_Nm), 1e-12))
     )
@@ -137,7 +144,10 @@ def largest_share(m: Memory) -> float:
 
 @compiled
 def tail_factor(excursions_Hz: float, seen_s: float) -> float:
-    """Return m(T), the factor on the largest residual of seen_s that gives the largest one to expect in 1 / RATE."""
+    """Return m(T), the factor on the largest residual of seen_s that gives the largest one to expect in 1 / RATE.
+
+    It is at least 1 and at most LARGEST. excursions_Hz: nu, independent excursions per second.
+    """
     share = math.log(excursions_Hz / RATE_HZ) / math.log(max(excursions_Hz * max(seen_s, 1.0), 1.01))
     return float(min(np.sqrt(max(share, 1.0)), LARGEST))
 
@@ -156,7 +166,10 @@ MEAN_S, BLIND_S = 1.0, 3.0
 
 @compiled
 def smallest_push(y: Vector, h: Vector, shown: Vector, joint: int) -> float:
-    """Return the smallest push on a joint, Nm, detected within WITHIN_S if the present y and h stay as they are."""
+    """Return the smallest push on a joint, Nm, detected within WITHIN_S if the present y and h stay as they are.
+
+    joint: from 0.
+    """
     filters = (y.shape[0] + 1) // 2
     least = np.inf
     for c in range(y.shape[0]):
@@ -170,7 +183,7 @@ def smallest_push(y: Vector, h: Vector, shown: Vector, joint: int) -> float:
 
 @compiled
 def begin_sight(m: Memory) -> None:
-    """Begin a test: empty the counts of thresholds and the worst values."""
+    """Begin a test: set its counts of thresholds and its worst values to 0, and the sums and times of monitoring."""
     own = m.margin
     own.seen[:] = 0.0
     own.seen_worst_Nm[:] = 0.0
@@ -182,7 +195,7 @@ def begin_sight(m: Memory) -> None:
 
 @compiled
 def follow_test(k: Constants, m: Memory) -> None:
-    """Count the thresholds in force in one contact-free sample of a test, and keep the worst push and threshold."""
+    """Count the thresholds of one contact-free sample of a test; keep the largest, and the largest `smallest_push`."""
     own = m.margin
     for i in range(own.dim_s.shape[0]):
         h = m.sensitivity.wide_threshold[i]
@@ -196,7 +209,8 @@ def follow_test(k: Constants, m: Memory) -> None:
 def follow_sight(k: Constants, m: Memory) -> bool:
     """Add one contact-free sample of monitoring to the mean smallest push; return whether to revoke the certificate.
 
-    True once the mean of a joint was over LESS times the worst of the test for BLIND_S.
+    True if a joint's mean over each MEAN_S of motion was over LESS times the worst of the test for BLIND_S in a row.
+    Skip a joint that stood still lately.
     """
     own = m.margin
     is_blind = False
@@ -217,7 +231,7 @@ def follow_sight(k: Constants, m: Memory) -> bool:
 
 
 def describe_sight(m: Memory) -> str:
-    """Return the smallest push, thresholds and residuals of the last test as text, joint 1 / joint 2."""
+    """Return the smallest push, thresholds and residuals of the last test as one text, each as "joint 1 / joint 2"."""
     seen = np.cumsum(m.margin.seen, axis=0)
     worst_Nm = m.margin.seen_worst_Nm
     median, most = ([_quantile(seen[:, i], worst_Nm[i], share) for i in range(JOINTS)] for share in (0.5, 0.99))
@@ -237,7 +251,7 @@ def describe_push(m: Memory) -> str:
 def describe_dim(m: Memory) -> list[str]:
     """Return a line for each joint whose mean smallest push is over LESS times the worst of the test.
 
-    It gives both pushes, for how long, and the cause.
+    A line gives both pushes, for how long, and the cause.
     """
     own = m.margin
     return [

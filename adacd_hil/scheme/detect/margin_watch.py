@@ -39,9 +39,9 @@ class MarginWatch:
         """Margin per joint (n,) when the watch had settled; None until then."""
 
     def add_block(self, ratio: Vector) -> None:
-        """Add each joint's largest ratio (n,) of statistic to threshold in a contact-free block; ignore NaN and inf.
+        """Add each joint's largest ratio (n,) of statistic to threshold in a contact-free block.
 
-        Set `reference` at block number `memory_blocks`.
+        Ignore the block if a ratio is NaN or inf. Set `reference` at block number `memory_blocks`.
         """
         if not np.isfinite(ratio).all():
             return
@@ -59,7 +59,7 @@ class MarginWatch:
 
     @property
     def margin(self) -> Vector:
-        """Threshold over expected peak of each joint (n,); infinite before the first block."""
+        """Threshold over the peak expected within the horizon, per joint (n,); inf before the first block."""
         if self._blocks == 0:
             return np.full(self._mean.shape, np.inf)
         scale = np.sqrt(np.maximum(self._square - self._mean**2, 0.0)) * math.sqrt(6.0) / math.pi
@@ -69,9 +69,9 @@ class MarginWatch:
 
     @property
     def warning(self) -> str:
-        """Return the joints whose margin has shrunk below `warn_share` of the reference, as text; "" without one.
+        """Text on joints with a margin below `warn_share` of the reference; "" without such a joint.
 
-        Such as `joint 1: margin 1.4 x, was 2.1 x`.
+        "" also without a reference. For example `joint 1: margin 1.4 x, was 2.1 x`.
         """
         if self.reference is None:
             return ""

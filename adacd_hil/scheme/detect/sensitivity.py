@@ -88,7 +88,11 @@ _SMOOTHED_FALL_RAD_S = 600.0
 
 
 def noise_constants(certified: CertifiedSettings, period_s: float) -> NoiseConstants:
-    """Return, by channel (2 C - 1,), (k_tau sigma_tau)² in Nm² and nu² in rad²/s⁴; and weights of a sample in means."""
+    """Return the constants of noise: variances by channel (2 C - 1,), and a sample's weights in running means.
+
+    torque_variance: (k_tau sigma_tau)², Nm²; torque_gain: the same for a noise of 1 Nm; velocity_variance: nu²,
+    rad²/s⁴.
+    """
     a, s = np.array(certified.cutoffs_rad_s), certified.smoothing_rad_s
     width = np.concatenate([a * s / (a + s), a[1:]])
     smoothed = np.minimum(_SMOOTHED_SHARE * s / (1.0 + a / _SMOOTHED_FALL_RAD_S), 1.0)
@@ -130,7 +134,7 @@ def follow_standstill(k: Constants, m: Memory, dq: Vector) -> None:
 
 @compiled
 def measure_noise(k: Constants, m: Memory, tau_J: Vector) -> None:
-    """Add one sample at rest to `roughness` (n,): variance of the torque over that of the settings, at least 1."""
+    """Add one sample at rest to `roughness` (n,): the torque's variance over that of the settings, at least 1."""
     own = m.sensitivity
     own.rest_samples += 1.0
     for i in range(tau_J.shape[0]):
@@ -143,10 +147,10 @@ def measure_noise(k: Constants, m: Memory, tau_J: Vector) -> None:
 
 @compiled
 def follow_torque_step(k: Constants, m: Memory, tau_J: Vector) -> None:
-    """Update the sensors' step L (n,), the smallest change ever seen, and its pull on their mean, by one sample.
+    """Update the torque sensors' step L (n,), the smallest change ever seen, and its pull on their mean, by one sample.
 
-    A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most. Until
-    enough changes were seen L is 0: the first ones may be a push.
+    A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most. L is
+    at most LARGEST_STEP_NM, and 0 until CHANGES changes were seen: the first ones may be a push.
     """
     own = m.sensitivity
     for i in range(tau_J.shape[0]):
@@ -191,7 +195,7 @@ def follow_velocity_noise(k: Constants, m: Memory, dq: Vector, is_steady: bool) 
 
 @compiled
 def keep_velocity_noise(k: Constants, m: Memory) -> None:
-    """Raise `roughness_kept` (n,) to the velocity's roughness in a sample without contact; let it decay in motion.
+    """Raise `roughness_kept` (n,) to the velocity's roughness in a sample without contact; it decays in motion.
 
     At rest an encoder without counts shows no noise, but shows it again with the first count.
     """
@@ -205,7 +209,7 @@ def keep_velocity_noise(k: Constants, m: Memory) -> None:
 
 @compiled
 def raise_strain(m: Memory, largest: float) -> None:
-    """Double the strain, up to `largest`, of each joint that is over a threshold in any channel.
+    """Double the strain of each joint that is over a threshold in any channel, up to `largest`; lower none.
 
     A contact while learning may be the model's failure. One contact may be a hand; repeated ones come from an error
     that no parameter explains, such as backlash. Then the arm is armed with higher thresholds rather than never.
@@ -222,8 +226,8 @@ def raise_strain(m: Memory, largest: float) -> None:
 def decay_strain(k: Constants, m: Memory) -> None:
     """Update `strain` and `peak_share` (n,) by one sample without contact.
 
-    The strain decays towards 1 while the residual has stayed below RELAXED of its threshold; `peak_share` is the
-    largest residual over its threshold.
+    The strain decays towards 1 while the residual has stayed below RELAXED of its threshold over about STRAIN_S.
+    `peak_share` rises to the sample's largest residual over its threshold.
     """
     own = m.sensitivity
     for i in range(own.strain.shape[0]):
@@ -242,7 +246,7 @@ def follow_unit(k: Constants, m: Memory, fit: int, share: float, is_monitored: b
 
     fit: index of the filter whose residual counts. In a faster one the velocity's noise would count as the model's
     error. is_monitored: the unit is the smaller one of those of positive and of negative residuals. Else it is that of
-    all residuals, with which both signs begin.
+    all residuals, with which both signs begin. A joint with an infinite variance, as one at rest, keeps its unit.
     """
     own = m.sensitivity
     for i in range(own.unit.shape[0]):
@@ -291,7 +295,7 @@ def fill_thresholds(k: Constants, m: Memory, h: Vector) -> None:
 
 @compiled
 def momentum_noise(m: Memory, joint: int) -> float:
-    """Return (M R M')_ii of a joint, from 0: its momentum's noise for velocities of roughness R and noise 1."""
+    """Return (M R M')_ii of a joint, from 0: variance of its momentum for a velocity noise of variance R."""
     total = 0.0
     for j in range(m.regressor.M.shape[1]):
         total += m.sensitivity.velocity_roughness[j] * m.regressor.M[joint, j] ** 2
@@ -429,7 +433,10 @@ def lift(m: Memory) -> None:
 
 
 def take_peak_shares(m: Memory) -> Vector:
-    """Return each joint's largest residual over its threshold (n,) since the last call, and reset it."""
+    """Return each joint's largest residual over its threshold (n,) in contact-free samples since the last call.
+
+    Set `peak_share` to 0.
+    """
     shares = np.array(m.sensitivity.peak_share)
     m.sensitivity.peak_share[:] = 0.0
     return shares
@@ -439,7 +446,7 @@ def take_peak_shares(m: Memory) -> Vector:
 def follow_lost(k: Constants, m: Memory, dq: Vector, steps: int, period_s: float, is_seen: bool) -> None:
     """Update `lost` (C, n), the variance by missing samples, by a sample that came `steps` periods after the last.
 
-    period_s: the whole interval. is_seen: its missing samples were interpolated; False: it was cut out of time.
+    period_s: time since the last sample. is_seen: the missing samples were interpolated; False: that time was cut out.
     """
     lost, before = m.sensitivity.lost, m.gaps.last[1]
     for c in range(lost.shape[0]):

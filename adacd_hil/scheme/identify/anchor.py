@@ -55,7 +55,8 @@ ASYMMETRY = 0.1
 def constants_of(settings: Settings) -> AnchorConstants:
     """Return the anchors' constants: `zero_drift_Nm2_s`, `rest_cycles`, and the following (n,).
 
-    `holding_Nm`; `zero_Nm`, `zero_std_Nm`: of the configuration; `last_zero_Nm`, `_std_Nm`: of the last certificate.
+    `holding_Nm`; `zero_Nm`, `zero_std_Nm`: of the configuration; `last_zero_Nm`, `_std_Nm`: of the last certificate. A
+    deviation or holding torque that isn't known is inf.
     """
     arm, history = settings.arm, settings.history
     return AnchorConstants(
@@ -103,7 +104,7 @@ def measure(k: Constants, m: Memory, tau_J: Vector, is_resting: bool) -> None:
     """Add one sample before the drives are enabled to the reading at rest; drop the reading if the arm moves.
 
     The reading is a mean over about the last `rest_cycles` samples, so a person who leaned before and has gone is
-    forgotten.
+    forgotten. If a joint's holding torque is unknown, the reading doesn't become its anchor.
     """
     own = m.anchor
     own.rest_count = min(own.rest_count + 1.0, k.anchor.rest_cycles) if is_resting else 0.0
@@ -127,7 +128,8 @@ def _rest_variance(k: Constants, m: Memory, joint: int) -> float:
 def is_rest_refused(k: Constants, m: Memory) -> bool:
     """Return whether a joint's reading at rest differs from its tare by more than noise and the torque the motor holds.
 
-    False while the reading has fewer than `rest_cycles` samples: the supervisor counts as many before the arm goes on.
+    False without a tare, with an unknown holding torque, or while the reading has fewer than `rest_cycles` samples: the
+    supervisor counts as many before the arm goes on. Store the comparison as evidence.
     """
     own = m.anchor
     if own.rest_count < k.anchor.rest_cycles:
@@ -147,9 +149,10 @@ def is_rest_refused(k: Constants, m: Memory) -> bool:
 
 @compiled
 def is_within(k: Constants, m: Memory, theta: Vector, P: Vector) -> bool:
-    """Return whether the torque offsets of a model are within the bounds of all anchors; store the bounds as evidence.
+    """Return whether the torque offsets of a model are within the bounds of all anchors.
 
-    theta (p,), P (p, p): the model. The last certificate is used only for a joint without a bound of `beta_Nm`.
+    Store the comparison as evidence. theta (p,), P (p, p): the model. A missing anchor bounds nothing. The last
+    certificate is used only for a joint without a bound of `beta_Nm`.
     """
     first_coulomb, is_within = int(k.first_coulomb), True
     evidence.fit(k, m, theta, P, min(np.max(m.sensitivity.unit), 1.0))
@@ -174,7 +177,7 @@ def _variance(k: Constants, m: Memory, kind: int, joint: int) -> float:
 
 @compiled
 def is_excluded(m: Memory, joint: int, offset_Nm: float) -> bool:
-    """Return whether `offset_Nm` of a joint, from 0, is outside an anchor's bounds for the last judged fit."""
+    """Return whether `offset_Nm` of a joint, from 0, is outside an anchor's bounds of the last judged fit."""
     bounds_Nm = m.evidence.limit[:KINDS, OFFSETS + joint]
     return not bool(np.all(np.abs(offset_Nm - m.anchor.anchor_Nm[:, joint]) <= bounds_Nm))
 
@@ -196,7 +199,10 @@ def innovation(k: Constants, m: Memory, joint: int, offset_Nm: float, variance_N
 
 
 def accept(m: Memory, offset_Nm: Vector, std_Nm: Vector) -> None:
-    """Drop all anchors, and set anchor ACCEPTED to the offsets (n,) that the user accepts as the sensors' zero."""
+    """Drop all anchors, and set anchor ACCEPTED to the offsets (n,) that the user accepts as the sensors' zero.
+
+    std_Nm (n,): their standard deviations.
+    """
     m.anchor.anchor_std[:] = np.inf
     m.anchor.anchor_Nm[ACCEPTED] = offset_Nm
     m.anchor.anchor_std[ACCEPTED] = std_Nm
@@ -215,7 +221,10 @@ def is_open(k: Constants, m: Memory, joint: int) -> bool:
 
 
 def tightest(k: Constants, m: Memory, joint: int) -> int | None:
-    """Return the number of the anchor that bounds a joint's last judged offset most closely; None if it `is_open`."""
+    """Return the number of the anchor that bounds a joint's last judged offset most closely; None if it `is_open`.
+
+    joint: from 0.
+    """
     return None if is_open(k, m, joint) else int(np.argmin(m.evidence.limit[:KINDS, OFFSETS + joint]))
 
 
@@ -275,7 +284,7 @@ LARGEST_OF_STD = 2.5
 def is_place_bounded(k: Constants, m: Memory) -> bool:
     """Return whether the fit's torque by place is at most `arm.position_torque_Nm` in each joint; fill `by_place_Nm`.
 
-    True, without filling, for a model without such a torque.
+    Torque by place: it depends on the joint's position. True, without filling, for a model without such a torque.
     """
     if k.position_torque_Nm == 0.0:
         return True
@@ -288,7 +297,7 @@ def is_place_bounded(k: Constants, m: Memory) -> bool:
 
 @compiled
 def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
-    """Return the largest torque by place of a joint over the fit's samples, with its offset moved to the anchor."""
+    """Return a joint's largest torque by place, Nm, over the fit's samples, with its offset moved to the anchor."""
     joints, first = m.anchor.by_place_Nm.shape[0], int(k.first_position)
     offset, largest = int(k.first_offset) + joint, 0.0
     P, theta = m.models.P_belief, m.models.belief
@@ -303,7 +312,7 @@ def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
 
 
 def describe_place(k: Constants, m: Memory) -> str:
-    """Return the last checked torque by place of each joint, and its bound, as text; empty without such a torque."""
+    """Return each joint's last checked torque by place, and its bound, as text; "" if the model has no such torque."""
     if k.position_torque_Nm == 0.0:
         return ""
     return (
@@ -312,7 +321,10 @@ def describe_place(k: Constants, m: Memory) -> str:
 
 
 def describe_place_refused(k: Constants, m: Memory) -> list[str]:
-    """Return a line for each joint whose torque by place exceeds `arm.position_torque_Nm`, with the torque."""
+    """Return a line for each joint whose last checked torque by place is over `arm.position_torque_Nm`, with it.
+
+    Torque by place: it depends on the joint's position. [] if all joints keep to the bound.
+    """
     limit = float(k.position_torque_Nm)
     return [
         f"joint {i + 1} has a torque of up to {torque:.3f} Nm that depends on where the arm is, bound {limit:g} Nm"

@@ -107,7 +107,10 @@ def pause(m: Memory, cycles: float) -> None:
 
 @compiled
 def is_free(k: Constants, m: Memory, is_touched: bool) -> bool:
-    """Count down the cycles without learning; return whether none is left. A touch renews them."""
+    """Count down the cycles without learning by one; return whether none is left.
+
+    A touch sets them to `recover_cycles`.
+    """
     if is_touched:
         pause(m, k.recover_cycles)
     elif m.models.recovering_cycles > 0.0:
@@ -117,7 +120,7 @@ def is_free(k: Constants, m: Memory, is_touched: bool) -> bool:
 
 @compiled
 def learn_and_use(k: Constants, m: Memory) -> bool:
-    """Learn from a sample as `learn` does; if the belief has changed, use it as the model, and return True."""
+    """Learn from a sample as `learn` does, and return its result; if it is True, use the belief as the model."""
     has_learnt = learn(k, m)
     if has_learnt:
         _use(m)
@@ -165,7 +168,8 @@ def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
 def learn(k: Constants, m: Memory) -> bool:
     """Put each `learn_every`-th sample into the ring; correct the belief by the sample that leaves the full ring.
 
-    Return whether it was corrected. The sample: `W_learnt` (n, p) and `tau_learnt` (n,) of the filters.
+    Return whether a sample left it. A joint's row of infinite variance, as of a joint at rest, corrects nothing. The
+    sample: `W_learnt` (n, p) and `tau_learnt` (n,) of the filters.
     """
     own = m.models
     W, tau_J, still = m.filters.W_learnt, m.filters.tau_learnt, m.sensitivity.still_smooth[filter_bank.LEARNT]
@@ -203,7 +207,7 @@ def learn(k: Constants, m: Memory) -> bool:
 def hold_lags(k: Constants, m: Memory) -> None:
     """Stop learning the lags: clear their covariances with other parameters in P_belief, keep their variances.
 
-    `learn` subtracts their torque from later samples.
+    From now on `learn` subtracts the lags' torque from samples that enter the ring.
     """
     m.models.are_lags_held = 1.0
     P = m.models.P_belief
@@ -217,7 +221,10 @@ def hold_lags(k: Constants, m: Memory) -> None:
 
 @compiled
 def _take_out_lags(k: Constants, m: Memory, place: int) -> None:
-    """Subtract the torque of the believed lags from the ring's sample at `place`, and set its columns of lags to 0."""
+    """Subtract the torque of the believed lags from the sample at index `place` of the ring.
+
+    Set its columns of lags to 0.
+    """
     joints = m.ring.tau.shape[1]
     first = int(k.first_offset) + joints
     for i in range(joints):

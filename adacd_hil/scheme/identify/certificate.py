@@ -32,11 +32,11 @@ FLOOR_NM, FLOOR_KGM2, FLOOR_NM_S = 0.02, 0.006, 0.02
 
 
 class Certificate(NamedTuple):
-    """A certificate's description of the arm at the time of certification.
+    """A certificate's description of the arm at the time of certification; `_std`: standard deviations.
 
-    parameters: a1 … F_c2, and those of gravity where there are any (p,); friction_Nm, their deviations (6,): joint 1 at
-    `records.FRICTION_SPEEDS_RAD_S`, then joint 2; inertia_kgm2 (3,); offset_Nm (n,): of the torque sensors, the
-    configuration's included.
+    parameters: a1 … F_c2, and those of gravity where there are any (p,); friction_Nm (6,): joint 1 at
+    `records.FRICTION_SPEEDS_RAD_S`, then joint 2; inertia_kgm2 (3,): a1, a2, a3; offset_Nm (n,): of the torque sensors,
+    the configuration's included; is_payload: a payload was learnt on top of an earlier certificate; text: of the event.
     """
 
     parameters: tuple[float, ...]
@@ -57,8 +57,8 @@ class Certificate(NamedTuple):
 def last_of(settings: Settings) -> tuple[Vector, Vector, Vector]:
     """Return value, variance and slack (Q,) of the last certificate per quantity of `evidence`.
 
-    The variance is inf for an unknown quantity, and for all without a last certificate. A viscous friction is computed
-    from two frictions. Their deviations count as independent, which overestimates its own.
+    The variance is inf for the torque offsets, and for all quantities without a last certificate. A viscous friction is
+    computed from two frictions. Their deviations count as independent, which overestimates its own.
     """
     history = settings.history
     counts = (FRICTIONS, INERTIAS, JOINTS, JOINTS)
@@ -102,8 +102,8 @@ def withhold(m: Memory, cause: int) -> None:
 def contradicted_by(k: Constants, m: Memory) -> int:
     """Return the first contradiction of the fit, one of ANCHOR to TOO_MUCH_BY_PLACE, or NOTHING.
 
-    In order: anchors, the fit's own samples and steps, kept beliefs, bound on torque by place, last certificate. If the
-    fit contradicts itself, keep its steps from before the change.
+    In order: with the anchors, within the fit's own samples and steps (then the beliefs of its steps from before the
+    change are kept), with kept beliefs, with the bound on torque by position, with the last certificate.
     """
     if not anchor.is_within(k, m, m.models.belief, m.models.P_belief):
         return ANCHOR
@@ -123,7 +123,10 @@ def contradicted_by(k: Constants, m: Memory) -> int:
 
 @compiled
 def is_no_more(k: Constants, m: Memory) -> bool:
-    """Return whether no friction or inertia of the fit exceeds the last certificate's limit; True with a payload."""
+    """Return whether no friction or inertia of the fit exceeds the last certificate's limit; store the comparison.
+
+    True without a last certificate, or with a payload.
+    """
     is_agreed = True
     for q in range(m.evidence.fitted.shape[0]):
         excess = evidence.weigh(k, m, LAST, q)

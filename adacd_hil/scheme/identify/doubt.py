@@ -110,7 +110,7 @@ def clear(m: Memory) -> None:
 
 @compiled
 def begin(k: Constants, m: Memory) -> None:
-    """Clear the sums, and add the samples from before the contact that wait in the ring, but for joints at rest."""
+    """Clear the sums, and add the samples from before the contact that wait in the ring, except of joints at rest."""
     clear(m)
     _follow_peak(m)
     for s in range(int(m.ring.used)):
@@ -121,7 +121,7 @@ def begin(k: Constants, m: Memory) -> None:
 
 @compiled
 def weigh(k: Constants, m: Memory) -> None:
-    """Add one sample of a contact to the sums, but for joints at rest, whose friction explains any torque."""
+    """Add one sample of a contact to the sums, except of joints at rest, whose friction explains any torque."""
     _follow_peak(m)
     for i in range(m.filters.tau_f.shape[1]):
         still = m.sensitivity.still_smooth[filter_bank.LEARNT, i]
@@ -156,17 +156,20 @@ def _add(k: Constants, m: Memory, i: int, w: Vector, tau: float, still: float, R
 
 
 class CommonCause(NamedTuple):
-    """The common cause of contacts. text: its description; is_payload: an object was picked up, or put down."""
+    """The common cause of contacts. text: its description; is_payload: an object was picked up, or put down.
+
+    Also a contradiction of the certificate, which ends it as a common cause does.
+    """
 
     text: str
     is_payload: bool
 
 
 class _Weighed(NamedTuple):
-    """One contact's sums (h,). waited_s: from going on to its beginning; ended_s: time of its end.
+    """One contact's sums over its samples, as `_weighed` returns them. rw, ww (h,): Σ r w and Σ w² by cause; rr: Σ r².
 
-    peak: largest residual over its threshold; 0 without a residual. load_ww (2,): evidence for a payload, by direction
-    of pull.
+    load_ww (2,): evidence for a payload, by direction of pull. peak: largest residual over its threshold; 0 without a
+    residual. waited_s: from going on to the contact's beginning; ended_s: time of its end.
     """
 
     rw: Vector
@@ -203,9 +206,9 @@ class Doubt:
     def begin_contact(self, cycle: int, is_touched: bool, contradiction: CommonCause | None = None) -> None:
         """Store how long the arm has monitored before it reacts in this cycle, and lower the odds of a wrong model.
 
-        is_touched: it reacts to a contact; if that follows at once, raise the thresholds of its joints. Else the cause
-        is another, such as a late host, and the sums are cleared. contradiction: of the certificate, if the arm reacts
-        to that; `end_contact` returns it.
+        is_touched: it reacts to a contact. If that follows within AT_REST_S of going on, raise the thresholds of its
+        joints. False: the cause is another, such as a late host, and the sums are cleared. contradiction: of the
+        certificate, if the arm reacts to that; `end_contact` returns it.
         """
         self._contradiction = contradiction
         self._waited_s = cycle * self._period_s - self._monitored_s
@@ -218,9 +221,10 @@ class Doubt:
             sensitivity.raise_strain(self._m, MOST_STRAIN)
 
     def end_contact(self, cycle: int) -> CommonCause | None:
-        """Store the contact that ends in this cycle; return the common cause of the last contacts, or None.
+        """Store the contact that ends in this cycle; return the common cause of the last contacts, None without one.
 
-        After a contradiction of the certificate store nothing and return the contradiction.
+        After a contradiction of the certificate store nothing and return the contradiction. Drop contacts that ended
+        more than WITHIN_S ago.
         """
         if self._contradiction is not None:
             return self._contradiction
@@ -235,7 +239,7 @@ class Doubt:
         return self._payload() or self._other() or self._alike() or self._unexplained()
 
     def describe_again(self) -> str | None:
-        """Return a warning if the last contact came within HELD_S after the arm went on from another, or None."""
+        """Return a warning if the last contact came within HELD_S of going on from another one; else None."""
         if len(self._contacts) < 2 or self._contacts[-1].waited_s > HELD_S:
             return None
         waited_s = self._contacts[-1].waited_s
@@ -245,7 +249,10 @@ class Doubt:
         )
 
     def _payload(self) -> CommonCause | None:
-        """Return the payload that explains the last contacts, or None: a few of strong evidence, or many that agree."""
+        """Return the payload that explains the last FEWEST_LOADED or more contacts; None without one.
+
+        There must be evidence for it in both directions of its pull.
+        """
         for count in range(FEWEST_LOADED, len(self._contacts) + 1):
             last = list(self._contacts)[-count:]
             if self._common(last, LOAD, SPREAD_LOADED) is None:
@@ -260,7 +267,10 @@ class Doubt:
         return None
 
     def _alike(self) -> CommonCause | None:
-        """Return the error in which contacts agree, each so soon after going on that it is weak evidence, or None."""
+        """Return the error that explains each of the last ALIKE contacts with about the same size, or None.
+
+        None also unless each of them came within HELD_S of going on.
+        """
         last = list(self._contacts)[-ALIKE:]
         if len(last) < ALIKE or max(contact.waited_s for contact in last) > HELD_S:
             return None
@@ -292,9 +302,10 @@ class Doubt:
         return None
 
     def _unexplained(self) -> CommonCause | None:
-        """Return a cause without a name if a person is unlikely to touch as often or as lightly, or None.
+        """Return a cause without a name if a person is unlikely to touch as often or as lightly, else None.
 
-        So often: MANY contacts, each within HELD_S of going on. So lightly: weak contacts with odds over ODDS.
+        As often: MANY contacts, each but the first within HELD_S of going on. As lightly: weak contacts with odds over
+        ODDS.
         """
         last = list(self._contacts)[-MANY:]
         text = ""
@@ -310,15 +321,19 @@ class Doubt:
         )
 
     def _can_be(self, h: int, size: float) -> bool:
-        """Return whether friction h can be `size` more than the model's: not negative, nor implausibly large."""
+        """Return whether friction h can be `size` more than the model's.
+
+        The sum may not be clearly negative, nor over PLAUSIBLE deviations of the prior.
+        """
         cause = self._k.causes[h]
         total = float(cause @ self._m.models.theta) + size
         return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._k.prior_std)
 
     def _common(self, contacts: list[_Weighed], h: int, spread: float) -> float | None:
-        """Return the size of cause h over all contacts; None if it doesn't explain each of them with about that size.
+        """Return the size of cause h over all contacts, in its unit.
 
-        spread: largest difference of a contact's own size, as a part of the common one, beside 2 sigma.
+        None if it doesn't explain each of them with that size. A contact's own size may differ by `spread` of the
+        common one, and 2 sigma.
         """
         ww = sum(contact.ww[h] for contact in contacts)
         if not ww > 0.0:

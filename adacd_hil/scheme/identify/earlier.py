@@ -71,15 +71,15 @@ def _drop(m: Memory) -> None:
 
 @compiled
 def is_keeping(m: Memory) -> bool:
-    """Return whether beliefs are kept."""
+    """Return whether at least one belief from before a touch is kept as evidence."""
     return bool(np.any(m.evidence.variance[KEPT:, 0] != np.inf))
 
 
 @compiled
 def keep_fit(k: Constants, m: Memory) -> None:
-    """Keep the fit's present belief and its steps, as a touch may have begun; not if beliefs are kept already.
+    """Keep the fit's present belief and those at its steps, as a touch may have begun; not if beliefs are kept already.
 
-    If the fit has changed since a step, keep only the steps up to that one. Keep nothing before the second step. Set
+    If the fit has changed since a step, keep only the beliefs up to that step. Keep none before the second step. Set
     the count of refused fits to 0 in any case.
     """
     m.earlier.refused_fits = 0.0
@@ -100,9 +100,9 @@ def keep_fit(k: Constants, m: Memory) -> None:
 
 @compiled
 def keep_steps(k: Constants, m: Memory, last: int) -> None:
-    """Keep the fit's steps up to number `last`, from 0, without the first YOUNG_STEPS; -1 or less keeps none.
+    """Keep the fit's beliefs at its steps up to number `last`, from 0, without the first YOUNG_STEPS.
 
-    Do nothing if beliefs are kept already.
+    -1 or less keeps none. Do nothing if beliefs are kept already.
     """
     if m.earlier.kept_count > 0.0:
         return
@@ -120,7 +120,8 @@ def keep_steps(k: Constants, m: Memory, last: int) -> None:
 def keep_belief(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float, age_s: float) -> None:
     """Keep a belief as the next source of evidence; leave the source empty if a friction is clearly negative.
 
-    unit: scale of its variances, see `fit_check.unit_of`. age_s: time since the belief was held.
+    unit: scale of its variances, see `fit_check.unit_of`. age_s: time since the belief was held. An empty source counts
+    as kept, too, in `kept_count`.
     """
     s = KEPT + int(m.earlier.kept_count)
     if not _fill_source(k, m, s, theta, P, unit):
@@ -131,9 +132,9 @@ def keep_belief(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float, 
 
 @compiled
 def _fill_source(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit: float) -> bool:
-    """Fill the rows of source `s` from a belief; return whether no friction is clearly below 0.
+    """Fill the rows of source `s` from a belief; return False if a friction is clearly below 0.
 
-    A person who pushes the arm on makes friction look negative: a negative one counts as 0.
+    A person who pushes the arm on makes friction look negative: a negative one is stored as 0.
     """
     has_friction = True
     for q in range(VISCOUS):
@@ -149,8 +150,8 @@ def _fill_source(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit
 def is_no_more(k: Constants, m: Memory) -> bool:
     """Return whether the fit agrees with the kept beliefs: same friction and unanchored offsets, no more inertia.
 
-    Drop a kept belief whose offset contradicts an anchor: it comes from a lean. True also if the kept beliefs lapse;
-    this drops all of them and sets `has_lapsed`.
+    Drop a kept belief whose offset contradicts an anchor: it comes from a lean. If enough fits in a row agree against
+    the kept beliefs, drop all of these, set `has_lapsed` and return True. True also without kept beliefs.
     """
     is_no_more = True
     for s in range(KEPT, KEPT + int(m.earlier.kept_count)):

@@ -46,10 +46,11 @@ BELIEF_SIGMAS = 3.5
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> EvidenceConstants:
-    """Return `columns`, `columns_prior`, `torque_Nm`, `sigmas` and `less_counts`. prior_std (p,).
+    """Return the constants of evidence. prior_std (p,): deviations of the prior.
 
-    torque_Nm: largest torque of one unit of the quantity on the trajectory; 0 for viscous friction, which is contained
-    in the friction at its speeds.
+    columns: each quantity in parameters; columns_prior: its variance in the prior. torque_Nm: largest torque of one
+    unit of the quantity on the trajectory; 0 for viscous friction, which is contained in the friction at its speeds.
+    less_counts: 1 if a fit with less of the quantity contradicts the source, too.
     """
     unit = np.eye(prior_std.size)
     base = len(settings.estimator.parameter_names)
@@ -139,14 +140,14 @@ def fit(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float) -> None:
 
 @compiled
 def put_fitted(m: Memory, q: int, value: float, variance: float) -> None:
-    """Set the fitted value and variance of one quantity."""
+    """Store the fitted value and variance of quantity `q`, for `weigh`."""
     m.evidence.fitted[q] = value
     m.evidence.fitted_variance[q] = variance
 
 
 @compiled
 def of_belief(k: Constants, q: int, theta: Vector, P: Vector, unit: float) -> tuple[float, float]:
-    """Return a belief's value of a quantity, c theta, and its variance."""
+    """Return a belief's value of quantity `q`, c theta, and its variance. unit: see `split`."""
     column = k.evidence.columns[q]
     return linalg.dot(column, theta), split(linalg.quadratic(P, column), k.evidence.columns_prior[q], unit)
 
@@ -185,7 +186,10 @@ def excess(m: Memory, s: int, q: int) -> float:
 
 @compiled
 def largest_excess(m: Memory, first: int, last: int, q: int) -> int:
-    """Return the source among first .. last - 1 whose last weighed excess of quantity `q` is largest in size."""
+    """Return the source among first ..
+
+    last - 1 whose last `excess` of quantity `q` is largest in size, the first of equals.
+    """
     worst = first
     for s in range(first, last):
         if not abs(excess(m, s, q)) <= abs(excess(m, worst, q)):
@@ -194,9 +198,9 @@ def largest_excess(m: Memory, first: int, last: int, q: int) -> int:
 
 
 def named(excesses: Vector) -> list[tuple[int, str, str]]:
-    """Return index, name and unit of each quantity with an excess (Q,) over 1; for a joint's friction only the largest.
+    """Return index, name and unit of each quantity with an excess (Q,) over 1; of a joint's frictions only the largest.
 
-    A viscous friction is named after the others.
+    Order: frictions, inertias, offsets, viscous frictions.
     """
     speeds = len(FRICTION_SPEEDS_RAD_S)
     found = []

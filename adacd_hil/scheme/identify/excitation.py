@@ -45,7 +45,7 @@ def begin_speeds(motion: Motion) -> None:
 
 @compiled
 def widen(value: Vector, low: Vector, high: Vector) -> None:
-    """Widen the range low .. high (2,) in place so that it holds `value` (2,)."""
+    """Widen the range low .. high (2,) in place, so that it contains `value` (2,)."""
     for i in range(value.shape[0]):
         low[i] = min(low[i], value[i])
         high[i] = max(high[i], value[i])
@@ -53,7 +53,7 @@ def widen(value: Vector, low: Vector, high: Vector) -> None:
 
 @compiled
 def has_moved(motion: Motion, travel_rad: float, velocity_rad_s: float) -> bool:
-    """Return whether each joint's range is at least `travel_rad`, and its speed at least `velocity_rad_s` both ways."""
+    """Return whether each joint has covered at least `travel_rad`, and reached `velocity_rad_s` in both directions."""
     for i in range(motion.q_low.shape[0]):
         if not (motion.q_high[i] - motion.q_low[i] >= travel_rad):
             return False
@@ -64,7 +64,7 @@ def has_moved(motion: Motion, travel_rad: float, velocity_rad_s: float) -> bool:
 
 @compiled
 def add_information(W_f: Vector, period_s: float, information: Vector) -> None:
-    """Add T W_f' W_f to the lower triangle of `information` (p, p) in place."""
+    """Add T W_f' W_f to the lower triangle of `information` (p, p) in place; T: period_s."""
     for j in range(W_f.shape[1]):
         for k in range(j + 1):
             for i in range(W_f.shape[0]):
@@ -73,7 +73,10 @@ def add_information(W_f: Vector, period_s: float, information: Vector) -> None:
 
 @compiled
 def gather(motion: Motion, q: Vector, dq: Vector, W_f: Vector, period_s: float) -> bool:
-    """Add a sample to the ranges of motion and the information matrix; return True every EXCITATION_EVERY samples."""
+    """Add a sample to the ranges of motion and the information matrix.
+
+    Return True at every EXCITATION_EVERY-th sample.
+    """
     widen(q, motion.q_low, motion.q_high)
     widen(dq, motion.dq_low, motion.dq_high)
     add_information(W_f, period_s, motion.information)
@@ -83,9 +86,10 @@ def gather(motion: Motion, q: Vector, dq: Vector, W_f: Vector, period_s: float) 
 
 @compiled
 def eigenvalue_range(information: Vector, scale: Vector, scratch: Vector) -> tuple[float, float]:
-    """Return the smallest and the largest eigenvalue of D I D, D = diag(scale), from the lower triangle of I (p, p).
+    """Return the smallest and the largest eigenvalue of D I D, D = diag(scale), each at least 0.
 
-    By Jacobi's cyclic rotations on `scratch` (p, p): the same bits on every machine, which LAPACK does not promise.
+    I (p, p): `information`, of which only the lower triangle is read; it is kept. `scratch` (p, p) is overwritten, by
+    Jacobi's cyclic rotations: they give the same bits on every machine, which LAPACK does not promise.
     """
     count = scale.shape[0]
     trace = 0.0

@@ -73,7 +73,7 @@ def step_samples_of(settings: Settings) -> int:
 
 @compiled
 def begin(m: Memory) -> None:
-    """Clear the steps, kept samples and sums of residuals of the fit before."""
+    """Empty the steps, the kept samples and the sums of residuals, as a new fit begins."""
     own = m.fit_check
     own.steps_used = 0.0
     own.fit_square = 0.0
@@ -93,9 +93,9 @@ def add_residual(m: Memory, square: float) -> None:
 
 @compiled
 def follow(k: Constants, m: Memory, W_f: Vector, tau_f: Vector) -> None:
-    """Count a learnt sample and keep it for the check; every `step_samples` store the belief as a step.
+    """Count a learnt sample and keep it for the check; after each `step_samples` of them store the belief as a step.
 
-    W_f (n, p), tau_f (n,): the sample in the filter by which the fit is tested.
+    W_f (n, p), tau_f (n,): the sample in the filter by which the fit is tested. Only the last STEPS steps are stored.
     """
     own = m.fit_check
     _keep_sample(m, W_f, tau_f)
@@ -157,7 +157,10 @@ def late_square(m: Memory) -> float:
 
 @compiled
 def _better_square(m: Memory, s: int) -> float:
-    """Return the mean square of the residuals over their variances, up to step s or after it, the smaller."""
+    """Return the mean square of the residuals over their variances, up to a step or after it, the smaller.
+
+    s: its slot.
+    """
     own = m.fit_check
     early = own.steps_square[s] / max(own.steps_rows[s], 1.0)
     late = (own.fit_square - own.steps_square[s]) / max(own.fit_rows - own.steps_rows[s], 1.0)
@@ -168,8 +171,8 @@ def _better_square(m: Memory, s: int) -> float:
 def last_step_before_change(k: Constants, m: Memory) -> int:
     """Return the number of the last step, from 0, before the fit contradicts itself; NONE if it doesn't.
 
-    As `last_step_before_contradiction`. If only the model of the samples after a step contradicts the fit, return the
-    last step of all; a payload's fit is not tested for that.
+    First by `last_step_before_contradiction`. If that finds none, but the model of the samples after a step contradicts
+    the fit, return the last step of all; a payload's fit is not tested for that.
     """
     own = m.fit_check
     used, oldest = int(own.steps_used), max(int(own.steps_used) - own.steps_rows.shape[0], 0)
@@ -184,9 +187,10 @@ def last_step_before_change(k: Constants, m: Memory) -> int:
 
 @compiled
 def last_step_before_contradiction(k: Constants, m: Memory) -> int:
-    """Return the number of the last step before the fit changed, or before the first sample that it doesn't explain.
+    """Return the number, from 0, of the last step whose belief contradicts the fit's; NONE without a contradiction.
 
-    Numbers from 0; -1: that sample is older than all steps. NONE if neither happened.
+    If no step does, but the fit doesn't explain a kept sample, return the last step before the first such sample; -1 if
+    that is older than all steps.
     """
     changed = last_unsteady_step(m)
     first = first_unexplained(m)
@@ -195,9 +199,9 @@ def last_step_before_contradiction(k: Constants, m: Memory) -> int:
 
 @compiled
 def first_unexplained(m: Memory) -> int:
-    """Return the index, from 0, of the first learnt sample that the fit's belief doesn't explain.
+    """Return the index, from 0, of about the first learnt sample that the fit's belief doesn't explain; -1 without one.
 
-    Only kept samples are examined. -1 without such a sample, and for a payload's fit.
+    Unexplained: a residual over `limit_Nm`. Only kept samples are examined. -1 for a payload's fit, too.
     """
     kept, first = int(m.fit_check.samples_kept), -1
     if m.models.is_payload != 0.0 or kept < 2:
@@ -234,15 +238,18 @@ def last_unsteady_step(m: Memory) -> int:
 
 @compiled
 def changed_share(m: Memory, s: int) -> float:
-    """Return the squared distance of step s from the whole fit over its limit; over 1: the fit has changed since."""
+    """Return the squared `distance` of a step from the whole fit over its limit; over 1: the fit has changed since.
+
+    s: slot of the step.
+    """
     return float(distance(m, s) / (STEADY * max(_better_square(m, s), SMALLEST_SQUARE)))
 
 
 @compiled
 def later_share(k: Constants, m: Memory, s: int) -> float:
-    """Return the largest torque on the kept samples between the fit and the model after step s, over its limit.
+    """Return the largest torque on the kept samples between the fit and the model after a step, over its limit.
 
-    Over 1: the samples after step s contradict the fit. inf if they determine no model.
+    s: slot of the step. Over 1: the samples after it contradict the fit. inf if they determine no model.
     """
     own = m.fit_check
     if not find_later(m, s):
@@ -262,7 +269,7 @@ def later_share(k: Constants, m: Memory, s: int) -> float:
 
 @compiled
 def better_rms(m: Memory) -> float:
-    """Return the root mean square of the residuals, Nm, of the earlier or later half of the samples, the smaller."""
+    """Return the rms of the residuals, Nm, over the earlier or the later half of the kept samples, the smaller."""
     squares, half = np.zeros(2), int(m.fit_check.samples_kept) // 2
     for s in range(2 * half):
         for i in range(m.fit_check.samples_tau.shape[1]):
@@ -274,8 +281,8 @@ def better_rms(m: Memory) -> float:
 def distance(m: Memory, s: int) -> float:
     """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of step s and the fit; inf if P_0 - P has no factor.
 
-    Leave the Cholesky factor of P_0 - P in `factor`, scaled by the square roots of P_0's diagonal, and in `apart` the
-    vector whose square is the result.
+    s: slot of the step, of belief theta_0, P_0. Leave the Cholesky factor of P_0 - P in `factor`, scaled by the square
+    roots of P_0's diagonal, and in `apart` the vector whose square is the result.
     """
     own = m.fit_check
     P_0, P, L, x = own.steps_P[s], m.models.P_belief, own.factor, own.apart
@@ -292,7 +299,10 @@ def distance(m: Memory, s: int) -> float:
 
 @compiled
 def find_later(m: Memory, s: int) -> bool:
-    """Fill `later` (p,): parameters of the samples after step s less those of the fit; return False if undefined."""
+    """Fill `later` (p,): parameters of the samples after step s less those of the fit.
+
+    Return False, and keep `later`, if the `distance` is inf. s: slot of the step. Overwrites `factor` and `apart`.
+    """
     own = m.fit_check
     if not distance(m, s) < np.inf:
         return False
@@ -307,7 +317,10 @@ def find_later(m: Memory, s: int) -> bool:
 
 @compiled
 def _later_variance(m: Memory, s: int, w: Vector) -> float:
-    """Return w P (P_0 - P)^-1 P w', the variance of the torque w `later`; call `find_later` for step s before."""
+    """Return w P (P_0 - P)^-1 P w', the variance of the torque w `later`; call `find_later` for step s before.
+
+    Overwrites `apart`.
+    """
     x = m.fit_check.apart
     for j in range(x.shape[0]):
         x[j] = linalg.dot(m.models.P_belief[j], w) / np.sqrt(m.fit_check.steps_P[s, j, j])

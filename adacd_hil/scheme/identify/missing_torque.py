@@ -51,9 +51,10 @@ FIRST_S, LONGEST_S = 2.0, 16.0
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> TermConstants:
-    """Return the prior deviations (f,), and the learnt samples before the first check and between later ones at most.
+    """Return the prior deviations (f,), and numbers of learnt samples before checks while the arm monitors.
 
-    prior_std (p,): prior deviations of the model's own parameters.
+    first: before the first check; longest: before each later one at most. prior_std (p,): prior deviations of the
+    model's own parameters.
     """
     learn_s = settings.bus.period_s * settings.certified.learn_every
     return TermConstants(
@@ -65,23 +66,23 @@ def constants_of(settings: Settings, prior_std: Vector) -> TermConstants:
 
 @compiled
 def forget(m: Memory) -> None:
-    """Set the filtered columns of torque by place to 0."""
+    """Set the filtered columns of the torque that depends on the position, `X_f` and `X_learnt`, to 0."""
     m.missing_torque.X_f[:] = 0.0
     m.missing_torque.X_learnt[:] = 0.0
 
 
 @compiled
 def rest(m: Memory) -> None:
-    """Set the filtered columns to their values after a long rest in the present pose."""
+    """Set the filtered columns `X_f` to their values after a long rest in the present pose."""
     m.missing_torque.X_f[:] = m.regressor.X
 
 
 @compiled
 def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
-    """Advance the columns X (n, PLACE_TERMS) over one period behind the learnt filter; after a gap the filter resumes.
+    """Advance the filtered columns X (n, PLACE_TERMS) over one period, by the filter `LEARNT` and the pole behind it.
 
-    rates (3,): the filter's coefficients for one period, see `torque_filter.FirstOrderHold`; smoothing: of the pole
-    behind it.
+    is_seen: False after a gap, when that filter keeps its values. rates (3,): its coefficients for one period, see
+    `torque_filter.FirstOrderHold`; smoothing: of the pole.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]
     X, X_old, X_f, X_learnt = m.regressor.X, m.missing_torque.X_old, m.missing_torque.X_f, m.missing_torque.X_learnt
@@ -95,13 +96,16 @@ def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
 
 @compiled
 def keep_columns(m: Memory, slot: int) -> None:
-    """Put the columns of this sample into a slot of the ring, where they wait with the row of the regressor."""
+    """Put the filtered columns of this sample into a slot of the ring, where they wait with the sample's regressor."""
     m.missing_torque.ring_X[slot] = m.missing_torque.X_learnt
 
 
 @compiled
 def clear(k: Constants, m: Memory) -> None:
-    """Empty the sums and the torque found before: for another arm or payload, or with a new certificate."""
+    """Set the sums and the torque found before to 0, and let the next check be the first one.
+
+    Call it for another arm or payload, or with a new certificate.
+    """
     _clear_sums(m)
     m.missing_torque.last_found[:] = 0.0
     m.missing_torque.rms_Nm[:] = 0.0
@@ -121,7 +125,10 @@ def _clear_sums(m: Memory) -> None:
 
 @compiled
 def add(k: Constants, m: Memory, slot: int, joint: int) -> None:
-    """Add a joint's row, learnt now from a slot of the ring, to the sums; skip it if the joint was slow or at rest."""
+    """Add a joint's row, which the belief learns now from a slot of the ring, to the sums.
+
+    Skip the row if the joint was slow or at rest. joint: from 0.
+    """
     own = m.missing_torque
     if m.ring.still[slot, joint] > STILL:
         return
@@ -151,10 +158,10 @@ def _rough_variance(k: Constants, m: Memory, joint: int) -> float:
 
 @compiled
 def is_confirmed(k: Constants, m: Memory) -> bool:
-    """Count a sample learnt while the arm monitors; return whether a torque by place is missing in the model.
+    """Count a sample learnt while the arm monitors; return whether the model lacks a torque by position.
 
-    Check after the first samples, then after stretches that double up to a limit; return False between checks. True:
-    the torque that an earlier stretch of samples showed explains this one, too.
+    Check after the first samples, then after stretches that double up to a limit; return False between checks. True if
+    the torque that an earlier stretch of samples showed explains this stretch, too. A check empties the sums.
     """
     own = m.missing_torque
     own.samples += 1.0
@@ -172,10 +179,10 @@ def is_confirmed(k: Constants, m: Memory) -> bool:
 
 @compiled
 def is_found(k: Constants, m: Memory) -> bool:
-    """Return whether a torque by place explains the residuals of all samples in the sums, and is missing in the model.
+    """Return whether a torque that depends on the position, and that the model lacks, explains the samples in the sums.
 
-    Fill `basic` and `full`, and `rms_Nm` (n,) with the torque of each joint, 0 if False. Always False for a model that
-    has such columns.
+    Fill `basic` and `full`, the coefficients without and with that torque, and `rms_Nm` (n,), the torque of each joint,
+    0 if False. Always False, with only `rms_Nm` filled, for a model that has such columns.
     """
     own = m.missing_torque
     own.rms_Nm[:] = 0.0
@@ -198,9 +205,9 @@ def is_found(k: Constants, m: Memory) -> bool:
 
 @compiled
 def scale_of(k: Constants, m: Memory, is_by_place: bool) -> Vector:
-    """Return the prior deviations (f,) of the parameters and of the columns by place, in `scale`, which is overwritten.
+    """Return `scale` (f,), overwritten with the prior deviations of the parameters and of the columns by position.
 
-    is_by_place: False sets those of the columns by place to 0, so that they explain no torque.
+    is_by_place: False sets those of the columns by position to 0, so that these explain no torque.
     """
     scale, count = m.missing_torque.scale, m.models.belief.shape[0]
     scale[:] = k.missing_torque.prior_std
@@ -213,7 +220,8 @@ def scale_of(k: Constants, m: Memory, is_by_place: bool) -> Vector:
 def _is_found_again(k: Constants, m: Memory) -> bool:
     """Return whether the torque found in an earlier stretch explains this stretch, too; fill `rms_Nm` (n,).
 
-    Fill `full` with this stretch's best model that has the earlier torque. False without an earlier torque.
+    Call `is_found` before, which fills `basic`. Fill `full` with this stretch's best model that has the earlier torque;
+    overwrite `row`. False without an earlier torque.
     """
     own = m.missing_torque
     own.rms_Nm[:] = 0.0
@@ -238,14 +246,17 @@ def _is_found_again(k: Constants, m: Memory) -> bool:
 
 @compiled
 def _fill_missing(m: Memory) -> None:
-    """Fill `rms_Nm` (n,) with the torque by place found in each joint."""
+    """Fill `rms_Nm` (n,) with each joint's torque by which `full` and `basic` differ."""
     for i in range(m.missing_torque.rms_Nm.shape[0]):
         m.missing_torque.rms_Nm[i] = _rms_Nm(m, i)
 
 
 @compiled
 def _rms_Nm(m: Memory, joint: int) -> float:
-    """Return the rms difference of the models with and without torque by place on a joint's samples, Nm."""
+    """Return the rms torque, Nm, over a joint's learnt rows, weighted by 1/R, by which two fits differ.
+
+    `full`: with a torque that depends on the position; `basic`: without. Overwrites `row`.
+    """
     own = m.missing_torque
     apart = own.row
     for j in range(apart.shape[0]):
@@ -256,9 +267,9 @@ def _rms_Nm(m: Memory, joint: int) -> float:
 
 @compiled
 def log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
-    """Return the log evidence of the columns with a deviation s (f,) above 0, less a common constant.
+    """Return the log evidence of the columns with a prior deviation s (f,) above 0, less a constant common to all s.
 
-    b (f,): the sums Σ v r/R. Fill x (f,) with the columns' most likely coefficients, 0 where s is 0.
+    b (f,): the sums Σ v r/R. Fill x (f,) with the columns' most likely coefficients, 0 where s is 0. Overwrites `M`.
     """
     M, count, log_det = m.missing_torque.M, s.shape[0], 0.0
     for j in range(count):
@@ -290,7 +301,7 @@ def squares_left(m: Memory, x: Vector) -> float:
 
 
 def describe(m: Memory) -> list[str]:
-    """Return the size of the torque that the model lacks, in one line; empty without such a torque."""
+    """Return one line on the torque that the model lacks, with its rms by joint; [] without such a torque."""
     missing_Nm = m.missing_torque.rms_Nm.tolist()
     if not any(missing_Nm):
         return []

@@ -33,8 +33,8 @@ def begin(m: Memory) -> None:
 def test(k: Constants, m: Memory) -> bool:
     """Add one sample to the candidate's test; at the test's end use a better candidate as the certified model.
 
-    Begin the next test then. Return True only at the end of a test that the candidate passes, but for an anchor that
-    excludes its torque offset: the certificate is to be revoked.
+    Then begin the next test. Return True only if an anchor excludes the torque offset of a candidate that has passed
+    otherwise: the certificate is to be revoked.
     """
     own = m.candidate
     own.cycles += 1.0

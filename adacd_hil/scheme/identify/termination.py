@@ -40,7 +40,7 @@ def is_quiet(tau_ext_hat: Vector, beta_Nm: float) -> bool:
 
 @compiled
 def begin_fit(m: Memory) -> None:
-    """Clear the evidence of the fit before in the certified scheme, with excitation 0 and condition inf."""
+    """Clear the evidence of the fit before in the certified scheme: motion, excitation, condition."""
     begin(m.motion)
     m.fit.excitation = 0.0
     m.fit.condition = np.inf
@@ -58,7 +58,7 @@ def follow(k: Constants, m: Memory, q: Vector, dq: Vector, W_f: Vector) -> bool:
 
 @compiled
 def begin_test(k: Constants, m: Memory, square: float) -> None:
-    """Begin the test of a frozen model: clear its count and the joints' speeds, and set the largest residual allowed.
+    """Begin the test of a frozen model: set its count to 0, clear the joints' speeds, and set `test_limit_Nm`.
 
     square: mean square of the fit's residuals over that of the settings.
     """
@@ -72,7 +72,7 @@ def test(k: Constants, m: Memory, dq: Vector, tau_ext_hat: Vector) -> int:
     """Add a sample to the test; return -1 if the model is refuted, 1 if it has passed, 0 if the test goes on.
 
     Refuted: a joint's |tau_ext_hat| is over `test_limit_Nm`. Passed: `test_cycles` samples, and each joint has once
-    reached `velocity_rad_s`.
+    reached `velocity_rad_s` in either direction.
     """
     own = m.motion
     m.fit.tested += 1.0
@@ -94,9 +94,11 @@ TEST_SHARE = 6.0
 
 @compiled
 def is_complete(k: Constants, m: Memory) -> bool:
-    """Return whether a fit can be frozen: enough samples, inertia, each parameter known, enough excitation and motion.
+    """Return whether a fit can be frozen.
 
-    Inertia: the mass matrix is positive definite. With a payload the first three are enough.
+    There must be enough samples, a mass matrix that is positive definite, and a small enough deviation of each
+    parameter; without a payload also enough excitation, a condition that is small enough, and enough motion of each
+    joint.
     """
     own = m.motion
     is_payload = m.models.is_payload != 0.0
@@ -114,7 +116,7 @@ def is_complete(k: Constants, m: Memory) -> bool:
 
 @compiled
 def test_limit_Nm(k: Constants, square: float) -> float:
-    """Return the largest |tau_ext_hat| of the slowest filter that a test allows.
+    """Return the largest |tau_ext_hat| of the slowest filter, Nm, that a test allows; at most `beta_Nm`.
 
     square: mean square of the fit's residuals over that of the settings. If the fit explains the arm well, the test
     requires the same: a torque just below `beta_Nm` may be a touch that was half learnt.

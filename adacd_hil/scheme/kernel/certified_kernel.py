@@ -69,8 +69,9 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     """Reset belief, filters, fit and residuals, to learn from the prior, or a payload on top of the certified arm.
 
     is_first: the first attempt on the present arm. False: an earlier attempt failed; its samples stay as evidence of a
-    torque by place. The belief learnt before is dropped, so a contact on the way leaves no trace, whenever it is
-    detected. Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
+    torque that depends on the position. The belief learnt before is dropped, so a contact on the way leaves no trace,
+    whenever it is detected. Filters that started with the old payload would mix the old theta into the new one for
+    about 4 / a.
     """
     k, m = constants[0], memory[0]
     if is_first:
@@ -91,7 +92,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
 
 @compiled
 def begin_test(constants: Structured, memory: Structured) -> None:
-    """Freeze the belief, without negative friction, as the model in use, and reset the counts of its test."""
+    """Use the belief, without negative friction, as the model, and begin its test, with all counts at 0."""
     k, m = constants[0], memory[0]
     belief.freeze(k, m)
     margin.begin_sight(m)
@@ -149,7 +150,8 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
 def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
     """Advance the bank to this sample, missing samples interpolated, and fill the torques of the block.
 
-    steps: periods since the fresh sample before. Return False after a gap: the filters resume from the sample.
+    steps: periods since the fresh sample before. Return False after a gap, when the filters resume from the sample; a
+    moving arm then doesn't learn for `settle_cycles`.
     """
     nominal_s: float = k.period_s
     period_s: float = out.period_s
@@ -191,7 +193,11 @@ def _take_sample(
     is_seen: bool,
     tau_ext_wide_hat: Vector,
 ) -> None:
-    """Advance the bank by one period to a sample, or resume there, and compare with the model in use."""
+    """Advance the bank by one period to a sample, and compare it with the model in use.
+
+    is_seen: False after a gap: the filters resume from the sample. Fill tau_ext_wide_hat (2,), and the residuals,
+    channels, standstill, velocity noise and friction at rest of `m`.
+    """
     cutoff = k.cutoff
     regressor.fill(k, m, q, dq, tau_J, period_s)
     filter_bank.take_sample(k, m, tau_J, is_seen)
@@ -214,8 +220,8 @@ def _take_sample(
 def _watch(k: Constants, m: Memory, out: CertifiedBlock, is_fresh: bool) -> int:
     """Fill the thresholds and compare the residuals with them; return bits of an observation, or 0.
 
-    The bits: CONTACT, COLLISION, and from CONTACT_SHIFT on one per joint over its threshold. is_fresh: False keeps the
-    thresholds of the sample before.
+    CONTACT, and from CONTACT_SHIFT on one bit per joint over its threshold. COLLISION: a bare channel is over
+    `collision_Nm`, too. is_fresh: False keeps the thresholds of the sample before.
     """
     if is_fresh:
         sensitivity.fill_thresholds(k, m, m.sensitivity.h)
@@ -262,7 +268,10 @@ def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode
 
 @compiled
 def _follow_noise(k: Constants, m: Memory, is_free: bool, mode: int) -> None:
-    """Add a sample to the noise of velocity and the largest residuals; discard waiting samples if not `is_free`."""
+    """If `is_free`, update the velocity's noise by a sample, and while testing or refining the largest residuals.
+
+    Else discard the samples that wait in the ring, and the residuals of the last two blocks.
+    """
     if not is_free:
         belief.discard(m)
         margin.discard_tail(m)
@@ -274,7 +283,11 @@ def _follow_noise(k: Constants, m: Memory, is_free: bool, mode: int) -> None:
 
 @compiled
 def _test(k: Constants, m: Memory, dq: Vector) -> int:
-    """Add this sample to the test of the frozen model; return CERTIFIED, REFUTED with or without WITHHELD, or 0."""
+    """Add this sample to the test of the frozen model; return CERTIFIED, REFUTED, REFUTED and WITHHELD, or 0.
+
+    0 while the test goes on. WITHHELD: the model lacks a torque that depends on the position. Set `withheld_by` if
+    refuted.
+    """
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_test_share, False)
     margin.follow_test(k, m)
     result = termination.test(k, m, dq, m.filters.r[filter_bank.SLOW])
@@ -291,7 +304,8 @@ def _test(k: Constants, m: Memory, dq: Vector) -> int:
 def _refine(k: Constants, m: Memory) -> int:
     """Learn on beside the model in use, and replace it by a better tested candidate.
 
-    Return WITHHELD if something contradicts the certificate, with the cause in `withheld_by`, else 0.
+    Return WITHHELD if later evidence contradicts the certificate, else 0; set `withheld_by` to the contradiction, or
+    NOTHING.
     """
     sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_share, True)
     sensitivity.decay_strain(k, m)
@@ -308,7 +322,10 @@ def _refine(k: Constants, m: Memory) -> int:
 
 @compiled
 def _fill_model(k: Constants, m: Memory, out: CertifiedBlock) -> None:
-    """Fill the block's fields of the model in use, of the channels, and of the fit's progress."""
+    """Fill the block's fields of the model in use, of the channels, and of the fit's progress.
+
+    The channels' thresholds only while thresholds are in force.
+    """
     base, joints = int(k.first_offset), m.filters.y.shape[1]
     for j in range(m.models.theta.shape[0]):
         if j < base:

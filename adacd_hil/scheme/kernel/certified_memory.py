@@ -60,7 +60,7 @@ def prior_of(settings: Settings) -> Vector:
 
 
 def prior_std_of(settings: Settings) -> Vector:
-    """Return the prior standard deviation of an unknown arm (p,)."""
+    """Return the prior standard deviation of each parameter of an unknown arm (p,), in the parameter's unit."""
     names = parameter_names(settings)
     std = _by_kind(settings.certified.prior_std, names)
     for j, name in enumerate(names):
@@ -87,9 +87,9 @@ def _first_of(term: str, names: tuple[str, ...]) -> int:
 
 
 def _enough_std_of(settings: Settings) -> Vector:
-    """Return the standard deviation that each parameter (p,) must reach for a complete fit.
+    """Return the standard deviation (p,) below which each parameter is known well enough for a complete fit.
 
-    That of an offset is combined with the bound on the torque by place.
+    That of an offset is combined with the bound on the torque that depends on the position.
     """
     std = _by_kind(settings.certified.enough_std, parameter_names(settings))
     base = len(settings.estimator.parameter_names)
@@ -196,7 +196,7 @@ def _waiting_of(settings: Settings) -> int:
 
 
 def sizes_of(settings: Settings) -> dict[str, int]:
-    """Return the sizes of arrays by the names that the annotations of `Memory` use."""
+    """Return the sizes of arrays by the names that the annotations of `Memory` use, such as "p" or "filters"."""
     count = len(parameter_names(settings))
     return {
         "n": JOINTS,
@@ -247,6 +247,6 @@ def new_block(settings: Settings) -> Structured:
 
 
 def numbers_of(settings: Settings) -> Numbers:
-    """Return the kernel's arrays for one run, before the first sample."""
+    """Return new arrays of the kernel for one run, as they are before the first sample."""
     block = new_block(settings)
     return Numbers(constants_of(settings), new_memory(settings), block, block.view(np.float64))

@@ -41,7 +41,10 @@ BEFORE_CONTACT = LEFT | REFUSED | TOOK_OVER | ACCEPTED
 
 
 class Decision:
-    """The result of a cycle. observation: bits of an observation (`transitions`)."""
+    """The result of a cycle. observation: bits of an observation (`transitions`).
+
+    contact_joints: bit i for joint i + 1.
+    """
 
     state: Annotated[int, np.uint8]
     previous_state: Annotated[int, np.uint8]
@@ -65,8 +68,8 @@ class RunConstants:
 class RunMemory:
     """Memory common to both schemes.
 
-    is_measured: intervals of samples are measured; sampled_ns: time of the last fresh one, is_sampled: there was one.
-    is_model_valid: the model may be fed forward. is_refusing: a refusal is pending that the user may accept.
+    is_measured: intervals of samples are measured; sampled_ns: time of the last complete one, is_sampled: there was
+    one. is_model_valid: the model may be fed forward. is_refusing: a refusal is pending that the user may accept.
     """
 
     supervisor: SupervisorMemory
@@ -113,7 +116,8 @@ def new_course(settings: Settings) -> tuple[Structured, Structured]:
 def interval_s(m: RunMemory, sample: Sample) -> float:
     """Return the time from the last complete sample to this one, s, and store this one's time in `m`.
 
-    0 for the first sample, an incomplete sample, and a run that doesn't measure intervals (`m.is_measured` = 0).
+    For an incomplete sample, or in a run that doesn't measure intervals (`m.is_measured` = 0), return 0 and store no
+    time. 0 also for the first sample.
     """
     if m.is_measured == 0 or sample.is_complete == 0:
         return 0.0
@@ -261,10 +265,10 @@ def end_paper(
 
 @compiled
 def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, decision: Decision) -> int:
-    """Run the supervisor; return LEFT, REFUSED or ACCEPTED as bits, tasks for Python before the contact's course.
+    """Run the supervisor; return LEFT, REFUSED or ACCEPTED as bits, tasks for Python before the contact's course; or 0.
 
     observation: the kernel's findings, see `transitions`. Fill previous state, findings and joints in contact of
-    `decision`. A pending refusal that the user accepts in this cycle doesn't withhold a certificate.
+    `decision`. If the user accepts a pending refusal in this cycle, the cycle doesn't withhold a certificate.
     """
     asked, previous = 0, m.supervisor.state
     if sample.request == Request.ACCEPT:
@@ -287,7 +291,7 @@ def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, deci
 def follow_contact(
     k: RunConstants, m: RunMemory, sample: Sample, decision: Decision, tau_ext_hat: Vector, tau_ext: Vector
 ) -> int:
-    """Advance the contact's course by one cycle, and fill the decision; return REPORT if a report is due."""
+    """Advance the contact's course by one cycle, and fill the decision; return REPORT if a report is due, else 0."""
     is_due = course.follow(
         k.contact,
         m.contact,

@@ -24,7 +24,7 @@ SHORTEST_SHARE, LONGEST_SHARE = 0.5, 1.5
 
 
 class Numbers(NamedTuple):
-    """A kernel's arrays. values: the same memory as block, as (size,) float64."""
+    """A kernel's arrays, each of one element. values: the block's memory as (size,) float64."""
 
     constants: Structured
     memory: Structured
@@ -36,7 +36,10 @@ SAMPLE = described(Sample, {"n": JOINTS})
 
 
 def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
-    """Write arm state and request of one cycle into `samples` (1,), of type SAMPLE."""
+    """Write arm state and request of one cycle into `samples` (1,), of type SAMPLE.
+
+    `age` is that of the oldest value.
+    """
     age = max(*arm.age_q, *arm.age_tau_J)
     sampled_ns = arm.t_ns if arm.sampled_ns is None else arm.sampled_ns
     counts = arm.cycle, arm.periods, arm.steps, sampled_ns, age, arm.fault, request
@@ -57,7 +60,10 @@ def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
 
 @compiled
 def put_sample(block: Structured, sample: Sample, period_s: float) -> None:
-    """Write q, dq, tau_J of a sample, and the interval before it, into the block for the kernel's next step."""
+    """Write q, dq, tau_J of a sample, and the interval before it, into the block for the kernel's next step.
+
+    period_s: 0: not measured.
+    """
     out: SchemeBlock = block[0]
     for i in range(out.q.shape[0]):
         out.q[i] = sample.q[i]
@@ -78,9 +84,10 @@ def limits_of(settings: Settings) -> Limits:
 
 @compiled
 def observe(limits: Limits, nominal_s: float, block: Structured, steps: int, too_fast: int) -> int:
-    """Return the findings of q, dq, tau_J as bits of an observation, with UNSEEN set; fill a period_s not measured.
+    """Return the findings of q, dq, tau_J as bits of an observation, with UNSEEN set.
 
-    steps: periods since the fresh sample before it. too_fast: the bit of a joint beyond its velocity limit.
+    Replace a period_s of 0 in the block by `steps` nominal periods. steps: periods since the fresh sample before it.
+    too_fast: the bit of a joint beyond its velocity limit.
     """
     out: SchemeBlock = block[0]
     if out.period_s == 0.0:
@@ -103,10 +110,10 @@ def observe(limits: Limits, nominal_s: float, block: Structured, steps: int, too
 
 @compiled
 def is_filled(steps: int, period_s: float, nominal_s: float, most: int) -> bool:
-    """Return whether the samples missing before a sample may be interpolated, or none is missing.
+    """Return whether the samples missing before a sample may be interpolated; True also if none is missing.
 
-    steps: periods since the sample before. period_s: measured time since then, which must be near steps * nominal_s.
-    most: largest number of missing samples.
+    steps: periods since the sample before. period_s: measured time since then, which must be 0.5 to 1.5 times steps *
+    nominal_s. most: largest number of missing samples.
     """
     if not 1 <= steps <= most + 1:
         return False
@@ -115,7 +122,7 @@ def is_filled(steps: int, period_s: float, nominal_s: float, most: int) -> bool:
 
 @compiled
 def put_between(last: Vector, q: Vector, dq: Vector, tau_J: Vector, share: float, between: Vector) -> None:
-    """Fill `between` (3, n) with the sample at a share of the way from `last` (3, n) to q, dq, tau_J (n,)."""
+    """Fill `between` (3, n) with the sample at a share, 0 to 1, of the way from `last` (3, n) to q, dq, tau_J (n,)."""
     for i in range(between.shape[1]):
         between[0, i] = last[0, i] + share * (q[i] - last[0, i])
         between[1, i] = last[1, i] + share * (dq[i] - last[1, i])

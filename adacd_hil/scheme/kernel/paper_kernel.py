@@ -58,7 +58,11 @@ line is within 2.1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
 
 
 class PaperMemory:
-    """The memory of the paper's scheme. mode: that of a step beside another scheme."""
+    """The memory of the paper's scheme. mode: LEARN, then ARMED, of a step beside another scheme.
+
+    motion: evidence of the excitation. quiet_cycles: cycles in a row within beta, eq. (15). standstill, integral, peak:
+    see `external_torque`. last, between: q, dq, tau_J of the sample before, and of an interpolated one.
+    """
 
     has_gap: float
     mode: float
@@ -156,7 +160,7 @@ def new_block(parameter_count: int) -> Structured:
 
 
 def numbers_of(settings: Settings) -> Numbers:
-    """Return the kernel's arrays for one run, before the first sample."""
+    """Return new arrays of the kernel for one run, as they are before the first sample."""
     count = len(settings.estimator.parameter_names)
     block = new_block(count)
     return Numbers(constants_of(settings), new_memory(count), block, block.view(np.float64))
@@ -263,7 +267,7 @@ def _advance(
 
 @compiled
 def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: SchemeBlock) -> None:
-    """Fill the torques predicted by the estimate and by the CAD model, and the external torque by each."""
+    """Fill the torques predicted by the estimate and by the CAD model, and the external torques by these."""
     external_torque.follow_standstill(dq, c.standstill_rad_s, decay, m.standstill)
     external_torque.predict(m.W_f, out.theta_hat, out.tau_f_hat)
     external_torque.predict(m.W_f, c.theta_cad, out.tau_f_cad)
@@ -274,7 +278,10 @@ def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: S
 
 @compiled
 def _learn(c: PaperConstants, m: PaperMemory, out: SchemeBlock, period_s: float) -> int:
-    """Test the estimate by eq. (15) on this sample, then correct it; return ADAPTED if the adaptation is over, or 0."""
+    """Test the estimate by eq. (15) on this sample, then correct it; return ADAPTED if the adaptation is over, or 0.
+
+    It is if eq. (15) has held for `hold_cycles` in a row, with enough excitation and motion.
+    """
     if excitation.gather(m.motion, out.q, out.dq, m.W_f, period_s):
         out.excitation = excitation.eigenvalue_range(m.motion.information, c.scale, m.motion.scratch)[0]
     m.quiet_cycles = m.quiet_cycles + 1.0 if termination.is_quiet(out.tau_ext_hat, c.beta_Nm) else 0.0
@@ -296,7 +303,8 @@ def _watch(
     """Fill the thresholds and compare the torques with them; return bits of an observation, or 0 without a contact.
 
     The bits: CONTACT and COLLISION, which this scheme doesn't tell apart, and from CONTACT_SHIFT on one per joint.
-    is_reporting: a report is open, so the contact's impulse and peak are kept.
+    is_fresh: False adds nothing to the contact's impulse and peak. is_reporting: a report is due, so they don't begin
+    anew.
     """
     F_c = out.theta_hat[regressor.F_C1 : regressor.F_C2 + 1]
     external_torque.fill_threshold(c.threshold_Nm, m.standstill, F_c, out.threshold)

@@ -64,9 +64,9 @@ def channels_of(settings: Settings) -> tuple[tuple[float, float | None], ...]:
 
 
 def step_response(after_s: float, a_rad_s: float, b_rad_s: float | None) -> float:
-    """Return the output of a low-pass, after_s after a step of 1 at its input.
+    """Return the output, after_s after a step of 1 at the input, of a low-pass of cut-off a_rad_s.
 
-    Of cut-off a, or with b_rad_s of two in a row: 1 - (b e^(-a t) - a e^(-b t)) / (b - a).
+    With b_rad_s, of two low-passes in a row: 1 - (b e^(-a t) - a e^(-b t)) / (b - a).
     """
     if b_rad_s is None:
         return 1.0 - math.exp(-a_rad_s * after_s)
@@ -117,9 +117,10 @@ def discretise(cutoff_rad_s: Vector, period_s: float, decay: Vector, weight_old:
 
 @compiled
 def take_sample(k: Constants, m: Memory, tau_J: Vector, is_seen: bool) -> None:
-    """Advance all filters over one period to a sample, Y_p, Y_h of `m` and tau_J (n,); after a gap they resume from it.
+    """Advance all filters over one period to a sample, Y_p, Y_h of `m` and tau_J (n,).
 
-    `rates` (3, C) of `m`: the filters' coefficients for the period, see `FirstOrderHold`.
+    is_seen: False after a gap: the filters resume from the sample. `rates` (3, C) of `m`: the filters' coefficients for
+    the period, see `choose_rates`.
     """
     own = m.filters
     rates = own.rates
@@ -141,7 +142,10 @@ def take_sample(k: Constants, m: Memory, tau_J: Vector, is_seen: bool) -> None:
 
 @compiled
 def fill_lag(cutoff_rad_s: Vector, tau_J: Vector, tau_f: Vector, first_column: int, W_f: Vector) -> None:
-    """Fill the columns of the lag in W_f (C, n, p), from `first_column` on: the filtered derivative of each tau_J."""
+    """Write the columns of the lag into W_f (C, n, p), from `first_column` on: the filtered derivative of each tau_J.
+
+    Only the cells of a joint's own lag are written.
+    """
     for c in range(cutoff_rad_s.shape[0]):
         for i in range(tau_J.shape[0]):
             W_f[c, i, first_column + i] = cutoff_rad_s[c] * (tau_J[i] - tau_f[c, i])
@@ -149,9 +153,10 @@ def fill_lag(cutoff_rad_s: Vector, tau_J: Vector, tau_f: Vector, first_column: i
 
 @compiled
 def fill_cross_talk(tau_f: Vector, first_column: int, W_f: Vector) -> None:
-    """Fill the columns of cross-talk in W_f (C, n, p), from `first_column` on: the other joint's filtered torque.
+    """Write the other joint's filtered torque into W_f (C filters, 2, p).
 
-    For two joints. The other joint's torque is itself distorted by cross-talk, but that error is of second order.
+    Joint 1's row at `first_column`, joint 2's at the next. All other cells stay as they are. The other joint's torque
+    is itself distorted by cross-talk, but that error is of second order.
     """
     for c in range(W_f.shape[0]):
         W_f[c, 0, first_column] = tau_f[c, 1]
@@ -177,11 +182,12 @@ def estimate_external(tau_f: Vector, W_f: Vector, theta: Vector, tau_ext_hat: Ve
 
 @compiled
 def smooth(smoothing: float, r: Vector, y: Vector) -> None:
-    """Advance the channels y (2 C - 1, n) by one period: r (C, n) through a second low-pass, then all but r[0] as is.
+    """Advance the channels y (2 C - 1, n) by one period: r (C, n) through a second low-pass, then copies of r[1:].
 
-    The drive's velocity noise rises with frequency up to the bandwidth of its tracking loop. A first-order filter
-    passes it on through the momentum undiminished; a second pole takes it away, for a few milliseconds of a small
-    step's detection. A large step is detected in the bare residual first.
+    smoothing: that low-pass's factor for one period. The drive's velocity noise rises with frequency up to the
+    bandwidth of its tracking loop. A first-order filter passes it on through the momentum undiminished; a second pole
+    takes it away, for a few milliseconds of a small step's detection. A large step is detected in the bare residual
+    first.
     """
     count = r.shape[0]
     for c in range(count):

@@ -39,7 +39,10 @@ def smooth_sign(dq: float, still_rad_s: float, width_rad_s: float) -> float:
 
 @compiled
 def bend_bristles(dq: Vector, period_s: float, still_rad_s: float, dahl_rad: Vector, bent: Vector) -> None:
-    """Advance `bent` (2, n), the bristles' bend of each length dahl_rad (2,), by one period; -1 or 1: they slide."""
+    """Advance `bent` (2, n), the bristles' bend of each length dahl_rad (2,), by one period; -1 or 1: they slide.
+
+    A joint slower than still_rad_s keeps its bend.
+    """
     for length in range(bent.shape[0]):
         for i in range(dq.shape[0]):
             if abs(dq[i]) >= still_rad_s:

@@ -61,7 +61,10 @@ def _fill_friction_and_gravity(q: Vector, dq: Vector, level_rad: float, W: Vecto
 
 @compiled
 def regressor(q: Vector, dq: Vector, ddq: Vector, parameter_count: int, level_rad: float) -> Vector:
-    """Return the regressor W (2, p) of eq. (17), tau = W theta. level_rad: q1 at which link 1 is level."""
+    """Return the regressor W (2, p) of eq. (17), tau = W theta. level_rad: q1 at which link 1 is level.
+
+    parameter_count: p, 7 or with gravity 9.
+    """
     W = np.zeros((JOINTS, parameter_count))
     fill_momentum(q, ddq, W)  # M ddq
     s2 = np.sin(q[1])
@@ -132,7 +135,7 @@ def fill(k: Constants, m: Memory, q: Vector, dq: Vector, tau_J: Vector, period_s
 def payload_direction(link_length_m: tuple[float, float], count: int, gravity_m_s2: float) -> Vector:
     """Return the contribution of 1 kg at the tip of a 2R arm to its parameters (count,).
 
-    gravity_m_s2: in the plane, 0 without gravity there.
+    It is 0 for all but those of inertia and gravity. gravity_m_s2: in the plane, 0 without gravity there.
     """
     l1, l2 = link_length_m
     direction = np.zeros(count)

@@ -14,7 +14,7 @@ PLACE_TERMS = len(POSITION_TERMS)
 
 @compiled
 def fill_position(q: Vector, X: Vector) -> None:
-    """Fill X (n, PLACE_TERMS) with the columns of torque by place at q (n,), in the order of `POSITION_TERMS`."""
+    """Fill X (n, PLACE_TERMS) with the columns of torque by position at q (n,), in the order of `POSITION_TERMS`."""
     total = np.sum(q)
     sin_sum, cos_sum = np.sin(total), np.cos(total)
     for i in range(q.shape[0]):
@@ -26,7 +26,10 @@ def fill_position(q: Vector, X: Vector) -> None:
 
 @compiled
 def put_position_columns(X: Vector, first_column: int, Y_h: Vector) -> None:
-    """Put X (n, PLACE_TERMS) into Y_h (n, p) from `first_column` on, by term and then by joint."""
+    """Write X (n, PLACE_TERMS) into Y_h (n, p) from `first_column` on, by term and then by joint.
+
+    Only the cells of a joint's own columns are written.
+    """
     joints = X.shape[0]
     for i in range(joints):
         for term in range(PLACE_TERMS):

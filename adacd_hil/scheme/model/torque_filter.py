@@ -91,7 +91,7 @@ def resume(
 ) -> None:
     """Set S and input_old (2, p), tau_old (2,) in place so that the filters go on from this sample after a gap.
 
-    W_f (2, p) and tau_f stay as they were. a, b: of F(s), rad/s.
+    W_f (2, p) and the filtered torque stay as they were. a, b: of F(s), rad/s.
     """
     for i in range(W_f.shape[0]):
         tau_old[i] = tau_new[i]

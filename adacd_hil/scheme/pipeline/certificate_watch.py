@@ -51,9 +51,9 @@ _CONTRADICTIONS = {
 
 
 class _Refusal(NamedTuple):
-    """A refusal: its contradiction and text; torques (n,) that were judged, their standard deviations.
+    """A refused reading at rest or fit: number of its contradiction, and its text, a line each.
 
-    times: refusals in a row.
+    torque_Nm, std_Nm (n,): the torques that were judged, their standard deviations. times: refusals in a row.
     """
 
     cause: int
@@ -66,7 +66,7 @@ class _Refusal(NamedTuple):
 class CertificateWatch:
     """Makes events of the kernel's findings on certificates, stores the certificates, and accepts a refused fit.
 
-    last_utc: date of the last run's certificate.
+    last_utc: date of the last run's certificate, for texts.
     """
 
     def __init__(self, k: Constants, m: Memory, last_utc: str) -> None:
@@ -80,16 +80,19 @@ class CertificateWatch:
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
-        """Return the certificates that were not taken back, in order."""
+        """The run's certificates that were not taken back, oldest first."""
         return tuple(self._certificates)
 
     @property
     def is_refusing(self) -> bool:
-        """Return whether a refusal stands: without a reply, a certificate or the enabling of the drives since."""
+        """Whether a refused reading at rest or fit still waits for the user.
+
+        The user's `accept`, a new certificate, or the enabling of the drives ends the refusal.
+        """
         return self._refusal is not None
 
     def enter(self, previous: SchemeState, state: SchemeState) -> Event | None:
-        """Store the certificate and return its event if the arm has just passed its test; else return None.
+        """Store a certificate and return its event if the state changes from CERTIFY to MONITOR; else return None.
 
         A certificate, or the enabling of the drives, ends a refusal.
         """
@@ -116,7 +119,10 @@ class CertificateWatch:
         return "; ".join([*texts, *[known_by] * known_by.startswith((BY_WORD, BY_FITS_THAT_AGREE))])
 
     def _known_by(self) -> str:
-        """Return the evidence on which the fit's friction and inertia rest, as text."""
+        """Return the evidence for the fit's friction and inertia as text.
+
+        That is the user's word, fits that agree, the last certificate, or this run only.
+        """
         if self._vouched_against:
             return BY_WORD + self._vouched_against
         if self._m.earlier.has_lapsed:
@@ -127,8 +133,8 @@ class CertificateWatch:
     def refuse(self) -> Event | None:
         """Store a refusal of the reading at rest or of a fit, with its cause; return the event to report, or None.
 
-        None for a cause that is known already, but for each REPORT_EACH-th refused fit in a row. Call it before the
-        kernel forgets the fit.
+        None if the refusal before had the same cause; but each REPORT_EACH-th refused fit in a row is reported again.
+        Call it before the kernel forgets the fit.
         """
         before, m, cause = self._refusal, self._m, int(self._m.certificate.withheld_by)
         offsets = slice(int(self._k.first_offset), int(self._k.first_offset) + JOINTS)
@@ -164,7 +170,10 @@ class CertificateWatch:
         self._is_standing = False
 
     def push(self, torque_Nm: Vector) -> Event:
-        """Return the event that the stopped arm is still pushed. torque_Nm (n,): external, filtered."""
+        """Return the event that something still pushes the stopped arm. torque_Nm (n,): external, filtered.
+
+        Stores nothing.
+        """
         torque = ", ".join(f"{value:.2f}" for value in torque_Nm)
         remedy = "if nobody touches it the model is wrong, and `relearn` learns it anew"
         text = f"something still pushes the arm at rest, {torque} Nm by joint: {remedy}"
@@ -176,7 +185,10 @@ class CertificateWatch:
         return BriefedEvent.of(Event("warning", "touch", text), brief)
 
     def contradiction(self) -> CommonCause:
-        """Return the kernel's contradiction of a certificate in MONITOR: offset, torque by place, or less sight."""
+        """Return the kernel's contradiction of a certificate in MONITOR, `withheld_by`, as a common cause.
+
+        It is an offset, a torque that depends on the position, or a smallest push that has grown.
+        """
         return CommonCause("; ".join(self._describe(int(self._m.certificate.withheld_by))), is_payload=False)
 
     def _describe(self, cause: int) -> list[str]:
@@ -202,8 +214,8 @@ class CertificateWatch:
     def accept(self) -> Event:
         """Drop the evidence that refuses a fit or reading, at the user's request; return the event to report.
 
-        For offsets that an anchor excludes, set the refused offsets as the new anchor. Without a refusal do nothing and
-        return a warning.
+        For offsets that an anchor excludes, set the refused offsets as the new anchor. This ends the refusal. Without a
+        refusal change nothing and return a warning.
         """
         refusal, self._refusal = self._refusal, None
         if refusal is None:
@@ -227,7 +239,7 @@ class CertificateWatch:
         return Event("warning", _CONTRADICTIONS[refusal.cause][0], text)
 
     def describe(self) -> list[str]:
-        """Return the lines of the present refusal: causes, number of refused fits, remedy; empty without a refusal."""
+        """Return the lines of the present refusal: causes, number of refused fits, remedy; [] without a refusal."""
         if self._refusal is None:
             return []
         is_reading = self._refusal.cause == certificate.READING

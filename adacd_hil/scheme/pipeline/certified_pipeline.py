@@ -99,12 +99,12 @@ class CertifiedPipeline(Pipeline):
         return [*self._watch.describe(), *termination.describe_missing(self._k, self._m, self._names, PARAMETER_UNITS)]
 
     def describe_withheld(self) -> list[str]:
-        """Return the lines of a present refusal: its contradictions and the remedy; empty without a refusal."""
+        """Return the lines of a present refusal: its contradictions and the remedy; [] without a refusal."""
         return self._watch.describe()
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
-        """Return the certificates of the run that were not taken back, in order."""
+        """The run's certificates that were not taken back, oldest first."""
         return self._watch.certificates
 
     def take_events(self) -> list[Event]:
@@ -154,7 +154,10 @@ class CertifiedPipeline(Pipeline):
             self._events.append(event)
 
     def _judge_margin(self) -> None:
-        """Add the last second's largest residuals to the margin; report a margin or sight that has become worse."""
+        """Add the last second's largest residuals to the margin.
+
+        Report a margin or a smallest push that has become worse. A warning is reported once, until it has ended.
+        """
         self._margin.add_block(sensitivity.take_peak_shares(self._m))
         dim = "; ".join(margin.describe_dim(self._m))
         for name, warning in (("margin", self._margin.warning), ("sight", dim)):
@@ -166,7 +169,7 @@ class CertifiedPipeline(Pipeline):
         """Store the beginning or end of a contact in MONITOR; stop the arm if contacts have a common cause.
 
         Return the state after that. A common cause takes the certificate back, unless the reaction lets the arm go on.
-        Else report a contact that followed soon on another.
+        Without a common cause report a contact that followed soon on another.
         """
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
             is_contradicted = self._course.supervisor.cause == SchemeEvent.CONTRADICTED
@@ -201,9 +204,9 @@ class CertifiedPipeline(Pipeline):
             self._feed_forward()
 
     def _begin_adaptation(self, previous: SchemeState) -> None:
-        """Begin an adaptation: of a payload if the arm is certified, of the whole arm if not, or if a test was failed.
+        """Begin an adaptation: of a payload if the arm is certified, of the whole arm if not, or after a failed test.
 
-        Revoke the certificate first if that is the cause.
+        If the user has taken the certificate back, revoke it first.
         """
         cause = self._course.supervisor.cause
         if cause == SchemeEvent.REVOKED:
@@ -219,11 +222,9 @@ class CertifiedPipeline(Pipeline):
     def _learn_anew(self, is_first: bool) -> None:
         """Begin to learn from the prior, or from the certified arm with a payload; drop the present fit.
 
-        is_first: the adaptation begins; False: it begins again.
-
-        Runs, too, once a contact that interrupted an adaptation has been reported: the adaptation may have learnt the
-        contact's beginning. Or the arm is free of contact now, and the adaptation had learnt an earlier one. Then the
-        arm goes on only with a model that claims no knowledge.
+        is_first: the adaptation begins; False: it begins again, also after the last report of a contact that
+        interrupted it. It may have learnt the beginning of that contact, or an earlier one that has ended. The arm goes
+        on only with a model that claims no knowledge.
         """
         certified_kernel.begin_adaptation(*self.numbers[:2], self._is_payload, is_first)
 

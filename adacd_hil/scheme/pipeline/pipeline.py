@@ -46,8 +46,9 @@ from adacd_hil.structured import Structured
 class SchemeBatch(NamedTuple):
     """SchemeOutputs of n cycles, as columns.
 
-    cycle (n,) int64; state, previous_state, fault, reaction (n,) uint8; contact_joints (n,) int64; is_model_valid (n,)
-    bool; block (n, size). contacts: k reports, contact_places (k,) int64 the rows of their cycles.
+    cycle (n,) int64; state, previous_state, fault, reaction (n,) uint8; contact_joints (n,) int64, bit i for joint i +
+    1; is_model_valid (n,) bool; block (n, size), see `layout_of`. contacts: k reports, contact_places (k,) int64 the
+    indices of their cycles.
     """
 
     cycle: NDArray[np.int64]
@@ -102,7 +103,7 @@ class Pipeline(ABC):
 
     @property
     def state(self) -> SchemeState:
-        """Return the scheme's state after the last cycle."""
+        """The scheme's state after the last cycle."""
         return SchemeState(self._course.supervisor.state)
 
     def compile_cycle(self) -> None:
@@ -138,17 +139,20 @@ class Pipeline(ABC):
     def describe_missing(self) -> list[str]:
         """Return the conditions that an adaptation still waits for, a line each.
 
-        Empty for the paper's scheme, which waits for eq. (15).
+        [] in the paper's scheme, which waits for eq. (15) alone.
         """
         return []
 
     def describe_withheld(self) -> list[str]:
-        """Return the contradictions for which a certificate is withheld, as lines; empty for the paper's scheme."""
+        """Return the contradictions for which a certificate is withheld, as lines; [] without one.
+
+        [] also in the paper's scheme.
+        """
         return []
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
-        """Return the run's certificates that were not taken back, in order; empty for the paper's scheme."""
+        """The run's certificates that were not taken back, oldest first; () in the paper's scheme."""
         return ()
 
     def take_events(self) -> list[Event]:
@@ -209,7 +213,7 @@ class Pipeline(ABC):
     def _finish(self, asked: int, samples: Structured, decisions: Structured, place: int) -> ContactReport | None:
         """Run the tasks that the compiled cycle leaves to Python, and end the cycle; return a due report, or None.
 
-        asked: bits of the tasks. place: row of the cycle in samples and decisions.
+        asked: bits of the tasks. place: index of the cycle in samples and decisions, whose decision is completed.
         """
         cycle = int(samples["cycle"][place])
         if asked & BEFORE_CONTACT:

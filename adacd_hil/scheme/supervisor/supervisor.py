@@ -84,7 +84,7 @@ or dropped."""
 
 
 def among(states: Collection[SchemeState]) -> NDArray[np.bool_]:
-    """Return, per state, whether it is in `states`."""
+    """Return, by number of each state, whether it is in `states`."""
     return np.array([state in states for state in SchemeState])
 
 
@@ -110,7 +110,12 @@ _OVERDUE[[SchemeState.ADAPT, SchemeState.CERTIFY]] = FaultReason.ADAPT_TIMEOUT
 
 
 class SupervisorConstants:
-    """Counts of cycles and periods. limit_periods: longest stay, by state; only some states have one."""
+    """Counts of cycles and periods.
+
+    max_age_cycles: largest age of a value; blind_limit: cycles in a row without a new sample. clear_cycles: cycles
+    without contact that clear it; patience_cycles: periods after which a contact is latched; rebound_cycles: first
+    periods of REACT, in which speed is no fault. limit_periods: longest stay, by state; only some states have one.
+    """
 
     has_gravity: int
     max_age_cycles: int
@@ -128,10 +133,12 @@ class SupervisorMemory:
     """State of the supervisor.
 
     origin: state to which REACT or STOPPED returns: the state before, or ADAPT after a broken test. cause: the event by
-    which the state was entered. is_latched: the user must acknowledge the cause of REACT or STOPPED. is_doubted: the
-    model is wrong. pending: bits of the requests that wait. is_weight_announced: the user has announced the payload's
-    weight since REACT began. is_announced_here: the user has announced a new payload in this state. `phase_periods`,
-    `learning_periods`: periods in this state, and in the learning states. `_cycles`: cycles in a row.
+    which the state was entered. is_latched: the user must acknowledge the cause of REACT or STOPPED. is_doubted:
+    contacts with a common cause show that the model is wrong. pending: bits of the requests that wait.
+    is_weight_announced: the user has announced the payload's weight since REACT began. is_announced_here: the user has
+    announced a new payload in this state. `phase_periods`, `learning_periods`: periods in this state, and in the
+    learning states. Cycles in a row, `_cycles`: all checks of COMMISSION passed, at rest, in motion, without contact,
+    without a new sample, with old data.
     """
 
     state: int
@@ -172,7 +179,7 @@ def fill_constants(settings: Settings, k: SupervisorConstants) -> None:
 
 
 def begin(m: SupervisorMemory) -> None:
-    """Set the state to INIT, and the origin to MONITOR, before the first cycle."""
+    """Set the state to INIT, and the origin to MONITOR. Call it before the first cycle, with all other fields 0."""
     m.state, m.origin = SchemeState.INIT, SchemeState.MONITOR
 
 
@@ -180,10 +187,12 @@ def begin(m: SupervisorMemory) -> None:
 def supervise(
     k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
 ) -> None:
-    """Count the cycle's findings, take its request, and change the state if an event of the table has happened.
+    """Advance the supervisor in `m` by a cycle.
 
-    observation: its bits, see `transitions`. is_reporting: a contact's report is not final yet. goes_on: the reaction
-    in force lets the arm move on, so that a contact clears without rest.
+    Count findings, keep or drop the request, and latch a contact that has grown. Change the state at most once: for a
+    fault, else a contact, else progress. observation: bits of the findings, see `transitions`. is_reporting: a
+    contact's report is not final yet, so REACT can't end as settled. goes_on: the reaction in force lets the arm move
+    on, so that a contact clears without rest.
     """
     _count(m, arm, observation)
     if arm.request != Request.NONE:
@@ -252,7 +261,7 @@ def _is_pending(m: SupervisorMemory, request: int) -> bool:
 def _has_grown(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> bool:
     """Return whether a contact that clears itself must be acknowledged from this cycle on.
 
-    So after a collision, a late host, `patience_cycles`, or a payload to which the user has attributed the contact.
+    It must after a collision, a late host, or `patience_cycles`, or if the user has attributed it to a changed payload.
     """
     is_over = observation & COLLISION != 0 or arm.is_late != 0 or m.phase_periods >= k.patience_cycles
     return bool(is_over or _is_payload_announced(k, m))
@@ -267,10 +276,10 @@ def _is_announced(m: SupervisorMemory) -> bool:
 
 @compiled
 def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
-    """Return whether the user has said that a changed payload, or its weight in gravity, caused the contact.
+    """Return whether the user has announced a changed payload to which the contact is attributed.
 
-    The weight counts only if announced since the contact began: an earlier announcement cannot exclude a person's
-    touch.
+    It is if the model is in doubt; with gravity also if the payload was being changed, and the user announced its
+    weight since the contact began: an earlier announcement cannot exclude a person's touch.
     """
     is_weight = k.has_gravity != 0 and m.origin == SchemeState.PAYLOAD and m.is_weight_announced != 0
     return bool((m.is_doubted != 0 or is_weight) and _is_pending(m, Request.PAYLOAD_CHANGED))
@@ -278,7 +287,10 @@ def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
 
 @compiled
 def _enter(m: SupervisorMemory, state: int, event: int) -> None:
-    """Enter another state by `event`, reset its counts, and drop the requests that don't wait there."""
+    """Enter another state by `event`, reset its counts, and drop the requests that don't wait there.
+
+    Do nothing if `state` is the present one.
+    """
     if state == m.state:
         return
     if state == SchemeState.REACT:
@@ -305,7 +317,7 @@ def _event(
 ) -> int:
     """Return the event of this cycle: a fault, a contact, or progress of the state, in this order; else NONE.
 
-    Without any of them, a state that lasts too long is a fault. Store the reason of a fault in `m.fault`.
+    If there is none, a state that has lasted too long is a fault. Store the reason of a fault in `m.fault`.
     """
     fault = 0
     if _IS_CHECKED[m.state]:
@@ -325,7 +337,10 @@ def _event(
 
 @compiled
 def _touch(m: SupervisorMemory, arm: Sample, observation: int) -> int:
-    """Return COLLISION or CONTACT if this state reacts to it, else 0; an arm without torque can't react."""
+    """Return COLLISION or CONTACT if a joint is over its threshold and this state reacts to it; else NONE.
+
+    NONE also while the drives aren't enabled: an arm without torque can't react.
+    """
     if observation & ANY_CONTACT == 0 or arm.is_enabled == 0:
         return SchemeEvent.NONE
     event = SchemeEvent.COLLISION if observation & COLLISION else SchemeEvent.CONTACT
@@ -361,7 +376,11 @@ def _progress(
 
 @compiled
 def _released(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_still: bool) -> int:
-    """Return the event by which the user's request ends STOPPED in this cycle, or 0."""
+    """Return the event by which the user's request ends STOPPED in this cycle, or NONE.
+
+    No request does while the host is late. A changed payload and RELEARN need an arm at rest, an acknowledgement joints
+    below their thresholds.
+    """
     event: int = SchemeEvent.NONE
     is_late = arm.is_late != 0
     if _is_payload_announced(k, m):
@@ -408,7 +427,11 @@ def _begun(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
 
 @compiled
 def _settled(k: SupervisorConstants, m: SupervisorMemory, is_still: bool, goes_on: bool) -> int:
-    """Return the event that ends REACT in this cycle: AT_REST if latched, else CLEARED; NONE if it lasts."""
+    """Return the event that ends REACT in this cycle, or NONE.
+
+    AT_REST if the contact is latched and the arm at rest. CLEARED if it isn't latched, `clear_cycles` in a row were
+    without contact, and the arm is at rest or its reaction lets it go on.
+    """
     event: int = SchemeEvent.NONE
     if m.is_latched != 0:
         if is_still:
@@ -422,7 +445,8 @@ def _settled(k: SupervisorConstants, m: SupervisorMemory, is_still: bool, goes_o
 def _is_commissioned(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> bool:
     """Count this cycle if all its checks pass, and return whether enough cycles in a row have passed.
 
-    A cycle with incomplete data doesn't count but doesn't break the row: `_check` limits how many may be missing.
+    The checks: at rest, unloaded, no reading refused, no fault. A cycle with incomplete data doesn't count but doesn't
+    break the row: `_check` limits how many may be missing.
     """
     is_resting = observation & (_REST_UNLOADED | WITHHELD) == _REST_UNLOADED
     is_good = is_resting and _check(k, m, arm, observation) == FaultReason.NONE
@@ -482,7 +506,7 @@ class KeptRequest:
     def ask(self, request: Request, state: SchemeState) -> None:
         """Keep a request to finish, or to change the payload in a state that serves it; ignore all others.
 
-        FINISH replaces a kept request and is not replaced. state: that of the cycle before.
+        A request replaces the kept one, but nothing replaces FINISH. state: that of the cycle before.
         """
         is_kept = request is Request.FINISH or (request is Request.PAYLOAD and state in KEPT_IN[request])
         if is_kept and self.request is not Request.FINISH:
