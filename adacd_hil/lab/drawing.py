@@ -63,7 +63,7 @@ def _style() -> dict[Any, Any]:
 
 
 def style(more: dict[Any, Any] | None = None) -> AbstractContextManager[None]:
-    """Return a context manager that applies the figures' style, whatever the user's matplotlib configuration says.
+    """Return a context manager that applies the figures' style. The user's matplotlib configuration has no effect.
 
     more: rcParams that override the style's.
     """
@@ -72,7 +72,7 @@ def style(more: dict[Any, Any] | None = None) -> AbstractContextManager[None]:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure with its name, its title and a caption."""
+    """A figure with the name of its files, its title and a caption."""
 
     name: str
     title: str
@@ -99,10 +99,10 @@ def paper_svg(drawing: Drawing) -> str:
 
 
 def write_figures(out_dir: Path, name: str, described: dict[str, Any], drawings: Iterable[Drawing]) -> tuple[Path, ...]:
-    """Write NAME.json and each drawing, by its name, as PNG and SVG, into a folder; return the files' paths.
+    """Write NAME.json, and each drawing by its own name as PNG and SVG, into a folder; return the files' paths.
 
-    Make the folder if missing, and replace files of these names. described: content of NAME.json. Raises LogError if a
-    file can't be written.
+    The folder is made if missing; files of these names are replaced. described: content of NAME.json. Raises LogError
+    if a file can't be written.
     """
     contents: dict[str, bytes | str] = {f"{name}.json": json_text(described) + "\n"}
     for drawing in drawings:
@@ -112,9 +112,9 @@ def write_figures(out_dir: Path, name: str, described: dict[str, Any], drawings:
 
 
 def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.int64]:
-    """Return indices of y (k,): the smallest and the largest value of each of `bins` equal parts, and both ends.
+    """Return indices of y (k,), ascending: smallest and largest value of each of `bins` equal parts, and both ends.
 
-    Indices ascend. Of a series with at most two rows per part, all are returned. NaN is neither.
+    A series with at most two values per part is returned whole. NaN is never smallest or largest.
     """
     width = -(-len(y) // bins)
     if width <= 2:
@@ -123,7 +123,7 @@ def envelope(y: Vector, bins: int = _ENVELOPE_BINS) -> NDArray[np.int64]:
 
 
 def plot(axes: Axes, x: Vector, y: Vector, **look: Any) -> None:
-    """Draw y over x, both (k,), on the axes, reduced to the rows of y's `envelope`. look: as of `Axes.plot`."""
+    """Draw y over x, both (k,), on the axes, by the points of y's `envelope` only. look: as of `Axes.plot`."""
     rows = envelope(y)
     axes.plot(x[rows], y[rows], **look)
 
@@ -151,7 +151,7 @@ HistoryPanel = tuple[str, tuple[str, ...], Vector, Vector]
 
 
 def history_figure(dates: Sequence[str], panels: Sequence[HistoryPanel]) -> Drawing:
-    """Draw panels below each other, their values over n dates (ISO 8601) with bars of two deviations."""
+    """Return a drawing of panels below each other: values over n dates (ISO 8601), with bars of two deviations."""
     at = np.array([date.removesuffix("Z") for date in dates], dtype="datetime64[s]")
     with style():
         figure = Figure(figsize=(7.2, 2.0 * len(panels)), layout="constrained")

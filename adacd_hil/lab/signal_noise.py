@@ -15,9 +15,10 @@ _MEDIAN_TO_SIGMA: Final = 1.4826 / math.sqrt(6.0)  # of the second difference of
 
 
 def white_noise(*parts: Vector) -> Vector:
-    """Estimate the rms of the white noise on otherwise smooth series: (n,) for parts (k, n), a number for parts (k,).
+    """Return the rms of the white noise on smooth series: (n,) for parts (k, n), a 0-d array for parts (k,).
 
-    By the median of the second differences of all parts, which motion hardly changes. 0 if no part has three samples.
+    It is estimated by the median of the second differences of all parts, which motion hardly changes. 0 if no part has
+    three samples.
     """
     seconds = np.concatenate([np.abs(np.diff(part, 2, axis=0)) for part in parts])
     if not len(seconds):
@@ -26,7 +27,10 @@ def white_noise(*parts: Vector) -> Vector:
 
 
 def resolution(values: Vector) -> float:
-    """Return the step of a quantised series (k,): its smallest difference of two values, 0 if it never changes."""
+    """Return the step of a quantised series (k,): the smallest difference between two of its values.
+
+    0 if all are equal.
+    """
     levels = np.unique(values)
     steps = np.diff(levels)
     steps = steps[steps > 1e-9 * (levels[-1] - levels[0])]
@@ -34,7 +38,7 @@ def resolution(values: Vector) -> float:
 
 
 def low_pass(values: Vector, poles_rad_s: Sequence[float], period_s: float) -> Vector:
-    """Filter series (k,) or (k, n) by a first-order low-pass per pole, one after the other, each 0 at the start."""
+    """Return series (k,) or (k, n) after one first-order low-pass per pole in turn; each filter starts at 0."""
     from scipy.signal import lfilter  # takes half a second to load
 
     for pole in poles_rad_s:

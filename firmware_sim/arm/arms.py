@@ -36,7 +36,10 @@ STOP_DAMPING_NM_S: Final = (10.0, 2.0)
 
 
 def pack_fields(settings: object, layout: np.dtype[np.void]) -> np.void:
-    """Return a record of dtype `layout`, its fields filled from attributes of the same name, else 0."""
+    """Return a record of dtype `layout` with the values of the equally named attributes of `settings`.
+
+    Other fields are 0.
+    """
     numbers: np.void = np.zeros(1, layout)[0]
     for name in layout.names or ():
         if hasattr(settings, name):
@@ -97,7 +100,7 @@ class EmulatedArm:
                 raise ConfigError(f"`own_arm.{key}` = {list(getattr(self, key))} must be +1 or -1 for each device")
 
     def inertia(self, payload_kg: float = 0.0) -> tuple[float, float, float]:
-        """Return α, β, γ of the mass matrix, kg m², with a payload at the tip."""
+        """Return α, β, γ of the mass matrix, kg m², with a point mass `payload_kg` at the tip."""
         (length1_m, length2_m), (mass1_kg, mass2_kg) = self.link_length_m, self.mass_kg
         (center1_m, center2_m), (inertia1_kg_m2, inertia2_kg_m2) = self.center_m, self.inertia_kg_m2
         alpha = inertia1_kg_m2 + mass1_kg * center1_m**2
@@ -107,12 +110,15 @@ class EmulatedArm:
         return alpha, beta, gamma
 
     def theta(self, payload_kg: float = 0.0) -> Vector:
-        """Return the dynamic parameters with a payload at the tip, in the order of `records.PARAMETER_NAMES` (7,)."""
+        """Return the arm's parameters (7,) in the order of `records.PARAMETER_NAMES`, with a point mass at the tip."""
         alpha, beta, gamma = self.inertia(payload_kg)
         return np.array([alpha + gamma, beta, gamma, *self.viscous_Nm_s, *self.coulomb_Nm])
 
     def numbers(self) -> np.void:
-        """Return the arm without payload as one record of dtype ARM_NUMBERS, for compiled functions."""
+        """Return the arm without payload as one record of dtype ARM_NUMBERS, for compiled functions.
+
+        Joint stops are at ± `stop_deg`. Their stiffness and damping, and the current loops, have default values.
+        """
         numbers = pack_fields(self, ARM_NUMBERS)
         numbers["alpha"], numbers["beta"], numbers["gamma"] = self.inertia()
         numbers["current_loop_rad_s"][:] = CURRENT_LOOP_RAD_S
@@ -125,7 +131,10 @@ class EmulatedArm:
 
     @property
     def wiring(self) -> "Wiring":
-        """Joint, directions and zero of the device at each place."""
+        """Joint (0, 1), signs and zero of Drive1 and Drive2, Sensor1 and Sensor2.
+
+        The unit of the zeros is 2^-20 revolutions.
+        """
         drive, sensor = (tuple(joint - 1 for joint in places) for places in (self.drive_joint, self.sensor_joint))
         torque = tuple(turn * up for turn, up in zip(self.drive_sign, self.motor_sign, strict=True))
         zero = tuple(round(math.radians(zero_deg) / POSITION_LSB_RAD) for zero_deg in self.zero_deg)
@@ -168,9 +177,9 @@ ARMS: Final = {
 
 @dataclass(frozen=True)
 class Wiring:
-    """Joint (0, 1) and direction of the device at each place.
+    """Joint (0, 1) and direction (1, -1) of the device at each place: pairs are (Drive1, Drive2) or (Sensor1, Sensor2).
 
-    torque_sign: a drive's torque. zero_counts: position of each drive at q = 0, before its sign.
+    torque_sign: direction of a drive's torque. zero_counts: position of each drive at q = 0, before `drive_sign`.
     """
 
     drive_joint: Joints = (0, 1)
@@ -181,7 +190,10 @@ class Wiring:
     zero_counts: Joints = (0, 0)
 
     def read(self, measured: Measurement) -> Measurement:
-        """Return measured values of the joints by the devices' places, with each device's sign and zero."""
+        """Return a measurement whose pairs are by joint as the devices at places 1 and 2 give it, in counts.
+
+        Each device takes the value of its joint, with its sign; a drive adds its zero before the sign.
+        """
         positions, velocities, torques = measured
         (d1, d2), (s1, s2) = self.drive_joint, self.sensor_joint
         (up1, up2), (turn1, turn2) = self.drive_sign, self.sensor_sign

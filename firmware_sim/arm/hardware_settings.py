@@ -139,12 +139,16 @@ class MechanicsSettings:
 
     @property
     def holding_torque_Nm(self) -> Pair:
-        """Torque that the motors hold without power: own friction, brakes and cogging."""
+        """Torque that each motor holds without power: motor-side Coulomb friction, holding brake and ripple, summed."""
         first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, self.ripple_Nm, strict=True)
         return sum(first), sum(second)
 
     def check(self, arm: EmulatedArm, start_deg: Pair, payloads: Sequence[PayloadBody]) -> None:
-        """Raise ConfigError when these mechanics do not go with the arm, its start pose or its payloads."""
+        """Raise ConfigError when these mechanics do not go with the arm, its start pose or its payloads.
+
+        Causes: static below Coulomb friction, bristles without dry friction, a start pose beyond the joint stops, or an
+        eigenfrequency too fast to integrate.
+        """
         for joint in range(2):
             static_Nm, coulomb_Nm = self.static_Nm[joint], arm.coulomb_Nm[joint]
             if 0.0 < static_Nm < coulomb_Nm:
@@ -169,7 +173,10 @@ class MechanicsSettings:
             )
 
     def arm_numbers(self, arm: EmulatedArm) -> np.void:
-        """Return an arm with the joint stops set here as one record of dtype ARM_NUMBERS, for compiled functions."""
+        """Return an arm as one record of dtype ARM_NUMBERS, with the joint stops of these settings.
+
+        Stop angles that are absent here are the arm's own.
+        """
         numbers = arm.numbers()
         low_deg, high_deg = self._stops_deg(arm)
         numbers["stop_low_rad"], numbers["stop_high_rad"] = np.radians(low_deg), np.radians(high_deg)
@@ -204,9 +211,10 @@ class MechanicsSettings:
         return arm.viscous_Nm_s if self.sigma2_Nm_s is None else self.sigma2_Nm_s
 
     def eigenvalues(self, arm: EmulatedArm, payloads: Sequence[PayloadBody]) -> tuple[float, float]:
-        """Return the largest |Im λ| and |λ|, rad/s, of the arm linearised about rest, bristles stuck and stops touched.
+        """Return the largest |Im λ| and the largest |λ|, rad/s, of the arm linearised about rest.
 
-        The largest of elbow angles from 0 to 180 degrees in steps of 45, with each of the payloads.
+        It is linearised with stuck bristles and touched stops. Each is the maximum over elbow angles from 0 to 180
+        degrees in steps of 45, and over the payloads.
         """
         elastic = [joint for joint in range(2) if self.stiffness_Nm_rad[joint] > 0.0]
         size = 2 + len(elastic)
@@ -246,7 +254,7 @@ class MechanicsSettings:
         return oscillation, largest
 
     def substeps(self, arm: EmulatedArm, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
-        """Return the integration steps per 100 µs tick that the fastest rates need, 1 to LARGEST_SUBSTEPS.
+        """Return the integration steps per 100 µs tick that the fastest rates need, at most LARGEST_SUBSTEPS.
 
         touch_rad_s: fastest rate of bodies, hands and walls.
         """

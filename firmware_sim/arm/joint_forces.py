@@ -79,7 +79,10 @@ MECHANICS_NUMBERS: Final = float_fields(
 def dry_level(
     mechanics: np.void, joint: int, coulomb_Nm: float, velocity_rad_s: float, transmitted_Nm: float, drift: float
 ) -> float:
-    """Return the level g(v) of dry friction at joint 0 or 1, Nm; drift: factor of `drift_factor`."""
+    """Return the level g(v) of dry friction at joint 0 or 1, Nm: Stribeck curve times `drift`, plus the load's share.
+
+    transmitted_Nm: load through the joint. drift: the temperature's factor, from `drift_factor`.
+    """
     level = coulomb_Nm
     surplus = mechanics["surplus_Nm"][joint]
     if surplus != 0.0:
@@ -114,7 +117,10 @@ def advance_bristle(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, l
 
 @compiled
 def warm(mechanics: np.void, joint: int, temperature_C: float, power_W: float, step_s: float) -> float:
-    """Return the lubricant's temperature after a step of constant friction power, °C."""
+    """Return the lubricant's temperature, °C, after a step of constant friction power.
+
+    It stays if the heat capacity is 0.
+    """
     capacity_J_K = mechanics["heat_capacity_J_K"][joint]
     if capacity_J_K == 0.0:
         return temperature_C
@@ -125,7 +131,10 @@ def warm(mechanics: np.void, joint: int, temperature_C: float, power_W: float, s
 
 @compiled
 def spring_torque(mechanics: np.void, joint: int, twist_rad: float, twist_rad_s: float) -> float:
-    """Return the torque τ_s in an elastic joint's spring, Nm; twist: motor side minus link side."""
+    """Return the torque τ_s in an elastic joint's spring, Nm; 0 inside the backlash, and never a pull across it.
+
+    twist: motor side minus link side.
+    """
     stiffness = mechanics["stiffness_Nm_rad"][joint]
     damping = mechanics["damping_Nm_s"][joint]
     half_rad = 0.5 * mechanics["backlash_rad"][joint]
@@ -175,9 +184,10 @@ FORCES: Final = float_fields(
 
 
 class Surroundings(NamedTuple):
-    """Everything that acts on the arm in a tick: elements of MECHANICAL_STATE, ARM_NUMBERS, MECHANICS_NUMBERS; touches.
+    """Everything that acts on the arm in a tick.
 
-    contact: one row of the contact table, or an empty array. things: the touch table.
+    state, arm, mechanics: elements of MECHANICAL_STATE, ARM_NUMBERS and MECHANICS_NUMBERS. contact: one row of the
+    contact table, or an empty array. things: the table of bodies, hands and walls.
     """
 
     state: np.void
@@ -189,7 +199,7 @@ class Surroundings(NamedTuple):
 
 @compiled
 def gravity_torque(state: np.void, arm: np.void, mechanics: np.void, q1: float, q2: float) -> tuple[float, float]:
-    """Return tau_gravity of both joints in Nm, positive where it must be held along +q."""
+    """Return the gravity torque of joints 1 and 2, Nm, positive where it must be held along +q; 0 on a level base."""
     gravity = mechanics["gravity_m_s2"]
     if gravity == 0.0:
         return 0.0, 0.0
@@ -205,7 +215,7 @@ def gravity_torque(state: np.void, arm: np.void, mechanics: np.void, q1: float, 
 
 @compiled
 def set_drift(state: np.void, mechanics: np.void, forces: np.void) -> None:
-    """Set the factors of friction in `forces` by the joints' temperatures."""
+    """Set `viscous_drift` and `coulomb_drift` of `forces`: the factors of friction at the joints' temperatures."""
     for joint in range(2):
         temperature_C = state["temperature_C"][joint]
         forces["viscous_drift"][joint] = drift_factor(mechanics["viscous_drop_per_K"][joint], temperature_C)
@@ -222,9 +232,10 @@ def collect_forces(
     elapsed_s: float,
     forces: np.void,
 ) -> None:
-    """Fill `forces`, friction levels included, and `touch_rates` for the state `now`.
+    """Fill all other fields of `forces`, and `touch_rates` where there are things, for the state `now`.
 
-    time_s: scenario time. elapsed_s: since the contact's onset.
+    Call `set_drift` first: the friction levels use its factors. time_s: scenario time. elapsed_s: time since the
+    contact's onset.
     """
     state, arm, mechanics = around.state, around.arm, around.mechanics
     q1, q2, dq1, dq2 = now["q"][0], now["q"][1], now["dq"][0], now["dq"][1]
@@ -278,9 +289,9 @@ def is_free(joint: int, state: np.void, mechanics: np.void) -> bool:
 
 @compiled
 def decide(now: np.void, around: Surroundings, forces: np.void) -> Slips:
-    """Return the slips of both links and both motors by the present forces: 1, -1 or 0 (sticks).
+    """Return the slips of both links, then of both motors, by the present forces: 1 or -1, or 0 if it sticks.
 
-    A link or motor that never sticks has 1.
+    The sign is the direction of the slip. A link or motor that never sticks has 1.
     """
     state, mechanics = around.state, around.mechanics
     slip1, slip2 = decide_slips(
@@ -311,7 +322,10 @@ def _motor_slip(joint: int, now: np.void, mechanics: np.void, forces: np.void) -
 def accelerate_links(
     now: np.void, around: Surroundings, slips: Slips, forces: np.void
 ) -> tuple[float, float, float, float]:
-    """Return ddq of both links and their dry friction, as `firmware_sim.arm.plant.accelerate` does."""
+    """Return ddq of joints 1 and 2, rad/s², and their dry friction, Nm, positive along +dq, for these slips.
+
+    The friction of a sticking link is the torque that holds it.
+    """
     link_Nm = forces["link_Nm"]
     return accelerate(
         around.state, forces, slips[0], slips[1], link_Nm[0], link_Nm[1], now["q"][1], now["dq"][0], now["dq"][1]
@@ -322,7 +336,10 @@ def accelerate_links(
 def find_friction(
     now: np.void, around: Surroundings, forces: np.void
 ) -> tuple[float, float, float, float, float, float]:
-    """Return ddq, friction of the joint and of a stiff joint's motor side, two each, from the present forces."""
+    """Return ddq, rad/s², and two frictions, Nm along +dq, of joints 1 and 2 each, from the present forces.
+
+    The first friction is on the link side of the sensor. The second is on the motor side, 0 for an elastic joint.
+    """
     mechanics = around.mechanics
     ddq1, ddq2, dry1, dry2 = accelerate_links(now, around, decide(now, around, forces), forces)
     motor1, motor2 = 0.0, 0.0
@@ -337,7 +354,10 @@ def find_friction(
 
 @compiled
 def _motor_share(joint: int, dry_Nm: float, now: np.void, mechanics: np.void, forces: np.void) -> float:
-    """Return the motor-side part of a stiff joint's friction, Nm."""
+    """Return the friction on the motor side of a stiff joint, Nm: viscous, plus its share of the dry friction.
+
+    dry_Nm: dry friction of the whole joint; both sides share it in the ratio of their levels.
+    """
     viscous = mechanics["motor_viscous_Nm_s"][joint] * forces["viscous_drift"][joint] * now["dq"][joint]
     if forces["coulomb_Nm"][joint] == 0.0:
         return float(viscous)

@@ -72,9 +72,9 @@ _BISECTIONS: Final = 40
 
 
 class _StepWork(NamedTuple):
-    """Parts of the work space: rows (_ROWS,) of ROW, the touch state's rows (_ROWS, n), one element of FORCES.
+    """Views of the work space: rows (_ROWS,) of ROW, rows of the touch state (_ROWS, n), one element of FORCES.
 
-    values (_ROWS, places of ROW): the same memory as the rows.
+    values (_ROWS, number of ROW's values): the same memory as `rows`.
     """
 
     rows: Structured
@@ -84,19 +84,19 @@ class _StepWork(NamedTuple):
 
 
 def work_space(touch_size: int) -> Vector:
-    """Return the work space of an integration step, zeros, for a touch state of `touch_size` values."""
+    """Return zeros for a touch state of `touch_size` values, as memory that integration and `observe` overwrite."""
     return np.zeros(_FORCES_END + _ROWS * touch_size)
 
 
 @compiled
 def _matrix(space: Vector) -> NDArray[np.float64]:
-    """Return a part of a work space as a matrix of _ROWS rows that shares its memory."""
+    """Return an array as a matrix with _ROWS rows that shares its memory."""
     return space.reshape((_ROWS, space.size // _ROWS))
 
 
 @compiled
 def _collect(row: int, around: Surroundings, time_s: float, elapsed_s: float, work: _StepWork) -> None:
-    """Fill forces, friction levels and touch rates for the state in `row`."""
+    """Fill the work space's forces, friction levels included, and its touch rates for the state in row number `row`."""
     collect_forces(around, work.rows[row], work.touch[row], work.touch[_TOUCH_RATES], time_s, elapsed_s, work.forces)
 
 
@@ -142,7 +142,10 @@ def _set_stage(rates: int, length_s: float, mechanics: np.void, work: _StepWork)
 
 @compiled
 def _set_bristles(row: int, length_s: float, mechanics: np.void, work: _StepWork) -> None:
-    """Set the bristles of `row`, `length_s` after the start row, by the mean velocity between the two rows."""
+    """Set the bristle deflections of row number `row` by the mean velocity since the start row, `length_s` before.
+
+    Joints without bristles stay as they are.
+    """
     start, now = work.rows[_START], work.rows[row]
     for joint in range(2):
         sigma0 = mechanics["sigma0_Nm_rad"][joint]
@@ -155,7 +158,7 @@ def _set_bristles(row: int, length_s: float, mechanics: np.void, work: _StepWork
 
 @compiled
 def _combine(values: NDArray[np.float64], count: int, sixth_s: float) -> None:
-    """Fill `count` places of the end row by RK4's sum of the start and the four rows of rates."""
+    """Fill the first `count` values of the end row by RK4's weighted sum; sixth_s: a sixth of the step's length."""
     for place in range(count):
         inner = values[_K2, place] + values[_K3, place]
         values[_END, place] = values[_START, place] + sixth_s * (values[_K1, place] + 2.0 * inner + values[_K4, place])
@@ -172,7 +175,11 @@ def _runge_kutta(
     step_s: float,
     work: _StepWork,
 ) -> None:
-    """Fill the end row by one step of classical RK4 with constant slips; needs the first rates in the row _K1."""
+    """Fill the end row by one step of classical RK4 from the start row with constant slips.
+
+    Needs the start's rates in the row _K1; overwrites the other rates, `_STAGE` and the forces. target: set-points of
+    the torque loops, Nm.
+    """
     touch, mechanics = work.touch, around.mechanics
     start, stage, end = work.rows[_START], work.rows[_STAGE], work.rows[_END]
     half_s = 0.5 * step_s
@@ -197,7 +204,11 @@ def _runge_kutta(
 
 @compiled
 def _margin(around: Surroundings, slips: Slips, work: _StepWork) -> float:
-    """Return by how much the slips still fit at the end row; negative: a joint has stopped or broken away."""
+    """Return by how much the slips still fit at the end row; negative: a link or motor has stopped or broken away.
+
+    It is the smallest of all velocities along their slips, rad/s, and all reserves of holding torque, Nm; inf if no
+    link or motor can stick.
+    """
     now, forces, mechanics = work.rows[_END], work.forces, around.mechanics
     margin = np.inf
     friction1, friction2 = 0.0, 0.0
@@ -219,7 +230,10 @@ def _margin(around: Surroundings, slips: Slips, work: _StepWork) -> float:
 
 @compiled
 def _take_end(around: Surroundings, slips: Slips, work: _StepWork) -> None:
-    """Copy the end row to the start row; a velocity that has passed zero is set to 0."""
+    """Copy the end row to the start row.
+
+    A velocity of a link or motor that can stick is set to 0 if it has passed zero.
+    """
     work.rows[_START] = work.rows[_END]
     for index in range(work.touch.shape[1]):
         work.touch[_START, index] = work.touch[_END, index]
@@ -284,7 +298,10 @@ def _step(
 
 @compiled
 def _load(around: Surroundings, touch_state: Vector, work: _StepWork) -> None:
-    """Fill the start row from mechanical state and touch state, and set rotor inertia and drift of friction."""
+    """Fill the start row of the work space from both states.
+
+    Set the friction factors of temperature in the work space's forces, and `rotor_kg_m2` in the mechanical state.
+    """
     start, state, mechanics = work.rows[_START], around.state, around.mechanics
     for joint in range(2):
         start["q"][joint] = state["q"][joint]
@@ -319,9 +336,8 @@ def integrate_mechanics(
     """Advance the mechanical state and the touch state by `step_s` in `substeps` substeps.
 
     contact: one row of the contact table, or empty; elapsed_s: since its onset. things, touch_state: table and state of
-    bodies, hands and walls for `firmware_sim.arm.touch_forces.touch`; time_s: scenario time,
-    negative before the scenario starts. target: set-points of the drives' torque loops, Nm. space: from
-    `work_space`.
+    bodies, hands and walls for `firmware_sim.arm.touch_forces.touch`; time_s: scenario time, negative before the
+    scenario starts. target: set-points of the drives' torque loops, Nm. space: from `work_space`, overwritten.
     """
     around = Surroundings(state, arm, mechanics, contact, things)
     rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]
@@ -351,7 +367,7 @@ def integrate_mechanics(
 
 @compiled
 def _has_stiff_motor(joint: int, mechanics: np.void, forces: np.void) -> bool:
-    """Return whether a stiff joint has a rotor or friction on its motor side, which the sensor does not measure."""
+    """Return whether a joint is stiff and its motor side has inertia or friction, which the sensor does not measure."""
     has_friction = mechanics["motor_viscous_Nm_s"][joint] != 0.0 or forces["motor_level_Nm"][joint] != 0.0
     is_stiff = mechanics["stiffness_Nm_rad"][joint] == 0.0
     return bool(is_stiff and (has_friction or mechanics["rotor_inertia_kg_m2"][joint] != 0.0))
@@ -373,7 +389,10 @@ def _set_joint_torque(around: Surroundings, work: _StepWork) -> None:
 
 @compiled
 def _warm(around: Surroundings, step_s: float, work: _StepWork) -> None:
-    """Warm the joints by the power of their friction, motor side included."""
+    """Set the joints' temperatures after `step_s` of the friction power at the start row.
+
+    Friction on the motor side counts, too.
+    """
     now, state, mechanics, forces = work.rows[_START], around.state, around.mechanics, work.forces
     _, _, friction1, friction2, motor1, motor2 = find_friction(now, around, forces)
     for joint in range(2):
@@ -401,7 +420,7 @@ def observe(
 ) -> tuple[float, float, float, float, float, float]:
     """Return the present true values, Nm: external torque, friction along +dq, gravity torque, two joints each.
 
-    Leaves the state of the simulation unchanged.
+    The friction is on the link side of the sensor. Position, velocity and touch state stay; `space` is overwritten.
     """
     around = Surroundings(state, arm, mechanics, contact, things)
     rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]

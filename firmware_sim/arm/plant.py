@@ -116,7 +116,7 @@ def fit_payload(
 
 @compiled
 def mass_matrix(state: np.void, q2: float) -> tuple[float, float, float]:
-    """Return m11, m12, m22 of Jᵀ N J + R at the elbow angle q2, kg m²."""
+    """Return m11, m12, m22 of the mass matrix Jᵀ N J + R at the elbow angle q2, kg m²; with payload and rotors."""
     coupling = state["beta"] * math.cos(q2)
     if state["sigma"] != 0.0:
         coupling -= state["sigma"] * math.sin(q2)
@@ -142,8 +142,9 @@ def accelerate(
 ) -> tuple[float, float, float, float]:
     """Return ddq1, ddq2 in rad/s² and the Coulomb friction of both joints in Nm, positive along +dq.
 
-    torque is motor plus external torque. A sticking joint has no acceleration; its friction is the holding torque,
-    even where that is more than F_c.
+    torque: of motor, touches, joint stops and gravity, Nm. slip: 1 or -1, the direction in which a joint slips, or 0:
+    it sticks. A sticking joint has no acceleration; its friction is the holding torque, even where that is more than
+    F_c.
     """
     sine = state["beta"] * math.sin(q2)
     if state["sigma"] != 0.0:
@@ -174,11 +175,11 @@ def accelerate(
 def decide_slips(
     state: np.void, arm: np.void, torque1: float, torque2: float, q2: float, dq1: float, dq2: float
 ) -> tuple[int, int]:
-    """Return the slip of each joint: the sign of its velocity, or at standstill of its breakaway, 0 if it sticks.
+    """Return the slip of each joint: the sign of its velocity, or at standstill of its breakaway; 0 if it sticks.
 
-    At standstill exactly one choice fits friction's law, because the inertia is positive definite: joints that stick
-    need no more than F_c, joints that slip accelerate the way they slip. Within rounding of the limit no choice may
-    fit; then the function returns the choice that fits best.
+    torque: all but friction, Nm. At standstill exactly one choice fits friction's law, because the inertia is positive
+    definite: joints that stick need no more than F_c, joints that slip accelerate the way they slip. Within rounding of
+    the limit no choice may fit; then the function returns the choice that fits best.
     """
     if dq1 != 0.0 and dq2 != 0.0:
         return (1 if dq1 > 0.0 else -1), (1 if dq2 > 0.0 else -1)
@@ -206,7 +207,7 @@ def decide_slips(
 
 @compiled
 def _stop_torque(arm: np.void, joint: int, q: float, dq: float) -> float:
-    """Return the torque of the joint stop that a joint (0 or 1) is beyond, Nm; 0 between the stops."""
+    """Return the torque, Nm, with which a stop pushes back a joint (0 or 1) that is beyond it; 0 between the stops."""
     if q > arm["stop_high_rad"][joint]:
         push = (
             -arm["stop_stiffness_Nm_rad"][joint] * (q - arm["stop_high_rad"][joint])
@@ -226,9 +227,9 @@ def _stop_torque(arm: np.void, joint: int, q: float, dq: float) -> float:
 def external_torque(
     arm: np.void, contact: Structured, elapsed_s: float, q1: float, q2: float, dq1: float, dq2: float
 ) -> tuple[float, float]:
-    """Return the external torque of joint stops and contact on both joints, Nm.
+    """Return the external torque on both joints, Nm: of joint stops, and of the contact if there is one.
 
-    contact: one row of the table, or empty. elapsed_s: since its onset.
+    contact: one row of the contact table, or empty. elapsed_s: time since its onset.
     """
     stop1, stop2 = _stop_torque(arm, 0, q1, dq1), _stop_torque(arm, 1, q2, dq2)
     if contact.size == 0:

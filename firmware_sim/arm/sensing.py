@@ -89,7 +89,10 @@ def track(
 
 
 class TorqueNoise:
-    """Random numbers of both torque sensors, noise or steps of their zeros, drawn block by block from one seed."""
+    """Random numbers of both torque sensors: noise of their samples, or steps of their zeros.
+
+    A seed always gives the same numbers.
+    """
 
     def __init__(self, seed: int | np.random.SeedSequence, rms_Nm: float | tuple[float, float]) -> None:
         self._generator = np.random.default_rng(seed)
@@ -99,7 +102,7 @@ class TorqueNoise:
         self._next = _SAMPLES_AT_ONCE
 
     def draw(self) -> NDArray[np.float64]:
-        """Return the next sample (2,), Nm; valid until the next call."""
+        """Return the next sample (2,), Nm, zeros if both rms are 0. Its memory is overwritten by later calls."""
         if self._next == _SAMPLES_AT_ONCE:
             self._next = 0
             if self._is_on:

@@ -110,7 +110,10 @@ TOUCH_TRUTH: Final = float_fields(
 
 @compiled
 def _own(state: Vector, row: int) -> np.void:
-    """Return a body's or a wall's part of the touch state, or of its rates, as a writable view; row: in the table."""
+    """Return the values of a body or wall in the touch state, or in its rates, as a writable view.
+
+    row: its row in the touch table.
+    """
     place = TOUCH_HEADER + row * THING_PLACES
     part: np.void = state[place : place + THING_PLACES].view(THING_STATE)[0]
     return part
@@ -118,7 +121,7 @@ def _own(state: Vector, row: int) -> np.void:
 
 @compiled
 def _hand(state: Vector, row: int) -> np.void:
-    """Return a hand's part of the touch state as a writable view; row: in the table."""
+    """Return a hand's values in the touch state as a writable view; row: its row in the touch table."""
     place = TOUCH_HEADER + row * THING_PLACES
     part: np.void = state[place : place + THING_PLACES].view(HAND_STATE)[0]
     return part
@@ -134,7 +137,10 @@ def _cosines(q1: float, q2: float) -> tuple[float, float, float, float]:
 def _moved_point(
     link: float, point_m: float, length1_m: float, pose: Pose, dq1: float, dq2: float
 ) -> tuple[float, float, float, float]:
-    """Return x, y, m, and their rates, m/s, in the world, of the point `point_m` from the joint that carries a link."""
+    """Return x, y, m, of a link's point in the world, and their rates, m/s.
+
+    point_m: distance from the joint that carries the link.
+    """
     c1, s1, c2, s2 = pose
     reach_m = length1_m if link == 2.0 else point_m
     x, y = reach_m * c1, reach_m * s1
@@ -152,7 +158,10 @@ def _moved_point(
 def _joint_torque(
     link: float, point_m: float, force_x: float, force_y: float, length1_m: float, pose: Pose
 ) -> tuple[float, float]:
-    """Return Jᵀ F of a force on a link's point, Nm."""
+    """Return the torques of both joints, Nm, of a force on a link's point, Jᵀ F. force: N, in the world.
+
+    point_m: distance from the joint that carries the link.
+    """
     c1, s1, c2, s2 = pose
     if link == 2.0:
         torque2 = point_m * (force_y * c2 - force_x * s2)
@@ -164,7 +173,8 @@ def _joint_torque(
 def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float, float, float]:
     """Return how a body meets its link: penetration and point along the link, m; normal x, y; distance across, m.
 
-    The normal points from the link to the body; the last is the signed distance of its centre from the link's line.
+    The penetration is negative while they are apart. The normal points from the link to the body; the last is the
+    signed distance of the body's centre from the link's line.
     """
     along_x, along_y, link2_x, link2_y = pose
     length_m = thing["length1_m"]
@@ -188,9 +198,9 @@ def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float
 
 @compiled
 def _recede_rate(thing: np.void, own: np.void) -> float:
-    """Return the velocity of a body along its free direction, m/s: 0 instead of into the wall behind it.
+    """Return a body's velocity along its free direction, m/s; 0 if it would move into the wall behind it.
 
-    Between ticks, speed ṡ against the wall is reset.
+    The stored velocity stays until `_settle_body` resets it.
     """
     if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
         return 0.0
@@ -199,7 +209,10 @@ def _recede_rate(thing: np.void, own: np.void) -> float:
 
 @compiled
 def _body_force(thing: np.void, own: np.void, pose: Pose, dq1: float, dq2: float) -> tuple[float, float, float, float]:
-    """Return a body's force on the arm, N, as x and y, its point in m, and the penetration in m."""
+    """Return a body's force on the arm, N, as x and y, its point on the link and the penetration, both in m.
+
+    Without penetration (0 or negative) the force is 0.
+    """
     depth_m, point_m, normal_x, normal_y, _ = _meet(thing, own, pose)
     if depth_m <= 0.0:
         return 0.0, 0.0, point_m, depth_m
@@ -212,7 +225,10 @@ def _body_force(thing: np.void, own: np.void, pose: Pose, dq1: float, dq2: float
 
 @compiled
 def _hand_force(thing: np.void, own: np.void, time_s: float, pose: Pose, dq1: float, dq2: float) -> tuple[float, float]:
-    """Return a hand's force on the arm, N, as x and y."""
+    """Return a hand's force on the arm, N, as x and y, limited to `force_limit_N`.
+
+    time_s: scenario time, which says how far the hand has moved.
+    """
     x, y, dx, dy = _moved_point(thing["link"], thing["point_m"], thing["length1_m"], pose, dq1, dq2)
     way_m = thing["speed_m_s"] * (time_s - thing["onset_s"])
     speed = thing["speed_m_s"]
@@ -235,7 +251,10 @@ def _hand_force(thing: np.void, own: np.void, time_s: float, pose: Pose, dq1: fl
 def _wall_force(
     thing: np.void, own: np.void, link: float, pose: Pose, dq1: float, dq2: float
 ) -> tuple[float, float, float, float]:
-    """Return a wall's force on the end of a link, N (x, y), the end's place on its link and the penetration, m."""
+    """Return a wall's force on the end of a link, N (x, y), the end's distance from its joint and the penetration, m.
+
+    In front of the wall the force is 0 and the penetration negative.
+    """
     point_m = thing["length2_m"] if link == 2.0 else thing["length1_m"]
     x, y, dx, dy = _moved_point(link, point_m, thing["length1_m"], pose, dq1, dq2)
     normal_x, normal_y = own["free_x"], own["free_y"]
@@ -328,7 +347,11 @@ def _appear(thing: np.void, own: np.void, hand: np.void, pose: Pose) -> None:
 
 @compiled
 def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
-    """Stop a body at the wall behind it and set its side, between ticks; return whether the arm touches it."""
+    """Stop a body that has reached the wall behind it, and return whether the arm touches the body.
+
+    While it doesn't touch: update the side of a body off the link's end, and the free direction of a body that has not
+    moved.
+    """
     if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
         own["shift_rate_m_s"] = 0.0
     depth_m, point_m, normal_x, normal_y, across_m = _meet(thing, own, pose)
@@ -346,10 +369,9 @@ def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
 def change_touch(things: Structured, time_s: float, q1: float, q2: float, state: Vector, is_prescribed: bool) -> None:
     """Apply the changes between ticks to `state`: things come and go, a body stops at its wall.
 
-    The energy restarts at 0 while nothing touches the arm.
-
-    Call it at the start of each tick and before `describe_touch`; twice at the same instant is once. is_prescribed:
-    whether a prescribed contact is in force. The free direction of a body that has not moved turns with the normal.
+    The energy is set to 0 while nothing touches the arm. Call it at the start of each tick and before `describe_touch`;
+    a second call at the same instant changes nothing. is_prescribed: whether a scripted contact acts. The free
+    direction of a body that has not moved turns with the normal.
     """
     is_touched = is_prescribed
     pose = _cosines(q1, q2)
@@ -401,7 +423,8 @@ def describe_touch(
 ) -> tuple[float, float]:
     """Fill `out`, a record of TOUCH_TRUTH, and return the external torque of all contacts on both joints, Nm.
 
-    contact, contact_index, elapsed_s: the prescribed contact in force, an empty array without one.
+    Link and index of `out` are those of the strongest force. contact, contact_index, elapsed_s: the scripted contact
+    that acts, its index and the time since its onset; an empty array without one.
     """
     out["force_N"], out["link"], out["index"] = 0.0, 0.0, -1.0
     torque1, torque2 = 0.0, 0.0
@@ -449,10 +472,10 @@ def add_prescribed_work(
     q2: float,
     state: Vector,
 ) -> None:
-    """Add the energy that the arm gave to a prescribed contact in a step: the mean torque along the way of the joints.
+    """Add to the touch state the energy that the arm gave to a scripted contact in a step, J; no change without one.
 
-    before1, before2: joint positions at the start of the step, at elapsed_s; q1, q2: at its end. Frame "motion" goes by
-    the mean velocity of the step. Without a contact, adds no energy.
+    before1, before2: joint positions at the start of the step, elapsed_s after the onset; q1, q2: at its end. A force
+    of frame "motion" is aimed by the mean velocity of the step.
     """
     if contact.size == 0:
         return

@@ -111,7 +111,7 @@ class ContactSettings:
 
     @property
     def impulse_N_s(self) -> float:
-        """Force integrated over time, N s, without the factor of frame "motion"."""
+        """Force integrated from onset to end, N s; without the reduction of a slow point's force in frame "motion"."""
         if self.shape == "half_sine":
             return self.force_N * self.duration_s * 2.0 / math.pi
         if self.shape == "push":
@@ -139,13 +139,13 @@ class ContactSettings:
 
 
 def contact_table(contacts: tuple[ContactSettings, ...]) -> Structured:
-    """Return contacts as a table (n,) of CONTACT for compiled functions."""
+    """Return scripted contacts as a table (n,) of dtype CONTACT, in the same order, for compiled functions."""
     return np.array([contact.row() for contact in contacts], dtype=CONTACT)
 
 
 @compiled
 def contact_force(contact: np.void, elapsed_s: float) -> float:
-    """Return the force in N of a contact, a row of the table, `elapsed_s` after its onset and before its end."""
+    """Return a contact's force, N, by its shape, `elapsed_s` after its onset. Call it between onset and end only."""
     duration_s = contact["duration_s"]
     if contact["shape"] == _HALF_SINE:
         return float(contact["force_N"] * math.sin(math.pi * elapsed_s / duration_s))
@@ -159,7 +159,10 @@ def contact_force(contact: np.void, elapsed_s: float) -> float:
 def aim(
     contact: np.void, force_N: float, length1_m: float, q1: float, q2: float, dq1: float, dq2: float
 ) -> tuple[float, float]:
-    """Return the world's angle of a contact's force, rad, and its size, N, which only frame "motion" changes."""
+    """Return the world's angle of a contact's force, rad, and its size, N.
+
+    The size is `force_N`; in frame "motion" less where the touched point is slow (FADE_M_S).
+    """
     angle_rad = contact["angle_rad"]
     if contact["frame"] == _WORLD:
         return angle_rad, force_N
@@ -198,7 +201,10 @@ TRANSIENT_FACTOR: Final = 2.0
 
 
 class BodyRegion(NamedTuple):
-    """One row of table A.3 with its force limits of table A.2."""
+    """A body region of ISO/TS 15066: one row of table A.3 with its force limits of table A.2.
+
+    has_transient_limit: False for skull, forehead and face.
+    """
 
     mass_kg: float  # effective mass m_H
     stiffness_N_m: float  # effective spring constant K
@@ -207,7 +213,7 @@ class BodyRegion(NamedTuple):
 
     @property
     def transient_force_N(self) -> float | None:
-        """Transient limit; None if the standard lacks one."""
+        """Force limit of transient contact, N, twice the quasi-static one; None if the standard gives none."""
         return TRANSIENT_FACTOR * self.force_N if self.has_transient_limit else None
 
 
@@ -274,28 +280,31 @@ class BodySettings:
 
     @property
     def onset_tick(self) -> int:
-        """First 100 µs tick in which it may stand there."""
+        """First 100 µs tick, since the drives were enabled, in which the body may stand there."""
         return ticks(self.at_s)
 
     @property
     def mass(self) -> float:
-        """Mass, kg: its own, or its region's."""
+        """Effective mass, kg: that of the region, or `mass_kg` without a region."""
         return BODY_REGIONS[self.region].mass_kg if self.region is not None else float(self.mass_kg or 0.0)
 
     @property
     def stiffness(self) -> float:
-        """Stiffness, N/m: its own, or its region's."""
+        """Stiffness, N/m: that of the region, or `stiffness_N_m` without a region."""
         return BODY_REGIONS[self.region].stiffness_N_m if self.region is not None else float(self.stiffness_N_m or 0.0)
 
     @property
     def room_m(self) -> float:
-        """Distance that the body can recede, m; inf without a wall behind it."""
+        """Distance that the body can recede, m: 0 if clamped, inf without a wall behind it."""
         if self.clamped:
             return 0.0
         return math.inf if self.gap_m is None else self.gap_m
 
     def overlap_m(self, lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> float:
-        """Return how deep the link enters the body in a pose (q1, q2), m; negative: their distance."""
+        """Return how deep the body's link enters the body in a pose (q1, q2), m.
+
+        While they are apart, it is minus their distance. lengths_m: of both links.
+        """
         ends = _ends(lengths_m, pose_rad)
         (base_x, base_y), (end_x, end_y) = ends[self.link - 1], ends[self.link]
         along_x, along_y = end_x - base_x, end_y - base_y
@@ -351,11 +360,14 @@ class WallSettings:
 
     @property
     def onset_tick(self) -> int:
-        """First 100 µs tick in which it may stand there."""
+        """First 100 µs tick, since the drives were enabled, in which the wall may stand there."""
         return ticks(self.at_s)
 
     def overlap_m(self, lengths_m: tuple[float, float], pose_rad: tuple[float, float]) -> float:
-        """Return how far the deeper of the two link ends is behind the wall in a pose, m; negative: in front of it."""
+        """Return how far elbow or tip, whichever is deeper, is behind the wall in a pose (q1, q2), m.
+
+        In front of the wall it is negative. lengths_m: of both links.
+        """
         normal_x, normal_y = math.cos(math.radians(self.normal_deg)), math.sin(math.radians(self.normal_deg))
         ends = _ends(lengths_m, pose_rad)[1:]
         return max(-(x - self.x_m) * normal_x - (y - self.y_m) * normal_y for x, y in ends)

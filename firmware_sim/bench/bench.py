@@ -35,7 +35,7 @@ _FAULTS = TRUTH_LAYOUT.slices["faults"]
 
 
 class Bench:
-    """Everything on the device's end of the bus. Single-threaded: it sends from within the calls made to it."""
+    """All devices of the emulated arm on the bus. Single-threaded: it sends frames from within the calls made to it."""
 
     def __init__(
         self,
@@ -53,11 +53,12 @@ class Bench:
     ) -> None:
         """Build and compile everything; the devices send no frame before `boot`.
 
-        send: called with (identifier, data). on_answer: called when all that answers a SYNC has been sent. seed:
-        outweighs the scenario's. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
+        send: called with (identifier, data). on_answer: called after each SYNC that devices answer, when all frames are
+        sent. seed: outweighs the scenario's. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
         TRUTH_LAYOUT), the block being valid until the next call. contract: which EDS files the devices have; default:
         those that go with the codec's DBC. on_event: called with t_ns, level, name and text when a fault begins or
         ends. arm: None: a body of the scenario's.
+
         Raises ConfigError when a fault is about a frame that the contract hasn't, CodecError when the DBC lacks a
         message, OSError when an EDS can't be read.
         """
@@ -92,7 +93,7 @@ class Bench:
 
     @property
     def is_paced(self) -> bool:
-        """Whether a host in lockstep says how much time passes."""
+        """Whether a host in lockstep paces the time by its marks."""
         return self._outbox.is_paced
 
     @property
@@ -107,21 +108,27 @@ class Bench:
 
     @property
     def now_ns(self) -> int:
-        """The bench's time: of `boot` plus, by SYNC, the periods since then; by wall, the clock's."""
+        """The bench's time, ns: by SYNC, the time of `boot` plus the periods since then; by wall, the clock's."""
         return self.time.now_ns
 
     @property
     def due_ns(self) -> int:
-        """When something is due by time; call `advance_to` then."""
+        """Time, ns, at which a timer, a fault or a held frame is due next; call `advance_to` then."""
         return self.time.due_ns
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the arm has stood still for a while and no drive powers its motor."""
+        """Whether, for 50 ms, the arm has stood still by the drives' velocities and no drive has powered its motor.
+
+        Motion between two calls is missed.
+        """
         return self.time.is_at_rest
 
     def boot(self, t_ns: int = 0) -> None:
-        """Power on at `t_ns`: every node announces itself."""
+        """Set the time to `t_ns` and power on all devices, which send their boot-up messages.
+
+        Faults from power-on begin.
+        """
         self.time.begin(t_ns)
         self.injector.power_on(t_ns)
         for device in self.devices:
@@ -141,11 +148,14 @@ class Bench:
         self.time.outlive_host()
 
     def release(self) -> None:
-        """End lockstep when its host has gone: time follows the given clock again."""
+        """Leave lockstep after its host has gone: time follows the caller's clock again."""
         self._outbox.is_paced = False
 
     def on_frame(self, frame: Frame) -> None:
-        """Take one frame from the bus: run a cycle on SYNC, and pass the others to the devices that receive them."""
+        """Take one frame from the bus: run a cycle on SYNC, and pass the others to the devices that receive them.
+
+        Error frames, and frames that no device takes, have no effect.
+        """
         can_id, data, t_ns, is_error = frame
         if is_error:
             return
@@ -170,7 +180,10 @@ class Bench:
             time.poll(time.now_ns)
 
     def _time_to_sync_ns(self, data: bytes) -> int:
-        """Return by how much this SYNC moves the bench's time, if a device hears it."""
+        """Return by how much this SYNC moves the bench's time if a device hears it, ns.
+
+        0 in clock mode `wall` and before the first SYNC.
+        """
         if self._is_wall or not self.time.has_begun:
             return 0
         overflow = self._nodes.listeners.overflow
@@ -202,7 +215,10 @@ class Bench:
         return answer
 
     def _on_sync(self, data: bytes, t_ns: int) -> None:
-        """Run one cycle, or report a SYNC that no device takes to the devices that hear it."""
+        """Run one cycle for a SYNC.
+
+        If no device takes it, or it comes twice or out of order, report that to the devices that hear it.
+        """
         takers = self._nodes.listeners.takers(data)
         if not (any(takers) and self._judge(data, t_ns)):
             self._ignore_sync(data, takers)
@@ -216,7 +232,10 @@ class Bench:
             self._answer(data, t_ns, late_ns)
 
     def _judge(self, data: bytes, t_ns: int) -> bool:
-        """Compare a SYNC with those before it, and count cycles and lost SYNCs; return whether devices take it."""
+        """Compare a SYNC's counter with the one before, and return whether it is a new one, which devices take.
+
+        If it is, advance `cycle` and store the number of lost SYNCs before it.
+        """
         order = self._order
         last = order.counter
         overflow = self._nodes.listeners.overflow if data else 0
@@ -233,7 +252,7 @@ class Bench:
         return True
 
     def _ignore_sync(self, data: bytes, takers: Sequence[int]) -> None:
-        """Report a SYNC that no device answers to the devices that hear it, and let due timers act.
+        """Report a SYNC that is not answered to the devices that hear it, and let due timers act.
 
         takers: 1 for each device that takes SYNCs of this length, else 0.
         """
@@ -243,7 +262,7 @@ class Bench:
         self.time.poll(self.time.now_ns)
 
     def _answer(self, data: bytes, t_ns: int, late_ns: int) -> None:
-        """Sample and answer a SYNC that reaches the devices now, or by SYNC `late_ns` after its time."""
+        """Let the devices sample and answer a SYNC, then log its truth. late_ns: by SYNC, how late it reaches them."""
         sync_ns = self.time.now_ns
         self.time.delay_sample(late_ns)
         takers = self._nodes.listeners.takers(data)
@@ -281,14 +300,18 @@ class Bench:
 
     @property
     def _is_plain(self) -> bool:
-        """Whether just the contract's cyclic frames answer this SYNC: no fault acts, and no held frame is due."""
+        """Whether just the contract's cyclic frames answer this SYNC.
+
+        Then no fault acts, and no held frame is due within a period.
+        """
         is_undisturbed = self._plan.is_quiet and self._outbox.due_ns >= self.time.now_ns + self._nodes.period_ns
         return is_undisturbed and self._nodes.has_all_answers
 
     def _sample_and_send(self, data: bytes, takers: Sequence[int]) -> None:
-        """Call `on_sync` of the nodes with their measured values, then send their answers.
+        """Give the nodes their measured values at this SYNC, then send their answers.
 
-        takers: 1 for each device that takes this SYNC, else 0.
+        Starts the scenario at the first SYNC at which both drives are ready. takers: 1 for each device that takes this
+        SYNC, else 0.
         """
         now_ns = self.time.now_ns
         drive1, drive2 = self.drives

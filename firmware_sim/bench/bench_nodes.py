@@ -101,7 +101,7 @@ class BenchNodes:
         self.listeners = SyncListeners(self.devices)
 
     def listen(self) -> None:
-        """Update `senders`, `commands` and `has_all_answers` after a change of the nodes' PDOs."""
+        """Update `senders`, `commands` and `has_all_answers`; call it after a change of the nodes' PDOs."""
         self.senders = tuple((i, send) for i, device in enumerate(self.devices) for send in device.pdos.on_sync)
         self.has_all_answers = self.answers == frozenset().union(*(device.pdos.answers for device in self.devices))
         commands: dict[int, tuple[tuple[int, Handler], ...]] = {}
@@ -111,13 +111,13 @@ class BenchNodes:
         self.commands = commands
 
     def poll(self, t_ns: int) -> int:
-        """Let all nodes act on their timers that are due at `t_ns`; return when the next one is due, ns."""
+        """Let all nodes act on their timers that are due at `t_ns`, and return the time, ns, of the next timer."""
         drive1, drive2 = self.drives
         sensor1, sensor2 = self.sensors
         return min(drive1.poll(t_ns), drive2.poll(t_ns), sensor1.poll(t_ns), sensor2.poll(t_ns))
 
     def latch_motors(self) -> None:
-        """Store the drives' present set-points and modes, by joint; `move_arm` uses them until the next call."""
+        """Store the drives' present set-points, Nm, and modes, by joint; `move_arm` uses them until the next call."""
         drive1, drive2 = self.drives
         torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
         modes = (drive1.motor_mode, drive2.motor_mode)
@@ -133,13 +133,16 @@ class BenchNodes:
         self._arm.advance(self._motor_Nm, self._motor_modes, tick_count)
 
     def lose_sync(self, heard: Sequence[int], t_ns: int) -> None:
-        """Report a lost SYNC to the drives that have not heard it; `heard`: how often each node has heard it."""
+        """Tell the drives that have not heard this SYNC that they have lost one.
+
+        heard: how often each node has heard it, drives first.
+        """
         for drive, has_heard in zip(self.drives, heard, strict=False):  # the drives come first
             if not has_heard:
                 drive.on_lost_sync(t_ns)
 
     def sample(self) -> Measurement:
-        """Return the measured values of the arm in counts, by the places of the devices."""
+        """Return the arm's measured values in counts, with pairs by device (Drive1, Drive2 or Sensor1, Sensor2)."""
         measured = self._arm.sample()
         return self.wiring.read(measured) if self.is_crossed else measured
 
@@ -181,11 +184,14 @@ def _scale_of(own: EmulatedArm | None, place: int) -> DriveScale:
 
 
 def _scaled(read: Callable[[], int], ratio: float, low: int, high: int) -> Callable[[], int]:
-    """Return a reader of the value times `ratio`, which ends at the range of the object that has it."""
+    """Return a reader of the value times `ratio`, rounded and limited to `low` to `high`.
+
+    For a ratio of 1 it is `read` itself.
+    """
     return read if ratio == 1.0 else lambda: min(max(round(read() * ratio), low), high)
 
 
 def _check_period(period_us: int) -> None:
-    """Refuse a period, µs, that is not 0 to 100 ms in whole ticks of 100 µs (VALUE_RANGE)."""
+    """Abort the SDO write (VALUE_RANGE) of a SYNC period, µs, that is not 0 to 100 ms in whole 100 µs ticks."""
     if not 0 <= period_us <= _LONGEST_PERIOD_US or period_us * 1000 % TICK_NS:
         refuse(Abort.VALUE_RANGE)

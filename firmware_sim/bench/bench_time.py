@@ -40,7 +40,7 @@ OnTruth = Callable[[int, int, Vector], None]
 
 
 class TruthFeed:
-    """Numbers and stamps the rows of truth of one bench."""
+    """Gives the rows of truth of one bench their cycle numbers and time stamps, and passes them to `on_truth`."""
 
     def __init__(self, fill: Callable[[Vector], None], on_truth: OnTruth | None) -> None:
         """`fill`: fills a block with the present truth."""
@@ -52,12 +52,18 @@ class TruthFeed:
         self._sync_stamp_ns = self._sync_cycle = 0
 
     def add_sync_row(self, cycle: int, stamp_ns: int) -> None:
-        """Call `on_truth` with the present truth as that of a SYNC; later rows count from this SYNC."""
+        """Call `on_truth` with the present truth as that of SYNC `cycle` at `stamp_ns`.
+
+        Later rows count from this SYNC.
+        """
         self._sync_stamp_ns, self._sync_cycle = stamp_ns, cycle
         self.add_later_row(0, 0)
 
     def add_later_row(self, periods: int, period_ns: int) -> None:
-        """Call `on_truth` with the present truth as that of `periods` periods after the last SYNC."""
+        """Call `on_truth` with the present truth as that of `periods` periods after the last SYNC's row.
+
+        Without `on_truth` it only counts.
+        """
         self.cycle = self._sync_cycle + periods
         if self.on_truth is not None:
             self._fill(self._block)
@@ -65,7 +71,7 @@ class TruthFeed:
 
 
 class TruthLog(Recorder):
-    """Writes the truth; `write` is a Bench's `on_truth`."""
+    """Log file of the truth; its `write` serves as a Bench's `on_truth`."""
 
     def __init__(
         self,
@@ -78,7 +84,9 @@ class TruthLog(Recorder):
     ) -> None:
         """Create the file. `blocking`: wait for the writer rather than lose a cycle.
 
-        Raises LogExistsError when there is one already, LogError.
+        scenario: attached, and its faults are named in the metadata.
+
+        Raises LogExistsError if there is a log already, LogError if it can't be written.
         """
         faults = () if scenario is None else scenario.faults
         super().__init__(
@@ -100,7 +108,7 @@ class TruthLog(Recorder):
         self.event(t_ns, Event(level, name, text))
 
     def discard(self) -> None:
-        """End the log and remove it. Raises OSError."""
+        """Close the log and delete its files. Raises OSError if one can't be deleted."""
         self.close()
         for part in find_parts(self.path).values():
             part.unlink()
@@ -144,12 +152,15 @@ class BenchTime:
 
     @property
     def host_ns(self) -> int:
-        """The bench's time on the clock of a host in lockstep."""
+        """The bench's time, ns, on the clock of a host in lockstep."""
         return self.now_ns - self._ahead_ns
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether the arm has stood still for a while and no drive powers its motor."""
+        """Whether, for 50 ms, the arm has stood still by the drives' velocities and no drive has powered its motor.
+
+        Motion between two calls is missed.
+        """
         return self._has_rested(self.now_ns)
 
     def begin(self, t_ns: int) -> None:
@@ -162,15 +173,19 @@ class BenchTime:
         self._move_arm(self.now_ns)
 
     def advance_to(self, t_ns: int) -> None:
-        """Advance the time to `t_ns` without frames: heartbeats, event timers and watchdogs act when they are due."""
+        """Advance the time to `t_ns` without frames: heartbeats, event timers and watchdogs act when they are due.
+
+        Faults and held frames do, too.
+        """
         while self.due_ns <= t_ns:
             self._act_at(max(self.due_ns, self.now_ns))
         self.reach(t_ns)
 
     def reach(self, t_ns: int) -> None:
-        """Advance the bench's time to `t_ns` by the clock; in clock mode `sync` the arm waits unless its host died.
+        """Advance the bench's time to `t_ns` without letting timers act; an earlier time changes nothing.
 
-        A host that dies sends no SYNC. The reaction of its drives must end, so their braking goes by time.
+        By SYNC the arm waits, except while its host is dead: then the drives' braking goes by time. By wall the arm
+        moves.
         """
         dt_ns = max(0, t_ns - self.now_ns)
         if self._is_wall or self._is_orphaned or any(drive.is_left_alone for drive in self._nodes.drives):
@@ -181,7 +196,10 @@ class BenchTime:
             self._sync_ns += dt_ns
 
     def reach_sync(self, lost: int) -> None:
-        """In clock mode `sync`, advance by the periods of `lost` SYNCs, then by the period before this SYNC."""
+        """In clock mode `sync`, advance by one period per lost SYNC, then by the period before this SYNC.
+
+        Nothing happens before the first SYNC, or in clock mode `wall`.
+        """
         if not self._is_wall and self.has_begun:
             self.pass_lost_syncs(lost)
             self.advance(self._nodes.period_ns)
@@ -199,26 +217,35 @@ class BenchTime:
         self._move_arm(self.now_ns + late_ns)
 
     def end_sync(self, cycle: int, stamp_ns: int) -> None:
-        """Latch the drives' set-points, and add the row of truth of a SYNC, answered or heard by no device."""
+        """Latch the drives' set-points, and add the row of truth of a SYNC.
+
+        Call it also if no device has heard the SYNC. stamp_ns: time of the SYNC frame, unused in lockstep.
+        """
         self._sync_ns, self._has_outlived = self.now_ns, False
         self._nodes.latch_motors()
         self._rows.add_sync_row(cycle, self.host_ns if self._outbox.is_paced else stamp_ns)
 
     def poll(self, t_ns: int) -> None:
-        """Let the nodes act on timers that are due at `t_ns`, and set `due_ns` to the next one."""
+        """Let the nodes act on timers that are due at `t_ns`; set `due_ns` to the next timer, fault or held frame."""
         self.due_ns = self._nodes.poll(t_ns)
         if self._injector.has_faults:
             self.due_ns = min(self.due_ns, self._injector.due_ns, self._outbox.due_ns)
 
     def advance_faults(self, stamp_ns: int, ahead_ns: int = 0) -> None:
-        """Begin and end the faults that are due within `ahead_ns` of now, and let babbling nodes send."""
+        """Begin and end the faults that are due within `ahead_ns` of now, and let babbling nodes send.
+
+        stamp_ns: time of their events, unused in lockstep.
+        """
         if self._injector.has_faults:
             is_paced = self._outbox.is_paced
             self._injector.advance(self.now_ns + ahead_ns, self.host_ns + ahead_ns if is_paced else stamp_ns)
             self._injector.flood(self._nodes.period_ns)
 
     def take_mark(self, data: bytes, _t_ns: int) -> None:
-        """On an ADVANCE mark, let time pass to the mark's time or until a frame is sent; then send a GRANT mark."""
+        """On an ADVANCE mark, let time pass to the mark's time or until a frame is sent; then send a GRANT mark.
+
+        The first mark begins lockstep. Other data has no effect.
+        """
         mark = unpack_mark(data)
         if mark is None or mark[0] is not MarkKind.ADVANCE:
             return
@@ -237,7 +264,7 @@ class BenchTime:
         outbox.mark(MarkKind.GRANT, self._granted_ns)
 
     def note_sent(self) -> None:
-        """Note that the host in lockstep has all frames sent so far, so that they don't end the next `take_mark`."""
+        """Store that the host has all frames sent so far: only later ones end the next `take_mark` early."""
         self._granted = self._outbox.sent
 
     def outlive_host(self) -> None:
@@ -259,14 +286,17 @@ class BenchTime:
         self._is_orphaned = False
 
     def _act_at(self, t_ns: int) -> None:
-        """Advance to `t_ns`: faults, held frames and the nodes' timers that are due then act."""
+        """Advance to `t_ns`, then let faults, held frames and the nodes' timers act that are due."""
         self.reach(t_ns)
         self.advance_faults(t_ns)
         self._outbox.release(self.now_ns)
         self.poll(self.now_ns)
 
     def _advance_without_sync(self, dt_ns: int) -> None:
-        """Advance by `dt_ns` without a SYNC; add a row of truth per period as long as the arm moves."""
+        """Advance arm and time by `dt_ns` without a SYNC.
+
+        Add a row of truth per period until the arm rests, by the wall from the fourth period after the last SYNC on.
+        """
         end_ns, period_ns = self.now_ns + dt_ns, self._nodes.period_ns
         first = _FIRST_OVERDUE if self._is_wall else 1
         self._nodes.latch_motors()
@@ -287,7 +317,10 @@ class BenchTime:
             self._nodes.move_arm(tick_count)
 
     def _has_rested(self, now_ns: int) -> bool:
-        """Return whether the arm has stood still for a while, and no drive could move it; call while it may move."""
+        """Return whether the arm has stood still for 50 ms and no drive could move it; call it often while it may move.
+
+        Each call with a moving arm or a powered drive restarts the 50 ms.
+        """
         is_powered = any(drive.motor_mode for drive in self._nodes.drives)
         if is_powered or max(map(abs, self._arm.drive_velocity_rad_s)) > REST_RAD_S:
             self._moving_ns = now_ns

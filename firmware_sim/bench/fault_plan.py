@@ -37,7 +37,7 @@ Pair = tuple[int, int]
 
 
 class FaultEdge(NamedTuple):
-    """A row that begins or ends now."""
+    """A fault of the scenario that begins or ends now. row: its index in the scenario; text: for a log."""
 
     row: int
     begins: bool
@@ -61,7 +61,10 @@ class ActionKind(Enum):
 
 
 class NodeAction(NamedTuple):
-    """Something that happens to a node now; `key`: of the object whose value changes."""
+    """An action on a node that is due now. node: place in NODES.
+
+    key: index and subindex of the object whose value changes.
+    """
 
     kind: ActionKind
     node: int
@@ -80,9 +83,9 @@ class FaultPlan:
         codec: Codec,
         torque_count_Nm: tuple[float, float] = (TORQUE_LSB_NM, TORQUE_LSB_NM),
     ) -> None:
-        """Begin before power-on. `period_ns`: SYNC's. `torque_count_Nm`: one count of each sensor.
+        """Begin before power-on. `period_ns`: SYNC's. `torque_count_Nm`: torque of one count of each sensor.
 
-        Raises ConfigError for a frame that the contract hasn't.
+        Raises ConfigError for a fault on a frame that the contract hasn't.
         """
         self._torque_count_Nm = torque_count_Nm
         self.mask = 0
@@ -114,7 +117,10 @@ class FaultPlan:
 
     @property
     def wait_ns(self) -> int:
-        """Longest time from the last `advance` to the next one, ns: until a row begins, ends or sends an EMCY."""
+        """Longest time from the last `advance` to the next one, ns: until a row begins, ends or sends an EMCY.
+
+        NEVER_NS if none will.
+        """
         wait_ns = NEVER_NS
         for now_ns, next_ns in (
             (self._scenario_ns, self._next_scenario_ns),
@@ -126,19 +132,21 @@ class FaultPlan:
 
     @property
     def is_acknowledged(self) -> bool:
-        """Whether some device has power and is on the bus, so that it acknowledges frames of the host."""
+        """Whether some device has power and is on the bus, so that the host's frames get their acknowledge bit."""
         return len(self._off | self._off_bus) < len(NODES)
 
     @property
     def is_flooding(self) -> bool:
-        """Whether a row of kind `babble` is active."""
+        """Whether a fault of kind `babble` is active."""
         return bool(self._babbling)
 
     def advance(self, scenario_ns: int, since_power_on_ns: int = _BEFORE_NS) -> list[FaultEdge]:
-        """Set the time; begin and end the rows that are due, and queue their actions; return these edges in order.
+        """Set the time, begin and end the faults that are due, queue their actions.
 
-        scenario_ns: since both drives were enabled, negative before. since_power_on_ns: negative if no time counts
-        from there. Neither goes back.
+        Return beginnings and ends in order.
+
+        scenario_ns: since both drives were enabled, negative before. since_power_on_ns: negative if no time counts from
+        there. Neither may go back.
         """
         self._scenario_ns, self._power_ns = scenario_ns, since_power_on_ns
         is_due = scenario_ns >= self._next_scenario_ns or since_power_on_ns >= self._next_power_ns
@@ -175,7 +183,7 @@ class FaultPlan:
         return self._change(rows, can_id, data) if rows else [(0, data)]
 
     def distort(self, position: Pair, velocity: Pair, torque: Pair) -> tuple[Pair, Pair, Pair]:
-        """Return the measured values with the active faults applied; call once per SYNC.
+        """Return the measured values with the active faults applied, unchanged without any; call once per SYNC.
 
         Pairs are the devices' in order, in counts of POSITION_LSB_RAD, VELOCITY_LSB_RAD_S and `torque_count_Nm`.
         """
@@ -192,7 +200,10 @@ class FaultPlan:
         return (position1, position2), (velocity1, velocity2), (torque1, torque2)
 
     def sync_delay_ns(self) -> int:
-        """Return a random delay with which this SYNC reaches the devices, ns; 0 without one. Call once per SYNC."""
+        """Return the delay, ns, with which this SYNC reaches the devices: the sum of random delays.
+
+        0 without an active fault. Call it once per SYNC.
+        """
         return sum(row.late_ns() for row in self._slowing if row.hit())
 
     def babble(self, period_ns: int) -> list[tuple[int, int, bytes]]:
@@ -220,7 +231,7 @@ class FaultPlan:
         return self._power_ns if row.settings.is_from_power_on else self._scenario_ns
 
     def _move(self, row: FaultRow) -> list[FaultEdge]:
-        """Begin or end a row if due, and queue the messages of its storm; return the beginning and end as edges."""
+        """Begin or end a row if it is due, and return these edges. Queue the EMCYs of its storm that are due."""
         edges: list[FaultEdge] = []
         now_ns = self._now_ns(row)
         if not row.is_active and not row.is_over and row.begin_ns <= now_ns:
@@ -235,7 +246,7 @@ class FaultPlan:
         return edges
 
     def _begin(self, row: FaultRow) -> None:
-        """Queue the actions of a reboot or drive fault without duration: off and on, or failure and repair."""
+        """Queue both actions of a reboot or drive fault without duration at once: off and on, or failure and repair."""
         settings = row.settings
         for node in settings.nodes:
             if settings.kind == "reboot" and not settings.duration_ns:
@@ -245,7 +256,10 @@ class FaultPlan:
                 self._actions += [NodeAction(ActionKind.FAIL, node, code), NodeAction(ActionKind.MEND, node)]
 
     def _take_over(self) -> None:
-        """Set mask and tables by the rows that are active now, and queue the actions on nodes that follow."""
+        """Set `mask` and the tables of effects by the rows that are active now.
+
+        Queue actions for the nodes that changed.
+        """
         active = [row for row in self._rows if row.is_active]
         self.mask = sum(1 << row.index for row in active)
         self._distorting = _of(active, *_VALUE_KINDS)
@@ -256,7 +270,10 @@ class FaultPlan:
         self._switch(active)
 
     def _sort_frames(self) -> None:
-        """Set the tables of the rows that act on each frame, sent and received, in the order of the rows."""
+        """Set the tables of the rows that change each frame, sent and received, in the scenario's order.
+
+        A row that holds a frame back stays in them.
+        """
         rows = _of([row for row in self._rows if row.is_active or row.held], *_FRAME_KINDS)
         received = [row for row in rows if row.settings.is_received]
         sent = [row for row in rows if not row.settings.is_received]
@@ -331,7 +348,10 @@ class FaultPlan:
             self._actions.append(NodeAction(ActionKind.EMERGENCY, node, row.settings.code or 0))
 
     def _change(self, rows: tuple[FaultRow, ...], can_id: int, data: bytes) -> Sent:
-        """Return the frames that rows make of one frame, one row after the other: delay in ns and data."""
+        """Return the frames that rows make of one frame, one row after the other: delay in ns and data.
+
+        [] if it is lost.
+        """
         frames: Sent = [(0, data)]
         for row in rows:
             if row.settings.kind == "reorder":
@@ -341,7 +361,10 @@ class FaultPlan:
         return frames
 
     def _swap(self, row: FaultRow, can_id: int, frames: Sent) -> Sent:
-        """Hold a frame back until the next with its identifier has overtaken it; return the frames to send now."""
+        """Hold a frame back until the next with its identifier has overtaken it; return the frames to send now.
+
+        While one is held back, that is [].
+        """
         if can_id in row.held:
             overtaken = row.held.pop(can_id)
             if not row.is_active:
@@ -354,7 +377,10 @@ class FaultPlan:
         return []
 
     def _plan_next(self) -> None:
-        """Set the times at which the next row begins, ends or sends, in the scenario's time and since power-on."""
+        """Set the next times at which a row begins, ends or sends, in scenario time and since power-on.
+
+        A time is NEVER_NS if no row will.
+        """
         by_scenario = [row for row in self._rows if not row.settings.is_from_power_on]
         by_power = [row for row in self._rows if row.settings.is_from_power_on]
         self._next_scenario_ns = min((row.due_ns for row in by_scenario), default=NEVER_NS)

@@ -42,10 +42,10 @@ Place = tuple[int, int]
 
 
 class FaultRow:
-    """One row of faults and its progress.
+    """One of a scenario's faults, and its progress.
 
-    sent: frames of its flood so far. held: by identifier, frames to be overtaken. kept: stuck counts by node, or frozen
-    counters by identifier.
+    hits_left: frames or values that it may still hit. sent: frames of its flood so far. held: by identifier, frames to
+    be overtaken. kept: stuck counts by node, or frozen counters by identifier.
     """
 
     def __init__(self, index: int, settings: FaultSettings, seed: str, period_ns: int) -> None:
@@ -76,12 +76,18 @@ class FaultRow:
 
     @property
     def due_ns(self) -> int:
-        """Time at which the fault next begins, ends or, in a storm of EMCY, sends an EMCY, ns."""
+        """Time at which the fault next begins, ends or, in a storm of EMCYs, sends one, ns.
+
+        NEVER_NS once it is over.
+        """
         is_storming = self.is_active and self.settings.kind == "emcy_storm"
         return min(self.next_ns, self.flood_ns) if is_storming else self.next_ns
 
     def hit(self) -> bool:
-        """Return whether the fault hits the next frame or value, at random, and count a hit; False while inactive."""
+        """Return whether the fault hits the next frame or value, by its random chance.
+
+        A hit uses up one of `hits_left`. False while inactive, and once `hits_left` is 0.
+        """
         if self.hits_left <= 0 or not self.is_active:
             return False
         chance = self.settings.chance
@@ -91,16 +97,17 @@ class FaultRow:
         return True
 
     def late_ns(self) -> int:
-        """Return the delay of a frame, ns: the row's delay plus random jitter."""
+        """Return by how much the fault delays a frame, ns: its delay plus random jitter, drawn anew at each call."""
         settings = self.settings
         jitter_us = settings.jitter_us * self.draws.random() if settings.jitter_us else 0.0
         return round(((settings.delay_us or 0.0) + jitter_us) * 1e3)
 
 
 def distort_value(row: FaultRow, node: int, counts: int, lsb: float) -> int:
-    """Return a measured value as the fault changes it; unchanged if the fault doesn't hit it.
+    """Return a measured value in counts as the fault changes it; unchanged if the fault doesn't hit it.
 
-    node: index in NODES; a stuck value is kept for each. lsb: of one count, in the unit of the signal.
+    A torque that jumps or saturates stays within TORQUE_COUNTS. node: index in NODES; a stuck value is kept for each.
+    lsb: one count in the unit of the signal.
     """
     settings = row.settings
     if not row.hit():
@@ -123,7 +130,7 @@ def _delay(row: FaultRow, _message: MessageCodec | None, frames: Sent) -> Sent:
 
 
 def _flip(row: FaultRow, data: bytes) -> bytes:
-    """Return data with the bits of the row's mask flipped, or else with as many random bits as the row says."""
+    """Return data with the bits of the fault's mask flipped; without a mask, with its number of random bits flipped."""
     settings = row.settings
     bits = int.from_bytes(data, "little")
     if settings.mask is not None:
@@ -136,7 +143,10 @@ def _flip(row: FaultRow, data: bytes) -> bytes:
 
 
 def _freeze_counter(row: FaultRow, message: MessageCodec | None, frames: Sent) -> Sent:
-    """Return protected frames with the counter of the first frame that was hit and a CRC for it; others unchanged."""
+    """Return protected frames with the counter of the first frame that was hit, and a CRC that fits.
+
+    Frames of wrong length or without protection stay.
+    """
     if message is None or message.profile is None:
         return frames
     changed = []
@@ -159,7 +169,10 @@ FRAME_CHANGES: dict[str, Callable[[FaultRow, MessageCodec | None, Sent], Sent]] 
 
 
 def name_streams(rows: Sequence[FaultSettings], seed: int) -> list[tuple[FaultSettings, str]]:
-    """Return each row with the seed of its random stream, a text: rows that are alike get different ones."""
+    """Return each fault with the seed text of its random numbers.
+
+    Faults of the same kind, node, frame and signal get different seeds, by their order.
+    """
     counts: dict[str, int] = {}
     named = []
     for row in rows:
@@ -170,7 +183,9 @@ def name_streams(rows: Sequence[FaultSettings], seed: int) -> list[tuple[FaultSe
 
 
 def find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Place]:
-    """Return node and identifier of the frames that a row is about; no frame if it is about none.
+    """Return (node, identifier) of the frames that a fault changes; no frame if it changes none.
+
+    EVERYBODY is the node of a broadcast, ANY_FRAME the identifier of frame "any".
 
     Raises ConfigError if the contract lacks a frame, or if a frame has no counter to freeze.
     """

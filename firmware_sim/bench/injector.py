@@ -57,7 +57,7 @@ class Outbox:
         return self._held[0].due_ns if self._held else NEVER_NS
 
     def put(self, can_id: int, data: bytes) -> None:
-        """Send a frame at once; between `collect` and `send_released`, hold it for the latter."""
+        """Send a frame at once; between `collect` and `send_released`, hold it until the latter."""
         if self._is_open:
             self.put_later(self._now_ns, can_id, data)
         else:
@@ -83,7 +83,7 @@ class Outbox:
             heapq.heappop(self._held).act()
 
     def collect(self, now_ns: int) -> None:
-        """Hold the frames that are put from now on, as due at `now_ns`, until `send_released`."""
+        """From now on, hold frames that are `put`, due at `now_ns`, until `send_released` sends them."""
         self._now_ns = now_ns
         self._is_open = True
 
@@ -111,18 +111,18 @@ class Outbox:
 
 
 class Departure:
-    """Gathers frames that `send_waiting` sends to the bus together."""
+    """Collects frames, and sends them to the bus in one call."""
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
         self._frames: list[tuple[int, bytes]] = []
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Add a frame to those that `send_waiting` sends."""
+        """Store a frame; `send_waiting` sends it."""
         self._frames.append((can_id, data))
 
     def send_waiting(self) -> None:
-        """Send the waiting frames. Raises BusError; unsent frames are dropped, as by a controller's reset."""
+        """Send the stored frames. Raises BusError; then the unsent ones are lost, as by a controller's reset."""
         if self._frames:
             frames, self._frames = self._frames, []
             self._bus.send_all(frames)
@@ -142,7 +142,7 @@ class Injector:
     def __init__(
         self, scenario: Scenario, seed: int, period_ns: int, codec: Codec, outbox: Outbox, on_event: OnEvent | None
     ) -> None:
-        """Begin before power-on. Raises ConfigError when a fault is about a frame that the contract hasn't."""
+        """Begin before power-on. Raises ConfigError for a fault on a frame that the contract hasn't."""
         first, second = (count_Nm(scenario.sensors, joint) for joint in scenario.wiring.sensor_joint)
         self.plan = FaultPlan(scenario.faults, seed, period_ns, codec, (first, second))
         self._rows = scenario.faults
@@ -161,7 +161,11 @@ class Injector:
     def attach(
         self, devices: Sequence[EmulatedDevice], drives: Sequence[DriveNode], sensors: Sequence[SensorNode]
     ) -> None:
-        """Set the nodes on which faults act. Raises ConfigError for a missing object, or a value that it can't have."""
+        """Set the nodes on which faults act.
+
+        Raises ConfigError if a fault replaces the value of an object that its device lacks, or by a value that the
+        object can't have.
+        """
         self._devices, self._drives, self._sensors = devices, drives, sensors
         for index, row in enumerate(self._rows):
             for place in row.nodes if row.kind == "object_value" else ():
@@ -173,21 +177,21 @@ class Injector:
         self.now_ns = self._power_on_ns = t_ns
 
     def start(self, t_ns: int) -> None:
-        """Set `t_ns` as the time at which the scenario begins."""
+        """Set `t_ns` as scenario time 0, from which most faults count."""
         self._started_ns = t_ns
 
     @property
     def is_quiet(self) -> bool:
-        """Whether no fault acts on frames or values and no action on a node waits."""
+        """Whether no fault acts on frames or values, and no action on a node is queued."""
         return self.plan.is_quiet
 
     @property
     def due_ns(self) -> int:
-        """Time at which a fault next begins, ends or sends, ns."""
+        """Time at which a fault next begins, ends or sends, ns; far in the future (NEVER_NS later) if none will."""
         return min(self.now_ns + self.plan.wait_ns, self._flooded_ns if self.plan.is_flooding else NEVER_NS)
 
     def sender(self, place: int) -> Send:
-        """Return the function by which a device sends its frames, which applies the faults. `place`: index in NODES."""
+        """Return the function by which the device `place` (index in NODES) sends; it applies faults to each frame."""
         outbox, plan = self._outbox, self.plan
 
         def put(can_id: int, data: bytes) -> None:
@@ -205,7 +209,7 @@ class Injector:
     def receive(self, place: int, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
         """Call `take` with a frame of the host, as faults change, repeat or delay it; return False if it is lost.
 
-        place: of the node that receives it, or EVERYBODY.
+        A delayed frame is taken when the outbox releases it. place: index in NODES of the receiver, or EVERYBODY.
         """
         if self.plan.is_quiet:
             take(data, t_ns)
@@ -220,7 +224,10 @@ class Injector:
         return bool(frames)
 
     def receive_by_all(self, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
-        """Call `take` with a host's frame to all nodes, as faults change or delay it; return False if it is lost."""
+        """Call `take` with a host's frame to all nodes, as faults change, repeat or delay it.
+
+        Return False if it is lost.
+        """
         return self.receive(EVERYBODY, can_id, data, take, t_ns)
 
     def advance(self, now_ns: int, stamp_ns: int) -> None:
@@ -241,27 +248,27 @@ class Injector:
                 self._outbox.mark(MarkKind.LIT if self._is_acknowledged else MarkKind.DARK)
 
     def late_ns(self, period_ns: int) -> int:
-        """Return, at random, how late this SYNC reaches the devices, ns; less than a period."""
+        """Return how late this SYNC reaches the devices, ns: random, 0 without such a fault, less than a period."""
         return 0 if self.plan.is_quiet else min(self.plan.sync_delay_ns(), period_ns - 1)
 
     def flood(self, period_ns: int) -> None:
-        """Hold the frames of babbling nodes in the period that begins now, each until its time."""
+        """Queue the frames that babbling nodes send in the period from now on, each until its time."""
         if self.plan.is_flooding:
             self._flooded_ns = self.now_ns + period_ns
             for offset_ns, can_id, data in self.plan.babble(period_ns):
                 self._outbox.put_later(self.now_ns + offset_ns, can_id, data)
 
     def count_heard(self, sync_id: int, data: bytes) -> tuple[int, ...]:
-        """Return how often each device hears a SYNC that is sent once: 0 off the bus or if it is lost."""
+        """Return how often each device hears one SYNC: 0 off the bus or if it is lost, 2 if it is doubled, else 1."""
         plan = self.plan
         return tuple(
             len(plan.receive(place, sync_id, data)) * device.is_on_bus for place, device in enumerate(self._devices)
         )
 
     def sync(self, heard: Sequence[int], measured: Measurement, now_ns: int) -> None:
-        """Call `on_sync` of the nodes that hear a SYNC, with measured values that faults have changed.
+        """Call `on_sync` of the nodes that hear a SYNC, with the measured values as faults change them.
 
-        heard: how often each device hears it, as from `count_heard`.
+        heard: how often each device hears it, from `count_heard`; a node that hears it twice acts once.
         """
         position, velocity, torque = self.plan.distort(*measured)
         for joint, drive in enumerate(self._drives):

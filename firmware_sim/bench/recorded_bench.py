@@ -32,7 +32,10 @@ Answer = tuple[int, bytes]
 
 
 class RecordedCycle(NamedTuple):
-    """The answers to one SYNC, with the numbers of its attempt and of its cycle there."""
+    """The recorded answers to one SYNC.
+
+    attempt counts NMT resets, cycle the SYNCs since the attempt's first; both from 0.
+    """
 
     attempt: int
     cycle: int
@@ -40,10 +43,10 @@ class RecordedCycle(NamedTuple):
 
 
 class RecordedCycles:
-    """The cycles of a recording, forwards."""
+    """The cycles of a recording, read forwards only."""
 
     def __init__(self, path: Path, codec: Codec) -> None:
-        """Open the recording. Raises LogError, CodecError."""
+        """Open the recording. Raises LogError if it can't be read, CodecError if the DBC lacks Sync or Nmt."""
         self.attempt = -1
         """Number of the attempt in progress, -1 before the first."""
         self.answered = 0
@@ -58,15 +61,18 @@ class RecordedCycles:
 
     @property
     def problem(self) -> str:
-        """Missing part of the recording, one line; empty if nothing is missing."""
+        """One line on the part of the recording that is damaged or missing; empty if it is whole."""
         return self._source.problem
 
     def begin(self) -> None:
-        """Begin the next attempt."""
+        """Begin the next attempt; `take` then refers to it."""
         self.attempt += 1
 
     def take(self, cycle: int) -> tuple[Answer, ...]:
-        """Return the answers to a cycle of the attempt, () if the recording lacks them. Raises LogError."""
+        """Return the answers to a cycle of this attempt, () if the recording lacks them.
+
+        Earlier cycles are skipped for good. Raises LogError.
+        """
         wanted = (self.attempt, cycle)
         while self._next is not None and (self._next.attempt, self._next.cycle) < wanted:
             self._next = self._fetch()
@@ -105,7 +111,10 @@ class RecordedCycles:
             yield RecordedCycle(attempt, cycle, tuple(answers))
 
     def _frames(self) -> Iterator[Answer]:
-        """Yield SYNC, NMT and the answers, in the order of the bus."""
+        """Yield identifier and data of SYNC, NMT and the answers, in the order of the bus.
+
+        Error and remote frames are left out.
+        """
         wanted = [self._sync_id, self._nmt_id, *self._answer_ids]
         for frames in self._source:
             is_data = ~frames["is_error"] & ~frames["is_remote"] & ~frames["is_extended"]
@@ -122,7 +131,7 @@ _TORQUES = ("Sensor1Torque", "Sensor2Torque")
 
 
 class RecordedBody:
-    """The arm as its recorded frames show it, for the nodes' objects and standstill; it has no truth."""
+    """The recorded arm in place of a `Body`: for the nodes' objects and standstill. It has no truth."""
 
     has_ideal_motors = True
     is_torque_limited = (False, False)
@@ -139,11 +148,14 @@ class RecordedBody:
 
     @property
     def drive_velocity_rad_s(self) -> tuple[float, float]:
-        """Velocity in the latest feedback of each drive, rad/s."""
+        """Velocity in the latest recorded feedback of each drive, rad/s; 0 before the first."""
         return self._dq_rad_s[0], self._dq_rad_s[1]
 
     def show(self, answers: Sequence[Answer]) -> None:
-        """Set position, velocity and torque of the recorded arm from answers (identifier, data); skip wrong lengths."""
+        """Store position, velocity and torque from recorded answers (identifier, data).
+
+        Answers of wrong length are skipped.
+        """
         for can_id, data in answers:
             for table in (self._feedbacks, self._torques):
                 if can_id in table:
@@ -165,12 +177,12 @@ class RecordedBody:
         drive_mode: Sequence[int],
         tick_count: int | None = None,  # noqa: ARG002 (the body's signature)
     ) -> None:
-        """Set the motors' torque to the set-points of drives in torque mode, else to 0; don't move the recorded arm."""
+        """Set `motor_torque_Nm` to the set-points of drives in torque mode, else to 0; don't move the recorded arm."""
         first_Nm, second_Nm = torque_setpoint_Nm
         self.motor_torque_Nm = first_Nm * (drive_mode[0] == _TORQUE), second_Nm * (drive_mode[1] == _TORQUE)
 
     def sample(self) -> Measurement:
-        """Return the latest values in the converters' counts."""
+        """Return the latest recorded values in the default counts of position, velocity and torque."""
         return Measurement(
             _counts(self._q_rad, POSITION_LSB_RAD),
             _counts(self._dq_rad_s, VELOCITY_LSB_RAD_S),
@@ -182,7 +194,7 @@ class RecordedBody:
 
 
 class RecordedBench(Bench):
-    """A bench whose cyclic frames come from a recording, or from another sender on the bus."""
+    """A bench whose cyclic frames come from a recording, or from another sender on the bus; all else is live."""
 
     def __init__(
         self,
@@ -195,7 +207,7 @@ class RecordedBench(Bench):
         contract: EmulatedContract | None = None,
         on_answer: Callable[[], None] = lambda: None,
     ) -> None:
-        """Build everything as `Bench` does. `scenario`: without faults. Without `cycles` SYNC isn't answered."""
+        """Build everything as `Bench` does. `scenario`: without faults. `cycles`: None: SYNC gets no cyclic answer."""
         self._cycles = cycles
         self._answers_now: tuple[Answer, ...] = ()
         self._codec = codec

@@ -59,7 +59,10 @@ _FASTEST_BLOW_M_S: Final = 2.0
 
 
 def _largest_mobility(arm: EmulatedArm, link: int, points_m: Vector) -> float:
-    """Return the largest 1/mass, 1/kg, that the unloaded arm shows a force at these points of a link, in any pose."""
+    """Return the largest 1/mass, 1/kg, by which a force at one of these points of a link moves it, in any pose.
+
+    The arm carries no payload. points_m: distances from the joint that carries the link.
+    """
     alpha, beta, gamma = arm.inertia()
     length1_m = arm.link_length_m[0]
     elbow_rad, point_m = np.meshgrid(np.linspace(0.0, math.pi, _POSES), points_m)
@@ -127,7 +130,7 @@ def _wall_row(arm: EmulatedArm, wall: WallSettings) -> np.void:
 
 
 def touch_table(scenario: Scenario) -> Structured:
-    """Return a scenario's bodies, hands and walls as a table (n,) of THING for compiled functions."""
+    """Return a scenario's bodies, then hands, then walls, as a table (n,) of dtype THING for compiled functions."""
     arm = scenario.arm
     rows = [_body_row(arm, body) for body in scenario.bodies]
     rows += [_hand_row(arm, hand) for hand in scenario.hands]
@@ -138,14 +141,15 @@ def touch_table(scenario: Scenario) -> Structured:
 
 
 def initial_touch_state(things: Structured) -> Vector:
-    """Return the touch state at power-on: no thing is in place yet (TOUCH_HEADER + n THING_PLACES,)."""
+    """Return the touch state at power-on, zeros (TOUCH_HEADER + n THING_PLACES,): no thing is in place yet."""
     return np.zeros(TOUCH_HEADER + things.size * THING_PLACES)
 
 
 def largest_rate_rad_s(things: Structured) -> float:
     """Return a bound of the fastest rate that bodies, hands and walls give the unloaded arm, rad/s; 0 without any.
 
-    Things that can be there at the same time add up: squares of the springs' rates, and the dampers' rates.
+    Rates of things that are there at the same time are summed: those of springs by squares, those of dampers as they
+    are. The result is the larger of the two sums.
     """
     largest = 0.0
     for onset_s in things["onset_s"]:
@@ -157,7 +161,10 @@ def largest_rate_rad_s(things: Structured) -> float:
 
 
 def fade_rate_rad_s(scenario: Scenario) -> float:
-    """Return the fastest rate that a scripted force of frame "motion" gives the unloaded arm at rest; 0 without one."""
+    """Return the fastest rate, rad/s, by which a scripted force of frame "motion" damps the slow, unloaded arm.
+
+    0 without one.
+    """
     return max(
         (
             one.force_N / FADE_M_S * _largest_mobility(scenario.arm, one.link, np.array([one.point_m]))
@@ -174,7 +181,7 @@ _ENCODER_STREAM: Final = (2,)
 
 
 def payload_table(payloads: tuple[PayloadSettings, ...]) -> Structured:
-    """Return payload changes as a table (n,) of PAYLOAD_CHANGE for compiled functions."""
+    """Return payload changes as a table (n,) of dtype PAYLOAD_CHANGE, in the same order, for compiled functions."""
     rows = [(change.tick, change.mass_kg, *change.center_m, change.inertia_kg_m2) for change in payloads]
     return np.array(rows, dtype=PAYLOAD_CHANGE)
 
@@ -212,7 +219,10 @@ class MovableArm(Protocol):
 
 
 class BodyParts(NamedTuple):
-    """Arguments of `body_ticks.advance_body` beside set-points, modes and ticks; the arrays are the body's own."""
+    """Arguments of `body_ticks.advance_body` beside set-points, modes and ticks.
+
+    Its arrays are the body's own, not copies.
+    """
 
     state: Vector
     numbers: Vector
@@ -286,7 +296,7 @@ class Body:
         self._compile()
 
     def _put_at_start(self) -> None:
-        """Set the state at power-on: the start pose at rest, with payload and settled sensors."""
+        """Set the state at power-on: the start pose at rest, the payload, motors at their preheat, settled sensors."""
         state: np.void = self._state_vector.view(BODY_STATE)[0]
         for name in ("q", "q_m", "q_encoder"):
             self._arm[name] = self.scenario.start_rad
@@ -302,7 +312,10 @@ class Body:
 
     @property
     def parts(self) -> BodyParts:
-        """Arguments of the compiled functions, for a caller that plays many cycles at once."""
+        """Arguments of the compiled functions, for a caller that plays many cycles at once.
+
+        They share the body's memory.
+        """
         return BodyParts(
             self._state_vector, self._number_vector, self._contacts, self._things, self._touch_state,
             self._payloads, self._encoder_noise.table, self._substeps, self._work,
@@ -325,20 +338,20 @@ class Body:
         )  # fmt: skip
 
     def start_scenario(self) -> None:
-        """Start the scenario time now, once both drives are enabled; later calls have no effect."""
+        """Set scenario time 0 to now; call it once both drives are enabled. Later calls have no effect."""
         if self._course["start_tick"] < 0.0:
             self._course["start_tick"] = self._course["tick"]
 
     @property
     def motor_torque_Nm(self) -> tuple[float, float]:
-        """Torque that the drives know from their motor currents, without the sensor's noise; 0x6077."""
+        """Torque that the drives believe, by joint, Nm: from their motor currents, with their zero error; 0x6077."""
         (gain1, gain2), (offset1_Nm, offset2_Nm) = self._gain, self._offset_Nm
         tau1_Nm, tau2_Nm = self._tau_m.tolist()
         return tau1_Nm / gain1 - offset1_Nm, tau2_Nm / gain2 - offset2_Nm
 
     @property
     def is_torque_limited(self) -> tuple[bool, bool]:
-        """Whether each drive wants more torque than current limit, I²t or temperature leave; statusword bit 11."""
+        """Whether each drive wants more torque than its peak current, I²t or temperature allow; statusword bit 11."""
         if self.has_ideal_motors:
             return False, False
         first, second = self._is_limited.tolist()
@@ -346,7 +359,10 @@ class Body:
 
     @property
     def motor_error_code(self) -> tuple[int, int]:
-        """Error code that each motor's I²t or temperature calls for now, 0 without a fault; 0x603F."""
+        """Error code 0x603F by joint: 0x4310 if too hot, else 0x2310 if I²t is spent and that is a fault, else 0.
+
+        A code stays until the winding has cooled below the derating start, or I²t's effort has fallen by a tenth.
+        """
         if self.has_ideal_motors:
             return 0, 0
         heat1, heat2 = self._is_overheated.tolist()
@@ -355,20 +371,23 @@ class Body:
 
     @property
     def joint_temperature_C(self) -> tuple[float, float]:
-        """True temperature of each joint, °C."""
+        """True temperature of each joint's lubricant, °C, which warms with friction."""
         first, second = self._temperature_C.tolist()
         return first, second
 
     @property
     def drive_velocity_rad_s(self) -> tuple[float, float]:
-        """Velocity that the drives know, not quantised; by this they see standstill."""
+        """Velocity that each drive estimates from its encoder, rad/s, before rounding to counts.
+
+        By it drives see standstill.
+        """
         first, second = self._velocity_rad_s.tolist()
         return first, second
 
     def advance(
         self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int], tick_count: int = PERIOD_TICKS
     ) -> None:
-        """Advance the arm by ticks of 100 µs with constant set-points (2,), Nm, and `DriveMode` (2,), by joint."""
+        """Advance the arm by ticks of 100 µs with constant set-points (2,), Nm, and `DriveMode`s (2,), by joint."""
         while tick_count > 0:
             count = tick_count
             if self._encoder_noise.is_on:
@@ -393,13 +412,16 @@ class Body:
             )
 
     def sample(self) -> Measurement:
-        """Return the measured values of now in counts. Call it once per SYNC: each call draws new noise."""
+        """Return the values that the devices measure now, in counts, by joint.
+
+        Call it once per SYNC: each call draws new noise, and moves the torque sensors' wandering zeros.
+        """
         sample_body(self._state_vector, self._number_vector, self._noise.draw(), self._walk.draw(), self._counts)
         q1, q2, dq1, dq2, tau1, tau2 = self._counts.tolist()
         return Measurement((q1, q2), (dq1, dq2), (tau1, tau2))
 
     def truth(self, out: Vector) -> None:
-        """Fill a block laid out by TRUTH_LAYOUT with the present true values; changes no measurement."""
+        """Fill a block laid out by TRUTH_LAYOUT with the present true values. Measurements stay the same."""
         fill_truth(
             self._state_vector,
             self._number_vector,

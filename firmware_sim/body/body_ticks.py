@@ -86,9 +86,10 @@ overshoot."""
 
 @compiled
 def find_contact(course: np.void, contacts: Structured) -> Structured:
-    """Return the row of the contact in force at this tick (1,), or an empty array; skip contacts that have ended.
+    """Return the row of the scripted contact that acts at this tick (1,), or an empty array.
 
-    Sets `course["contact"]` to the index of the contact in force or the next one.
+    Sets `course["contact"]` to the index of that contact or of the next one. Contacts that have ended are skipped for
+    good.
     """
     tick = course["tick"] - course["start_tick"]
     index = int(course["contact"])
@@ -102,7 +103,7 @@ def find_contact(course: np.void, contacts: Structured) -> Structured:
 
 @compiled
 def _elapsed_s(course: np.void, contact: Structured) -> float:
-    """Return the time since the onset of the contact in force, s; 0 without one."""
+    """Return the time since the onset of the contact in row `contact` (1,), s; 0 for an empty array."""
     if contact.size == 0:
         return 0.0
     return float((course["tick"] - course["start_tick"] - contact[0]["onset_tick"]) * TICK_S)
@@ -110,7 +111,10 @@ def _elapsed_s(course: np.void, contact: Structured) -> float:
 
 @compiled
 def _change_payload(state: np.void, arm: np.void, payloads: Structured) -> None:
-    """Apply the payload changes of this tick; payloads: rows of PAYLOAD_CHANGE."""
+    """Apply the payload changes that are due by this tick, each once; none before the scenario starts.
+
+    payloads: rows of PAYLOAD_CHANGE.
+    """
     course = state["course"]
     if course["start_tick"] < 0.0:
         return
@@ -133,7 +137,10 @@ def _scenario_s(course: np.void) -> float:
 
 @compiled
 def _torque_target(arm: np.void, joint: int, mode: int, setpoint_Nm: float, velocity_rad_s: float) -> float:
-    """Return the torque that a drive wants in a `DriveMode`, Nm: set-point or braking, within its rated torque."""
+    """Return the torque that a drive wants in a `DriveMode`, Nm: set-point or braking, limited to its rated torque.
+
+    0 while it is off.
+    """
     limit_Nm = arm["rated_torque_Nm"][joint]
     if mode == _TORQUE:
         return float(min(max(setpoint_Nm, -limit_Nm), limit_Nm))
@@ -149,7 +156,10 @@ def _torque_target(arm: np.void, joint: int, mode: int, setpoint_Nm: float, velo
 
 @compiled
 def _read_encoder(course: np.void, numbers: np.void, joint: int, angle_rad: float, noise_counts: float) -> None:
-    """Store the encoder's reading of its shaft's angle at the end of a tick, and advance the drive's velocity by it."""
+    """Store the angle that the encoder measures at a tick's end.
+
+    Update the drive's position and velocity estimates by it.
+    """
     now_rad = read_angle(numbers["encoder"], joint, angle_rad, noise_counts)
     course["estimate_rad"][joint], course["velocity_rad_s"][joint] = track(
         course["encoder_rad"][joint],
@@ -164,7 +174,10 @@ def _read_encoder(course: np.void, numbers: np.void, joint: int, angle_rad: floa
 
 @compiled
 def _measure_tick(state: np.void, numbers: np.void, encoder_noise: NDArray[np.float64]) -> None:
-    """Update encoders, motor temperatures and torque sensors by the arm's state at the end of a tick."""
+    """Update encoders, motor temperatures and torque sensors by the arm's state at the end of a tick.
+
+    encoder_noise: table of `EncoderNoise`, counts.
+    """
     arm, course, motor = state["arm"], state["course"], numbers["motor"]
     tick = course["tick"]
     noise = encoder_noise[int(tick) % (2 * NOISE_TICKS)]
@@ -232,9 +245,10 @@ def advance_body(
 def sample_body(
     state_vector: Vector, number_vector: Vector, noise: Vector, walk: Vector, out: NDArray[np.int64]
 ) -> None:
-    """Write the measured values to `out` (6,): counts of position, velocity and torque, two each.
+    """Write the measured values to `out` (6,): counts of position, velocity and torque, two each, by joint.
 
-    noise, walk (2,): noise of the torque sensors, Nm, and steps of their zeros' walk.
+    noise (2,): noise of the torque sensors, Nm. walk (2,): normal numbers times the rms after one second of their
+    zeros' walk, which each call advances.
     """
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     arm, course, transducers = state["arm"], state["course"], state["transducer"]
@@ -261,7 +275,11 @@ def fill_truth(
     touch_truth: Vector,
     block: Vector,
 ) -> None:
-    """Fill a block laid out by TRUTH_LAYOUT with the true values of this instant. touch_truth: room for TOUCH_TRUTH."""
+    """Fill a block laid out by TRUTH_LAYOUT with the true values of this instant.
+
+    First applies the payload and touch changes that are due. touch_truth, overwritten: room for TOUCH_TRUTH. work: from
+    `work_space`, overwritten.
+    """
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     now, course, arm = state["arm"], state["course"], numbers["arm"]
     touched, out = touch_truth.view(TOUCH_TRUTH)[0], block.view(_TRUTH)[0]

@@ -71,7 +71,10 @@ MOTOR_STATE: Final = float_fields(
 
 
 def motor_numbers(settings: DriveSettings, rated_torque_Nm: tuple[float, float]) -> np.void:
-    """Return the drives' properties as one record of dtype MOTOR_NUMBERS, for compiled functions."""
+    """Return both drives' loops, torque constant, current and temperature limits as one record of dtype MOTOR_NUMBERS.
+
+    A peak torque of 0 or above rated torque becomes rated torque; a continuous torque not below the peak means no I²t.
+    """
     numbers = pack_fields(settings, MOTOR_NUMBERS)
     plant_way = math.expm1(-2.0 * math.pi * CURRENT_LOOP_HZ * TICK_S)
     for joint in range(2):
@@ -99,7 +102,7 @@ def motor_numbers(settings: DriveSettings, rated_torque_Nm: tuple[float, float])
 
 
 def motor_state(settings: DriveSettings) -> np.void:
-    """Return the state of both motors at power-on, MOTOR_STATE."""
+    """Return the state of both motors at power-on, dtype MOTOR_STATE: cold windings, preheated housings."""
     state: np.void = np.zeros(1, MOTOR_STATE)[0]
     state["housing_K"][:] = settings.preheat_K
     return state
@@ -107,13 +110,13 @@ def motor_state(settings: DriveSettings) -> np.void:
 
 @compiled
 def winding_temperature(numbers: np.void, state: np.void, joint: int) -> float:
-    """Return the winding's temperature, °C: T in the module's first lines."""
+    """Return the winding's temperature, °C: ambient, plus housing over ambient, plus winding over housing."""
     return float(numbers["ambient_C"][joint] + state["winding_K"][joint] + state["housing_K"][joint])
 
 
 @compiled
 def available_torque(numbers: np.void, state: np.void, joint: int) -> float:
-    """Return the largest torque that the drive may ask for now, Nm."""
+    """Return the largest torque that the drive may ask for now, Nm: its peak, less by I²t and by derating."""
     limit_Nm = numbers["peak_Nm"][joint]
     if numbers["has_limits"] == 0.0:
         return float(limit_Nm)
@@ -130,11 +133,10 @@ def command_torque(
 ) -> float:
     """Return the target, Nm, with which the plant's 1 kHz torque loop gives the motor's torque after this tick.
 
-    Sets `is_limited` in the state if the drive wants more than it may.
-
-    wanted: the drive's set-point, within rated torque. tau: the motor's torque now. The plant's loop has 1 kHz; one
-    of another bandwidth is exact at the ends of the ticks. Within a tick a slower one is off by a hundredth of the way
-    to the target at most, one of 2 kHz by a twentieth, one of 5 kHz by a quarter.
+    Sets `is_limited` in the state if the drive wants more than it may. wanted: the drive's set-point, within rated
+    torque. tau: the motor's torque now. is_powered: errors of torque constant and current sensor act only then. The
+    result is exact at the ends of the ticks. Within a tick a loop slower than 1 kHz is off by a hundredth of the way to
+    the target at most, one of 2 kHz by a twentieth, one of 5 kHz by a quarter.
     """
     limit_Nm = available_torque(numbers, state, joint)
     target_Nm = min(max(wanted_Nm, -limit_Nm), limit_Nm)
@@ -172,7 +174,7 @@ def heat_motor(numbers: np.void, state: np.void, joint: int, tau_Nm: float) -> N
 
 
 def error_code(is_overheated: float, is_overloaded: float) -> int:
-    """Return the error code 0x603F that a motor calls for, 0 without a fault; excess temperature comes first.
+    """Return the error code 0x603F of a motor: 0x4310 if overheated, else 0x2310 if overloaded, else 0.
 
     is_overloaded: I²t is spent, and the drive's reaction to that is a fault.
     """

@@ -55,7 +55,7 @@ NOISE_TICKS: Final = 64
 
 
 def encoder_numbers(settings: SensorSettings) -> np.void:
-    """Return the encoders' properties as one record of dtype ENCODER_NUMBERS, for compiled functions."""
+    """Return both encoders' errors and resolution as one record of dtype ENCODER_NUMBERS, for compiled functions."""
     numbers = pack_fields(settings, ENCODER_NUMBERS)
     numbers["lsb_rad"][:] = [2.0 * math.pi / (1 << bits) for bits in settings.encoder_bits]
     return numbers
@@ -63,7 +63,10 @@ def encoder_numbers(settings: SensorSettings) -> np.void:
 
 @compiled
 def read_angle(numbers: np.void, joint: int, angle_rad: float, noise_counts: float) -> float:
-    """Return the angle that an encoder reads at a true angle, rad: with errors of its disc, in whole counts."""
+    """Return the angle that an encoder measures at a true angle, rad: with its disc's errors, in whole encoder counts.
+
+    noise_counts is added before rounding.
+    """
     disc_rad = angle_rad + numbers["index_error_rad"][joint]
     if numbers["eccentricity_rad"][joint] != 0.0:
         disc_rad += numbers["eccentricity_rad"][joint] * math.sin(angle_rad + numbers["eccentricity_phase_rad"][joint])
@@ -76,7 +79,7 @@ def read_angle(numbers: np.void, joint: int, angle_rad: float, noise_counts: flo
 
 
 class EncoderNoise:
-    """The noise of both encoders at every tick, so that a run doesn't depend on the ticks per call."""
+    """The noise of both encoders at every tick. It is the same however many ticks each call advances."""
 
     def __init__(self, seed: np.random.SeedSequence, rms_counts: tuple[float, float]) -> None:
         self.is_on = any(rms_counts)
@@ -87,7 +90,7 @@ class EncoderNoise:
         self._drawn = 0  # ticks
 
     def draw(self, last_tick: int) -> None:
-        """Fill `table` with the noise of the ticks up to `last_tick`.
+        """Fill `table` with the noise of the ticks up to `last_tick`; draws NOISE_TICKS ticks at once, and none twice.
 
         Call it every NOISE_TICKS ticks at least: the table keeps the noise of twice as many.
         """
@@ -139,7 +142,10 @@ TRANSDUCER_STATE: Final = float_fields(
 
 
 def transducer_numbers(settings: SensorSettings, offset_Nm: tuple[float, float]) -> np.void:
-    """Return the torque sensors' properties as one record of dtype TRANSDUCER_NUMBERS, for compiled functions."""
+    """Return both torque sensors' properties as one record of dtype TRANSDUCER_NUMBERS, for compiled functions.
+
+    offset_Nm: their constant zero errors.
+    """
     numbers = pack_fields(settings, TRANSDUCER_NUMBERS)
     reach_Nm = np.array(settings.hysteresis_reach_Nm)
     numbers["gain"][:] = 1.0 + np.array(settings.gain_error)
@@ -157,19 +163,19 @@ def transducer_numbers(settings: SensorSettings, offset_Nm: tuple[float, float])
 
 
 def count_Nm(settings: SensorSettings, joint: int) -> float:
-    """Return the torque of one count on the wire: 16 bits over the range, or over ±50 Nm where that is wider."""
+    """Return the torque of one count on the wire, Nm: 1/2^16 of ±50 Nm, or of the sensor's range if that is wider."""
     return TORQUE_LSB_NM * max(1.0, settings.torque_range_Nm[joint] / TORQUE_RANGE_NM)
 
 
 def converter_ends(settings: SensorSettings, joint: int) -> tuple[int, int]:
-    """Return the lowest and the highest value that a sensor can send, in counts of the wire."""
+    """Return the lowest and the highest counts on the wire that a joint's sensor can send; they mean saturation."""
     numbers = transducer_numbers(settings, (0.0, 0.0))
     return _convert(numbers, joint, -1e6), _convert(numbers, joint, 1e6)
 
 
 @compiled
 def _convert(numbers: np.void, joint: int, torque_Nm: float) -> int:
-    """Return a torque in counts of the wire, rounded to the converter's bits and limited to its range."""
+    """Return a torque in counts of the wire, after rounding to the converter's bits and limiting to its range."""
     lsb_Nm = numbers["lsb_Nm"][joint]
     highest = numbers["highest"][joint]
     code = min(max(math.floor(torque_Nm / lsb_Nm + 0.5), -1.0 - highest), highest)
@@ -178,7 +184,10 @@ def _convert(numbers: np.void, joint: int, torque_Nm: float) -> int:
 
 @compiled
 def _bridge(numbers: np.void, joint: int, tau_Nm: float, other_Nm: float, temperature_C: float) -> float:
-    """Return the torque that a sensor's bridge senses, Nm: x in the module's first lines."""
+    """Return the torque that a sensor's bridge senses, Nm: with gain error, drift by temperature, and cross-talk.
+
+    other_Nm: torque in the spring of the other joint.
+    """
     gain = numbers["gain"][joint] + numbers["gain_drift_1_K"][joint] * (temperature_C - REFERENCE_C)
     return float(gain * tau_Nm + numbers["cross_talk"][joint] * other_Nm)
 
@@ -187,9 +196,9 @@ def _bridge(numbers: np.void, joint: int, tau_Nm: float, other_Nm: float, temper
 def settle_transducer(
     numbers: np.void, state: np.void, tau1_Nm: float, tau2_Nm: float, temperature1_C: float, temperature2_C: float
 ) -> None:
-    """Set both sensors' `state`, which is all 0, as at power-on under a steady load, without hysteresis so far.
+    """Set both sensors' `state` as at power-on under a steady load; it must be all 0 before.
 
-    tau: torques in the springs.
+    Hysteresis begins at its middle. tau: torques in the springs.
     """
     state["bridge_Nm"][0] = _bridge(numbers, 0, tau1_Nm, tau2_Nm, temperature1_C)
     state["bridge_Nm"][1] = _bridge(numbers, 1, tau2_Nm, tau1_Nm, temperature2_C)
@@ -203,7 +212,10 @@ def settle_transducer(
 
 @compiled
 def _sense_joint(numbers: np.void, state: np.void, joint: int, tick: float, bridge_Nm: float) -> None:
-    """Advance the `state` of one sensor by the tick that began at `tick` and ended with `bridge_Nm`."""
+    """Advance one sensor's `state` by the tick that began at `tick`: hysteresis, amplifier, sample of its own clock.
+
+    bridge_Nm: torque at the bridge when the tick ends.
+    """
     shaped_Nm = bridge_Nm
     weight = numbers["loop_weight"][joint]
     if weight > 0.0:
@@ -244,7 +256,7 @@ def sense_torque(
     temperature1_C: float,
     temperature2_C: float,
 ) -> None:
-    """Advance both sensors' `state` by the tick that began at `tick`; call only with `has_memory`.
+    """Advance both sensors' `state` by the tick that began at `tick`; call it only if `has_memory` is set.
 
     Torques in the springs and joint temperatures: at the end of the tick.
     """
@@ -254,9 +266,9 @@ def sense_torque(
 
 @compiled
 def walk_offset(state: np.void, tick: float, step_Nm: Vector) -> None:
-    """Add a random step to the walk of both sensors' zeros, for the time since the last step.
+    """Add a random step to the wandering zeros of both sensors, scaled by the root of the time since the last step.
 
-    step_Nm (2,): normal numbers times the walk's rms after one second.
+    step_Nm (2,): normal numbers times the walk's rms after one second. Stores `tick` as the time of this step.
     """
     root_s = math.sqrt((tick - state["walk_tick"]) * TICK_S)
     state["walk_Nm"][0] += step_Nm[0] * root_s
@@ -277,7 +289,8 @@ def sample_torque(
 ) -> int:
     """Return the counts that the sensor of a joint sends at the SYNC at `tick`.
 
-    tau, other: torque in the spring of this joint and of the other one, now.
+    A sensor with its own clock repeats the last counts until that clock has a new sample. tau, other: torque in the
+    spring of this joint and of the other one, now.
     """
     if numbers["has_memory"] == 0.0:
         torque_Nm = _bridge(numbers, joint, tau_Nm, other_Nm, temperature_C)

@@ -44,7 +44,7 @@ _COUNT_SUB = 2  # 0x2210: counts are at sub-index 2 + number
 
 
 class Watchdog(IntEnum):
-    """Numbers of the watchdogs. Each says how it clears."""
+    """Numbers of the watchdogs. A comment names the event that clears each."""
 
     SYNC = 1  # a SYNC comes
     COMMAND = 2  # a valid command acts
@@ -74,7 +74,7 @@ WARNINGS = frozenset({Watchdog.LENGTH, Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH
 
 
 class ErrorReporter:
-    """Sends EMCY messages with inhibit time, remembers their codes, newest first, and which watchdogs are tripped."""
+    """Sends EMCYs with inhibit time; keeps the history of their codes, newest first, and the tripped watchdogs."""
 
     def __init__(
         self, dictionary: ObjectDictionary, send: Send, register: Callable[[], int], is_allowed: Callable[[], bool]
@@ -106,9 +106,10 @@ class ErrorReporter:
             dictionary.serve(0x2210, _COUNT_SUB + watchdog, lambda w=watchdog: self._counts[w] & 0xFFFF)  # type: ignore[misc]
 
     def report_error(self, code: int, t_ns: int, number: int = 0, time_ms: int = 0) -> None:
-        """Add a code other than 0 to the history; send an EMCY after the inhibit time if 0x1014 and NMT state allow it.
+        """Add a code other than 0 to the history, and send an EMCY after the inhibit time.
 
-        number: of the watchdog, 0 for none. time_ms: on the device's clock.
+        It sends none if 0x1014 or the NMT state forbids it. number: of the watchdog, 0 for none. time_ms: on the
+        device's clock.
         """
         if code != 0:
             self._history.appendleft(code)
@@ -117,16 +118,19 @@ class ErrorReporter:
             self.send_waiting(t_ns)
 
     def report_at_once(self, code: int, t_ns: int) -> None:
-        """Add a code to the history, and send an EMCY now, before those that wait for the inhibit time."""
+        """Add a code to the history, and send an EMCY now, before those that wait for the inhibit time.
+
+        It sends none if 0x1014 or the NMT state forbids it.
+        """
         self._history.appendleft(code)
         if self._is_valid and self._is_allowed():
             self._allowed_ns = t_ns + self._inhibit_ns
             self._send(self._cob_id, _EMERGENCY.pack(code, self._register(), 0, 0))
 
     def trip(self, watchdog: Watchdog, t_ns: int, time_ms: int) -> None:
-        """Add a watchdog to `tripped`, count it, and send its EMCY; ignore one that is tripped.
+        """Mark a watchdog as tripped, count the trip and send its EMCY.
 
-        time_ms: on the device's clock.
+        A watchdog that is tripped already changes nothing. time_ms: on the device's clock.
         """
         if watchdog in self.tripped:
             return
@@ -136,24 +140,27 @@ class ErrorReporter:
         self.report_error(ERROR_CODES[watchdog], t_ns, watchdog, time_ms)
 
     def clear(self, watchdog: Watchdog, t_ns: int, time_ms: int) -> None:
-        """Remove a watchdog from `tripped` and send an EMCY with code 0. Raises KeyError if it isn't tripped."""
+        """Mark a watchdog as no longer tripped, and send an EMCY with code 0. Raises KeyError if it isn't tripped."""
         self.tripped.remove(watchdog)
         self.report_error(0, t_ns, watchdog, time_ms)
 
     def forget_messages(self) -> None:
-        """Drop the waiting messages and the history, as a loss of power does."""
+        """Drop the waiting EMCYs, the history and the running inhibit time, as a loss of power does."""
         self._waiting.clear()
         self._history.clear()
         self._allowed_ns = 0
 
     def forget_trips(self) -> None:
-        """Clear the tripped watchdogs and their counts without an EMCY, as a reset of the node does."""
+        """Clear the tripped watchdogs and all counts of trips without an EMCY, as a reset of the node does."""
         self.tripped.clear()
         self._last = self._last_ms = 0
         self._counts = dict.fromkeys(Watchdog, 0)
 
     def send_waiting(self, t_ns: int) -> int:
-        """Send the waiting messages that the inhibit time allows; return when the next may follow, else NEVER_NS."""
+        """Send the waiting EMCYs that the inhibit time allows.
+
+        Return when the next may follow, ns, NEVER_NS if none waits.
+        """
         while self._waiting and t_ns >= self._allowed_ns:
             self._allowed_ns = t_ns + self._inhibit_ns
             self._send(self._cob_id, self._waiting.popleft())
@@ -176,7 +183,7 @@ class ErrorReporter:
 
 
 class HeartbeatProducer:
-    """0x1017: sends the NMT state every so many ms; the boot-up message is the first heartbeat."""
+    """Sends the NMT state every n ms, n being the value of 0x1017. A value of 0 ends that."""
 
     def __init__(
         self, dictionary: ObjectDictionary, send: Send, state: Callable[[], int], now_ns: Callable[[], int]
@@ -194,7 +201,7 @@ class HeartbeatProducer:
         self._due_ns = t_ns + self._period_ns if self._period_ns else NEVER_NS
 
     def send_due(self, t_ns: int) -> int:
-        """Send a heartbeat that is due; return when the next one is."""
+        """Send a heartbeat if it is due; return when the next one is due, ns, NEVER_NS without heartbeats."""
         if t_ns >= self._due_ns:
             self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
             self._send(self._can_id, bytes([self._state()]))
@@ -206,7 +213,10 @@ class HeartbeatProducer:
 
 
 class HeartbeatConsumer:
-    """0x1016:1: monitors one node from its first heartbeat on. A lost heartbeat is found again when one arrives."""
+    """Monitors the heartbeat of the node in 0x1016:1, from its first heartbeat on.
+
+    A lost one is found again when one arrives.
+    """
 
     def __init__(
         self,
@@ -225,14 +235,20 @@ class HeartbeatConsumer:
         dictionary.watch(0x1016, 1, self._configure, _check_node)
 
     def on_heartbeat(self, node_id: int, t_ns: int) -> None:
-        """Restart the timeout if the heartbeat is of the watched node."""
+        """Restart the timeout if the heartbeat is of the monitored node, and report the return of a lost one.
+
+        Other nodes' heartbeats have no effect.
+        """
         if self._timeout_ns == 0 or node_id != self._node_id:
             return
         self._due_ns = t_ns + self._timeout_ns
         self._find(t_ns)
 
     def find_silence(self, t_ns: int) -> int:
-        """Report the heartbeat as lost if its timeout is over; return when to call again, ns."""
+        """Report the heartbeat as lost if its timeout is over; return when to call again, ns.
+
+        NEVER_NS before the first heartbeat and while it is lost.
+        """
         if t_ns >= self._due_ns:
             self._due_ns = NEVER_NS
             self.is_lost = True
@@ -253,7 +269,7 @@ class HeartbeatConsumer:
 
 
 def _check_node(value: int) -> None:
-    """Refuse a value of 0x1016 with a timeout and a node id outside 1 to 127 (VALUE_RANGE)."""
+    """Abort the SDO write (VALUE_RANGE) of a value of 0x1016 that has a timeout and a node id outside 1 to 127."""
     if value & 0xFFFF and not 1 <= value >> 16 <= 127:
         refuse(Abort.VALUE_RANGE)
 
@@ -267,7 +283,7 @@ _LOST_SUB = 5  # of 0x2211
 
 
 class SyncKind(Enum):
-    """Kind of one SYNC beside those before. Except for RIGHT, the value is its sub-index of 0x2211."""
+    """How one SYNC compares with those before. Except for RIGHT, the value is its sub-index of 0x2211."""
 
     RIGHT = 0
     REPEATED = 1
@@ -294,17 +310,21 @@ class SyncOrder:
         self._lateness_ns = 0.0
 
     def forget_last(self) -> None:
-        """Forget the last SYNC, so that the next counts as the first."""
+        """Forget the last SYNC's counter, so that the next SYNC is judged as the first."""
         self.counter = 0
 
     def periods_to(self, counter: int, overflow: int) -> int:
-        """Return the periods from the last SYNC to one with this counter; 1 if a counter is missing."""
+        """Return the periods from the last SYNC taken to one with this counter.
+
+        1 before the first, or if a counter is missing. overflow: 0x1019, above 0.
+        """
         return (counter - self.counter) % overflow if counter and self.counter else 1
 
     def judge(self, counter: int, overflow: int, t_ns: int, period_ns: int) -> None:
         """Set `kind`, `is_taken`, `counter` and `periods` by a SYNC of the right length.
 
-        `counter`: 0 without one. `overflow`: 0x1019. `period_ns`: 0x1006; 0: not set, so no SYNC is early.
+        A SYNC that isn't taken leaves `counter`. `counter`: 0 without one. `overflow`: 0x1019. `period_ns`: 0x1006; 0:
+        not set, so no SYNC is early.
         """
         last = self.counter
         self.kind, self.is_taken, self.periods = SyncKind.RIGHT, True, 1
@@ -338,7 +358,10 @@ class SyncOrder:
 
 
 class SyncCounts:
-    """Counts of the odd and the lost SYNCs of one device: 0x2211."""
+    """Counts of one device in 0x2211: of lost SYNCs, and of odd ones.
+
+    Odd ones are repeated, out of sequence, early or of wrong length.
+    """
 
     def __init__(self, dictionary: ObjectDictionary) -> None:
         self.odd = 0
@@ -350,16 +373,19 @@ class SyncCounts:
 
     @property
     def is_in_order(self) -> bool:
-        """Whether no odd SYNC is remembered."""
+        """Whether no odd SYNC of the right length has come since the last `CLEAN_SYNCS` right ones in a row."""
         return self.odd == 0
 
     @property
     def is_time_base(self) -> bool:
-        """Whether SYNC can serve as time base: at most TOLERATED odd SYNCs are remembered."""
+        """Whether SYNC can serve as time base: `odd` is at most TOLERATED."""
         return self.odd <= TOLERATED
 
     def count_sync(self, kind: SyncKind, lost: int) -> None:
-        """Count a SYNC by its kind, and `lost` SYNCs before it; forget odd ones after `CLEAN_SYNCS` right ones."""
+        """Count a SYNC by its kind, and `lost` SYNCs before it.
+
+        `CLEAN_SYNCS` right ones in a row set `odd` to 0; the counts of 0x2211 stay.
+        """
         self._counts[_LOST_SUB] += lost
         if kind is not SyncKind.RIGHT:
             self._counts[kind.value] += 1
@@ -372,6 +398,6 @@ class SyncCounts:
             self._clean = 0
 
     def forget_counts(self) -> None:
-        """Forget everything, as at power-on."""
+        """Set all counts, those of 0x2211 included, to 0, as at power-on."""
         self.odd = self._clean = 0
         self._counts = [0] * (_LOST_SUB + 1)

@@ -77,7 +77,7 @@ Refusal = canopen.SdoAbortedError
 
 
 def refuse(code: Abort) -> NoReturn:
-    """Raise `Refusal` with an abort code, which the SDO server answers to the request in progress."""
+    """Raise `Refusal` with an abort code, which the SDO server sends as the answer to the request in progress."""
     raise canopen.SdoAbortedError(code)
 
 
@@ -103,7 +103,10 @@ class _SilentNetwork(canopen.Network):
 
 
 class _Server(SdoServer):
-    """canopen's SDO server, one transfer at a time; refuses segments outside a transfer, and wrong lengths."""
+    """canopen's SDO server, one transfer at a time.
+
+    It aborts segments outside a transfer, wrong lengths, and block upload.
+    """
 
     def __init__(self, node: "_DictionaryNode") -> None:
         node_id = int(node.id or 0)
@@ -188,7 +191,10 @@ def _compare_lengths(length: int, expected: int) -> None:
 
 
 def read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
-    """Return the objects of an EDS or DCF in any encoding; `node_id` replaces $NODEID. Cached: don't change it."""
+    """Return the objects of an EDS or DCF file of any encoding; `node_id` replaces $NODEID.
+
+    The result is cached: don't change it. Raises OSError if the file can't be read.
+    """
     return _parse_eds(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff"), node_id)
 
 
@@ -200,7 +206,7 @@ def _parse_eds(text: str, node_id: int) -> canopen.ObjectDictionary:
 
 
 class LiveValue(NamedTuple):
-    """The value of another object, times `ratio`."""
+    """The present value of another object (index, sub-index), times `ratio`."""
 
     key: tuple[int, int]
     ratio: float = 1.0
@@ -218,8 +224,8 @@ class MadeUp(NamedTuple):
 class DeviceDescription:
     """One device: its EDS, and further values of its objects at power-on.
 
-    defaults: values in place of the EDS's. fallbacks: values that the EDS lacks. made_up: objects that the EDS
-    omits, by index. aliases: objects that hold the live value of another.
+    defaults: values in place of the EDS's. fallbacks: values for objects to which the EDS gives none. made_up: objects
+    that the EDS omits, by index. aliases: objects that hold the live value of another.
     """
 
     eds: Path
@@ -232,7 +238,7 @@ class DeviceDescription:
 def _read_objects(node_id: int, description: DeviceDescription) -> canopen.ObjectDictionary:
     """Return the objects of a device with their values at power-on.
 
-    If the description adds to the EDS, a number without a value is 0.
+    If the description adds values or objects to the EDS, a number without a value is 0.
     """
     objects = read_eds(description.eds, node_id)
     if not (description.defaults or description.fallbacks or description.made_up):
@@ -262,7 +268,10 @@ class _DictionaryNode(canopen.LocalNode):
         self.sdo._index = self.sdo._subindex = 0  # an abort before the first transfer needs an index to name
 
     def _find_object(self, index: int, subindex: int) -> ODVariable:
-        """Return an object; raise `Refusal` if the EDS lacks it, also for sub-indices that canopen would add."""
+        """Return an object.
+
+        Raise `Refusal` if the EDS lacks its index or sub-index, also for those that canopen would add.
+        """
         if index < _FIRST_INDEX or index not in self.object_dictionary:
             refuse(Abort.NO_OBJECT)
         entry = self.object_dictionary[index]
@@ -273,10 +282,10 @@ class _DictionaryNode(canopen.LocalNode):
 
 
 class ObjectDictionary:
-    """The objects of one device: values from the EDS, live values, checked writes, and SDO over the bus."""
+    """The objects of one device: values from the EDS, live values, checked writes, and an SDO server."""
 
     def __init__(self, node_id: int, description: DeviceDescription, send: Send) -> None:
-        """Read the EDS. Raises OSError when it can't be read."""
+        """Read the EDS. Raises OSError if it can't be read. send: called with identifier and data of SDO answers."""
         self.node_id = node_id
         self._readers: dict[tuple[int, int], Callable[[], int]] = {}
         self._replaced: dict[tuple[int, int], Callable[[], int]] = {}
@@ -292,11 +301,11 @@ class ObjectDictionary:
 
     @property
     def objects(self) -> canopen.ObjectDictionary:
-        """The objects that the EDS lists."""
+        """The objects that the device has: those of the EDS, and those that its description adds."""
         return self._node.object_dictionary
 
     def has(self, index: int, subindex: int = 0) -> bool:
-        """Return whether the EDS lists this object."""
+        """Return whether the device has this object: the EDS lists it, or the description adds it."""
         try:
             self._node._find_object(index, subindex)
         except canopen.SdoAbortedError:
@@ -304,39 +313,57 @@ class ObjectDictionary:
         return True
 
     def dummy_bits(self, index: int) -> int:
-        """Return the size of a data type that the EDS lets be mapped as a dummy (DummyUsage), 0 when it doesn't."""
+        """Return the size, bits, of a data type that the EDS lists for mapping as a dummy.
+
+        It is 0 for other types and for objects.
+        """
         if index >= _FIRST_INDEX or index not in self.objects:
             return 0
         return len(self.objects[index])
 
     def find(self, index: int, subindex: int) -> ODVariable:
-        """Return an object; raise `Refusal` if the EDS lacks it."""
+        """Return an object's description; raise `Refusal` if the device lacks it."""
         return self._node._find_object(index, subindex)
 
     def serve(self, index: int, subindex: int, read: Callable[[], int]) -> None:
-        """Set `read` as the source of an object's value. An object that the EDS lacks stays absent."""
+        """Set `read` as the source of an object's value for all later reads.
+
+        An object that the device lacks stays absent.
+        """
         self._readers[index, subindex] = read
 
     def reader(self, index: int, subindex: int) -> Callable[[], int]:
-        """Return a function that returns the present value of a numeric object, by `serve` or as written."""
+        """Return a function that reads a numeric object: its replaced value, its live value by `serve`, or as written.
+
+        It keeps the source of now: a later `serve` or `replace_value` doesn't reach it.
+        """
         key = index, subindex
         return self._replaced.get(key) or self._readers.get(key) or (lambda: self.value(index, subindex))
 
     def replace_value(self, index: int, subindex: int, value: int | None) -> None:
-        """Give a numeric object a value in place of its own, for all who read it from now on; None: its own again."""
+        """Give a numeric object a value in place of its own; None: its own again.
+
+        Reads by SDO and by `value` return it from now on; functions that `reader` returned before don't.
+        """
         if value is None:
             self._replaced.pop((index, subindex), None)
         else:
             self._replaced[index, subindex] = lambda: value
 
     def range_of(self, index: int, subindex: int) -> tuple[int, int]:
-        """Return the least and the greatest value of an object's integer type; raise `Refusal` if the EDS lacks it."""
+        """Return the least and the greatest value of an object's integer type, not of its limits in the EDS.
+
+        Raise `Refusal` if the device lacks the object.
+        """
         variable = self.find(index, subindex)
         bits, is_signed = len(variable), variable.data_type in datatypes.SIGNED_TYPES
         return (-(1 << bits - 1), (1 << bits - 1) - 1) if is_signed else (0, (1 << bits) - 1)
 
     def describe_misfit(self, index: int, subindex: int, value: int) -> str:
-        """Return why a value can't be a numeric object's, in a line; empty if it can."""
+        """Return in a line why an object can't have this value: it is missing, no integer, or too small.
+
+        Empty if it can.
+        """
         name = f"object 0x{index:04X}:{subindex}"
         if not self.has(index, subindex):
             return f"has no {name}"
@@ -354,7 +381,8 @@ class ObjectDictionary:
     ) -> None:
         """Register functions for writes of an object: `check` may `refuse` the value, then `apply` gets it.
 
-        `apply` also gets the default when a reset restores it. An object that the EDS lacks is never written.
+        `apply` also gets the default when a reset restores it. Several functions of an object are called in order. An
+        object that the device lacks is never written, and nothing is registered.
         """
         if not self.has(index, subindex):
             return
@@ -364,23 +392,26 @@ class ObjectDictionary:
             self._appliers.setdefault((index, subindex), []).append(apply)
 
     def value(self, index: int, subindex: int = 0) -> int:
-        """Return the present value of a numeric object; raise `Refusal` if the EDS lacks it."""
+        """Return the present value of a numeric object; raise `Refusal` if the device lacks it."""
         variable = self._node._find_object(index, subindex)
         return int(variable.decode_raw(self._node.get_data(index, subindex)))
 
     def value_or(self, default: int, index: int, subindex: int = 0) -> int:
-        """Return the present value of a numeric object, `default` when the EDS lacks it."""
+        """Return the present value of a numeric object; `default` if the device lacks the object."""
         return self.value(index, subindex) if self.has(index, subindex) else default
 
     def default_or(self, default: int, index: int, subindex: int = 0) -> int:
-        """Return the EDS's default of a numeric object, `default` if the EDS has none."""
+        """Return the EDS's default of a numeric object; `default` if it lacks the object or gives it no default."""
         if not self.has(index, subindex):
             return default
         value = self._node._find_object(index, subindex).default
         return default if value is None else int(value)
 
     def take_over(self, index: int, subindex: int, value: int) -> bool:
-        """Write an object with the checks of an SDO request except `is_locked`; return False if it is refused."""
+        """Write an object with the checks of an SDO request except `is_locked`.
+
+        Return False, with the object unchanged, if a check refuses it or the device lacks it.
+        """
         try:
             data = self._node._find_object(index, subindex).encode_raw(value)
             self._node.set_data(index, subindex, data, check_writable=True)
@@ -389,7 +420,7 @@ class ObjectDictionary:
         return True
 
     def on_request(self, data: bytes, t_ns: int) -> None:
-        """Answer an SDO request of 8 bytes."""
+        """Answer an SDO request of 8 bytes through the `send` of the constructor."""
         self._is_requested = True
         try:
             self._node.sdo.on_request(0x600 + self.node_id, data, t_ns)  # type: ignore[no-untyped-call]
@@ -397,7 +428,10 @@ class ObjectDictionary:
             self._is_requested = False
 
     def restore(self, last: int) -> None:
-        """Forget the values written to objects up to the index `last`; functions that watch them get the defaults."""
+        """Restore the defaults of all objects up to index `last`.
+
+        Functions that watch them get the defaults, 0 without one.
+        """
         for index in [index for index in self._node.data_store if index <= last]:
             del self._node.data_store[index]
         for (index, subindex), appliers in self._appliers.items():
@@ -409,7 +443,10 @@ class ObjectDictionary:
         return None if read is None else read()
 
     def _write(self, index: int, subindex: int, od: ODVariable, data: bytes) -> None:
-        """Refuse a write that lock, range or a check forbids; else pass the value to the functions that watch it."""
+        """Refuse a write that lock, the EDS's limits or a check forbid.
+
+        Else pass the value to the functions that watch it. Values that aren't numbers are only checked for the lock.
+        """
         if self._is_requested and self.is_locked(index, subindex):
             refuse(Abort.DEVICE_STATE)
         if od.data_type not in datatypes.NUMBER_TYPES:
@@ -433,8 +470,8 @@ def _call_all(functions: list[Callable[[int], None]], value: int) -> None:
 class EmulatedContract:
     """A contract that the emulator plays: its DBC and its EDS, as file names within `contract_folder`.
 
-    devices: those of an arm of one's own, by place, in their stead. period_us: time of a SYNC where no master can
-    write 0x1006; 0: 1 ms.
+    devices: the devices of an arm of one's own, in the order of `describe_device`; empty: those of the two EDS.
+    period_us: time of a SYNC where no master can write 0x1006; 0: 1 ms.
     """
 
     dbc: str
@@ -451,7 +488,7 @@ class EmulatedContract:
 
     @property
     def path(self) -> Path:
-        """The DBC."""
+        """Path of the DBC."""
         return contract_folder() / self.dbc
 
 
@@ -465,14 +502,17 @@ CONTRACTS = {
 
 
 def contract_of(codec: Codec) -> EmulatedContract:
-    """Return the emulated contract with a DBC's file name; for others `arm`, or `arm_fd` with longer frames."""
+    """Return the emulated contract with a DBC's file name.
+
+    For other names return `arm`, or `arm_fd` if a frame is longer than 8 bytes.
+    """
     return CONTRACTS.get(codec.path.stem, CONTRACTS["arm_fd" if is_fd(codec) else "arm"])
 
 
 def playable_contract(codec: Codec) -> EmulatedContract:
-    """Return the emulated contract with the frame layout of a DBC, whatever its node ids.
+    """Return the emulated contract with the frame layout of a DBC, even if its node ids are moved.
 
-    Raises ConfigError if no contract has it.
+    Raises ConfigError if no contract has this layout.
     """
     for contract in CONTRACTS.values():
         if codec.path == contract.path:
@@ -490,10 +530,10 @@ def playable_contract(codec: Codec) -> EmulatedContract:
 
 
 def is_fd(codec: Codec) -> bool:
-    """Return whether frames are longer than classic CAN allows."""
+    """Return whether some frame of the contract is longer than the 8 bytes of classic CAN."""
     return any(message.length > CLASSIC_BYTES for message in codec.messages.values())
 
 
 def longest_pdo(codec: Codec) -> int:
-    """Return how many bytes a PDO may have on this contract's bus."""
+    """Return the longest PDO of this contract's bus, bytes: 8, or 64 if it has frames of CAN FD."""
     return FD_LENGTHS[-1] if is_fd(codec) else CLASSIC_BYTES

@@ -46,12 +46,12 @@ class TransmitPdo(PdoRecord):
         """Whether its events are the changes of its content."""
 
     def restart_sequence(self) -> None:
-        """Count the protected frames from their beginning."""
+        """Restart the counter of protected frames; a plain PDO stays as it is."""
         if self.message is not None and self.message.is_protected:
             self._sender = self.message.sender()
 
     def bind(self) -> None:
-        """Prepare reading and sending for the present type and mapping."""
+        """Set `send` and the events by the present transmission type and mapping; call it after each change of them."""
         self._reads = tuple(self._pdos.dictionary.reader(*key) for key in self.layout.keys)
         is_asynchronous = self.type == 0 or self.type in EVENT_DRIVEN
         self.is_compared = is_asynchronous and not self._pdos.events.intersection(self.layout.keys)
@@ -59,13 +59,16 @@ class TransmitPdo(PdoRecord):
         self.send = self._make_sender()
 
     def begin_sending(self, t_ns: int) -> None:
-        """Make an event-driven PDO that has become active due at once, and stop its timer."""
+        """Make the PDO due now, and stop its event timer; call it when the PDO becomes active."""
         self.is_due = True
         self._allowed_ns = t_ns
         self._timer_due_ns = NEVER_NS
 
     def _make_sender(self) -> Callable[[], None]:
-        """Return the function that sends a frame of the present values, protected if the mapping has a header."""
+        """Return a function that sends a frame of the mapped objects' present values.
+
+        It protects the frame if the mapping begins with a header.
+        """
         pdos, can_id, layout, reads, sender = self._pdos, self.can_id, self.layout, self._reads, self._sender
         send, header_bytes, length = pdos.send, layout.header_bytes, layout.length
         pack, pack_into = layout.packing.pack, layout.packing.pack_into
@@ -103,7 +106,10 @@ class TransmitPdo(PdoRecord):
         return send_pair
 
     def on_sync(self) -> None:
-        """Send the frame of this SYNC: every n-th, or an event that waited."""
+        """Send a frame if this SYNC is the n-th of transmission type n.
+
+        Type 0 sends if an event has happened since its last frame.
+        """
         if self.type == 0:
             self.compare()
             if self.is_due:
@@ -116,7 +122,7 @@ class TransmitPdo(PdoRecord):
             self.send()
 
     def compare(self) -> None:
-        """Set `is_due` if the content has changed, in a PDO whose events are such changes."""
+        """Set `is_due` if the content has changed since the last call, in a PDO whose events are such changes."""
         if self.is_compared:
             content = self.layout.packing.pack(*[read() for read in self._reads])
             if content != self._sent:
@@ -124,7 +130,10 @@ class TransmitPdo(PdoRecord):
                 self.is_due = True
 
     def poll(self, t_ns: int) -> int:
-        """Send a frame for an event, after the inhibit time, or by the event timer; return when to call again, ns."""
+        """Send a frame for an event, after the inhibit time, or by the event timer; return when to call again, ns.
+
+        It returns NEVER_NS without an event and a timer.
+        """
         if (self.is_due and t_ns >= self._allowed_ns) or t_ns >= self._timer_due_ns:
             self.is_due = False
             self._allowed_ns = t_ns + self.inhibit_ns
@@ -154,14 +163,14 @@ class ReceivePdo(PdoRecord):
         self._is_length_wrong = False
 
     def restart_sequence(self) -> None:
-        """Accept any counter in the next protected frame, drop a waiting frame, and end the deadline."""
+        """Accept any counter in the next protected frame, drop a frame that waits for SYNC, and stop the deadline."""
         if self.receiver is not None:
             self.receiver.restart_sequence()
         self.forget()
         self.acted_ns = None
 
     def bind(self) -> None:
-        """Set the functions that take received values by the present mapping."""
+        """Set the functions that take received values by the present mapping, and `is_command` to False."""
         self.writes = tuple(self._pdos.writer(*key) for key in self.layout.keys)
         self.is_command = False
 
@@ -170,9 +179,9 @@ class ReceivePdo(PdoRecord):
         self.pending = None
 
     def on_frame(self, data: bytes, t_ns: int) -> None:
-        """Check a frame; store its values until SYNC, or write them at once, as the transmission type says.
+        """Check a frame; keep its values until SYNC, or write them at once for an event-driven type.
 
-        t_ns: by the bench. A frame that fails the check of length or protection changes no object.
+        A frame of wrong length, or one that fails the end-to-end check, changes no object. t_ns: the bench's time.
         """
         layout = self.layout
         if len(data) != layout.length:
@@ -191,7 +200,10 @@ class ReceivePdo(PdoRecord):
             self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
 
     def is_late(self, t_ns: int) -> bool:
-        """Return whether the last frame acted longer ago than the event timer; False without timer or earlier frame."""
+        """Return whether the last frame acted longer ago than the event timer.
+
+        False without a timer, or before the first frame.
+        """
         return self.timer_ns > 0 and self.acted_ns is not None and t_ns - self.acted_ns >= self.timer_ns
 
 
@@ -205,7 +217,7 @@ class Pdos:
         messages: Mapping[int, MessageCodec],
         longest: int,
     ) -> None:
-        """`messages`: the contract's, by identifier. `longest`: frame, in bytes."""
+        """`messages`: the contract's, by identifier. `longest`: the longest frame, bytes."""
         self.dictionary = dictionary
         self.send = send
         self.longest = longest
@@ -250,33 +262,42 @@ class Pdos:
 
     @property
     def is_commandable(self) -> bool:
-        """Whether a PDO is exchanged that brings commands."""
+        """Whether an active RPDO brings target torque, or, if none does, the controlword."""
         return any(pdo.is_command for pdo in self._receiving)
 
     def brings(self, index: int, subindex: int) -> bool:
-        """Return whether an exchanged PDO brings values of an object."""
+        """Return whether an active RPDO has an object in its mapping."""
         return any((index, subindex) in pdo.layout.keys for pdo in self._receiving)
 
     def accept_values(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
-        """Pass values of an object that PDOs bring to `write`, instead of writing the object as SDO does."""
+        """Register `write` for an object's values that come by RPDO.
+
+        It then replaces the checked write of the object.
+        """
         self._writers[index, subindex] = write
 
     def writer(self, index: int, subindex: int) -> Callable[[int], object]:
-        """Return the function that takes received values of an object. It drops a value that the object can't take."""
+        """Return the function that takes an object's values from RPDOs: by `accept_values`, else by a checked write.
+
+        The latter drops a value that the object can't take.
+        """
         return self._writers.get((index, subindex)) or (lambda value: self.dictionary.take_over(index, subindex, value))
 
     def handlers(self) -> list[tuple[int, Callable[[bytes, int], None]]]:
-        """Return the identifiers of the RPDOs that are exchanged now, with the functions that take their frames."""
+        """Return pairs (identifier, function that takes data and time) of the RPDOs that are active now."""
         return [(pdo.can_id, pdo.on_frame) for pdo in self._receiving]
 
     def set_operational(self, is_operational: bool, t_ns: int) -> None:
-        """Begin or end the exchange of PDOs, as the device enters or leaves Operational."""
+        """Begin or end the exchange of PDOs, as the device enters or leaves NMT state Operational at `t_ns`."""
         self._is_operational = is_operational
         self._now_ns = t_ns
         self.refresh()
 
     def refresh(self) -> None:
-        """Update which PDOs are exchanged, after a change of the NMT state or of a PDO's objects; call `on_refresh`."""
+        """Update which PDOs are active, after a change of the NMT state or of a PDO's objects; then call `on_refresh`.
+
+        TPDOs that become active are due at once; frames that wait in an RPDO no longer synchronous are dropped.
+        """
         self._receiving = tuple(pdo for pdo in self.receive if self._is_operational and pdo.is_active)
         sending = tuple(pdo for pdo in self.transmit if self._is_operational and pdo.is_active)
         exchanged: tuple[ReceivePdo | TransmitPdo, ...] = (*self._receiving, *sending)
@@ -299,7 +320,7 @@ class Pdos:
         self.on_refresh()
 
     def _find_commands(self) -> None:
-        """Mark the RPDOs that count as commands: all with target torque; if there are none, all with controlword."""
+        """Mark the RPDOs that count as commands: all with target torque, or, without any, all with the controlword."""
         for key in ((0x6071, 0), (0x6040, 0)):
             found = [pdo for pdo in self._receiving if key in pdo.layout.keys]
             if found:
@@ -314,18 +335,18 @@ class Pdos:
             pdo.restart_sequence()
 
     def act_on_sync(self, t_ns: int) -> bool:
-        """Write the values of frames that waited for SYNC; return whether a command has acted since the SYNC before."""
+        """Write the values of frames that waited for SYNC. Return whether a command has acted since the SYNC before."""
         is_commanded, self._is_commanded = self._is_commanded, False
         return self._act(self._waiting, t_ns) or is_commanded
 
     def act_at_once(self, pdo: ReceivePdo, t_ns: int) -> None:
-        """Write the pending values of an RPDO that doesn't wait for SYNC, and call `act`."""
+        """Write the received values of an event-driven RPDO, and call `act`."""
         self._is_commanded |= self._act((pdo,), t_ns)
         self.act(t_ns)
 
     @staticmethod
     def _act(pdos: Iterable[ReceivePdo], t_ns: int) -> bool:
-        """Write the waiting values; return whether a command was among them."""
+        """Write the waiting values of RPDOs, and return whether one of them was a command."""
         is_commanded = False
         for pdo in pdos:
             values = pdo.pending
@@ -338,35 +359,38 @@ class Pdos:
         return is_commanded
 
     def find_late(self, t_ns: int) -> bool:
-        """Return whether some RPDO is late: its last frame acted longer ago than its event timer."""
+        """Return whether the last frame of some RPDO acted longer ago than its event timer."""
         return any(pdo.is_late(t_ns) for pdo in self._receiving)
 
     @property
     def deadline_ns(self) -> int:
-        """When the next deadline of an RPDO ends, by the device's clock, ns; NEVER_NS without one."""
+        """Time on the device's clock at which the first RPDO gets late, ns.
+
+        It is NEVER_NS if no RPDO has an event timer and an earlier frame.
+        """
         ends = [pdo.acted_ns + pdo.timer_ns for pdo in self._receiving if pdo.timer_ns and pdo.acted_ns is not None]
         return min(ends, default=NEVER_NS)
 
     @property
     def rejected_frames(self) -> int:
-        """Frames so far that failed the end-to-end check."""
+        """Number of received frames so far that failed the end-to-end check."""
         receivers = [pdo.receiver for pdo in self.receive if pdo.receiver is not None]
         return sum(receiver.counts[s] for receiver in receivers for s in E2eStatus if not s.is_valid)
 
     def notify(self) -> None:
-        """Make each event-driven PDO due, except those that compare their data."""
+        """Make all active TPDOs due whose events are state changes, not changes of their content."""
         for pdo in self._sending:
             if not pdo.is_compared:
                 pdo.is_due = True
 
     def compare(self) -> bool:
-        """Compare the content of PDOs whose events are its changes with that sent; return whether such a PDO is due."""
+        """Check the TPDOs whose events are changes of their content, and return whether one of them is due."""
         for pdo in self._compared:
             pdo.compare()
         return any(pdo.is_due for pdo in self._compared)
 
     def poll(self, t_ns: int) -> int:
-        """Send event-driven PDOs that are due; return when to call again, ns."""
+        """Send event-driven TPDOs that are due; return when to call again, ns, NEVER_NS without any."""
         due_ns = NEVER_NS
         for pdo in self._asynchronous:
             due_ns = min(due_ns, pdo.poll(t_ns))
@@ -378,5 +402,5 @@ def _records(pdos: Pdos, first: int) -> list[int]:
 
 
 def _message(pdos: Pdos, messages: Mapping[int, MessageCodec], index: int) -> MessageCodec | None:
-    """Return the contract's message with the default COB-ID of a record."""
+    """Return the contract's message with a PDO's default COB-ID; None if the contract has none."""
     return messages.get(pdos.dictionary.value(index, 1) & 0x7FF)

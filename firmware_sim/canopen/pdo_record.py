@@ -28,14 +28,14 @@ most as wide, and the emulator's kernel filter is this one."""
 
 
 def _is_restricted(can_id: int) -> bool:
-    """Return whether an identifier is not allowed for PDOs: CiA 301, table 34, and SYNC and EMCY."""
+    """Return whether CiA 301, table 34, or SYNC and EMCY forbid an identifier to PDOs."""
     lowest = (0x000, 0x080, 0x101, 0x581, 0x601, 0x6E0, 0x701)
     highest = (0x07F, 0x100, 0x180, 0x5FF, 0x67F, 0x6FF, 0x7FF)
     return any(low <= can_id <= high for low, high in zip(lowest, highest, strict=True))
 
 
 class PdoRecord:
-    """Communication and mapping record of one PDO."""
+    """Communication and mapping record of one PDO: its objects, and its present configuration by them."""
 
     is_received: bool
 
@@ -48,9 +48,10 @@ class PdoRecord:
         message_ids: frozenset[int],
         refresh: Callable[[], None],
     ) -> None:
-        """`longest`: frame, in bytes. `message_ids`: those of the contract. `refresh`: takes over a new configuration.
+        """Read the defaults, and watch the record's objects.
 
-        `message`: the contract's with the PDO's default COB-ID.
+        `longest`: the longest frame, bytes. `message_ids`: identifiers of the contract. `refresh`: called after each
+        change of the configuration. `message`: the contract's with the PDO's default COB-ID, None without one.
         """
         self._dictionary, self._longest, self._message_ids, self._refresh = dictionary, longest, message_ids, refresh
         self.layout = NOTHING
@@ -86,7 +87,7 @@ class PdoRecord:
 
     @property
     def is_synchronous(self) -> bool:
-        """Whether the PDO is sent, or acts, on SYNC."""
+        """Whether the transmission type is 0 to 240: the PDO is sent, or acts, on SYNC."""
         return self.type not in EVENT_DRIVEN
 
     def _check_cob_id(self, value: int) -> None:
@@ -109,7 +110,7 @@ class PdoRecord:
 
     @property
     def _is_held(self) -> bool:
-        """Whether a master must make the PDO invalid before changing it; False where the identifier is read-only."""
+        """Whether a master must make the PDO invalid before changing it: it is valid, and its COB-ID is writable."""
         return self._is_valid and self._can_be_invalid
 
     def _check_inhibit(self, value: int) -> None:
@@ -155,7 +156,7 @@ class PdoRecord:
         self._refresh()
 
     def _lay_out(self, count: int) -> None:
-        """Set `layout` by the first `count` entries; refuse and change nothing if they can't be mapped."""
+        """Set `layout` by the first `count` entries. Raise `Refusal` and change nothing if they can't be mapped."""
         layout = lay_out(self._dictionary, self._entries[:count], self.is_received, self._longest)
         if layout.header_bytes and not self._has_data_ids(layout.header_bytes):
             refuse(Abort.INCOMPATIBLE)
@@ -174,7 +175,10 @@ _HEADER_OBJECTS = {key for keys in _HEADERS.values() for key in keys}
 
 
 class PdoLayout(NamedTuple):
-    """The layout of a frame: header_bytes, then `packing` with the values of `keys`, then padding up to `length`."""
+    """Layout of a frame: `header_bytes` of the end-to-end header, the values of the objects `keys`, padding.
+
+    packing: format of values and padding. length: of the whole frame, bytes.
+    """
 
     keys: tuple[tuple[int, int], ...]
     packing: struct.Struct
@@ -186,9 +190,10 @@ NOTHING = PdoLayout((), struct.Struct("<"), 0, 0)
 
 
 def check_entry(dictionary: ObjectDictionary, value: int, is_received: bool) -> str:
-    """Refuse an entry that can't be mapped in this direction; return its `struct` format.
+    """Return the `struct` format of a mapping entry; raise `Refusal` if it can't be mapped in this direction.
 
-    An entry is index << 16 | sub-index << 8 | bits.
+    An entry is index << 16 | sub-index << 8 | bits. Causes: the object is missing, not mappable, not readable or
+    writable as needed, or of another size.
     """
     index, subindex, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
     dummy_bits = dictionary.dummy_bits(index)
@@ -209,9 +214,8 @@ def check_entry(dictionary: ObjectDictionary, value: int, is_received: bool) -> 
 def lay_out(dictionary: ObjectDictionary, values: Sequence[int], is_received: bool, longest: int) -> PdoLayout:
     """Return the layout of a frame with the mapped objects (`values`: entries as in `check_entry`), in their order.
 
-    Refuses a mapping that is invalid or takes more than `longest` bytes.
-
-    A header must lead and be whole. Frames of more than 8 bytes have one of CAN FD's lengths.
+    Raises `Refusal` for an invalid entry, more than `longest` bytes, or a header that is incomplete or doesn't lead.
+    Frames of more than 8 bytes are padded to one of CAN FD's lengths.
     """
     formats = [check_entry(dictionary, value, is_received) for value in values]
     size = sum(value & 0xFF for value in values) // 8

@@ -111,7 +111,7 @@ _OPTIONS = (  # last first: click lists them the other way round
 
 
 def on_bus(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a command with the options of the bus and of the devices on it; a decorator."""
+    """Return a click command with added options for the bus and the devices on it; a decorator."""
     for option in _OPTIONS:
         command = option(command)
     return command
@@ -317,9 +317,9 @@ def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
 
 
 def _log_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> None:
-    """Make a bench write its truth and faults to a log, stamped by the host's clock in lockstep, else by wall clock.
+    """Make a bench write its truth and faults to a log.
 
-    epoch_ns: wall clock minus the bench's clock.
+    Time stamps are the host's in lockstep, else wall time. epoch_ns: wall clock minus the bench's clock.
     """
 
     def stamp(t_ns: int) -> int:
@@ -350,7 +350,10 @@ def _make_folder(path: Path) -> None:
 def _report(
     bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: TruthLog | None, as_json: bool
 ) -> EmulatorExit:
-    """Close the truth log, removed if it is empty; as_json: print counts and drive states. Return the exit status."""
+    """Close the truth log, and delete it if no host came; return the exit status.
+
+    It is FAILURE, with a line on stderr, if the log is incomplete. as_json: print counts and drive states on stdout.
+    """
     described: dict[str, Any] = {
         "scenario": scenario.name,
         "profile": scenario.arm.name,
@@ -381,7 +384,10 @@ def _report(
 
 
 def _check_contract(log: Path, codec: Codec) -> None:
-    """Raise LogError if an MCAP log's metadata name a contract other than the codec's; ignore other formats."""
+    """Raise LogError if an MCAP log names a contract with another layout digest.
+
+    Other formats, and logs without a digest, pass.
+    """
     digest = run_metadata(log).get("layout_digest", "") if log.suffix.lower() == ".mcap" else ""
     own = f"0x{codec.layout_digest:08X}"
     if digest and digest.casefold() != own.casefold():
@@ -409,7 +415,7 @@ def _report_played(bench: RecordedBench, cycles: RecordedCycles | None, as_json:
 
 
 def _refuse_beside_config() -> None:
-    """Raise ConfigError if an option is given beside --config whose value the configuration sets."""
+    """Raise ConfigError if --contract, --node-offset or --host-node is given, which --config sets."""
     context = click.get_current_context()
     for name, option in (("contract", "--contract"), ("node_offset", "--node-offset"), ("host_node", "--host-node")):
         if context.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT:
@@ -421,7 +427,7 @@ def _complain(line: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the command line, by default that of this process, and exit with a documented status."""
+    """Run the command line, by default that of this process, and exit with a status of `EmulatorExit`."""
     if arguments is None:
         open_terminals()
     logging.getLogger("canopen").addHandler(logging.NullHandler())

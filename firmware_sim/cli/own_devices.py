@@ -73,7 +73,10 @@ _SIGNED8, _UNSIGNED16, _UNSIGNED32 = 0x0002, 0x0006, 0x0007  # data types, CiA 3
 
 
 def _made_up(kind: str, settings: Settings) -> dict[int, MadeUp]:
-    """Return the objects, by index, that every device of a kind has, even if its EDS lacks them."""
+    """Return objects, by index, that the emulated devices of a kind need; the caller adds those that an EDS lacks.
+
+    kind: "drive" or "sensor".
+    """
     made = {
         0x1006: MadeUp("SYNC period", _UNSIGNED32, 0),
         0x1017: MadeUp("heartbeat time", _UNSIGNED16, settings.bus.heartbeat_ms),
@@ -88,7 +91,10 @@ def _made_up(kind: str, settings: Settings) -> dict[int, MadeUp]:
 
 
 class Rehearsal(NamedTuple):
-    """An arm that can be played: its frames, its devices, its scenario; and the assumptions, a line each."""
+    """An arm that can be played: its frames, its devices, its scenario.
+
+    assumed: a line for each assumption about the arm, for the user.
+    """
 
     codec: Codec
     contract: EmulatedContract
@@ -99,7 +105,10 @@ class Rehearsal(NamedTuple):
 def rehearse(
     config: str, scenario: str, truth: str | None = None, profile: str | None = None, seed: int | None = None
 ) -> Rehearsal:
-    """Return the arm of a configuration with a scenario, to be played. Raises ConfigError, CodecError."""
+    """Return the arm of a configuration with a scenario, to be played; all names: built in, or files.
+
+    Raises ConfigError for a configuration, scenario or truth that can't be used, CodecError for its DBC.
+    """
     layers = configuration_layers(config, profile)
     settings = parse(Settings, resolved_table(layers))
     return rehearse_settings(settings, layers, scenario, truth, seed)
@@ -114,7 +123,8 @@ def rehearse_settings(
 ) -> Rehearsal:
     """Return the arm of a configuration with a scenario, to be played; `layers`: those that gave the settings.
 
-    Without a truth and keys of an own arm, the profile's arm and our own devices. Raises ConfigError, CodecError.
+    If there is no truth and no layer describes an own arm, it is the profile's arm with our own devices. Raises
+    ConfigError, CodecError.
     """
     devices = place_devices(settings)
     codec = load_contract(settings, devices)
@@ -140,7 +150,7 @@ def rehearse_settings(
 
 
 def _omissions(devices: list[PlacedDevice], contract: EmulatedContract) -> list[str]:
-    """Return a line for each EDS that omits objects, with those that the emulator adds."""
+    """Return a line for each EDS that omits objects which the emulator adds, naming these."""
     lines: dict[str, None] = {}
     for device, description in zip(devices, contract.devices, strict=True):
         if names := ", ".join(f"0x{index:04X} ({made.name})" for index, made in description.made_up.items()):
@@ -159,13 +169,16 @@ def _habits_by_vendor() -> dict[int, HabitSettings]:
 
 
 def _maker_habits(device: PlacedDevice) -> HabitSettings:
-    """Return the habits of a maker's drives, by the vendor id in the device's EDS; the default habits if unknown."""
+    """Return the habits of the maker's drives, by the vendor id in the device's EDS.
+
+    Other makers have default habits.
+    """
     vendor = _default(device, 0x1018, 1) or device.objects.device_information.vendor_number
     return _habits_by_vendor().get(vendor, HabitSettings())
 
 
 def _counts(codec: Codec, devices: list[PlacedDevice]) -> DeviceCounts:
-    """Return position counts, torque ranges, and rated torques with their counts, by profiles and EDS."""
+    """Return position increments, torque ranges, Nm, rated torques, Nm, and their counts, Nm, by profiles and EDS."""
     drives, sensors = devices[:JOINTS], devices[JOINTS:]
     first, second = (float(drive.settings.scale.increments_per_joint_rev) for drive in drives)
     ranges = []
@@ -179,13 +192,16 @@ def _counts(codec: Codec, devices: list[PlacedDevice]) -> DeviceCounts:
 
 
 def _default(device: PlacedDevice, index: int, sub: int) -> int:
-    """Return an object's default in the EDS, 0 without one."""
+    """Return an object's default in the EDS; 0 if the EDS lacks the object or gives it no default."""
     variable = device.variable(ObjectName(index, sub)) if device.has(index, sub) else None
     return 0 if variable is None or variable.default is None else variable.default
 
 
 def _can_be_set(device: PlacedDevice, index: int, sub: int) -> bool:
-    """Return whether an object may get another value than its EDS's: it is writable, or the increments are assumed."""
+    """Return whether an object may get another value than its EDS's: it is writable, or the increments are assumed.
+
+    False if the EDS lacks it.
+    """
     if not device.has(index, sub):
         return False
     is_guess = "scale.increments_per_joint_rev" in device.settings.assumed
@@ -193,13 +209,19 @@ def _can_be_set(device: PlacedDevice, index: int, sub: int) -> bool:
 
 
 def describe_devices(codec: Codec, devices: list[PlacedDevice], settings: Settings) -> EmulatedContract:
-    """Return the contract of a DBC whose devices are described by their own EDS files."""
+    """Return the contract of a DBC whose devices have the EDS and values of their profiles.
+
+    Raises ConfigError for an EDS that can't be played.
+    """
     described = tuple(_describe(device, settings) for device in devices)
     return EmulatedContract(codec.path.name, "", "", described, settings.bus.period_us)
 
 
 def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
-    """Return values of encoder, gear and feed constant (0x608F, 0x6091, 0x6092) that give the profile's increments."""
+    """Return values of encoder, gear and feed constant by (index, sub-index) that give the profile's increments.
+
+    The objects are 0x608F, 0x6091 and 0x6092; a gear in the EDS is kept.
+    """
     scale = device.settings.scale
     told_in, told_out = _default(device, 0x6091, 1), _default(device, 0x6091, 2)
     gear = Fraction(told_in, told_out) if told_in and told_out else Fraction(scale.gear_ratio).limit_denominator(1000)
@@ -214,9 +236,9 @@ def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
 
 
 def _live_value(device: PlacedDevice, pdo: PdoSettings, signal: SignalSettings) -> LiveValue | None:
-    """Return the live value that a mapped object has: that of its name, else of the signal with which it is compared.
+    """Return the live value of a mapped object: that of its own signal, else of the signal with which it is compared.
 
-    None: the object has a value of its own.
+    None: the emulator has neither, so the object keeps a value of its own.
     """
     objects = _OBJECTS[device.settings.kind]
     if signal.signal in objects:
@@ -233,7 +255,7 @@ _BOTH_WAYS = ("position", "velocity", "torque", "target_torque")
 
 
 def _check_objects(device: PlacedDevice) -> None:
-    """Raise ConfigError if an object's type isn't the standard's, or a signal with negative values is unsigned."""
+    """Raise ConfigError if an object hasn't the standard's type, or a signal with negative values is unsigned."""
     place = f"device profile {device.profile.name}"
     for index in STANDARD_TYPES:
         if device.has(index):
@@ -246,7 +268,7 @@ def _check_objects(device: PlacedDevice) -> None:
 def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
     """Return a device's description: its EDS, and the values at power-on that the profile adds or replaces.
 
-    Raises ConfigError for an EDS by which no device can be played.
+    Raises ConfigError for an EDS with a wrong type or an unsigned signal.
     """
     _check_objects(device)
     kind, scale = device.settings.kind, device.settings.scale

@@ -13,7 +13,10 @@ from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_sce
 
 @dataclass(frozen=True)
 class ScenarioFinding:
-    """The result of checking one file. `problems`: one line each; `checked`: the checked content, if all is good."""
+    """The result of checking one scenario file.
+
+    `problems`: one line each, () if there are none; `checked`: then, a summary of the checked content.
+    """
 
     file: str
     problems: tuple[str, ...]
@@ -21,12 +24,15 @@ class ScenarioFinding:
 
     @property
     def lines(self) -> list[str]:
-        """The finding for a terminal."""
+        """Lines for a terminal, each with the file's name: the problems, or one line that says good."""
         return [f"{self.file}: {problem}" for problem in self.problems] or [f"{self.file}: good: {self.checked}"]
 
 
 def describe_all() -> list[dict[str, Any]]:
-    """Return name, group, content, duration and expectation of the package's scenarios, sorted by group and name."""
+    """Return a table per built-in scenario: name, group, about, lasts_s, expect.
+
+    They are sorted by group and name; `expect` is "" without an expectation.
+    """
     scenarios = sorted((load_scenario(name) for name in builtin_scenarios()), key=lambda one: (one.group, one.name))
     return [
         {
@@ -46,7 +52,9 @@ def show(scenario: Scenario, is_whole: bool) -> str:
 
 
 def check(file: str, codec: Codec) -> ScenarioFinding:
-    """Check a scenario file against a contract; return its problems, or a summary if it has none.
+    """Check a scenario file and its faults' frames against a contract.
+
+    Return its problems, or a summary if it has none.
 
     A file that can't be read is a problem, too.
     """

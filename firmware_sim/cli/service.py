@@ -23,19 +23,19 @@ _SILENCE_NS = 2_000_000_000  # a host that is silent for this long has gone
 
 
 class StopRequest:
-    """A request to end the emulator: `is_made` is True once `make` was called."""
+    """A request to end the emulator. `is_made` gets True by `make`."""
 
     def __init__(self) -> None:
         self.is_made = False
 
     def make(self, *_signal: object) -> None:
-        """Set `is_made`, and end waits of the terminal; callable as a signal handler."""
+        """Set `is_made`, and cut short waits of the terminal; callable as a signal handler."""
         self.is_made = True
         hurry()
 
 
 class Service:
-    """Carries frames and time to a bench until a stop is requested."""
+    """Carries frames and time between a bus and a bench until a stop is requested."""
 
     def __init__(
         self,
@@ -47,9 +47,9 @@ class Service:
         stop: StopRequest,
         is_once: bool = False,
     ) -> None:
-        """Prepare. `departure`: where the bench puts its frames.
+        """`departure`: where the bench puts its frames.
 
-        `is_once`: also end when the host that started the nodes stops or resets them or falls silent.
+        `is_once`: end also when the host has started the nodes and then stops or resets them, or is silent for 2 s.
         """
         self._bench = bench
         self._bus = bus
@@ -64,7 +64,7 @@ class Service:
         self._gone_ns = NEVER_NS  # when the host was found to have gone
 
     def boot(self) -> None:
-        """Drop earlier frames of the bus, power the bench on, and send the nodes' boot-up messages. Raises BusError."""
+        """Drop frames that wait on the bus, power the bench on, and send the boot-up messages. Raises BusError."""
         while self._bus.receive(0.0) is not None and not self._stop.is_made:
             pass
         self._time_ns = self._heard_ns = self._clock.now_ns()
@@ -72,9 +72,10 @@ class Service:
         self._departure.send_waiting()
 
     def run(self) -> None:
-        """Carry frames and time until a stop is requested, with `is_once` until the host has gone.
+        """Carry frames and time until a stop is requested; `is_once` also ends it when the host has gone.
 
-        Waits for an interface that has gone down. Raises BusError.
+        Then it waits until the arm is at rest. Waits for an interface that has gone down. Raises BusError for other
+        failures of the bus.
         """
         while not self._stop.is_made:
             try:
@@ -105,7 +106,7 @@ class Service:
         return frame
 
     def _await_interface(self) -> None:
-        """Try to recover the interface until it is back or a stop is requested."""
+        """Try every 50 ms to recover the interface, until it is back or a stop is requested."""
         while not self._stop.is_made:
             try:
                 self._bus.recover()
@@ -115,16 +116,19 @@ class Service:
                 return
 
     def _patience_s(self) -> float:
-        """Return the time to wait for a frame, s."""
+        """Return how long to wait for a frame, s.
+
+        By SYNC it is 10 ms; by wall clock the time to the bench's next timer, 50 ms at most.
+        """
         if not self._is_wall:
             return _IDLE_NS * 1e-9
         due_ns = self._bench.due_ns - self._clock.now_ns()
         return max(0, min(due_ns, _LONGEST_WAIT_NS)) * 1e-9
 
     def _pass_time(self, now_ns: int, is_idle: bool) -> None:
-        """Pass the time to the bench: by wall clock whenever no frame waits, by SYNC when no SYNC has come for a while.
+        """Pass the time to the bench: by wall clock if no frame came, by SYNC if no SYNC has come for 10 ms.
 
-        A host in lockstep sends the time itself, until it has gone. A host that has gone is outlived.
+        A host in lockstep sends the time itself. After 2 s of silence the bench outlives the host, and lockstep ends.
         """
         is_silent = now_ns - self._heard_ns > _SILENCE_NS
         if is_silent:
@@ -146,7 +150,10 @@ class Service:
         return self._has_been_operational and (is_silent or not self._bench.is_operational)
 
     def _is_settled(self) -> bool:
-        """Return whether the arm of a host that has gone is at rest, or has been given the time for it."""
+        """Return whether the arm of a host that has gone is at rest, or 5 s have passed since by wall clock.
+
+        In clock mode `sync` the first call lets the arm come to rest.
+        """
         self._bench.outlive_host()
         self._departure.send_waiting()
         now_ns = self._clock.now_ns()
@@ -156,9 +163,9 @@ class Service:
 
 @contextmanager
 def stop_by_signal() -> Iterator[StopRequest]:
-    """Yield a request that SIGINT, SIGTERM and SIGHUP make, instead of ending the process; restore handlers at the end.
+    """Yield a request that SIGINT, SIGTERM and SIGHUP make, instead of ending the process.
 
-    An ignored SIGHUP stays ignored.
+    At the end the former handlers are back. An ignored SIGHUP stays ignored.
     """
     stop = StopRequest()
     numbers = [signal.SIGINT, signal.SIGTERM]
@@ -173,7 +180,11 @@ def stop_by_signal() -> Iterator[StopRequest]:
 
 
 def open_devices_end(interface: str, channel: str, clock: Clock, codec: Codec) -> Bus:
-    """Return the devices' end of a bus, open; CAN FD only if the contract has such frames. Raises BusMissingError."""
+    """Return the devices' end of a bus, open.
+
+    It hears the host's frames, marks and possible RPDOs; CAN FD only if the contract has such frames. Raises
+    BusMissingError if the interface or channel is missing.
+    """
     heard = {message.can_id for message in codec.messages.values() if "HOST" in message.senders} | LISTENED_IDS
     heard.add(HOST_MARK)
     options: dict[str, Any] = {"is_fd": True} if is_fd(codec) else {}

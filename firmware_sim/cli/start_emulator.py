@@ -10,7 +10,7 @@ INTERRUPTED = 0
 
 
 def start_emulator() -> NoReturn:
-    """Import, run the command line and exit with a documented status."""
+    """Import the command line, run it, and exit with a status of `EmulatorExit`."""
 
     def load() -> Callable[[], NoReturn]:
         from firmware_sim.cli.emulator_main import main

@@ -43,7 +43,10 @@ _OF_SYNC = {Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH}
 
 
 class Application:
-    """The application of a device: everything besides communication. The methods of this base class are empty."""
+    """The application of a device: everything besides communication.
+
+    `EmulatedDevice` calls the methods; here they are empty.
+    """
 
     @property
     def is_at_work(self) -> bool:
@@ -51,35 +54,35 @@ class Application:
         return False
 
     def act(self, t_ns: int) -> None:
-        """Act on the values of a received PDO that doesn't wait for SYNC; they have been written."""
+        """Act on the values of an RPDO that doesn't wait for SYNC, after they have been written."""
 
     def mind_length(self, is_right: bool, t_ns: int) -> None:
-        """Act on an RPDO frame with a wrong length, or on the first one with the right length after it."""
+        """React to an RPDO frame of wrong length, or, with `is_right`, to the first of right length after it."""
 
     def leave_operational(self, t_ns: int) -> None:
         """React to leaving Operational; EMCY messages can still be sent."""
 
     def enter_operational(self, t_ns: int) -> None:
-        """Act on entering Operational."""
+        """React to entering Operational; PDOs are exchanged already."""
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """Report and act on the loss of the master's heartbeat, before the device leaves Operational."""
+        """React to the loss of the master's heartbeat; called before the device leaves Operational."""
 
     def find_heartbeat(self, t_ns: int) -> None:
-        """Act on the return of the master's heartbeat."""
+        """React to the return of the master's heartbeat."""
 
     def distrust_sync(self, t_ns: int) -> None:
-        """Act on SYNCs with too many odd ones among them to serve as a time base."""
+        """React to more than TOLERATED odd SYNCs: SYNC can't serve as a time base."""
 
     def note_error(self) -> None:
-        """Follow a possible change of the error register, 0x1001; empty here."""
+        """React to a possible change of the error register, 0x1001."""
 
     def restart_node(self, is_node_reset: bool) -> None:
         """Reset the application's state; `is_node_reset`: False at a reset of the communication only."""
 
 
 class EmulatedDevice(ObjectDictionary):
-    """A CANopen device: everything but its application."""
+    """A CANopen device: its communication; `attach` gives it an application."""
 
     def __init__(
         self,
@@ -89,9 +92,9 @@ class EmulatedDevice(ObjectDictionary):
         messages: Mapping[int, MessageCodec],
         longest_pdo: int,
     ) -> None:
-        """Read the EDS; the device sends no frame before `power_on`. Raises OSError when the EDS can't be read.
+        """Read the EDS; the device sends no frame before `power_on`. Raises OSError if the EDS can't be read.
 
-        `messages`: the contract's, by identifier. `longest_pdo` in bytes.
+        `messages`: the contract's, by identifier. `longest_pdo`: in bytes.
         """
         super().__init__(node_id, description, self._send)
         self.clock = NodeClock()
@@ -132,34 +135,46 @@ class EmulatedDevice(ObjectDictionary):
 
     @property
     def error_register(self) -> int:
-        """Error register 0x1001, from the tripped watchdogs and the application's faults."""
+        """Error register 0x1001: bits 0 and 4 while a watchdog is tripped, the fault's bits during a fault.
+
+        The fault's bits are bit 0 and those that name its kind.
+        """
         register = _GENERIC | _COMMUNICATION if self.tripped else 0
         return register | (_GENERIC | self.fault_bits if self.is_faulty else 0)
 
     @property
     def is_sync_odd(self) -> bool:
-        """Whether a watchdog of SYNC's order or length is tripped, so that right SYNCs count, too."""
+        """Whether the watchdog of SYNC's order or length is tripped. Then right SYNCs must be counted, too."""
         return bool(_OF_SYNC & self.tripped)
 
     def attach(self, application: Application) -> None:
-        """Set the application; it then gets the frames and state changes that concern it."""
+        """Set the application, which then gets received values and state changes."""
         self._application = application
         self.pdos.act, self.pdos.mind_length = application.act, application.mind_length
 
     def replace_value(self, index: int, subindex: int, value: int | None) -> None:
-        """Give an object a value in place of its own, in PDOs and by SDO; None: its own value again."""
+        """Give an object a value in place of its own, in PDOs and by SDO; None: its own value again.
+
+        The PDOs are bound anew.
+        """
         super().replace_value(index, subindex, value)
         self.pdos.refresh()
 
     def power_on(self, t_ns: int) -> None:
-        """Switch the power on: begin the device's time, send the boot-up message, and enter Pre-operational."""
+        """Switch the power on: send the boot-up message, and enter Pre-operational.
+
+        In bus-off the device stays silent.
+        """
         self.is_powered = True
         self.is_on_bus = not self._is_bus_off
         self.power_on_ns = self.clock.own_ns(t_ns)
         self._boot(self.power_on_ns)
 
     def power_off(self, _t_ns: int) -> None:
-        """Switch the power off: the device neither sends nor hears, and forgets all written values."""
+        """Switch the power off: the device neither sends nor hears.
+
+        Written values, errors and application state are lost.
+        """
         self.is_powered = self.is_on_bus = False
         self._errors.forget_messages()
         self.is_operational = False
@@ -168,21 +183,27 @@ class EmulatedDevice(ObjectDictionary):
         self._reset(is_node_reset=True)
 
     def leave_bus(self, t_ns: int) -> None:
-        """Take the controller off the bus; an operational device goes to Pre-operational, the default of 0x1029."""
+        """Put the controller into bus-off: the device neither sends nor hears.
+
+        An operational device goes to Pre-operational, the default of 0x1029.
+        """
         self._is_bus_off = True
         self.is_on_bus = False
         if self.is_operational:
             self._enter(NmtState.PRE_OPERATIONAL, self.clock.own_ns(t_ns))
 
     def return_to_bus(self, t_ns: int) -> None:
-        """End `leave_bus`: a powered device takes part in the bus again and sends an EMCY (0x8140)."""
+        """End `leave_bus`: a device with power takes part in the bus again, and sends an EMCY (0x8140)."""
         self._is_bus_off = False
         self.is_on_bus = self.is_powered
         if self.is_on_bus:
             self._errors.report_error(_RECOVERED_FROM_BUS_OFF, self.clock.own_ns(t_ns))
 
     def send_emergency(self, code: int, t_ns: int) -> None:
-        """Send an EMCY at once, whatever its inhibit time, as a device out of control does."""
+        """Add an error code to the history and send its EMCY at once, whatever the inhibit time.
+
+        No EMCY is sent if the NMT state or 0x1014 forbids it.
+        """
         self._errors.report_at_once(code, self.clock.own_ns(t_ns))
 
     def _boot(self, t_ns: int) -> None:
@@ -192,7 +213,10 @@ class EmulatedDevice(ObjectDictionary):
         self._enter(NmtState.PRE_OPERATIONAL, t_ns)
 
     def on_nmt(self, data: bytes, t_ns: int) -> None:
-        """Change the NMT state or reset the device by an NMT command; ignore one for another device."""
+        """Change the NMT state or reset the device by an NMT command.
+
+        Commands to other devices or off the bus have no effect.
+        """
         if len(data) != 2 or data[1] not in (0, self.node_id) or not self.is_on_bus:
             return
         self.now_ns = t_ns = self.clock.own_ns(t_ns)
@@ -216,12 +240,12 @@ class EmulatedDevice(ObjectDictionary):
             self.on_request(data, t_ns)
 
     def on_heartbeat(self, node_id: int, t_ns: int) -> None:
-        """Pass another node's heartbeat to the heartbeat consumer; ignore it off the bus."""
+        """Note another node's heartbeat, if it is the monitored one; ignore it off the bus."""
         if self.is_on_bus:
             self._consumer.on_heartbeat(node_id, self.clock.own_ns(t_ns))
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """React to the master's silence: the application, then Pre-operational (CiA 301, default of 0x1029)."""
+        """React to the master's silence: call the application, then leave Operational (CiA 301, default of 0x1029)."""
         self._application.lose_heartbeat(t_ns)
         if self.is_operational:
             self._enter(NmtState.PRE_OPERATIONAL, t_ns)
@@ -231,7 +255,10 @@ class EmulatedDevice(ObjectDictionary):
         self._application.find_heartbeat(t_ns)
 
     def note_sync(self, kind: SyncKind, lost: int, t_ns: int) -> None:
-        """Count a SYNC and the `lost` ones before it; trip or clear the watchdogs of SYNC. Only in Operational."""
+        """Count a SYNC and the `lost` ones before it; trip or clear the watchdogs of SYNC.
+
+        Outside Operational do nothing. Too many odd SYNCs are reported to the application by `distrust_sync`.
+        """
         if not (self.is_operational and self.is_on_bus):
             return
         t_ns = self.clock.own_ns(t_ns)
@@ -249,7 +276,10 @@ class EmulatedDevice(ObjectDictionary):
                 self._application.distrust_sync(t_ns)
 
     def trip(self, watchdog: Watchdog, t_ns: int) -> None:
-        """Trip a watchdog and send its EMCY, unless it is tripped; report to the application by `note_error`."""
+        """Trip a watchdog and send its EMCY, unless it is tripped already.
+
+        Call the application's `note_error` in any case.
+        """
         self._errors.trip(watchdog, t_ns, self._time_ms(t_ns))
         self._application.note_error()
 
@@ -260,7 +290,7 @@ class EmulatedDevice(ObjectDictionary):
             self._application.note_error()
 
     def report_fault(self, code: int, t_ns: int) -> None:
-        """Send the EMCY of a fault that no watchdog found."""
+        """Send the EMCY of a fault that no watchdog has found, and add its code to the history."""
         self._errors.report_error(code, t_ns, time_ms=self._time_ms(t_ns))
 
     def report_no_error(self, t_ns: int) -> None:
@@ -268,23 +298,26 @@ class EmulatedDevice(ObjectDictionary):
         self._errors.report_error(0, t_ns)
 
     def poll(self, t_ns: int) -> int:
-        """Send heartbeats and EMCYs that are due and find a lost heartbeat; return when the next timer is due.
+        """Send heartbeats and EMCYs that are due, and find a lost heartbeat; return when the next timer is due.
 
-        Both times by the device's own clock, ns.
+        Both times are ns on the device's own clock.
         """
         return min(self._producer.send_due(t_ns), self._consumer.find_silence(t_ns), self._errors.send_waiting(t_ns))
 
     def _is_locked_at_work(self, index: int, subindex: int) -> bool:
-        """Return whether SDO may not write an object now: while the device is at work, only those in `open_at_work`."""
+        """Return whether SDO may not write an object: the device is at work, and the object isn't in `open_at_work`."""
         return self._application.is_at_work and (index, subindex) not in self.open_at_work
 
     def _check_period(self, period_us: int) -> None:
-        """Refuse a change of the SYNC period, 0x1006, while the device is Operational."""
+        """Abort an SDO write (DEVICE_STATE) that changes the SYNC period, 0x1006, while the device is Operational."""
         if self.is_operational and period_us != self.value(0x1006):
             refuse(Abort.DEVICE_STATE)
 
     def _check_overflow(self, overflow: int) -> None:
-        """Refuse a SYNC overflow of 1 or above 240, and a change while the SYNC period is not 0: CiA 301, 7.5.2.22."""
+        """Abort an SDO write of an invalid SYNC overflow, 0x1019, or a change while 0x1006 is not 0: CiA 301, 7.5.2.22.
+
+        Invalid are 1 and more than 240.
+        """
         if overflow == 1 or overflow > SYNC_OVERFLOW:
             refuse(Abort.VALUE_RANGE)
         if overflow != self.value(0x1019) and self.value(0x1006) != 0:
@@ -294,7 +327,7 @@ class EmulatedDevice(ObjectDictionary):
         self.sync_overflow = overflow
 
     def _send(self, can_id: int, data: bytes) -> None:
-        """Send a frame that isn't a PDO; PDOs are exchanged in Operational only, and there a device is on the bus."""
+        """Send a frame that isn't a PDO, unless the device is off the bus."""
         if self.is_on_bus:
             self._put_on_bus(can_id, data)
 
@@ -312,7 +345,7 @@ class EmulatedDevice(ObjectDictionary):
             self._application.enter_operational(t_ns)
 
     def _reset(self, is_node_reset: bool) -> None:
-        """Restore the EDS values, of the communication profile or of all objects, and reset the application."""
+        """Restore the EDS's values of all objects, or of the communication profile only, and reset the application."""
         self.restore(0xFFFF if is_node_reset else 0x1FFF)
         self.pdos.restart_sequences()
         if is_node_reset:
@@ -338,27 +371,33 @@ class NodeClock:
         self._rate = _BILLION  # own ns in a second of the bench
 
     def set_drift(self, drift_ppm: float, t_ns: int) -> None:
-        """Let the clock run fast by `drift_ppm` from the bench's `t_ns` on, without a jump."""
+        """Let the clock run fast by `drift_ppm` from the bench's time `t_ns` on, without a jump.
+
+        Negative: slow, 0: no drift.
+        """
         self._own_since_ns = self.own_ns(t_ns)
         self._since_ns = t_ns
         self._rate = _BILLION + round(drift_ppm * 1000)
         self.is_true = self._rate == _BILLION and self._own_since_ns == t_ns
 
     def own_ns(self, t_ns: int) -> int:
-        """Return the device's time at the bench's `t_ns`."""
+        """Return the device's time, ns, at the bench's time `t_ns`."""
         if self.is_true:
             return t_ns
         return self._own_since_ns + (t_ns - self._since_ns) * self._rate // _BILLION
 
     def bench_ns(self, own_ns: int) -> int:
-        """Return the first time of the bench at which the device's is at least `own_ns`; NEVER_NS stays."""
+        """Return the first bench time, ns, at which the device's time is at least `own_ns`; NEVER_NS for NEVER_NS."""
         if self.is_true or own_ns >= NEVER_NS:
             return own_ns
         return self._since_ns - (own_ns - self._own_since_ns) * _BILLION // -self._rate
 
 
 class SyncListeners:
-    """Reports each SYNC to the devices of a bench, with the number lost before. A SYNC in order needs no report."""
+    """Reports each SYNC to the devices of a bench, with the number lost before.
+
+    A right SYNC needs no report unless `is_remembering`.
+    """
 
     def __init__(self, devices: Sequence[EmulatedDevice]) -> None:
         self._devices = devices
@@ -376,18 +415,21 @@ class SyncListeners:
         self._sort()
 
     def forget_unheard(self) -> None:
-        """Forget the SYNCs that devices have not heard, so that none counts as lost before the next one."""
+        """Forget the SYNCs that devices have not heard: they won't be reported as lost."""
         self._unheard = [0] * len(self._devices)
 
     def takers(self, data: bytes) -> tuple[int, ...]:
-        """Return 1 for each device that takes SYNCs of this length, by its 0x1019; else 0."""
+        """Return 1 for each device that takes SYNCs of this length, by its 0x1019; else 0.
+
+        All 0 for more than one byte.
+        """
         return self._takers.get(len(data), self._nobody)
 
     def report_sync(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, lost: int, t_ns: int) -> None:
         """Report the kind of a SYNC to the devices that hear it, with the number of SYNCs lost before it.
 
-        heard: how often each device hears it. takers: 1 for each device that takes its length, else 0. lost: SYNCs
-        that the counter skipped.
+        heard: how often each device hears it; the second time counts as repeated. takers: 1 for each device that takes
+        its length, else 0. lost: SYNCs that the counter skipped.
         """
         for place, device in enumerate(self._devices):
             self._unheard[place] += lost
@@ -401,14 +443,17 @@ class SyncListeners:
         self._remember()
 
     def ignore(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, t_ns: int) -> None:
-        """Report the kind of a SYNC that no device answers to the devices; `heard`, `takers` as in `report_sync`."""
+        """Report the kind of a SYNC that no device answers, without lost ones before it.
+
+        `heard`, `takers` as in `report_sync`.
+        """
         for place, device in enumerate(self._devices):
             for _ in range(heard[place]):
                 device.note_sync(kind if takers[place] else SyncKind.WRONG_LENGTH, 0, t_ns)
         self._remember()
 
     def miss(self, count: int) -> None:
-        """Count `count` SYNCs as lost for every device."""
+        """Add `count` lost SYNCs for every device; the next `report_sync` reports them."""
         self._unheard = [unheard + count for unheard in self._unheard]
         self._remember()
 
@@ -416,7 +461,7 @@ class SyncListeners:
         self.is_remembering = any(self._unheard) or any(device.is_sync_odd for device in self._devices)
 
     def _sort(self) -> None:
-        """Update the takers of SYNC by its length, and `overflow`, by the devices' 0x1019."""
+        """Update the devices that take SYNCs with and without counter, and `overflow`, by their 0x1019."""
         overflows = [device.sync_overflow for device in self._devices]
         self._takers = {
             0: tuple(int(not overflow) for overflow in overflows),

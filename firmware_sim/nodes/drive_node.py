@@ -57,7 +57,7 @@ _EVENTS = frozenset({(0x6041, 0), (0x6061, 0), (0x603F, 0)})
 
 
 class DriveNode(Application):
-    """One drive on the bus. `motor_mode` and `torque_Nm` are the motor's command until the next SYNC."""
+    """One drive on the bus. `motor_mode` and `torque_Nm`, the set-point, are its command to the motor."""
 
     def __init__(
         self,
@@ -70,7 +70,7 @@ class DriveNode(Application):
         scale: DriveScale,
         habits: HabitSettings,
     ) -> None:
-        """Connect the node to its device.
+        """Connect the node to its device, whose application it becomes.
 
         `number`: 1 or 2, as in the DBC's names. `is_free_running`: time passes without SYNC, so SYNC is watched.
         """
@@ -141,7 +141,7 @@ class DriveNode(Application):
         serve(0x6077, 0, lambda: self._torque_permille)
 
     def _configure(self) -> None:
-        """Register checks of, and reactions to, writes of the drive's objects by SDO or PDO."""
+        """Register checks of writes by SDO or PDO of the drive's objects, and the functions that take the values."""
         device = self.device
         device.open_at_work |= {_CONTROLWORD}
         self._pdos.events = _EVENTS
@@ -161,28 +161,34 @@ class DriveNode(Application):
 
     @property
     def is_ready(self) -> bool:
-        """Whether a master that looks at statusword and mode may command torque."""
+        """Whether the drive is in Operation enabled and shows mode 10, so that a master may command torque."""
         return self.is_enabled and (not self._has_habits or self._shown_mode == CYCLIC_SYNCHRONOUS_TORQUE)
 
     @property
     def is_at_work(self) -> bool:
-        """Whether the motor has power by command, so that neither watchdogs nor limits may change."""
+        """Whether the drive is in Operation enabled or Quick stop active: watchdogs and limits may not change."""
         return self.state in _POWERED
 
     @property
     def is_left_alone(self) -> bool:
-        """Whether the drive brakes because a timeout, not a SYNC, showed the loss of the master, and the loss lasts."""
+        """Whether the drive brakes after a fault because its master is lost.
+
+        A timeout, not a SYNC, has shown the loss, and the loss lasts.
+        """
         is_reacting = self.state is DriveState.FAULT_REACTION_ACTIVE
         return is_reacting and self._is_found_by_time and self._cause in self._tripped
 
     @property
     def rejected_commands(self) -> int:
-        """Command frames so far that failed the end-to-end check."""
+        """Number of command frames so far that failed the end-to-end check."""
         return self._pdos.rejected_frames
 
     @property
     def statusword(self) -> int:
-        """0x6041, by state, warnings and limits. Target reached (bit 10) has no meaning in mode 10 and stays 0."""
+        """0x6041, by state, warning of the command PDO, and limits.
+
+        Target reached (bit 10) has no meaning in mode 10 and stays 0.
+        """
         word = STATE_BITS[self.state] | _REMOTE
         if Watchdog.COMMAND_PDO in self._tripped:
             word |= _WARNING
@@ -197,11 +203,11 @@ class DriveNode(Application):
         return self.state is _ENABLED and self._mode == CYCLIC_SYNCHRONOUS_TORQUE and self._ramp_end is None
 
     def on_sync(self, position: int, velocity: int, t_ns: int, *, is_distorted: bool = False) -> None:
-        """Store the measured values, carry out the pending command, check the watchdogs, and command the motor.
+        """Take the measured values, carry out the waiting command, check the watchdogs, and command the motor.
 
-        `position`, `velocity`: sampled at this SYNC, in the body's LSBs.
-
-        `is_distorted`: the velocity isn't the motor's, so it counts where the contract has an LSB of its own, too.
+        `position`, `velocity`: sampled at this SYNC, in counts of POSITION_LSB_RAD and VELOCITY_LSB_RAD_S.
+        `is_distorted`: a fault changed the velocity, so it is used in place of the motor's own where the contract has
+        another LSB.
         """
         t_ns = self._clock.own_ns(t_ns)
         self._patience.sync_ns = t_ns
@@ -233,22 +239,22 @@ class DriveNode(Application):
             self.has_news = True
 
     def act(self, t_ns: int) -> None:
-        """Carry out the command of a PDO that doesn't wait for SYNC."""
+        """Carry out the command of an RPDO that doesn't wait for SYNC, and command the motor."""
         if self._received_word is not None:
             self._obey_received(t_ns)
         self._drive_motor()
 
     def mind_length(self, is_right: bool, t_ns: int) -> None:
-        """Report a command frame of the wrong length, once until a right one comes."""
+        """Trip the length watchdog at a command frame of wrong length; clear it at the first right one."""
         if not is_right:
             self.device.trip(Watchdog.LENGTH, t_ns)
         else:
             self.device.clear(Watchdog.LENGTH, t_ns)
 
     def on_lost_sync(self, t_ns: int) -> None:
-        """Count a period without SYNC as one without a command; check the motor and standstill, and command the motor.
+        """Count a SYNC that this drive has not heard as one without a command.
 
-        For benches that count periods by SYNC counters.
+        Check motor and standstill, and command the motor. Benches that count lost SYNCs by the SYNC counter call it.
         """
         t_ns = self._clock.own_ns(t_ns)
         self._miss_command(t_ns)
@@ -258,7 +264,10 @@ class DriveNode(Application):
         self._drive_motor()
 
     def poll(self, t_ns: int) -> int:
-        """Act on timers that are due, and send frames that are; return when the next timer is due, by the bench, ns."""
+        """Act on timers that are due, and send event-driven frames; return when the next timer is due.
+
+        Both times are ns of the bench.
+        """
         t_ns = self._clock.own_ns(t_ns)
         due_ns = self.device.poll(t_ns)
         self._feel_failure(t_ns)
@@ -278,47 +287,57 @@ class DriveNode(Application):
         return self._clock.bench_ns(due_ns)
 
     def fail(self, code: int, t_ns: int) -> None:
-        """Latch a fault with this error code, 0x603F, now or once powered, and again after each reset until `mend`."""
+        """Latch a fault with this error code, 0x603F, now or once the drive has power.
+
+        It returns after each reset until `mend`.
+        """
         self._failure = code
         self._feel_failure(self._clock.own_ns(t_ns))
 
     def mend(self) -> None:
-        """Remove the cause that `fail` set; the fault stays latched until it is reset."""
+        """Remove the failure that `fail` set; its fault stays latched until it is reset."""
         self._failure = 0
 
     def _feel_failure(self, t_ns: int) -> None:
-        """Latch the fault of a failure that lasts, again after each reset."""
+        """Latch the fault of a failure that `fail` has set, if the drive has power."""
         if self._failure and self.device.is_powered:
             self._latch(self._failure, None, t_ns)
 
     def leave_operational(self, t_ns: int) -> None:
-        """Enter Fault if powered: without PDOs no command arrives."""
+        """Latch a fault in Operation enabled or Quick stop active: without PDOs no command arrives."""
         if self.state in _POWERED:
             self._fault(Watchdog.OPERATIONAL, t_ns)
 
     def enter_operational(self, t_ns: int) -> None:
-        """Clear the watchdog; a fault stays latched."""
+        """Clear the watchdog of Operational, and that of the command PDO if a PDO brings commands.
+
+        A fault stays latched.
+        """
         self.device.clear(Watchdog.OPERATIONAL, t_ns)
         self._find_command_pdo(t_ns)
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """Enter Fault if powered; else only trip the watchdog."""
+        """Latch a fault in Operation enabled or Quick stop active; in other states only trip the watchdog."""
         if self.state in _POWERED:
             self._fault(Watchdog.HEARTBEAT, t_ns, is_found_by_time=True)
         else:
             self.device.trip(Watchdog.HEARTBEAT, t_ns)
 
     def find_heartbeat(self, t_ns: int) -> None:
-        """Clear the watchdog; a fault stays latched."""
+        """Clear the heartbeat watchdog; a fault stays latched."""
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def distrust_sync(self, t_ns: int) -> None:
-        """Enter Fault if enabled: torque acts at SYNC, which is no time base any more."""
+        """Latch a fault in Operation enabled: torque acts at SYNC, which is no time base any more."""
         if self.is_enabled:
             self._fault(Watchdog.SYNC, t_ns)
 
     def restart_node(self, is_node_reset: bool) -> None:
-        """Forget the last command; at a node reset also fault and target torque, and run transitions 0 and 1."""
+        """Forget the controlword that waits.
+
+        At a node reset also forget fault, target torque and controlword, and run the state machine up to Switch on
+        disabled.
+        """
         self._received_word = None
         if not is_node_reset:
             return
@@ -342,7 +361,7 @@ class DriveNode(Application):
         self._received_word = controlword
 
     def _obey_received(self, t_ns: int) -> None:
-        """Carry out the controlword that a PDO brought, if any, and forget it."""
+        """Carry out the controlword that an RPDO brought, if any, and store it as the last one."""
         controlword, self._received_word = self._received_word, None
         if controlword is None:
             return
@@ -358,7 +377,10 @@ class DriveNode(Application):
         self._drive_motor()
 
     def _obey(self, controlword: int, t_ns: int) -> None:
-        """Carry out a controlword."""
+        """Carry out the command of a controlword, if it has one that this state allows.
+
+        Enable operation without a PDO that brings commands trips a watchdog in place of it.
+        """
         event = decode_command(controlword, self._controlword)
         if event is None:
             return
@@ -385,7 +407,10 @@ class DriveNode(Application):
         self._apply(event, t_ns)
 
     def _ramp_down(self, event: DriveEvent, t_ns: int) -> None:
-        """Shut down or disable operation, at once or by braking, as the event's option code says."""
+        """Make the transition of an event, shutdown or disable operation.
+
+        The event's option code says whether the drive brakes first.
+        """
         stop = RAMPS[self.device.value_or(0, _RAMPED[event])]
         if stop is DISABLE:
             self._apply(event, t_ns)
@@ -394,7 +419,10 @@ class DriveNode(Application):
         self._brake(stop, t_ns)
 
     def _apply(self, event: DriveEvent, t_ns: int) -> None:
-        """Make the transition of an event, if this state has one, and set the motor's mode by the new state."""
+        """Make the transition of an event and set the motor's mode by the new state; do nothing if this state has none.
+
+        Quick stop and fault reaction begin to brake by their option codes.
+        """
         transition = find_transition(self.state, event)
         if transition is None:
             return
@@ -423,7 +451,10 @@ class DriveNode(Application):
         self._standstill.begin_braking(t_ns)
 
     def _reset_fault(self, t_ns: int) -> None:
-        """Leave Fault, unless its cause is still there."""
+        """Leave the state Fault for Switch on disabled, with an EMCY.
+
+        Do nothing in other states or while the cause is there.
+        """
         if self.state is not DriveState.FAULT or self._is_cause_present(t_ns):
             return
         self._apply(DriveEvent.FAULT_RESET, t_ns)
@@ -434,11 +465,17 @@ class DriveNode(Application):
         self.device.report_no_error(t_ns)
 
     def _fault(self, cause: Watchdog, t_ns: int, is_found_by_time: bool = False) -> None:
-        """Latch the fault of a watchdog; ignored while a fault is latched."""
+        """Latch the fault of a watchdog and trip it; do nothing while a fault is latched.
+
+        is_found_by_time: a timeout, not a SYNC, showed the cause.
+        """
         self._latch(ERROR_CODES[cause], cause, t_ns, is_found_by_time)
 
     def _latch(self, code: int, cause: Watchdog | None, t_ns: int, is_found_by_time: bool = False) -> None:
-        """Latch a fault, begin the fault reaction, and send the EMCY; ignored while a fault is latched."""
+        """Latch a fault, begin the fault reaction, and send the EMCY; do nothing while a fault is latched.
+
+        cause: None: no watchdog.
+        """
         if self.state in (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT):
             return
         self.error_code = code
@@ -455,7 +492,10 @@ class DriveNode(Application):
             self.device.trip(cause, t_ns)
 
     def _watch_motor(self, t_ns: int) -> None:
-        """Latch a fault that the motor's state calls for; set `has_news` when a torque limit comes or goes."""
+        """Latch a fault that the motor's I²t or temperature calls for.
+
+        Set `has_news` if a torque limit begins or ceases to act.
+        """
         motor = self._motor
         if not motor.is_ideal and (code := motor.error_code()):
             self._latch(code, None, t_ns)
@@ -466,7 +506,10 @@ class DriveNode(Application):
             self.has_news = True
 
     def _is_cause_present(self, t_ns: int) -> bool:
-        """Return whether the drive fails, its motor calls for a fault, or a watchdog stops it, or would at once."""
+        """Return whether a reset fault would return: drive or motor fails, a watchdog is tripped, or commands miss.
+
+        Watchdogs that only warn don't count.
+        """
         if self._failure or self._tripped - WARNINGS or self._motor.error_code():
             return True
         return self._cause is Watchdog.COMMAND and self._is_command_missing(t_ns)
@@ -485,13 +528,13 @@ class DriveNode(Application):
             self.device.clear(Watchdog.COMMAND_PDO, t_ns)
 
     def _miss_command(self, t_ns: int) -> None:
-        """Count a SYNC without a command; latch a fault of an enabled drive after too many."""
+        """Count a SYNC without a command; after too many (0x2200) latch a fault if the drive is enabled."""
         self._patience.silent_syncs += 1
         if self.is_enabled and self._patience.is_command_missing:
             self._fault(Watchdog.COMMAND, t_ns)
 
     def _watch_bus(self, t_ns: int) -> int:
-        """Latch a fault if SYNC or commands stay away for too long; return when to check again, ns."""
+        """Latch a fault if SYNC is missing or an RPDO is late; return when to check again, ns of the device."""
         due_ns = NEVER_NS
         if self.is_free_running:
             due_ns = self._patience.sync_due_ns
@@ -503,7 +546,7 @@ class DriveNode(Application):
 
     @property
     def _obstacle(self) -> int:
-        """0x2212, reason against Operation enabled: 0 no reason, 1 PDOs are not exchanged, 2 no PDO brings commands."""
+        """0x2212, reason against Operation enabled: 0 none, 1 not in Operational, 2 no active RPDO brings commands."""
         if self._pdos.is_commandable:
             return 0
         return 2 if self.device.is_operational else 1
@@ -512,7 +555,10 @@ class DriveNode(Application):
         return self._patience.is_command_missing or self._pdos.find_late(t_ns)
 
     def _watch_standstill(self, t_ns: int) -> None:
-        """End the braking once the motor stands still, or after the longest time."""
+        """End the braking once the motor has stood still for 10 ms, or after 1 s.
+
+        The state then changes, except in a quick stop that stays.
+        """
         if not self._standstill.is_reached(self._motor.velocity_rad_s(), t_ns):
             return
         if self.state is DriveState.FAULT_REACTION_ACTIVE:
@@ -523,7 +569,7 @@ class DriveNode(Application):
             self._apply(DriveEvent.QUICK_STOP_DONE, t_ns)
 
     def _drive_motor(self) -> None:
-        """Set the motor's torque set-point: 0 except in Operation enabled with mode 10, and not while it ramps down."""
+        """Set torque demand and set-point: 0 unless the drive follows its target in Operation enabled with mode 10."""
         self._demand = self._limits.demand() if self._follows_target else 0
         self.torque_Nm = self._demand * self._rated_mNm * 1e-6
 
@@ -533,7 +579,7 @@ class DriveNode(Application):
         return max(-0x8000, min(0x7FFF, permille))
 
     def _keep_habits(self, t_ns: int) -> None:
-        """Update the mode shown on 0x6061, and enter Operation enabled, with the delays of the drive's habits."""
+        """Update the mode on 0x6061 and carry out a delayed Enable operation, by the times of the drive's habits."""
         if self._enabling_ns is not None and t_ns - self._enabling_ns >= self._habits.enable_s * 1e9:
             self._enabling_ns = None
             self._apply(DriveEvent.ENABLE_OPERATION, t_ns)

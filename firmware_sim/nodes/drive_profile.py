@@ -28,7 +28,10 @@ _VOLTAGE_ENABLED = 1 << 4  # of the statusword: the power stage has its supply
 
 
 class DriveState(Enum):
-    """States of CiA 402. The comment says how to leave each; a fault also ends all but START and the last two."""
+    """States of CiA 402. A comment names the events that leave the state.
+
+    A fault leaves all but START and the last two.
+    """
 
     START = "start"  # by itself, at power-on or reset
     NOT_READY_TO_SWITCH_ON = "not ready to switch on"  # by itself, when initialised
@@ -42,7 +45,7 @@ class DriveState(Enum):
 
 
 class DriveEvent(Enum):
-    """The events of the state machine: the controlword's commands and the drive's own findings."""
+    """Events of the state machine: the controlword's commands, and changes that the drive finds itself."""
 
     SHUTDOWN = "shutdown"
     SWITCH_ON = "switch on, disable operation"  # one bit pattern; its meaning depends on the state
@@ -115,16 +118,15 @@ STATE_BITS = {
 
 
 def find_transition(state: DriveState, event: DriveEvent) -> StateTransition | None:
-    """Return the transition that `event` causes in `state`, None without one."""
+    """Return the transition that `event` causes in `state`; None if it causes none there."""
     return _BY_SOURCE.get((state, event))
 
 
 def decode_command(controlword: int, previous: int) -> DriveEvent | None:
-    """Return the command of a controlword, None if it has none (CiA 402-2, command coding).
+    """Return the command of a controlword; None if it has none (CiA 402-2, command coding).
 
-    `previous`: the controlword before it.
-
-    Fault reset is the rising edge of bit 7; while bit 7 stays set, a controlword carries no command.
+    `previous`: the controlword before it. Fault reset is the rising edge of bit 7; while bit 7 stays set, a controlword
+    carries no command.
     """
     if controlword & _FAULT_RESET:
         return None if previous & _FAULT_RESET else DriveEvent.FAULT_RESET
@@ -143,7 +145,10 @@ _LONGEST_BRAKING_NS = 1_000_000_000  # an arm that someone keeps pushing never s
 
 
 class Stop(NamedTuple):
-    """Meaning of one value of a stop's option code. `mode` OFF: the drive function ends at once, without braking."""
+    """How an option code stops the drive. `mode` OFF: at once, without braking.
+
+    stays: the drive then stays in Quick stop active.
+    """
 
     mode: DriveMode
     stays: bool = False  # in Quick stop active
@@ -167,17 +172,20 @@ FAULT_REACTIONS = {code: QUICK_STOPS[code] for code in (0, 1, 2, 3)}
 
 
 class Standstill:
-    """Finds when a braking motor stands still, or has braked for long enough."""
+    """Finds whether a braking motor has stood still for 10 ms, or has braked for 1 s."""
 
     def __init__(self) -> None:
         self._since_ns = self._moving_ns = 0
 
     def begin_braking(self, t_ns: int) -> None:
-        """Start the times of standstill and of the longest braking at `t_ns`."""
+        """Restart both times at `t_ns`."""
         self._since_ns = self._moving_ns = t_ns
 
     def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:
-        """Return whether the motor has stood still for 10 ms, or has braked for 1 s. Call while it brakes."""
+        """Return whether the motor has stood still (0.02 rad/s) for 10 ms, or has braked for 1 s.
+
+        Call it often while it brakes.
+        """
         if abs(velocity_rad_s) > REST_RAD_S:
             self._moving_ns = t_ns
         return t_ns - self._moving_ns >= _REST_NS or t_ns - self._since_ns >= _LONGEST_BRAKING_NS
@@ -191,7 +199,10 @@ _UNLIMITED = 0xFFFF  # where the EDS lacks a limit
 
 
 class TorqueLimits:
-    """Target, offset and limits of torque, as written by SDO or PDO, and the demand that follows from them."""
+    """Target, offset and limits of torque, per mille of rated torque, as SDO or RPDO writes them.
+
+    `demand` follows from them. A limit that the EDS lacks doesn't limit.
+    """
 
     def __init__(self, dictionary: ObjectDictionary, pdos: Pdos) -> None:
         self.target = self._offset = 0
@@ -231,7 +242,7 @@ class TorqueLimits:
         self._combine()
 
     def _combine(self) -> None:
-        """Set the lowest and highest torque from the smallest of the limits in each direction."""
+        """Set the lowest and the highest torque: in each direction the smaller of its own limit and of 0x6072."""
         most, positive, negative = self._limits.values()
         self._low, self._high = -min(most, negative), min(most, positive)
 
@@ -252,9 +263,9 @@ class Motor(NamedTuple):
 
 
 class DriveScale(NamedTuple):
-    """Counts of a drive: position per count of the body, velocity per count of the contract.
+    """Counts of a drive, as factors: position counts per count of the body, velocity counts per count of the contract.
 
-    rated_count_Nm: one count of 0x6076, behind the gear.
+    rated_count_Nm: torque of one count of 0x6076, behind the gear.
     """
 
     position: float = 1.0
@@ -279,18 +290,21 @@ class Patience:
 
     @property
     def is_command_missing(self) -> bool:
-        """Whether too many SYNCs came without a command."""
+        """Whether 0x2200 SYNCs or more have come since the last command; True before the first command."""
         return self.silent_syncs >= self._syncs
 
     @property
     def sync_due_ns(self) -> int:
-        """When SYNC is missing, by the device's clock; never while 0x1006 is 0."""
+        """Time on the device's clock from which SYNC counts as missing, ns: 0x2201 tenths of a period after the last.
+
+        NEVER_NS while 0x1006 is 0.
+        """
         if not self._period_us:
             return NEVER_NS
         return self.sync_ns + self._period_us * self._tenth_periods * 100
 
     def forget_command(self) -> None:
-        """Forget the last command, so that a command counts as missing until the next one."""
+        """Forget the last command: commands count as missing until the next one."""
         self.silent_syncs = _NO_COMMAND_YET
 
     def _set_syncs(self, syncs: int) -> None:
@@ -308,7 +322,7 @@ class Patience:
 def velocity_lsb(codec: Codec, number: int, factor: float) -> float | None:
     """Return a drive's LSB of velocity, rad/s: the contract's divided by `factor`; None if it is VELOCITY_LSB_RAD_S.
 
-    number: of the drive, 1 or 2.
+    Then the body's counts fit as they are. number: of the drive, 1 or 2.
     """
     signals = codec.message(f"Drive{number}Feedback").signals
     scale = next(signal.scale for signal in signals if signal.name == "velocity") / factor

@@ -31,7 +31,7 @@ _EVENTS = frozenset({(0x6150, 1), (0x1001, 0)})
 
 
 class SensorNode(Application):
-    """One torque sensor on the bus. It takes no commands, and reports odd SYNCs."""
+    """One torque sensor on the bus. It takes no commands; odd SYNCs cause EMCYs only."""
 
     def __init__(
         self,
@@ -42,11 +42,11 @@ class SensorNode(Application):
         temperature_C: Callable[[], float],
         count_Nm: float | None,
     ) -> None:
-        """Connect the node to its device.
+        """Connect the node to its device, whose application it becomes.
 
-        `number`: 1 or 2, as in the DBC's names. `converter_ends`: lowest and highest counts that the converter gives.
-        `temperature_C`: of the joint, 0x2111. `count_Nm`: torque sent for a converter's count; None: the
-        true one, and then no value is beyond the signal.
+        `number`: 1 or 2, as in the DBC's names. `converter_ends`: lowest and highest counts that the converter gives,
+        which mean overload. `temperature_C`: of the joint, 0x2111. `count_Nm`: torque sent for a converter's count;
+        None: the true one, and then no value is beyond the signal.
         """
         self.device = device
         self.has_news = False
@@ -79,7 +79,10 @@ class SensorNode(Application):
         device.attach(self)
 
     def on_sync(self, counts: int) -> None:
-        """Store the torque sampled at this SYNC, in the converter's counts; update status and a running autozero."""
+        """Take the torque sampled at this SYNC, in the converter's counts; update status and a running autozero.
+
+        A torque beyond the signal's range is limited to it.
+        """
         status = self._error_bits
         if counts >= self._highest_count:
             status |= STATUS_POSITIVE_OVERLOAD | STATUS_NOT_VALID
@@ -102,7 +105,10 @@ class SensorNode(Application):
         self._error_bits = bits
 
     def poll(self, t_ns: int) -> int:
-        """Act on timers that are due, and send frames that are; return when the next timer is due, by the bench, ns."""
+        """Act on timers that are due, and send event-driven frames; return when the next timer is due.
+
+        Both times are ns of the bench.
+        """
         clock = self.device.clock
         t_ns = clock.own_ns(t_ns)
         due_ns = self.device.poll(t_ns)
@@ -120,16 +126,19 @@ class SensorNode(Application):
         self.device.clear(Watchdog.HEARTBEAT, t_ns)
 
     def note_error(self) -> None:
-        """Set `has_news`, so that the status frame is sent: the error register may have changed."""
+        """Set `has_news`: the error register may have changed, so the next `poll` sends the status frame."""
         self.has_news = True
 
     @property
     def is_at_work(self) -> bool:
-        """Whether the sensor is Operational, so that a host relies on its measurement."""
+        """Whether the sensor is in Operational, where a host relies on its measurement."""
         return self.device.is_operational
 
     def restart_node(self, is_node_reset: bool) -> None:
-        """At a node reset, forget zero and torque and mark the value invalid; otherwise do nothing."""
+        """At a node reset, forget zero, torque and a running autozero, and mark the value as invalid.
+
+        At a reset of the communication do nothing.
+        """
         if is_node_reset:
             self._status = STATUS_NOT_VALID
             self._torque = self._counts = 0
@@ -149,7 +158,7 @@ class SensorNode(Application):
             self._zero_counts = self._autozero_sum / AUTOZERO_SAMPLES
 
     def _check_unchanged(self, index: int) -> Callable[[int], None]:
-        """Return a write check for sub-index 1 that refuses every value except the present one (VALUE_RANGE)."""
+        """Return a write check for sub-index 1 of an object that refuses all but the present value (VALUE_RANGE)."""
 
         def check(value: int) -> None:
             if value != self.device.value(index, 1):

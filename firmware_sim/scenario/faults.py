@@ -48,7 +48,10 @@ _COUNTED = ("feedback", "torque", "command")
 
 
 class _Kind(NamedTuple):
-    """The keys of a kind, besides those of its time, and the nodes that it can affect."""
+    """A kind of fault: its keys, besides those of its time, and the nodes and frames that it can affect.
+
+    is_timed: False: it lasts from power-on and has no `at_s`.
+    """
 
     required: tuple[str, ...]
     optional: tuple[str, ...] = ()
@@ -145,7 +148,7 @@ class FaultSettings:
             raise ValueError(f"same_as = {self.same_as!r} is the node itself")
 
     def _check_node(self, kind: _Kind) -> None:
-        """Raise ValueError unless the node can have such a frame, value or fault."""
+        """Raise ValueError if this kind can't have the frame, or the node can't have such a frame, value or fault."""
         if self.frame is not None and self.frame not in kind.frames:
             raise ValueError(_refusal("frame", self.frame, kind.frames, f"kind {self.kind!r}"))
         allowed, what = kind.nodes, f"kind {self.kind!r}"
@@ -165,12 +168,12 @@ class FaultSettings:
 
     @property
     def onset_ns(self) -> int:
-        """Onset, ns since the moment that its time counts from."""
+        """Onset, ns since power-on or since the drives were enabled (`is_from_power_on`)."""
         return round((self.at_s or 0.0) * 1e9)
 
     @property
     def duration_ns(self) -> int | None:
-        """From onset to end, ns; None: by count, or no end."""
+        """Time from onset to end, ns; None if `count` ends the fault or it has no end."""
         return None if self.duration_s is None else round(self.duration_s * 1e9)
 
     @property
@@ -195,7 +198,7 @@ class FaultSettings:
 
     @property
     def is_broadcast(self) -> bool:
-        """Whether the fault affects frames of the host that all devices receive at once."""
+        """Whether the fault affects host frames that come to all devices at once, as one frame."""
         return (self.frame in BROADCAST and self.node in (None, ALL)) or self.node == HOST
 
     @property
@@ -205,7 +208,7 @@ class FaultSettings:
 
     @property
     def text(self) -> str:
-        """Kind, frame or signal, node and details, in one line."""
+        """One line: kind, frame or signal, node, then the other keys but for onset."""
         whom = self.node or ALL
         what = next((part for part in (self.frame, self.signal) if part is not None), None)
         details = [
@@ -218,7 +221,7 @@ class FaultSettings:
 
     @property
     def timed_text(self) -> str:
-        """Kind, frame or signal, node, details and onset of the fault, in one line."""
+        """One line: `text` and the onset."""
         if not KINDS[self.kind].is_timed:
             return f"{self.text}, from power on"
         return f"{self.text}, at {self.at_s:g} s since {(self.since or SINCE[0]).replace('_', ' ')}"
@@ -262,7 +265,7 @@ def _check_hex(key: str, text: str | None, longest: int) -> None:
 
 
 def check_rows(rows: Sequence[FaultSettings]) -> None:
-    """Raise ConfigError if there are more than MOST_ROWS rows, or if two of them change the same node's id."""
+    """Raise ConfigError if there are more than MOST_ROWS faults, or if two of them change the same node's id."""
     if len(rows) > MOST_ROWS:
         raise ConfigError(f"`faults` has {len(rows)} rows, {MOST_ROWS} at most")
     renamed: dict[str | None, int] = {}
@@ -291,9 +294,10 @@ Message = TypeVar("Message")
 
 
 def own_messages(messages: Mapping[int, Message], right_id: int, node_id: int) -> Mapping[int, Message]:
-    """Return the messages, by identifier, as a device with a wrong node id takes them.
+    """Return the messages, by identifier, as a device with a wrong node id expects them.
 
-    Its own frames, data ids included, are at the identifiers that follow from the id that it has.
+    Its own frames are at the identifiers that follow from the wrong id, but keep their data ids; others with that id
+    are left out.
     """
     if node_id == right_id:
         return messages

@@ -58,7 +58,7 @@ _OF_THE_ARM: Final = _GEOMETRY | {
 
 
 class DeviceCounts(NamedTuple):
-    """Counts of the emulated devices by their profiles; pairs are by place.
+    """Counts of the emulated devices by their profiles; pairs are by joint, as the configuration places the devices.
 
     increments_per_joint_rev: of position. torque_range_Nm: the largest torque that the sensors' signals, or the
     profile, allow. rated_count_Nm: one count of 0x6076 behind the gear. rated_torque_Nm: 0x6076 of the EDS, behind the
@@ -73,7 +73,7 @@ class DeviceCounts(NamedTuple):
 
 @dataclass(frozen=True)
 class _Links:
-    """Length, mass, centre of mass from the link's joint, and inertia about that centre, by link."""
+    """Both links: length, m, mass, kg, centre of mass from the link's joint, m, and inertia about that centre."""
 
     length_m: Pair
     mass_kg: Pair
@@ -82,24 +82,30 @@ class _Links:
 
 
 class ToldArm(NamedTuple):
-    """A configuration, and which of its keys are the user's own: neither built in nor of an emulated profile."""
+    """A host's configuration, and its keys ("section.key") that the user has set.
+
+    own_keys: neither built in nor of an emulated profile.
+    """
 
     settings: Settings
     own_keys: frozenset[str]
 
     @property
     def is_own(self) -> bool:
-        """Whether the file has keys of an arm that belong to no profile."""
+        """Whether the user has set a key that describes an arm or its devices, so that it is not the profile's."""
         return bool(self.own_keys & _OF_THE_ARM)
 
     @property
     def has_geometry(self) -> bool:
-        """Whether the file has lengths or masses of the links; otherwise they are the profile's."""
+        """Whether the user has set lengths, masses or CAD parameters of the links; otherwise they are the profile's."""
         return bool(self.own_keys & _GEOMETRY)
 
 
 def told_arm(settings: Settings, layers: Sequence[ConfigurationLayer]) -> ToldArm:
-    """Return a configuration with its keys that are neither built in nor of an emulated profile."""
+    """Return a configuration with those of its keys that the user has set: neither built in nor of an emulated profile.
+
+    `layers`: those that gave the settings.
+    """
     own = [layer for layer in layers if layer.origin not in builtin_names() and "[profiles." not in layer.origin]
     table = resolved_table(own)
     keys = {f"{name}.{key}" for name, section in table.items() if isinstance(section, dict) for key in section}
@@ -111,7 +117,8 @@ def compose_scenario(
 ) -> tuple[dict[str, Any], list[str]]:
     """Return a scenario's table with the arm of a configuration and a truth put in, and the assumptions, a line each.
 
-    `is_builtin`: it comes with the package, so it is fitted to the size of the arm. Raises ConfigError.
+    `table` stays as it is. `is_builtin`: the scenario comes with the package, so it is fitted to the size of the arm.
+    Raises ConfigError if the configuration's inertia or torque counts can't be played.
     """
     settings, arm = told.settings, told.settings.arm
     assumed: list[str] = []
@@ -180,12 +187,18 @@ def _times(values: Pair, factors: Pair) -> Pair:
 
 
 def _by_place(truth: ArmTruth, what: str, by_joint: Pair) -> Pair:
-    """Return values of joints in the order of the devices that are at them."""
+    """Return values by joint in the order of the devices; exchanged if the truth exchanges `what`.
+
+    what: "drives" or "sensors".
+    """
     return (by_joint[1], by_joint[0]) if truth.wiring.swapped in (what, "joints") else by_joint
 
 
 def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
-    """Return the links' lengths, masses and inertia, and append a line to `assumed` for each assumption."""
+    """Return the links of truth or configuration, and append a line to `assumed` for each assumption.
+
+    Raises ConfigError if no links can have the inertia of `arm.cad_theta`.
+    """
     arm = told.settings.arm
     told_m = truth.arm.link_length_m or arm.link_length_m
     if not told.has_geometry and truth.arm.link_length_m is None and truth.arm.mass_kg is None:
@@ -230,7 +243,10 @@ def _multiply(links: _Links, truth: ArmTruth) -> _Links:
 
 
 def _weighed(length_m: Pair, body: TruthArmSettings | ArmSettings, source: str, assumed: list[str]) -> _Links:
-    """Return links with the masses of `body`; a missing centre or inertia is a rod's, with a line in `assumed`."""
+    """Return links with the masses of `body`. A missing centre or inertia is a uniform rod's, with a line in `assumed`.
+
+    source: "truth" or "file", for that line.
+    """
     assert body.mass_kg is not None
     rods = _rods(length_m, body.mass_kg)
     for key, meaning in (
@@ -248,7 +264,7 @@ def _rods(length_m: Pair, mass_kg: Pair) -> _Links:
 
 
 def _heavy_enough(length_m: Pair, rated_Nm: Pair) -> Pair:
-    """Return the masses of rods that their rated torque accelerates about as it does profile P's."""
+    """Return the masses of uniform rods, kg, that their rated torque accelerates about as it does profile P's."""
     (l1, l2), (r1, r2) = length_m, rated_Nm
     alpha, _, gamma = _MODEL.inertia()
     m2 = 3.0 * gamma * r2 / _MODEL.rated_torque_Nm[1] / l2**2
@@ -258,7 +274,10 @@ def _heavy_enough(length_m: Pair, rated_Nm: Pair) -> Pair:
 
 
 def _from_cad(length_m: Pair, theta: Sequence[float]) -> _Links:
-    """Return two links with the inertia of `arm.cad_theta`, `theta`. Raises ConfigError if no links can have it."""
+    """Return two links with the inertia of `theta`, which is `arm.cad_theta`.
+
+    Raises ConfigError if no links can have it.
+    """
     a1, a2, a3 = theta[:3]
     l1, l2 = length_m
     alpha, beta, gamma = a1 - a3, a2, a3
@@ -286,9 +305,11 @@ def _joint_inertia(links: _Links) -> Pair:
 
 
 def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -> tuple[Pair, Pair]:
-    """Return viscous and Coulomb friction: of the truth, else configuration, `arm.cad_theta`, profile.
+    """Return viscous, Nm s/rad, and Coulomb friction, Nm, by joint.
 
-    Without any of these: a share of the rated torque, with a line in `assumed`.
+    It is that of the truth, else of the configuration, `arm.cad_theta` or the profile.
+
+    Without any of these it is a share of the rated torque, with a line in `assumed`.
     """
     theta = told.settings.arm.cad_theta if "arm.cad_theta" in told.own_keys else ()
     known = theta[3:7] if any(theta[3:7]) else ()
@@ -319,7 +340,7 @@ def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -
 
 
 def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
-    """Return joints and signs of the devices, as keys of `own_arm`: the configuration's, changed by the truth."""
+    """Return the keys of `own_arm` on joints and signs of the devices: the configuration's, changed by the truth."""
     wiring = truth.wiring
     drive_joint, sensor_joint = (
         (2, 1) if wiring.swapped in (what, "joints") else (1, 2) for what in ("drives", "sensors")
@@ -337,9 +358,10 @@ def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
 
 
 def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
-    """Return the scenario's `said` sensor settings, completed by range, noise and encoder bits.
+    """Return the scenario's sensor settings, `said`, completed by range, noise and encoder bits.
 
-    Appends a line to `assumed` for each addition. Raises ConfigError if the frames carry too little torque.
+    Appends a line to `assumed` for each addition. Raises ConfigError if the frames carry less than a tenth of rated
+    torque.
     """
     sensors = dict(said)
     for joint, (rated_Nm, most_Nm) in enumerate(zip(rated, counts.torque_range_Nm, strict=True)):
@@ -372,7 +394,7 @@ def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: l
 
 
 def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
-    """Return the scenario's `said` mechanics, completed by the configuration's mounting and by holding brakes.
+    """Return the scenario's mechanics, `said`, completed by the configuration's mounting and by holding brakes.
 
     Appends a line to `assumed` for each assumption.
     """
@@ -403,7 +425,10 @@ _LENGTHS: Final = ("x_m", "y_m", "radius_m", "room_m")
 
 
 def _fit(table: dict[str, Any], settings: Settings, links: _Links, rated: Pair, assumed: list[str]) -> None:
-    """Fit a scenario's table that was made for profile P to the arm, in place: start pose, places, forces, payloads."""
+    """Scale a scenario's table, made for profile P, to the arm, in place: start pose, places, forces, payloads.
+
+    Appends a line to `assumed` if a factor isn't 1.
+    """
     length_m = links.length_m
     longer = length_m[0] / _MODEL.link_length_m[0], length_m[1] / _MODEL.link_length_m[1]
     alpha, _, gamma = _MODEL.inertia()

@@ -95,7 +95,7 @@ class ExpectSettings:
 
     @property
     def text(self) -> str:
-        """The expectation in a few words."""
+        """The expectation in a few words: adaptations, detections, false alarms and misses if any, fault, end."""
         words = [f"{self._count('adaptations')} adapted", f"{self._count('contacts')} detected"]
         words += [f"{self._count(key)} {word}" for key, word in _TROUBLES if self._count(key) != "0"]
         if self.fault is not None:
@@ -114,7 +114,11 @@ _TROUBLES: Final = (("false_alarms", "false"), ("missed", "missed"))
 
 
 class ScenarioOutcome(NamedTuple):
-    """The outcome of a run, named as in `ExpectSettings`. Times since motion start; None: it did not happen."""
+    """The outcome of a run, named as in `ExpectSettings`. Times, s, since motion start; None: it did not happen.
+
+    fault: reason of the first fault. adaptation_s: of the first adaptation. delay_ms: the longest of all detected
+    contacts, None without any. force_N: largest true contact force, 0 without any.
+    """
 
     end: str
     fault: str | None
@@ -141,7 +145,10 @@ class ScenarioOutcome(NamedTuple):
 
 
 def deviations(expect: ExpectSettings, outcome: ScenarioOutcome) -> tuple[str, ...]:
-    """Return the differences of an outcome from an expectation, a text each; () if it is as expected."""
+    """Return the differences of an outcome from an expectation, a line each; () if it is as expected.
+
+    A bound on delay or force is not checked where the outcome is None.
+    """
     found = []
     for key in ("end", "fault"):
         wanted, got = getattr(expect, key), getattr(outcome, key)
@@ -271,7 +278,10 @@ class Scenario:
                 )
 
     def expected_of(self, scheme: str) -> ExpectSettings | None:
-        """Return the outcome with a healthy host of a scheme, `paper` or `certified`; None: the file lacks it."""
+        """Return the expected outcome with a healthy host of a scheme, `paper` or `certified`.
+
+        None if the file has none.
+        """
         own = self.expect_certified if scheme == "certified" else None
         return own or self.expect
 
@@ -282,18 +292,18 @@ class Scenario:
 
     @property
     def wiring(self) -> Wiring:
-        """Joint, directions and zero of the device at each place."""
+        """Joint, directions and zero of the device at each place; straight for an arm of a profile."""
         return STRAIGHT if self.own_arm is None else self.own_arm.wiring
 
     @property
     def payload_bodies(self) -> tuple[PayloadBody, ...]:
-        """Every payload of this scenario, and the arm without payload."""
+        """All payloads, as (mass kg, centre of mass m, inertia kg m²): none, that at power-on, then the changes."""
         changes = ((change.mass_kg, change.center_m, change.inertia_kg_m2) for change in self.payloads)
         return (0.0, (0.0, 0.0), 0.0), (self.payload_kg, (0.0, 0.0), 0.0), *changes
 
     @property
     def start_rad(self) -> Vector:
-        """Pose at power-on, rad (2,)."""
+        """Pose at power-on, rad, (2,)."""
         return np.array([math.radians(angle_deg) for angle_deg in self.start_deg])
 
 
@@ -303,7 +313,10 @@ def builtin_scenarios() -> list[str]:
 
 
 def load_scenario(name_or_file: str, profile: str | None = None, seed: int | None = None) -> Scenario:
-    """Return a scenario: a built-in name or a TOML file. `profile`, `seed` outweigh the file's. Raises ConfigError."""
+    """Return a scenario: a built-in name or a TOML file. `profile`, `seed`: in place of the file's.
+
+    Raises ConfigError if the file is missing, can't be read or has errors.
+    """
     return resolve_scenario(name_or_file, read_table(name_or_file), profile, seed)
 
 
@@ -312,7 +325,7 @@ def resolve_scenario(
 ) -> Scenario:
     """Check a scenario's table and return the scenario; a given `profile` and `seed` are written into the table.
 
-    name_or_file: named in the ConfigError that it raises.
+    Raises ConfigError with `name_or_file` if the table has errors.
     """
     if profile is not None:
         table["profile"] = profile
@@ -325,7 +338,10 @@ def resolve_scenario(
 
 
 def read_table(name_or_file: str) -> dict[str, Any]:
-    """Return a scenario's TOML table, unchecked but for its syntax, with a `name`. Raises ConfigError."""
+    """Return a scenario's TOML table, unchecked but for its syntax; `name` is the file's where the table has none.
+
+    Raises ConfigError if the file is missing or no TOML.
+    """
     return _read("scenario", name_or_file)
 
 
@@ -337,7 +353,10 @@ def _read(kind: str, name_or_file: str) -> dict[str, Any]:
 
 
 def named_profile(name_or_file: str) -> str | None:
-    """Return the profile that a scenario's file names, unchecked; None if it names none. Raises ConfigError."""
+    """Return the profile in a scenario's file, unchecked; None if it names none.
+
+    Raises ConfigError if the file can't be read.
+    """
     profile = read_table(name_or_file).get("profile")
     return None if profile is None else str(profile)
 
@@ -428,9 +447,9 @@ def truth_names() -> list[str]:
 
 
 def load_truth(name_or_file: str) -> tuple[ArmTruth, dict[str, Any]]:
-    """Return a truth, a built-in name or a TOML file, and its sections of a scenario, these unchecked.
+    """Return a truth, a built-in name or a TOML file, and its sections `sensors`, `drives`, `mechanics`, unchecked.
 
-    Raises ConfigError.
+    Raises ConfigError if the file is missing, can't be read or has errors.
     """
     table = _read("truth", name_or_file)
     sections = {key: table.pop(key) for key in SCENARIO_SECTIONS if key in table}

@@ -30,7 +30,10 @@ _OWN_NAMES = ("localhost", "localhost.localdomain")
 
 
 class ViewerRefusal(NamedTuple):
-    """The reason why a viewer is refused. `notice`: the line for the run's terminal; no word of it is the viewer's."""
+    """A refusal of a viewer, with the HTTP status and the reason that the viewer gets.
+
+    `notice`: the line for the run's terminal, in which no word is the viewer's.
+    """
 
     status: HTTPStatus
     reason: str
@@ -61,7 +64,10 @@ NOTICES = tuple(refusal.notice for refusal in (_ORIGIN, _HOST, _PROTOCOL, FULL))
 
 
 def normal_origin(origin: str) -> str:
-    """Return an origin as browsers write it. Raises ValueError if it isn't one."""
+    """Return an origin in lower case, without a slash at its end.
+
+    Raises ValueError if it isn't scheme, host and port.
+    """
     found = re.fullmatch(r"([a-z][a-z0-9+.-]*://[^/\s@]*)/?", origin.lower())
     if not found:
         raise ValueError(f"{origin!r} is no origin: scheme, host and port, such as https://view.lab.example")
@@ -69,7 +75,7 @@ def normal_origin(origin: str) -> str:
 
 
 class Admission:
-    """The origins and host names from which a run's live view admits viewers."""
+    """Decides by origins and host names which viewers the live view of a run admits."""
 
     def __init__(self, setup: LiveView) -> None:
         """Allow the origins and names of `setup`, besides the viewers' own pages and this machine's own names."""
@@ -81,10 +87,10 @@ class Admission:
     def refuse(
         self, origins: Sequence[str], hosts: Sequence[str], subprotocols: Sequence[str] | None
     ) -> ViewerRefusal | None:
-        """Return why a request is refused; None: it is admitted.
+        """Return why a request is refused; None if it is admitted.
 
         origins, hosts, subprotocols: all values of its headers Origin, Host and Sec-WebSocket-Protocol; subprotocols is
-        None for a browser that asks for a page.
+        None for a browser that asks for a page. There may be no origin, but there must be one host.
         """
         if len(hosts) != 1 or not self._is_own_host(hosts[0]):
             return _HOST
@@ -99,7 +105,7 @@ class Admission:
         return origin.lower() in self._origins or _OWN_PAGE.fullmatch(origin.lower()) is not None
 
     def _is_own_host(self, host: str) -> bool:
-        """Return whether a Host header, as `name:port` or `[::1]:port`, is an address, or a name of this machine."""
+        """Return whether a Host header, `name:port` or `[::1]:port`, is an IP address or an allowed name."""
         found = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::\d{1,5})?", host)
         if not found:
             return False

@@ -26,7 +26,7 @@ MOST_MESSAGE_BYTES = 16 * 1024 * 1024
 
 
 class LiveTopic(NamedTuple):
-    """A topic that is served. `text`: of its schema."""
+    """A topic that the server offers, with the name and the text of its schema."""
 
     name: str
     type_name: str
@@ -42,10 +42,14 @@ class LiveMessage(NamedTuple):
 
 
 class LiveClient:
-    """A connection to a live view, subscribed to topics."""
+    """A connection to a live view, with subscriptions to topics."""
 
     def __init__(self, connection: ClientConnection, topics: Collection[str] | None) -> None:
-        """Subscribe to `topics`, None: to all, and wait until the server sends messages. Raises LogError."""
+        """Subscribe to `topics`, None: to all, and wait until the server confirms it by the arm's description.
+
+        Raises LogError after 5 s, or for data that is no log of adacd-hil. The messages received so far are returned by
+        `receive`.
+        """
         self.topics: dict[str, LiveTopic] = {}
         """By name."""
         self.is_open = True
@@ -58,7 +62,10 @@ class LiveClient:
         self._wait()
 
     def _wait(self) -> None:
-        """Receive messages until the subscriptions are in force. Raises LogError after OPEN_TIMEOUT_S."""
+        """Receive and store messages up to the arm's description: then the subscriptions are in force.
+
+        Raises LogError after OPEN_TIMEOUT_S.
+        """
         clock = MonotonicClock()
         end_ns = clock.now_ns() + round(OPEN_TIMEOUT_S * 1e9)
         while not self._waiting or self._waiting[-1].topic != DESCRIPTION_TOPIC:
@@ -68,11 +75,19 @@ class LiveClient:
             self._waiting.append(message)
 
     def receive(self, timeout_s: float) -> LiveMessage | None:
-        """Return the next message; None after the timeout, or when the server has ended."""
+        """Return the next message, a waiting one at once; None after the timeout, or at the server's end.
+
+        At the end `is_open` is False. The server's other messages, such as its time, restart the timeout. Raises
+        LogError for data that is no log of adacd-hil.
+        """
         return self._waiting.popleft() if self._waiting else self._receive(timeout_s)
 
     def _receive(self, timeout_s: float) -> LiveMessage | None:
-        """Return the next message, after the server's words before it; None after the timeout or at the end."""
+        """Return the next message from the connection; None after the timeout or at the server's end.
+
+        The server's other messages are obeyed on the way; each of them restarts the timeout. Raises LogError for data
+        that is no log of adacd-hil.
+        """
         while self.is_open:
             try:
                 data = self._connection.recv(timeout=timeout_s)
@@ -92,7 +107,10 @@ class LiveClient:
         return None
 
     def _obey(self, word: dict[str, Any]) -> None:
-        """Subscribe to the channels that the server advertises, last to the arm's description, which ends `_wait`."""
+        """Subscribe to the wanted channels that the server advertises, and last to the arm's description.
+
+        The description ends `_wait`. Other words have no effect.
+        """
         if word["op"] != "advertise":
             return
         last: dict[str, int] | None = None
@@ -110,7 +128,7 @@ class LiveClient:
             self._connection.send(json.dumps({"op": "subscribe", "subscriptions": group}))
 
     def decode(self, message: LiveMessage) -> Any:
-        """Return a message of numbers as a numpy record, its fields named as in the schema.
+        """Return a message as a numpy record with the fields of its schema, which must have numbers only.
 
         Raises LogError if the message doesn't fit its schema, or if the schema has no fixed size.
         """
@@ -124,7 +142,11 @@ class LiveClient:
 
 @contextmanager
 def live_client(url: str, topics: Collection[str] | None = None) -> Iterator[LiveClient]:
-    """Connect to a live view while the block lasts; `topics`: to subscribe to, None: all. Raises LogError."""
+    """Connect to a live view while the block lasts; `topics`: to subscribe to, None: all.
+
+    Raises LogError if none answers at `url`, or for data that is no log of adacd-hil. OSError, ValueError and LogError
+    of the block become LogErrors with the URL.
+    """
     try:
         connection = connect(
             url,

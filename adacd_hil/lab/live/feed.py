@@ -56,8 +56,8 @@ _HEAD = struct.Struct("<HqqI")
 class ServerSetup(NamedTuple):
     """Setup of the view's process.
 
-    live: its address and admitted viewers. setup: of the log. ids: the file's number of each channel. start_ns: log
-    time before the first message.
+    live: its address and admitted viewers. setup: of the log. ids: number in the file of each of our channels.
+    start_ns: log time before the first message.
     """
 
     live: LiveView
@@ -67,7 +67,7 @@ class ServerSetup(NamedTuple):
 
 
 def pack_batch(messages: Iterable[LoggedMessage]) -> bytes:
-    """Return messages as bytes."""
+    """Return messages as bytes, from which `unpack_batch` gives them again."""
     parts = []
     for channel, log_ns, publish_ns, payload in messages:
         parts += [_HEAD.pack(channel, log_ns, publish_ns, len(payload)), payload]
@@ -90,12 +90,16 @@ RING_BYTES = 8 * 1024 * 1024
 
 
 class LiveFeed:
-    """Passes messages to the live view. `url`: where it is; `process`: serves it; `hidden`: batches without room."""
+    """Passes messages to the process that serves the live view.
+
+    `url`: for viewers; `process`: the view's; `hidden`: number of batches dropped because the ring was full.
+    """
 
     def __init__(self, live: LiveView, setup: WriterSetup, ids: dict[int, int], start_ns: int) -> None:
-        """Start the view's process, and wait until it listens on the address of `live`. Raises LogError.
+        """Start the view's process, and wait until it listens on the address of `live`.
 
         setup: of the log. ids: the file's number of each channel, by ours. start_ns: log time before the first message.
+        Raises LogError if the process can't start or listen, or doesn't answer within 30 s.
         """
         self.hidden = 0
         self._is_watched = False
@@ -128,7 +132,7 @@ class LiveFeed:
         self._socket.setblocking(False)
 
     def _hear(self) -> dict[str, str]:
-        """Return the first word of the view's process: its address, or an error."""
+        """Return the first word of the view's process, within 30 s: its "url" with an empty "error", or an "error"."""
         self._socket.settimeout(START_TIMEOUT_S)
         try:
             received = self._socket.recv(processes.MOST_BYTES)
@@ -139,7 +143,7 @@ class LiveFeed:
 
     @property
     def is_watched(self) -> bool:
-        """Whether a viewer is connected."""
+        """Whether a viewer has subscribed to a topic."""
         with contextlib.suppress(BlockingIOError, ConnectionResetError):
             while word := self._socket.recv(processes.MOST_BYTES):
                 self._is_watched = word == processes.WATCHED
@@ -152,9 +156,9 @@ class LiveFeed:
         return self._ring.waiting
 
     def show(self, messages: Sequence[LoggedMessage]) -> None:
-        """Hand messages that follow each other to the view's process; without a viewer, do nothing.
+        """Hand consecutive messages to the view's process, without waiting; without a subscription, do nothing.
 
-        If the ring is full, drop them and count the batch in `hidden`.
+        If the ring is full, the messages are dropped and `hidden` counts the batch.
         """
         if not messages or not self.is_watched:
             return
@@ -168,7 +172,7 @@ class LiveFeed:
             self._socket.send(word)
 
     def end_view(self) -> None:
-        """Ask the view's process to send the rest and end; don't wait for it."""
+        """Ask the view's process to send the rest and end, without waiting for it. No other call may follow."""
         self._say(processes.END)
         self._release()
 
@@ -184,12 +188,12 @@ EVERY_MESSAGE = 0
 
 
 def rate_of(topic: str) -> int:
-    """Return the rate at which a topic is shown, Hz; EVERY_MESSAGE: all its messages are shown."""
+    """Return the rate at which a topic is shown, Hz; EVERY_MESSAGE (0) if all its messages are."""
     return DECODED_RATE_HZ if topic.startswith(DECODED) else RATES_HZ.get(topic, EVERY_MESSAGE)
 
 
 class Decimator:
-    """Chooses the messages of one topic that are shown."""
+    """Chooses the messages of one topic that are shown: all of the first cycle in each slot of 1 / rate."""
 
     def __init__(self, rate_Hz: int) -> None:
         self._slot_ns = 1_000_000_000 // rate_Hz if rate_Hz else 0
@@ -197,7 +201,7 @@ class Decimator:
         self._first_ns = -1  # the first cycle of the slot
 
     def takes(self, cycle_ns: int) -> bool:
-        """Return whether the next message is shown: whether its cycle is the first one in its slot of 1 / rate.
+        """Return whether the next message is shown; at a rate of 0 always.
 
         cycle_ns: time of the message's cycle, which never runs backwards.
         """
@@ -213,7 +217,7 @@ _BODY = len(ENCAPSULATION) + 8
 
 
 class Shown(NamedTuple):
-    """A message for the viewers that have subscribed to its topic."""
+    """A message for the viewers that have subscribed to its channel."""
 
     channel: int
     log_ns: int
@@ -221,10 +225,13 @@ class Shown(NamedTuple):
 
 
 class LiveTopics:
-    """The topics that are served. `latest_ns`: log time of the latest message; before the first, of the beginning."""
+    """The topics of a live view, and the choice of messages that are shown.
+
+    `latest_ns`: log time of the latest message; before the first, `start_ns`.
+    """
 
     def __init__(self, setup: LiveView, channels: Iterable[LogChannel], ids: dict[int, int], start_ns: int) -> None:
-        """Prepare the topics of a log, and three that are drawn from them.
+        """Prepare the topics of a log, and the three that the view draws: poses, scene, and the arm's description.
 
         ids: the file's number of each channel, by ours. start_ns: log time before the first message.
         """
@@ -249,11 +256,11 @@ class LiveTopics:
         self._description = pack_string(setup.robot_description)
 
     def description(self) -> Shown:
-        """Return the message with the arm's URDF, for a viewer that has just subscribed to it."""
+        """Return the message with the arm's URDF, which each new subscription to its topic gets."""
         return Shown(self.robot, self.latest_ns, self._description)
 
     def choose(self, messages: Iterable[LoggedMessage], wanted: Collection[int]) -> Iterator[Shown]:
-        """Yield the messages that are shown, in their order, and those that are drawn from them.
+        """Yield the messages that are shown, in their order, each followed by those that are drawn from it.
 
         wanted: channels to which viewers have subscribed; others yield nothing.
         """
@@ -269,7 +276,7 @@ class LiveTopics:
                 yield from self._drawn_from(shown, wanted)
 
     def _sources(self, wanted: Collection[int]) -> set[int]:
-        """Return the file's channels that are wanted, or that something wanted is drawn from."""
+        """Return the log's channels that are wanted, or from which a wanted topic is drawn."""
         sources = set(wanted)
         if self.transforms in sources:
             sources.add(self._joint_states or 0)
@@ -278,7 +285,7 @@ class LiveTopics:
         return sources & self._decimators.keys()
 
     def _drawn_from(self, shown: Shown, wanted: Collection[int]) -> Iterator[Shown]:
-        """Yield the wanted messages that are drawn from a shown one: poses, or shapes of the scene."""
+        """Yield the wanted messages that are drawn from a shown one, poses or shapes; none from most channels."""
         channel, log_ns, payload = shown
         if channel == self._joint_states and self.transforms in wanted:
             q = np.frombuffer(payload, JOINT_STATE_DTYPE)[0]["q"]

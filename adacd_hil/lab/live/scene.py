@@ -36,7 +36,7 @@ class Transform(NamedTuple):
 
 
 class Arrow(NamedTuple):
-    """An arrow from `tail`, along +x before it is rotated; lengths in m."""
+    """An arrow that begins at `tail` and points along +x, turned by `rotation`."""
 
     tail: Point
     rotation: Quaternion
@@ -62,7 +62,10 @@ class Label(NamedTuple):
 
 
 class Entity(NamedTuple):
-    """Shapes that move with one frame; they replace the entity of the same name. `lifetime_ns` 0: until then."""
+    """Shapes that move with the coordinate frame `frame`; they replace the entity of the same name.
+
+    `lifetime_ns`: how long they are shown; 0: until they are replaced.
+    """
 
     name: str
     frame: str
@@ -73,19 +76,19 @@ class Entity(NamedTuple):
 
 
 class _Payload:
-    """A `cdr` payload in the making."""
+    """A `cdr` payload that is put together field by field."""
 
     def __init__(self) -> None:
         self._data = bytearray()
 
     def put(self, code: str, *values: float) -> None:
-        """Append numbers of one kind, each aligned to its size; code: their format in `struct`."""
+        """Append numbers of one type, aligned to its size; code: the type's letter in `struct`."""
         size = struct.calcsize(code)
         self._data += bytes(-len(self._data) % size)
         self._data += struct.pack(f"<{len(values)}{code}", *values)
 
     def time(self, t_ns: int) -> None:
-        """Append a time or a duration, ns."""
+        """Append a time or a duration, ns, as seconds and nanoseconds."""
         self.put("I", *divmod(t_ns, 1_000_000_000))
 
     def text(self, text: str) -> None:
@@ -107,7 +110,7 @@ def pack_string(text: str) -> bytes:
 
 
 def pack_transforms(time_ns: int, transforms: tuple[Transform, ...]) -> bytes:
-    """Return a payload of tf2_msgs/TFMessage; time_ns: log time of all poses."""
+    """Return a payload of tf2_msgs/msg/TFMessage with these poses; time_ns: log time of all."""
     payload = _Payload()
     payload.put("I", len(transforms))
     for transform in transforms:
@@ -119,7 +122,7 @@ def pack_transforms(time_ns: int, transforms: tuple[Transform, ...]) -> bytes:
 
 
 def pack_scene(time_ns: int, entities: tuple[Entity, ...]) -> bytes:
-    """Return a payload of foxglove_msgs/SceneUpdate that adds or replaces `entities`; time_ns: log time."""
+    """Return a payload of foxglove_msgs/msg/SceneUpdate that adds or replaces `entities`; time_ns: log time."""
     payload = _Payload()
     payload.put("I", 0, len(entities))  # no deletions
     for entity in entities:
@@ -164,7 +167,10 @@ _ABOVE_M = 0.16
 
 
 class Shape(NamedTuple):
-    """The arm as it is drawn: tilt of its plane of motion, and the q1 at which link 1 is level, rad."""
+    """The arm as it is drawn.
+
+    tilt_rad: of its plane of motion against the ground. level_rad: q1 at which link 1 is level.
+    """
 
     link_length_m: tuple[float, float]
     tilt_rad: float = 0.0
@@ -177,7 +183,7 @@ def about_z(angle_rad: float) -> Quaternion:
 
 
 def transforms_of(shape: Shape, q: Vector) -> tuple[Transform, ...]:
-    """Return the poses of all frames of the robot description for the joint positions q (2,)."""
+    """Return the poses of the robot description's frames at the joint positions q (2,), rad: base, both links, tip."""
     half_rad = 0.5 * shape.tilt_rad
     origin = (0.0, 0.0, 0.0)
     elbow, end = ((length_m, 0.0, 0.0) for length_m in shape.link_length_m)
@@ -190,12 +196,15 @@ def transforms_of(shape: Shape, q: Vector) -> tuple[Transform, ...]:
 
 
 def residual_over_threshold(tau_ext_hat: float, threshold: float) -> float:
-    """Return |residual| / threshold of a joint; NaN while detection is off."""
+    """Return |residual| / threshold of a joint; NaN while detection is off: the threshold is 0, infinite or NaN."""
     return abs(tau_ext_hat) / threshold if 0.0 < threshold < math.inf else math.nan
 
 
 def draw_joints(state: SchemeState, tau_ext_hat: Vector, threshold: Vector) -> tuple[Entity, ...]:
-    """Return the shapes that show both joints and the state; tau_ext_hat, threshold (2,), Nm."""
+    """Return three entities: a sphere and text at each joint, and the state's name above the base.
+
+    Size and colour of a sphere show residual over threshold. tau_ext_hat, threshold (2,), Nm.
+    """
     entities = []
     for index, link in enumerate(LINK_NAMES):
         share = residual_over_threshold(float(tau_ext_hat[index]), float(threshold[index]))
@@ -207,7 +216,11 @@ def draw_joints(state: SchemeState, tau_ext_hat: Vector, threshold: Vector) -> t
 
 
 def draw_contact(shape: Shape, report: ContactReport) -> Entity:
-    """Return an arrow with the force of a report: where link 2 was touched if that is known, else at the link's end."""
+    """Return an entity with the arrow and text of a report's force, which viewers show for 2 s.
+
+    It is at the touched place of link 2 if that is known, else at the link's end. "≥" stands before a force that is not
+    known.
+    """
     on_link_2 = report.link == 2
     length_m = shape.link_length_m[report.link - 1]
     place_m = min(max(report.lever_m, 0.0), length_m) if on_link_2 and report.location is Location.KNOWN else length_m
@@ -226,7 +239,10 @@ def draw_contact(shape: Shape, report: ContactReport) -> Entity:
 
 
 def _force(shape: Shape, report: ContactReport) -> tuple[float, bool]:
-    """Return the force across the link, N, and whether it is known; if not, it is the smallest with this torque."""
+    """Return the force across the link, N, positive toward +q, and whether it is known.
+
+    If it was not sought, it is the force at the link's end that has the joint's peak torque: the smallest possible one.
+    """
     if report.location is Location.NOT_SOUGHT:
         torque = report.tau_ext_peak[report.link - 1]
         return torque / shape.link_length_m[report.link - 1], False

@@ -72,7 +72,7 @@ Data = str | bytes
 
 
 class Viewer:
-    """A connection, its subscriptions, and the messages waiting for it."""
+    """A connection of a viewer, its subscriptions, and the data that wait for it."""
 
     def __init__(self, connection: ServerConnection) -> None:
         self.subscriptions: dict[int, int] = {}
@@ -85,7 +85,7 @@ class Viewer:
         self._is_warned = False
 
     def put(self, data: Data) -> None:
-        """Queue data for the viewer; if too much waits, drop the oldest."""
+        """Queue data for the viewer; drop the oldest if more than BACKLOG messages or BACKLOG_BYTES wait."""
         self._waiting.append(data)
         self._waiting_bytes += len(data)
         while len(self._waiting) > BACKLOG or self._waiting_bytes > BACKLOG_BYTES:
@@ -93,23 +93,23 @@ class Viewer:
         self._has_some.set()
 
     def put_message(self, shown: Shown) -> None:
-        """Queue a message for the viewer, once for each of its subscriptions to the topic."""
+        """Queue a message for the viewer once per subscription to its channel; none without one."""
         for number in self.by_channel.get(shown.channel, ()):
             self.put(_message(number, shown))
 
     def warn_once(self, text: str) -> None:
-        """Queue a warning about a request that isn't supported, for the first such request only."""
+        """Queue a warning for the viewer; later calls do nothing."""
         if not self._is_warned:
             self._is_warned = True
             self.put(_status(_WARNING, text))
 
     @property
     def is_served(self) -> bool:
-        """Whether no message waits for the viewer."""
+        """Whether no data wait for the viewer."""
         return not self._waiting
 
     async def send_all(self) -> None:
-        """Send queued messages to the viewer until the task is cancelled."""
+        """Send queued data to the viewer until the task is cancelled. Raises ConnectionClosed."""
         while True:
             await self._has_some.wait()
             self._has_some.clear()
@@ -120,7 +120,7 @@ class Viewer:
 
 
 class LiveServer:
-    """Serves viewers the messages of a ring, as long as the writer is there."""
+    """Serves the messages of a ring to viewers until the writer ends or dies."""
 
     def __init__(self, setup: LiveView, topics: LiveTopics, ring: RingReader, writer: socket.socket) -> None:
         self._setup = setup
@@ -140,9 +140,9 @@ class LiveServer:
         self._notices: int | None = None
 
     async def run(self, listening: socket.socket, notices: int | None = None) -> None:
-        """Serve until the writer ends or dies.
+        """Serve until the writer ends or dies; then send the rest and close.
 
-        listening: the open socket; notices: descriptor of the run's terminal.
+        listening: the open socket; notices: descriptor of the run's terminal, None: no notices.
         """
         self._notices = notices
         loop = asyncio.get_running_loop()
@@ -170,7 +170,10 @@ class LiveServer:
     # -- the writer -----------------------------------------------------------------------------------------------
 
     def _hear(self) -> None:
-        """Receive all waiting messages of the writer, which may end the server, then show packets of the ring."""
+        """Receive all waiting words of the writer, of which END or a closed socket ends the server.
+
+        Then show packets of the ring.
+        """
         word: bytes | None = None
         with contextlib.suppress(BlockingIOError):
             while True:
@@ -184,7 +187,7 @@ class LiveServer:
         self._show_some()
 
     def _show_some(self) -> None:
-        """Send a part of the ring's packets to the viewers; the rest follows after other tasks."""
+        """Show 256 KiB of the ring's packets; the rest follows after other tasks."""
         for batch in split(self._ring.take_packets(_AT_ONCE_BYTES)):
             self._show(batch)
         if self._ring.waiting:
@@ -200,14 +203,14 @@ class LiveServer:
         self._tell_time(self._topics.latest_ns)
 
     def _tell_time(self, log_ns: int) -> None:
-        """Queue the log time for all viewers, if `_TIME_STEP_NS` have passed since the last."""
+        """Queue the log time for all viewers if 10 ms of it have passed since the last time."""
         if log_ns - self._time_ns >= _TIME_STEP_NS:
             self._time_ns = log_ns
             for viewer in self._viewers:
                 viewer.put(_TIME.pack(_TIME_DATA, log_ns))
 
     def _tell_writer(self) -> None:
-        """Tell the writer when the first viewer subscribes, or the last subscription ends."""
+        """Send the writer a word if the first subscription has begun or the last one ended."""
         is_watched = any(viewer.subscriptions for viewer in self._viewers)
         if is_watched != self._is_watched:
             self._is_watched = is_watched
@@ -217,13 +220,16 @@ class LiveServer:
     # -- viewers --------------------------------------------------------------------------------------------------
 
     def _counted(self, *given: Any, **named: Any) -> ServerConnection:
-        """Return a connection that is counted from its first byte to its last."""
+        """Return a connection that is counted while it lasts, and aborted if there are too many."""
         return _CountedConnection(
             self._connections, self._admitted, self._setup.most_viewers + OPENING, *given, **named
         )
 
     def _judge(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the answer to a refused request, or a page for a browser; None: the connection is admitted."""
+        """Return the answer to a refused request, or the page for a browser.
+
+        None: the connection is admitted, and counted as a viewer.
+        """
         headers = request.headers
         origins, hosts, protocols = (headers.get_all(name) for name in ("Origin", "Host", "Sec-WebSocket-Protocol"))
         is_page = not headers.get_all("Upgrade")
@@ -239,14 +245,14 @@ class LiveServer:
         return connection.respond(refusal.status, refusal.reason + "\n")
 
     def _notice(self, refusal: ViewerRefusal) -> None:
-        """Print a refusal's line on the run's terminal, once for each kind."""
+        """Print a refusal's line on the run's terminal, once per line; nothing without a terminal."""
         if self._notices is not None and refusal.notice not in self._noticed:
             self._noticed.add(refusal.notice)
             with contextlib.suppress(OSError):
                 os.write(self._notices, f"{refusal.notice}\n".encode())
 
     async def _attend(self, connection: ServerConnection) -> None:
-        """Serve one viewer until it disconnects."""
+        """Serve one viewer until it disconnects. One that asks for too many subscriptions is disconnected."""
         viewer = Viewer(connection)
         viewer.put(json.dumps(self._describe()))
         viewer.put(json.dumps({"op": "advertise", "channels": self._topics.advertised}))
@@ -277,7 +283,10 @@ class LiveServer:
         }
 
     def _obey(self, viewer: Viewer, data: Data) -> bool:
-        """Carry out a viewer's request; return False if it asks for too many subscriptions."""
+        """Carry out a viewer's request; return False if it asks for too many subscriptions.
+
+        A request that makes no sense or isn't supported is answered with an error or warning.
+        """
         try:
             word = json.loads(data) if isinstance(data, str) else {}
             op = word.get("op") if isinstance(word, dict) else None
@@ -294,7 +303,10 @@ class LiveServer:
         return True
 
     def _subscribe(self, viewer: Viewer, asked: list[tuple[int, int]]) -> bool:
-        """Add subscriptions, wrong ones answered with an error; return False if they are too many."""
+        """Add subscriptions, and answer invalid ones with an error; return False if they are too many.
+
+        A subscription to the arm's description gets it at once.
+        """
         for number, channel in asked:
             if len(viewer.subscriptions) >= _SUBSCRIPTIONS_PER_TOPIC * len(self._topics.advertised):
                 return False
@@ -318,7 +330,7 @@ class LiveServer:
         self._tell_writer()
 
     async def _end(self, server: Server) -> None:
-        """Stop listening; send the rest for a moment, then close."""
+        """Stop listening, send the rest for at most 1 s, then close all connections."""
         for listening in server.sockets:  # before it closes: asyncio drops, unclosed, whom it accepts while it does
             asyncio.get_running_loop().remove_reader(listening)
         server.close(close_connections=False)
@@ -332,7 +344,10 @@ class LiveServer:
 
 
 class _CountedConnection(ServerConnection):
-    """A connection that stands in two sets while it lasts: of all, and of those that were admitted."""
+    """A connection that is in the set `present` while it lasts, and removes itself from `admitted` at its end.
+
+    It aborts at once if `present` has more than `most`.
+    """
 
     def __init__(
         self, present: set[Connection], admitted: set[Connection], most: int, *given: Any, **named: Any
@@ -361,7 +376,10 @@ def _status(level: int, text: str) -> str:
 
 
 def _page(connection: ServerConnection, host: str) -> Response:
-    """Return the answer to a browser: a page that names viewers for this address; host: requested and admitted."""
+    """Return the page for a browser, with the address for viewers.
+
+    host: the admitted value of the request's Host header.
+    """
     page = Template(_PAGE.read_text(encoding="utf-8")).substitute(url=f"ws://{html.escape(host)}")
     response = connection.respond(HTTPStatus.OK, page)
     del response.headers["Content-Type"]  # headers may be there twice
@@ -378,26 +396,29 @@ _PAGE = Path(__file__).with_name("live_page.html")
 
 
 def _no_logger() -> logging.Logger:
-    """Return a logger that drops every message unformatted, since strangers may send much."""
+    """Return a logger that is disabled, since strangers may send much."""
     logger = logging.getLogger("adacd_hil.live")
     logger.disabled = True
     return logger
 
 
 def listen(setup: LiveView) -> socket.socket:
-    """Open and return the listening socket, on the first address of the host's name. Raises OSError."""
+    """Return the open listening socket, on the first address of the host's name.
+
+    Raises OSError if it can't be opened.
+    """
     family, _, _, _, address = socket.getaddrinfo(setup.host, setup.port, type=socket.SOCK_STREAM)[0]
     return socket.create_server(address[:2], family=family, backlog=128)
 
 
 def url_of(setup: LiveView, listening: socket.socket) -> str:
-    """Return the URL for viewers; listening: the open socket, whose port it names."""
+    """Return the URL for viewers: `setup`'s host, and the port of the open socket `listening`."""
     host = f"[{setup.host}]" if ":" in setup.host else setup.host
     return f"ws://{host}:{listening.getsockname()[1]}"
 
 
 def make_server(told: ServerSetup, ring: RingReader, writer: socket.socket) -> LiveServer:
-    """Return the server of a log's live view. told: its setup; writer: socket to the writer."""
+    """Return the server of a log's live view. told: setup from the writer; writer: socket to it."""
     topics = LiveTopics(told.live, told.setup.channels, told.ids, told.start_ns)
     return LiveServer(told.live, topics, ring, writer)
 
@@ -409,7 +430,10 @@ async def _serve(
 
 
 def main(socket_descriptor: int, ring_descriptor: int, notices: int) -> None:
-    """Serve the live view: report the address, show packets, end with the writer."""
+    """Serve the live view: send the writer the address or an error, then serve until the writer ends.
+
+    notices: descriptor of the run's terminal. The setup is read from stdin.
+    """
     writer = socket.socket(fileno=socket_descriptor)
     told: ServerSetup = read_setup()
     with contextlib.suppress(OSError):

@@ -26,9 +26,9 @@ def default_out(path: Path) -> Path:
 
 
 def find_contact(path: Path, contact: int, around_s: float) -> TimeWindow:
-    """Return the stretch of a log from `around_s` before a contact's detection to as long after it. Raises LogError.
+    """Return the time window from `around_s` before a contact's detection to as long after it.
 
-    contact: its number, from 1.
+    contact: its number, from 1. Raises LogError if the log can't be read or has no such contact.
     """
     log = read_log(path, (CONTACT.name,))
     begun = each_once(log.contacts)
@@ -45,10 +45,10 @@ def cut(
     topics: Collection[str] = (),
     progress: Callable[[str], None] = lambda _: None,
 ) -> int:
-    """Copy a stretch of the log whose first part is `path` to the new log `out`; return its number of messages.
+    """Copy a time window of the log whose first part is `path` to the new log `out`; return its number of messages.
 
-    topics: those that are copied; (): all. Raises LogError when the log is damaged, when the stretch has no message, or
-    when `out` is the log itself.
+    Attachments and metadata are copied whole. topics: those that are copied; (): all. Raises LogError if the log is
+    damaged, lacks a topic, has no message in the window, or is `out` itself.
     """
     log = SalvagedLog(path, progress)
     known = set()
@@ -76,6 +76,6 @@ def cut(
 
 
 def _times(log: SalvagedLog, contents: Contents) -> NDArray[np.int64]:
-    """Return the times (n,) by which messages are cut, ns: publish_time in a log of ours, else log_time."""
+    """Return the times (n,), ns, by which messages are cut: publish_time in a log of ours, else log_time."""
     is_ours = RUN_METADATA in log.metadata
     return (contents.publish_times if is_ours else contents.log_times).astype(np.int64)

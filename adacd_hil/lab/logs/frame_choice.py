@@ -17,9 +17,11 @@ HOST: Final = "HOST"
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """A choice of frames. The contract gives the sender by the identifier; for an unknown one the direction does.
+    """A choice of frames by sender, identifier and time.
 
-    `start_ns`, `end_ns` count from the first frame of the recording; `can_ids` empty: all.
+    `only`: whose frames. The contract's `host_ids` and `device_ids` give the sender; for other identifiers the
+    direction does: frames sent are the host's. `start_ns`, `end_ns` count from the first frame of the recording, None:
+    no bound; `can_ids` empty: all.
     """
 
     only: Side = "both"
@@ -30,7 +32,7 @@ class FrameChoice:
     end_ns: int | None = None
 
     def pieces(self, source: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-        """Yield the chosen frames of each piece of a recording; skips pieces without any."""
+        """Yield the chosen frames of each piece of a recording; pieces without any are skipped."""
         first_ns = None
         for frames in source:
             if first_ns is None and len(frames):
@@ -54,7 +56,7 @@ class FrameChoice:
         return is_chosen
 
     def _is_hosts(self, frames: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which frames (n,) are the host's: by the identifier, else those that were sent."""
+        """Return which frames (n,) are the host's: by the identifier, else those that the recorder sent."""
         is_known = ~frames["is_error"] & ~frames["is_remote"]
         is_host = is_known & np.isin(frames["can_id"], list(self.host_ids))
         is_device = is_known & np.isin(frames["can_id"], list(self.device_ids))

@@ -28,7 +28,7 @@ _STAMP = struct.Struct("<II")
 
 
 class FrameWriter:
-    """Writes frames as an MCAP file to a stream; the stream stays open."""
+    """Writes frames as an MCAP file to a stream, which stays open. The file is whole after `finish`."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._messages = 0
@@ -45,7 +45,7 @@ class FrameWriter:
         self._flushed_ns: int | None = None
 
     def write_frame(self, frame: RecordedFrame) -> None:
-        """Write a frame. Raises ValueError for a time that no stamp can hold."""
+        """Write a frame. Raises ValueError for a time below 0 or beyond the range of ROS stamps."""
         if not 0 <= frame.t_ns < END_OF_TIME_NS:
             raise ValueError(f"t_ns = {frame.t_ns} is not within 0 and {END_OF_TIME_NS} ns")
         if self._flushed_ns is None or not 0 <= frame.t_ns - self._flushed_ns < FLUSH_PERIOD_NS:
@@ -70,7 +70,10 @@ class FrameWriter:
         self._frames += frame.channel == self._first_channel
 
     def _add_channel(self, frame: RecordedFrame) -> int:
-        """Register schema and channel for frames like this one; return the channel's id."""
+        """Register an MCAP schema, if new, and an MCAP channel for frames like this one; return the channel's id.
+
+        Topics of all CAN channels but the first begin with the channel's name.
+        """
         kind = FD_FRAME if frame.is_fd else CAN_FRAME
         if frame.is_fd not in self._schemas:
             self._schemas[frame.is_fd] = self._writer.register_schema(kind.name, "ros2msg", kind.text.encode())
@@ -88,7 +91,7 @@ class FrameWriter:
         return channel_id
 
     def finish(self) -> None:
-        """Write the summary, with which the file ends; the stream stays open."""
+        """Write the summary, with which the file ends. Call it once."""
         counts = {"frames": str(self._frames), "messages": str(self._messages), "dropped": "0"}
         self._writer.add_metadata(SUMMARY_METADATA, {**counts, ENDING_KEY: "closed"})
         self._writer.finish()  # type: ignore[no-untyped-call]
@@ -96,6 +99,6 @@ class FrameWriter:
 
 
 def _topic_name(channel: str) -> str:
-    """Return a channel's name as ROS 2 demands of a part of a topic."""
+    """Return a CAN channel's name in letters that a ROS 2 topic may have; "can" before it if it begins with none."""
     spelled = re.sub(r"[^A-Za-z0-9]+", "_", channel).strip("_")
     return spelled if spelled[:1].isalpha() else f"can{spelled}"

@@ -21,7 +21,10 @@ Bag = tuple[Mapping[str, str], Callable[[str], Iterator[tuple[int, JointStateMes
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is a folder, an MCAP file, a bag of ROS 1, or a database of ROS 2."""
+    """Return whether a path is a folder, or a file that begins as MCAP, a bag of ROS 1 or a database of ROS 2.
+
+    False if it can't be read.
+    """
     if path.is_dir():
         return True
     try:
@@ -33,7 +36,10 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def opened_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag while the block lasts. Raises LogError for any error of its reader."""
+    """Open a bag while the block lasts; yields its topics with types, and a function that reads one topic.
+
+    Raises LogError for any error of its reader, also within the block; a LogError or ConfigError of the block passes.
+    """
     try:
         if not path.is_dir():
             with open_input(path) as file:
@@ -97,5 +103,5 @@ def _opened_rosbag(path: Path, is_ros1: bool) -> Iterator[Bag]:
 
 
 def joint_state_topics(topics: Mapping[str, str]) -> list[str]:
-    """Return the topics of joint states; topics: type by name."""
+    """Return the topics with type sensor_msgs/JointState, in any spelling; topics: type by name."""
     return [topic for topic, kind in topics.items() if kind.replace("/msg/", "/") == TYPE.replace("/msg/", "/")]

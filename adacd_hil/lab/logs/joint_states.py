@@ -18,7 +18,10 @@ _FIELDS = ("position", "velocity", "effort")
 
 
 class JointStateMessage(NamedTuple):
-    """A message: its stamp, the joints' names, and arrays that are empty where it has no such values."""
+    """A message: its stamp, the joints' names, and their position, velocity, effort.
+
+    Arrays are empty where it has none.
+    """
 
     stamp_ns: int
     names: tuple[str, ...]
@@ -28,7 +31,7 @@ class JointStateMessage(NamedTuple):
 
 
 def decode_joint_state(payload: bytes, is_ros1: bool = False) -> JointStateMessage:
-    """Decode a message of ROS 2 (CDR), or of ROS 1. Raises LogError for an invalid one."""
+    """Return a message of ROS 2 (CDR), or of ROS 1, decoded. Raises LogError if it is invalid."""
     from rosbags.serde import SerdeError
 
     store = _store(is_ros1)
@@ -52,10 +55,10 @@ def is_joint_state(payload: bytes) -> bool:
 
 
 def joint_state_columns(payloads: Iterable[bytes]) -> Iterator[tuple[tuple[str, ...], dict[str, Any]]]:
-    """Yield a table of messages of ROS 2 for each set of joints: the joints' names, and the columns.
+    """Yield the joints' names and a table of columns for each list of joints in messages of ROS 2.
 
-    Columns: `t_ns` of the stamp, and `position_NAME`, `velocity_NAME`, `effort_NAME`; nan if a message has none, or not
-    one of each joint. Invalid payloads are left out.
+    Columns: `t_ns` of the stamp, and `position_NAME`, `velocity_NAME`, `effort_NAME`; nan in a row whose message hasn't
+    one for each joint. Invalid payloads are left out.
     """
     groups: dict[tuple[str, ...], list[JointStateMessage]] = {}
     for payload in payloads:

@@ -39,12 +39,16 @@ _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 
 
 class LogCopy:
-    """The log in the making: a hidden file beside until `finish`, which replaces another copy, but no recording."""
+    """A log in the making: a hidden file until `finish`. It may replace another copy, but no recording.
+
+    Without `finish`, the end of its `with` block removes the hidden file.
+    """
 
     def __init__(self, path: Path, log: SalvagedLog, topics: Collection[str] | None = None) -> None:
         """Begin a log at `path` that is copied from `log`; topics: those that are copied, None: all.
 
-        Raises LogError, also where `path` is the log itself.
+        Raises LogError if `path` is the log itself, is no result of these commands, has the name of another log's part,
+        or can't be created.
         """
         if path.exists() and any(part.exists() and path.samefile(part) for part in log.parts.values()):
             raise LogError(f"{path} is the log itself; --out names another file")
@@ -68,7 +72,10 @@ class LogCopy:
         self._file.add_attachment(attachment)
 
     def add_messages(self, contents: Contents, is_chosen: NDArray[np.bool_] | None = None) -> None:
-        """Copy messages of a chunk, those where `is_chosen` (n,) is True; None: all. Other channels are left out."""
+        """Copy messages of a chunk, those where `is_chosen` (n,) is True; None: all.
+
+        Messages of topics that aren't copied, or without a definition, are left out.
+        """
         self._follow()
         numbers = self._numbers[contents.channels]
         is_taken = numbers >= 0 if is_chosen is None else (numbers >= 0) & is_chosen
@@ -83,7 +90,7 @@ class LogCopy:
             self._file.end_packet()
 
     def _follow(self) -> None:
-        """Copy the metadata, and define the channels, that the other log has read since the last call."""
+        """Copy the metadata, and define the channels, that the source has read since the last call."""
         for name in [name for name in self._log.metadata if name not in self._metadata]:
             self._metadata.add(name)
             table = self._log.metadata[name]
@@ -93,7 +100,10 @@ class LogCopy:
                 self._define(channel)
 
     def _define(self, channel: Channel) -> None:
-        """Define a channel of the other log in the copy, unless its schema is lost. Raises LogError for too many."""
+        """Define a channel of the source in the copy, unless its schema is lost.
+
+        Raises LogError if there are too many channels.
+        """
         schema_id = 0
         if channel.schema_id:
             schema = self._log.definitions.schemas.get(channel.schema_id)
@@ -110,9 +120,9 @@ class LogCopy:
         self._topics[number] = channel.topic
 
     def finish(self, ending: str, more: Mapping[str, str]) -> None:
-        """End the log with a summary and give the file its name. Raises LogError.
+        """End the log with a summary, and give the file its name.
 
-        ending: why it ends. more: further entries of the summary.
+        ending: why it ends. more: further entries of the summary. Raises LogError if it can't be written.
         """
         self._follow()
         self._file.flush()
@@ -136,7 +146,7 @@ class LogCopy:
 
 
 def _common_profile(sources: Iterable[Path]) -> str:
-    """Return ROS_PROFILE if all logs fit it, else "". Earlier logs of ours fit it without naming it."""
+    """Return ROS_PROFILE if all files have it, else "". Logs of ours without a profile count as having it."""
     headers = [read_header(path) for path in sources]
     return ROS_PROFILE if headers and all(header is not None and _is_ros(header) for header in headers) else ""
 
@@ -146,7 +156,7 @@ def _is_ros(header: Header) -> bool:
 
 
 class _CopyTarget:
-    """A temporary file beside its final name, renamed by `commit`."""
+    """A temporary file beside its final name; `commit` gives it that name."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -174,7 +184,7 @@ class _CopyTarget:
             raise self._error(error) from None
 
     def discard(self) -> None:
-        """Close and remove the file, unless it was committed."""
+        """Close and remove the temporary file, unless `commit` has been called."""
         with contextlib.suppress(OSError):
             self._file.close()
         self._replacement.discard()
@@ -184,7 +194,7 @@ class _CopyTarget:
 
 
 def _is_copy(path: Path) -> bool:
-    """Return whether a file is a log that was made of others, so that it may be overwritten."""
+    """Return whether a file is a whole log that `recover` or `cut` made, so that it may be overwritten."""
     try:
         with open_input(path) as file:
             return read_end(file) is not None and read_info(path).ending in COPY_ENDINGS

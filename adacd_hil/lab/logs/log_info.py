@@ -43,7 +43,10 @@ _MILESTONES = ("supervisor", "certificate", "revoked")
 
 
 class TopicInfo(NamedTuple):
-    """A topic. `bytes`: of its payloads; None where that takes to read the whole file."""
+    """A topic of a log. `messages`: their number; `rate_hz`: that over the log's duration.
+
+    `bytes`: of its payloads; None if only reading the whole file would tell.
+    """
 
     topic: str
     type: str
@@ -54,7 +57,11 @@ class TopicInfo(NamedTuple):
 
 @dataclass
 class LogInfo:
-    """The content of a log. Times in ns of the log, s since its first message."""
+    """The content of a log, over all its parts. start_ns, end_ns: log times of the first and last message.
+
+    frames: on the bus. ending: why the log ended, "" if unknown. collisions: those of the contacts that were one.
+    problems: a line each.
+    """
 
     path: Path
     files: int = 0
@@ -87,7 +94,7 @@ def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
     """Return an overview of the log whose first part is `path`, over all its parts.
 
     is_brief: without events and contacts, and of a damaged file no more than the metadata of the run: some 2 ms. Raises
-    LogError when a file can't be read, or has neither MCAP's magic nor anything of a log.
+    LogError if a file can't be read, or has neither MCAP's magic nor anything of a log.
     """
     parts = parts_of(path)
     info = LogInfo(path, files=len(parts))
@@ -107,7 +114,7 @@ def read_info(path: Path, *, is_brief: bool = False) -> LogInfo:
 
 
 class _InfoView:
-    """Gathers the records of a log in a `LogInfo`."""
+    """Adds the files of a log to a `LogInfo`: `add_file` for each, then `sum_up`."""
 
     def __init__(self, info: LogInfo, is_brief: bool) -> None:
         self._info = info
@@ -121,7 +128,10 @@ class _InfoView:
         self._contact_cycles: dict[int, int] = {}  # level, by the cycle of the contact
 
     def add_file(self, path: Path, file: IO[bytes]) -> None:
-        """Read one file of the log; add its counts."""
+        """Read one file of the log, by its summary or, if that can't be trusted, whole; add its counts and problems.
+
+        With `is_brief` a file is never read whole: only its metadata are added then.
+        """
         self._info.ending = ""
         end = read_end(file)
         statistics = None
@@ -142,7 +152,7 @@ class _InfoView:
             self._info.problems.append(f"{path.name} is cut or damaged: `adacd-hil log check` says how")
 
     def _take_each(self, path: Path) -> Losses:
-        """Read every record of a file and add it to the info; return the losses by damage."""
+        """Read every record of a file and add it to the info; return what damage has destroyed."""
         salvage = Salvage(path)
         for item in salvage:
             if isinstance(item, Attachment):
@@ -165,7 +175,10 @@ class _InfoView:
         return salvage.losses
 
     def _take_whole(self, file: IO[bytes], end: FileEnd, statistics: Statistics) -> None:
-        """Add the facts of a file's summary to the info, and events and contacts from the chunks that have some."""
+        """Add the facts of a file's summary to the info, and the events and contacts in the chunks that have some.
+
+        With `is_brief` no chunk is read.
+        """
         definitions = Definitions()
         definitions.add_records(end.summary)
         self._know(definitions)
@@ -197,7 +210,7 @@ class _InfoView:
             self._info.problems.append(f"the chunk at byte {record.offset} {error}")
 
     def _know(self, definitions: Definitions) -> None:
-        """Keep type and payload size of each topic."""
+        """Store type and payload size of each topic; the first definition of a topic stays."""
         for channel in definitions.channels.values():
             schema = definitions.schemas.get(channel.schema_id)
             name = schema.name if schema is not None else channel.message_encoding
@@ -217,7 +230,7 @@ class _InfoView:
             info.ending = item.metadata.get(ENDING_KEY, "")
 
     def _read(self, contents: Contents, definitions: Definitions) -> None:
-        """Add the events and contacts of a chunk to the info."""
+        """Add the events and contacts of a chunk to the info; skip those that can't be decoded."""
         for channel in definitions.channels.values():
             if channel.topic not in _READ:
                 continue
@@ -252,7 +265,7 @@ class _InfoView:
                 self._contact_cycles[cycle] = max(level, self._contact_cycles.get(cycle, 0))
 
     def sum_up(self) -> None:
-        """Fill in the totals of the info after the last file: times, counts, contacts, topics."""
+        """Fill in the totals of the info: times, counts, contacts, topics. Call it after the last file."""
         info = self._info
         if self._end_ns:
             info.start_ns, info.end_ns = self._start_ns, self._end_ns

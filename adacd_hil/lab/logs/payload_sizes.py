@@ -19,7 +19,10 @@ _SIZES = ((CAN_FRAME, CAN_FRAME_DTYPE.itemsize), (JOINT_STATE, JOINT_STATE_DTYPE
 
 
 def payload_size(channel: Channel, schema: Schema | None) -> int | None:
-    """Return the payload size of a channel, bytes; None if its schema is not ours or its payloads vary in size."""
+    """Return the payload size of a channel, bytes.
+
+    None if this package doesn't define its schema, or its payloads vary in size.
+    """
     if schema is None or channel.message_encoding != "cdr":
         return None
     for own, size in _SIZES:
@@ -32,6 +35,6 @@ def payload_size(channel: Channel, schema: Schema | None) -> int | None:
 
 
 def is_own(channel: Channel, schema: Schema, own: MessageType) -> bool:
-    """Return whether a channel's schema is exactly that of `own`, a message type that we write."""
+    """Return whether a channel is cdr and its schema has name and text of `own`, a message type that we write."""
     is_named = channel.message_encoding == "cdr" and schema.encoding == "ros2msg" and schema.name == own.name
     return is_named and schema.data == own.text.encode()

@@ -24,7 +24,7 @@ _MOST_AT_ONCE = 64
 
 
 class PlayedFrame(NamedTuple):
-    """A frame of a recording. t_ns: by any clock."""
+    """A frame of a recording. t_ns: by any clock, only differences matter."""
 
     t_ns: int
     can_id: int
@@ -32,7 +32,7 @@ class PlayedFrame(NamedTuple):
 
 
 class Lateness:
-    """Histogram of how late frames were handed to the bus, in whole µs, so that memory stays bounded."""
+    """Histogram, in whole µs, of how late frames were handed to the bus. Its memory is bounded."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -49,7 +49,7 @@ class Lateness:
         self._counts[lateness_ns // _BUCKET_NS] += 1
 
     def quantile_us(self, share: float) -> int:
-        """Return the lateness that a share (0…1) of the frames did not exceed, µs, rounded up; 0 without frames."""
+        """Return the lateness, µs, rounded up, that a share (0…1) of the frames did not exceed; 0 without frames."""
         needed = share * self.frames
         for bucket, count in sorted(self._counts.items()):
             needed -= count
@@ -67,10 +67,10 @@ def play(
     longest_pause_ns: int | None = None,
     is_stopped: Callable[[], bool] = lambda: False,
 ) -> Lateness:
-    """Send frames at their times until they end or `is_stopped`; return how late they were sent.
+    """Send frames at their times until they end or `is_stopped` returns True; return how late they were sent.
 
-    speed: 2 plays twice as fast. longest_pause_ns: longer pauses of the recording are shortened to this. Frames out of
-    order are sent with the frames before them. Raises BusError.
+    speed: 2 plays twice as fast. longest_pause_ns: longer pauses of the recording are shortened to this; None: none is.
+    A frame with an earlier time than the one before is sent with it. Raises BusError.
     """
     lateness = Lateness()
     for due_ns, group in _grouped(_scheduled(frames, clock, speed, longest_pause_ns)):
@@ -86,7 +86,10 @@ def play(
 
 
 def repeat(frames: Callable[[], Iterable[PlayedFrame]], times: int) -> Iterator[PlayedFrame]:
-    """Yield the frames of a recording several times in a row, with times that go on; times 0: forever."""
+    """Yield the frames of a recording `times` times in a row, with times that go on; times 0: forever.
+
+    Ends at once if the recording is empty. `frames` is called for each repetition.
+    """
     shift_ns, end_ns, done = 0, None, 0
     while not times or done < times:
         is_first = True
@@ -104,7 +107,7 @@ def repeat(frames: Callable[[], Iterable[PlayedFrame]], times: int) -> Iterator[
 def _scheduled(
     frames: Iterable[PlayedFrame], clock: Clock, speed: float, longest_pause_ns: int | None
 ) -> Iterator[tuple[int, PlayedFrame]]:
-    """Yield each frame with its due time, which never decreases."""
+    """Yield each frame with the time at which it is due, ns of `clock`; the times never decrease."""
     begin_ns, first_ns, cut_ns, latest_ns = 0, None, 0, 0
     for frame in frames:
         if first_ns is None:
@@ -118,7 +121,7 @@ def _scheduled(
 
 
 def _grouped(scheduled: Iterable[tuple[int, PlayedFrame]]) -> Iterator[tuple[int, list[PlayedFrame]]]:
-    """Yield the frames that are due at the same time together, up to 64 of them."""
+    """Yield due time and frames of each group with the same due time, 64 frames at most."""
     group: list[PlayedFrame] = []
     group_ns = 0
     for due_ns, frame in scheduled:

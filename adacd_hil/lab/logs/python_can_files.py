@@ -23,13 +23,13 @@ from adacd_hil.printable import in_line
 
 
 class McapReader(BinaryIOMessageReader):
-    """The messages of an MCAP file, in its order; of a log of ours all parts.
+    """The messages of an MCAP file as python-can's, in its order; of a log of ours all parts.
 
-    `problem` names afterwards the missing data, "" for a whole file. It is also logged as a warning.
+    After iteration `problem` names missing data; it is also logged as a warning.
     """
 
     def __init__(self, file: Any, **_: Any) -> None:
-        """Open a path or take an open binary file. Raises LogError when it can't be read or isn't MCAP."""
+        """Open a path, or read an open binary file. Raises LogError if it can't be read or isn't MCAP."""
         super().__init__(file, mode="rb")
         try:
             is_path = isinstance(file, str | os.PathLike)
@@ -40,7 +40,7 @@ class McapReader(BinaryIOMessageReader):
 
     @property
     def problem(self) -> str:
-        """The missing or unreadable parts, one line; "" for a whole file."""
+        """One line on missing or unreadable parts, known after iteration; "" for a whole file."""
         return self._frames.problem
 
     def __iter__(self) -> Generator[can.Message, None, None]:
@@ -52,10 +52,13 @@ class McapReader(BinaryIOMessageReader):
 
 
 class McapWriter(BinaryIOMessageWriter):
-    """Writes messages to an MCAP file with the topics and types of our logs."""
+    """Writes python-can's messages to an MCAP file with the topics and types of our logs."""
 
     def __init__(self, file: Any, append: bool = False, **_: Any) -> None:
-        """Create a file, or take an open binary one. Raises ValueError for `append`, FileExistsError for a log."""
+        """Create a file, or write to an open binary one.
+
+        Raises ValueError for `append`, FileExistsError for a file that isn't empty.
+        """
         if append:
             raise ValueError("nothing can be appended to an MCAP file; log to another one")
         if isinstance(file, str | os.PathLike) and Path(file).is_file() and Path(file).stat().st_size:
@@ -69,7 +72,7 @@ class McapWriter(BinaryIOMessageWriter):
         self._writer.write_frame(to_frame(msg))
 
     def stop(self) -> None:
-        """End and close the file; ignore a second call."""
+        """Complete and close the file; a second call has no effect."""
         if not self._is_stopped:
             self._is_stopped = True
             self._writer.finish()
@@ -89,9 +92,9 @@ class TimedMessage(can.Message):
 
 
 def to_messages(frames: NDArray[Any], channels: list[str], epoch_ns: int = 0) -> Iterator[TimedMessage]:
-    """Yield a message for each frame, a row of RECORDED_FRAME_DTYPE; `epoch_ns` is added to its time.
+    """Yield a python-can message for each frame, a row of RECORDED_FRAME_DTYPE; `epoch_ns` is added to its time.
 
-    channels: name of each channel, by its number in a row.
+    channels: name of each CAN channel, by its number in a row.
     """
     names = [int(name) if name.isdecimal() and len(name) < _MOST_DIGITS else name or None for name in channels]
     for row in frames:

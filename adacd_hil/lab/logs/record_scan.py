@@ -25,16 +25,16 @@ _WINDOW = 1 << 20
 
 
 class FileGap(NamedTuple):
-    """Bytes that belong to no record."""
+    """Bytes of a file that belong to no record."""
 
     offset: int
     size: int
 
 
 def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap]:
-    """Yield the records of a file, and the gaps between them: after damage, search for the next record.
+    """Yield the records of a file, and the gaps between them, where no record could be found.
 
-    It ends with a Footer that the magic follows, or with the file.
+    It ends after a Footer that MCAP's magic follows, or at the end of the file.
     """
     size = os.fstat(file.fileno()).st_size
     position = len(MAGIC) if read_bytes(file, 0, len(MAGIC)) == MAGIC else 0
@@ -53,7 +53,10 @@ def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap]:
 
 
 def _head(file: IO[bytes], position: int, size: int) -> tuple[int, int] | None:
-    """Return opcode and length of the record at `position` of a file of `size` bytes, if one is there."""
+    """Return opcode and length of the record at `position` of a file of `size` bytes.
+
+    None if none with a right shape is there.
+    """
     head = read_bytes(file, position, HEAD.size)
     if len(head) < HEAD.size:
         return None
@@ -69,13 +72,16 @@ def _head(file: IO[bytes], position: int, size: int) -> tuple[int, int] | None:
 
 
 def _is_shaped(file: IO[bytes], position: int, size: int) -> bool:
-    """Return whether a record that repeats its length is at `position`."""
+    """Return whether at `position` a record begins whose kind and contents confirm its length."""
     opcode = read_bytes(file, position, 1)
     return bool(opcode) and has_shape(opcode[0]) and _head(file, position, size) is not None
 
 
 def _find_next(file: IO[bytes], position: int, size: int) -> int:
-    """Return the offset of the next record, from `position` on, that repeats its length; `size` if there is none."""
+    """Return the offset of the next record, from `position` on, whose contents confirm its length.
+
+    `size` if there is none.
+    """
     while position < size:
         window = read_bytes(file, position, _WINDOW + HEAD.size)
         for match in _BEGINNING.finditer(window):
@@ -86,7 +92,7 @@ def _find_next(file: IO[bytes], position: int, size: int) -> int:
 
 
 def read_header(path: Path) -> Header | None:
-    """Return the header of an MCAP file; None if it can't be read or trusted."""
+    """Return the Header of an MCAP file; None if the file can't be read or doesn't begin with one."""
     try:
         with open_input(path) as file:
             first = next(scan(file), None)
@@ -99,5 +105,5 @@ def read_header(path: Path) -> Header | None:
 
 
 def chunk_crc(record: RawRecord) -> int:
-    """Return the CRC, stored in a chunk, of its decompressed records; 0 without one."""
+    """Return the CRC of its decompressed records that a chunk stores; 0 if it stores none."""
     return int.from_bytes(record.body[24:28], "little")

@@ -18,7 +18,7 @@ from adacd_hil.log.log_parts import LOST_KEY, RECOVERED
 
 
 class LogRecovery(NamedTuple):
-    """The result of `recover`."""
+    """The result of `recover`: source, new log, and the numbers of saved messages, attachments and metadata records."""
 
     path: Path
     out: Path
@@ -34,9 +34,11 @@ def default_out(path: Path) -> Path:
 
 
 def recover(path: Path, out: Path | None = None, progress: Callable[[str], None] = lambda _: None) -> LogRecovery:
-    """Save the trusted records of all parts of a log to `out`. path: the log's first part.
+    """Save the trusted records of all parts of a log to the new log `out`. path: the log's first part.
 
-    Raises LogError when no record can be trusted, when a file can't be read, or when `out` is the log itself.
+    out: None: `default_out`.
+
+    Raises LogError if no record can be trusted, a file can't be read or written, or `out` is the log itself.
     """
     out = out or default_out(path)
     log = SalvagedLog(path, progress)

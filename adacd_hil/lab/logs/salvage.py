@@ -40,7 +40,11 @@ _NOTES = 20
 
 @dataclass
 class Losses:
-    """The records that could not be saved. `messages`: None where their number is unknown."""
+    """The records that could not be saved.
+
+    `bytes`: in gaps and in lost records. `messages`: None if their number is unknown. `is_cut`: the file has no end.
+    `notes`: a line for each damage, the first 20.
+    """
 
     chunks: int = 0
     bytes: int = 0
@@ -56,11 +60,11 @@ class Losses:
 
     @property
     def is_any(self) -> bool:
-        """Whether anything is lost, or may be."""
+        """Whether anything is lost or may be wrong; a gap in time alone is no loss."""
         return bool(self.describe())
 
     def describe(self) -> str:
-        """Return the losses in words; "" without a loss. Gaps in time alone, without lost data, are no loss."""
+        """Return the losses in words; "" without a loss. Gaps in time are named only beside another loss."""
         messages = "an unknown number of messages" if self.messages is None else f"{self.messages} messages"
         head = [
             ("the end", self.is_cut),
@@ -80,7 +84,7 @@ class Losses:
         return ", ".join(word for word, is_said in (*head, holes, *tail) if is_said)
 
     def add_note(self, text: str) -> None:
-        """Add a text about a damage to `notes`; ignore it when there are already 20."""
+        """Add a line on a damage to `notes`, unless it has 20 already."""
         if len(self.notes) < _NOTES:
             self.notes.append(text)
 
@@ -101,10 +105,10 @@ class Losses:
 
 
 class Salvage:
-    """One file: iterate for its trusted records, then ask for `losses`. `definitions` fill up on the way."""
+    """One file: iterate once for its trusted records; then `losses` is filled. `definitions` fill up on the way."""
 
     def __init__(self, path: Path) -> None:
-        """Read the summary of a file, and find which CRCs it has. Raises LogError when it can't be read."""
+        """Read the summary of a file, and find which CRCs it has. Raises LogError if it can't be read."""
         self.losses = Losses()
         self.definitions = Definitions()
         self.is_vouched = False
@@ -126,7 +130,7 @@ class Salvage:
             self._look_at_end(file)
 
     def _look_at_end(self, file: IO[bytes]) -> None:
-        """Keep definitions and statistics of a sound summary, and compare the CRC of the data section."""
+        """Keep definitions and statistics of a sound summary; set `is_vouched` by the CRC of the data section."""
         end = read_end(file)
         has_data_crc = end is not None and end.data_crc != 0
         chunks = (item for item in scan(file) if isinstance(item, RawRecord) and item.opcode == Opcode.CHUNK)
@@ -154,7 +158,10 @@ class Salvage:
         self._sum_up()
 
     def _take(self, record: RawRecord) -> Iterator[Attachment | Metadata | Contents]:
-        """Yield the content of a record that can be trusted."""
+        """Yield the content of a record if it can be trusted; else add it to the losses.
+
+        Definitions are kept, not yielded.
+        """
         opcode = record.opcode
         is_trusted = self.is_vouched or (self._is_unchecked and not self.losses.bytes)
         try:
@@ -188,7 +195,10 @@ class Salvage:
             self._lose(record.offset, len(record.body), str(error))
 
     def _take_chunk(self, record: RawRecord) -> Iterator[Contents]:
-        """Yield the content of a chunk. Raises ChunkError if no CRC vouches for it, except in a file without CRCs."""
+        """Yield the content of a chunk. Raises ChunkError if no CRC vouches for it, except in a file without CRCs.
+
+        Raises ChunkError also if it can't be opened or fails its CRC.
+        """
         self._chunk = None
         chunk: Chunk = parse(record.opcode, record.body)
         is_vouched = self.is_vouched or chunk.uncompressed_crc != 0
@@ -207,7 +217,10 @@ class Salvage:
         yield from self._give(contents, is_vouched)
 
     def _give(self, contents: Contents, is_vouched: bool) -> Iterator[Contents]:
-        """Yield messages; count the saved, the unvouched and those without a channel, and add a gap before them."""
+        """Yield messages.
+
+        Count those saved, unvouched or without a channel, and add the gap in time before them, if any.
+        """
         known = np.isin(contents.channels, list(self.definitions.channels))
         self._left_out += int(np.count_nonzero(~known))
         saved = int(np.count_nonzero(known))
@@ -221,14 +234,17 @@ class Salvage:
         yield contents
 
     def _compare_index(self, body: bytes) -> None:
-        """Compare a message index with its chunk: a difference explains why the CRC of the data section fails."""
+        """Compare a message index with its chunk. A difference explains why the CRC of the data section fails."""
         if self._chunk is not None:
             contents, entries = self._chunk
             is_own = contents.channels == int.from_bytes(body[:2], "little")
             self._is_explained |= body[6:] != entries[is_own].tobytes()
 
     def _doubt(self, file: IO[bytes]) -> None:
-        """Note that metadata may be wrong if the CRC of the data section fails without a damage that explains it."""
+        """Mark the losses as doubtful if the CRC of the data section fails though no damage was found.
+
+        Then metadata may be wrong.
+        """
         stored = int.from_bytes(self._data_end.body, "little")
         if stored and stored != crc_of(file, 0, self._data_end.offset):
             self.losses.is_doubtful = True
@@ -243,7 +259,7 @@ class Salvage:
         self._is_explained = True
 
     def _sum_up(self) -> None:
-        """Fill in `losses` at the end of the file, from its statistics where these can be trusted."""
+        """Fill in `losses` at the end of the file; by its statistics, if it has a sound summary."""
         losses, statistics = self.losses, self._statistics
         losses.is_cut = not self._has_data_end and not self._has_footer and statistics is None
         if losses.is_cut:

@@ -13,10 +13,11 @@ from adacd_hil.log.mcap.mcap_records import Definitions
 
 
 class SalvagedLog:
-    """Iterate once for chunks and, of each name, the first attachment; then `losses` names the missing parts.
+    """The trusted records of all parts of a log. Iterate once for chunks and, of each name, the first attachment.
 
-    `metadata`, by name the first of each, and `definitions`, those of the present part, fill up on the way. Iterating
-    raises LogError when a file can't be read, or when no record of the log can be trusted.
+    `metadata`, by name the first of each, and `definitions`, those of the present part, fill up on the way; then
+    `losses` is complete. A part of another run is left out, and named as missing. Iterating raises LogError if a file
+    can't be read, or if no record of the log can be trusted.
     """
 
     def __init__(self, path: Path, progress: Callable[[str], None] = lambda _: None) -> None:
@@ -61,7 +62,10 @@ class SalvagedLog:
         self.losses.missing_parts = [*(part.name for part in missing), *foreign]
 
     def _is_foreign(self, item: Metadata, is_vouched: bool) -> bool:
-        """Return whether metadata show that a part is of another run; one entry that differs may be damaged."""
+        """Return whether a part's metadata show that it is of another run.
+
+        A single entry that differs counts only if CRCs vouch for both, since it may be damaged.
+        """
         if item.name != RUN_METADATA:
             return False
         mine, theirs = (

@@ -44,7 +44,10 @@ AddRows = Callable[[Columns], None]
 
 
 def series_columns(series: Series, epoch_ns: int) -> dict[str, Any]:
-    """Return the columns of a topic's table; epoch_ns: offset of the file's times from t_ns."""
+    """Return the columns of a topic's table by name; a field of n numbers becomes n columns.
+
+    epoch_ns: offset of the file's times from t_ns.
+    """
     columns: dict[str, Any] = {
         "t_ns": series.t_ns,
         "cycle_t_ns": series.records["publish_time"].astype(np.int64) - epoch_ns,
@@ -59,7 +62,7 @@ def series_columns(series: Series, epoch_ns: int) -> dict[str, Any]:
 
 
 def event_columns(events: Iterable[LoggedEvent]) -> dict[str, Any]:
-    """Return the columns of the table of /events."""
+    """Return the columns t_ns, level, name and message of the table of /events."""
     rows = [(t_ns, *event) for t_ns, event in events]
     return {name: [row[place] for row in rows] for place, name in enumerate(("t_ns", "level", "name", "message"))}
 
@@ -67,7 +70,7 @@ def event_columns(events: Iterable[LoggedEvent]) -> dict[str, Any]:
 def frame_columns(frames: NDArray[Any], decoder: DbcDecoder) -> Iterator[tuple[str, dict[str, Any]]]:
     """Decode frames of RECORDED_FRAME_DTYPE by a DBC; yield name and columns of each message that occurs.
 
-    A signal that a frame lacks, because it is short or multiplexed, is NaN.
+    A signal that a frame lacks, because it is short or multiplexed, is NaN. Error and remote frames are left out.
     """
     frames = frames[~frames["is_error"] & ~frames["is_remote"]]
     there = set(frames["can_id"].tolist())
@@ -89,12 +92,15 @@ def frame_columns(frames: NDArray[Any], decoder: DbcDecoder) -> Iterator[tuple[s
 
 
 class Tables:
-    """Files of tables in one folder, each begun when its first rows come; they appear when all are whole."""
+    """Files of tables in one folder, each begun with its first rows.
+
+    They appear at the end of the `with` block, if no error ends it.
+    """
 
     def __init__(self, folder: Path, kind: str, metadata: Mapping[str, str]) -> None:
         """Make the folder for tables of a kind, "csv" or "parquet"; `metadata` goes into Parquet files.
 
-        Raises LogError if that fails, or if pyarrow is missing.
+        Raises LogError if the folder can't be made, or if pyarrow is missing.
         """
         self.rows: dict[Path, int] = {}
         """Number of rows of each file."""
@@ -110,7 +116,10 @@ class Tables:
             folder.mkdir(parents=True, exist_ok=True)
 
     def add_rows(self, topic: str, columns: Columns) -> None:
-        """Add rows to a topic's table, which the first call makes, even without rows. Raises LogError."""
+        """Add rows to a topic's table; the first call begins the file, even without rows.
+
+        Raises LogError if the file can't be written, or if what is there is no table.
+        """
         path = self._paths.get(topic) or self._path(topic)
         with failing_as(f"{path} can't be written"):
             if topic not in self._tables:
@@ -127,7 +136,7 @@ class Tables:
         self.rows[path] += len(columns["t_ns"])
 
     def _path(self, topic: str) -> Path:
-        """Return a file for one topic only, even if the names of other topics give the same file name."""
+        """Return the path of a topic's file; a number tells topics apart whose names give the same file name."""
         stem = re.sub(r"[^\w.-]", "_", topic.strip("/"))[:_LONGEST_STEM] or "_"
         stems = itertools.chain((stem,), (f"{stem}_{number}" for number in itertools.count(2)))
         paths = (self._folder / f"{stem}.{self._kind}" for stem in stems)
@@ -140,7 +149,7 @@ class Tables:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End all files, or remove them after an error. Raises LogError."""
+        """Complete all files and give them their names; remove them after an error. Raises LogError if that fails."""
         with failing_as(f"{self._folder} can't be written"):
             self._files.__exit__(kind, value, trace)
 
@@ -167,7 +176,10 @@ def _parquet_table(path: Path, head: Columns, metadata: dict[str, str]) -> Itera
 
 
 def import_pyarrow() -> tuple[Any, Any]:
-    """Return pyarrow and its module for Parquet. Raises LogError with the command that installs it."""
+    """Return the modules pyarrow and pyarrow.parquet.
+
+    Raises LogError with the command to install if they are missing.
+    """
     try:
         import pyarrow
         import pyarrow.parquet
@@ -182,7 +194,11 @@ _RAW = tuple(name.removeprefix("/") for name in FRAME_TOPICS)
 
 
 class TableSummary(NamedTuple):
-    """The written rows of each file. `problem`: the missing part of the recording, one line. `notes`: a line each."""
+    """Number of rows of each written file.
+
+    `problem`: one line on the missing part of the recording, "" if it is whole. `notes`: a line each on messages that
+    were decoded in part.
+    """
 
     rows: Mapping[Path, int]
     problem: str
@@ -197,11 +213,11 @@ def export_tables(
     decoder: DbcDecoder,
     progress: Callable[[int], None] = lambda _: None,
 ) -> TableSummary:
-    """Write the tables of a recording into the folder `out`.
+    """Write the tables of a recording into the folder `out`; return their numbers of rows.
 
-    wanted: topics or patterns such as `decoded/*`, with or without the first slash; empty: all. decoder:
-    decodes the frames of recordings that have no decoded topics. progress: called with the number of rows so far.
-    Raises LogError when the recording can't be read, lacks a topic, or a table can't be written.
+    kind: "csv" or "parquet". wanted: topics or patterns such as `decoded/*`, with or without the first slash; empty:
+    all. decoder: decodes the frames of recordings that have no other topics. progress: called with the number of rows
+    so far. Raises LogError if the recording can't be read, lacks a topic, or a table can't be written.
     """
     is_mcap = path.suffix.lower() == ".mcap"
     defined = _topics(path) if is_mcap else []
@@ -217,7 +233,9 @@ def export_tables(
 def choose_topics(
     topics: Collection[str], wanted: Collection[str], raw: Collection[str] = (), owner: str = "the log"
 ) -> list[str]:
-    """Return the topics that fit names or patterns; wanted empty: all. Raises LogError for one that fits no topic.
+    """Return the topics that fit names or patterns, each once; wanted empty: all.
+
+    Raises LogError if one of `wanted` fits no topic.
 
     raw: topics of frames, of which no table is made. owner: the source of the topics, for the error.
     """
@@ -288,7 +306,7 @@ def _export_frames(
 
 
 def _topics(path: Path) -> list[str]:
-    """Return the topics that an MCAP file defines before its first messages. Raises LogError for any other file."""
+    """Return the topics that an MCAP file defines before its first messages. Raises LogError if it can't be read."""
     stream = LogStream(path, is_ahead=False)
     next(iter(stream), None)
     return list(stream.topics)

@@ -24,7 +24,7 @@ class NextStep(NamedTuple):
 
 
 def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[NextStep], list[NextStep]]:
-    """Return the next steps, the gravest first, STEPS at most, and further ones."""
+    """Return the next steps, the gravest first, STEPS at most, and a second list with the further ones."""
     log = _quoted(source.log_name)
     steps = [NextStep("The log is not whole: see what it lacks.", f"adacd-hil log check {log}")] * bool(
         source.log_problem
@@ -46,7 +46,7 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
 
 
 def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
-    """Return a next step for each kind of failure that the run shows."""
+    """Return a next step for each kind of failure that the run shows; [] if there is none."""
     has_stopped = bool(metrics.fault) or (not metrics.adaptation_s and run.stretch is None)
     stopped = _checked(run, "Mend the cause above.")
     late = _checked(run, "Frames came late or were lost, more than allowed.")
@@ -78,7 +78,10 @@ def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
 
 
 def _checked(run: Run, text: str) -> NextStep:
-    """Return a next step: `text`, and the check of host, bus and arm; for an emulated arm, a demo to play again."""
+    """Return a next step: `text`, and the `doctor` command for host, bus and arm.
+
+    For an emulated arm the command is `demo`, to play the run again.
+    """
     interface, channel = run.metadata.get("interface", ""), run.metadata.get("channel", "")
     if interface in ("", EMBEDDED):
         played = f" --scenario {_scenario(run)}" if run.metadata.get("scenario") else ""
@@ -90,13 +93,13 @@ def _checked(run: Run, text: str) -> NextStep:
 
 
 def _configuration(run: Run) -> str:
-    """Return a run's configuration, quoted, as a command takes it: a built-in name, or `<arm's name>.toml`."""
+    """Return a run's configuration for a command, quoted for the shell: a built-in name, or `<arm's name>.toml`."""
     name = run.metadata.get("config", "")
     return _quoted(name) if name in builtin_names() else _quoted(f"{name or 'my-arm'}.toml")
 
 
 def _scenario(run: Run) -> str:
-    """Return a run's scenario, quoted, as `demo` takes it: a built-in name, or `<its name>.toml`."""
+    """Return a run's scenario for `demo`, quoted for the shell: a built-in name, or `<its name>.toml`."""
     name = run.metadata["scenario"]
     is_builtin = name in toml_names(resources.files("firmware_sim") / "scenarios")
     return _quoted(name if is_builtin else f"{name}.toml")
@@ -107,7 +110,7 @@ def _quoted(text: str) -> str:
 
 
 def origin_words(run: Run) -> list[str]:
-    """Return phrases on a run's arm, bus, scenario and version, as far as the log names them."""
+    """Return phrases on a run's arm, bus, scenario and version, without those that the log doesn't name."""
     said = run.metadata
     name, profile, interface = said.get("config", ""), said.get("profile", ""), said.get("interface", "")
     is_own = name not in builtin_names()

@@ -56,14 +56,20 @@ STEPS: Final = 2
 
 
 class Cell(NamedTuple):
-    """The content of a table's cell, and its class for the style sheet."""
+    """A cell of a table.
+
+    kind: its class for the style sheet, such as "bad" or "strong"; "" for none.
+    """
 
     content: object
     kind: str = ""
 
 
 class Table(NamedTuple):
-    """A table; columns are aligned right but those of `left`. head: empty for a table without one."""
+    """A table for the template. Its columns are aligned right, except those in `left`, numbered from 0.
+
+    head: empty for a table without one.
+    """
 
     head: Sequence[Cell]
     rows: Sequence[Sequence[Cell]]
@@ -71,7 +77,10 @@ class Table(NamedTuple):
 
 
 def make_table(head: Sequence[object], rows: Iterable[Sequence[object]], left: Sequence[int] = (0,)) -> Table:
-    """Return a table; contents that aren't a `Cell` become cells without a class. left: columns aligned left."""
+    """Return a table; contents that aren't a `Cell` become cells without a class.
+
+    left: numbers of the columns, from 0, that are aligned left.
+    """
 
     def line(contents: Sequence[object]) -> list[Cell]:
         return [content if isinstance(content, Cell) else Cell(content) for content in contents]
@@ -95,9 +104,10 @@ def render_page(
     traces: "Traces | None" = None,
     **values: Any,
 ) -> str:
-    """Return the HTML of a page whose template extends `page.html.j2`. traces: its curves; None: a page without script.
+    """Return the HTML of a page whose template extends `page.html.j2`.
 
-    over: a line over the headline; problems: of the log, and further findings, a line each.
+    traces: its curves; None: a page without script. over: a line over the headline; problems: of the log, and further
+    findings, a line each. is_good: colour of the headline. values: for the template.
     """
     sheets, programs = ([_asset(name) for name in names] for names in (_STYLES, _SCRIPTS if traces else ()))
     heading = {"over": over, "title": headline, "is_good": is_good, "problems": problems, "further": findings}
@@ -105,7 +115,7 @@ def render_page(
 
 
 def render(template: str, **values: Any) -> str:
-    """Return the text of a template filled with values; raises an error of Jinja2 for a missing one."""
+    """Return the text of a template filled with values. Raises an error of Jinja2 if one is missing."""
     return _environment().get_template(template).render(values) + "\n"
 
 
@@ -131,25 +141,28 @@ def _environment() -> Environment:
 
 @cache
 def _asset(name: str) -> dict[str, str]:
-    """Return text and digest of a style or script; the content security policy allows it by the digest."""
+    """Return "text" and "digest" (SHA-256, base64) of a style sheet or script.
+
+    The content security policy allows it by the digest.
+    """
     text = f"\n{resources.files(_PACKAGE).joinpath('assets', name).read_text(encoding='utf-8').strip()}\n"
     return {"text": text, "digest": b64encode(hashlib.sha256(text.encode()).digest()).decode()}
 
 
 def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:
-    """Return the contacts to be listed: the first `most`, and of the others at most as many that went wrong."""
+    """Return the contacts to be listed: the first `most`, and of the later ones that went wrong the first `most`."""
     later = [contact for contact in metrics.contacts[most:] if went_wrong(contact)]
     return (*metrics.contacts[:most], *later[:most])
 
 
 def went_wrong(contact: ReportedContact) -> bool:
-    """Return whether a contact was missed, or named on a link that nobody touched or with a wrong direction."""
+    """Return whether armed detection missed a contact, or found it on a wrong link or with a wrong direction."""
     is_missed = contact.is_armed and contact.detected_s is None
     return is_missed or contact.link_ok is False or contact.direction_ok is False
 
 
 def left_out_text(metrics: Metrics, most: int) -> str:
-    """Return a sentence that says which of all contacts `shown_contacts` lists; "" if it lists all."""
+    """Return a sentence on which of all contacts `shown_contacts` lists; "" if it lists all."""
     count, shown = len(metrics.contacts), len(shown_contacts(metrics, most))
     if shown == count:
         return ""
@@ -158,20 +171,21 @@ def left_out_text(metrics: Metrics, most: int) -> str:
 
 
 def has_paper(metrics: Metrics) -> bool:
-    """Return whether the run played the paper's experiment, so that figures of the paper stand beside its own."""
+    """Return whether the run played the paper's experiment. Then the paper's figures stand beside its own."""
     return any(row.paper is not None for row in metrics.paper)
 
 
 def shown_beside(metrics: Metrics) -> Beside | None:
-    """Return the result of the paper's scheme on the same stream if the paper's experiment was played, else None.
+    """Return the result of the paper's scheme on the same stream for the page.
 
-    report.json has it of every run.
+    None if the run didn't play the paper's experiment, or was not certified; report.json has it even without the
+    experiment.
     """
     return metrics.evidence.paper_beside if metrics.evidence is not None and has_paper(metrics) else None
 
 
 def paper_head(metrics: Metrics) -> tuple[str, ...]:
-    """Return the head of the table of `paper_cells`; with the paper's column if its experiment was played."""
+    """Return the head of the table of `paper_cells`; with columns of the paper if its experiment was played."""
     if metrics.evidence is None:
         return ("", "paper", "measured") if has_paper(metrics) else ("", "measured")
     paper = ("paper (printed)", "paper's scheme, same stream") if has_paper(metrics) else ()
@@ -194,7 +208,8 @@ _PLAIN_NAMES: Final = {
 def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
     """Return a row of texts per quantity: name, the paper's value, its scheme's on the same stream, the measured one.
 
-    Columns as in `paper_head`.
+    Columns as in `paper_head`: the two of the paper only if its experiment was played. Quantities without any value are
+    left out.
     """
     rows = []
     for row in metrics.paper:
@@ -207,7 +222,7 @@ def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
 
 
 def stretch_text(stretch: StretchOfRun) -> str:
-    """Return a phrase on the stretch of a log that was read, and why it differs from the requested one."""
+    """Return a phrase on the time window of a log that was read; if it is wider than requested, the phrase says why."""
     start_s, end_s = stretch.found
     text = (
         "the log"

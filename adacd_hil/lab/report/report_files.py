@@ -38,7 +38,10 @@ HTML_NAME: Final = "report.html"
 
 @dataclass(frozen=True)
 class Report:
-    """A report that has been written. content: of report.json."""
+    """A report that has been written, with its run's metrics.
+
+    content: of report.json.
+    """
 
     metrics: Metrics
     source: ReportSource
@@ -48,7 +51,7 @@ class Report:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the log is whole and no record was dropped before it was written."""
+        """Whether log and truth are whole, no record was dropped before, and all alarms could be judged."""
         return self.source.is_complete
 
     def as_text(self) -> str:
@@ -73,7 +76,7 @@ PRINTED_CONTACTS: Final = 8
 
 
 def _contact_lines(contacts: Sequence[ReportedContact], width: int | None) -> list[str]:
-    """Return the lines of a table of contacts for a terminal of `width` letters; None: of any width."""
+    """Return the lines of a table of contacts, with its head, for a terminal of `width` letters; None: of any width."""
     rows: list[tuple[str, ...]] = [("contact", "at", "touched", "found on", "after")]
     for contact in contacts:
         found = NONE if contact.link_detected is None else f"link {contact.link_detected}"
@@ -94,16 +97,17 @@ def write_report(
 ) -> Report:
     """Read a log, or a stretch of it, with the emulator's truth if there is one; write and return its report.
 
-    Raises LogError, ConfigError when a log can't be read, and LogError when the report can't be written.
+    Raises LogError if a log can't be read or the report can't be written, ConfigError for the log's configuration.
+    progress: called with a line on the cycles read.
     """
     run, gathered, source = read_run(log_path, truth_path, stretch, progress)
     return write_run_report(run, out_dir, source, gathered)
 
 
 def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: RunGatherer | None = None) -> Report:
-    """Write the report of a run that is in memory into `out_dir`; return it. Raises LogError if it can't be written.
+    """Write the report of a run that is in memory into `out_dir`, over an earlier one; return it.
 
-    gathered: the sums over all cycles; None: the run has all of its cycles.
+    gathered: the sums over all cycles; None: the run has all of its cycles. Raises LogError if it can't be written.
     """
     metrics = evaluate(run, gathered)
     shown_run = run if has_paper(metrics) else dataclasses.replace(run, beside=None)
@@ -125,7 +129,7 @@ _CSV_DIGITS: Final = 9
 
 
 def report_tables(run: Run, metrics: Metrics) -> dict[str, str]:
-    """Return the tables of contacts, parameters and states as CSV, by file name."""
+    """Return contacts.csv, parameters.csv and states.csv as texts by file name."""
     names = [field.name for field in dataclasses.fields(ReportedContact)]
     pairs = [name for name in names if any(isinstance(getattr(c, name), tuple) for c in metrics.contacts)]
     head = [column for name in names for column in ((f"{name}_1", f"{name}_2") if name in pairs else (name,))]
@@ -138,7 +142,7 @@ def report_tables(run: Run, metrics: Metrics) -> dict[str, str]:
 
 
 def _cells(value: Any, is_pair: bool) -> Sequence[Any]:
-    """Return the cells of a value: one, or for a pair that of each joint, empty if it is None."""
+    """Return a value as a list of cells: one, or, for a pair, one per joint. Both are None if the pair is None."""
     if not is_pair:
         return (value,)
     return (None, None) if value is None else tuple(value)

@@ -19,7 +19,10 @@ _DIGITS: Final = 6
 def report_json(
     metrics: Metrics, metadata: Mapping[str, str], source: ReportSource, stretch: StretchOfRun | None = None
 ) -> dict[str, Any]:
-    """Return the content of report.json; the keys are described in `adacd_hil.lab.score.metrics`."""
+    """Return the content of report.json as plain values, rounded to 6 digits.
+
+    The keys are described in `adacd_hil.lab.score.metrics`. stretch: None: the whole log was read.
+    """
     evidence = metrics.evidence
     fault = None if metrics.fault is None else {"reason": metrics.fault, "at_s": metrics.fault_s}
     plain: dict[str, Any] = plain_values(
@@ -62,7 +65,7 @@ def report_json(
 
 
 def _stretch_json(stretch: StretchOfRun) -> dict[str, Any]:
-    """Return found and requested stretch and motion start by the keys of report.json, s since the log began."""
+    """Return the found and the requested stretch and motion start by keys of report.json, s since the log began."""
     return {
         "from_s": stretch.found.start_s,
         "until_s": stretch.found.end_s,

@@ -35,14 +35,17 @@ from adacd_hil.score.wording import NONE, number_of
 
 
 def paper_table(metrics: Metrics) -> Table:
-    """Return the table of the paper's figures beside the measured ones."""
+    """Return the table of `paper_cells`: the paper's figures, if any, beside the measured ones."""
     rows = [[*cells[:-1], Cell(cells[-1], "strong")] for cells in paper_cells(metrics)]
     head = paper_head(metrics)
     return make_table(head, rows, left=range(len(head)))
 
 
 def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
-    """Return the table of residual, threshold and margin per section and channel; None without margins."""
+    """Return the table of residual, threshold and margin per section and channel; None without margins.
+
+    Sections after the first SECTIONS are left out, except the one with the smallest margin.
+    """
     if evidence is None or not evidence.margins:
         return None
     head = ("section", "filter, rad/s", "", "largest residual, Nm", "threshold, Nm", "margin")
@@ -59,7 +62,10 @@ def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def push_table(evidence: CertifiedEvidence | None) -> Table | None:
-    """Return the table of the smallest push found in time and the threshold in force; None if unknown."""
+    """Return the table of the smallest push found in time and the threshold in force, by joint.
+
+    None if the run has no certified evidence of it.
+    """
     push = None if evidence is None else evidence.smallest_push
     if push is None:
         return None
@@ -75,7 +81,7 @@ def push_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def counted_sentence(metrics: Metrics) -> str:
-    """Return a sentence with the number of false alarms and the bound of their rate; "" if the bound is not known."""
+    """Return a sentence with the number of false alarms and the bound of their rate; "" if the bound is unknown."""
     bound = metrics.false_alarm_bound_per_h
     return "" if bound is None else rate_sentence(metrics.armed_false_alarms or 0, bound)
 
@@ -89,7 +95,10 @@ def _first_and_worst(evidence: CertifiedEvidence) -> dict[str, tuple[ChannelMarg
 
 
 def further_table(evidence: CertifiedEvidence | None) -> Table | None:
-    """Return the table of the certified scheme's parameters with their standard deviations; None without any."""
+    """Return the table of the certified scheme's parameters with their standard deviations; None without any.
+
+    Columns are the first ADAPTATIONS adaptations.
+    """
     if evidence is None or not evidence.estimates:
         return None
     estimates = dict(islice(evidence.estimates.items(), ADAPTATIONS))
@@ -106,7 +115,7 @@ def further_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def sections_table(metrics: Metrics, run: Run) -> Table:
-    """Return the table of sections: kind, times, and largest residuals of the frozen models."""
+    """Return the table of the first SECTIONS sections: kind, times, and largest residuals of the frozen models."""
     threshold = run.settings.detector.threshold_Nm
     rows = []
     for section in metrics.sections[:SECTIONS]:
@@ -140,13 +149,16 @@ def _judged(values: tuple[float, float] | None, threshold: tuple[float, float]) 
 
 
 def _symbol(name: str) -> tuple[str, str]:
-    """Return a parameter's name as stem and index: F_v1 as F and v1, a1 as a and 1."""
+    """Return stem and index of a parameter's name: ("F", "v1") of F_v1, ("a", "1") of a1."""
     stem, index = name.split("_", 1) if "_" in name else (name.rstrip("0123456789"), name.lstrip(ascii_letters))
     return stem, index
 
 
 def parameters_table(metrics: Metrics, run: Run) -> Table | None:
-    """Return the table of identified, true and CAD parameters; None without identified ones."""
+    """Return the table of identified, true and CAD parameters; None without identified ones.
+
+    Columns are those of the first ADAPTATIONS adaptations.
+    """
     if not metrics.parameters:
         return None
     cad = dict(zip(run.parameter_names, run.settings.arm.cad_theta, strict=True)) if run.has_cad else {}
@@ -166,7 +178,10 @@ def parameters_table(metrics: Metrics, run: Run) -> Table | None:
 
 
 def data_table(data: CyclicData) -> Table | None:
-    """Return the table of the share of cyclic data that was missing, old or repeated; None without a cycle."""
+    """Return the table of shares of cyclic data that was missing, old or repeated, with the worst second.
+
+    None without a cycle.
+    """
     if not data.cycles:
         return None
     rows = [
@@ -187,7 +202,7 @@ def _share(share: float | None) -> str:
 
 
 def origin_table(metrics: Metrics, run: Run, source: ReportSource) -> Table:
-    """Return the table of a run's origin: log, stretch and metadata."""
+    """Return the table of a run's origin: log, number of frames and drops, stretch, and the log's metadata."""
     log = [("log", source.log_name), ("frames", metrics.frames), ("packets dropped", metrics.dropped)]
     if run.stretch is not None:
         log.append(("stretch", stretch_text(run.stretch)))
@@ -213,7 +228,7 @@ _QUEUES: Final = {
 def timing_tables(evidence: TimingEvidence) -> dict[str, Table | bool | None] | None:
     """Return the tables of `timing.html.j2` by name: times, counts, queues and ages; None without a cycle.
 
-    is_modelled: the times come from a model, which has no queues.
+    is_modelled: the times come from a model; then "queues" is None, since it has none.
     """
     if not evidence.cycles:
         return None
@@ -227,7 +242,10 @@ def timing_tables(evidence: TimingEvidence) -> dict[str, Table | bool | None] | 
 
 
 def _times_table(evidence: TimingEvidence) -> Table:
-    """Return the table of times, µs; slack comes last, under a head of low percentiles: its small values are bad."""
+    """Return the table of times, µs.
+
+    Slack comes last, under a head of low percentiles, since its small values are bad.
+    """
     reserves = [quantity for quantity in QUANTITIES if quantity.is_reserve]
     rows = [_time_row(quantity, evidence, PERCENTILE_NAMES) for quantity in QUANTITIES if not quantity.is_reserve]
     reaction = evidence.reaction

@@ -61,10 +61,10 @@ _Point = tuple[float, float]
 
 
 class Push(NamedTuple):
-    """A force at right angles to a link: how far from the link's joint, and how strong, of the strongest to be shown.
+    """A force at right angles to a link, to be drawn as an arrow. share: its size over that of the strongest one drawn.
 
-    lever_m, lever_sigma_m: None where the place is not known; the arrow then points at the middle, or at `lever_m`
-    without its spread, and is dashed. side: +1 toward +q, -1, or 0 where not known.
+    lever_m, from the link's joint, and lever_sigma_m: None where not known. Without `lever_m` the arrow points at the
+    link's middle; without `lever_sigma_m` it is dashed. side: +1 toward +q, -1, or 0 where not known: no arrow.
     """
 
     link: int
@@ -75,7 +75,7 @@ class Push(NamedTuple):
 
 
 class Stroke(NamedTuple):
-    """A straight line, and its class for the style sheet."""
+    """A straight line of a drawing, mm, y up, and its class for the style sheet."""
 
     start: _Point
     end: _Point
@@ -85,8 +85,9 @@ class Stroke(NamedTuple):
 def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, description: str) -> dict[str, Any]:
     """Return a drawing of the arm, for its template, at joint angles q, rad (2,), with the arrow of a push, if any.
 
-    description: of the picture, in words. view: left, top, width and height of the picture with y down; force: strokes
-    of arrow and spread; arrowhead: its corners.
+    Lengths are in mm. description: of the picture, in words. Keys: view: left, top, width and height of the picture
+    with y down; reach: length of both links; links: their strokes; force: strokes of arrow and spread; arrowhead: its
+    corners.
     """
     angles = (float(q[0]), float(q[0] + q[1]))
     l1, l2 = (1000.0 * length for length in length_m)
@@ -120,7 +121,10 @@ def _along(start: _Point, angle: float, distance: float) -> _Point:
 def _arrow(
     push: Push, links: tuple[Stroke, Stroke], angles: tuple[float, float], reach: float
 ) -> tuple[list[Stroke], list[_Point]]:
-    """Return the strokes of a force's arrow and of the spread of its place, and the corners of the arrowhead."""
+    """Return the strokes of a force's arrow and of its place's deviation, and the corners of the arrowhead.
+
+    Without a known side there is no arrow: no corners.
+    """
     start, end, _ = links[push.link - 1]
     angle = angles[push.link - 1]
     lever = 0.5 * math.dist(start, end) if push.lever_m is None else 1000.0 * push.lever_m
@@ -149,9 +153,9 @@ _CONTACT_HEAD: Final = (
 
 
 def contacts_table(metrics: Metrics) -> Table | None:
-    """Return the table of contacts, wrong cells marked, with the delay of the paper's scheme if it is known.
+    """Return the table of the contacts of `shown_contacts`, wrong cells marked; None without contacts.
 
-    None without contacts.
+    The delay of the paper's scheme has a column if it is shown beside.
     """
     if not metrics.contacts:
         return None
@@ -186,9 +190,9 @@ def contacts_table(metrics: Metrics) -> Table | None:
 
 
 def contact_cards(metrics: Metrics, run: Run) -> list[dict[str, Any]]:
-    """Return the content of the first contacts' cards: report with uncertainty, truth, and drawing of the arm.
+    """Return the cards of the first CARDS contacts: report with uncertainty, truth, and drawing of the arm.
 
-    stretch_s: the part of the traces that a script shows.
+    stretch_s: from and to which time, s since motion start, the traces of a card show.
     """
     contacts = metrics.contacts[:CARDS]
     strongest_N = max((abs(contact.force_N) for contact in contacts if contact.force_N is not None), default=0.0)
@@ -235,7 +239,7 @@ def _why_not(contact: ReportedContact) -> str:
 
 
 def _found(contact: ReportedContact) -> list[tuple[str, str]]:
-    """Return six rows on a contact, name and text; a missing value has a placeholder."""
+    """Return six pairs of name and text on a contact that was found; NONE as text for a missing value."""
     lever = uncertain_text(scaled(contact.lever_m, 100.0), scaled(contact.lever_sigma_m, 100.0), 1, "cm")
     return [
         ("found after", number_text(contact.delay_ms, 0, "ms")),
@@ -248,7 +252,11 @@ def _found(contact: ReportedContact) -> list[tuple[str, str]]:
 
 
 def _force(contact: ReportedContact) -> tuple[str, str]:
-    """Return name and text of a contact's force: with deviation, as a lower bound, "not known", or NONE."""
+    """Return name and text of a contact's force: NONE if none was computed, "not known" if the torques don't tell it.
+
+    On link 1 it is a lower bound, with its deviation if known. On link 2 it is the force at right angles with its
+    deviation, NONE without one.
+    """
     location = Location[contact.location or Location.NOT_SOUGHT.name]
     if contact.force_N is None:
         return "force", NONE
@@ -262,7 +270,10 @@ def _force(contact: ReportedContact) -> tuple[str, str]:
 
 
 def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
-    """Return name and text of each joint's peak torque and impulse; a peak without its deviation if unknown."""
+    """Return pairs of name and text: each joint's peak torque and impulse, [] if no torque was reported.
+
+    A peak without known deviation stands alone; an impulse without one is NONE.
+    """
     unknown = (None, None)
     impulses = contact.impulse_Nm_s or unknown
     impulse_sigmas = contact.impulse_sigma_Nm_s or unknown
@@ -277,7 +288,10 @@ def _torques(contact: ReportedContact) -> list[tuple[str, str]]:
 
 
 def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, Any] | None:
-    """Return a drawing of the arm when a contact was found, or else began; None without measured positions."""
+    """Return a drawing of the arm when a contact was found, or, if it was missed, when it began.
+
+    None without measured positions.
+    """
     if run.motion is None:
         return None
     at_s = contact.at_s if contact.detected_s is None else contact.detected_s
@@ -290,10 +304,10 @@ def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, An
 
 
 def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Push | None:
-    """Return the force of a contact for the drawing, on the link that was found, or else the true one; None without.
+    """Return the force of a contact for the drawing; None if neither a link was found nor the true one is known.
 
-    Place and size are those reported; if the place is unknown, half the largest size at an unknown place.
-    strongest_N: largest force to be shown.
+    It is on the link that was found, else on the true one. Place and size are those reported; without a reported place
+    the size is half the largest, and the place unknown. strongest_N: largest force to be shown.
     """
     link = contact.link if contact.link_detected is None else contact.link_detected
     if link is None:
@@ -371,7 +385,7 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> dict[str, Any]
 
 
 def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
-    """Return label, number and unit of each figure on the first screen, without unknown ones."""
+    """Return label, number and unit of each figure on the first screen. Unknown figures are left out."""
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]
     times_s = [number_text(value, 2) for value in metrics.adaptation_s.values()]

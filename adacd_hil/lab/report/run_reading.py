@@ -88,7 +88,7 @@ Bounds = tuple[int, int]
 
 
 class ReadRun(NamedTuple):
-    """A run with the cycles that are drawn, the sums over all of its cycles, and its log."""
+    """A run with the cycles that are drawn, the sums over all of its cycles, and facts on its log."""
 
     run: Run
     gathered: RunGatherer
@@ -104,10 +104,9 @@ def read_run(
 ) -> ReadRun:
     """Return the run in a log, or in a stretch of it, with the emulator's truth if there is one.
 
-    Raises LogError, ConfigError.
-
-    The truth of another run is left out, and is a problem of the source. Raises LogError also for a stretch without a
-    cycle. full_cycles: of a log with more, some are kept.
+    The truth of another run is left out, and named as a problem of the source. Raises LogError if a file can't be read,
+    or if the stretch has no cycle; ConfigError for the log's configuration. full_cycles: the run of a log with more
+    cycles has only some of them.
     """
     problem = "" if truth_path is None else foreign_truth(log_path, truth_path)
     truth = None if truth_path is None or problem else read_truth(truth_path)
@@ -132,7 +131,10 @@ def read_run(
 
 
 def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
-    """Return a run without a cycle, with metadata and settings of the log."""
+    """Return a run without a cycle, with metadata, settings and start of the log.
+
+    Metadata of the truth that the log lacks are there as "emulator_<key>".
+    """
     metadata = dict(stream.metadata)
     if DBC_NAME in stream.attachments:
         metadata["dbc_sha256"] = hashlib.sha256(stream.attachments[DBC_NAME]).hexdigest()
@@ -167,7 +169,10 @@ def _read(
     bounds_ns: Bounds | None = None,
     until_ns: int | None = None,
 ) -> None:
-    """Add the pieces of a log to `reading`: all, those within `bounds_ns`, or until `until_ns` is settled."""
+    """Add the pieces of a log to `reading`: all, those within `bounds_ns`, or until it is settled at `until_ns`.
+
+    progress: called with a line on the cycles read.
+    """
     milestones = Milestones(lambda count: progress(f"{stream.path}: {count} cycles read"))
     cycles = 0
     for piece in stream:
@@ -188,7 +193,10 @@ def _read(
 def _with_ending(
     run: Run, gathered: RunGatherer, stream: LogStream, truth: TruthTable | None, truth_problem: str
 ) -> ReadRun:
-    """Return a run with the ending and counts of its log, and the problems of log and truth in the source."""
+    """Return a run with the ending and counts of its log.
+
+    The source has the problems of log and truth, and unjudged alarms.
+    """
     ending = stream.summary.get(ENDING_KEY, "")
     if ending and ending not in PLANNED_ENDINGS:
         run = replace(run, broken_off=one_line(ending))
@@ -203,18 +211,25 @@ def _with_ending(
 
 
 def _count(summary: Mapping[str, str], key: str) -> int | None:
-    """Return a number of the log's summary; None if it is missing (a cut file) or not a number (a damaged one)."""
+    """Return a number of the log's summary.
+
+    None if it is missing, as in a cut file, or no number, as in a damaged one.
+    """
     text = summary.get(key, "")
     return int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
 
 
 class RunReading:
-    """Makes a run of the pieces of a log, front to back: `sums` over all cycles, and the cycles that are kept."""
+    """Makes a run of the pieces of a log, front to back.
+
+    `sums` are over all cycles; of a long run only some cycles are kept.
+    """
 
     def __init__(self, shell: Run, empty: Mapping[str, Series], truth: TruthTable | None, full_cycles: int) -> None:
-        """`shell`: a run with empty arrays: settings, metadata, and a truth on the host's cycles if there is one.
+        """`shell`: a run with empty arrays, but settings, metadata, and a truth on the host's cycles if there is one.
 
-        truth: rows whose cycle of the host is still to be found.
+        empty: for each topic a series without records, which shows its fields. truth: rows whose host cycle is still to
+        be found; None: the shell's truth, if any. full_cycles: up to so many all are kept.
         """
         self._shell = shell
         self._truth = truth
@@ -240,7 +255,10 @@ class RunReading:
         self._last_cycle = -1
 
     def add_piece(self, series: Mapping[str, Series], events: list[LoggedEvent]) -> None:
-        """Add the next piece of the log, and sum up the cycles that have settled."""
+        """Add the next piece of the log.
+
+        Sums up and thins cycles once enough of them are older than the settling time.
+        """
         self._reports += [report for _, report in contacts_of(series[CONTACT.name])]
         self._events += events
         self._checks += _checks_of(series[FRAME_CHECKS.name])
@@ -263,7 +281,10 @@ class RunReading:
             self._settle(int(np.searchsorted(self._rows.column("t_ns"), scheme.t_ns[-1] - beyond_ns)))
 
     def _add_facts(self, scheme: Series, cycle: Cycles, state: NDArray[np.uint8]) -> None:
-        """Note the first cycle, motion start, the first request to finish, and the last cycle in a state of `BUSY`."""
+        """Store the first cycle, motion start, the first request to finish, and the last cycle in a state of `BUSY`.
+
+        Facts that the piece lacks stay as they were.
+        """
         if self._first_ns is None:
             self._first_ns = int(scheme.t_ns[0])
         adapting = np.flatnonzero(state == SchemeState.ADAPT)
@@ -277,7 +298,10 @@ class RunReading:
             self._busy_ns = max(self._busy_ns, int(scheme.t_ns[busy[-1]]))
 
     def _edges(self, scheme: Series) -> Rows:
-        """Return the first and last row of a piece, and those beside changes of the state or of the paper's arming."""
+        """Return the first and last row of a piece, and rows around changes of the state or of the paper's arming.
+
+        Rows beyond the piece may be among them.
+        """
         state = scheme.records["state"].astype(np.int64)
         is_armed = np.zeros(len(state), np.bool_)
         if "paper_is_armed" in scheme.fields:
@@ -290,7 +314,10 @@ class RunReading:
         return np.concatenate((ends, changes - 1, changes, changes + 1, switches - 1, switches))
 
     def _onset_rows(self, scheme: Series, cycle: Cycles) -> Rows:
-        """Return the rows of a piece in which true contacts begin, and the rows before them."""
+        """Return the rows of a piece in which true contacts begin, and the rows before them; none without a truth.
+
+        Rows beyond the piece may be among them.
+        """
         if self._clock is not None:
             rows, cycles = self._clock.place_rows(scheme, self._attempts.begins)
             onsets = cycles[self._is_onset[rows]]
@@ -309,15 +336,15 @@ class RunReading:
         return SETTLING_TIME_CONSTANTS / self._rows.run(self._shell, slice(0)).a_rad_s
 
     def is_settled(self, until_ns: int, last_ns: int) -> bool:
-        """Return whether contacts, reactions and adaptations before `until_ns` are over at the last cycle, `last_ns`.
+        """Return whether contacts, reactions and adaptations from before `until_ns` are over at the cycle at `last_ns`.
 
-        They are if the settling time before `last_ns` begins after `until_ns` and has none.
+        They are if the settling time before `last_ns` begins after `until_ns` and has no cycle in a state of `BUSY`.
         """
         before_ns = last_ns - round(self._settling_s * 1e9)
         return before_ns > until_ns and self._busy_ns < before_ns
 
     def outline(self) -> Run:
-        """Return the run so far, with the kept cycles and those not summed up yet."""
+        """Return the run so far with the cycles that are in memory: those kept, and those not summed up yet."""
         zero_ns = next((t_ns for t_ns in (self._zero_ns, self._first_ns) if t_ns is not None), 0)
         run = replace(
             self._rows.run(self._shell),
@@ -333,7 +360,7 @@ class RunReading:
         return replace(run, truth=host_truth(self._truth, self._attempts.begins, self._last_cycle, time_s))
 
     def _settle(self, end: int) -> None:
-        """Sum up the rows before `end`; of a long run, drop those of them that are not drawn."""
+        """Sum up the rows before `end`. Of a long run, drop then those of them that are not drawn."""
         outline = self.outline()
         shell = replace(self._shell, truth=None, motion_start_ns=outline.motion_start_ns)
         self.sums.untouched.add_untouched(self._rows.run(shell, slice(self._settled, end)), outline)
@@ -345,26 +372,29 @@ class RunReading:
         self._settled -= self._rows.thin(first, end, lambda rows: self._curves(shell, rows), around_ns, _NOISE_CYCLES)
 
     def _thin_times(self) -> None:
-        """Of a long run, drop the waiting cycles' rows of /cycle without an extreme value."""
+        """Of a long run, drop the waiting rows of /cycle in which no time is smallest or largest in its bucket."""
         self._waiting = 0
         if self._times.cycles > self._full_cycles:
             self._times.thin(self._thinned, self._times.count, self._time_curves)
             self._thinned = self._times.count
 
     def _time_curves(self, rows: slice) -> Iterator[NDArray[np.float64]]:
-        """Yield the curves of the cycles' times, queues and skipped periods."""
+        """Yield the cycles' times, queues and skipped periods in these rows, a curve (n,) each."""
         for name in (*(quantity.column for quantity in QUANTITIES), *QUEUES.values(), "overruns"):
             if name in self._times.names:
                 yield self._times.column(name)[rows].astype(np.float64)
 
     def _curves(self, shell: Run, rows: slice) -> Iterator[NDArray[np.float64]]:
-        """Yield the curves that the report draws over the whole run."""
+        """Yield the curves (n,) that the report draws over the whole run, in these rows."""
         for panel in panels_of(self._rows.run(shell, rows)):
             for trace in panel.traces:
                 yield trace.values
 
     def finished(self) -> Run:
-        """Sum up the last cycles, so that `sums` has all; return the run with the kept cycles. Call at the end."""
+        """Return the run with the kept cycles; sum up the last ones, so that `sums` has all.
+
+        Call it once, at the end.
+        """
         self._settle(self._rows.count)
         if self._waiting:
             self._thin_times()
@@ -374,7 +404,7 @@ class RunReading:
 
 
 def _around(run: Run) -> list[Bounds]:
-    """Return the times around the first contacts, detections and adaptations, whose cycles are all kept."""
+    """Return spans of time around the first contacts, detections and adaptations, whose cycles are all kept."""
     onsets_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
     found_s = [(detection.t_ns - run.zero_ns) * 1e-9 for detection in find_detections(run)]
     around = [
@@ -390,7 +420,7 @@ _CHECKS: Final = "_checks"
 
 
 def _checks_of(series: Series) -> list[CheckCounts]:
-    """Return the counts of a piece of /frame_checks; [] if it has none."""
+    """Return the counts of a piece of /frame_checks as one element; [] if it has none."""
     devices = tuple(name.removesuffix(_CHECKS) for name in series.fields if name.endswith(_CHECKS))
     if not len(series) or not devices:
         return []
@@ -406,7 +436,7 @@ def _joined(parts: list[CheckCounts]) -> CheckCounts | None:
 
 
 class TruthClock:
-    """Finds the host's time of each row of the truth, as the log is read: between the cycles that it lies between."""
+    """Finds the host's time, `t_ns`, of each row of the truth, as the log is read: interpolated between its cycles."""
 
     def __init__(self, truth: TruthTable) -> None:
         assert truth.rows.attempt is not None
@@ -416,9 +446,9 @@ class TruthClock:
         self._before: tuple[int, int] | None = None  # cycle and time of the last row before the piece
 
     def place_rows(self, scheme: Series, begins: Cycles) -> tuple[Rows, Cycles]:
-        """Place the rows of the truth that fall into a piece of the log; return these rows and their cycles.
+        """Set the times of the truth's rows that fall into a piece of the log; return these rows and their host cycles.
 
-        begins: first cycle of each attempt so far.
+        Each row is returned once. begins: first host cycle of each attempt so far.
         """
         cycle, t_ns = scheme.records["cycle"].astype(np.int64), scheme.t_ns
         pending = self._pending
@@ -450,7 +480,7 @@ class KeptRows:
     """Rows of a topic, gathered piece by piece: only the fields that a report reads, of a long run only some rows.
 
     One block of memory holds them: columns that are gathered apart and joined at the end need the memory twice, and
-    fragment it. `index`: place among all cycles that were read; `is_kept`: never dropped.
+    fragment it. `index`: number of a row among all that were read; `is_kept`: never dropped.
     """
 
     def __init__(self, empty: Series, fields: Sequence[str], most_buckets: int) -> None:
@@ -463,7 +493,7 @@ class KeptRows:
         self._begin(empty)
 
     def _begin(self, scheme: Series) -> None:
-        """Allocate the block of rows, with the fields of `scheme` that a report reads."""
+        """Allocate the block of rows with those of the wanted fields that `scheme` has; rows so far are lost."""
         names = [name for name in self._fields if name in scheme.fields]
         own = [("t_ns", np.dtype(np.int64)), ("index", np.dtype(np.int64)), ("is_kept", np.dtype(np.bool_))]
         fields = [*own, *((name, scheme.records.dtype[name]) for name in names)]
@@ -471,7 +501,7 @@ class KeptRows:
         self._rows = np.empty(_ROOM, np.dtype(fields, align=True))
 
     def add_records(self, scheme: Series, kept: Rows | list[int]) -> None:
-        """Add the records of a piece of the topic. kept: its rows that are never dropped."""
+        """Append the records of a piece of the topic. kept: numbers of its rows that are never dropped."""
         if self.count == 0:
             self._begin(scheme)  # only a record shows the fields of a log
         end = self.count + len(scheme)
@@ -490,7 +520,7 @@ class KeptRows:
         self.cycles += len(scheme)
 
     def column(self, name: str) -> NDArray[Any]:
-        """Return a column (n,)."""
+        """Return a column (n,), as a view that the next piece or `thin` makes invalid."""
         return self._rows[name][: self.count]
 
     def thin(
@@ -503,9 +533,9 @@ class KeptRows:
     ) -> int:
         """Drop the rows from `first` to before `end` in which no curve is smallest or largest in its bucket.
 
-        If the buckets have to grow, rows before `first` are dropped likewise. curves: of some rows. Rows within
-        `around_ns`, first and last ns each, are never dropped; in every `_NOISE_BUCKETS`-th bucket the first
-        `noise_cycles` are left, too. Return the number of dropped rows.
+        Buckets double once there are more than `most_buckets`; then rows before `first` are thinned, too. curves:
+        returns curves of some rows. Rows within `around_ns`, first and last ns each, are never dropped; in every
+        `_NOISE_BUCKETS`-th bucket the first `noise_cycles` are left, too. Return the number of dropped rows.
         """
         while self.cycles > self._most_buckets * self.bucket:
             first, self.bucket = 0, 2 * self.bucket
@@ -527,7 +557,10 @@ class KeptRows:
 
 
 def _arrays(columns: dict[str, NDArray[Any]], settings: Settings) -> dict[str, Any]:
-    """Return the fields of `Run` from columns of /scheme."""
+    """Return those fields of `Run`, by name, that come from columns of /scheme.
+
+    Fields of schemes that the log lacks are left out.
+    """
     arrays: dict[str, Any] = {name: columns[name] for name in _PLAIN}
     arrays |= {"cycle": columns["cycle"].astype(np.int64), "t_ns": columns["t_ns"]}
     arrays["motion"] = MeasuredMotion(*(columns[name] for name in _MOTION))
@@ -550,10 +583,12 @@ def _arrays(columns: dict[str, NDArray[Any]], settings: Settings) -> dict[str, A
 
 
 def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[Run, Bounds]:
-    """Extend a stretch so that it cuts no contact and no adaptation; return `shell` for reading it, and its bounds.
+    """Widen a stretch so that it cuts no contact, reaction or adaptation.
 
-    run: has the cycles in which contacts and adaptations begin or end. start_ns: beginning of the log. The returned
-    run has motion start, truth and stretch.
+    Return `shell` for reading it, and its bounds, ns.
+
+    run: has the cycles in which contacts and adaptations begin or end. start_ns: beginning of the log. The returned run
+    has motion start, truth and stretch.
     """
     zero_ns = run.zero_ns
     first_s, last_s = ((bound_ns - zero_ns) * 1e-9 for bound_ns in stretch.bounds_ns(start_ns))
@@ -581,7 +616,10 @@ def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[
 
 
 def _busy(run: Run) -> Iterator[tuple[float, float]]:
-    """Yield start and end of each true contact and each stretch in a state of `BUSY`, margins included, s."""
+    """Yield start and end, s since motion start, of each true contact and each time in a state of `BUSY`.
+
+    A margin before and the settling time after are included.
+    """
     time_s, later_s = run.time_s(), SETTLING_TIME_CONSTANTS / run.a_rad_s
     is_busy: Mask = np.concatenate(([False], np.isin(run.state, BUSY), [False]))
     edges = np.flatnonzero(is_busy[1:] != is_busy[:-1])

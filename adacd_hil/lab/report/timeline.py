@@ -40,7 +40,7 @@ _MOST_NOTICES: Final = 300
 
 
 class Stay(NamedTuple):
-    """A stretch in one state, s."""
+    """A span of time in one state, s since motion start."""
 
     state: SchemeState
     start_s: float
@@ -48,7 +48,10 @@ class Stay(NamedTuple):
 
 
 class Notice(NamedTuple):
-    """Something that went wrong, or nearly: a warning or an error of the log, a fault, a false alarm."""
+    """A warning or error of the log, a fault or a false alarm, `at_s` s after motion start.
+
+    is_bad: all but a warning.
+    """
 
     at_s: float
     is_bad: bool
@@ -56,7 +59,10 @@ class Notice(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """A mark on a lane: the stretch that it stands for, its words, its place, its colour or class, its label."""
+    """A mark on a lane: the time that it stands for, s since motion start, its words, its place on the drawing.
+
+    look: its colour or class. label: text on it, "" for none.
+    """
 
     from_s: float
     to_s: float
@@ -68,7 +74,7 @@ class Mark(NamedTuple):
 
 
 def stays_of(run: Run) -> list[Stay]:
-    """Return the stretches of a run in one state each, in order of time."""
+    """Return the spans of a run in one state each, in order of time; [] for a run without cycles."""
     if run.state.size == 0:
         return []
     edges = np.flatnonzero(run.state[1:] != run.state[:-1]) + 1
@@ -82,7 +88,10 @@ def stays_of(run: Run) -> list[Stay]:
 
 
 def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
-    """Return warnings, errors, faults and false alarms by time; of too many, warnings are left out first."""
+    """Return warnings, errors, faults and false alarms in order of time.
+
+    Of more than 300, warnings are left out first.
+    """
     notices = [
         Notice((t_ns - run.zero_ns) * 1e-9, event.level == "error", f"{event.name}: {event.message}")
         for t_ns, event in run.events
@@ -99,7 +108,7 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
 
 
 def certificates_of(run: Run) -> list[tuple[float, bool, list[str]]]:
-    """Return, for each certificate given or taken back: time, s, whether it was taken back, and its clauses."""
+    """Return, per certificate given or taken back: s since motion start, whether it was taken back, its clauses."""
     return [
         ((t_ns - run.zero_ns) * 1e-9, event.name == "revoked", event.message.split("; "))
         for t_ns, event in run.events
@@ -108,7 +117,7 @@ def certificates_of(run: Run) -> list[tuple[float, bool, list[str]]]:
 
 
 def state_key(run: Run) -> list[tuple[str, str]]:
-    """Return colour and name of each coloured state that the run has been in, as a key to the timeline."""
+    """Return (colour, name) of each coloured state that the run has been in, as a key to the timeline."""
     there = {stay.state for stay in stays_of(run)}
     return [(colour, STATE_WORDS[state]) for state, colour in STATE_COLOURS.items() if state in there]
 
@@ -116,7 +125,8 @@ def state_key(run: Run) -> list[tuple[str, str]]:
 def timeline_of(run: Run, metrics: Metrics) -> dict[str, Any] | None:
     """Return the timeline of a run, for its template, with the marks of each lane; None for a run without cycles.
 
-    ticks: place and label; is_thinned: stays narrower than a mark are drawn together.
+    left, width: of the lanes; ticks: place and label; is_thinned: whether there are so many stays or contacts that
+    narrow neighbours share a mark.
     """
     if run.state.size == 0:
         return None
@@ -138,14 +148,17 @@ _Scale = tuple[float, float]
 
 
 def _x(scale: _Scale, time_s: float) -> float:
-    """Return the place of a time on the drawing; of one outside, the nearer edge."""
+    """Return the abscissa of a time on the drawing; the nearer edge for a time outside."""
     start_s, end_s = scale
     share = (time_s - start_s) / (end_s - start_s)
     return _LEFT + min(max(share, 0.0), 1.0) * (_RIGHT - _LEFT)
 
 
 def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[list[Stay]]:
-    """Yield the stays in groups, one mark each; of more than MARKS stays, narrow neighbours form a group."""
+    """Yield the stays in groups, one mark each.
+
+    Of more than MARKS stays, neighbours narrower than a mark form a group.
+    """
     group: list[Stay] = []
     for stay in stays:
         is_narrow = len(stays) > MARKS and _x(scale, stay.end_s) - _x(scale, stay.start_s) < _NARROWEST
@@ -161,7 +174,7 @@ def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[list[Stay]]:
 
 
 def _rank(stay: Stay) -> int:
-    """Return the rank of a stay's state: of stays drawn as one, the highest gives the colour."""
+    """Return the rank of a stay's state: of stays that share a mark, the highest gives the colour."""
     order = list(STATE_COLOURS)
     return 1 + order.index(stay.state) if stay.state in order else 0
 
@@ -235,7 +248,10 @@ def _ticks(scale: _Scale) -> Iterator[tuple[float, str]]:
 
 
 def traces_of(run: Run, metrics: Metrics) -> Traces | None:
-    """Return the curves of a run, packed, with states, contacts and bad notices; None with fewer than two cycles."""
+    """Return the curves of a run, packed for the page's script, with states, contacts and bad notices.
+
+    None with fewer than two cycles.
+    """
     if run.cycle.size < 2:
         return None
     marks = {

@@ -49,7 +49,10 @@ _BANK_COLOURS: Final = ("identified", "cad", "joint1", "beside", "joint2")
 
 
 class Trace(NamedTuple):
-    """One curve (n,). colour: a variable of the page. is_dashed: a bound. is_mirrored: drawn at ± the values."""
+    """One curve (n,), a value per sample of its track. finest: smallest step to which it may be rounded.
+
+    colour: a variable of the page. is_dashed: drawn as a bound. is_mirrored: drawn at + and - the values.
+    """
 
     label: str
     values: Vector
@@ -60,7 +63,10 @@ class Trace(NamedTuple):
 
 
 class TracePanel(NamedTuple):
-    """Curves on one ordinate. levels: values with a line of their own; near: half the range near zero, if any."""
+    """Curves on one ordinate. levels: values with a horizontal line of their own.
+
+    near: half the ordinate's range when it shows the values near zero; None: no such range.
+    """
 
     name: str
     title: str
@@ -71,7 +77,10 @@ class TracePanel(NamedTuple):
 
 
 class Track(NamedTuple):
-    """Panels over one abscissa, s (n,). is_next (n,): samples that follow the one before at once; None: all do."""
+    """Panels over one abscissa, `at_s` (n,), s.
+
+    is_next (n,): samples that follow the one before without a gap; None: all do.
+    """
 
     name: str
     at_s: Vector
@@ -80,7 +89,7 @@ class Track(NamedTuple):
 
 
 def panels_of(run: Run) -> tuple[TracePanel, ...]:
-    """Return the panels of a run's curves, without those for which it has no data."""
+    """Return the panels of a run's curves over /scheme; those for which the run has no data are left out."""
     return (*_residuals(run), *_motion(run), *_channels(run), *_parameters(run))
 
 
@@ -98,7 +107,7 @@ def _motion(run: Run) -> Iterator[TracePanel]:
 
 
 def _residuals(run: Run) -> Iterator[TracePanel]:
-    """Yield a panel per joint: the residual of every model, with its threshold and the true external torque."""
+    """Yield a panel per joint: the residual of each model with its threshold, and the true external torque if known."""
     finest = FINEST["Nm"]
     ours = "identified" if run.certified is None else "certified"
     for joint in range(JOINTS):
@@ -122,7 +131,7 @@ def _residuals(run: Run) -> Iterator[TracePanel]:
 
 
 def _true_torque(run: Run) -> Vector:
-    """Return the true external torque in each cycle (n, 2); zero where the truth has no contact."""
+    """Return the true external torque in each cycle, Nm (n, 2); zero in cycles that the truth doesn't have."""
     assert run.truth is not None
     torque = np.zeros((run.cycle.size, JOINTS))
     if run.truth.cycle.size:
@@ -133,7 +142,7 @@ def _true_torque(run: Run) -> Vector:
 
 
 def _in_view(threshold: Vector, residual: Vector) -> Vector:
-    """Return a threshold (n,) with NaN where it is above all residuals and three times its smallest value."""
+    """Return a threshold (n,) with NaN where it exceeds both the largest residual and three times its own minimum."""
     largest = float(np.max(np.abs(residual[np.isfinite(residual)]), initial=0.0))
     finite = threshold[np.isfinite(threshold)]
     ceiling = max(largest, _NEAR * float(finite.min())) if finite.size else 0.0
@@ -141,7 +150,10 @@ def _in_view(threshold: Vector, residual: Vector) -> Vector:
 
 
 def _channels(run: Run) -> Iterator[TracePanel]:
-    """Yield panels of the bank's channels per joint, and of the largest ratio of a channel to its threshold."""
+    """Yield a panel per joint of the bank's channels, and one of the largest ratio of residual to threshold.
+
+    Yield none for a run that was not certified.
+    """
     stream = run.certified
     if stream is None:
         return
@@ -161,7 +173,7 @@ def _channels(run: Run) -> Iterator[TracePanel]:
 
 
 def _shares(stream: CertifiedStream) -> Vector:
-    """Return |residual| / threshold (n, 2), the largest of all channels in each cycle."""
+    """Return |residual| / threshold (n, 2): in each cycle the largest of all channels."""
     shares = np.zeros((len(stream.tau_ext), JOINTS))
     for channel in range(stream.tau_ext.shape[1]):
         with np.errstate(over="ignore"):  # a damaged log's threshold near 0
@@ -170,7 +182,7 @@ def _shares(stream: CertifiedStream) -> Vector:
 
 
 def _parameters(run: Run) -> Iterator[TracePanel]:
-    """Yield the estimates theta_hat, a panel per unit."""
+    """Yield the estimates theta_hat, a panel per unit, with the true values if known."""
     names = run.parameter_names
     for unit in dict.fromkeys(PARAMETER_UNITS[name] for name in names):
         chosen = [name for name in names if PARAMETER_UNITS[name] == unit]
@@ -185,7 +197,10 @@ def _parameters(run: Run) -> Iterator[TracePanel]:
 
 
 def _true_parameter(run: Run, name: str) -> Vector | None:
-    """Return a parameter's true value in each cycle (n,); None if it is unknown."""
+    """Return a parameter's true value in each cycle (n,).
+
+    None without a truth, or if the truth hasn't the parameter.
+    """
     truth = run.truth
     if truth is None or name not in PARAMETER_NAMES:
         return None
@@ -200,7 +215,7 @@ _TIMES: Final = ((LATENESS, "identified"), (COMPUTE, "joint1"), (SYNC_TO_COMMAND
 
 
 def timing_track(columns: CycleColumns, period_us: float, zero_ns: int, has_grid: bool) -> Track:
-    """Return a track of the cycles' times, queues and skipped periods over the time since `zero_ns`.
+    """Return a track of the cycles' times, queues and skipped periods, as far as logged, over s since `zero_ns`.
 
     has_grid: False in lockstep, where lateness and queues are left out.
     """
@@ -227,7 +242,7 @@ def timing_track(columns: CycleColumns, period_us: float, zero_ns: int, has_grid
 
 
 def run_tracks(run: Run) -> list[Track]:
-    """Return the tracks of a run's curves: of the cycles in /scheme, and of those in /cycle."""
+    """Return the two tracks of a run's curves: over the cycles of /scheme, and over those of /cycle."""
     is_next = None if run.bucket == 1 else np.diff(run.cycle, prepend=run.cycle[:1] - 2) == 1
     timing = timing_track(run.timing, run.settings.bus.period_us, run.zero_ns, is_realtime(run))
     return [Track("scheme", run.time_s(), panels_of(run), is_next), timing]
@@ -239,9 +254,9 @@ _LARGEST_CODE: Final = 2**30
 
 
 def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = None) -> float:
-    """Return the step to round a series to: half the deviation of its white noise, but at least `finest`.
+    """Return the step to which a series (n,) is rounded: half the rms of its white noise, but at least `finest`.
 
-    is_next (n,): samples that follow the one before at once; None: all do.
+    is_next (n,): samples that follow the one before without a gap; None: all do.
     """
     is_finite = np.isfinite(values)
     parts = [values[is_finite]]
@@ -251,9 +266,9 @@ def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = N
 
 
 def pack(values: Vector, step: float) -> tuple[str, dict[str, Any]]:
-    """Return a series (n,) as text, rounded to `step`, or coarser if its range has more than 2^30 steps.
+    """Return a series (n,) as base64 text, rounded to `step`, or coarser if its range has more than 2^30 steps.
 
-    Return with it, for the page's script, low and step in the series' unit; order: how often it was differenced;
+    Return with it a table for the page's script: low and step in the series' unit; order: how often it was differenced;
     planes: bytes per number.
     """
     is_finite = np.isfinite(values)
@@ -281,7 +296,7 @@ _TIME_STEP_S: Final = 1e-5
 
 
 class Traces(NamedTuple):
-    """The curves of a page: panels by track, the series as text by name, and the script's plan."""
+    """The curves of a page: panels by their track's name, packed series by name, and the plan for the page's script."""
 
     panels: dict[str, tuple[TracePanel, ...]]
     blocks: dict[str, str]
@@ -293,8 +308,8 @@ def pack_tracks(
 ) -> Traces | None:
     """Return the curves of a page, packed for its script; None if no track has two samples and a panel.
 
-    period_s: eight of it are the shortest part that is shown. marks: bands, contacts and faults of the run. is_dated:
-    the abscissa is the time since 1970.
+    period_s: the script can't zoom in below eight periods. marks: bands, contacts and faults of the run. is_dated: the
+    abscissa is the time since 1970.
     """
     tracks = [track for track in tracks if track.at_s.size > 1 and track.panels]
     if not tracks:
@@ -330,6 +345,9 @@ def pack_tracks(
 
 
 def _packed(blocks: dict[str, str], name: str, values: Vector, step: float) -> dict[str, Any]:
-    """Add a series, packed, to `blocks` under a name; return the name and the form by which the script reads it."""
+    """Pack a series into `blocks` under a name.
+
+    Return a table with the name as "id" and the form that the script needs.
+    """
     blocks[name], form = pack(values, step)
     return {"id": name, **form}

@@ -34,10 +34,10 @@ Contact = tuple[float, ContactReport]
 
 
 class RunReader:
-    """One of the logs: iterate once for its rows of /scheme; its figures are complete then.
+    """One of the compared logs. Iterate once for its records of /scheme; then its figures are complete.
 
-    zero_cycle, zero_ns: of motion start. states: entered, s since then; parameters: at each beginning of MONITOR, else
-    at the end.
+    zero_cycle, zero_ns: of motion start. states: (s since motion start, name) of each entered one. parameters: by name,
+    theta_hat at each entry of MONITOR, else at the end. problem: known after the iteration.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,18 +54,21 @@ class RunReader:
         self._bounds: tuple[int, int] | None = None
 
     def only(self, first: int, end: int) -> None:
-        """Limit the reading to the cycles from `first` to before `end`, counted since motion start."""
+        """Limit the reading to the cycles from `first` to before `end`, counted since motion start.
+
+        Call it before the iteration.
+        """
         self._bounds = first + self.zero_cycle, end + self.zero_cycle
 
     def _wanted(self, series: Series) -> Series:
-        """Return the records within the limits set by `only`; all without limits or a field `cycle`."""
+        """Return the records in the cycles set by `only`; all records without limits or without a field `cycle`."""
         if self._bounds is None or "cycle" not in series.fields:
             return series
         cycle = series.records["cycle"].astype(np.int64)
         return series.part((cycle >= self._bounds[0]) & (cycle < self._bounds[1]))
 
     def _is_over(self, series: Series) -> bool:
-        """Return whether the records begin after the last cycle set by `only`; False without limits."""
+        """Return whether the records begin after the cycles set by `only`; False without limits or records."""
         return self._bounds is not None and bool(len(series)) and int(series.records["cycle"][0]) >= self._bounds[1]
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
@@ -100,17 +103,17 @@ class RunReader:
 
     @property
     def problem(self) -> str:
-        """The parts of the log that are missing, one line."""
+        """One line on the missing parts of the log; "" if it is whole."""
         return self._stream.problem
 
     @property
     def contacts(self) -> list[Contact]:
-        """The contacts, by time."""
+        """The contacts by the time of their detection, s since motion start, each once with its last report."""
         return sorted(self._contacts, key=lambda contact: contact[0])
 
     @property
     def timing_us(self) -> dict[str, dict[str, float]]:
-        """Percentiles of the times of its cycles."""
+        """Percentiles, µs, of the cycles' times by name ("lateness", …); of slack the low ones."""
         return {
             name.removesuffix("_ns"): times.low_percentiles() if name == "slack_ns" else times.percentiles()
             for name, times in self._times.items()
@@ -118,7 +121,7 @@ class RunReader:
 
 
 def _reports(contacts: Series) -> Iterator[ContactReport]:
-    """Yield the records of /contact as reports, with the log's numbers for enums."""
+    """Yield the records of /contact as reports; enums stay numbers, and fields that the log lacks have defaults."""
     there = [name for name in ContactReport._fields if name in contacts.fields]
     for record in contacts.records:
         yield ContactReport(**{name: record[name].tolist() for name in there})
@@ -129,7 +132,10 @@ def _name_of(state: int) -> str:
 
 
 def _motion_start(path: Path) -> tuple[int, int]:
-    """Return cycle and time of the first ADAPT, else of the first cycle. Raises LogError."""
+    """Return cycle and time, ns, of the first cycle in ADAPT, else of the first cycle.
+
+    Raises LogError if the log has no /scheme or can't be read.
+    """
     first: tuple[int, int] | None = None
     for piece in LogStream(path, (SCHEME.name,)):
         scheme = piece.series[SCHEME.name]
@@ -151,9 +157,10 @@ MATCH_S: Final = 0.5
 
 
 class FieldDifference(NamedTuple):
-    """A field of /scheme that differs: first where, s since motion start, in how many cycles, and by how much at most.
+    """A field of /scheme that differs between two logs. cycles: in how many it differs.
 
-    largest: 0.0 for values that are named, infinite where one is not a number and the other is.
+    first_cycle: of the first log; first_s: s since motion start. largest: difference; 0.0 for integers, inf where one
+    value is NaN and the other isn't.
     """
 
     field: str
@@ -169,11 +176,11 @@ ContactPair = tuple[Contact | None, Contact | None]
 
 @dataclass(frozen=True)
 class LogComparison:
-    """How two runs differ. settings, metadata: both values of each key that differs. cycles: number of compared ones.
+    """How two runs differ.
 
-    only: numbers of cycles that are in the first, and in the second log alone.
-
-    stretch: of the first log, to which all but settings and metadata is limited.
+    settings, metadata: both values of each key that differs. cycles: number of compared ones. only: numbers of cycles
+    that just the first, and just the second log has. stretch: of the first log, to which all but settings and metadata
+    is limited.
     """
 
     first: RunReader
@@ -189,12 +196,12 @@ class LogComparison:
 
     @property
     def is_same(self) -> bool:
-        """Whether both runs decided the same in the same cycles."""
+        """Whether no field differs and no cycle is in one log only."""
         return not self.fields and self.only == (0, 0)
 
     @property
     def is_same_where_whole(self) -> bool:
-        """Whether cycles were compared, all of them the same, and none is missing but in a damaged log."""
+        """Whether cycles were compared, no field differs, and only a damaged log lacks cycles of the other."""
         damages = self.second.problem, self.first.problem
         lacks = any(count and not damage for count, damage in zip(self.only, damages, strict=True))
         return self.cycles > 0 and not self.fields and not lacks
@@ -234,7 +241,10 @@ def _contact_json(contact: Contact | None) -> dict[str, Any] | None:
 
 
 class _Differences:
-    """Counts differences, field by field."""
+    """Counts the differences of two logs, field by field.
+
+    found: by field. missing: fields that one log lacks, or that differ in size.
+    """
 
     def __init__(self, period_s: float, zero_cycle: int) -> None:
         self.found: dict[str, FieldDifference] = {}
@@ -243,7 +253,7 @@ class _Differences:
         self._zero_cycle = zero_cycle
 
     def take(self, first: NDArray[Any], second: NDArray[Any], since: NDArray[np.int64]) -> None:
-        """Add the differences between the two logs' rows of the same cycles; since (n,): cycles since motion start."""
+        """Compare records of the same cycles and count the differences; since (n,): cycles since motion start."""
         names, others = _fields(first), _fields(second)
         self.missing |= set(names) ^ set(others)
         for name in names:
@@ -251,7 +261,7 @@ class _Differences:
                 self._compare(name, first[name], second[name], since)
 
     def _compare(self, name: str, first: NDArray[Any], second: NDArray[Any], since: NDArray[np.int64]) -> None:
-        """Add the differences of one field to `found`; the field to `missing` if its sizes differ. NaN equals NaN."""
+        """Count the differences of one field in `found`; add it to `missing` if its sizes differ. NaN equals NaN."""
         if first.shape != second.shape:
             self.missing.add(name)
             return
@@ -282,10 +292,11 @@ def _fields(records: NDArray[Any]) -> list[str]:
 def compare_logs(
     first: Path, second: Path, progress: Progress = lambda _: None, stretch: TimeWindow = WHOLE
 ) -> LogComparison:
-    """Compare two logs. Raises LogError, ConfigError.
+    """Compare two logs.
 
-    stretch: of the first log; the second is read over the same time after its own motion start. Raises LogError also
-    when one of the logs has no cycle in it.
+    stretch: of the first log; the second is read over the same time after its own motion start. progress: called with a
+    line on the cycles compared. Raises LogError if a log can't be read or has no cycle in the stretch, ConfigError for
+    a log's configuration.
     """
     readers = RunReader(first), RunReader(second)
     period_s = readers[0].settings.bus.period_s
@@ -322,7 +333,10 @@ def compare_logs(
 def _walk_together(
     readers: tuple[RunReader, RunReader], differences: _Differences, progress: Progress
 ) -> tuple[int, tuple[int, int]]:
-    """Compare the cycles that both logs have; return their number, and the numbers of cycles that only one log has."""
+    """Compare the cycles that both logs have, by cycles since motion start.
+
+    Return their number, and the numbers of cycles that only the first, and only the second log has.
+    """
     streams = iter(readers[0]), iter(readers[1])
     first, second = (_next_rows(stream) for stream in streams)
     common = 0
@@ -352,9 +366,9 @@ def _next_rows(stream: Iterator[NDArray[Any]]) -> NDArray[Any] | None:
 
 
 def match_contacts(first: list[Contact], second: list[Contact]) -> list[ContactPair]:
-    """Return pairs of contacts of two runs, in order of time, None in place of a missing partner.
+    """Return pairs of contacts of two runs, in order of time; None in place of a missing partner.
 
-    Matches detections within MATCH_S of each other, the nearest ones first.
+    Contacts are partners if their detections are within MATCH_S of each other; the nearest ones are matched first.
     """
     order = sorted(range(len(second)), key=lambda k: second[k][0])
     times_s = [second[k][0] for k in order]

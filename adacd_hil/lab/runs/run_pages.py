@@ -26,7 +26,10 @@ _SHOWN: Final = 60
 
 
 class ListedRun(NamedTuple):
-    """A run of the list. report: None without one; problem: reason why the log can't be reported, else ""."""
+    """A run of the list.
+
+    report: path of its page; None without one. problem: reason why the log can't be reported, "" if it can.
+    """
 
     run: RunSummary
     report: Path | None
@@ -34,12 +37,12 @@ class ListedRun(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """The verdict, in a line."""
+        """One line: the run's verdict, or why the log can't be reported."""
         return f"The log can't be reported: {self.problem}" if self.problem else self.run.verdict
 
 
 def runs_page(folder: Path, listed: Sequence[ListedRun]) -> str:
-    """Return the page with the list of runs; links to the reports are relative to `folder`."""
+    """Return the HTML of the list of runs; links to the reports are relative to `folder`."""
     runs = [each.run for each in listed]
     count = count_text(runs)
     return render_page(
@@ -55,12 +58,12 @@ def runs_page(folder: Path, listed: Sequence[ListedRun]) -> str:
 
 
 def _place(folder: Path, report: Path | None) -> str:
-    """Return the link to a report, relative to a folder, quoted; "" without a report."""
+    """Return the link to a report, relative to a folder, percent-encoded; "" without a report."""
     return "" if report is None else quote(Path(os.path.relpath(report, folder)).as_posix())
 
 
 def trend_page(found: Sequence[Trend]) -> str:
-    """Return the page with the trends, a section for each arm."""
+    """Return the HTML of the trends, a section for each arm."""
     sections = [
         (trend, f"trend{number}", _changes_table(trend), _runs_table(trend)) for number, trend in enumerate(found)
     ]
@@ -79,7 +82,10 @@ def trend_page(found: Sequence[Trend]) -> str:
 
 
 def _track_of(trend: Trend, name: str) -> Track:
-    """Return a track with the curves of thresholds, friction, offsets and margins over the dates of the runs."""
+    """Return a track with the curves of thresholds, friction, offsets and margins over the dates of the runs.
+
+    Runs without a date are left out; dashed curves are two deviations apart from a value.
+    """
     dated = [row for row, run in enumerate(trend.runs) if run.started is not None]
     at_s = [run.started.timestamp() for run in trend.runs if run.started is not None]
     panels = []

@@ -49,7 +49,10 @@ Pair = tuple[float, float]
 
 
 class CertificateState(NamedTuple):
-    """The last of `given` certificates of a run: its state, of CERTIFICATES, and when, s since motion start."""
+    """The last certificate of a run: its state, of CERTIFICATES, and when it got it, s since motion start.
+
+    given: number of certificates of the run.
+    """
 
     state: str
     at_s: float | None
@@ -62,9 +65,9 @@ class RunSummary:
 
     name: of its folder, from the folder that was looked through. started: local time, by `started_by`: "log" where the
     log has the date, "folder" where its name has, else "file". status: of STATUSES; verdict: the reason in a sentence.
-    expected: contacts that there were while detection was armed, None on a real arm; found: the detected ones, or all
-    detections if the run isn't judged. margin: smallest threshold over residual. duration_s: from the log's first
-    message to its last.
+    expected: contacts that there were while detection was armed, None on a real arm; found: the detected ones of those,
+    or all detections if the run isn't judged. margin: smallest threshold over residual. duration_s: from the log's
+    first message to its last.
     """
 
     name: str
@@ -94,20 +97,25 @@ class RunSummary:
 
     @property
     def is_clean(self) -> bool:
-        """Whether the run was good and its log is whole."""
+        """Whether the status is GOOD: the run was judged good and its log is whole.
+
+        False also while it is not judged.
+        """
         return self.status == GOOD
 
     @property
     def is_judged(self) -> bool:
-        """Whether the figures are the judge's."""
+        """Whether the status is GOOD or NOT_GOOD: the figures are those of a report."""
         return self.status in (GOOD, NOT_GOOD)
 
 
 def find_runs(folder: Path) -> Iterator[Path]:
-    """Yield the folders of runs in a folder, by name; only the folder itself if it is a run. Ignores links.
+    """Yield the folders of runs in a folder and up to DEEPEST levels below, by name.
 
-    A folder whose log lacks its first part is also a run. A folder that can't be read is given as a run, so that the
-    list names it.
+    Only the folder itself if it is a run.
+
+    Links are ignored. A folder whose log lacks its first part is also a run. A folder that can't be read is yielded, so
+    that the list names it.
     """
     if _has_run(folder, [entry.name for entry in folder.iterdir()] if folder.is_dir() else []):
         yield folder
@@ -124,16 +132,17 @@ def find_runs(folder: Path) -> Iterator[Path]:
 
 
 def _has_run(folder: Path, names: Sequence[str]) -> bool:
-    """Return whether a folder has the log of a run, or later parts of one. names: of its files."""
+    """Return whether a folder has the log of a run, or later parts of one. names: those of its files."""
     return LOG_NAME in names or (
         any(re.fullmatch(r"run_\d{3,5}\.mcap", name) for name in names) and bool(parts_of(folder / LOG_NAME))
     )
 
 
 def summarise(folder: Path, name: str = "") -> RunSummary:
-    """Return the summary of the run in a folder, from its report if it has one, else from its log's events.
+    """Return the summary of the run in a folder, by its report if there is one that fits, else by its log's events.
 
-    name: of the run in the list; "": the folder's. Never raises: status BROKEN or RUNNING tells of problems.
+    name: of the run in the list; "": the folder's. Does not raise: a log that can't be read gives the status BROKEN,
+    one that is being written RUNNING.
     """
     log = folder / LOG_NAME
     started, started_by = _started(log)
@@ -157,7 +166,7 @@ def summarise(folder: Path, name: str = "") -> RunSummary:
 
 
 def _figured(headed: RunSummary, info: LogInfo) -> RunSummary:
-    """Return the summary with the figures of the run's report, or else of the log's events."""
+    """Return the summary with the figures of the run's report; if none can be used, with those of the log's events."""
     try:
         table = _report_of(headed.log.parent, info)
         return _unjudged(headed, "") if table is None else _with_report(headed, table)
@@ -170,7 +179,7 @@ def _figured(headed: RunSummary, info: LogInfo) -> RunSummary:
 def judged(summary: RunSummary) -> RunSummary:
     """Return the summary with the judge's figures: reads the whole log, and the emulator's truth if there is one.
 
-    Returns summaries of another status than NOT_JUDGED unchanged; a log that can't be judged gets BROKEN.
+    Summaries of another status than NOT_JUDGED are returned unchanged; a log that can't be judged gets BROKEN.
     """
     from adacd_hil.lab.report.report_json import report_json
     from adacd_hil.lab.report.run_reading import read_run  # it compiles
@@ -187,7 +196,10 @@ def judged(summary: RunSummary) -> RunSummary:
 
 
 def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:
-    """Return the summary of a run with the figures of a report, even one of a stretch. table: as in report.json."""
+    """Return the summary of the run in `folder` with the figures of a report, even one of a stretch.
+
+    BROKEN without a log. table: as in report.json. name: of the run in the list.
+    """
     log = folder / LOG_NAME
     empty = RunSummary(name, log, BROKEN, "")
     try:
@@ -197,7 +209,7 @@ def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:
 
 
 def _settings(log: Path) -> Settings | None:
-    """Return the settings in a log; None if it has none, or those of another version."""
+    """Return the settings in a log; None if it has none, or those of another version that can't be read."""
     text = attachment(log, CONFIG_NAME)
     try:
         return None if text is None else settings_of(log, {CONFIG_NAME: text})
@@ -206,7 +218,7 @@ def _settings(log: Path) -> Settings | None:
 
 
 def _headed(summary: RunSummary, info: LogInfo, settings: Settings | None) -> RunSummary:
-    """Return the summary with the data of a log's metadata and settings: date, arm, duration and such."""
+    """Return the summary with the data of a log's metadata and settings, such as date, arm and duration."""
     said = info.metadata
     config, profile = said.get("config", ""), said.get("profile", "")
     started, started_by = _started(summary.log, info.start_ns if info.metadata.get(EPOCH_KEY, "0") != "0" else 0)
@@ -228,7 +240,7 @@ def _headed(summary: RunSummary, info: LogInfo, settings: Settings | None) -> Ru
 def _started(log: Path, start_ns: int = 0) -> tuple[datetime | None, str]:
     """Return when a run began, local time, and the source: "log", "folder" (its name) or "file"; (None, "") if unknown.
 
-    start_ns: by the log; 0 in lockstep, which has no date.
+    start_ns: the log's first time, since 1970; 0 if it has no date, as in lockstep.
     """
     try:
         if start_ns:
@@ -244,7 +256,10 @@ def _started(log: Path, start_ns: int = 0) -> tuple[datetime | None, str]:
 
 
 def _report_of(folder: Path, info: LogInfo) -> dict[str, Any] | None:
-    """Return report.json if it is of the whole log; None without one. Raises LogError with the reason if it isn't."""
+    """Return report.json of a run; None without one.
+
+    Raises LogError if it is damaged, or of a stretch, another log or another layout.
+    """
     path = folder / JSON_NAME
     if not path.exists():
         return None
@@ -271,9 +286,9 @@ def _damage(error: BaseException) -> str:
 
 
 def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
-    """Return the summary as NOT_JUDGED, with contacts and certificate of the log's events; BROKEN for a damaged log.
+    """Return the summary as NOT_JUDGED, with contacts and certificate by the log's events; BROKEN for a damaged log.
 
-    problem: why the report is not used; it begins the verdict.
+    problem: why the report is not used, "" without a report; it begins the verdict.
     """
     try:
         info = read_info(summary.log)
@@ -295,7 +310,7 @@ def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
 
 
 def _told_certificate(info: LogInfo) -> CertificateState:
-    """Return the state of the last certificate that the log's events tell of."""
+    """Return the state of the last certificate by the log's events."""
     found = CertificateState(NO_CERTIFICATE, None)
     start_ns: int | None = None
     for t_ns, event in info.milestones:
@@ -311,7 +326,10 @@ def _told_certificate(info: LogInfo) -> CertificateState:
 
 
 def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
-    """Return the summary with the figures of a report. Raises one of _DAMAGES if the report is damaged."""
+    """Return the summary as GOOD or NOT_GOOD with the figures of a report.
+
+    Raises one of _DAMAGES if the report is damaged.
+    """
     log, certified = table["log"], table["certified"]
     is_good = _flag(table["is_clean"]) and _flag(log["is_complete"])
     missing = f" The log is not whole: {_text(log['problem'])}" if log["problem"] else ""
@@ -333,7 +351,10 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
 
 
 def _reported_certificate(summary: RunSummary, table: Mapping[str, Any]) -> CertificateState:
-    """Return the state of a run's last certificate by its report; by the log's events if one was taken back."""
+    """Return the state of a run's last certificate by its report.
+
+    By the log's events if a certificate was taken back.
+    """
     certified = table["certified"]
     if certified is not None and certified["revoked"]:
         return _told_certificate(read_info(summary.log))
@@ -348,12 +369,15 @@ def _sections(table: Mapping[str, Any], kind: str) -> list[Mapping[str, Any]]:
 
 
 def _first_adaptation(table: Mapping[str, Any]) -> str | None:
-    """Return the label of the first complete adaptation in a report, None without one."""
+    """Return the label of the first complete adaptation in a report; None without one."""
     return next((_text(each["label"]) for each in _sections(table, "adaptation") if _flag(each["is_complete"])), None)
 
 
 def _threshold(table: Mapping[str, Any]) -> Pair | None:
-    """Return the smallest of the channels' median thresholds while the arm was watched for the first time."""
+    """Return, by joint, the smallest of the channels' median thresholds in the first detection section, Nm.
+
+    None if no section has margins.
+    """
     margins = table["certified"]["margins"]
     for section in _sections(table, "detection"):
         if channels := margins.get(section["label"]):
@@ -367,7 +391,10 @@ def _configured_threshold(settings: Settings | None) -> Pair | None:
 
 
 def _first_model(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return friction and offsets of the first certificate without a payload, else those of the paper's scheme."""
+    """Return friction and offsets, by field of RunSummary, of the first certificate without a payload.
+
+    A run of the paper's scheme has the friction of its first adaptation only; {} without such a certificate.
+    """
     certified, section = table["certified"], _first_adaptation(table)
     if certified is None:
         return {"friction_Nm": _identified_friction(table["parameters"], section)}
@@ -377,7 +404,10 @@ def _first_model(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _identified_friction(parameters: Mapping[str, Any], section: str | None) -> Pair | None:
-    """Return the friction at FRICTION_AT_RAD_S that the paper's scheme identified in a section, Nm; None if unknown."""
+    """Return the friction at FRICTION_AT_RAD_S that the paper's scheme identified in a section, Nm; None if unknown.
+
+    section: None: no adaptation was complete.
+    """
     if section is None or section not in parameters:
         return None
     values = {name: _number(pair[1]) for name, pair in parameters[section].items()}
@@ -389,7 +419,7 @@ def _identified_friction(parameters: Mapping[str, Any], section: str | None) -> 
 
 
 def _number(value: Any) -> float | None:
-    """Return a value of a report as float, None if null or not finite. Raises TypeError if it is no number."""
+    """Return a value of a report as float; None if it is null or not finite. Raises TypeError if it is no number."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float):

@@ -37,7 +37,7 @@ COLUMNS: Final[Mapping[str, str | tuple[str, str]]] = {
 
 
 def values_of(run: RunSummary) -> dict[str, Any]:
-    """Return a run's values by column; None: not known."""
+    """Return a run's values by column of COLUMNS; None: not known. A value per joint is a pair."""
     state, at_s, given = run.certificate or (None, None, None)
     own = {
         "run": run.name,
@@ -60,9 +60,9 @@ NUMBERS: Final = (5, 6, 7)
 
 @dataclass(frozen=True)
 class RunFilter:
-    """The conditions that a run of the list meets; None or empty: all runs meet it.
+    """The conditions that a run of the list meets; None or empty: no condition.
 
-    arms: names as in the list, configurations, or patterns of them. since, until: bounds of the beginning, both
+    arms: names as in the list, configurations, or patterns of them. since, until: bounds of the run's beginning, both
     included; a run without a date is outside any bounds.
     """
 
@@ -94,12 +94,12 @@ def is_arm(run: RunSummary, arm: str) -> bool:
 
 
 def in_order(runs: Iterable[RunSummary]) -> list[RunSummary]:
-    """Return runs sorted by their beginnings, the oldest first; those without a date come before."""
+    """Return runs sorted by their beginnings, the oldest first; those without a date come before all."""
     return sorted(runs, key=lambda run: (run.started is not None, run.started and run.started.timestamp(), run.name))
 
 
 def count_text(runs: Sequence[RunSummary]) -> str:
-    """Return a phrase with the number of runs, and of those not good, not judged and still running."""
+    """Return a phrase with the number of runs, and of those that are not good or broken, not judged, and running."""
     text = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     bad = sum(run.status not in (GOOD, NOT_JUDGED, RUNNING) for run in runs)
     parts = [f"{bad} not good"] if bad else []
@@ -110,7 +110,7 @@ def count_text(runs: Sequence[RunSummary]) -> str:
 
 
 def row_texts(run: RunSummary) -> tuple[str, ...]:
-    """Return the texts of a run's row in the table of runs, in the order of HEAD."""
+    """Return the texts of a run's row in the table of runs, in the order of HEAD; NONE for unknown values."""
     return (
         run.name,
         NONE if run.started is None else f"{run.started:%Y-%m-%d %H:%M}",
@@ -126,7 +126,10 @@ def row_texts(run: RunSummary) -> tuple[str, ...]:
 
 
 def certificate_text(run: RunSummary) -> str:
-    """Return the state of a run's last certificate, and when it was given or taken back, s since motion start."""
+    """Return the state of a run's last certificate, and when it got it, s since motion start; NONE if unknown.
+
+    A certified run with several certificates has their number, too.
+    """
     if run.certificate is None:
         return NONE
     state, at_s, given = run.certificate
@@ -137,7 +140,10 @@ def certificate_text(run: RunSummary) -> str:
 
 
 def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row by the columns of CSV and Parquet: a value per joint in two, `threshold_1_Nm`. row: by COLUMNS."""
+    """Return a row by the columns of CSV and Parquet: a value per joint becomes two, `threshold_1_Nm`.
+
+    row: by COLUMNS.
+    """
     flat: dict[str, Any] = {}
     for name, value in row.items():
         if isinstance(COLUMNS[name], str):
@@ -149,7 +155,7 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def as_csv(runs: Sequence[RunSummary]) -> str:
-    """Return the table of runs as CSV, with the head of COLUMNS."""
+    """Return the table of runs as CSV, with a head and a line per run."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(_flat(COLUMNS))
@@ -158,7 +164,10 @@ def as_csv(runs: Sequence[RunSummary]) -> str:
 
 
 def write_parquet(runs: Sequence[RunSummary], path: Path) -> None:
-    """Write the table of runs as Parquet, in one step. Raises LogError without pyarrow, or if it can't be written."""
+    """Write the table of runs as Parquet; an earlier file is replaced once the new one is whole.
+
+    Raises LogError without pyarrow, or if the file can't be written.
+    """
     arrow, parquet = import_pyarrow()
     rows = [_flat(values_of(run)) for run in runs]
     columns = {
@@ -172,6 +181,6 @@ def write_parquet(runs: Sequence[RunSummary], path: Path) -> None:
 
 
 def write_result(content: bytes | str, path: Path) -> None:
-    """Write a file in one step. Raises LogError when it can't be written."""
+    """Write a file; an earlier one is replaced once the new one is whole. Raises LogError if it can't be written."""
     with failing_as(f"{path} can't be written"):
         replace_files(path.parent, {path.name: content})

@@ -37,7 +37,10 @@ _OF_A_RUN: Final = ("name", "history.", "operator.", "log.", "realtime.")
 
 
 class TrendChange(NamedTuple):
-    """A run whose value differs from that of an earlier one, `before`; joint from 1; sigmas: None for a threshold."""
+    """A run whose value at a joint (1, 2) differs from that of an earlier run, `before`.
+
+    sigmas: the difference in standard deviations of both; None for a threshold.
+    """
 
     run: RunSummary
     before: RunSummary
@@ -49,7 +52,7 @@ class TrendChange(NamedTuple):
 
 @dataclass(frozen=True)
 class TrendQuantity:
-    """A quantity over the runs of an arm: values and deviations (n, 2), nan where not known, and its changes."""
+    """A quantity over the runs of an arm: values and standard deviations (n, 2), nan if not known, and its changes."""
 
     name: str
     title: str
@@ -60,9 +63,10 @@ class TrendQuantity:
 
 @dataclass(frozen=True)
 class Trend:
-    """The runs of an arm with a judge's figures, the oldest first; left_out: those without.
+    """The runs of an arm with a judge's figures, the oldest first; left_out: its other runs.
 
-    sentence: when the thresholds last changed; further: when friction and offsets did.
+    margins (n, 1), nan where not known. sentence: on the last change of the thresholds; further: on those of friction
+    and offsets, () without runs.
     """
 
     arm: str
@@ -77,7 +81,7 @@ class Trend:
 
     @property
     def quantities(self) -> tuple[TrendQuantity, ...]:
-        """The quantities that may have changed."""
+        """Thresholds, friction and offsets: the quantities whose changes are found."""
         return self.thresholds, self.friction, self.offsets
 
     def by_key(self) -> dict[str, Any]:
@@ -103,9 +107,9 @@ class Trend:
 
 
 def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE) -> list[Trend]:
-    """Return the trend of each arm, sorted by name; runs that are not judged are listed as left out.
+    """Return the trend of each arm, sorted by name; runs that are not judged are left out of it, but listed.
 
-    threshold_share: share of a threshold from which a difference counts as a change.
+    threshold_share: share of a threshold from which a difference is a change.
     """
     by_arm: dict[str, list[RunSummary]] = {}
     for run in in_order(runs):
@@ -114,12 +118,15 @@ def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE)
 
 
 def arm_of(run: RunSummary) -> str:
-    """Return the name of a run's arm; ", emulated" is added if it was emulated in the host's process."""
+    """Return the name of a run's arm, "unknown arm" without one.
+
+    With ", emulated" if it was emulated in the host's process.
+    """
     return f"{run.arm or 'unknown arm'}{', emulated' if run.interface == EMBEDDED else ''}"
 
 
 def _trend(arm: str, runs: Sequence[RunSummary], threshold_share: float) -> Trend:
-    """Return the trend of one arm: its judged runs, the changes of each quantity, and sentences on them."""
+    """Return the trend of one arm: its judged runs, the changes of each quantity, and sentences on these."""
     judged = [run for run in runs if run.is_judged]
     unknown = [None] * len(judged)
     speed = f"{FRICTION_AT_RAD_S:g} rad/s"
@@ -150,15 +157,16 @@ def _trend(arm: str, runs: Sequence[RunSummary], threshold_share: float) -> Tren
 
 
 def _columns(pairs: Sequence[tuple[float, float] | None]) -> Vector:
-    """Return values per joint as rows (n, 2), nan for None."""
+    """Return values per joint as an array (n, 2), nan for None."""
     rows = [(math.nan,) * JOINTS if pair is None else pair for pair in pairs]
     return np.array(rows, np.float64).reshape(-1, JOINTS)
 
 
 def _changes(runs: Sequence[RunSummary], values: Vector, std: Vector, share: float | None) -> tuple[TrendChange, ...]:
-    """Return the runs whose value differs too much from the first one since the last change, for each joint.
+    """Return the runs whose value differs too much from the first one since the last change, joint by joint.
 
-    share: of that first value; None: compare by deviations `std`, LAST_SIGMAS.
+    share: of that first value, a quarter of it if settings of the detection differ from the run before; None: compare
+    by standard deviations `std`, more than LAST_SIGMAS of both.
     """
     found: list[TrendChange] = []
     for joint in range(JOINTS):
@@ -184,12 +192,15 @@ def _changes(runs: Sequence[RunSummary], values: Vector, std: Vector, share: flo
 
 
 def _is_meant(run: RunSummary, before: RunSummary) -> bool:
-    """Return whether settings of the detection differ from those of the run before."""
+    """Return whether settings of the detection differ from those of the run before: then thresholds may well change."""
     return any(key.startswith(_DETECTION) for key in _changed(run, before))
 
 
 def _changed(run: RunSummary, before: RunSummary) -> dict[str, tuple[str, str]]:
-    """Return the settings that a run changed against the one before it, without those of `_OF_A_RUN`."""
+    """Return the settings that differ from those of the run before, both values by key, without those of `_OF_A_RUN`.
+
+    {} if the settings of either run are unknown.
+    """
     if run.settings is None or before.settings is None or run.settings == before.settings:
         return {}
     changed = changed_keys(before.settings, run.settings)
@@ -197,7 +208,10 @@ def _changed(run: RunSummary, before: RunSummary) -> dict[str, tuple[str, str]]:
 
 
 def _threshold_sentence(runs: Sequence[RunSummary], thresholds: TrendQuantity) -> str:
-    """Return a sentence on the last change of thresholds: run, values before and after, settings changed with it."""
+    """Return a sentence on the last change of thresholds: run, values before and after, settings that changed with it.
+
+    Without a change it says so, or why none can be found.
+    """
     known = int(np.isfinite(thresholds.values).all(axis=1).sum())
     if not runs:
         return "No run is judged."
@@ -212,7 +226,7 @@ def _threshold_sentence(runs: Sequence[RunSummary], thresholds: TrendQuantity) -
 
 
 def _last_changes(quantity: TrendQuantity) -> tuple[RunSummary, str]:
-    """Return the run of the last changes, and a text with the change at each joint."""
+    """Return the run of the last change, and a text with the change at each joint of it."""
     run = quantity.changes[-1].run
     parts = []
     for each in quantity.changes:
@@ -223,7 +237,10 @@ def _last_changes(quantity: TrendQuantity) -> tuple[RunSummary, str]:
 
 
 def _settings_text(runs: Sequence[RunSummary], run: RunSummary) -> str:
-    """Return a phrase with the settings that a run changed against the one before it."""
+    """Return a phrase with the settings that a run changed against the one before it.
+
+    It may say that none changed, or that they are unknown.
+    """
     place = next(number for number, each in enumerate(runs) if each is run)
     if run.settings is None or runs[place - 1].settings is None:
         return "the settings are not known"
@@ -236,7 +253,10 @@ def _settings_text(runs: Sequence[RunSummary], run: RunSummary) -> str:
 
 
 def _drift_sentence(quantity: TrendQuantity, what: str) -> str:
-    """Return a sentence on the last change of friction or torque offsets; what: which of the two."""
+    """Return a sentence on the last change of friction or torque offsets, or why none can be found.
+
+    what: "friction" or "torque offsets", as the sentence's subject.
+    """
     known = np.isfinite(quantity.values) & np.isfinite(quantity.std)
     rows = int(known.all(axis=1).sum())
     if rows < 2:
@@ -254,7 +274,7 @@ def _when(run: RunSummary) -> str:
 
 
 def _rows(values: Vector) -> Vector:
-    """Return values (n, k) unchanged; for k = 1 as (n,)."""
+    """Return values (n, k) unchanged, but (n, 1) as (n,)."""
     return values[:, 0] if values.shape[1] == 1 else values
 
 

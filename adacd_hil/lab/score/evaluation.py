@@ -47,7 +47,10 @@ from adacd_hil.settings.scheme_settings import KIND_S
 
 
 class RunGatherer:
-    """Sums up a run piece by piece, in bounded memory: `add_times` times and cyclic data, `untouched` residuals."""
+    """Sums over a run, gathered piece by piece in bounded memory.
+
+    `add_times` adds times and cyclic data; `untouched.add_untouched` adds residuals.
+    """
 
     def __init__(self, settings: Settings, is_modelled: bool) -> None:
         self.untouched = UntouchedGatherer(settings)
@@ -56,7 +59,7 @@ class RunGatherer:
         self._state = int(SchemeState.INIT)  # of the last cycle so far
 
     def add_times(self, timing: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
-        """Gather the times of the next cycles, and the states of the same cycles (k,)."""
+        """Add the times of the next cycles; cycle, state: those of /scheme for the same cycles (k,)."""
         self.timing.add_columns(timing, find_reactions(timing, cycle, state, self._state))
         self.data.add_columns(timing, cycle, state)
         if state.size:
@@ -66,7 +69,7 @@ class RunGatherer:
 def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
     """Return all metrics of a run.
 
-    gathered: the sums over all cycles; None: the run has all of its cycles.
+    gathered: the sums over all cycles; None: they are formed from the run, which must then have all of its cycles.
     """
     if gathered is None:
         gathered = RunGatherer(run.settings, not is_realtime(run))
@@ -114,7 +117,10 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
 
 
 def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, tuple[float | None, float]]]:
-    """Return each parameter's true and identified value at the end of each adaptation, by the adaptation's label."""
+    """Return (true, identified) of each parameter at the end of each adaptation, by the adaptation's label and by name.
+
+    The true value is None without the truth.
+    """
     found = {}
     for section in sections:
         if section.kind != "adaptation":
@@ -129,7 +135,7 @@ def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, 
 
 
 def true_parameters(run: Run, cycle: int) -> dict[str, float]:
-    """Return the true parameters in a cycle by name; empty without the truth."""
+    """Return the true parameters in a cycle by name; {} if the truth is missing or empty."""
     row = None if run.truth is None else run.truth.model_row(cycle)
     if run.truth is None or row is None:
         return {}
@@ -137,7 +143,7 @@ def true_parameters(run: Run, cycle: int) -> dict[str, float]:
 
 
 def _payloads(run: Run, sections: tuple[Section, ...]) -> dict[str, float | None]:
-    """Return the true payload at the end of each adaptation, kg, by label; None without the truth."""
+    """Return the true payload at the end of each adaptation, kg, by label; the value is None without the truth."""
     payloads: dict[str, float | None] = {}
     time_s = run.time_s()
     for section in sections:
@@ -155,7 +161,7 @@ def _payload_at(run: Run, cycle: int) -> float | None:
 def list_contacts(
     run: Run, sections: tuple[Section, ...], detections: tuple[Detection, ...], score: Score
 ) -> tuple[ReportedContact, ...]:
-    """Return the true contacts with the detection that found each; without the truth, the detections."""
+    """Return the true contacts with the detection that found each; without the truth, each detection as a contact."""
     if run.truth is None:
         return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, run.first_contact))
     raised = {detection.t_ns: detection for detection in detections}
@@ -166,7 +172,10 @@ def list_contacts(
 
 
 def _reported(run: Run, detection: Detection | None) -> dict[str, Any]:
-    """Return those fields of a contact, by name, that the reports of its detection have; {} without a detection."""
+    """Return those fields of a `ReportedContact`, by name, that its detection and reports give.
+
+    {} without a detection.
+    """
     if detection is None:
         return {}
     said: dict[str, Any] = {"detected_s": (detection.t_ns - run.zero_ns) * 1e-9}
@@ -184,7 +193,10 @@ def _reported(run: Run, detection: Detection | None) -> dict[str, Any]:
 
 
 def _told(report: ContactReport) -> dict[str, Any]:
-    """Return those fields of a contact that only the certified scheme reports."""
+    """Return those fields of a `ReportedContact`, by name, that only the certified scheme reports.
+
+    Values without a finite standard deviation are None.
+    """
     return {
         "level": report.level.name,
         "kind": report.kind.name,
@@ -206,12 +218,12 @@ def _finite(value: float) -> float | None:
 
 
 def _state_at(run: Run, time_s: float) -> SchemeState:
-    """Return the state in the cycle before a time."""
+    """Return the state in the cycle before a time, s since motion start; in the first cycle at the earliest."""
     return SchemeState(run.state[max(row_at(run, time_s) - 1, 0)])
 
 
 def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: Detection) -> ReportedContact:
-    """Return a detection as a contact of a run without the truth."""
+    """Return a detection as a contact of a run without the truth; number: of the contact."""
     reported = _reported(run, detection)
     return ReportedContact(
         number=number,
@@ -225,7 +237,10 @@ def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: D
 def _contact(
     run: Run, sections: tuple[Section, ...], contact: TrueContact, detection: Detection | None
 ) -> ReportedContact:
-    """Return a true contact with its delays, and whether its detection named link and direction rightly."""
+    """Return a true contact with its delays, and whether its detection named link and direction rightly.
+
+    detection: None: it was not detected.
+    """
     truth, time_s = run.truth, contact.time_s
     assert truth is not None
     assert time_s is not None
@@ -264,9 +279,9 @@ def _contact(
 
 
 def _touches(run: Run, from_s: float, until_s: float) -> tuple[Vector, Cycles]:
-    """Return the true torque (k, 2) and the touched link (k,) of all cycles with a contact between two times.
+    """Return the true torque, Nm (k, 2), and the touched link (k,) of all cycles with any contact between two times.
 
-    A second person who joins is in the report of the contact before.
+    So a second person who touches the arm meanwhile is included.
     """
     assert run.truth is not None
     time_s = run.truth_time_s()
@@ -276,15 +291,15 @@ def _touches(run: Run, from_s: float, until_s: float) -> tuple[Vector, Cycles]:
 
 
 def _window_s(run: Run) -> float:
-    """Return the time from a detection to the final report of its contact, s."""
+    """Return the time from a detection to the final report of its contact, s, by the run's scheme."""
     return run.settings.detector.isolation_window_s if run.certified is None else KIND_S
 
 
 def _is_direction_right(direction: tuple[int, int] | None, impulse: Vector) -> bool | None:
-    """Return whether every joint with a direction was pushed that way, and at least one has a direction.
+    """Return whether the reported direction names a joint, and its sign is right at each joint that it names.
 
-    direction: reported sign of each joint, 0: none; None: not reported, and so is the result. impulse (2,): its sign is
-    the true direction.
+    direction: reported sign of each joint, 0: not named; None: not reported, and so is the result. impulse (2,): its
+    sign is the true direction.
     """
     if direction is None:
         return None
@@ -293,7 +308,10 @@ def _is_direction_right(direction: tuple[int, int] | None, impulse: Vector) -> b
 
 
 def _torque_ratio(peak_hat: tuple[float, float] | None, peak: Vector) -> float | None:
-    """Return the reported over the true peak, at the joint with the larger true one; None without either."""
+    """Return the reported over the true peak torque, at the joint with the larger true one.
+
+    None if no peak was reported, or if the true one is 0.
+    """
     joint = int(np.argmax(np.abs(peak)))
     if peak_hat is None or peak[joint] == 0.0:
         return None
@@ -315,7 +333,7 @@ _PER_CYCLE: Final = ("frames_missing", "commands_late")
 
 
 class TimingGatherer:
-    """Sums up /cycle piece by piece, in bounded memory."""
+    """Sums over /cycle, gathered piece by piece in bounded memory."""
 
     def __init__(self, period_us: float, is_modelled: bool) -> None:
         self._period_us = period_us
@@ -330,9 +348,9 @@ class TimingGatherer:
         self._reactions: Distribution | None = None
 
     def add_columns(self, columns: CycleColumns, reactions: NDArray[np.bool_] | None = None) -> None:
-        """Gather times, queues, data ages and counts of the next cycles.
+        """Add times, queues, data ages and counts of the next cycles, of those columns that the log has.
 
-        reactions: those in which the state becomes REACT (n,); None without states.
+        reactions (n,): whether the state becomes REACT in a cycle; None without states.
         """
         self._cycles += len(columns)
         for quantity in QUANTITIES:
@@ -360,7 +378,7 @@ class TimingGatherer:
         self._histograms[quantity.name] = self._histograms.get(quantity.name, 0) + log_counts(values_us)
 
     def evidence(self) -> TimingEvidence:
-        """Return the statistics of all columns added so far."""
+        """Return the statistics of all cycles added so far."""
         reactions = self._reactions
         return TimingEvidence(
             period_us=self._period_us,
@@ -388,7 +406,10 @@ class TimingGatherer:
 
 
 def collect_evidence(columns: CycleColumns, period_us: float, is_modelled: bool) -> TimingEvidence:
-    """Return the statistics of the times in the columns of a log that has no states."""
+    """Return the statistics of the times in the columns of a log without states: reactions are left out.
+
+    is_modelled: the log is of lockstep.
+    """
     gatherer = TimingGatherer(period_us, is_modelled)
     gatherer.add_columns(columns)
     return gatherer.evidence()
@@ -397,9 +418,11 @@ def collect_evidence(columns: CycleColumns, period_us: float, is_modelled: bool)
 def find_reactions(
     columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8], before: int = SchemeState.INIT
 ) -> NDArray[np.bool_] | None:
-    """Return for each cycle of `columns` whether the state becomes REACT; cycle, state: those of /scheme (k,).
+    """Return for each cycle of `columns` (n,) whether the state becomes REACT in it.
 
-    before: the state in the cycle before the first. Returns None for a log that does not number its cycles.
+    None for a log that does not number its cycles.
+
+    cycle, state: those of /scheme (k,). before: the state in the cycle before the first.
     """
     if "cycle" not in columns:
         return None

@@ -14,7 +14,7 @@ _BAR = 40
 
 
 def log_counts(values: Values) -> NDArray[np.int64]:
-    """Return how many values lie below EDGES, in each bin between them, and above (n + 1,).
+    """Return the numbers of values below EDGES, in each bin between them, and above (len(EDGES) + 1,).
 
     A value on an edge belongs to the upper bin.
     """
@@ -22,7 +22,7 @@ def log_counts(values: Values) -> NDArray[np.int64]:
 
 
 def histogram_by_key(counts: NDArray[np.int64]) -> dict[str, Any]:
-    """Return a histogram, as of `log_counts`, by the keys of report.json, without the empty bins at both ends."""
+    """Return a histogram by the keys of report.json, without the empty bins at both ends; counts: of `log_counts`."""
     below, *inside, above = counts.tolist()
     filled = np.flatnonzero(inside)
     first, end = (int(filled[0]), int(filled[-1]) + 1) if filled.size else (0, 0)
@@ -30,9 +30,10 @@ def histogram_by_key(counts: NDArray[np.int64]) -> dict[str, Any]:
 
 
 def doubling_bins(values: Values, first: float, count: int) -> list[tuple[float, int]]:
-    """Return upper bound and number of values of each bin: below first, 2 first, 4 first, …; the last bound is inf.
+    """Return (upper bound, number of values) of bins whose bounds double from `first` on; the last bound is inf.
 
-    count: largest number of bins. Empty bins at the end are left out.
+    A value on a bound belongs to the upper bin. count: largest number of bins. Empty bins at the end are left out,
+    except the first.
     """
     bounds = [first * 2.0**power for power in range(count - 1)] + [float("inf")]
     places = np.searchsorted(bounds, values, side="right")
@@ -44,7 +45,10 @@ def doubling_bins(values: Values, first: float, count: int) -> list[tuple[float,
 
 
 def bar_chart(labels: Sequence[str], counts: Sequence[int]) -> list[str]:
-    """Return one line of text per bin: label, bar, count, share. A bin that isn't empty has a bar."""
+    """Return a line of text per bin: label, bar, count, share.
+
+    The largest count has a bar of 40 signs, any other but 0 at least one sign.
+    """
     total, largest = sum(counts), max(counts, default=0)
     width = max((len(label) for label in labels), default=0)
     lines = []

@@ -43,9 +43,9 @@ SETTLING_TIME_CONSTANTS = 10.0
 
 
 def larger(largest: Vector | None, values: Vector) -> Vector | None:
-    """Return, element by element, the larger of `largest` (…) and all sizes |values| (k, …).
+    """Return, element by element, the larger of `largest` (…) and of all |values| (k, …); NaN stays.
 
-    largest: of the values so far; None before the first. NaN stays.
+    largest: of the values so far; None before the first. Without values it is returned as it is.
     """
     if values.shape[0] == 0:
         return largest
@@ -54,7 +54,7 @@ def larger(largest: Vector | None, values: Vector) -> Vector | None:
 
 
 class BesideGatherer:
-    """Gathers the results of the paper's scheme, piece by piece."""
+    """Gathers the results of the paper's scheme that ran beside, piece by piece."""
 
     def __init__(self, settings: Settings) -> None:
         self._a_rad_s = settings.filter.a_rad_s
@@ -63,9 +63,10 @@ class BesideGatherer:
         self._largest: dict[str, Vector | None] = {}
 
     def add_stream(self, piece: Run, outline: Run, sections: Sequence[Section], free: Mask) -> None:
-        """Gather the paper's scheme's results in the next cycles (n,) of a run.
+        """Add the paper's scheme's results in the next cycles (n,) of a run.
 
-        piece: these cycles. outline: the run, with all that has happened so far. free (n,): cycles free of contact.
+        piece: these cycles. outline: the run, with all that has happened so far. free (n,): whether a cycle is free of
+        contact.
         """
         stream, time_s, end_s = piece.beside, piece.time_s(), float(outline.time_s()[-1])
         assert stream is not None
@@ -96,7 +97,10 @@ class BesideGatherer:
                 self._largest[section.label] = larger(self._largest.get(section.label), values)
 
     def _contacts(self, run: Run, sections: Sequence[Section], since_s: float = -np.inf) -> Sequence[TrueContact]:
-        """Return the true contacts that end at `since_s` or later, on a run's clock, for the paper's scheme."""
+        """Return the true contacts that end at `since_s` or later, placed in time for the paper's scheme.
+
+        Each has the times in which it explains that scheme's alarms.
+        """
         assert run.beside is not None
         time_s = run.time_s()
         armed = run.beside.is_armed & ~_parked(time_s, sections, float(time_s[-1]) if time_s.size else 0.0)
@@ -106,7 +110,7 @@ class BesideGatherer:
         return placed_in(run, contacts, state, threshold, self._a_rad_s)
 
     def beside(self, run: Run, sections: Sequence[Section]) -> Beside:
-        """Return the results of all cycles; run: the outline of all of them."""
+        """Return the results of the cycles added; run: the outline of all of them."""
         score = self._judge.score(self._contacts(run, sections))
         has_truth = run.truth is not None
         false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
@@ -133,15 +137,15 @@ _LEARNT_OR_WATCHED = ("adaptation", "detection")
 
 
 def _left_s(adaptation: Section, sections: Sequence[Section]) -> float:
-    """Return when an adaptation and the detection after it are left, s; infinite at the end of the run."""
+    """Return when an adaptation and the detection after it end, s since motion start; inf if the run ends in them."""
     later = (section for section in sections if section.start_s > adaptation.start_s and section.kind != "detection")
     return next((section.start_s for section in later), np.inf)
 
 
 def _parked(time_s: Vector, sections: Sequence[Section], end_s: float) -> Mask:
-    """Return for each cycle at the times `time_s` (n,) whether the payload is being changed.
+    """Return for each cycle at the times `time_s` (n,) whether it is in a payload section.
 
-    end_s: when the run ends.
+    end_s: when the run ends, s since motion start.
     """
     parked = np.zeros(time_s.size, dtype=np.bool_)
     for section in sections:
@@ -151,9 +155,9 @@ def _parked(time_s: Vector, sections: Sequence[Section], end_s: float) -> Mask:
 
 
 def last_row(run: Run, section: Section) -> int:
-    """Return the row with an adaptation's result: the next section's first cycle, which still learns.
+    """Return the row in which an adaptation's result stands: the next section's first cycle, which still learns.
 
-    If the run ended or failed in the adaptation, its own last cycle.
+    If the run ended or failed in the adaptation, it is the adaptation's own last cycle.
     """
     time_s = run.time_s()
     end = int(rows_of(time_s, section, float(time_s[-1])).stop)
@@ -161,7 +165,7 @@ def last_row(run: Run, section: Section) -> int:
 
 
 def _tests(run: Run, section: Section) -> list[float]:
-    """Return the lengths of the stays in CERTIFY of a section, s."""
+    """Return the length of each stay in CERTIFY within a section, s, in order; [] without one."""
     time_s = run.time_s()
     rows = rows_of(time_s, section, float(time_s[-1]))
     inside = np.concatenate(([False], run.state[rows] == SchemeState.CERTIFY, [False]))
@@ -171,7 +175,10 @@ def _tests(run: Run, section: Section) -> list[float]:
 
 
 def _estimates(run: Run, stream: CertifiedStream, section: Section) -> dict[str, ParameterEstimate]:
-    """Return the parameters at the end of an adaptation, by name, those beyond the paper's model included."""
+    """Return the parameters at the end of an adaptation with their deviations, by name.
+
+    They include those beyond the paper's model.
+    """
     row = last_row(run, section)
     values = np.concatenate((run.theta_hat[row], stream.theta_further[row]))
     names = run.parameter_names + run.settings.further_names
@@ -182,7 +189,7 @@ def _estimates(run: Run, stream: CertifiedStream, section: Section) -> dict[str,
 
 
 class MarginGatherer:
-    """Gathers the margins of one section, cycles at a time."""
+    """Gathers the margins of one section, piece by piece."""
 
     def __init__(self, settings: Settings) -> None:
         self._channels = channels_of(settings)
@@ -191,7 +198,7 @@ class MarginGatherer:
         self._thresholds = [[Distribution() for _ in range(JOINTS)] for _ in self._channels]
 
     def add_residuals(self, tau_ext: Vector, threshold: Vector) -> None:
-        """Gather residuals and thresholds (k, channels, 2), k > 0, of cycles free of contact."""
+        """Add residuals and thresholds, Nm (k, channels, 2), k > 0, of cycles free of contact."""
         self._residual = larger(self._residual, tau_ext)
         self._share = larger(self._share, np.abs(tau_ext) / threshold)
         for place, distributions in enumerate(self._thresholds):
@@ -199,7 +206,7 @@ class MarginGatherer:
                 distribution.add_values(threshold[:, place, joint])
 
     def margins(self) -> tuple[ChannelMargin, ...]:
-        """Return the margins of each channel over all cycles so far; () before the first cycle."""
+        """Return the margins of each channel over all cycles added so far; () before the first."""
         if self._residual is None or self._share is None:
             return ()
         found = []
@@ -223,7 +230,7 @@ def _inverse(share: float) -> float:
 
 
 class UntouchedGatherer:
-    """Gathers residuals, margins and pushes of a run's cycles free of contact, and the paper's scheme beside."""
+    """Gathers residuals, margins and pushes over a run's cycles free of contact, and the paper's scheme beside."""
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
@@ -238,9 +245,10 @@ class UntouchedGatherer:
         self._beside: BesideGatherer | None = None
 
     def add_untouched(self, piece: Run, outline: Run) -> None:
-        """Gather the cycles free of contact in a piece of a run: residuals, margins and pushes of their sections.
+        """Add the next piece of a run: of its cycles free of contact the residuals, margins and pushes, by section.
 
-        outline: the run, with all that has happened so far.
+        outline: the run, with all that has happened so far, and a second or more beyond the piece. Promotions and the
+        paper's scheme beside are gathered from all cycles.
         """
         if piece.cycle.size == 0:
             return
@@ -265,7 +273,10 @@ class UntouchedGatherer:
             self._beside.add_stream(piece, outline, sections, free)
 
     def _free(self, piece: Run, outline: Run) -> Mask:
-        """Return for each cycle (n,) of a piece whether it is free of contact."""
+        """Return for each cycle (n,) of a piece whether it is free of contact.
+
+        Call it once per piece, in order: it stores the piece's last cycle in REACT.
+        """
         settling_ns = round(SETTLING_TIME_CONSTANTS / outline.a_rad_s * 1e9)
         t_ns, truth, finish = piece.t_ns, outline.truth, outline.finish_cycle
         free = np.ones(t_ns.size, dtype=np.bool_) if finish is None else piece.cycle < finish
@@ -310,7 +321,7 @@ class UntouchedGatherer:
             self.push.add_residuals(piece.certified.tau_ext[rows][armed], threshold[armed])
 
     def _close(self, label: str) -> None:
-        """Replace a section's margins by their sums, when the section is complete: its values need not be kept."""
+        """Sum up the margins of a section that is complete, and drop its values."""
         if label in self._margins:
             self._done[label] = self._margins.pop(label).margins()
 
@@ -320,24 +331,30 @@ class UntouchedGatherer:
         self._promoted = float(promotions[-1])
 
     def residuals(self, sections: Sequence[Section]) -> dict[str, Residual]:
-        """Return the largest residuals of all cycles free of contact, by section."""
+        """Return the largest residuals of the cycles added, by label of the section.
+
+        Sections without any are left out.
+        """
         return {each.label: self._residuals[each.label] for each in sections if each.label in self._residuals}
 
     def margins(self, sections: Sequence[Section]) -> dict[str, tuple[ChannelMargin, ...]]:
-        """Return the margins of all cycles free of contact, by section."""
+        """Return the margins of the cycles added, by label of the section; sections without any are left out.
+
+        Call it after the last piece.
+        """
         for label in list(self._margins):
             self._close(label)
         return {each.label: self._done[each.label] for each in sections if each.label in self._done}
 
     def beside(self, run: Run, sections: Sequence[Section]) -> Beside | None:
-        """Return the results of the paper's scheme beside; run: the outline of all cycles. None if it didn't run."""
+        """Return the results of the paper's scheme beside; None if it didn't run. run: the outline of all cycles."""
         return None if self._beside is None else self._beside.beside(run, sections)
 
 
 def evaluate_certified(run: Run, sections: Sequence[Section], untouched: UntouchedGatherer) -> CertifiedEvidence | None:
-    """Return tests, estimates, margins and certificates of a run; None for the paper's scheme.
+    """Return tests, estimates, margins and certificates of a run; None if the paper's scheme ran alone.
 
-    untouched: the sums over all its cycles free of contact.
+    untouched: the sums over all of its cycles.
     """
     stream = run.certified
     if stream is None:

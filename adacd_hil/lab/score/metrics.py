@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 class Count(NamedTuple):
-    """How often something happened, in all and per 100 000 cycles; None without a cycle."""
+    """How often a thing happened, in all and per 100 000 cycles; the latter is None without a cycle."""
 
     total: int
     per_100000: float | None
@@ -49,9 +49,10 @@ class TimingEvidence:
     """The times of a run, summed up; None: not in the log, or without a meaning in lockstep.
 
     is_modelled: lockstep, the times are those of the model of bus and host, not of this machine. times: percentiles by
-    name, µs, of each time; histograms: of the same. reaction: percentiles of the latency from the decision to the first
-    command that reacts, and the `count` of reactions. data_age: cycles by the age of the oldest value used; the last
-    entry counts all from OLDEST_CYCLES on.
+    name, µs, of each time; histograms: of the same, without those that the log lacks. reaction: percentiles of the
+    latency from the decision to the first command that reacts, µs, and the `count` of reactions. data_age: number of
+    cycles by the age, in cycles, of the oldest value used; the last entry is for OLDEST_CYCLES and more. queues_bytes,
+    counts: by name.
     """
 
     period_us: float
@@ -65,7 +66,7 @@ class TimingEvidence:
     counts: Mapping[str, Count | None]
 
     def by_key(self) -> dict[str, Any]:
-        """Return the evidence by the keys of report.json."""
+        """Return the evidence by the keys of report.json; a histogram is None where the log lacks the time."""
         return {
             "is_modelled": self.is_modelled,
             "period_us": self.period_us,
@@ -80,14 +81,17 @@ class TimingEvidence:
 
 
 class Finding(NamedTuple):
-    """A clause about the run; is_bad: the run was not good because of it."""
+    """A clause about the run; is_bad: the run is not good because of it."""
 
     text: str
     is_bad: bool = False
 
 
 class Fault(NamedTuple):
-    """A stay in FAULT. cause: the log's words for it, "" without any; is_last: the run ended in it."""
+    """A stay in FAULT, from `at_s` s after motion start.
+
+    reason: name of a FaultReason. cause: the log's words for it, "" without any; is_last: the run ended in it.
+    """
 
     reason: str
     at_s: float
@@ -97,7 +101,10 @@ class Fault(NamedTuple):
 
 @dataclass(frozen=True)
 class DeviceShares:
-    """Shares of the cycles of a device, 0…1: without a new frame, with a repeated one, and the worst second of each."""
+    """Shares of a device's cycles, 0…1: without a new frame, with a repeated one, and the worst second of each.
+
+    cycles: number of those that are judged.
+    """
 
     cycles: int
     no_new_data: float
@@ -108,9 +115,10 @@ class DeviceShares:
 
 @dataclass(frozen=True)
 class CyclicData:
-    """Shares of `cycles` cycles with powered drives, 0…1; excesses: over their limit in some second, a line each.
+    """Shares of `cycles` cycles with powered drives, 0…1, in which data was incomplete or older than the cycle.
 
-    incomplete, worst_incomplete, aged: None where the log does not say. devices: empty where it does not.
+    incomplete, worst_incomplete (of a second), aged: None where the log lacks it. devices: empty where it does.
+    excesses: a line for each share over its limit in some second.
     """
 
     cycles: int
@@ -123,10 +131,10 @@ class CyclicData:
 
 @dataclass(frozen=True)
 class Beside:
-    """The results of the paper's scheme beside, by the definitions of the module's first lines.
+    """The results of the paper's scheme that ran beside, by the definitions of the module's first lines.
 
     contacts: of each true contact `number`, as in the list of contacts, `is_armed`, `detected_s`, `delay_ms`. Without
-    the truth there are no contacts, and false alarms and misses are None.
+    the truth there are no contacts, and false alarms and misses are None. adaptation_s: None where it did not end.
     """
 
     adaptation_s: dict[str, float | None]
@@ -139,7 +147,7 @@ class Beside:
 
 @dataclass(frozen=True)
 class ParameterEstimate:
-    """A parameter at the end of an adaptation and the standard deviation that the scheme gives it, in its unit."""
+    """A parameter at the end of an adaptation, and the scheme's own standard deviation of it, both in its unit."""
 
     value: float
     std: float
@@ -147,10 +155,11 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class ChannelMargin:
-    """A channel of the bank over a section: cut-off and smoothing, rad/s; then per joint, in cycles free of contact.
+    """A channel of the bank over a section, in cycles free of contact; pairs are by joint.
 
-    residual_max_Nm: largest |residual|. threshold_Nm: median of the threshold. margin: smallest threshold / |residual|
-    of a cycle; inf if the residual was 0 throughout.
+    cutoff_rad_s, smoothing_rad_s: of its one or two filters, None: one. residual_max_Nm: largest |residual|.
+    threshold_Nm: median of the threshold. margin: smallest threshold / |residual| of a cycle; inf if the residual was 0
+    throughout.
     """
 
     cutoff_rad_s: float
@@ -162,12 +171,15 @@ class ChannelMargin:
 
 @dataclass(frozen=True)
 class CertifiedEvidence:
-    """Of each adaptation: how often the frozen model was tested, for how long the last time, and the parameters.
+    """Evidence of the certified scheme.
+
+    By label of each adaptation: number of tests of the frozen model, length of the last test, s (None without one), and
+    the parameters.
 
     margins: by section. promotions: refined models that took over in the run. is_anchored: whether every certificate in
-    the log names the anchors of all its offsets; True without a certificate. revoked: why
-    certificates were withdrawn, in order. smallest_push: None where the scheme was never armed. certificates: those
-    that were not withdrawn, as the log has them at its end; () for a log without its end, or of an earlier version.
+    the log names the anchors of all its offsets; True without a certificate. revoked: why certificates were withdrawn,
+    in order. smallest_push: None if the scheme was never armed. certificates: those that were not withdrawn, as the log
+    has them at its end; () for a log without its end, or of an earlier version.
     """
 
     tests: dict[str, int]
@@ -183,15 +195,17 @@ class CertifiedEvidence:
 
     @property
     def smallest_margin(self) -> float | None:
-        """The smallest of all margins, of sections in which the model was learnt or in force; None without margins."""
+        """The smallest margin of any channel, joint and section; None without margins."""
         values = [min(row.margin) for rows in self.margins.values() for row in rows]
         return min(values, default=None)
 
 
 def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
-    """Yield the certificates in events of the name CERTIFIED_MODEL; leave out unreadable ones.
+    """Yield the certificates in events of the name CERTIFIED_MODEL.
 
-    told: names and messages.
+    Unreadable ones, such as those of another version, are left out.
+
+    told: (name, message) of each event.
     """
     from adacd_hil.scheme.identify.certificate import Certificate  # it compiles
 
@@ -207,7 +221,11 @@ def certificates_in(told: Iterable[tuple[str, str]]) -> "Iterator[Certificate]":
 
 @dataclass(frozen=True)
 class Residual:
-    """Largest |tau_ext_hat| of a section, Nm per joint, over `cycles` cycles free of contact; None without a cycle."""
+    """Largest |tau_ext_hat| of a section, Nm per joint, over `cycles` cycles free of contact.
+
+    identified: of the frozen model, cad: of the CAD model. None without such a cycle; identified also in an adaptation
+    section, cad without a CAD model.
+    """
 
     identified: tuple[float, float] | None
     cad: tuple[float, float] | None
@@ -215,10 +233,10 @@ class Residual:
 
 
 class PaperRow(NamedTuple):
-    """One line of *paper against measured*.
+    """One row of the table that compares the run with the paper, as texts.
 
-    paper: None where the run is not of the paper's experiment; beside: the paper's scheme on the same stream, None
-    if it didn't run.
+    paper: the paper's value, None if the run is not of the paper's experiment; beside: that of the paper's scheme on
+    the same stream, None if it didn't run.
     """
 
     quantity: str
@@ -228,9 +246,10 @@ class PaperRow(NamedTuple):
 
 
 class ReportSource(NamedTuple):
-    """The log that a run was read from; `is_complete`: it and its truth are whole, no record was dropped before.
+    """The log that a run was read from.
 
-    log_problem: the parts that the log lacks, one line. truth_problem: why the truth says nothing of all or some of it.
+    is_complete: log and truth are whole, no record was dropped before, and all alarms could be judged. log_problem: the
+    parts that the log lacks, one line. truth_problem: why the truth could not judge some or all of the run.
     """
 
     log_name: str
@@ -240,12 +259,12 @@ class ReportSource(NamedTuple):
 
     @property
     def problem(self) -> str:
-        """Both problems, one line; "" without any."""
+        """Both problems in one line; "" without any."""
         return "; ".join(filter(None, (self.log_problem, self.truth_problem)))
 
     @property
     def notice(self) -> str:
-        """A line on both problems; "" without any."""
+        """One line for a reader on both problems; "" without any."""
         log = f"The log is not whole: {self.log_problem}" if self.log_problem else ""
         truth = f"Not all could be judged: {self.truth_problem}" if self.truth_problem else ""
         return "; ".join(filter(None, (log, truth)))
@@ -253,17 +272,15 @@ class ReportSource(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class ReportedContact:
-    """A true contact and its detection, or on a real arm a detection alone.
+    """A true contact and its detection, or on a real arm a detection alone. None: unknown, or there is none.
 
-    state: of the scheme at the onset, on a real arm at the detection.
-    law_ms: closed-form delay of a step of the largest torque up to the detection, the faster joint; None if never.
-    ideal_ms: delay that the filter alone gives to the true torque as it was; None if never.
-    link_at_alarm, link_detected: isolated at detection and at the end of the isolation window. link_ok: somebody
-    touched that link at some time until then.
-    torque_error_ratio: peak with the filter undone over the true peak, at the joint with the larger true torque.
-    true_force_N: size of the true force, at whatever angle.
-    level to blind_deg: of the last report, in the names of `records`; None where it has no value. A sigma is a
-    standard deviation.
+    Times in s since motion start. state: of the scheme at the onset, on a real arm at the detection. law_ms:
+    closed-form delay of a step of the largest torque up to the detection, the faster joint; None if never. ideal_ms:
+    delay that the filter alone gives to the true torque as it was; None if never. link_at_alarm, link_detected:
+    isolated at detection and at the end of the isolation window. link_ok: somebody touched that link at some time until
+    then. torque_error_ratio: peak with the filter undone over the true peak, at the joint with the larger true torque.
+    true_force_N: size of the true force, at whatever angle. level to blind_deg: of the last report, in the names of
+    `records`; None where it has no value. A sigma is a standard deviation.
     """
 
     number: int
@@ -302,7 +319,7 @@ class ReportedContact:
 
     @property
     def at_s(self) -> float:
-        """Its onset, or its detection where the onset is not known."""
+        """Its onset, or its detection if the onset is unknown, s since motion start."""
         at_s = self.onset_s if self.onset_s is not None else self.detected_s
         assert at_s is not None
         return at_s
@@ -312,8 +329,9 @@ class ReportedContact:
 class Metrics:
     """The content of the report, see the module's first lines for the definitions.
 
-    fault, fault_s: the first one of the run. cycle: number, duration, clock and scheduler of all cycles. findings: a
-    clause each, the gravest first.
+    fault, fault_s: the first one of the run, None without one. cycle: number, duration, clock and scheduler of all
+    cycles. false_alarms, missed and false_alarms_s: None without the truth. evidence: None for the paper's scheme.
+    findings: a clause each, the gravest first.
     """
 
     sections: tuple[Section, ...]
@@ -339,18 +357,21 @@ class Metrics:
 
     @property
     def verdict(self) -> str:
-        """All findings in one sentence."""
+        """All findings in one sentence, with a capital and a full stop."""
         text = "; ".join(finding.text for finding in self.findings)
         return f"{text[:1].upper()}{text[1:]}."
 
     @property
     def is_clean(self) -> bool:
-        """Whether the run was good: no finding is bad."""
+        """Whether no finding is bad. The log may be damaged all the same."""
         return not any(finding.is_bad for finding in self.findings)
 
     @property
     def false_alarm_bound_per_h(self) -> float | None:
-        """Upper 95 % bound of the certified scheme's rate of false alarms in MONITOR, by counting; None: not known."""
+        """Upper 95 % bound, one-sided, of the certified scheme's rate of false alarms in MONITOR, 1/h, by their number.
+
+        None without the truth, for the paper's scheme, or if the scheme was never armed.
+        """
         push = None if self.evidence is None else self.evidence.smallest_push
         if push is None or self.armed_false_alarms is None:
             return None

@@ -14,7 +14,7 @@ CONFIDENCE_TEXT: Final = f"{100.0 * CONFIDENCE:g} %"
 
 
 def share_bounds(found: int, count: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share, seen in `found` of `count` cases; (0, 1) for no case."""
+    """Return the two-sided 95 % interval of a share that was seen in `found` of `count` cases; (0, 1) for no case."""
     rest = 0.5 * (1.0 - CONFIDENCE)
     low = float(betaincinv(found, count - found + 1, rest)) if found > 0 else 0.0
     high = float(betaincinv(found + 1, count - found, 1.0 - rest)) if found < count else 1.0
@@ -22,10 +22,13 @@ def share_bounds(found: int, count: int) -> tuple[float, float]:
 
 
 def rate_bound_per_h(alarms: int, hours: float) -> float:
-    """Return the upper 95 % bound of a rate, one-sided: 3 / T after T hours without an alarm; infinite without time."""
+    """Return the one-sided upper 95 % bound of a rate, 1/h, after `alarms` in `hours`; inf without time.
+
+    Without an alarm it is 3 / hours.
+    """
     return float(gammaincinv(alarms + 1, CONFIDENCE)) / hours if hours > 0.0 else math.inf
 
 
 def least_rate_per_h(alarms: int, hours: float) -> float:
-    """Return the lower 95 % bound of a rate, one-sided; 0 after no alarm."""
+    """Return the one-sided lower 95 % bound of a rate, 1/h, after `alarms` in `hours`; 0 without an alarm or time."""
     return float(gammaincinv(alarms, 1.0 - CONFIDENCE)) / hours if alarms > 0 and hours > 0.0 else 0.0

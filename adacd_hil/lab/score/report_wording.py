@@ -34,12 +34,12 @@ STATE_WORDS: Final = {
 
 
 def state_words(name: str | None) -> str:
-    """Return the words for a state that a log names; a dash for None."""
+    """Return the words for a state by its name in `SchemeState`; a dash for None."""
     return NONE if name is None else STATE_WORDS[SchemeState[name]]
 
 
 def number_text(value: float | None, digits: int, unit: str = "") -> str:
-    """Return a number as text, with a fixed count of decimals and a true minus sign; a dash for None."""
+    """Return a number as text with `digits` decimals and a true minus sign; a dash for None, NaN and infinity."""
     if value is None or not math.isfinite(value):
         return NONE
     text = f"{value:z.{digits}f}".replace("-", "−")
@@ -47,7 +47,7 @@ def number_text(value: float | None, digits: int, unit: str = "") -> str:
 
 
 def pair_text(values: Sequence[float] | None, digits: int) -> str:
-    """Return the values of both joints as text; a dash for None."""
+    """Return the values of both joints as "1.00 / 2.00" with `digits` decimals; a dash for None."""
     return NONE if values is None else " / ".join(number_text(value, digits) for value in values)
 
 
@@ -57,12 +57,12 @@ def yes_text(value: bool | None) -> str:
 
 
 def signs_text(direction: tuple[int, int] | None) -> str:
-    """Return the signs of both joints as text; a dash for None."""
+    """Return the signs of both joints as "+ / −", 0 as "0"; a dash for None."""
     return NONE if direction is None else " / ".join({1: "+", -1: "−", 0: "0"}[sign] for sign in direction)
 
 
 def signed_text(value: float) -> str:
-    """Return a number as text, with its sign and one decimal."""
+    """Return a number as text with one decimal, its sign, "+" included, and a true minus sign."""
     return f"{value:+.1f}".replace("-", "−")
 
 
@@ -72,9 +72,9 @@ def scaled(value: float | None, factor: float) -> float | None:
 
 
 def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: str) -> str:
-    """Return a value with its standard deviation as text; a dash where either is not known.
+    """Return a value with its standard deviation, "1.00 ± 0.10 Nm"; a dash if either is None.
 
-    A standard deviation that would read as 0 gets up to three more decimals.
+    digits: decimals of both; up to three more for a standard deviation that would read as 0.
     """
     if value is None or sigma is None:
         return NONE
@@ -84,7 +84,10 @@ def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: 
 
 
 def score_sentence(score: Score) -> str:
-    """Return a clause with the contacts found and missed, the longest delay, and the false alarms."""
+    """Return a clause with the contacts found and missed, the longest delay, and the false alarms.
+
+    Contacts while detection was not armed are named apart.
+    """
     armed = [contact for contact in score.contacts if contact.is_armed]
     delays_ms = [contact.delay_ms for contact in armed if contact.delay_ms is not None]
     within = f" within {max(delays_ms):.0f} ms" if delays_ms else ""
@@ -105,7 +108,10 @@ def score_sentence(score: Score) -> str:
 
 
 def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
-    """Return a clause with the number of false alarms, and an upper bound of their rate if the time is long enough."""
+    """Return a clause with the number of false alarms, and the upper bound of their rate.
+
+    A bound above 3 per hour is replaced by words that the time is too short.
+    """
     count = number_of(false_alarms, "false alarm") if false_alarms else "No false alarms"
     if bound_per_h > _TELLING_PER_H:
         return f"{count} in that time, which is too short to tell a rate by counting"
@@ -113,7 +119,7 @@ def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
 
 
 def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """Return median, 90th percentile and largest of delays; None for each without delays."""
+    """Return median, 90th percentile and largest of delays; three times None without delays."""
     if not delays_ms:
         return None, None, None
     median, p90, largest = np.quantile(delays_ms, (0.5, 0.9, 1.0)).tolist()
@@ -121,25 +127,31 @@ def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | Non
 
 
 def delays_phrase(delays_ms: Sequence[float]) -> str:
-    """Return the distribution of delays as text; "" without delays."""
+    """Return a phrase with median, 90th percentile and largest of delays, beginning with a comma; "" without delays."""
     if not delays_ms:
         return ""
     return ", after {:.1f} ms (median), {:.1f} (p90), {:.1f} (largest)".format(*delay_figures(delays_ms))
 
 
 def share_phrase(delays_ms: Sequence[float], contacts: int, bounds: tuple[float, float]) -> str:
-    """Return as text how many contacts were found, the bounds of their share, and their delays."""
+    """Return a phrase with the number of contacts found, the bounds of their share (0…1) in percent, and their delays.
+
+    delays_ms: of each contact found.
+    """
     found = found_text(len(delays_ms), contacts)
     return f"{found} contacts found ({100 * bounds[0]:.0f} to {100 * bounds[1]:.0f} %){delays_phrase(delays_ms)}"
 
 
 def rate_phrase(alarms: int, hours: float, bound_per_h: float) -> str:
-    """Return as text how many false alarms came in how many hours, and the upper bound of their rate."""
+    """Return a phrase with the number of false alarms, the hours, and the 95 % bound of their rate."""
     return f"{alarms} false alarms in {hours:.4f} h, {CONFIDENCE_TEXT} bound {bound_per_h:.3g} per hour"
 
 
 def percent_text(share: float) -> str:
-    """Return a share (0…1) in percent as text with two significant digits; below 0.005 % "less than 0.01 %"."""
+    """Return a share (0…1) in percent as text with two significant digits.
+
+    A share above 0 and below 0.005 % gives "less than 0.01 %".
+    """
     if 0.0 < share < 5e-5:
         return "less than 0.01 %"
     return f"{100.0 * share:.2g} %" if share < 0.995 else f"{100.0 * share:.0f} %"

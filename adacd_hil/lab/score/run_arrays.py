@@ -31,7 +31,10 @@ from adacd_hil.settings.configuration import Settings
 
 
 class Quantity(NamedTuple):
-    """A time of each cycle: its column in /cycle, ns. `is_reserve`: it must be large, not small."""
+    """A time that each cycle has.
+
+    column: its name in /cycle, where it is in ns. `is_reserve`: it should be large, not small.
+    """
 
     name: str
     column: str
@@ -67,7 +70,7 @@ QUANTITIES: Final = (
 
 @dataclass(frozen=True)
 class CycleColumns:
-    """The columns of /cycle over n cycles, int64 (n,); a column that the log does not have is not in `columns`."""
+    """The columns of /cycle over n cycles, int64 (n,). Columns that the log lacks are not in `columns`."""
 
     t_ns: Cycles
     columns: Mapping[str, Cycles]
@@ -82,11 +85,14 @@ class CycleColumns:
         return name in self.columns
 
     def rows(self, rows: Cycles) -> "CycleColumns":
-        """Return some of the cycles; rows: their indices."""
+        """Return the columns of some of the cycles; rows: their indices."""
         return CycleColumns(self.t_ns[rows], {name: column[rows] for name, column in self.columns.items()})
 
     def times_us(self, quantity: Quantity) -> Vector | None:
-        """Return a time of the cycles that have it, µs; None if the log lacks it."""
+        """Return a time of the cycles that have it, µs (k,); None if the log lacks it.
+
+        Cycles with missing frames have no time from SYNC to feedback.
+        """
         if quantity.column not in self:
             return None
         values_ns = self[quantity.column]
@@ -95,7 +101,7 @@ class CycleColumns:
         return np.asarray(values_ns / 1000.0, dtype=np.float64)
 
     def steps(self, name: str, before: int = 0) -> Cycles:
-        """Return the increments (n,) of a count that runs on from cycle to cycle; a count that began anew begins at 0.
+        """Return by how much a running count goes up in each cycle (n,); where it went down, it began anew from 0.
 
         before: the count in the cycle before the first.
         """
@@ -105,13 +111,13 @@ class CycleColumns:
 
 
 def columns_of_series(series: Series) -> CycleColumns:
-    """Return the columns of a log's /cycle; one of an older version lacks some."""
+    """Return the columns of a log's /cycle; those that an older version lacks are left out."""
     names = [name for name in CycleRecord._fields if name in series.fields]
     return CycleColumns(series.t_ns, {name: series[name].astype(np.int64) for name in names})
 
 
 def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> CycleColumns:
-    """Return the columns of records, one per cycle, at times t_ns."""
+    """Return the columns of records, one per cycle, at the times t_ns."""
     table = np.array(records, dtype=np.int64).reshape(len(records), len(CycleRecord._fields))
     columns = {name: table[:, place].copy() for place, name in enumerate(CycleRecord._fields)}
     return CycleColumns(np.array(t_ns, dtype=np.int64), columns)
@@ -125,14 +131,14 @@ _BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
 
 
 class AttemptBegins:
-    """Finds the cycles in which attempts begin, in columns that come piece by piece."""
+    """Finds the cycles in which attempts begin: INIT or COMMISSION after another state. Cycles come piece by piece."""
 
     def __init__(self) -> None:
         self._begins: list[int] = []
         self._was_beginning: bool | None = None  # None before the first cycle
 
     def add_cycles(self, cycle: NDArray[Any], state: NDArray[np.uint8]) -> None:
-        """Look for beginnings in the next cycles (k,), k > 0; keep them in `begins`."""
+        """Look for beginnings in the next cycles (k,), k > 0, and add them to `begins`."""
         is_beginning = np.isin(state, _BEGINNING)
         if self._was_beginning is None and not is_beginning[0]:
             self._begins.append(0)
@@ -142,16 +148,17 @@ class AttemptBegins:
 
     @property
     def begins(self) -> Cycles:
-        """First cycle of each attempt so far; of one that began before the log, 0."""
+        """First cycle of each attempt so far; 0 for one that began before the log, or if none is known."""
         return np.array(self._begins or [0], np.int64)
 
 
 @dataclass(frozen=True)
 class CertifiedStream:
-    """Fields of the certified scheme's block beyond the paper's, over n cycles.
+    """The certified scheme's values beyond the paper's, over n cycles.
 
-    tau_ext, threshold: of the bank (n, channels, 2): each filter smoothed, then all but the slowest bare. theta_further
-    (n, k): offsets, lags and friction terms; theta_std (n, p + k); promotions (n,).
+    tau_ext, threshold: of the bank, Nm (n, channels, 2): each filter smoothed, then all but the slowest bare.
+    theta_further (n, k): offsets, lags and friction terms; theta_std (n, p + k): of all parameters; promotions (n,):
+    running count of refined models that took over.
     """
 
     tau_ext: Vector
@@ -163,7 +170,7 @@ class CertifiedStream:
 
 @dataclass(frozen=True)
 class PaperStream:
-    """The paper's scheme beside, over n cycles: is_armed (n,), its residual and threshold (n, 2)."""
+    """The paper's scheme that ran beside, over n cycles: is_armed (n,), its residual and threshold, Nm (n, 2)."""
 
     is_armed: Mask
     tau_ext_hat: Vector
@@ -181,7 +188,10 @@ class MeasuredMotion:
 
 @dataclass(frozen=True)
 class CheckCounts:
-    """Running counts of the checks of cyclic frames, as logged (k,): counts (k, devices, statuses)."""
+    """Running counts of the end-to-end checks of cyclic frames, as logged k times: counts (k, devices, statuses).
+
+    cycle (k,): of each logging.
+    """
 
     devices: tuple[str, ...]
     cycle: Cycles
@@ -189,9 +199,9 @@ class CheckCounts:
 
 
 class StretchOfRun(NamedTuple):
-    """A stretch of a log: as requested, as found, widened so that it cuts nothing, and the contacts before it.
+    """A stretch of a log that was read: as asked, and as found, widened so that it cuts nothing.
 
-    motion_start_s: s since the beginning of the log.
+    contacts_before: number of contacts before it. motion_start_s: s since the beginning of the log.
     """
 
     asked: TimeWindow
@@ -204,7 +214,8 @@ class StretchOfRun(NamedTuple):
 class Run:
     """A run as plain arrays over n of its cycles: over all, or of a long one over those that the report keeps.
 
-    `truth` is None on a real arm.
+    Joint arrays are (n, 2), theta_hat (n, p). `truth` is None on a real arm. frames, dropped: counts of the log's
+    summary, None if it lacks them.
     """
 
     cycle: Cycles
@@ -238,7 +249,7 @@ class Run:
 
     @property
     def first_contact(self) -> int:
-        """Number of the first contact in this stretch, by its place among all contacts of the log, from 1."""
+        """Number that the first contact in this stretch has among all contacts of the log, from 1."""
         return 1 if self.stretch is None else 1 + self.stretch.contacts_before
 
     @property
@@ -248,18 +259,18 @@ class Run:
 
     @property
     def has_cad(self) -> bool:
-        """Whether the configuration gives a CAD model."""
+        """Whether the configuration has a CAD model, `arm.cad_theta`."""
         return len(self.settings.arm.cad_theta) > 0
 
     @property
     def a_rad_s(self) -> float:
-        """Cut-off of the filter of `tau_ext_hat`: the bank's slowest, or the paper's."""
+        """Cut-off of the filter of `tau_ext_hat`, rad/s: the slowest of the certified scheme's bank, or the paper's."""
         is_certified = self.certified is not None
         return self.settings.certified.cutoffs_rad_s[0] if is_certified else self.settings.filter.a_rad_s
 
     @property
     def zero_ns(self) -> int:
-        """Motion start, ns."""
+        """Motion start, ns: the first cycle in ADAPT, else the first cycle; 0 without a cycle."""
         if self.motion_start_ns is not None:
             return self.motion_start_ns
         if self.t_ns.size == 0:
@@ -268,18 +279,21 @@ class Run:
         return int(self.t_ns[int(np.argmax(adapting)) if adapting.any() else 0])
 
     def time_s(self) -> Vector:
-        """Return the time of every cycle since motion start, s (n,)."""
+        """Return the time of each cycle since motion start, s (n,)."""
         # Subtracted as integers: float64 resolves only 256 ns of an absolute time.
         return np.asarray((self.t_ns - self.zero_ns) * 1e-9, dtype=np.float64)
 
     def time_of_s(self, cycle: NDArray[Any]) -> Vector:
-        """Return the time of any cycle numbers since motion start, s; between logged cycles by interpolation."""
+        """Return the time of any cycle numbers since motion start, s, interpolated between the run's cycles.
+
+        Zeros for a run without cycles.
+        """
         if self.cycle.size == 0:
             return np.zeros(len(cycle))
         return np.asarray(np.interp(cycle, self.cycle, self.time_s()), dtype=np.float64)
 
     def truth_time_s(self) -> Vector:
-        """Return the time of the cycles of the truth since motion start, s (k,)."""
+        """Return the time of each row of the truth since motion start, s (k,); empty without the truth."""
         if self.truth is None:
             return np.zeros(0)
         time_s = self.truth.time_s
@@ -288,7 +302,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Section:
-    """One part of a run; `is_complete` is False if the run ended, or failed, in it."""
+    """A section of a run, times in s since motion start. `is_complete`: False if the run ended, or failed, in it."""
 
     label: str
     kind: str  # "adaptation", "detection", "payload", "fault"
@@ -312,20 +326,26 @@ _KINDS: Final = {
 
 
 def section_label(index: int) -> str:
-    """Return the label of a section by its place, from 0: A to Z, then AA, AB and so on."""
+    """Return the label of the section with number `index`, from 0: A to Z, then AA, AB and so on."""
     letter = chr(ord("A") + index % 26)
     return letter if index < 26 else section_label(index // 26 - 1) + letter
 
 
 def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the state of each cycle (n,); for REACT and STOPPED, the state that was interrupted."""
+    """Return the state of each cycle (n,), but for REACT and STOPPED the state that was interrupted.
+
+    MONITOR if that is before the first cycle.
+    """
     rows = np.arange(state.size)
     own = np.maximum.accumulate(np.where(is_interrupted(state), -1, rows))
     return np.where(own < 0, np.uint8(SchemeState.MONITOR), state[np.maximum(own, 0)])
 
 
 def split_sections(run: Run) -> tuple[Section, ...]:
-    """Return the lettered sections of a run; cycles before the first ADAPT belong to no section."""
+    """Return the lettered sections of a run, in order; () for a run without cycles.
+
+    Cycles before the first ADAPT belong to no section.
+    """
     if run.state.size == 0:
         return ()
     kinds = np.array([_KINDS.get(SchemeState(value), "") for value in range(len(SchemeState))])[origins(run.state)]
@@ -344,14 +364,18 @@ def split_sections(run: Run) -> tuple[Section, ...]:
 
 
 def section_at(sections: Iterable[Section], time_s: float) -> str | None:
-    """Return the label of the section that a time belongs to; None if there is none."""
+    """Return the label of the first section that contains a time, s since motion start, its ends included.
+
+    None if none does.
+    """
     return next((section.label for section in sections if section.start_s <= time_s <= section.end_s), None)
 
 
 def rows_of(time_s: Vector, section: Section, end_s: float) -> slice:
     """Return the rows of a section among cycles at the ascending times `time_s` (n,).
 
-    end_s: when the run ends. Its last cycle belongs to the last section; the first one of the next section to that.
+    end_s: when the run ends. The cycle between two sections belongs to the later one, the run's last cycle to the last
+    section.
     """
     is_last = bool(section.end_s >= end_s)
     first = int(np.searchsorted(time_s, section.start_s))
@@ -359,12 +383,12 @@ def rows_of(time_s: Vector, section: Section, end_s: float) -> slice:
 
 
 def is_realtime(run: Run) -> bool:
-    """Return whether the host's own clock drove the cycles."""
+    """Return whether the run went by the host's clock, not in lockstep."""
     return run.metadata.get("clock") == "realtime"
 
 
 def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
-    """Return the truth on the host's cycles; None where the emulator never cycled.
+    """Return the truth on the host's cycles; None if it has no row.
 
     begins: first cycle of each attempt of the run so far; last: the host's last cycle; time_s: of the rows (m,). Rows
     of later attempts, and those after the host's last cycle, are left out: the arm goes on when the host has died.
@@ -389,7 +413,10 @@ def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> 
 
 
 def truth_rows(truth: Truth, rows: NDArray[np.bool_]) -> Truth:
-    """Return a truth with some of its rows, and with all of its payloads and parameters. rows (m,): a mask."""
+    """Return a truth with the chosen ones of its rows, and with all of its payloads and parameters.
+
+    rows (m,): a mask.
+    """
     names = ("cycle", "tau_ext", "contact_link", "contact_index", "force_N", "time_s", "attempt")
     columns = {name: getattr(truth, name) for name in names}
     return replace(truth, **{name: column[rows] for name, column in columns.items() if column is not None})

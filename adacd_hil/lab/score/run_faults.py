@@ -32,7 +32,7 @@ _MOST_LETTERS = 300
 
 
 def find_faults(run: Run) -> tuple[Fault, ...]:
-    """Return the faults of a run, in order; the run has the cycles in which the state changes."""
+    """Return the faults of a run, in order; () without one. The run must have the cycles in which the state changes."""
     is_fault = run.state == SchemeState.FAULT
     before = np.concatenate(([False], is_fault[:-1]))
     time_s = run.time_s()
@@ -46,7 +46,10 @@ def find_faults(run: Run) -> tuple[Fault, ...]:
 
 
 def _cause(run: Run, t_ns: int) -> str:
-    """Return the supervisor's words for the fault at a time, without state and reason; "" without an event of it."""
+    """Return the supervisor's words for the fault at `t_ns`, without state and reason.
+
+    "" if the log has no event of it within 2 ms.
+    """
     for logged in run.events:
         event = logged.event
         if event.name == _SUPERVISOR and event.level == "error" and abs(logged.t_ns - t_ns) <= _NEAR_NS:
@@ -55,9 +58,9 @@ def _cause(run: Run, t_ns: int) -> str:
 
 
 def find_causes(run: Run) -> tuple[str, ...]:
-    """Return the logged causes that ended attempts, or the log, without a fault, each once.
+    """Return the logged causes that ended attempts, or the log, without a fault, each once; () without any.
 
-    An interruption is one if a scenario played: the rest of its script is missing.
+    An interruption by the user counts only if a scenario played: the rest of its script is missing.
     """
     is_scripted = "scenario" in run.metadata
     said = [
@@ -79,7 +82,7 @@ _POWERED: Final = tuple(int(state) for state in POWERED)
 
 
 class CyclicDataGatherer:
-    """Sums up the cycles of a run, piece by piece, in constant memory."""
+    """Sums over the cyclic data of a run, gathered piece by piece in constant memory."""
 
     def __init__(self, settings: Settings) -> None:
         self._window = max(1, round(DATA_WINDOW_S / settings.bus.period_s))
@@ -90,7 +93,10 @@ class CyclicDataGatherer:
         self._present = np.empty((2, 0), np.int64)  # of the window under way: each cycle's number, and if incomplete
 
     def add_columns(self, columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
-        """Count incomplete and aged data in the next cycles. cycle, state: those of /scheme (k,)."""
+        """Count incomplete and aged data in the next cycles with powered drives.
+
+        cycle, state: those of /scheme (k,).
+        """
         is_powered = np.isin(state, _POWERED)
         self._cycles += int(np.count_nonzero(is_powered))
         if "cycle" not in columns:
@@ -107,7 +113,10 @@ class CyclicDataGatherer:
             self._add_windows(np.array([powered["cycle"], powered["frames_missing"] > 0]))
 
     def _add_windows(self, cycles: Cycles) -> None:
-        """Keep the worst window of one second; a gap in the numbers of the cycles ends one. cycles: as `_present`."""
+        """Store the worst share so far of incomplete cycles in one second; a gap in the cycle numbers ends a second.
+
+        cycles (2, k): numbers, and whether incomplete.
+        """
         cycles = np.concatenate((self._present, cycles), axis=1)
         begins = np.flatnonzero(np.diff(cycles[0], prepend=-2) != 1)
         place = np.arange(cycles.shape[1])
@@ -117,7 +126,7 @@ class CyclicDataGatherer:
         self._present = cycles[:, firsts[-1] :]
 
     def _judge_windows(self, is_incomplete: Cycles, firsts: Cycles) -> None:
-        """Keep the share of the worst window that is long enough; firsts: where in the cycles each begins."""
+        """Store the worst share of those windows that are long enough; firsts: where in the cycles each begins."""
         sizes = np.diff(firsts, append=is_incomplete.size)
         is_long = sizes >= SHORTEST_DATA_WINDOW * self._window
         if is_long.any():
@@ -125,7 +134,10 @@ class CyclicDataGatherer:
             self._worst = max(self._worst, float(shares[is_long].max()))
 
     def data(self, run: Run) -> CyclicData:
-        """Return the shares of incomplete and aged data so far. run: has the cycles in which the state changes."""
+        """Return the shares of incomplete and aged data so far.
+
+        run: has the cycles in which the state changes, and the checks' counts. Call it after the last piece.
+        """
         self._judge_windows(self._present[1], np.zeros(1, np.int64))
         limits = run.settings.data
         shares = {name: count / self._logged for name, count in self._counted.items()} if self._logged else {}
@@ -143,7 +155,10 @@ class CyclicDataGatherer:
 
 
 def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShares]:
-    """Return the shares of each device's cycles, from counts that begin anew in each attempt."""
+    """Return each device's shares by its name.
+
+    {} without counts in the log, or with fewer than two loggings of them.
+    """
     if checks is None or len(checks.cycle) < 2 or not run.cycle.size:
         return {}
     cycles = np.diff(checks.cycle)
@@ -167,7 +182,10 @@ def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShar
 
 
 def _excesses(worst: float | None, devices: dict[str, DeviceShares], limits: DataSettings) -> list[str]:
-    """Return a line for each share that was over its limit in some second."""
+    """Return a line for each share that was over its limit in some second.
+
+    worst: share of incomplete cycles, None if unknown.
+    """
     judged = [("incomplete cycles", worst, limits.incomplete_share)]
     for name, shares in devices.items():
         judged.append((f"no new data of {name}", shares.worst_no_new_data, limits.no_new_data_share))

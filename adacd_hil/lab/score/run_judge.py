@@ -21,7 +21,7 @@ from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge
 
 
 def find_detections(run: Run) -> tuple[Detection, ...]:
-    """Return the alarms of a run, each with the reports that belong to it by their cycle."""
+    """Return the alarms of a run in order, each with its first and last report by cycle; None where there is none."""
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
     detections = []
@@ -39,7 +39,7 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
 
 
 def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
-    """Return the true contacts of a run, with the times of their rows; () without the truth."""
+    """Return the true contacts of a run, with the times of their rows; () without the truth or cycles."""
     truth = run.truth
     if truth is None or run.cycle.size == 0:
         return ()
@@ -49,16 +49,16 @@ def timed_contacts(run: Run) -> tuple[TrueContact, ...]:
 
 
 def contacts_of(run: Run) -> tuple[TrueContact, ...]:
-    """Return the true contacts of a run, on its clock, with the thresholds and the filter of its own scheme."""
+    """Return the true contacts of a run, with the times in which they explain alarms of its own scheme."""
     return placed_in(run, timed_contacts(run), run.state, run.threshold, run.a_rad_s)
 
 
 def placed_in(
     run: Run, contacts: Iterable[TrueContact], state: NDArray[np.uint8], threshold: Vector, a_rad_s: float
 ) -> tuple[TrueContact, ...]:
-    """Return timed contacts on the clock of a run, with the times in which they explain alarms of a scheme.
+    """Return timed contacts with the times, on the run's clock, in which they explain alarms of a scheme.
 
-    state (n,), threshold (n, 2), a_rad_s: of that scheme, in the run's cycles; cut-off of its slowest filter.
+    state (n,), threshold (n, 2), a_rad_s: of that scheme, in the run's cycles; a_rad_s: cut-off of its slowest filter.
     """
     host = HostCycles(run.cycle, run.t_ns, np.concatenate(([SchemeState.INIT], state[:-1])), threshold)
     placed = []
@@ -71,7 +71,7 @@ def placed_in(
 
 
 def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
-    """Return the delay after which a torque step crosses a threshold behind a first-order low-pass; None: never.
+    """Return after how long a torque step crosses a threshold behind a first-order low-pass, s; None if never.
 
     Closed form: t = -ln(1 - h / |tau|) / a.
     """
@@ -81,7 +81,7 @@ def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) ->
 
 
 def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float) -> float | None:
-    """Return the delay after which a torque step crosses a threshold behind two first-order low-passes; None: never.
+    """Return after how long a torque step crosses a threshold behind two first-order low-passes, s; None if never.
 
     The response rises steadily, so that there is one crossing.
     """
@@ -93,14 +93,20 @@ def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_r
 
 @dataclass(frozen=True)
 class FilterChannel:
-    """A filter with its threshold, Nm (2,): first order, and with `smoothing_rad_s` a second one behind it."""
+    """A filter with its threshold, Nm (2,).
+
+    It is of first order; unless `smoothing_rad_s` is None, a second one is behind it.
+    """
 
     cutoff_rad_s: float
     smoothing_rad_s: float | None
     threshold: Vector
 
     def step_delay_s(self, tau_ext: Vector) -> float | None:
-        """Return how long a step of tau_ext (2,) takes to cross the threshold, at the faster joint; None: never."""
+        """Return after how long a step of tau_ext, Nm (2,), crosses the threshold at the faster joint, s.
+
+        None if never.
+        """
         delays_s = []
         for joint in range(JOINTS):
             tau, h = float(tau_ext[joint]), float(self.threshold[joint])
@@ -111,7 +117,10 @@ class FilterChannel:
         return min((delay_s for delay_s in delays_s if delay_s is not None), default=None)
 
     def respond(self, tau_ext: Vector, cycle: Cycles, period_s: float) -> Vector:
-        """Return the channel's output for a true torque (n, 2), at rest at the first sample; see `filtered`."""
+        """Return the channel's output, Nm (n, 2), for a true torque (n, 2), from rest at the first sample.
+
+        See `filtered`.
+        """
         response = filtered(tau_ext, cycle, period_s, self.cutoff_rad_s)
         if self.smoothing_rad_s is None:
             return response
@@ -119,20 +128,23 @@ class FilterChannel:
 
 
 def threshold_in(run: Run, row: int) -> Vector:
-    """Return the threshold of `tau_ext_hat` in force in a cycle, Nm (2,); the configured one where detection is off."""
+    """Return the threshold of `tau_ext_hat` in a row, Nm (2,); at a joint without detection, the configured one."""
     configured = np.array(run.settings.detector.threshold_Nm)
     return np.where(np.isfinite(run.threshold[row]), run.threshold[row], configured)
 
 
 def row_at(run: Run, time_s: float) -> int:
-    """Return the row of the first cycle at a time or after it; the last row if there is none."""
+    """Return the row of the first cycle at `time_s`, s since motion start, or after it.
+
+    The last row if there is none.
+    """
     t_ns, zero_ns = run.t_ns, run.zero_ns
     row = bisect_left(range(len(t_ns)), time_s, key=lambda row: float((t_ns[row] - zero_ns) * 1e-9))
     return min(row, len(t_ns) - 1)
 
 
 def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
-    """Return the filters that detect at a time, with their thresholds: the paper's one, or the bank."""
+    """Return the filters that detect at a time, with their thresholds: the paper's one filter, or the bank's."""
     if run.certified is None:
         return (FilterChannel(run.a_rad_s, None, threshold_in(run, row_at(run, time_s))),)
     thresholds = run.certified.threshold[row_at(run, time_s)]
@@ -145,13 +157,16 @@ def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
 def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[Detection]) -> Score:
     """Return which contacts a run's own scheme detected, and its false alarms.
 
-    Alarms about the weight of a changed payload are left out, see `is_payload_alarm`.
+    Alarms about the weight of a changed payload are neither, see `is_payload_alarm`.
     """
     return judge(contacts, [detection for detection in detections if not is_payload_alarm(run, detection.row)])
 
 
 def is_payload_alarm(run: Run, row: int) -> bool:
-    """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet."""
+    """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet.
+
+    False without the truth or without gravity; the row before must be in PAYLOAD.
+    """
     truth, armed = run.truth, np.flatnonzero(is_armed_in(run.state[:row]))
     if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:
         return False

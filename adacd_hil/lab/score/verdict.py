@@ -38,7 +38,10 @@ _NO_LOSS: Final = "no cyclic data was late or lost"
 def list_findings(
     run: Run, metrics: Metrics, score: Score, faults: tuple[Fault, ...], causes: tuple[str, ...]
 ) -> tuple[Finding, ...]:
-    """Return the findings of a run, failures first. causes: of attempts that ended without a fault."""
+    """Return the findings of a run, failures first. causes: those of attempts that ended without a fault.
+
+    A run without cycles has one bad finding.
+    """
     if run.cycle.size == 0:
         cause = "; ".join(causes) or "the log does not say why"
         return (Finding(f"no cycle was run: {cause}", True),)
@@ -74,7 +77,10 @@ def list_findings(
 
 
 def _judged_text(run: Run, found: str) -> str:
-    """Return `found`, with the time that the truth covers where it doesn't cover all of MONITOR."""
+    """Return `found`, with the time that the truth covers unless it covers all of MONITOR.
+
+    If it covers nothing of MONITOR, return words on that instead.
+    """
     watched = is_armed_in(run.state)
     if run.truth is None or run.truth.span is None or not watched.any():
         return found
@@ -92,9 +98,9 @@ _HEADLINE_LETTERS: Final = 160
 
 
 def headlines(metrics: Metrics) -> list[str]:
-    """Return the findings as lines for a first screen, the bad ones first; a long one is cut, the log has all of it.
+    """Return the findings as lines for a first screen, the bad ones first, each cut at 160 letters.
 
-    The paper's scheme beside, and cyclic data without a loss, are left to the tables.
+    Findings on the paper's scheme beside, and on cyclic data without a loss, are left out.
     """
     ordered = sorted(metrics.findings, key=lambda finding: not finding.is_bad)
     plain = [finding.text for finding in ordered if not finding.text.startswith((_BESIDE, _NO_LOSS))]
@@ -104,12 +110,12 @@ def headlines(metrics: Metrics) -> list[str]:
 
 
 def is_margin_below_1(evidence: CertifiedEvidence | None) -> bool:
-    """Return whether some residual was over its threshold in a cycle free of contact."""
+    """Return whether some residual was over its threshold in a cycle free of contact; False without margins."""
     return evidence is not None and evidence.smallest_margin is not None and evidence.smallest_margin < 1.0
 
 
 def is_revoked(evidence: CertifiedEvidence | None) -> TypeGuard[CertifiedEvidence]:
-    """Return whether some certificate was taken back."""
+    """Return whether some certificate was taken back; False for the paper's scheme."""
     return evidence is not None and bool(evidence.revoked)
 
 
@@ -119,7 +125,7 @@ def _margin_text(evidence: CertifiedEvidence | None) -> str:
 
 
 def _fault_texts(faults: tuple[Fault, ...]) -> list[str]:
-    """Return texts of the faults: the first one, and the one in which the run ended."""
+    """Return texts of the first fault and of the last one, with the number of faults; [] without a fault."""
     if not faults:
         return []
     last = faults[-1]
@@ -146,14 +152,17 @@ def _beside_text(times_s: list[float | None]) -> str:
 
 
 def _summary(times_s: list[float | None], failed: str) -> str:
-    """Return a phrase on many adaptations: the shortest and the longest time, and how many of them failed."""
+    """Return a phrase on many adaptations: the shortest and the longest time, and how many of them `failed` (words)."""
     took_s = [time_s for time_s in times_s if time_s is not None]
     text = f"{min(took_s):.2f} to {max(took_s):.2f} s, {len(took_s)} times"
     return text if len(took_s) == len(times_s) else f"{text}, and {failed} {len(times_s) - len(took_s)} times"
 
 
 def begun_anew(sections: tuple[Section, ...]) -> frozenset[str]:
-    """Return the labels of further adaptations that follow no payload change, but a fault or a broken attempt."""
+    """Return the labels of adaptations that follow another section than a payload change: a fault, or a broken attempt.
+
+    The first section is not among them.
+    """
     pairs = itertools.pairwise(sections)
     return frozenset(now.label for before, now in pairs if now.kind == "adaptation" and before.kind != "payload")
 
@@ -161,7 +170,10 @@ def begun_anew(sections: tuple[Section, ...]) -> frozenset[str]:
 def identified_text(
     adaptation_s: dict[str, float | None], payload_kg: dict[str, float | None], anew: frozenset[str], done: str
 ) -> str:
-    """Return a phrase with the time until the model was `done`, identified or certified. anew: see `begun_anew`."""
+    """Return a phrase with the times until the model was `done`, "identified" or "certified".
+
+    anew: labels from `begun_anew`. More than LISTED adaptations are summed up.
+    """
     if not adaptation_s:
         return "the arm never moved to adapt"
     labels = list(adaptation_s)
@@ -196,7 +208,7 @@ _ELSEWHERE = {
 
 
 def is_papers_experiment(run: Run) -> bool:
-    """Return whether the emulator played the paper's experiment, with its arm; False on a real arm."""
+    """Return whether the emulator played the paper's scenario with the paper's arm, by lengths and CAD model."""
     played = (run.metadata.get("scenario"), run.metadata.get("emulator_scenario"))
     arm, papers = run.settings.arm, _papers_arm(run.settings.arm.profile)
     return _EXPERIMENT in played and (arm.link_length_m, arm.cad_theta) == (papers.link_length_m, papers.cad_theta)
@@ -223,9 +235,10 @@ _COUNTED: Final = ("Contacts detected", "Median delay", "False alarms")
 
 
 def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
-    """Return a row per figure: measured, the paper's, and of the paper's scheme on the same stream.
+    """Return a row per figure: measured, the paper's, and that of the paper's scheme on the same stream.
 
-    For a run that is not the paper's experiment, the paper's figures are left out.
+    For a run that is not the paper's experiment, the paper's figures are None, and rows without another figure are left
+    out.
     """
     settings, evidence = run.settings, metrics.evidence
     detections = [section.label for section in metrics.sections if section.kind == "detection"]
@@ -294,7 +307,10 @@ def _figures(
     missed: int | None,
     false_alarms: int | None,
 ) -> dict[str, str]:
-    """Return a scheme's figures as text by quantity. contacts: armed, detected at, s, and delay, ms, of each."""
+    """Return a scheme's figures as text by quantity. contacts: is_armed, detected at, s, and delay, ms, of each.
+
+    missed, false_alarms: None: unknown.
+    """
     times_s = list(adaptation_s.values())
     seen = [at_s for _, at_s, _ in contacts if at_s is not None]
     delays_ms = [delay_ms for is_armed, _, delay_ms in contacts if is_armed and delay_ms is not None]
@@ -312,7 +328,10 @@ def _figures(
 
 
 def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, ...]:
-    """Return the rows, without the paper's numbers if the run was not the paper's experiment; drop rows then empty."""
+    """Return the rows; for a run that is not the paper's experiment without the paper's figures.
+
+    Rows that are then empty are left out.
+    """
     if is_papers_experiment(run):
         return tuple(rows)
     return tuple(
@@ -323,7 +342,10 @@ def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, .
 
 
 def _tests_text(times_s: list[float | None]) -> str:
-    """Return the durations of the tests as text; of many, the shortest and the longest."""
+    """Return the durations of the tests as text; of more than LISTED the shortest and the longest.
+
+    times_s: None: no test.
+    """
     found = [time_s for time_s in times_s if time_s is not None]
     if len(times_s) > LISTED and found:
         return f"tests of {min(found):.2f} to {max(found):.2f} s"
@@ -331,13 +353,16 @@ def _tests_text(times_s: list[float | None]) -> str:
 
 
 def _threshold_text(evidence: CertifiedEvidence, detections: list[str]) -> str:
-    """Return the range of the slowest channel's thresholds as text: smallest and largest median of a section."""
+    """Return the range of the slowest channel's thresholds as text: of their medians in the detection sections.
+
+    NONE without any.
+    """
     found = [h for label in detections for row in evidence.margins.get(label, ())[:1] for h in row.threshold_Nm]
     return f"{min(found):.3f} to {max(found):.3f} Nm" if found else NONE
 
 
 def _push_text(evidence: CertifiedEvidence) -> str:
-    """Return the smallest push that is found as text: its median, and at the worst moment."""
+    """Return the median and the worst smallest push that is found, of both joints, as text; NONE if unknown."""
     if evidence.smallest_push is None:
         return NONE
     median, worst = (
@@ -365,7 +390,10 @@ def _residual_text(frozen: list[tuple[float, float] | None], index: int) -> str:
 
 
 def data_text(data: CyclicData) -> str:
-    """Return the verdict's clause on cyclic data that was late, lost or repeated; "" if the drives never had torque."""
+    """Return the verdict's clause on cyclic data that was late, lost or repeated; "" if the drives never had torque.
+
+    It names the worst device only.
+    """
     if not data.cycles:
         return ""
     if data.incomplete is None:

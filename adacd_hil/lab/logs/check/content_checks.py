@@ -23,7 +23,10 @@ _LAST_ENCAPSULATION = 0x0D
 
 
 class DefinitionCheck:
-    """Checks the schemas and channels of a file, in the data section and then in the summary."""
+    """Checks the schemas and channels of a file.
+
+    Call it for those of the data section, then of the summary, then `finish`.
+    """
 
     def __init__(self, findings: Findings) -> None:
         self.schemas: dict[int, Schema] = {}
@@ -37,9 +40,9 @@ class DefinitionCheck:
         self._duplicates: set[str] = set()
 
     def schema(self, schema: Schema, offset: int, is_summary: bool) -> None:
-        """Check a schema against the rules and against earlier ones of its number; add findings.
+        """Check a schema by the rules and against an earlier one with its number, and store it; add findings.
 
-        offset: place in the file. is_summary: it stands in the summary.
+        offset: of its record or chunk in the file. is_summary: it stands in the summary.
         """
         name = f"schema {schema.id}"
         if schema.id == 0:
@@ -59,9 +62,9 @@ class DefinitionCheck:
             self.schemas.setdefault(schema.id, schema)
 
     def channel(self, channel: Channel, offset: int, is_summary: bool) -> None:
-        """Check a channel against the rules and against earlier ones of its number; add findings.
+        """Check a channel by the rules and against an earlier one with its number, and store it; add findings.
 
-        offset: place in the file. is_summary: it stands in the summary.
+        offset: of its record or chunk in the file. is_summary: it stands in the summary.
         """
         name = f"channel {channel.id}"
         known = self.channels.get(channel.id)
@@ -95,7 +98,10 @@ class DefinitionCheck:
             )
 
     def _place(self, kind: str, number: int, is_known: bool, offset: int, is_summary: bool) -> None:
-        """Note a definition that only the summary has; add a finding on one that the data section repeats."""
+        """Note a definition that only the summary has.
+
+        Add a finding, once per number, for one that the data section repeats.
+        """
         name = f"{kind} {number}"
         if is_summary and not is_known:
             self._summary_only.append((kind, number, offset))
@@ -104,7 +110,10 @@ class DefinitionCheck:
             self._findings.add_finding("duplicate", f"{name} is defined more than once in the data section", offset)
 
     def finish(self, counts: NDArray[Any]) -> None:
-        """Add findings on channels and schemas that only the summary defines. counts: messages by channel number."""
+        """Add findings on channels and schemas that only the summary defines.
+
+        Each that messages use is an error; the others make one note. counts: messages by channel number.
+        """
         used = {"channel": set(np.flatnonzero(counts).tolist())}
         used["schema"] = {self.all_channels[number].schema_id for number in used["channel"] & set(self.all_channels)}
         unused = []
@@ -119,7 +128,7 @@ class DefinitionCheck:
 
 
 class ContentCheck:
-    """Checks the messages of a file, their order and payloads, and the texts of the schemas."""
+    """Checks the messages of a file, their order and payloads, and the texts of schemas."""
 
     def __init__(self, findings: Findings) -> None:
         self._findings = findings
@@ -131,14 +140,17 @@ class ContentCheck:
         self._checks: dict[int, Callable[[bytes], bool]] = {}  # of payloads that don't have that size
 
     def schema(self, schema: Schema, offset: int) -> None:
-        """Check the text of a schema, once for each number; add a finding if it can't be read."""
+        """Check the text of a ros2msg schema, the first of each number only; add a finding if it can't be read."""
         if schema.encoding == "ros2msg" and schema.id not in self._read:
             self._read.add(schema.id)
             if problem := text_problem(schema.data):
                 self._findings.add_finding("schema-text", f"schema {schema.id} ({schema.name}): {problem}", offset)
 
     def messages(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
-        """Check order and payloads of the messages of a chunk; add findings. offset: of the chunk in the file."""
+        """Check times and cdr payloads of the messages of a chunk; add findings. offset: of the chunk in the file.
+
+        Times are also compared with those of earlier calls.
+        """
         for number in np.unique(contents.channels).tolist():
             if number not in self._described and number in definitions.channels:
                 channel = definitions.channels[number]
@@ -147,7 +159,7 @@ class ContentCheck:
         self._check_payloads(contents, definitions, offset)
 
     def _describe(self, channel: Channel, schema: Schema | None) -> None:
-        """Store the size and the kind that the payloads of a channel must have."""
+        """Store the payload size of a channel, whether its payloads are cdr, and, for varying sizes, their check."""
         self._described.add(channel.id)
         self._is_cdr[channel.id] = channel.message_encoding == "cdr"
         self._sizes[channel.id] = _ANY_SIZE if (size := payload_size(channel, schema)) is None else size
@@ -216,7 +228,7 @@ _CONSTANT = re.compile(r"=\s*\S.*")
 
 
 def text_problem(data: bytes) -> str:
-    """Return the defect in the text of a schema, in words; "" when it can be read."""
+    """Return the defect in the text of a ros2msg schema, in words; "" if there is none."""
     try:
         text = data.decode("utf-8")
     except UnicodeDecodeError:
@@ -237,7 +249,10 @@ def text_problem(data: bytes) -> str:
 
 
 def _line_problem(line: str, known: set[str]) -> str:
-    """Return the defect in a line of a schema's text, in words; "" without one. known: types as package/Type."""
+    """Return the defect in a line of a ros2msg schema's text, in words; "" without one.
+
+    known: names of the types that the text defines, as package/Type.
+    """
     if not line or line.startswith("#") or line == _PARTS:
         return ""
     match = _LINE.fullmatch(line)
@@ -253,6 +268,6 @@ def _line_problem(line: str, known: set[str]) -> str:
 
 
 def _short(name: str) -> str:
-    """Return package/Type for package/msg/Type."""
+    """Return package/Type for package/msg/Type; a name without a slash as it is."""
     parts = name.split("/")
     return f"{parts[0]}/{parts[-1]}" if len(parts) > 1 else name

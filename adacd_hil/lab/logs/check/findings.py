@@ -22,7 +22,10 @@ class Severity(StrEnum):
 
 
 class LogFinding(NamedTuple):
-    """One place where a rule is broken. `offset`: byte of the file, -1 for the file as a whole."""
+    """One place where a log breaks a rule of `RULES`.
+
+    `offset`: byte of the file, -1 for the file as a whole.
+    """
 
     file: str
     severity: Severity
@@ -33,7 +36,7 @@ class LogFinding(NamedTuple):
 
 @dataclass
 class Findings:
-    """The findings of one file."""
+    """The findings of one file. `found` has the first ten of each rule."""
 
     file: str
     found: list[LogFinding] = field(default_factory=list)
@@ -43,13 +46,13 @@ class Findings:
     """Parts of the file that have no CRC, by kind."""
 
     def add_finding(self, rule: str, text: str, offset: int = -1) -> None:
-        """Count a finding of a rule of `RULES`, and keep it if it is one of the rule's first ten."""
+        """Count a finding of a rule of `RULES`; keep it in `found` if it is one of the rule's first ten."""
         self.counts[rule] += 1
         if self.counts[rule] <= _TOLD:
             self.found.append(LogFinding(self.file, RULES[rule], rule, text, offset))
 
     def count(self, severity: Severity) -> int:
-        """Return the number of all findings of a severity, those that were only counted too."""
+        """Return the number of all findings of a severity, including those that aren't in `found`."""
         return sum(count for rule, count in self.counts.items() if RULES[rule] is severity)
 
 

@@ -50,10 +50,10 @@ _DATA_SECTION = "data section"
 
 
 class _FileCheck:
-    """The check of one file by itself; afterwards, its metadata and counts."""
+    """The check of one file by itself, done at construction; then `findings`, metadata and counts are filled."""
 
     def __init__(self, name: str, file: IO[bytes]) -> None:
-        """Check a whole file; the results are in `findings`."""
+        """Check a whole file. The results are in `findings`, `metadata`, `messages` and `frames`."""
         self.metadata: dict[str, dict[str, str]] = {}
         self.messages = self.frames = 0
         self._file = file
@@ -97,14 +97,14 @@ class _FileCheck:
         return self._counts[Opcode.DATA_END] > 0
 
     def _gap(self, gap: FileGap) -> None:
-        """Add a finding on bytes that form no record; the CRC includes them."""
+        """Add a finding on bytes that form no record, and add them to the CRC."""
         self.findings.add_finding("record", f"{gap.size} bytes are no record", gap.offset)
         position = self._file.tell()
         self._crc = crc_of(self._file, gap.offset, gap.offset + gap.size, self._crc)
         self._file.seek(position)
 
     def _record(self, record: RawRecord) -> None:
-        """Add a record to the CRC of its section, and judge it; a DataEnd ends the data section."""
+        """Add a record to the CRC of its section and check it; a DataEnd ends the data section."""
         head = HEAD.pack(record.opcode, len(record.body))
         if record.opcode != Opcode.MESSAGE_INDEX:
             self._chunks.end_indexes()
@@ -123,7 +123,7 @@ class _FileCheck:
             self.findings.add_finding("record", str(error), record.offset)
 
     def _count(self, record: RawRecord) -> None:
-        """Count a record that a file may have only once; add a finding for a second one."""
+        """Count a record that a file may have only once, and add a finding for the second and later ones."""
         opcode = Opcode(record.opcode)
         self._counts[opcode] += 1
         if self._counts[opcode] > 1:
@@ -140,7 +140,10 @@ class _FileCheck:
         self._crc = 0
 
     def _judge(self, record: RawRecord) -> None:
-        """Pass a record to the rules for its kind; add a finding on an unknown kind or a wrong section."""
+        """Check a record by the rules for its kind; add a finding on an unknown kind or a wrong section.
+
+        Raises LogError if the record can't be parsed.
+        """
         opcode = record.opcode
         if opcode not in set(Opcode):
             self.findings.add_finding("unknown-record", f"{name_of(opcode)} of {len(record.body)} bytes", record.offset)
@@ -194,7 +197,7 @@ class _FileCheck:
             )
 
     def _finish(self, end: int) -> None:
-        """Add the findings on the file as a whole; end: offset up to which it was read."""
+        """Add the findings on the file as a whole; end: offset of the first byte that was not read."""
         for opcode, rule in _ONCE.items():
             if not self._counts[opcode]:
                 self.findings.add_finding(rule, f"there is no {name_of(opcode)}")
@@ -209,7 +212,10 @@ class _FileCheck:
         self._judge_missing_crcs()
 
     def _judge_missing_crcs(self) -> None:
-        """Add a finding on the parts that no CRC covers. The CRC of the data section covers all that is in it."""
+        """Add a note on the parts that no CRC covers, and a warning if only some chunks have one.
+
+        The CRC of the data section covers all that is in it.
+        """
         missing, chunks = self.findings.without_crc, len(self._chunks.facts)
         if not missing[_DATA_SECTION]:
             missing = Counter(summary=missing["summary"])
@@ -226,7 +232,10 @@ class _FileCheck:
 
 
 class LogCheck(NamedTuple):
-    """The findings in a log, with all its parts."""
+    """The findings in a log, with all its parts.
+
+    path: of the first part. files: number of parts.
+    """
 
     path: Path
     files: int
@@ -238,7 +247,9 @@ class LogCheck(NamedTuple):
 
 
 def find_logs(given: Path) -> list[Path]:
-    """Return the paths of the logs in a folder: each .mcap file except the later parts of a log; of a file, the file.
+    """Return the paths of the logs in a folder and below: each .mcap file except later parts of a log.
+
+    Any other path is returned as it is.
 
     Raises LogError for a folder without a log.
     """
@@ -254,7 +265,7 @@ def find_logs(given: Path) -> list[Path]:
 def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> LogCheck:
     """Check the log whose first part is `path`, with all its parts; return the findings.
 
-    Raises LogError when a file can't be read.
+    progress: called with a line per file. Raises LogError if a file can't be read.
     """
     parts = parts_of(path)
     checked: dict[int, _FileCheck] = {}
@@ -279,7 +290,7 @@ def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> L
 
 
 def _check_parts(path: Path, checked: dict[int, _FileCheck], findings: Findings) -> None:
-    """Compare the parts of a log with each other; add findings."""
+    """Check that no part of a log is missing, and that all are of one run; add findings."""
     last = max(checked)
     for missing in missing_parts(path, checked):
         findings.add_finding("missing-part", f"{missing.name} is missing")
@@ -309,7 +320,10 @@ def _summary(facts: _FileCheck) -> dict[str, str]:
 
 
 def _check_words(facts: _FileCheck) -> None:
-    """Compare a log's metadata with its contents, and check how it ended; skip a file that is no log of ours."""
+    """Compare a log's metadata with its contents, and check how it ended; add findings.
+
+    A file without our metadata is skipped.
+    """
     findings, summary = facts.findings, _summary(facts)
     if RUN_METADATA not in facts.metadata:
         return

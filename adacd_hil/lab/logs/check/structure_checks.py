@@ -32,7 +32,7 @@ from adacd_hil.log.mcap.record_layout import HEAD, INDEX_ENTRY
 
 @dataclass
 class ChunkFacts:
-    """The values that the index of a chunk must have; the first ones have mcap's names."""
+    """Facts on a chunk, with which its index in the summary is compared. The first ones have mcap's names."""
 
     chunk_length: int
     message_start_time: int
@@ -59,12 +59,15 @@ _INDEXED = (
 
 
 def pack_offsets(offsets: Mapping[int, int]) -> bytes:
-    """Return the offsets of message indexes as bytes, in the order of their channels."""
+    """Return the offsets of message indexes as bytes, uint16 channel and uint64 offset each, ascending by channel."""
     return b"".join(struct.pack("<HQ", channel, offsets[channel]) for channel in sorted(offsets))
 
 
 class ChunkCheck:
-    """Checks the chunks of a file with their messages and indexes, and the messages outside of chunks."""
+    """Checks the chunks of a file with their messages and indexes, and the messages outside of chunks.
+
+    Call its methods in the order of the records in the file.
+    """
 
     def __init__(self, findings: Findings, definitions: DefinitionCheck) -> None:
         self.facts: dict[int, ChunkFacts] = {}
@@ -84,7 +87,10 @@ class ChunkCheck:
         self._offsets: dict[int, int] = {}
 
     def chunk(self, record: RawRecord) -> None:
-        """Check a chunk, its messages and definitions; add findings, and keep the facts that its index must have."""
+        """Check a chunk, its messages and definitions; add findings.
+
+        Keep the facts with which its indexes are compared.
+        """
         chunk: Chunk = parse(record.opcode, record.body)
         facts = ChunkFacts(
             HEAD.size + len(record.body),
@@ -128,7 +134,7 @@ class ChunkCheck:
             self._findings.add_finding("chunk-times", text, offset)
 
     def _expect(self, contents: Contents, facts: ChunkFacts) -> None:
-        """Keep the message indexes that the chunk must have."""
+        """Store the message indexes that the chunk must have, and its channels."""
         order = np.argsort(contents.channels, kind="stable")
         channels, firsts = np.unique(contents.channels[order], return_index=True)
         groups = np.split(contents.entries[order], firsts[1:])
@@ -136,7 +142,10 @@ class ChunkCheck:
         facts.channels = channels.tobytes()
 
     def message_index(self, record: RawRecord) -> None:
-        """Compare a message index with the chunk before it; add findings."""
+        """Compare a message index with the messages of the chunk before it; add findings.
+
+        If that chunk couldn't be opened, only note where the index is.
+        """
         channel = int.from_bytes(record.body[:2], "little")
         latest = self._latest
         if latest is None:
@@ -156,7 +165,10 @@ class ChunkCheck:
             self._findings.add_finding("message-index", text, record.offset)
 
     def end_indexes(self) -> None:
-        """Add a finding if the latest chunk lacks a message index; called at the first record after its indexes."""
+        """Add a finding if the latest chunk lacks a message index.
+
+        Call it at each record that is no message index, and at the end.
+        """
         if self._latest is not None and self._expected:
             channels = [channel for channel, entries in self._expected.items() if len(entries)]
             offset = next(reversed(self.facts))
@@ -168,12 +180,18 @@ class ChunkCheck:
         self._latest = None
 
     def message(self, record: RawRecord) -> None:
-        """Check a message outside of chunks; add findings."""
+        """Check and count a message outside of chunks: its channel, time and payload; add findings.
+
+        Sets `has_outside`.
+        """
         self.has_outside = True
         self._messages(message_contents(record), record.offset)
 
     def _messages(self, contents: Contents, offset: int) -> None:
-        """Check and count messages, after the definitions that stand between them; add findings."""
+        """Check and count messages and the definitions between them; add findings.
+
+        offset: of the chunk or message in the file.
+        """
         channels, firsts = np.unique(contents.channels, return_index=True)
         first_at = dict(zip(channels.tolist(), contents.starts[firsts].tolist(), strict=True))
         known = set(self._definitions.channels)
@@ -200,7 +218,7 @@ class ChunkCheck:
             self.content.messages(contents, self._definitions, offset)
 
     def compare(self, index: ChunkIndex, offset: int) -> None:
-        """Compare a chunk index with its chunk; add findings. offset: of the index in the file."""
+        """Compare a chunk index of the summary with its chunk; add findings. offset: of the index in the file."""
         facts = self.facts.get(index.chunk_start_offset)
         if facts is None:
             text = f"a chunk index points to byte {index.chunk_start_offset}, where no chunk begins"
@@ -222,7 +240,10 @@ class ChunkCheck:
 
 
 class SummaryCheck:
-    """Compares the summary of a file with the facts that it must state; these are gathered before it."""
+    """Compares the summary of a file with the data section.
+
+    Call it for each record of both, then for the footer, then `finish`.
+    """
 
     def __init__(self, findings: Findings, definitions: DefinitionCheck, chunks: ChunkCheck) -> None:
         self.statistics: Statistics | None = None
@@ -239,7 +260,7 @@ class SummaryCheck:
         self._offset_start = 0
 
     def attachment(self, record: RawRecord, attachment: Attachment) -> None:
-        """Count an attachment; keep the index that the summary must have for it."""
+        """Count an attachment, and store the index that the summary must have for it."""
         self._attachment_count += 1
         self._attachments[record.offset] = AttachmentIndex(
             offset=record.offset,
@@ -252,12 +273,15 @@ class SummaryCheck:
         )
 
     def metadata(self, record: RawRecord, name: str) -> None:
-        """Count a metadata record; keep the index that the summary must have for it."""
+        """Count a metadata record, and store the index that the summary must have for it."""
         self._metadata_count += 1
         self._metadata[record.offset] = MetadataIndex(record.offset, HEAD.size + len(record.body), name)
 
     def record(self, record: RawRecord) -> None:
-        """Keep the place of a record of the summary, no definition; check an index or the statistics, add findings."""
+        """Store the place of a record of the summary.
+
+        Compare an index or the statistics' channels, and add findings.
+        """
         self._start = self._start or record.offset
         if record.opcode == Opcode.SUMMARY_OFFSET:
             self._offset_start = self._offset_start or record.offset
@@ -280,7 +304,10 @@ class SummaryCheck:
             self._check_counted_channels(self.statistics, record.offset)
 
     def _compare(self, rule: str, expected: Mapping[int, Any], index: Any, offset: int) -> None:
-        """Compare an index of the summary with the expected ones, by offset; add a finding on a wrong or second one."""
+        """Compare an index of the summary with the expected ones, by offset; add a finding on a wrong or second one.
+
+        rule: "attachment-index" or "metadata-index".
+        """
         kind = rule.removesuffix("-index")
         if index.offset in self._indexed:
             self._findings.add_finding(rule, f"the {kind} at byte {index.offset} is indexed more than once", offset)
@@ -300,7 +327,7 @@ class SummaryCheck:
             self._findings.add_finding("summary-channels", text, offset)
 
     def footer(self, record: RawRecord, crc: int) -> None:
-        """Check the footer; add findings. crc: of the summary up to the footer's own CRC."""
+        """Compare the footer with the summary; add findings. crc: that of the summary up to the footer's own CRC."""
         footer: Footer = parse(record.opcode, record.body)
         if footer.summary_start != self._start:
             text = f"the Footer says that the summary begins at byte {footer.summary_start}, it is {self._start}"
@@ -314,7 +341,7 @@ class SummaryCheck:
             self._findings.add_finding("summary-crc", "the summary fails its CRC", record.offset)
 
     def finish(self) -> None:
-        """Add the findings on the summary as a whole."""
+        """Add the findings on groups, missing indexes and statistics; call it after the footer."""
         self._check_groups()
         self._check_indexes()
         if self.statistics is not None:
