@@ -21,7 +21,7 @@ SHORT = """
 lasts_s = {lasts_s}
 contacts = [{{ at_s = {touched_s}, link = 2, point_m = 0.2, force_N = 20.0, duration_s = 0.1 }}]
 """
-LASTS_S = {"see": 1.0, "recordings": 11.5, "arm": 1.0}
+LASTS_S = {"see": 1.0, "recordings": 10.3, "arm": 1.0}
 """How long demos last: for `identify` the README takes the first 9 s, in which nobody touches the arm."""
 PROGRAMS = {
     "adacd-hil": "from adacd_hil.cli.start_host import start_host as start",

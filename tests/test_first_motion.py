@@ -368,9 +368,10 @@ def test_rotors_friction_before_the_sensors_and_slow_drives_are_no_mistake(tmp_p
 drives = { torque_constant_error = [0.1, -0.1], current_loop_Hz = [100.0, 100.0] }
 mechanics = { rotor_inertia_kg_m2 = [0.3, 0.02], motor_coulomb_Nm = [0.4, 0.2], motor_viscous_Nm_s = [0.2, 0.1] }
 """
-    summary = rehearse(tmp_path, truth)
+    summary = rehearse(tmp_path, truth, lasts_s=2.1)
     assert summary.result is not None
     assert summary.result.fault is FaultReason.NONE
+    assert len(lines_of(load(tmp_path / "run"), "info")) == 2
     assert lines_of(load(tmp_path / "run"), "warning") == []
 
 

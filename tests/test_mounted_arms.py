@@ -10,6 +10,7 @@ from long_cases import long_but
 from played_outcome import outcome_of
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
+from adacd_hil.settings.setting_keys import apply_settings
 from firmware_sim.scenario.scenario import ScenarioOutcome
 
 ARM = ("--no-bus", "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", "--yes")
@@ -53,7 +54,8 @@ def play(folder: Path, mounting: tuple[str, ...], truth: str = "", text: str = T
     truth_file.write_text(truth)
     said: list[str] = []
     cast = resolve(str(file), str(touched) if text else "paper", None, None, str(truth_file) if truth else None)
-    ended = run_embedded(cast, "lockstep", folder / "run", said.append)
+    settings = apply_settings(cast.settings, {"safety.phase_timeout_s": "1.0"})
+    ended = run_embedded(cast._replace(settings=settings), "lockstep", folder / "run", said.append)
     return Played(outcome_of(*ended), "\n".join(said))
 
 
@@ -95,13 +97,13 @@ def test_a_wrong_mounting_is_named_before_a_certificate(tmp_path: Path, mounting
 
 @pytest.mark.slow
 def test_an_arm_that_stands_and_is_told_to_hang_is_named_with_its_certificate(tmp_path: Path) -> None:
-    said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 180.0), f"lasts_s = 4.5\n{START}").said
+    said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 180.0), f"lasts_s = 3.6\n{START}").said
     assert re.search(r"arm.mounting_deg\[1\] = 0 deg; link 1 hangs at q1 = 180", said), said
 
 
 @pytest.mark.slow
 def test_a_stop_before_the_first_motion_is_acknowledged_and_the_run_ends(tmp_path: Path) -> None:
-    still = "lasts_s = 4.0\nstart_deg = [0.0, 0.0]\n"
+    still = "lasts_s = 2.0\nstart_deg = [0.0, 0.0]\n"
     said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 20.0), still).said
     assert "[ENABLE -> REACT]" in said
     assert "[STOPPED -> ENABLE]" in said
@@ -109,7 +111,7 @@ def test_a_stop_before_the_first_motion_is_acknowledged_and_the_run_ends(tmp_pat
 
 @pytest.mark.slow
 def test_the_weight_of_an_arm_that_is_told_to_be_flat_is_named_with_the_mounting(tmp_path: Path) -> None:
-    said = play(tmp_path, ("--mounting", "flat"), mounted(90.0, -90.0), f"lasts_s = 2.0\n{START}").said
+    said = play(tmp_path, ("--mounting", "flat"), mounted(90.0, -90.0), f"lasts_s = 1.5\n{START}").said
     assert re.search(r"joint 1 is loaded: .* the mounting is not flat: estimator.gravity = true", said), said
 
 
