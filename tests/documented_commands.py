@@ -4,11 +4,12 @@ Command lines are parsed by the commands' own click definitions, in a folder whe
 exist; values are resolved as the command would: settings, configurations, scenarios, contracts, interfaces.
 """
 
-import ast
+import copy
 import dataclasses
 import functools
-import importlib
 import importlib.metadata
+import itertools
+import pkgutil
 import re
 import shlex
 import tomllib
@@ -38,19 +39,16 @@ from adacd_hil.wire.codec import CodecError
 from adacd_hil.wire.dbc_contract import load_codec
 from firmware_sim.cli.emulator_main import cli as emulator_cli
 from firmware_sim.cli.scenario_list import check as check_scenario
-from firmware_sim.scenario.faults import FaultSettings
 from firmware_sim.scenario.scenario import Scenario, load_scenario
 
 Complaints = list[str]
 
 PROGRAMS = {"adacd-hil": host_cli, "firmware-sim": emulator_cli}
 OTHERS = {
-    *("apt-get", "candump", "canbusload", "canplayer", "cp", "dask", "duckdb", "echo", "grep", "groupadd", "ip"),
-    *("openssl", "python3", "sleep", "ssh", "systemctl", "udevadm", "useradd", "usermod"),
+    *("cp", "duckdb", "echo", "grep", "groupadd", "ip", "python3", "sleep", "systemctl", "udevadm", "useradd"),
+    "usermod",
 }
-"""Programs that aren't ours: known to be meant, their arguments are not looked at."""
-PREFIXES = {"chrt": 3, "nice": 3}
-"""Programs that run another one, with the words before it."""
+"""Programs that aren't ours: known to be meant, their arguments are not looked at but for keys of our settings."""
 TOOL = re.compile(r"tools/(campaigns/)?[\w-]+(\.py|\.sh)?|tests/[\w/-]+\.py")
 PLACEHOLDER = re.compile(r"[A-Z][A-Z0-9_]*(=[A-Z,.…]+)?|\.\.\.|…")
 PACKAGES = ("", "adacd_hil", "firmware_sim", "dbc", "docs", "tests")
@@ -90,196 +88,138 @@ def command_complaints(words: list[str], is_whole: bool = True) -> Complaints:
     program, *rest = words
     program = program.removeprefix(".venv/bin/").removeprefix("/opt/adacd-hil/bin/")
     if program in PROGRAMS:
-        return _click_complaints(program, rest, is_whole)
+        return [f"`{' '.join(words)}`: {line}" for line in _click_complaints(program, rest, is_whole)]
     if program == "python" and rest:
         return command_complaints(rest, is_whole)
     if TOOL.fullmatch(program):
         return _tool_complaints(program, rest)
     if program == "sh" and rest[:1] == ["-c"]:
         return [line for inner in split_commands(rest[1]) for line in command_complaints(inner)]
-    if program in PREFIXES:
-        return command_complaints(words[PREFIXES[program] :])
     if program == "make":
-        return [f"the Makefile has no target {target}" for target in rest if target not in make_targets()]
+        targets = re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+        return [f"the Makefile has no target {target}" for target in rest if target not in targets]
     if program == "pip":
         return _pip_complaints(rest)
     if program == "podman":
         return command_complaints(rest[rest.index("adacd-hil") :]) if "run" in rest else []
     if program.startswith("can_"):
-        return [] if program in _scripts("python-can") else [f"python-can has no program {program}"]
+        scripts = importlib.metadata.distribution("python-can").entry_points.names
+        return [] if program in scripts else [f"python-can has no program {program}"]
     if program in OTHERS:
-        return _key_complaints(re.findall(r"set\.([a-z]+\.\w+)", " ".join(rest)))
+        return [line for key in re.findall(r"set\.([a-z]+\.\w+)", " ".join(rest)) for line in key_complaints(key)]
     return [f"program {program!r} is unknown to tests/documented_commands.py"]
 
 
 def _click_complaints(program: str, words: list[str], is_whole: bool) -> Complaints:
-    found = _find(program, words)
-    if isinstance(found, str):
-        return [found]
-    command, rest = found
-    if not rest and not is_whole:
-        return []
-    context = click.Context(command, info_name=program)
-    if _is_usage(rest) or (not is_whole and rest[-1] in _valued_options(command)):
-        return _usage_complaints(command, context, rest)
     try:
-        parsed = _made(command, rest, is_whole)
+        command, rest = _find(program, words)
+        if _is_pattern(rest) or (rest[-1:] and rest[-1].startswith("--") and not is_whole):
+            return _pattern_complaints(command, rest)
+        parsed = (command if is_whole else _lenient(command)).make_context(command.name, rest).params if rest else {}
     except click.UsageError as error:
-        return [f"`{program} {' '.join(words)}`: {error.format_message()}"]
-    lines = [line for param in command.params for line in _value_complaints(param, parsed.params)]
-    return [f"`{program} {' '.join(words)}`: {line}" for line in lines]
+        return [error.format_message()]
+    return [line for param in command.params for line in _value_complaints(param, parsed)]
 
 
-def _find(program: str, words: list[str]) -> tuple[click.Command, list[str]] | str:
-    """Walk down to the command; where words are left that name none, say so."""
+def _find(program: str, words: list[str]) -> tuple[click.Command, list[str]]:
+    """Walk down to the command; return the words after it, too. Raises click.UsageError where a word names none."""
     command: click.Command = PROGRAMS[program]
     rest = list(words)
     while isinstance(command, click.Group) and rest:
-        names = rest[0].split("|")
+        names = rest.pop(0).split("|")
         for name in names:
             if name not in command.commands:
-                return f"`{program} {' '.join(words)}`: no command {name!r}; known: {', '.join(command.commands)}"
+                raise click.UsageError(f"no command {name!r}; known: {', '.join(command.commands)}")
         command = command.commands[names[0]]
-        rest = rest[1:]
     return command, rest
 
 
-def _is_usage(words: list[str]) -> bool:
+def _lenient(command: click.Command) -> click.Command:
+    """Copy a command, so that nothing is required."""
+    lenient = copy.deepcopy(command)
+    for param in lenient.params:
+        param.required = False
+    return lenient
+
+
+def _is_pattern(words: list[str]) -> bool:
     """Whether words are the pattern of a command line rather than one."""
     return any(word.startswith("[") or "|" in word or PLACEHOLDER.fullmatch(word.strip("[]….")) for word in words)
 
 
-def _valued_options(command: click.Command) -> set[str]:
-    return {name for param in command.params if not getattr(param, "is_flag", False) for name in param.opts}
-
-
-def _usage_complaints(command: click.Command, context: click.Context, words: list[str]) -> Complaints:
-    options = {name: param for param in command.params for name in (*param.opts, *param.secondary_opts)}
-    lines = []
+def _pattern_complaints(command: click.Command, words: list[str]) -> Complaints:
+    """Check the options that a pattern names, and the values that it gives them."""
+    options = {name: param for param in command.params for name in _names(param)}
     words = [word.strip("[]") for word in words]
-    for word, value in zip(words, (*words[1:], ""), strict=True):
-        if not word.startswith("-"):
-            continue
-        if word not in options:
-            lines.append(f"`{command.name}` has no option {word}")
-            continue
-        param = options[word]
-        if getattr(param, "is_flag", False) or not value or PLACEHOLDER.fullmatch(value.strip("….")):
+    lines = [f"no option {word}" for word in words if word.startswith("-") and word not in options]
+    for word, value in itertools.pairwise(words):
+        param = options.get(word)
+        if param is None or getattr(param, "is_flag", False) or PLACEHOLDER.fullmatch(value.strip("….")):
             continue
         for choice in value.split("|"):
             is_placeholder = PLACEHOLDER.fullmatch(choice) and not isinstance(param.type, click.Choice)
             try:
                 if not is_placeholder:
-                    param.type.convert(choice, param, context)
+                    param.type.convert(choice, param, None)
             except click.UsageError as error:
-                lines.append(f"`{command.name} {word}`: {error.format_message()}")
+                lines.append(f"{word}: {error.format_message()}")
     return lines
 
 
-SAMPLES = {
-    "interface": "socketcan",
-    "channel": "vcan0",
-    "map_path": "map.toml",
-    "out": "out",
-    "recordings": "recording.csv",
-    "scenario": "paper",
-    "files": "my.toml",
-}
-"""Values for what a command requires and a document, naming only a part of the command, leaves out."""
-
-
-def _made(command: click.Command, words: list[str], is_whole: bool) -> click.Context:
-    """Parse. Raises click.UsageError."""
-    while True:
-        try:
-            return command.make_context(command.name, list(words))
-        except click.MissingParameter as error:
-            if is_whole or error.param is None:
-                raise
-            sample = SAMPLES.get(error.param.name or "", "runs/run/run.mcap")
-            is_argument = isinstance(error.param, click.Argument)
-            words = [*words, sample] if is_argument else [*words, error.param.opts[0], sample]
+def _names(param: click.Parameter) -> tuple[str, ...]:
+    return (*param.opts, *param.secondary_opts)
 
 
 def _value_complaints(param: click.Parameter, values: dict[str, Any]) -> Complaints:
     """Resolve a value as the command would."""
-    value = values.get(param.name or "")
-    if value is None or value == () or value == "":
+    value, resolve = values.get(param.name or ""), RESOLVED.get(param.name or "")
+    if value in (None, (), ""):
         return []
     try:
-        resolve = RESOLVED.get(param.name or "")
-        if resolve is not None:
-            resolve(value, values)
-        elif _is_input(param):
-            for path in value if isinstance(value, tuple) else (value,):
-                _require(path)
-    except (ConfigError, CodecError, OSError, LookupError) as error:
+        if resolve is not None and not resolve(value, values):
+            return [f"{param.name} {value!r} is none"]
+        if resolve is None and isinstance(param.type, click.Path) and not isinstance(param.type, WrittenPath):
+            _find_files(value, values)
+    except (ConfigError, CodecError, OSError) as error:
         return [str(error)]
     return []
 
 
-def _is_input(param: click.Parameter) -> bool:
-    return isinstance(param.type, click.Path) and not isinstance(param.type, WrittenPath)
-
-
-def _require(path: Path) -> None:
-    if not path.exists():
-        raise FileNotFoundError(
-            f"{path}: the fixture `folder` of tests/test_documented_commands.py has no such example"
-        )
+def _find_files(value: Any, values: dict[str, Any]) -> object:
+    """Raise OSError for a file that is not in the folder of tests/test_documented_commands.py."""
+    return [Path(path).stat() for path in (value if isinstance(value, tuple) else (value,))]
 
 
 def _base(values: dict[str, Any]) -> Settings:
     return load_settings(values.get("config") or "certified", values.get("profile"))
 
 
-def _resolve_changes(value: tuple[str, ...], values: dict[str, Any]) -> None:
-    apply_settings(_base(values), parse_changes(value))
+def _change_each(value: tuple[str, ...], values: dict[str, Any]) -> object:
+    return [apply_settings(_base(values), choice) for choice in parse_variations(value)]
 
 
-def _resolve_variations(value: tuple[str, ...], values: dict[str, Any]) -> None:
-    for choice in parse_variations(value):
-        apply_settings(_base(values), choice)
+def _load_scenarios(value: str | tuple[str, ...], values: dict[str, Any]) -> object:
+    return [load_scenario(name) for name in ((value,) if isinstance(value, str) else value)]
 
 
-def _resolve_scenarios(value: str | tuple[str, ...], values: dict[str, Any]) -> None:
-    for name in (value,) if isinstance(value, str) else value:
-        load_scenario(name)
-
-
-def _resolve_contract(value: str | Path, values: dict[str, Any]) -> None:
-    load_codec(value if isinstance(value, Path) else find_contract(value))
-
-
-def _resolve_interface(value: str, values: dict[str, Any]) -> None:
-    if value not in can.VALID_INTERFACES:
-        raise LookupError(f"python-can has no interface {value!r}")
-
-
-def _resolve_address(value: str, values: dict[str, Any]) -> None:
-    if not re.fullmatch(r"(tcp|tls|ws|wss)://[\w.-]+:\d+", value):
-        raise LookupError(f"{value!r} is no address such as tcp://host:8786")
-
-
-def _resolve_files(value: tuple[str, ...], values: dict[str, Any]) -> None:
-    for name in value:
-        _require(Path(name))
+def _is_address(value: str, values: dict[str, Any]) -> object:
+    return re.fullmatch(r"(tcp|tls|ws|wss)://[\w.-]+:\d+", value)
 
 
 RESOLVED: dict[str, Callable[[Any, dict[str, Any]], object]] = {
-    "changes": _resolve_changes,
-    "vary": _resolve_variations,
+    "changes": lambda value, values: apply_settings(_base(values), parse_changes(value)),
+    "vary": _change_each,
     "config": lambda value, values: loaded_contract(load_settings(value, values.get("profile"))),
-    "scenario": _resolve_scenarios,
-    "scenarios": _resolve_scenarios,
-    "dbc": _resolve_contract,
-    "interface": _resolve_interface,
-    "map_path": lambda value, values: None if values.get("is_init") else read_map(value),
-    "url": _resolve_address,
-    "scheduler": _resolve_address,
-    "files": _resolve_files,
+    "scenario": _load_scenarios,
+    "scenarios": _load_scenarios,
+    "dbc": lambda value, values: load_codec(value if isinstance(value, Path) else find_contract(value)),
+    "interface": lambda value, values: value in can.VALID_INTERFACES,
+    "map_path": lambda value, values: values.get("is_init") or read_map(value),
+    "url": _is_address,
+    "scheduler": _is_address,
+    "files": _find_files,
 }
-"""What becomes of a parameter's value, by the parameter's name; raises where the value is good for nothing."""
+"""What becomes of a parameter's value, by its name; raises or gives nothing where it is good for nothing."""
 
 
 @functools.cache
@@ -295,31 +235,22 @@ def _click_commands() -> dict[str, click.Command]:
     return {words: command for program, group in PROGRAMS.items() for words, command in below(program, group)}
 
 
-def _own_options(command: click.Command) -> set[str]:
-    return {name for param in command.params for name in (*param.opts, *param.secondary_opts)}
-
-
 def option_complaints(span: str, row_head: str = "") -> Complaints:
     """Check an option that stands alone: of the command that begins its table row, else of any command or tool."""
-    option, _, value = span.partition(" ")
-    names = row_head.replace("\\|", "|").strip("`").split(" ")
-    if names[0] in PROGRAMS:
-        found = _find(names[0], [word for word in names[1:] if not _is_usage([word]) or "|" in word])
-        if isinstance(found, str):
-            return [found]
-        return _usage_complaints(found[0], click.Context(found[0]), [option, *value.split()])
-    known = set().union(*(_own_options(command) for command in _click_commands().values()), *map(flags, tools()))
-    return [] if option in known else [f"no command and no tool has an option {option}"]
+    option, *value = span.split()
+    program, *names = row_head.replace("\\|", "|").strip("`").split(" ")
+    if program in PROGRAMS:
+        return _pattern_complaints(_find(program, names)[0], [option, *value])
+    known = {name for command in _click_commands().values() for param in command.params for name in _names(param)}
+    return [] if option in known.union(*map(flags, tools())) else [f"no command and no tool has an option {option}"]
 
 
 @functools.cache
 def environment_names() -> frozenset[str]:
     """Return the environment variables that stand for options."""
-    names = set()
-    for words, command in _click_commands().items():
-        prefix = words.upper().replace("-", "_").replace(" ", "_")
-        names |= {f"{prefix}_{(param.name or '').upper()}" for param in command.params}
-    return frozenset(names)
+    commands = _click_commands().items()
+    names = (f"{words} {param.name}" for words, command in commands for param in command.params)
+    return frozenset(re.sub(r"[- ]", "_", name).upper() for name in names)
 
 
 def tools() -> list[Path]:
@@ -330,50 +261,21 @@ def tools() -> list[Path]:
 
 @functools.cache
 def flags(tool: Path) -> frozenset[str]:
-    """Return the options that a tool's argument parsers have, and its subcommands, from its source."""
+    """Return the words in quotes in a tool and the tools that it imports: options and subcommands are among them."""
     text = tool.read_text(encoding="utf-8")
-    if "import argparse" not in text:
-        return frozenset()
-    nodes = list(ast.walk(ast.parse(text)))
-    nodes += [inner for node in nodes if isinstance(node, ast.ImportFrom) for inner in _shared_options(node)]
-    calls = [node for node in nodes if isinstance(node, ast.Call)]
-    added = [call for call in calls if getattr(call.func, "attr", "") == "add_argument"]
-    found = {argument.value for call in added for argument in call.args if isinstance(argument, ast.Constant)}
-    if any(getattr(call.func, "attr", "") == "add_parser" for call in calls):  # whose names may come from a table
-        found |= {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    return frozenset(found)
-
-
-def _shared_options(imported: ast.ImportFrom) -> Iterator[ast.AST]:
-    """Give what is in the functions that a tool imports from another: some add options that several tools have."""
-    names = {alias.name for alias in imported.names}
-    for source in (tool for tool in tools() if tool.stem == imported.module):
-        for node in ast.parse(source.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.FunctionDef) and node.name in names:
-                yield from ast.walk(node)
+    imported = re.findall(r"^(?:from|import) (\w+)", text, re.MULTILINE)
+    texts = [text, *(other.read_text(encoding="utf-8") for other in tools() if other.stem in imported)]
+    return frozenset(re.findall(r'"([\w-]+)"', "".join(texts)))
 
 
 def _tool_complaints(tool: str, words: list[str]) -> Complaints:
     path = ROOT / tool
     if not path.is_file():
         return [f"{tool} does not exist"]
-    own, inner = words, []
-    if "--" in words:
-        own, inner = words[: words.index("--")], words[words.index("--") + 1 :]
+    own = list(itertools.takewhile(lambda word: word != "--", words))
     lines = [f"{tool} has no option {word}" for word in own if word.startswith("-") and word not in flags(path)]
+    inner = words[len(own) + 1 :]
     return lines + (command_complaints(inner) if inner else [])
-
-
-@functools.cache
-def make_targets() -> frozenset[str]:
-    """Return the targets of the Makefile that have names."""
-    text = (ROOT / "Makefile").read_text(encoding="utf-8")
-    return frozenset(re.findall(r"^([a-z-]+):", text, re.MULTILINE))
-
-
-@functools.cache
-def _scripts(package: str) -> frozenset[str]:
-    return frozenset(entry.name for entry in importlib.metadata.distribution(package).entry_points)
 
 
 def _pip_complaints(words: list[str]) -> Complaints:
@@ -387,117 +289,73 @@ def _pip_complaints(words: list[str]) -> Complaints:
 
 def toml_complaints(text: str, path: Path) -> Complaints:
     """Check a TOML block, written to `path`: one of the kinds of files must take it whole, or all say why not."""
-    try:
-        table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        return [f"not TOML: {error}"]
-    refusals = {}
+    refusals = []
     for kind, load in KINDS.items():
         try:
             load(path)
+            return []
         except (ConfigError, CodecError, OSError) as error:
-            refusals[kind] = str(error)
-    if len(refusals) < len(KINDS):
-        return []
-    return [f"keys {', '.join(table)} are of no kind of file:", *(f"  {kind}: {why}" for kind, why in refusals.items())]
+            refusals.append(f"no {kind}: {error}")
+    return refusals
 
 
 def _load_scenario(path: Path) -> None:
-    problems = check_scenario(str(path), load_codec()).problems
-    if problems:
+    if problems := check_scenario(str(path), load_codec()).problems:
         raise ConfigError("; ".join(problems))
-
-
-def _load_profile(path: Path) -> None:
-    load_profile(str(path), "drive")
 
 
 KINDS: dict[str, Callable[[Path], object]] = {
     "configuration": lambda path: loaded_contract(load_settings(str(path))),
     "scenario": _load_scenario,
-    "device profile": _load_profile,
+    "device profile": lambda path: load_profile(str(path), "drive"),
     "map of a recording": read_map,
     "tare": read_tare,
 }
 """Every kind of TOML file that somebody writes for us, with what reads it."""
 
-SECTIONS = (Settings, Scenario, ProfileSettings, Tare)
 
-
-def _all_sections() -> Iterator[type[Any]]:
-    """Give every dataclass of settings."""
-    waiting: list[Any] = list(SECTIONS)
-    seen = set()
+@functools.cache
+def _all_sections() -> dict[type[Any], set[str]]:
+    """Return every dataclass of settings, with its fields."""
+    waiting: list[Any] = [Settings, Scenario, ProfileSettings, Tare]
+    found = {}
     while waiting:
         section = waiting.pop()
-        if section in seen:
-            continue
-        seen.add(section)
-        yield section
-        for hint in typing.get_type_hints(section).values():
-            options = (hint, *typing.get_args(hint))
-            waiting += [option for option in options if dataclasses.is_dataclass(option)]
+        if dataclasses.is_dataclass(section) and section not in found:
+            hints = typing.get_type_hints(section)
+            found[section] = set(hints)
+            waiting += [option for hint in hints.values() for option in (hint, *typing.get_args(hint))]
+    return found
 
 
 def assignment_complaints(span: str) -> Complaints:
-    """Check inline TOML: a row of `[[faults]]`, or a key with a value that some section takes."""
-    span = re.sub(r"^\[(\w+)\] ", r"\1.", span)
+    """Check inline TOML: a key of the configuration with its section, or one that some section takes, and its value."""
     try:
-        table = tomllib.loads(span if "kind = " not in span else f"row = {{ {span} }}")
+        table = tomllib.loads(re.sub(r"^\[(\w+)\] ", r"\1.", span))
     except tomllib.TOMLDecodeError as error:
         return [f"`{span}` is not TOML: {error}"]
-    if "row" in table:
-        return _row_complaints(table["row"])
     ((key, value),) = table.items()
-    if key in ("extends", "name"):  # of a configuration's file, not of the settings
-        return []
-    if isinstance(value, dict):
-        ((inner, inner_value),) = value.items()
-        return _key_complaints([f"{key}.{inner}"]) or _values_refused(inner, inner_value)
-    return _values_refused(key, value)
-
-
-def _row_complaints(row: dict[str, Any]) -> Complaints:
-    """Check a fault. Its time, which most kinds need, stands in another column."""
     complaints = []
-    for table in (row, {"at_s": 1.0, **row}):
+    for section in [Settings] if isinstance(value, dict) else [s for s, keys in _all_sections().items() if key in keys]:
         try:
-            parse(FaultSettings, table)
-        except ConfigError as error:
-            complaints.append(f"{row}: {error}")
-        else:
-            return []
-    return complaints
-
-
-def _values_refused(key: str, value: Any) -> Complaints:
-    complaints = []
-    for section in _all_sections():
-        if key not in {field.name for field in dataclasses.fields(section)}:
-            continue
-        try:
-            parse(section, {key: value})
+            parse(section, table)
             return []
         except ConfigError as error:
             about = [line for line in error.problems if f"`{key}" in line]
-        if not about:
-            return []
-        complaints += about
+            if not about:
+                return []
+            complaints += about
     return complaints or [f"no section of settings, scenarios or profiles has a key `{key}`"]
 
 
-def _key_complaints(keys: list[str]) -> Complaints:
-    return [line for key in keys for line in key_complaints(key)]
+SETTING_SECTIONS = {name: hint for name, hint in typing.get_type_hints(Settings).items() if hint in _all_sections()}
 
 
 def key_complaints(key: str) -> Complaints:
     """Check a dotted key of the configuration."""
     section, _, name = key.partition(".")
-    known = {field.name for field in dataclasses.fields(typing.get_type_hints(Settings)[section])}
+    known = _all_sections()[SETTING_SECTIONS[section]]
     return [] if name in known else [f"the configuration has no key `{key}`"]
-
-
-SETTING_SECTIONS = {name for name, hint in typing.get_type_hints(Settings).items() if dataclasses.is_dataclass(hint)}
 
 
 # -- paths and names -------------------------------------------------------------------------------------------------
@@ -514,33 +372,8 @@ def path_complaints(text: str, page: Path) -> Complaints:
 
 def name_complaints(dotted: str) -> Complaints:
     """Check that a dotted Python name of ours can be imported."""
-    parts = dotted.split(".")
-    for count in range(len(parts), 0, -1):
-        try:
-            found: Any = importlib.import_module(".".join(parts[:count]))
-        except ModuleNotFoundError:
-            continue
-        for name in parts[count:]:
-            if not hasattr(found, name):
-                return [f"{found.__name__} has no {name}"]
-            found = getattr(found, name)
-        return []
-    return [f"there is no module {dotted}"]
-
-
-def tree_complaints(text: str) -> Complaints:
-    """Check a tree of the project: a folder per line, what is in it parted by `·`, words about it after `#`."""
-    lines = []
-    root = folder = ROOT
-    for row in text.splitlines():
-        names = row.partition("#")[0].split("·")
-        first, _, more = names[0].strip().partition(" ")
-        if first.endswith("/"):
-            root = ROOT / first if not row.startswith(" ") else root
-            folder = root if not row.startswith(" ") else root / first
-            names = [more, *names[1:]]
-        lines += [f"{folder.relative_to(ROOT)}/ does not exist"] if not folder.is_dir() else []
-        for name in filter(None, (each.strip() for each in names)):
-            if not (folder / name).exists() and not (folder / f"{name}.py").exists():
-                lines.append(f"{(folder / name).relative_to(ROOT)} does not exist")
-    return lines
+    try:
+        pkgutil.resolve_name(dotted)
+    except (ImportError, AttributeError) as error:
+        return [f"{dotted}: {error}"]
+    return []

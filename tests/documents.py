@@ -1,9 +1,9 @@
-"""The project's documents, in pieces: fenced blocks, inline code with the table row it stands in, links, headings."""
+"""The project's documents, in pieces: fenced blocks, inline code with the table row it stands in."""
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
@@ -28,15 +28,11 @@ class Piece:
         return f"{self.page.relative_to(ROOT)}:{self.line}"
 
 
-@dataclass(frozen=True)
-class Document:
-    """One page."""
+class Document(NamedTuple):
+    """What one page shows: fenced blocks, and inline code."""
 
-    path: Path
     blocks: tuple[Piece, ...]
     spans: tuple[Piece, ...]
-    links: tuple[Piece, ...]
-    anchors: frozenset[str]
 
 
 def read_document(path: Path) -> Document:
@@ -47,7 +43,7 @@ def read_document(path: Path) -> Document:
 def parse_document(path: Path, text: str) -> Document:
     """Take the text of a page, or a part of it, apart."""
     tokens = MarkdownIt("commonmark").enable("table").parse(text)
-    blocks, spans, links, anchors = [], [], [], set()
+    blocks, spans = [], []
     for number, token in enumerate(tokens):
         line = (token.map or [0])[0] + 1
         if token.type in ("fence", "code_block"):
@@ -55,27 +51,15 @@ def parse_document(path: Path, text: str) -> Document:
             blocks.append(Piece(path, line, token.content, language))
         if token.type != "inline":
             continue
-        if tokens[number - 1].type == "heading_open":
-            anchors.add(_anchor(token))
         head = _first_cell(tokens, number)
-        for child in _flat(token):
-            if child.type == "code_inline":
-                spans.append(Piece(path, line, child.content, head=head))
-            elif child.type in ("link_open", "image"):
-                links.append(Piece(path, line, str(child.attrs.get("href") or child.attrs.get("src"))))
-    return Document(path, tuple(blocks), tuple(spans), tuple(links), frozenset(anchors))
+        spans += [Piece(path, line, child.content, head=head) for child in _flat(token) if child.type == "code_inline"]
+    return Document(tuple(blocks), tuple(spans))
 
 
 def _flat(token: Token) -> Iterator[Token]:
     for child in token.children or []:
         yield child
         yield from _flat(child)
-
-
-def _anchor(heading: Token) -> str:
-    """Make the anchor of a heading as GitHub does."""
-    text = "".join(child.content for child in _flat(heading) if child.type in ("text", "code_inline"))
-    return re.sub(r"[^\w\- ]", "", text.lower()).replace(" ", "-")
 
 
 def _first_cell(tokens: list[Token], number: int) -> str:

@@ -32,8 +32,8 @@ class EdsVariant:
             self.table[section][key] = str(value)
         return self
 
-    def with_object(self, section: str, value: int) -> Self:
-        """Add an object, or a sub-index of one that is there."""
+    def with_object(self, section: str, value: int, **keys: str) -> Self:
+        """Add an object, or a sub-index of one that is there; keys: instead of those of one that is written by SDO."""
         self.table[section] = {
             "ParameterName": f"Object {section}",
             "ObjectType": "0x7",
@@ -41,7 +41,7 @@ class EdsVariant:
             "AccessType": "rw",
             "DefaultValue": str(value),
             "PDOMapping": "0",
-        }
+        } | keys
         return self
 
     def write(self, path: Path) -> Path:

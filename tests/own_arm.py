@@ -3,6 +3,8 @@
 from importlib import resources
 from pathlib import Path
 
+from eds_variants import EdsVariant
+
 from adacd_hil.wire.dbc_contract import contract_folder
 
 OWN_ARM = """
@@ -49,18 +51,10 @@ signals = [
 
 def write_drive(folder: Path) -> Path:
     """Write a drive with position, velocity and target torque in objects of its maker, in other PDOs than ours."""
-    listed = "[ManufacturerObjects]\nSupportedObjects={}\n1=0x2211\n2=0x2212\n{}"
-    eds = (contract_folder() / "stock_drive.eds").read_text()
-    assert listed.format(2, "") in eds
-    eds = eds.replace(listed.format(2, ""), listed.format(5, "3=0x2063\n4=0x2069\n5=0x2071\n"))
-    for index, name, kind, access in (
-        ("2063", "Position", 4, "ro"),
-        ("2069", "Velocity", 4, "ro"),
-        ("2071", "Torque set-point", 3, "rww"),
-    ):
-        eds += f"\n[{index}]\nParameterName={name}\nObjectType=0x7\nDataType=0x000{kind}\nAccessType={access}\n"
-        eds += "DefaultValue=0\nPDOMapping=1\n"
-    (folder / "other_drive.eds").write_text(eds)
+    eds = EdsVariant()
+    for index, kind, access in (("2063", "0x0004", "ro"), ("2069", "0x0004", "ro"), ("2071", "0x0003", "rww")):
+        eds.with_object(index, 0, DataType=kind, AccessType=access, PDOMapping="1")
+    eds.write(folder / "other_drive.eds")
     ours = (resources.files("adacd_hil") / "device_profiles" / "stock-drive.toml").read_text()
     profile = folder / "other-drive.toml"
     profile.write_text(ours.partition("[[pdo]]")[0].replace("stock_drive.eds", "other_drive.eds") + OTHER_LAYOUT)

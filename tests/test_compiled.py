@@ -72,54 +72,43 @@ def test_compiled_code_lies_in_the_users_cache_for_this_user_alone(places: Path)
         assert folder.stat().st_mode & 0o777 == 0o700
 
 
-def writable_by_the_group(folder: Path) -> None:
-    folder.mkdir(parents=True)
-    folder.chmod(0o770)
+def make(folder: Path, kind: str) -> None:
+    """Make what lies where a cache should: a folder that others can write, or that is theirs, a link, or a file."""
+    if kind == "somebody else's" and os.geteuid():
+        pytest.skip("only root can give a folder away")
+    folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if kind == "a link":
+        (folder.parent / "elsewhere").mkdir()
+        folder.symlink_to("elsewhere")
+    elif kind == "a file":
+        folder.touch()
+    else:
+        folder.mkdir()
+        folder.chmod(0o1777 if kind == "for all" else 0o770)
+        os.chown(folder, 12345 if kind == "somebody else's" else -1, -1)
 
 
-def writable_by_all(folder: Path) -> None:
-    folder.mkdir(parents=True)
-    folder.chmod(0o1777)
-
-
-def somebody_elses(folder: Path) -> None:
-    folder.mkdir(parents=True)
-    os.chown(folder, 12345, -1)
-
-
-def link(folder: Path) -> None:
-    (folder.parent / "elsewhere").mkdir(parents=True)
-    folder.symlink_to(folder.parent / "elsewhere")
-
-
-def file(folder: Path) -> None:
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    folder.touch()
+OTHERS = ("somebody else's", "a link", "a file")
 
 
 @pytest.mark.parametrize(
-    ("name", "make"),
+    ("name", "kind"),
     [
-        *(("adacd-hil", make) for make in (somebody_elses, link, file)),
-        *(("adacd-hil/digest", make) for make in (writable_by_the_group, writable_by_all, somebody_elses, link, file)),
+        *(("adacd-hil", kind) for kind in OTHERS),
+        *(("adacd-hil/digest", kind) for kind in ("for a group", "for all", *OTHERS)),
     ],
 )
-def test_a_cache_that_others_can_write_is_not_read(places: Path, name: str, make) -> None:
-    if make is somebody_elses and os.geteuid():
-        pytest.skip("only root can give a folder away")
-    (places / "user" / name).parent.mkdir(parents=True, mode=0o700)
-    make(places / "user" / name)
+def test_a_cache_that_others_can_write_is_not_read(places: Path, name: str, kind: str) -> None:
+    make(places / "user" / name, kind)
     own = places / "temporary" / f"adacd-hil-{os.geteuid()}"
     assert cache_folder("digest") == own / "digest"
     assert own.stat().st_mode & 0o777 == 0o700
 
 
-@pytest.mark.parametrize("make", [somebody_elses, link, file])
-def test_where_every_known_folder_is_somebody_elses_there_is_a_new_one(places: Path, make) -> None:
-    if make is somebody_elses and os.geteuid():
-        pytest.skip("only root can give a folder away")
-    file(places / "user")
-    make(places / "temporary" / f"adacd-hil-{os.geteuid()}")
+@pytest.mark.parametrize("kind", OTHERS)
+def test_where_every_known_folder_is_somebody_elses_there_is_a_new_one(places: Path, kind: str) -> None:
+    make(places / "user", "a file")
+    make(places / "temporary" / f"adacd-hil-{os.geteuid()}", kind)
     first, second = cache_folder("digest"), cache_folder("digest")
     assert first != second
     assert first.parent == second.parent == places / "temporary"
@@ -127,7 +116,7 @@ def test_where_every_known_folder_is_somebody_elses_there_is_a_new_one(places: P
 
 
 def test_a_cache_that_was_left_open_is_closed_to_others(places: Path) -> None:
-    writable_by_the_group(places / "user" / "adacd-hil")
+    make(places / "user" / "adacd-hil", "for a group")
     assert cache_folder("digest") == places / "user" / "adacd-hil" / "digest"
     assert (places / "user" / "adacd-hil").stat().st_mode & 0o777 == 0o700
 
@@ -144,7 +133,7 @@ def test_the_folder_that_the_user_names_comes_first(places: Path, monkeypatch: p
 def test_a_named_folder_that_others_can_write_is_not_used_and_that_is_said(
     places: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    writable_by_all(places / "shared")
+    make(places / "shared", "for all")
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(places / "shared"))
     with pytest.warns(UserWarning, match="NUMBA_CACHE_DIR .*/shared is not used: not this user's alone"):
         assert cache_folder("digest") == places / "user" / "adacd-hil" / "digest"

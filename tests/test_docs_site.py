@@ -1,5 +1,7 @@
 """The documentation's site is built from every page, without a warning: no broken link, no page left out."""
 
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +9,21 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def with_readme(folder: Path) -> Path:
+    """Copy what the site is made of, the README as one more page; return the folder of the pages."""
+    pages = folder / "docs"
+    shutil.copytree(ROOT / "docs", pages, ignore=shutil.ignore_patterns("_site"))
+    for path in ROOT.iterdir():
+        if path.is_file():
+            shutil.copy(path, folder)
+        elif path.name in ("adacd_hil", "firmware_sim", "dbc", "tests", "tools"):
+            (folder / path.name).symlink_to(path)
+    links = re.compile(r"\]\((?!http)(docs/)?")
+    readme = links.sub(lambda found: "](" if found[1] else "](../", (ROOT / "README.md").read_text())
+    (pages / "readme.md").write_text(f"---\norphan: true\n---\n{readme}")
+    return pages
 
 
 def build(pages: Path, out: Path) -> str:
@@ -18,19 +35,15 @@ def build(pages: Path, out: Path) -> str:
 
 @pytest.mark.slow
 def test_every_page_and_notebook_is_in_the_site_and_links_lead_inside(tmp_path):
-    site = tmp_path / "site"
-    assert build(ROOT / "docs", site) == ""
-    pages = {
-        path.relative_to(ROOT / "docs").with_suffix(".html")
-        for pattern in ("*.md", "*.ipynb")
-        for path in (ROOT / "docs").rglob(pattern)
-        if not path.is_relative_to(ROOT / "docs" / "_site")
-    }
-    assert {page for page in pages if not (site / page).is_file()} == set()
+    pages, site = with_readme(tmp_path), tmp_path / "site"
+    assert build(pages, site) == ""
+    written = [path for pattern in ("*.md", "*.ipynb") for path in pages.rglob(pattern)]
+    assert [path for path in written if not (site / path.relative_to(pages)).with_suffix(".html").is_file()] == []
     contributing = (site / "contributing.html").read_text()
     assert "How a change lands" in contributing
     assert 'href="timing.html"' in contributing
     assert 'href="contributing.html"' in (site / "adding-things.html").read_text()
+    assert 'href="index.html"' in (site / "readme.html").read_text()
     notebook = (site / "notebooks" / "a-run.html").read_text()
     assert "8 contacts, 2 certificates" in notebook
     assert notebook.count('src="data:image/png;base64,') == 2

@@ -15,10 +15,11 @@ from adacd_hil.cli.output import ExitCode, exit_code
 from adacd_hil.device.device_files import load_profile
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.settings.setting_keys import apply_settings
 
 pytestmark = pytest.mark.slow
 
-SHORT = "lasts_s = 0.4\n"
+SHORT = "lasts_s = 0.1\n"
 LENGTHS = ("--no-bus", "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", "--flat", "--yes")
 RPM = 0x00B44700
 RECEIVED, SENT = ("1400", "1401", "1402", "1403"), ("1800", "1801", "1802", "1803")
@@ -72,7 +73,7 @@ def init(folder: Path, *words: str) -> Result:
 
 
 def rehearse(folder: Path) -> ExitCode:
-    """Play 0.4 s of the arm; return the exit status."""
+    """Play 0.1 s of the arm; return the exit status."""
     (folder / "short.toml").write_text(SHORT)
     cast = resolve(str(folder / "my-arm.toml"), str(folder / "short.toml"), None, None)
     return exit_code(run_embedded(cast, "lockstep", folder / "run")[0])
@@ -163,7 +164,9 @@ def play(geared: Path, folder: Path, gear: tuple[float, float], lasts_s: float, 
     (folder / "truth.toml").write_text(f"[factor]\ngear = {list(gear)}\n")
     (folder / "scenario.toml").write_text(f"lasts_s = {lasts_s}\n{scenario}")
     files = str(folder / "scenario.toml"), None, None, str(folder / "truth.toml")
-    run_embedded(resolve(str(geared / "my-arm.toml"), *files), "lockstep", folder / "run")
+    cast = resolve(str(geared / "my-arm.toml"), *files)
+    settings = apply_settings(cast.settings, {"safety.phase_timeout_s": "1.0"})
+    run_embedded(cast._replace(settings=settings), "lockstep", folder / "run")
     return [event.message for event in load(folder / "run").events]
 
 
@@ -191,7 +194,7 @@ def test_the_torque_of_a_geared_arm_is_the_joint_s(geared: Path, tmp_path: Path)
 def test_a_gear_that_is_told_wrong_is_named(
     geared: Path, tmp_path: Path, gear: tuple[float, float], joint: int, least: float, most: float
 ) -> None:
-    said = play(geared, tmp_path, gear, 3.5)
+    said = play(geared, tmp_path, gear, 2.7)
     named = [line for line in said if f"scale.gear_ratio = 30 of devices.drive[{joint - 1}]" in line]
     assert named, said
     (number,) = re.findall(rf"joint {joint}: its torque sensor measures \+?([\d.]+) ", named[0])
@@ -200,7 +203,7 @@ def test_a_gear_that_is_told_wrong_is_named(
 
 
 def test_a_wrong_gear_of_an_arm_that_is_not_at_zero_is_named_before_it_moves(geared: Path, tmp_path: Path) -> None:
-    said = play(geared, tmp_path, (26.0, 1.0), 6.0, "start_deg = [-30.0, -60.0]\n")
+    said = play(geared, tmp_path, (26.0, 1.0), 1.5, "start_deg = [-30.0, -60.0]\n")
     (line,) = [line for line in said if "COMMISSION -> FAULT" in line]
     assert "joint 1: position -780" in line
     assert "scale.gear_ratio" in line

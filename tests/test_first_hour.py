@@ -12,7 +12,7 @@ from pathlib import Path
 import first_hour
 import pytest
 from documents import ROOT
-from first_hour import Played, Step, Way, judge, logical_lines, play, read_way
+from first_hour import Played, Step, Way, judge, play, read_way
 from long_cases import long_but
 
 pytestmark = pytest.mark.slow
@@ -21,7 +21,7 @@ SHORT = """
 lasts_s = {lasts_s}
 contacts = [{{ at_s = {touched_s}, link = 2, point_m = 0.2, force_N = 20.0, duration_s = 0.1 }}]
 """
-LASTS_S = {"see": 1.0, "recordings": 11.5, "arm": 1.0}
+LASTS_S = {"see": 1.0, "recordings": 10.3, "arm": 1.0}
 """How long demos last: for `identify` the README takes the first 9 s, in which nobody touches the arm."""
 PROGRAMS = {
     "adacd-hil": "from adacd_hil.cli.start_host import start_host as start",
@@ -74,12 +74,6 @@ def test_a_newcomer_gets_there_by_the_text_alone(name: str, tmp_path: Path) -> N
     assert sum(step.status is not None for step in way.played) >= 4
 
 
-def played(text: str, folder: Path) -> Way:
-    way = Way("x", [Step("x.md", text)], 0, [])
-    play(way, folder, dict(os.environ), lambda _: "")
-    return way
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -89,19 +83,10 @@ def played(text: str, folder: Path) -> Way:
     ],
 )
 def test_what_a_newcomer_can_not_type_is_a_complaint(text: str, said: str, tmp_path: Path) -> None:
-    (complaint,) = played(text, tmp_path).complaints
+    way = Way("x", [Step("x.md", text)], 0, [])
+    play(way, tmp_path, dict(os.environ), lambda _: "")
+    (complaint,) = way.complaints
     assert said in complaint
-
-
-def test_a_question_is_answered_by_enter(tmp_path: Path) -> None:
-    way = played("""python3 -c 'assert input("name [x]: ") == input("sure? ") == ""'""", tmp_path)
-    assert way.complaints == []
-    assert way.played[0].questions == 2
-
-
-def test_a_block_is_typed_line_by_line_and_a_quote_keeps_lines_together() -> None:
-    block = "# first\nfoo a \\\n  b   # else's\nsh -c '\n  foo # x\n  bar'\n\nbaz '#'\n"
-    assert logical_lines(block) == ["foo a \\\n  b", "sh -c '\n  foo # x\n  bar'", "baz '#'"]
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from called import called
@@ -10,7 +9,10 @@ from long_cases import long_but
 from played_outcome import outcome_of
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
+from adacd_hil.settings.setting_keys import apply_settings
 from firmware_sim.scenario.scenario import ScenarioOutcome
+
+pytestmark = pytest.mark.slow
 
 ARM = ("--no-bus", "--length-m", "0.4", "0.25", "--mass-kg", "2", "1", "--yes")
 STRENGTH = ("--rated-torque-nm", "30", "10", "--torque-limit-nm", "30", "10")
@@ -37,15 +39,8 @@ def mounted(tilt_deg: float, hangs_deg: float) -> str:
     return f"[mechanics]\ntilt_deg = {tilt_deg}\ntilt_direction_deg = {hangs_deg}\n"
 
 
-class Played(NamedTuple):
-    """What came of a run, and the lines that it printed."""
-
-    outcome: ScenarioOutcome
-    said: str
-
-
-def play(folder: Path, mounting: tuple[str, ...], truth: str = "", text: str = TOUCHED) -> Played:
-    """Draft an arm and play it. text: of the scenario; "": `paper`."""
+def play(folder: Path, mounting: tuple[str, ...], truth: str = "", text: str = TOUCHED) -> tuple[ScenarioOutcome, str]:
+    """Draft an arm and play it; return the lines that it printed, too. text: of the scenario; "": `paper`."""
     file, touched, truth_file = folder / "arm.toml", folder / "touched.toml", folder / "truth.toml"
     drafted = called("init", str(file), *ARM, *STRENGTH, *mounting)
     assert drafted.exit_code == 0, drafted.stderr
@@ -53,11 +48,11 @@ def play(folder: Path, mounting: tuple[str, ...], truth: str = "", text: str = T
     truth_file.write_text(truth)
     said: list[str] = []
     cast = resolve(str(file), str(touched) if text else "paper", None, None, str(truth_file) if truth else None)
-    ended = run_embedded(cast, "lockstep", folder / "run", said.append)
-    return Played(outcome_of(*ended), "\n".join(said))
+    settings = apply_settings(cast.settings, {"safety.phase_timeout_s": "1.0"})
+    ended = run_embedded(cast._replace(settings=settings), "lockstep", folder / "run", said.append)
+    return outcome_of(*ended), "\n".join(said)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mounting", "truth"),
     long_but(
@@ -79,7 +74,6 @@ def test_a_mounted_arm_is_certified_and_its_touches_are_found(tmp_path: Path, mo
     assert (outcome.contacts, outcome.missed, outcome.false_alarms) == (2, 0, 0), said
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mounting", "hangs_deg"),
     long_but(2, [("hanging", 40.0), ("tilted", 0.0), ("hanging", -90.0), ("standing", 90.0)]),
@@ -93,28 +87,24 @@ def test_a_wrong_mounting_is_named_before_a_certificate(tmp_path: Path, mounting
     assert outcome.adaptations == 0
 
 
-@pytest.mark.slow
 def test_an_arm_that_stands_and_is_told_to_hang_is_named_with_its_certificate(tmp_path: Path) -> None:
-    said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 180.0), f"lasts_s = 4.5\n{START}").said
+    _, said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 180.0), f"lasts_s = 3.6\n{START}")
     assert re.search(r"arm.mounting_deg\[1\] = 0 deg; link 1 hangs at q1 = 180", said), said
 
 
-@pytest.mark.slow
 def test_a_stop_before_the_first_motion_is_acknowledged_and_the_run_ends(tmp_path: Path) -> None:
-    still = "lasts_s = 4.0\nstart_deg = [0.0, 0.0]\n"
-    said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 20.0), still).said
+    still = "lasts_s = 2.0\nstart_deg = [0.0, 0.0]\n"
+    _, said = play(tmp_path, MOUNTINGS["hanging"], mounted(90.0, 20.0), still)
     assert "[ENABLE -> REACT]" in said
     assert "[STOPPED -> ENABLE]" in said
 
 
-@pytest.mark.slow
 def test_the_weight_of_an_arm_that_is_told_to_be_flat_is_named_with_the_mounting(tmp_path: Path) -> None:
-    said = play(tmp_path, ("--mounting", "flat"), mounted(90.0, -90.0), f"lasts_s = 2.0\n{START}").said
+    _, said = play(tmp_path, ("--mounting", "flat"), mounted(90.0, -90.0), f"lasts_s = 1.5\n{START}")
     assert re.search(r"joint 1 is loaded: .* the mounting is not flat: estimator.gravity = true", said), said
 
 
 @pytest.mark.long
-@pytest.mark.slow
 def test_a_payload_is_learnt_and_all_touches_are_found_in_gravity(tmp_path: Path) -> None:
     outcome, said = play(tmp_path, MOUNTINGS["hanging"], text="")
     assert outcome.adaptations == 2, said

@@ -79,14 +79,11 @@ def test_an_isolated_processor_that_is_not_there_is_missed(monkeypatch: pytest.M
     assert [refusal.reason for refusal in grant.missing] == ["isolated processor: there is none"]
 
 
-@pytest.mark.parametrize(("text", "cpus"), [("2-3,7\n", (2, 3, 7)), ("5", (5,)), ("\n", ())])
-def test_isolated_processors_are_read_from_the_kernels_list(tmp_path: Path, text: str, cpus: tuple[int, ...]) -> None:
-    (tmp_path / "isolated").write_text(text)
-    assert isolated_cpus(tmp_path) == cpus
-
-
-def test_a_kernel_that_tells_no_isolated_processors_has_none(tmp_path: Path) -> None:
+def test_isolated_processors_are_read_from_the_kernels_list(tmp_path: Path) -> None:
     assert isolated_cpus(tmp_path) == ()
+    for text, cpus in (("2-3,7\n", (2, 3, 7)), ("5", (5,)), ("\n", ())):
+        (tmp_path / "isolated").write_text(text)
+        assert isolated_cpus(tmp_path) == cpus
 
 
 @pytest.mark.parametrize(

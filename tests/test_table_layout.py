@@ -64,11 +64,6 @@ def test_where_the_first_column_goes_on_it_is_no_further_row() -> None:
     ]
 
 
-def test_a_cell_without_room_goes_on_below_between_words() -> None:
-    lines = [("", "found"), ("a", "a sentence that is longer than the terminal is wide")]
-    assert fit_table(lines, width=30) == ["   found", "a  a sentence that is longer", "   than the terminal is wide"]
-
-
 def test_a_key_that_is_parted_has_no_space_in_it_and_a_number_is_not_parted() -> None:
     lines = [("key", "value"), ("arm.cad_theta", "[0.178607, 0.036855]")]
     assert fit_table(lines, width=20) == [
@@ -92,15 +87,6 @@ def test_a_number_has_its_unit_in_the_same_line_where_both_have_room() -> None:
     assert fold("certified after 2.0 s", 20) == "certified after\n  2.0 s"
     assert fold("certified after 2.0 sails", 20) == "certified after 2.0\n  sails"
     assert fold("0.0000000002 rad/s", 16) == "0.0000000002\n  rad/s"
-
-
-def test_a_path_or_a_key_without_room_is_parted_at_its_joints() -> None:
-    lines = [("a", "/home/someone/runs/2026-11-25T10-00-00/run.mcap"), ("b", "certified.position_torque_Nm")]
-    assert fit_table(lines, width=31) == [
-        "a  /home/someone/runs/",
-        "   2026-11-25T10-00-00/run.mcap"[:31],
-        "b  certified.position_torque_Nm",
-    ]
 
 
 def test_a_row_of_a_screen_is_one_line_and_says_where_it_is_cut() -> None:

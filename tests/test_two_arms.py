@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -11,18 +12,13 @@ from rig import SessionRig, scripted
 from two_arms_rig import FIRST, SECOND, TwoArms
 
 from adacd_hil.cli.connection import received_ids
-from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.control.pacing import make_pacer
-from adacd_hil.device.arm import Arm
+from adacd_hil.control.session import Session, SessionSummary
 from adacd_hil.device.device_files import place_devices
-from adacd_hil.device.network import Master
 from adacd_hil.log.reader import read_log
-from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
-from adacd_hil.wire.bus import BusError, Tap
 
 pytestmark = pytest.mark.slow
 
@@ -39,86 +35,73 @@ def second_settings() -> Settings:
     )
 
 
-class Rig:
-    """The two arms, and the second one's host with its log. `dies_ns`: when the first host falls silent."""
+class WatchedSession(Session):
+    """A session whose devices watch the host by time, though its clock is virtual."""
 
-    def __init__(self, folder: Path, dies_ns: int = 1 << 62) -> None:
-        settings = second_settings()
-        arms = TwoArms(settings, dies_ns=dies_ns)
-        self.wire, self.first, self.end, clock = arms.wire, arms.first, arms.end, arms.clock
-        self.tap = Tap(self.end, clock)
-        self.arm = Arm(settings, loaded_contract(settings), place_devices(settings), self.tap)
-        self.master = Master(settings, loaded_contract(settings), place_devices(settings), self.tap)
-        self.pacer = make_pacer(settings, clock, self.tap, self.arm.sync_id)
-        operator = ScriptedOperator(settings.operator)
-        self.cycle = Cycle(settings, self.tap, self.arm, self.master, self.pacer, operator, lambda _: None, clock)
-        self.cycle.compile()
-        self.path = folder / "run.mcap"
-        self.recorder = Recorder(self.path, blocking=True)
+    is_lockstep = False
 
-    def run(self) -> RunResult:
-        self.master.reset()
-        self.master.identify()
-        self.master.configure()
-        self.master.start()
-        try:
-            return self.cycle.run(self.recorder)
-        finally:
-            self.master.stop()
-            self.recorder.close()
+
+class Played(NamedTuple):
+    """The two arms, and how the second one's run ended."""
+
+    arms: TwoArms
+    summary: SessionSummary
+
+
+def play(folder: Path, dies_ns: int = 1 << 62) -> Played:
+    """Play the second host to its end; dies_ns: when the first one falls silent."""
+    settings = second_settings()
+    arms, devices = TwoArms(settings, dies_ns=dies_ns), place_devices(settings)
+    host = settings, loaded_contract(settings), devices, arms.end, arms.clock, ScriptedOperator(settings.operator)
+    return Played(arms, WatchedSession(*host, folder, "embedded").run())
 
 
 @pytest.fixture(scope="module")
-def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Rig, RunResult]:
-    rig = Rig(tmp_path_factory.mktemp("two_arms"))
-    return rig, rig.run()
+def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
+    return play(tmp_path_factory.mktemp("two_arms"))
 
 
-def test_the_second_host_moves_its_arm_by_the_first_ones_sync(played: tuple[Rig, RunResult]) -> None:
-    rig, result = played
+def test_the_second_host_moves_its_arm_by_the_first_ones_sync(played: Played) -> None:
+    result = played.summary.result
+    assert result is not None
     assert (result.fault, result.overruns, result.state) == (FaultReason.NONE, 0, SchemeState.ADAPT)
-    log = read_log(rig.path)
+    log = read_log(played.summary.log.path)
     assert np.abs(np.degrees(log.scheme["q"][-1])).max() > 5.0
     assert (log.cycle["frames_missing"] > 0).sum() <= 1
 
 
-def test_the_first_arm_is_not_disturbed(played: tuple[Rig, RunResult]) -> None:
-    rig, _ = played
-    states = rig.first.states
+def test_the_first_arm_is_not_disturbed(played: Played) -> None:
+    states = played.arms.first.states
     assert states[-1].is_enabled
     assert {state.fault for state in states} == {FaultReason.NONE}
     assert [state.cycle for state in states if not state.is_complete] == []
-    assert [event for event in rig.first.master.take_events() if event.level != "info"] == []
+    assert [event for event in played.arms.first.master.take_events() if event.level != "info"] == []
     assert np.abs(states[-1].q).min() > 0.1
 
 
-def test_the_follower_sends_no_sync_and_nothing_that_is_not_its_own(played: tuple[Rig, RunResult]) -> None:
-    rig, _ = played
-    sent = {can_id for can_id, _ in rig.end.sent}
+def test_the_follower_sends_no_sync_and_nothing_that_is_not_its_own(played: Played) -> None:
+    sent = {can_id for can_id, _ in played.arms.end.sent}
     assert sent == {0x000, 0x205, 0x206, 0x605, 0x606, 0x607, 0x608, 0x77E}
 
 
 @pytest.mark.parametrize("arm", [FIRST, SECOND])
-def test_on_a_shared_bus_nmt_names_a_node_of_the_own_arm(played: tuple[Rig, RunResult], arm: int) -> None:
-    rig, _ = played
-    commands = [tuple(data) for can_id, data in rig.wire.ends[arm].sent if can_id == 0x000]
+def test_on_a_shared_bus_nmt_names_a_node_of_the_own_arm(played: Played, arm: int) -> None:
+    commands = [tuple(data) for can_id, data in played.arms.wire.ends[arm].sent if can_id == 0x000]
     nodes = [1 + 4 * arm, 2 + 4 * arm, 3 + 4 * arm, 4 + 4 * arm]
     assert {node for _, node in commands} == set(nodes)
     assert [node for command, node in commands if command == 0x82] == nodes
 
 
-def test_the_devices_of_each_arm_have_the_set_up_of_their_own_host(played: tuple[Rig, RunResult]) -> None:
-    rig, _ = played
-    watched = [{device.value(0x1016, 1) >> 16 for device in bench.devices} for bench in rig.wire.benches]
+def test_the_devices_of_each_arm_have_the_set_up_of_their_own_host(played: Played) -> None:
+    watched = [{device.value(0x1016, 1) >> 16 for device in bench.devices} for bench in played.arms.wire.benches]
     assert watched == [{127}, {126}]
-    assert {bench.devices[0].value(0x1006) for bench in rig.wire.benches} == {2000}
+    assert {bench.devices[0].value(0x1006) for bench in played.arms.wire.benches} == {2000}
 
 
 def test_without_sync_the_follower_ends_with_one_line(tmp_path: Path) -> None:
-    rig = Rig(tmp_path, dies_ns=500 * PERIOD_NS)
-    with pytest.raises(BusError, match="no SYNC on shared within 100 ms"):
-        rig.run()
-    assert [tuple(data) for can_id, data in rig.end.sent[-4:]] == [(0x80, node) for node in (5, 6, 7, 8)]
+    played = play(tmp_path, dies_ns=500 * PERIOD_NS)
+    assert "no SYNC on shared within 100 ms" in played.summary.error
+    assert [tuple(data) for can_id, data in played.arms.end.sent[-4:]] == [(0x80, node) for node in (5, 6, 7, 8)]
 
 
 def test_an_arm_at_other_node_ids_runs_in_lockstep_on_a_bus_of_its_own(tmp_path: Path) -> None:

@@ -51,10 +51,13 @@ def stem(word: str) -> str:
     return str(_stemmer.stemWord(word.lower()))
 
 
-def count_stems(text: str) -> Counter[str]:
-    """Count the stems of a text's words, identifiers split at underscores and capitals."""
+def count_stems(*texts: str) -> Counter[str]:
+    """Count the stems of all words of texts, identifiers split at underscores and capitals."""
+    words: Counter[str] = Counter()
+    for text in texts:
+        words.update(_WORD.findall(text))
     stems: Counter[str] = Counter()
-    for word, uses in Counter(_WORD.findall(text)).items():
+    for word, uses in words.items():
         stems[stem(word)] += uses
     return stems
 
@@ -68,11 +71,9 @@ def frequent_terms(ours: Iterable[str], theirs: Iterable[str]) -> list[Term]:
         stems = count_stems(text)
         uses.update(stems)
         files.update(stems.keys())
-        for word in _WORD.findall(text):
-            spellings[stem(word)][word.lower()] += 1
-    elsewhere: Counter[str] = Counter()
-    for text in theirs:
-        elsewhere.update(count_stems(text))
+        for word, number in Counter(_WORD.findall(text)).items():
+            spellings[stem(word)][word.lower()] += number
+    elsewhere = count_stems(*theirs)
     here, there = uses.total(), max(elsewhere.total(), 1)
     found = []
     for key, number in uses.items():
