@@ -27,7 +27,7 @@ _MOST_RAD = 2.0 * math.pi
 
 
 class ConfigurationFindings(NamedTuple):
-    """errors: reasons why it can't be used. warnings: likely mistakes. `settings`: None with errors."""
+    """errors: reasons why the configuration can't be used. warnings: likely mistakes. `settings`: None with errors."""
 
     errors: list[str]
     warnings: list[str]
@@ -37,9 +37,10 @@ class ConfigurationFindings(NamedTuple):
 
 
 def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
-    """Return all errors and likely mistakes of a configuration, by its name or file.
+    """Return errors and likely mistakes of a configuration, by its name or file; a configuration error raises nothing.
 
-    profile: name of one of its `[profiles]` to apply. The checks stop at the first kind of error.
+    profile: name of one of its `[profiles]` to apply. Checked in turn are the keys, the motion's limits, the device
+    profiles, the contract; if one of these has errors, the later ones and the warnings are left out.
     """
     try:
         layers = configuration_layers(name_or_file, profile)
@@ -65,7 +66,10 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
 
 
 def profile_guesses(settings: Settings) -> dict[str, float]:
-    """Return the values that device profiles list as assumed, by a key such as `my-drive.toml: scale.gear_ratio`."""
+    """Return the values that device profiles list as assumed, by a key such as `my-drive.toml: scale.gear_ratio`.
+
+    Raises ConfigError as `load_profile`.
+    """
     found = {}
     for kind, names in (("drive", settings.devices.drive), ("sensor", settings.devices.sensor)):
         for name in dict.fromkeys(names):
@@ -77,7 +81,10 @@ def profile_guesses(settings: Settings) -> dict[str, float]:
 
 
 def oddities(settings: Settings) -> list[str]:
-    """Return the likely mistakes that the settings alone show, a line each."""
+    """Return the likely mistakes that the settings alone show, a line each; [] without any.
+
+    They are values above their bounds, degrees that look like radians, and unknown keys in `assumed`.
+    """
     return [line for look in _LOOKS for line in look(settings)]
 
 
@@ -86,7 +93,7 @@ _MOST_NAMED = 4
 
 
 def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
-    """Return a line that names up to four guessed values of a configuration, without measured ones; "" if none."""
+    """Return a line that names up to four guessed values of a configuration; "" if none. `measured`: left out."""
     guesses = [f"`{key}`" for key in (*profile_guesses(settings), *settings.assumed) if key not in measured]
     more = f" and {len(guesses) - _MOST_NAMED} more" if len(guesses) > _MOST_NAMED else ""
     named = f"{', '.join(guesses[:_MOST_NAMED])}{more}"

@@ -214,9 +214,10 @@ class Cycle:
             self._master.parameters.step(arm.cycle, arm.t_ns)
 
     def _request(self, cycle: int) -> Request:
-        """Return this cycle's request for the scheme: an interruption's, a carried one, or the operator's.
+        """Return this cycle's request for the scheme: FINISH after an interruption, a carried one, or the operator's.
 
-        Store requests that wait to be served. On FINISH begin to park the arm.
+        An interruption requests once, a carried request is made as soon as the drives have been enabled. Store PAYLOAD
+        and FINISH until they are served. On FINISH begin to park the arm.
         """
         if self._interrupts and not self._is_finishing:
             return self._finish()
@@ -227,7 +228,10 @@ class Cycle:
         return self._finish() if request is Request.FINISH else request
 
     def _finish(self) -> Request:
-        """Begin to park the arm if its drives may have torque, and store when; return FINISH."""
+        """Return FINISH, and begin to park the arm if the state has power.
+
+        The first call stores the present cycle, from which FINISH_S counts.
+        """
         if not self._is_finishing:
             self._finish_cycle = self._arm.cycle
         self._is_finishing = True
@@ -236,7 +240,10 @@ class Cycle:
         return Request.FINISH
 
     def _follow(self, arm: ArmState, output: SchemeOutput) -> None:
-        """Fill the desired torque: that of the floating law while the arm floats, else that of the controller."""
+        """Fill `_tau_d` with the torque of the floating law while the arm floats, else with the controller's.
+
+        If the scheme's model is valid, first begin to blend the controller's feedforward to it.
+        """
         if output.is_model_valid:
             self._controller.feed_forward(output.theta_ff)
         if self._reference.is_floating:
@@ -311,7 +318,7 @@ class Cycle:
     def _follow_state(self, state: SchemeState, cycle: int) -> None:
         """Store a new state, and the cycle in which the drives were enabled or the fault came.
 
-        Compare the first certificate with the link lengths. Drop a request that the state serves.
+        At the first MONITOR compare the certificate with the link lengths. Drop a stored request that the state serves.
         """
         self._state = state
         if state in (SchemeState.ADAPT, SchemeState.REACT) and self._enabled_cycle is None:
@@ -339,7 +346,10 @@ class Cycle:
         return is_overdue or self._state not in POWERED or self._reference.is_parked(output.cycle)
 
     def _disable(self, recorder: Recorder, quick_stop: bool) -> None:
-        """Send zero torque and the command to disable the drives for DISABLE_CYCLES cycles, without the scheme."""
+        """Send zero torque and the command to disable the drives for DISABLE_CYCLES cycles, without the scheme.
+
+        Log their frames, and the counts of the frame checks.
+        """
         self._tau_c[:] = 0.0
         command = ArmCommand(self._tau_c, enable=False, quick_stop=quick_stop)
         for _ in range(DISABLE_CYCLES):

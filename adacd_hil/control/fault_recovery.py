@@ -76,7 +76,10 @@ class SelfChecks:
         return self._fail(FaultReason.FOLLOWING, Request.FAULT_FOLLOWING, line) if line else Request.NONE
 
     def suspicions(self, fault: FaultReason) -> list[str]:
-        """Return possible causes of a fault of an arm that ran away in its first motion; usually []."""
+        """Return [line] on likely wrong settings if the first motion suggests them and `fault` is LIMIT or FOLLOWING.
+
+        Else [].
+        """
         line = self._first_motion.suspicion() if fault in _RUN_AWAY else ""
         return [line] if line else []
 
@@ -108,7 +111,8 @@ class SelfChecks:
     def _judge_torque(self, cycle: int) -> str:
         """Return a line for a drive whose torque has been outside its recent commands' range for too long, else "".
 
-        Only statuses of this cycle are judged. Too long: TORQUE_STATUSES in a row, and TORQUE_S.
+        Outside: by more than `arm.torque_error_share` of its rated torque. Only statuses of this cycle are judged. Too
+        long: TORQUE_STATUSES in a row, and TORQUE_S.
         """
         for drive, rated_Nm in zip(self._arm.drives, self._arm.limits.rated_torque_Nm, strict=True):
             if drive.status_cycle != cycle or not drive.shows_torque:
@@ -129,9 +133,9 @@ class SelfChecks:
 
     @staticmethod
     def _excess(drive: Drive) -> float:
-        """Return by how much, per mille, a drive's torque is outside the range of its recent commands.
+        """Return by how much a drive's torque is outside the range of its recent commands, per mille of rated torque.
 
-        A drive that reports a limit of its own may have less.
+        0 within the range. A drive that reports a limit of its own may have less torque, down to zero.
         """
         low, high = min(drive.recent_permille), max(drive.recent_permille)
         if drive.is_limited:
@@ -169,7 +173,7 @@ class FaultReport:
         }
 
     def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
-        """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
+        """Count a cycle as `CommissionReport.count_cycle`."""
         self.commission.count_cycle(state, arm)
 
     def list_causes(self, fault: FaultReason) -> list[str]:
@@ -217,7 +221,10 @@ class CommissionReport(EventSource):
         self._worst: dict[tuple[int, int], float] = {}
 
     def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
-        """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
+        """Count the reasons for which an arm in INIT or COMMISSION stays there in this cycle; else do nothing.
+
+        Add an event for each device with a value outside its bounds, once. state: of the scheme after the cycle before.
+        """
         if state not in _STATES:
             return
         self._cycles += 1
@@ -237,7 +244,7 @@ class CommissionReport(EventSource):
                     self._worst[joint, place] = max(self._worst.get((joint, place), 0.0), abs(value))
 
     def list_unrest(self) -> list[str]:
-        """Return a line for each counted cause, the most frequent first; empty if every cycle was good."""
+        """Return a line for each counted reason, the most frequent first; empty if no cycle had one."""
         lines = [
             f"{self._text(cause)} in {count} of {self._cycles} cycles" for cause, count in self._causes.most_common()
         ]

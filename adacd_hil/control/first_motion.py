@@ -171,7 +171,10 @@ class FirstMotion(EventSource):
             self.events.append(event)
 
     def suspicion(self) -> str:
-        """Return the likely causes of an arm that runs away in its first motion, as text; empty if none is likely."""
+        """Return the likely causes of an arm that runs away in its first motion, as text; TOO_SHORT for unknown ones.
+
+        "" if the motion fits the configuration, is no longer judged, or `line` is set already.
+        """
         if self._readings is None or self.line:
             return ""
         if scales := self._suspect_scales():
@@ -201,9 +204,9 @@ class FirstMotion(EventSource):
         ]
 
     def _suspect_scales(self) -> str:
-        """Return a text on the joint whose sensor measures far more or less than its command, though in step with it.
+        """Return a text on a joint whose sensor measures 2.5 times its command or more, or 1 / 2.5 or less.
 
-        Empty if there is none.
+        "" without one. Torque and command must be correlated by _IN_SCALE. Of two joints the one that is further off.
         """
         _, tau_c, tau_J, _, _, _, both = self._pushed
         found = [
@@ -290,7 +293,10 @@ class FirstMotion(EventSource):
         return ""
 
     def _close(self, joint: int, ratio: "TorqueRatio") -> None:
-        """Stop judging a joint that agrees with the configuration; warn if its torque ratio is off."""
+        """Stop judging a joint that agrees with the configuration; add an event with its torque ratio.
+
+        The event is a warning if the ratio is more than _WARNED away from 1.
+        """
         self._open.remove(joint)
         is_off = abs(ratio.own - 1.0) > _WARNED
         text = (

@@ -65,7 +65,8 @@ def _by_direction(settings: Settings, theta: tuple[float, ...]) -> Event | None:
 def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:
     """Compare the length of link 1 by inertia over gravity with the configured one; return an event if they differ.
 
-    An info if link 1 seems longer, as a smaller tilt has the same effect; a warning if it seems shorter.
+    An info if link 1 seems longer, as a smaller tilt has the same effect; a warning if it seems shorter. None if they
+    agree within 12 %, or a2 or a5 is 0.
     """
     configured_m, configured_tilt_deg = settings.arm.link_length_m[0], settings.mounting_deg[0]
     if theta[A2] == 0.0 or theta[A5] == 0.0:

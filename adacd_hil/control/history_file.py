@@ -72,7 +72,7 @@ class CertificateRecord:
         self.known(HistorySettings())
 
     def known(self, settings: HistorySettings) -> HistorySettings:
-        """Return the settings with this record as the last certificate. Raises ValueError if values are missing."""
+        """Return section `history` of the settings with this record's values. Raises ValueError if some are missing."""
         return dataclasses.replace(
             settings,
             date_utc=self.date_utc,
@@ -212,9 +212,11 @@ class UsedHistory:
     def add_certificates(
         self, certificates: Sequence[Certificate], identities: Sequence[Identity], origin: "Origin"
     ) -> str:
-        """Append certificates of a run to the history file, in one step; return a summary. Raises OSError, ConfigError.
+        """Append certificates of a run to the history file, in one step; return a summary.
 
-        Read the file again first, so that certificates of another run are kept; identities: of the devices found.
+        Read the file again first, so that certificates of another run are kept; make one if there is none. identities:
+        of the devices found. Raises ConfigError for an invalid file or one of another arm, OSError if it can't be
+        written.
         """
         devices, records = tuple(DeviceRecord(*identity) for identity in identities), []
         if self.path.exists():
@@ -243,7 +245,10 @@ class Origin(NamedTuple):
 
 
 def use_history(path: Path, now_ns: int) -> UsedHistory:
-    """Read the arm's history for a run; a missing file is a first run. Raises ConfigError if it can't be used."""
+    """Read the arm's history for a run; a missing file is a first run. now_ns: wall clock.
+
+    Raises ConfigError for an invalid file, a link to a missing one, and a certificate over 6 minutes in the future.
+    """
     if (link := dangling_link(path)) is not None:  # the history was moved: the arm is known, not on its first run
         raise ConfigError(f"history {path}: link {link} leads to {link.readlink()}, which is not there")
     if not path.exists():

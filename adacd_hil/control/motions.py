@@ -103,7 +103,7 @@ class Pace:
         self.lag_s += (1.0 - self.share) * self._period_s
 
     def _phase_step(self, dq: Vector, ddq: Vector) -> float:
-        """Return the part of the present change of pace by which one period may advance it, within the limits."""
+        """Return by how much this period may advance the present change of pace, 1 in all, within the limits."""
         step, x = self._period_s / CHANGE_S, self._phase
         steepest = min(max(x, 0.5), x + step)  # where d(share)/dx is largest in this period
         slope = abs(self._to - self._from) * 6.0 * steepest * (1.0 - steepest)
@@ -134,7 +134,10 @@ class Excitation:
         self.is_on = bool(period_s and self._rad_s.size)
 
     def peaks_deg(self) -> tuple[Vector, Vector, Vector]:
-        """Return the largest |q|, |dq| and |ddq|, (2,) each, of 1000 points of a period, in deg, deg/s and deg/s²."""
+        """Return the largest |q|, |dq| and |ddq|, (2,) each, of 1000 points of a period, in deg, deg/s and deg/s².
+
+        Call it only if `is_on`.
+        """
         motion = np.zeros((1000, 3, JOINTS))
         for row, elapsed_s in zip(motion, np.linspace(0.0, 2.0 * np.pi / self._rad_s[0], len(motion)), strict=True):
             self.evaluate(float(elapsed_s), *row)
@@ -189,7 +192,10 @@ TOLERANCE = 1e-3
 
 
 def motion_problems(settings: Settings) -> list[str]:
-    """Return a line for each of the arm's limits that trajectory or excitation exceeds; empty if none."""
+    """Return a line for each limit that trajectory or excitation exceeds by more than 0.1 %; empty if none.
+
+    Limits: the arm's positions and velocities, and the reaction's accelerations.
+    """
     arm, trajectory = settings.arm, settings.trajectory
     travel = 2.0 * np.array(trajectory.amplitude_deg)
     half_period_s = np.array(trajectory.half_period_s)

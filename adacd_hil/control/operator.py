@@ -53,7 +53,10 @@ class ScriptedOperator:
         return FaultAnswer.RECOVER
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return the script's next request if it is due, or ACKNOWLEDGE a given time after a stop, else NONE."""
+        """Return the script's next request if it is due, or ACKNOWLEDGE a given time after a stop, else NONE.
+
+        NONE before the drives are enabled, and in FAULT.
+        """
         if elapsed_s is None or state is SchemeState.FAULT:
             return Request.NONE
         if self._script and elapsed_s >= self._script[0].at_s:

@@ -83,6 +83,8 @@ _MOST_SPIN_SHARE = 0.1
 class Tick(NamedTuple):
     """The beginning of one cycle. `periods` since the previous one, 1 unless periods were skipped.
 
+    `t_ns`: its time; `lateness_ns`: behind the grid, or since the received SYNC.
+
     Of a SYNC that was received: `late` came before it and belongs to the cycle before, `ahead` came after it.
     """
 

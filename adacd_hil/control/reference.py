@@ -120,7 +120,7 @@ class Reference(EventSource):
             self._approach()
 
     def is_parked(self, cycle: int) -> bool:
-        """Return whether the arm has settled in the corner after `park`; True, too, while it is stopped anywhere."""
+        """Return whether the arm has settled in the corner after `park`, or has been STOPPED, anywhere, after it."""
         if not self._is_parking or self._state is SchemeState.REACT:
             return False
         if self._state is SchemeState.STOPPED:
@@ -171,9 +171,9 @@ class Reference(EventSource):
             self._approach()
 
     def _is_yielding(self, arm: ArmState, output: SchemeOutput) -> bool:
-        """Fill the desired motion of FLOAT and ADMITTANCE; return False for other reactions, which follow a path.
+        """Fill the desired motion of FLOAT or ADMITTANCE and return True; return False for reactions along a path.
 
-        If a blow has just thrown the arm, restart the reaction from the measured motion.
+        If a blow has just thrown the arm, restart the reaction, of any kind but FLOAT, from the measured motion.
         """
         if self._reaction is Reaction.FLOAT:
             self._stay(arm)
@@ -268,7 +268,7 @@ class Reference(EventSource):
             self._warn_beyond(self._stop_from(self._q_d, self._dq_d))
 
     def _is_thrown(self, arm: ArmState, tau_ext_hat: Vector) -> bool:
-        """Return whether an ending blow has made the arm faster than planned, away from the contact.
+        """Return whether an ending blow has made a joint faster than planned by THROWN_rad_s, away from the contact.
 
         During the push the controller resists. False while the arm learns, because an adaptation that restarts forgets
         a push that continues.

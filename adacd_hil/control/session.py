@@ -103,6 +103,7 @@ class Ending(NamedTuple):
 class Session:
     """One run on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time.
 
+    `out`: folder of the log. `metadata`: further entries of the log. `files`: of the arm, checked against the devices.
     `viewer_files`: attached to the log and written beside it, by name. `on_started` is called when the devices are set
     to Operational for the first time. `touched_ns`: see `RunNarration`.
     """
@@ -240,7 +241,7 @@ class Session:
         return ending
 
     def _boot(self, master: Master, recorder: Recorder, tap: Tap) -> None:
-        """Reset and identify the devices, compare them with the files, and configure them. Raises DeviceError."""
+        """Reset and identify the devices, compare them with `files`, configure them. Raises DeviceError, BusError."""
         master.reset()
         self._identities = identities = tuple(master.identify())
         for identity in identities:
@@ -252,7 +253,10 @@ class Session:
         recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _run(self, cycle: Cycle, master: Master, recorder: Recorder, tap: Tap) -> RunResult:
-        """Set the devices to Operational, run the cycles, and stop the devices in any case; return the result."""
+        """Set the devices to Operational, run the cycles, and stop the devices in any case; return the result.
+
+        Raises BusError as `Cycle.run`.
+        """
         if not self._has_started:
             self._has_started = True
             self.on_started()
