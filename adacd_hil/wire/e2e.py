@@ -185,7 +185,7 @@ class E2eReceiver:
         return 0
 
     def check(self, frame: bytes) -> E2eStatus:
-        """Check one frame and return its status; use its values only if the status is valid."""
+        """Check one frame; return, store and count its status. Use its values only if the status is valid."""
         status = self.status = self._judge(frame)
         self.counts[status] += 1
         return status
@@ -205,7 +205,7 @@ class E2eReceiver:
         return E2eStatus.NO_NEW_DATA
 
     def tally(self) -> list[tuple[E2eStatus, int]]:
-        """Return the number of frames by status, in NO_NEW_DATA of cycles without a frame."""
+        """Return (status, number of frames so far) of each status; of NO_NEW_DATA the cycles without a frame."""
         return list(zip(E2eStatus, self.counts, strict=True))
 
     def restart_sequence(self) -> None:
@@ -247,9 +247,9 @@ class ProtectedReceiver(E2eReceiver):
         return self._mask + 1
 
     def step_of(self, frame: bytes) -> int | None:
-        """Return the counter's step from the last frame; don't check the CRC.
+        """Return the counter's step from the last frame with a right CRC, modulo its range; 0: it stands still.
 
-        None before the first frame, or for another length.
+        None before the first frame, or for another length. This frame's CRC is not checked; nothing is stored.
         """
         if self._last is None or len(frame) != self._length:
             return None
@@ -268,7 +268,10 @@ class ProtectedReceiver(E2eReceiver):
         self._max_delta += self._profile.is_growing
 
     def _judge(self, frame: bytes) -> E2eStatus:
-        """Return the status of a frame by its length, CRC and counter, and advance the sequence."""
+        """Return the status of a frame by its length, CRC and counter, and advance the sequence.
+
+        A wrong length is WRONG_CRC, too.
+        """
         is_growing = self._profile.is_growing
         self._max_delta += is_growing
         if not self.is_signed(frame):

@@ -63,7 +63,7 @@ class LockstepBus(Bus):
         queue_length: int = DEFAULT_QUEUE_LENGTH,
         is_fifo: bool = False,
     ) -> None:
-        """Take over a bus.
+        """Take over a bus, the one behind. frame_time: duration of a frame, ns. period_ns: between SYNCs.
 
         answers: identifiers that devices send on every SYNC. patience_s: by the wall clock, longest wait for devices
         that send no marks. queue_length: frames that wait at most while no node acknowledges. is_fifo: the host's
@@ -192,12 +192,15 @@ class LockstepBus(Bus):
         self._bus.close()
 
     def _transmit_before(self, limit_ns: int) -> None:
-        """Let everything win the bus, in its turn, that starts before `limit_ns`."""
+        """Transmit in turn all waiting frames, of host and devices, that start before `limit_ns`."""
         while self._transmit_next(limit_ns):
             pass
 
     def _transmit_next(self, limit_ns: int) -> bool:
-        """Let the next frame win the bus, if one starts before `limit_ns`; else return False."""
+        """Transmit the next waiting frame of host or devices that starts before `limit_ns`; return False without one.
+
+        Before, the devices are asked for frames up to its start if they haven't lived that long yet.
+        """
         queue = self._queue
         if not self._offered:
             return bool(queue) and self._transmit_own(limit_ns)
@@ -254,7 +257,10 @@ class LockstepBus(Bus):
             self._take_answers()
 
     def _take_answers(self) -> None:
-        """Take the answers to this SYNC. Raises SilenceError when no frame comes."""
+        """Take the devices' answers to the SYNC just sent, until all are in, END comes, or the patience is over.
+
+        Raises SilenceError when answers are expected and no frame comes.
+        """
         count = missing = len(self._answers)
         came = self._bus.receive_some(self._patience_s, count) if count and not self._ahead else []
         if len(came) == count and {frame.can_id for frame in came} == self._answers:
@@ -283,7 +289,10 @@ class LockstepBus(Bus):
                 self._offer(frame, self.sync_ns)
 
     def _take_marked(self, mark: Frame) -> None:
-        """Take frames by their release, from a mark up to END."""
+        """Queue the devices' frames up to the mark END, or silence, each from its release on.
+
+        A release is the time after SYNC that the last mark RELEASE gave. `mark`: the first one.
+        """
         offset_ns = 0
         frame: Frame | None = mark
         while frame is not None:
@@ -306,7 +315,10 @@ class LockstepBus(Bus):
         return self._bus.receive(self._patience_s if timeout_s is None else timeout_s)
 
     def _line_up(self, came: list[Frame]) -> None:
-        """Send answers without competing frames one after the other, by identifier."""
+        """Store answers as received one after the other, by identifier, from when the bus is free.
+
+        Call it only if no other frames compete.
+        """
         came.sort()
         through_ns = self._free_ns
         for can_id, data, _, is_error in came:
@@ -337,11 +349,14 @@ class LockstepBus(Bus):
         self._offered.append((frame.can_id, self._count, t_ns, frame.data))
 
     def _is_cyclic(self, t_ns: int) -> bool:
-        """Return whether the devices live by SYNC at a time."""
+        """Return whether the last SYNC is so recent at a time, two periods, that the devices live by SYNC."""
         return t_ns - self.sync_ns < _CYCLIC_PERIODS * self._period_ns
 
     def _let_pass(self, limit_ns: int) -> bool:
-        """Ask the devices to let time pass; return whether that may have brought a frame."""
+        """Ask the devices to let time pass up to `limit_ns`; return False if no frame can come before.
+
+        Devices without marks are waited for by the wall clock. Soon after a SYNC, return False at once.
+        """
         now_ns = self._clock.now_ns()
         if self._is_cyclic(now_ns):
             return False
@@ -362,7 +377,10 @@ class LockstepBus(Bus):
         self._ask(self._clock.now_ns())
 
     def _await_grant(self) -> bool:
-        """Take frames until the devices grant time; return whether a frame came."""
+        """Queue frames until the devices grant time, or the patience is over; return whether a frame came.
+
+        Store whether the devices send marks, and the granted time.
+        """
         came: list[Frame] = []
         while (frame := self._receive()) is not None:
             if frame.can_id != DEVICE_MARK:

@@ -105,7 +105,7 @@ class PythonCanBus(Bus):
             timeout_s = max(deadline_ns - self._waiting.now_ns(), 0) * 1e-9
 
     def recover(self) -> None:
-        """Empty the transmit buffer if the interface can, and open it again. Raises BusError."""
+        """Empty the transmit buffer if the interface can, and open it again. Raises BusError if it doesn't open."""
         # Few interfaces can empty a buffer, and a broken one fails: `_open` raises if the interface doesn't work.
         with contextlib.suppress(Exception):
             self._bus.flush_tx_buffer()

@@ -255,7 +255,7 @@ class SocketCanBus(Bus):
         self._open()
 
     def _carries_frames(self) -> bool:
-        """Return whether any frame is received within 0.25 s, including transmitted frames of other programs."""
+        """Return whether a frame passes within 0.25 s, from the bus or from another program of this machine."""
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as listener:
             listener.bind((self.channel,))
             return bool(select.select([listener], [], [], _LIVE_S)[0])
