@@ -5,7 +5,7 @@ from typing import Any
 
 
 def to_toml(settings: Any) -> str:
-    """Return settings as TOML that `parse` reads back to the same value."""
+    """Return settings as TOML that `parse` reads back to the same value; those that are None are left out."""
     lines: list[str] = []
     _write_section(settings, "", lines)
     return "\n".join(lines).strip() + "\n"
