@@ -79,9 +79,9 @@ _MODEL: Final = ("payload", "theta")
 
 
 def read_truth(path: Path) -> TruthTable:
-    """Read the emulator's log: the cycles of contacts and the one after each, payload and parameters.
+    """Return the truth in the emulator's log: the cycles of contacts and the one after each, payload and parameters.
 
-    Raises LogError.
+    Of a long contact some cycles are left out, see the module. Raises LogError for a file that is no log.
     """
     stream = LogStream(path, (TRUTH.name,))
     rows = _TruthRows()
@@ -231,7 +231,7 @@ def foreign_truth(log: Path, truth: Path) -> str:
 
 
 def config_digest(config: str) -> str:
-    """Return the digest by which a truth names its host's configuration. Raises ConfigError.
+    """Return the digest by which a truth names its host's configuration. Raises ConfigError for a text that is no TOML.
 
     The digest leaves out `realtime`, which a session sets to the host's abilities, and `safety.enable_timeout_s`, which
     it sets by the devices' profiles.
@@ -273,7 +273,8 @@ class HostCycles(NamedTuple):
 def placed_contacts(contacts: Sequence[TrueContact], host: HostCycles, settings: Settings) -> list[TrueContact]:
     """Return the contacts that begin within the host's cycles, with their times on the host's clock.
 
-    contacts: their cycles are counted by the host. host: has the cycles that each onset and each end lies between.
+    contacts: their cycles are counted by the host. host: its cycles before and after each onset and end, others may be
+    left out.
     """
     contacts = [contact for contact in contacts if len(host.cycle) and contact.onset <= host.cycle[-1]]
     if not contacts:
@@ -316,8 +317,8 @@ KnownContacts = tuple[tuple[TrueContact, ...], EmulatorSpan]
 def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownContacts | None:
     """Return the true contacts of a log's run from truth.mcap beside it, and the cycles of which they are known.
 
-    None without that file. The truth of another run is left out, and `progress` gets a line with the reason. Raises
-    LogError.
+    None without that file, for a truth of another run, of which `progress` gets a line, and if the emulator never
+    cycled. Raises LogError for a log that can't be read.
     """
     truth = path.with_name(TRUTH_NAME)
     if not truth.exists():
