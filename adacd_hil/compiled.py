@@ -271,7 +271,10 @@ class _SharedCache(FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the code compiled for these types; None: this process has to compile it, then save it."""
+        """Return the code compiled for these types; None: this process has to compile it, then save it.
+
+        Wait, 120 s at most, while another process compiles it.
+        """
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         if found is None and _claims.claim(self._claim(sig)):
             found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
@@ -354,7 +357,10 @@ class _Compilation(event.Listener):
 
     @contextmanager
     def of(self, functions: Sequence[Any], on_first: Callable[[], None]) -> Iterator[None]:
-        """Count these functions in the block, unless a block around it counts already."""
+        """Count these functions in the block, and call `on_first` as the first one compiles.
+
+        Do neither if a block around it counts already.
+        """
         if self._on_first is not None or self._count.is_expecting:
             yield
             return

@@ -253,7 +253,7 @@ def freeze_garbage() -> None:
 
 @contextmanager
 def frozen_garbage() -> Iterator[None]:
-    """Collect garbage once; the collection is disabled while the block lasts, and enabled after it."""
+    """Collect garbage once; disable the collection while the block lasts, and enable it afterwards in any case."""
     freeze_garbage()
     try:
         yield
