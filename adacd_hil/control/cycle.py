@@ -64,7 +64,11 @@ _ENABLING = POWERED | {SchemeState.ENABLE}
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a run ended. `fault`: NONE when it ended as asked. `data`: how much of the cyclic data came."""
+    """How an attempt ended. `fault`: NONE when it ended as asked. `data`: how much of the cyclic data came.
+
+    `cycles`: number of the last cycle + 1; `overruns`: skipped periods; both since the session's first cycle. `state`:
+    the last one.
+    """
 
     cycles: int
     overruns: int
@@ -75,7 +79,7 @@ class RunResult:
 
 
 class Cycle:
-    """Everything one cycle needs; `run` is the loop."""
+    """The loop of one attempt, with everything that a cycle needs: call `compile`, then `run`."""
 
     def __init__(
         self,
@@ -161,7 +165,8 @@ class Cycle:
     def run(self, recorder: Recorder) -> RunResult:
         """Run and log cycles until the run is finished, faulted or interrupted; disable the drives; return the result.
 
-        After a fault the cycles go on for FAULT_LINGER_S. Raises BusError, of it SilenceError in lockstep.
+        After a fault the cycles go on for FAULT_LINGER_S. Raises BusError, in lockstep its SilenceError if no device
+        answers; then the drives are not disabled here.
         """
         output = None
         self._pacer.resume()
@@ -203,11 +208,14 @@ class Cycle:
 
     @property
     def reached(self) -> tuple[int, SchemeState]:
-        """Return the number of cycles so far, and the present state."""
+        """Return the number of cycles so far, skipped ones included, and the present state."""
         return self._arm.cycle + 1, self._state
 
     def _look_after_devices(self, arm: ArmState, output: SchemeOutput) -> None:
-        """After a fault, stop drives that a command has not stopped; with power, read the devices' parameters again."""
+        """After a fault, stop drives by NMT that a command has not stopped; else, with power, step `ParameterWatch`.
+
+        Raises BusError.
+        """
         if self._faulted_cycle is not None:
             self._escalation.step(arm.cycle - self._faulted_cycle, arm.t_ns, output.fault)
         elif output.state in POWERED:
@@ -255,8 +263,9 @@ class Cycle:
     def _limit(self, arm: ArmState, output: SchemeOutput, now_ns: int) -> tuple[ArmCommand, GateFlag]:
         """Return the command of this cycle, with the desired torque limited, and the gate's changes to the torque.
 
-        now_ns: time at which the command leaves. The torque is zero if that is too long after SYNC, for example because
-        the process was stopped: then the torque is stale.
+        The torque is zero unless the state has power and both drives are enabled, and if the command leaves, at
+        now_ns, more than `bus.max_age_cycles` periods after SYNC. It is a quick stop in FAULT, and for a desired torque
+        that is not finite.
         """
         is_stale = now_ns - self._exchange.sync_ns > self._stale_ns
         is_open = output.state in POWERED and arm.is_enabled and not is_stale
@@ -302,7 +311,10 @@ class Cycle:
             self._narration.transition(t_ns, output, event.message)
 
     def _transition(self, output: SchemeOutput, arm: ArmState) -> Event:
-        """Return the event of a change of state, with the cause where the states' names don't show it."""
+        """Return the event of a change of state.
+
+        Its text has the causes of a fault, of a stop without a contact, and of a return to COMMISSION.
+        """
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is SchemeState.REACT and output.contact is None:
             late = f"{FaultReason.DEADLINE.name}; {self._watch.deadline.describe_misses()}"

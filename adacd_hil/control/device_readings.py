@@ -298,7 +298,10 @@ class DeviceReadings:
         return list(texts.values())
 
     def is_unlike_an_arm(self) -> bool:
-        """Return whether the configured devices give an inertia that no arm has, or the blocks are too few to know."""
+        """Return whether the configured devices give an inertia that no arm has.
+
+        True also with fewer than _SUSPECT_BLOCKS blocks, which are too few to know. Solves all readings anew.
+        """
         self._solve(())
         return 0 < self._blocks < _SUSPECT_BLOCKS or not is_positive_definite(self._solutions[0])
 

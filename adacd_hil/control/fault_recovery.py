@@ -59,9 +59,10 @@ class SelfChecks:
         self.line = ""
 
     def judge(self, arm: ArmState, state: SchemeState) -> Request:
-        """Check a cycle for changed parameters, wrong torque or motion; return the scheme's request to fault, or NONE.
+        """Return the request to fault for changed parameters, wrong torque, wrong configuration or lagging motion.
 
-        Store the first failure in `reason` and `line`. `state`: of the scheme after the previous cycle.
+        Else NONE, and while the drives are not enabled. Store the first failure in `reason` and `line`. `state`: of the
+        scheme after the previous cycle.
         """
         if not arm.is_enabled:
             return Request.NONE
@@ -95,7 +96,10 @@ class SelfChecks:
         return ""
 
     def _judge_motion(self, arm: ArmState) -> str:
-        """Return a line if the arm has been outside its following window for the timeout, else ""."""
+        """Return a line if the arm has been outside its following window for the timeout, else "".
+
+        The window, `controller.following_window_deg`, is around the desired position; one joint outside is enough.
+        """
         (q1, q2), (desired1, desired2), (window1, window2) = arm.q.tolist(), self._q_d.tolist(), self._window_rad
         errors = abs(q1 - desired1), abs(q2 - desired2)
         is_near = errors[0] <= window1 and errors[1] <= window2
@@ -284,7 +288,7 @@ class Recovery:
         self._is_interrupted = is_interrupted
 
     def empty(self) -> bool:
-        """Drop all queued frames of the bus; if that isn't possible yet, log the reason and return False."""
+        """Drop all queued frames of the bus and return True; if that isn't possible yet, log why and return False."""
         try:
             self._tap.recover()
         except BusError as error:

@@ -163,7 +163,7 @@ class FirstMotion(EventSource):
     def check_lengths(self, certificates: tuple[Certificate, ...]) -> None:
         """Compare the first certificate of the run, if any, with the configured lengths; add an event if they differ.
 
-        Another event tells that they can't be compared. Set `is_certified`, also without a certificate.
+        An info if torques can't check a length. Set `is_certified`, also without a certificate.
         """
         self.is_certified = True
         event = geometry_event(self._settings, certificates[0]) if certificates else None
@@ -193,7 +193,10 @@ class FirstMotion(EventSource):
         return f"perhaps {text.removeprefix('either ')}" if text else TOO_SHORT
 
     def _left(self) -> list[Reading]:
-        """Return the device readings that agree with the arm's equation and with the commanded torques."""
+        """Return the device readings that neither the arm's equation nor the commanded torques refute, best first.
+
+        [] as of `DeviceReadings.left`, and if they are no longer judged.
+        """
         return [] if self._readings is None else self._readings.left(self._ratios(), self._error)
 
     def _ratios(self) -> list[TorqueRatio | None]:
@@ -389,7 +392,7 @@ class _Blocks:
 def is_of_other(ratio: TorqueRatio) -> bool:
     """Return whether the sensor measures the other joint's torque instead of its own; False while a ratio is uncertain.
 
-    Uncertain: a standard deviation of 2 _SURE or more.
+    Instead: |own| < 0.4 and |other| > 0.6. Uncertain: a standard deviation of 2 _SURE or more.
     """
     is_known = max(ratio.own_std, ratio.other_std) < 2.0 * _SURE
     return is_known and abs(ratio.own) < 0.4 and abs(ratio.other) > 0.6

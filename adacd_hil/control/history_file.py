@@ -91,7 +91,10 @@ class CertificateRecord:
 
 @dataclass(frozen=True)
 class History:
-    """The certificates of one arm, the oldest first."""
+    """The certificates of one arm, the oldest first.
+
+    Raises ValueError when made without certificates, or with a wrong date or digest.
+    """
 
     format: int = setting(low=HISTORY_FORMAT, high=HISTORY_FORMAT, meaning="version of this file's layout")
     devices: tuple[DeviceRecord, ...] = setting(meaning="drives and sensors of the arm")

@@ -16,7 +16,10 @@ from adacd_hil.settings.configuration import Settings
 def corner_to_corner(
     elapsed_s: float, amplitude: Vector, half_period_s: Vector, q: Vector, dq: Vector, ddq: Vector
 ) -> None:
-    """Fill q, dq, ddq (2,) of the endless motion between -amplitude and +amplitude; each joint has a half period."""
+    """Fill q, dq, ddq (2,) of the endless motion between -amplitude and +amplitude, by quintics from rest to rest.
+
+    It begins at -amplitude. half_period_s (2,): of one way, by joint. amplitude (2,): rad.
+    """
     for i in range(JOINTS):
         index = np.floor(elapsed_s / half_period_s[i])
         direction = 1.0 if index % 2.0 == 0.0 else -1.0

@@ -109,7 +109,7 @@ class RunNarration:
         self._enabled_ns: int | None = None
 
     def event(self, t_ns: int, text: str) -> None:
-        """Print a text with the time since the drives were enabled. t_ns: of its cycle."""
+        """Print a text after the time since the drives were enabled, blank before. t_ns: of its cycle."""
         since = "" if self._enabled_ns is None else f"{(t_ns - self._enabled_ns) * 1e-9:.2f} s"
         self._progress(f"{since:>9}  {text}")
 

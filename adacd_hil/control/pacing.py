@@ -196,7 +196,10 @@ class FollowingPacer:
         self._periods_ns: list[float] = []
 
     def next(self) -> Tick:
-        """Wait for SYNC and return the cycle that it begins. Raises BusError if it is overdue or has a wrong period."""
+        """Wait for SYNC and return the cycle that it begins.
+
+        Raises BusError if it doesn't come within the timeout, or as `_judge`.
+        """
         frames, place = self._receive()
         sync = frames[place]
         periods = self._count(sync)
@@ -250,7 +253,7 @@ class FollowingPacer:
         return frame.can_id == self._sync_id and not frame.is_error
 
     def _count(self, sync: Frame) -> int:
-        """Return the periods since the SYNC before, at least 1; 0 for the first. Raises BusError for a wrong period."""
+        """Return the periods since the SYNC before, at least 1; 0 for the first. Raises BusError as `_judge`."""
         last = self._last
         if last is None:
             return 0
@@ -263,7 +266,10 @@ class FollowingPacer:
         return max(periods, 1)
 
     def _judge(self, period_ns: float) -> None:
-        """Compare the median period of the first SYNCs with the configured one, once. Raises BusError if it differs."""
+        """Add a period; raise BusError if the median of the first 101 is over 10 % away from the configured one.
+
+        Later periods are not judged.
+        """
         if len(self._periods_ns) == _JUDGED_SYNCS:
             return
         self._periods_ns.append(period_ns)

@@ -110,7 +110,7 @@ class Reference(EventSource):
 
     @property
     def is_floating(self) -> bool:
-        """Return whether the arm yields to a push, reaction FLOAT, without a desired motion."""
+        """Return whether the arm yields to a push, by FLOAT: its desired motion is then the measured position."""
         return self._state in REACTING and self._reaction is Reaction.FLOAT
 
     def park(self) -> None:
@@ -129,7 +129,10 @@ class Reference(EventSource):
         return self._arrival_cycle is not None and cycle >= self._arrival_cycle + settle_cycles
 
     def step(self, arm: ArmState, output: SchemeOutput) -> None:
-        """Fill `q_d`, `dq_d`, `ddq_d` for this cycle; leave them as they are while the feedback is old."""
+        """Fill `q_d`, `dq_d`, `ddq_d` for this cycle; leave them as they are while positions are older than OLD_CYCLES.
+
+        A new state or reaction begins its motion in any case.
+        """
         if output.state is not output.previous_state:
             self._enter(output, arm)
         elif self._waits(arm):

@@ -38,7 +38,7 @@ from adacd_hil.wire.codec import Codec
 
 @dataclass(frozen=True)
 class SessionSummary:
-    """Result of a session. `error`: empty, or the one line that ended the run early.
+    """Result of a session. `result`: of the last attempt, None if an error ended it; `error`: its line, or "".
 
     `has_started`: whether the devices were set to Operational, so that the arm may have moved. `reached`: cycles and
     state of the last attempt, however it ended. `recoveries`: number of acknowledged faults after which the run started
@@ -87,7 +87,7 @@ class Attempt(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """End of an attempt. `error`: empty, or the one line that ended it."""
+    """End of an attempt: by itself with a `result`, or by an `error`, in one line; is_bus_failed: by a BusError."""
 
     result: RunResult | None
     error: str
@@ -276,7 +276,10 @@ class Session:
         recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
-        """Create the log with its attachments and metadata, and the files beside it; return its recorder."""
+        """Create the log with its attachments and metadata, and the files beside it; return its recorder.
+
+        Raises as `run` for the log.
+        """
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
         attachments = device_attachments(self.devices)
@@ -303,7 +306,10 @@ class Session:
         return recorder
 
     def _write_beside(self, recorder: Recorder) -> None:
-        """Write the viewers' files and the contract beside the log; the log contains them, too."""
+        """Write the viewers' files and the contract beside the log, which contains them, too.
+
+        A file that can't be written is reported and left out.
+        """
         writes: list[Callable[[], object]] = [
             partial(write_new_file, self.out / name, content) for name, content in self.viewer_files.items()
         ]

@@ -117,7 +117,7 @@ def compose(settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
 def find_contract(name: str) -> Path:
     """Return the file of the DBC that a name (`arm`) or a path stands for; a path with a suffix need not exist.
 
-    Raises ConfigError, with the nearest name if there is one.
+    Raises ConfigError for any other text, with the nearest name if there is one.
     """
     folder = contract_folder()
     if (folder / f"{name}.dbc").is_file():

@@ -12,7 +12,7 @@ from adacd_hil.wire.codec import MessageCodec
 
 
 class ValueBound(NamedTuple):
-    """The bounds of one value: its places among a message's values, and `low` and `high` in `unit`."""
+    """The bounds of one value: its place among a message's values, `low` and `high` in `unit`, its name as text."""
 
     text: str
     unit: str
