@@ -221,7 +221,7 @@ class Budget:
 
     @property
     def feedback_ns(self) -> int:
-        """Time from SYNC to the end of the last feedback frame."""
+        """Duration of SYNC and all feedback frames, one after the other."""
         return self._sum_ns(Trigger.SYNC)
 
     @property
@@ -269,7 +269,7 @@ class Budget:
 
     @property
     def line(self) -> str:
-        """The verdict in one line."""
+        """The verdict in one line: the time left for the host, or a frame that misses its deadline and by how much."""
         where = f"{self.name} at {self.period_us} µs"
         if self.is_fit:
             left = f"{format_us(self.host_ns)} µs left for the host"
@@ -406,7 +406,7 @@ def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, d
 
 
 def _function(can_id: int, is_extended: bool) -> int:
-    """Return the function code of the predefined connection set; -1 for an extended frame."""
+    """Return an identifier without its node id, the function code of CiA 301; -1 for an extended frame."""
     return -1 if is_extended else can_id & ~NODE_MASK
 
 
@@ -444,7 +444,10 @@ def _is_sent(entry: FrameBudget, traffic: LoadCase) -> bool:
 def _respond(
     entries: list[FrameBudget], place: int, traffic: LoadCase, bit_ns: int, period_ns: int, hosts: int
 ) -> ResponseTime:
-    """Return the response time of the frame at `place` in arbitration order; each host sends one request a period."""
+    """Return the response time in a load case of the frame at index `place` of all, in arbitration order.
+
+    Each of `hosts` sends one request a period. A frame that the load case lacks is judged as a single one.
+    """
     entry = entries[place]
     above = [other for other in entries[:place] if _is_sent(other, traffic)]
     below = [other for other in entries[place + 1 :] if _is_sent(other, traffic)]

@@ -75,7 +75,7 @@ class Bus(Protocol):
         return 0
 
     def queue_bytes(self) -> QueueBytes:
-        """Read the fill of both queues; a system call if the kernel keeps them."""
+        """Return the fill of both queues, zeros if this end has none; a system call if the kernel keeps them."""
         return NOTHING_QUEUED
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -135,7 +135,7 @@ class Tap(Bus):
         return self._bus.frames_lost
 
     def queue_bytes(self) -> QueueBytes:
-        """Read the fill of the wrapped bus's queues."""
+        """Return the fill of the wrapped bus's queues."""
         return self._bus.queue_bytes()
 
     def send(self, can_id: int, data: bytes) -> None:

@@ -224,7 +224,10 @@ class InterfaceState:
 
 
 def read_link(name: str) -> InterfaceState | None:
-    """Return the state of a CAN interface; None if there is no such interface or it is not CAN."""
+    """Return the state of a CAN interface; None if there is no such interface or it is not CAN.
+
+    By `ip` of iproute2; if that is missing or fails, by sysfs, with fewer fields.
+    """
     ip = shutil.which("ip", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
     if ip is not None:
         with contextlib.suppress(OSError, subprocess.SubprocessError, ValueError, LookupError):
@@ -235,7 +238,10 @@ def read_link(name: str) -> InterfaceState | None:
 
 
 def parse_ip_link(link: dict[str, Any]) -> InterfaceState | None:
-    """Return the state in one entry of `ip -details -json link`; None if it is not CAN."""
+    """Return the state in one entry of `ip -details -json link`; None if it is not CAN.
+
+    Raises KeyError if name, flags or MTU are missing.
+    """
     if link.get("link_type") != "can":
         return None
     info = link.get("linkinfo", {})

@@ -73,7 +73,7 @@ class MessageCodec(MessageTable):
         raise CodecError(f"{self.name} has no signal {name}")
 
     def sender(self) -> E2eSender:
-        """Return a new end-to-end sender of this message; without protection it leaves frames unchanged."""
+        """Return a new end-to-end sender of this message, its counter at 0; without protection it changes no frame."""
         return E2eSender(self.profile, self.data_ids)
 
     def receiver(self) -> E2eReceiver:
@@ -172,7 +172,7 @@ class Codec:
 
 
 def _describe(messages: dict[str, MessageCodec]) -> str:
-    """Return the text whose CRC-32 is `Codec.layout_digest`: a line per message and per signal."""
+    """Return the text whose CRC-32 is `Codec.layout_digest`: a line per message and per signal, by identifier."""
     lines = []
     for message in sorted(messages.values(), key=lambda message: message.can_id):
         # A list of ids alone says Profile 2, as in a DBC.

@@ -75,7 +75,7 @@ def _protection(message: Message) -> tuple[Protection, bytes]:
 
 
 def _data_id_list(name: str, text: str, count: int) -> bytes:
-    """Return the data ids of a hexadecimal list. Raises CodecError unless they are `count` bytes."""
+    """Return the data ids of a hexadecimal list, a byte each. Raises CodecError for other text, or another count."""
     try:
         ids = bytes.fromhex(text)
     except ValueError:
@@ -145,7 +145,7 @@ def _lay_out(message: Message) -> tuple[SignalCodec, ...]:
 
 
 def _check_messages(database: Database) -> None:
-    """Raise CodecError for two messages of the same name or identifier, and for too many messages."""
+    """Raise CodecError for two messages of the same name or identifier, and for more than _MOST_MESSAGES."""
     by_name: dict[str, Message] = {}
     by_id: dict[tuple[int, bool], Message] = {}
     for message in database.messages:

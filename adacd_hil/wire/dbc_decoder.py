@@ -40,7 +40,8 @@ class MessageDecoder:
     def decode(self, data: bytes) -> dict[str, float]:
         """Return the values of the signals that a frame holds, by name; a short or multiplexed frame doesn't hold all.
 
-        If the DBC doesn't list the multiplexer's value, only the signals outside the multiplexer are decoded.
+        If the DBC doesn't list the multiplexer's value, only the signals outside the multiplexer are decoded, and the
+        frame is counted in `partly_decoded`.
         """
         try:
             values = self._message.decode_simple(data, decode_choices=False, allow_truncated=True)
@@ -50,7 +51,7 @@ class MessageDecoder:
         return {name: float(value) for name, value in values.items()}  # type: ignore[arg-type]
 
     def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
-        """Return (name, value, unit) of each signal that a frame holds."""
+        """Return (name, value, unit) of each signal that a frame holds, as `decode`."""
         return tuple((name, value, self.units[name]) for name, value in self.decode(data).items())
 
 

@@ -74,7 +74,7 @@ class E2eStatus(IntEnum):
 
     @property
     def is_valid(self) -> bool:
-        """Whether the frame's values may be used."""
+        """Whether the frame's values may be used: OK or OK_SOME_LOST."""
         return self <= _LAST_VALID
 
 
@@ -162,7 +162,10 @@ class E2eSender:
         self._counter = 0
 
     def protect(self, frame: bytearray) -> bytes:
-        """Return `frame` as bytes; with a profile, fill in its counter and CRC. The sender's status stays."""
+        """Return `frame` as bytes; with a profile, first write counter and CRC into it, and advance the counter.
+
+        The sender's status in the header stays.
+        """
         profile = self._profile
         if profile is not None:
             profile.sign(frame, self._counter, self._data_ids)
@@ -199,7 +202,7 @@ class E2eReceiver:
         return True
 
     def miss(self) -> E2eStatus:
-        """Count a cycle without a frame and return NO_NEW_DATA; the status of the last frame stays."""
+        """Count a cycle without a frame and return NO_NEW_DATA; `status`, that of the last frame, stays."""
         self._note_silence()
         self.counts[E2eStatus.NO_NEW_DATA] += 1
         return E2eStatus.NO_NEW_DATA
@@ -289,7 +292,7 @@ class ProtectedReceiver(E2eReceiver):
         return self._accept(delta) if is_in_sequence else self._lose_sequence()
 
     def _begin(self, counter: int) -> E2eStatus:
-        """Accept the first frame, the standard's INITIAL. Its values are used; silence before it is ignored."""
+        """Begin the sequence with the first frame, the standard's INITIAL, and return OK; ignore silence before it."""
         self._last, self._max_delta = counter, self._tolerance.max_delta
         self._missing = 0
         return E2eStatus.OK

@@ -250,7 +250,10 @@ class LockstepBus(Bus):
         return True
 
     def _forward(self, can_id: int, data: bytes) -> None:
-        """Give a frame that the host has transmitted to the devices; after SYNC take their answers."""
+        """Give a frame that the host has transmitted to the devices; after SYNC take their answers.
+
+        Raises SilenceError as `_take_answers`, and BusError.
+        """
         self._bus.send(can_id, data)
         if can_id == self._sync_id:
             self.sync_ns = self._free_ns
@@ -330,7 +333,7 @@ class LockstepBus(Bus):
         self._free_ns = through_ns
 
     def _withdraw(self, now_ns: int) -> None:
-        """Take back the answers that have not begun: the host sends a frame that may come first."""
+        """Queue received answers again whose transmission begins at `now_ns` or later, to compete with a new frame."""
         while self._received:
             last = self._received[-1]
             start_ns = last.t_ns - (0 if last.is_error else self._frame_time(last.can_id, last.data))
@@ -399,7 +402,10 @@ class LockstepBus(Bus):
         return bool(came)
 
     def _take_while(self, timeout_s: float) -> bool:
-        """Take frames of the bus behind, waiting `timeout_s` for the first; return whether one came."""
+        """Queue the frames of the bus behind, waiting `timeout_s` for the first; return whether one came.
+
+        Marks are not frames in this sense.
+        """
         has_come = False
         while (frame := self._receive(timeout_s)) is not None:
             timeout_s = 0.0
@@ -419,9 +425,9 @@ class LockstepBus(Bus):
 
 
 def make_lockstep_bus(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> LockstepBus:
-    """Return a modelled bus of a contract, as `settings.lockstep` says, at the rates of its DBC. Raises CodecError.
+    """Return a modelled bus of a contract, with the stuffing and queue of `settings.lockstep`, at the rates of its DBC.
 
-    A DBC without rates means 1 and 5 Mbit/s.
+    A DBC without rates means 1 and 5 Mbit/s. Raises CodecError for one without SYNC or a cyclic frame.
     """
     bitrate, data_bitrate = read_bitrates(codec)
     make = worst_time if settings.lockstep.stuffing == "worst" else exact_time

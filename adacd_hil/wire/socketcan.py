@@ -163,7 +163,10 @@ class SocketCanBus(Bus):
         )
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None after `timeout_s`. Raises BusOffError, InterfaceDownError, BusError."""
+        """Return the next frame, or None after `timeout_s`. Raises BusOffError, InterfaceDownError, BusError.
+
+        An error frame is returned like others, except for one of bus-off, which the BusOffError has.
+        """
         received = self._received
         if not received:
             if self._socket.fileno() < 0:
@@ -192,7 +195,7 @@ class SocketCanBus(Bus):
         return take_first(received, most)
 
     def _take(self, timeout_s: float) -> None:
-        """Fetch received frames; wait for the first up to `timeout_s`."""
+        """Fetch received frames into `_received`; wait for the first up to `timeout_s`. Raises as `_fail`."""
         try:
             if timeout_s <= 0.0 or self._receiver.wait(timeout_s):
                 self._received.extend(self._receiver.take_frames())
