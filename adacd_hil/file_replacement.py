@@ -73,7 +73,10 @@ def replace_file(path: Path, content: bytes | str) -> None:
 
 
 def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Path, ...]:
-    """Write whole files, by name, into a folder, which is made if missing; return their paths. Raises OSError."""
+    """Write whole files, by name, into a folder, which is made if missing; return their paths.
+
+    Each is replaced as by `replace_file`, one after the other. Raises OSError; files written before it stay.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
         replace_file(folder / name, content)
@@ -81,9 +84,9 @@ def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Pa
 
 
 def has_other_head(path: Path, head: bytes) -> bool:
-    """Return whether the file exists, isn't empty, and doesn't begin with `head`: then it may not be replaced.
+    """Return whether a file exists, isn't empty, and doesn't begin with `head`: then it may not be replaced.
 
-    Raises OSError.
+    False for a folder. Raises OSError if it can't be read.
     """
     if not path.is_file():
         return False

@@ -73,7 +73,8 @@ class RealtimeRequest:
 class RealtimeGrant:
     """The grant of the operating system.
 
-    `cpu`: the processor that the process stays on, None for any. `cpus`: processors that it was allowed before.
+    `scheduler`: its name, with the priority. `missing`: requests that were refused. `cpu`: the processor that the
+    process stays on, None for any. `cpus`: processors that it was allowed before.
     `is_awake`: idle states with a long wake-up are forbidden.
     """
 
@@ -183,7 +184,7 @@ def _schedule(libc: ctypes.CDLL, request: RealtimeRequest) -> tuple[str, list[Re
 
 
 def _request_deadline(libc: ctypes.CDLL, period_ns: int) -> int:
-    """Request SCHED_DEADLINE; return the error's number, 0 for none."""
+    """Request SCHED_DEADLINE with _DEADLINE_SHARE of each period; return the error's number, 0 if it is granted."""
     number = _SYS_SCHED_SETATTR.get(os.uname().machine)
     if number is None:
         return errno.ENOSYS

@@ -19,7 +19,7 @@ Values = NDArray[np.int64] | NDArray[np.float64]
 
 
 def percentiles(values: Values) -> dict[str, float]:
-    """Return p50, p99, p99.9 and max of values that occurred (no interpolation); empty without values."""
+    """Return p50, p99, p99.9 and max by these names, each a value that occurred (no interpolation); {} without any."""
     if values.size == 0:
         return {}
     found = np.percentile(values, PERCENTILES, method="higher")
@@ -27,7 +27,10 @@ def percentiles(values: Values) -> dict[str, float]:
 
 
 def low_percentiles(values: Values) -> dict[str, float]:
-    """Return p50, p1, p0.1 and min of values that occurred, for values that must not be small; empty without values."""
+    """Return p50, p1, p0.1 and min by these names, each a value that occurred; {} without any.
+
+    For values that must not be small.
+    """
     mirrored = percentiles(-values)
     return {name: -value for name, value in zip(LOW_PERCENTILE_NAMES, mirrored.values(), strict=False)}
 
@@ -116,7 +119,10 @@ class Distribution:
         return self._kept[0]
 
     def _at(self, rank: int) -> float:
-        """Return the value of a rank from 0: the end of its bin that is nearer to 0."""
+        """Return the value of a rank from 0 in ascending order: the end of its bin that is nearer to 0.
+
+        The first and the last are exact. Call it only if the values are in bins.
+        """
         if rank in (0, self.count - 1):
             return self._range[rank != 0]
         assert self._bins is not None

@@ -58,8 +58,8 @@ _HELD: Final = 30_000
 class TruthTable(NamedTuple):
     """The truth in an emulator's log: kept rows on the emulator's own cycles, and its metadata.
 
-    problem: missing parts; is_complete: it is whole and no record was dropped on the way to it. span: None if the
-    emulator never cycled.
+    problem: missing parts, or ""; is_complete: it is whole and no record was dropped on the way to it. span: attempt
+    and cycle of the first and of the last record; None if the emulator never cycled.
     """
 
     rows: Truth
@@ -180,7 +180,7 @@ class _TruthRows:
             self._keep(middle[extreme_rows(series, np.arange(0, len(middle), _BUCKET))])
 
     def table(self, stream: LogStream) -> TruthTable:
-        """Return the kept rows as a truth, at the end of the log."""
+        """Return the kept rows as a truth, with metadata and problem of `stream`; call it once, at the log's end."""
         self._thin()
         rows = np.concatenate([np.zeros(0, _ROW), *self._kept, self._waiting])
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, len(PARAMETER_NAMES)))
@@ -251,7 +251,7 @@ def _digest(config: bytes) -> str | None:
 
 
 def _played(truth: Path) -> dict[str, str]:
-    """Return scenario and seed of a truth by name; old ones have them in an attachment alone."""
+    """Return the metadata of a truth; of an old one, scenario and seed from its attached scenario, if it has that."""
     said = run_metadata(truth)
     try:
         table = parse_toml(attachment(truth, SCENARIO_NAME) or b"")

@@ -34,8 +34,8 @@ Times = NDArray[np.int64]
 class Detection:
     """An alarm of a scheme. is_armed: raised by armed detection, in MONITOR; is_known: the truth covers that time.
 
-    row: of the run's cycles. first, last: its report at the alarm, and the newest one of the same contact; None
-    without a report.
+    row: index in the run's cycles, -1: unknown. first, last: its report at the alarm, and the newest one of the same
+    contact; None without a report.
     """
 
     t_ns: int
@@ -123,7 +123,7 @@ class Score:
 
     @property
     def missed(self) -> int:
-        """Number of contacts that armed detection did not find."""
+        """Number of contacts that began while detection was armed and that no alarm found."""
         return sum(contact.is_missed for contact in self.contacts)
 
     @property
@@ -169,8 +169,8 @@ def contacts_of_alarms(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[An
 def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossings_ns: Sequence[int] = ()) -> Score:
     """Return which alarm found each true contact, and which alarms are false; contacts and alarms are in order.
 
-    crossings_ns: when some threshold is first exceeded, of a scheme replayed on a motion that is not its own: while it
-    still reacts, it can raise no alarm, and a crossing finds the contacts that begin meanwhile.
+    crossings_ns: times at which a scheme, replayed on another scheme's motion, first exceeds a threshold. While it
+    still reacts it can raise no alarm: then a crossing finds a contact that began meanwhile (`is_reacting`).
     """
     onsets, until = _bounds(contacts)
     about = contacts_of_alarms(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()
@@ -219,7 +219,7 @@ class StreamJudge:
             self._last_ns = int(false_ns[-1])
 
     def score(self, contacts: Sequence[TrueContact]) -> Score:
-        """Return the score of all samples so far; contacts: all true contacts."""
+        """Return the score of all samples so far; contacts: all true contacts, whose `detected_ns` is set anew."""
         judged = (replace(contact, detected_ns=self._found.get(contact.number)) for contact in contacts)
         return Score(tuple(judged), tuple(self._false))
 

@@ -40,7 +40,7 @@ def with_todays_keys(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Return two TOML tables merged, section by section; `over` wins."""
+    """Return two TOML tables merged, with tables within them, to any depth; `over` wins. Lists are replaced whole."""
     merged = dict(base)
     for key, value in over.items():
         if isinstance(value, dict) and isinstance(merged.get(key), dict):
@@ -106,7 +106,7 @@ def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
 
 
 def _find_beside(table: dict[str, Any], folder: Path) -> None:
-    """Put the configuration's folder before the paths of device and contract files that exist in it."""
+    """Change `table`: put `folder` before the names in `devices` of files, with a suffix, that exist in it."""
 
     def found(name: Any) -> Any:
         is_beside = isinstance(name, str) and Path(name).suffix and exists(folder / name)

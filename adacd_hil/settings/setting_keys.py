@@ -49,7 +49,7 @@ def sections() -> Iterator[tuple[str, type[Any], str]]:
 
 
 def keys_of(section: type[Any], prefix: str) -> Iterator[KnownKey]:
-    """Yield the settings of a table, rows of its lists included; tables within it are sections of their own."""
+    """Yield the settings of a table and of the rows of its lists, `prefix` before each key; no tables within it."""
     hints = typing.get_type_hints(section)
     for field in dataclasses.fields(section):
         kind = hints[field.name]
@@ -237,7 +237,7 @@ def split_list(text: str) -> list[str]:
 
 
 def changed_keys(before: Settings, after: Settings) -> dict[str, tuple[str, str]]:
-    """Return the settings that differ, by key: both values as Python writes them; `unset` for an absent one."""
+    """Return the settings that differ, by dotted key: (before, after) as Python writes them; `unset` for None."""
     tables = [_flat(tomllib.loads(to_toml(settings)), "") for settings in (before, after)]
     keys = [*tables[0], *(key for key in tables[1] if key not in tables[0])]
     words = {key: (tables[0].get(key, "unset"), tables[1].get(key, "unset")) for key in keys}
