@@ -283,7 +283,10 @@ class Cycle:
         command: ArmCommand,
         flags: GateFlag,
     ) -> None:
-        """Hand messages and events of the cycle to the recorder, print those for the user, and store a new state."""
+        """Hand messages, frames and events of the cycle to the recorder, print those for the user, store a new state.
+
+        The events of all sources are taken, so that each is logged once.
+        """
         t_ns = arm.t_ns
         if self._first_cycle < 0:
             self._first_cycle = arm.cycle

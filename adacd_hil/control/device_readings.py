@@ -229,7 +229,10 @@ def solve_readings(normals: Vector, count: int, blocks: int, shares: Vector, sol
 
 
 class DeviceReadings:
-    """Fits all readings to the blocks of a motion, and returns and names those that the motion doesn't refute."""
+    """Fits the arm's equation to a motion under each hypothesis (`Reading`); names those that it doesn't refute.
+
+    The motion comes as means over blocks.
+    """
 
     def __init__(self, settings: Settings) -> None:
         """Prepare the normal equations of all readings, without blocks."""

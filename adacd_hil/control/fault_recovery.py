@@ -45,7 +45,7 @@ class SelfChecks:
     def __init__(
         self, settings: Settings, arm: Arm, parameters: ParameterWatch, q_d: Vector, first_motion: FirstMotion
     ) -> None:
-        """`q_d` (2,): the desired position, rad, at the beginning of the present cycle."""
+        """`q_d` (2,): memory of the desired position, rad; `judge` reads in it that of the cycle before."""
         self._first_motion = first_motion
         period_s = settings.bus.period_s
         self._arm, self._parameters, self._q_d = arm, parameters, q_d

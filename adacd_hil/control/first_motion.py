@@ -81,7 +81,10 @@ def is_shown(event: Event) -> bool:
 
 
 class FirstMotion(EventSource):
-    """Judges the arm's first motion. `line`: the contradiction to the configuration, empty without one."""
+    """Compares the arm's first motion with the configured signs, order and scales of its devices.
+
+    `line`: the first contradiction, with its remedy; "" without one.
+    """
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         """Prepare to judge both joints; with `safety.first_motion_error` = 0, prepare to judge nothing."""
@@ -227,7 +230,10 @@ class FirstMotion(EventSource):
         )
 
     def _take_block(self, block: "_Block") -> None:
-        """Add a long block to the sums of positions, and of torques where a joint moves; judge each fifth block."""
+        """Add a long block to the sums by which positions are judged, and of a moving joint also torques.
+
+        Judge the joints at each fifth block.
+        """
         self._path += block.travel * block.way, block.way * block.way, block.travel * block.travel
         self._way_rad += np.abs(block.way)
         for joint in range(JOINTS):
@@ -243,7 +249,7 @@ class FirstMotion(EventSource):
             self._judge()
 
     def _give_up(self) -> None:
-        """Stop judging, and report the joints that are still unknown."""
+        """Stop judging joints and device readings; add a warning for each joint that is still unknown."""
         for joint in sorted(self._open):
             text = (
                 f"joint {joint + 1} is not known after {_LONGEST_S:g} s, since it moves too little, a drive is at a "
@@ -258,7 +264,10 @@ class FirstMotion(EventSource):
         self.line = self._judge_position() or self._judge_torque()
 
     def _judge_position(self) -> str:
-        """Return the contradiction of a joint's position to its velocity, a wrong scale or sign; "" without one."""
+        """Return the contradiction of a joint's position to its velocity, a wrong scale or sign; "" without one.
+
+        "" also for a way below _LEAST_WAY_RAD, and if no single scale explains the way.
+        """
         for joint in range(JOINTS):
             if self._way_rad[joint] < _LEAST_WAY_RAD:
                 continue
@@ -275,7 +284,11 @@ class FirstMotion(EventSource):
         return ""
 
     def _judge_torque(self) -> str:
-        """Return the contradiction of a torque sensor to the commands, "" without one; close joints that agree."""
+        """Return the contradiction of a torque sensor to the commands, "" without one; close joints that agree.
+
+        A contradiction: both sensors measure the other joint's torque, or a ratio is surely outside the tolerance of
+        `safety.first_motion_error`.
+        """
         found = self._ratios()
         first, second = found
         if first is not None and second is not None and is_of_other(first) and is_of_other(second):
@@ -356,7 +369,7 @@ class _Block(NamedTuple):
 
 
 class _Blocks:
-    """Collects consecutive cycles into blocks."""
+    """Forms the means over blocks of consecutive cycles, each `span_s` long."""
 
     def __init__(self, span_s: float, period_s: float) -> None:
         self._period_s = period_s

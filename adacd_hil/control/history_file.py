@@ -129,7 +129,7 @@ def _digest(text: str) -> str:
 
 
 def _difference(devices: Sequence[DeviceRecord], identities: Sequence[Identity], path: Path) -> str:
-    """Return the first found device that a history doesn't have, as text; "" if it has all.
+    """Return the first found device that a history doesn't have, or has as another one, as text; "" if none.
 
     devices: of the history in `path`. identities: of the devices found.
     """

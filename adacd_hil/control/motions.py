@@ -40,7 +40,10 @@ class QuinticMove:
     def __init__(
         self, start: Vector, end: Vector, speed_rad_s: Vector, acceleration_rad_s2: Vector, shortest_s: float
     ) -> None:
-        """Plan the move. start, end (2,): positions. speed, acceleration (2,): limits. shortest_s: least duration."""
+        """Plan the move; `duration_s` is the least that keeps all limits, and at least shortest_s.
+
+        start, end (2,): positions. speed, acceleration (2,): limits.
+        """
         self._start, self._end, self._travel = start.copy(), end.copy(), end - start
         distance = np.abs(self._travel)
         by_speed_s = QUINTIC_PEAK_SPEED * distance / speed_rad_s
@@ -174,7 +177,10 @@ class Admittance:
         self._bound = (settings.arm.position_limit_rad - np.radians(wish.position_margin_deg)).tolist()
 
     def step(self, tau_ext_hat: Vector, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
-        """Advance q_d, dq_d, ddq_d (2,) in place by one period under the external torque, Nm."""
+        """Advance q_d, dq_d, ddq_d (2,) in place by one period under the external torque (2,), Nm.
+
+        Torque within the dead band counts as 0. The limits of the settings hold for each joint.
+        """
         for i in range(JOINTS):
             speed, tau = float(dq_d[i]), float(tau_ext_hat[i])
             push = math.copysign(max(abs(tau) - self._deadband[i], 0.0), tau)

@@ -196,7 +196,10 @@ class Reference(EventSource):
         self._ddq_d[:] = 0.0
 
     def _advance(self, cycle: int) -> None:
-        """Fill the desired motion of the path, at the present pace."""
+        """Fill the desired motion of the path, at the present pace, after a change to the next path if one is due.
+
+        Advance the pace by a period.
+        """
         self._follow_on(cycle)
         path, pace, motion = self._path, self._pace, (self._q_d, self._dq_d, self._ddq_d)
         assert path is not None
@@ -227,7 +230,12 @@ class Reference(EventSource):
         self._start_cycle, self._arrival_cycle = self._arrival_cycle, None
 
     def _enter(self, output: SchemeOutput, arm: ArmState) -> None:
-        """Begin the motion of a new state: the reaction, braking, the way to the corner, or none; else go on."""
+        """Begin the motion of a new state.
+
+        REACT: the reaction. STOPPED: brake, if the reaction kept the path. ADAPT, CERTIFY, MONITOR: go on with the
+        path, or go to the corner if the arm was on none or changes from excitation to trajectory. PAYLOAD: go to the
+        corner. Other states: no path. While parking, go on in all states with power.
+        """
         state, previous = output.state, self._state
         self._state = state
         self._beyond.clear()
@@ -253,7 +261,10 @@ class Reference(EventSource):
             self._path, self._arrival_cycle, self._is_stopping = None, None, False
 
     def _react(self, output: SchemeOutput, arm: ArmState) -> None:
-        """Begin the reaction to a contact: brake, withdraw, or yield; NONE and SLOW_DOWN keep the path."""
+        """Begin the reaction to a contact: STOP brakes, WITHDRAW takes a new path, FLOAT and ADMITTANCE have none.
+
+        NONE and SLOW_DOWN keep the path. Store contact and external torque, by which `_is_thrown` judges.
+        """
         self._reaction = output.reaction
         self._contact_cycle = arm.cycle
         if self._reaction in _ON_PATH:
@@ -331,7 +342,10 @@ class Reference(EventSource):
             self._is_stopping = True
 
     def _go(self, cycle: int) -> None:
-        """Start the way from rest to the corner."""
+        """Start the way from rest at the desired position to the corner; store the cycle of arrival.
+
+        It takes SHORTEST_APPROACH_S or longer; a period or longer if the arm is in the corner already.
+        """
         shortest_s = SHORTEST_APPROACH_S
         if float(np.max(np.abs(self._corner - self._q_d))) < AT_CORNER_RAD:
             shortest_s = self._period_s

@@ -362,7 +362,7 @@ def write_contract(codec: Codec, folder: Path) -> Path:
 
 
 def git_commit() -> str:
-    """Return the commit of the source tree, empty if installed without one."""
+    """Return the commit of the source tree as `git describe` names it, `-dirty` for changed files; "" without one."""
     try:
         done = subprocess.run(
             ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],

@@ -111,7 +111,7 @@ class Tare:
 
 
 def read_tare(path: Path) -> Tare:
-    """Return the tare of a file. Raises ConfigError if it is missing or invalid."""
+    """Return the tare of a file. Raises ConfigError if it is missing, no TOML, or has an invalid key or value."""
     if not path.exists():
         raise ConfigError(f"tare {path} does not exist; `adacd-hil tare` makes one")
     table = read_toml(path, "tare")

@@ -156,7 +156,7 @@ class HeartbeatWatch:
         self._is_watching = False
 
     def accept(self, frame: Frame) -> None:
-        """Take a heartbeat; ignore other frames."""
+        """Store the state and time of a watched node's heartbeat; ignore other frames."""
         node = self._nodes.get(frame.can_id)
         if node is None or frame.is_error or len(frame.data) != 1:
             return

@@ -122,7 +122,7 @@ class CyclicDevice(ABC):
         return bool(self._status_bounds) and cycle - self._status_came > self.status_age_limit
 
     def _excesses(self) -> Iterator[tuple[ValueBound, Sequence[float]]]:
-        """Yield the bounds that the newest values exceed, with these values."""
+        """Yield (bound, values of its frame) for each bound that the newest values exceed, if any came."""
         for bounds, values in (
             (self._cyclic_bounds, self._cyclic_values),
             (self._status_bounds, self._status_values),

@@ -34,7 +34,7 @@ class Slave:
     """A device of the arm on the bus, as its master sees it."""
 
     def __init__(self, device: PlacedDevice, node: Any, wait: Callable[[float], object] = lambda _: None) -> None:
-        """`wait`: lets so many seconds pass on the bus."""
+        """`node`: canopen's object of it. `wait`: lets so many seconds pass on the bus."""
         self.wait = wait
         self.device = device
         self.name = device.name
@@ -460,7 +460,8 @@ def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
     """Write the PDOs of a device that differ from its profile, or all if the profile's `mapping` is `rewritten`.
 
     PDOs that the profile doesn't name are switched off. `command_deadline_ms`: event timer of the command PDO if the
-    profile's `command_watchdog` is there. Raises DeviceError if a PDO still differs, or as `Slave.read`; and BusError.
+    profile's `command_watchdog` is `0x1400:5`. Raises DeviceError if a PDO still differs, or as `Slave.read`; and
+    BusError.
     """
     profile = slave.device.settings
     timers = {pdo.message: _event_timer(slave, pdo, command_deadline_ms) for pdo in profile.pdo}
@@ -481,13 +482,16 @@ def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
 
 
 def _event_timer(slave: Slave, pdo: PdoSettings, command_deadline_ms: int) -> int:
-    """Return the event timer that a PDO shall have, ms: the command deadline if `command_watchdog` is there."""
+    """Return the event timer that a PDO shall have, ms: by its profile, or the command deadline.
+
+    The latter for the command PDO if `command_watchdog` is `0x1400:5`.
+    """
     has_deadline = pdo.is_received and slave.device.settings.command_watchdog == "0x1400:5"
     return command_deadline_ms if has_deadline else pdo.event_timer_ms
 
 
 def _switch_off_others(slave: Slave) -> None:
-    """Make the PDOs of a device invalid that its profile doesn't name."""
+    """Make the PDOs of a device invalid that its profile doesn't name, if their identifier can be written."""
     used = {pdo.communication_index for pdo in slave.device.settings.pdo}
     for index in _RECORDS:
         if index in used or not slave.can_write(index, _COB_ID):

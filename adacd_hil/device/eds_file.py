@@ -46,8 +46,8 @@ def eds_bytes(path: Path) -> bytes:
 def parse_eds(data: bytes, path: Path, node_id: int | None) -> Any:
     """Return canopen's object dictionary of an EDS; `$NODEID` in it becomes `node_id`; None: the node id of a DCF.
 
-    Defaults of manufacturer objects that are no numbers are dropped. The same data give the same object: don't change
-    it. `path`: names the EDS in errors. Raises ConfigError for an EDS that can't be parsed, or as `_check_eds`.
+    Values that canopen can't read as a number are dropped. The same data give the same object: don't change it. `path`:
+    names the EDS in errors. Raises ConfigError for an EDS that can't be parsed, or as `_check_eds`.
     """
     try:
         return _parse(data, node_id)

@@ -137,7 +137,11 @@ class Master(EventSource):
         return [self._identify(slave) for slave in self.slaves]
 
     def _identify(self, slave: Slave) -> Identity:
-        """Return a device's identity. Raises DeviceError if it differs from DBC, EDS or profile, and BusError."""
+        """Return a device's identity, 0 for entries that the EDS lacks.
+
+        Raises DeviceError for another node id than the DBC's, another device than the EDS's, another serial number than
+        the profile's, and another contract in 0x2000, as far as the profile has these; and BusError.
+        """
         profile = slave.device.settings
         by_contract = self._codec.node_id(f"{slave.name}Heartbeat")
         if slave.node_id != by_contract:

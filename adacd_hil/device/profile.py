@@ -277,7 +277,10 @@ class ProfileSettings:
         self._check_assumed()
 
     def _check_frames(self) -> None:
-        """Raise ValueError for missing, doubled or misplaced frames or signals, and for feedback apart from SYNC."""
+        """Raise ValueError unless all needed frames and signals are there once, in the right frame.
+
+        Each PDO has its own number. Signals of one sample or command share a frame, and feedback comes on every SYNC.
+        """
         wanted = {"drive": ("Feedback", "Command"), "sensor": ("Torque",)}[self.kind]
         found = [pdo.message for pdo in self.pdo]
         if missing := [name for name in wanted if name not in found]:
@@ -329,7 +332,10 @@ class ProfileSettings:
                 raise ValueError(f"{place}: unit = {unit!r} must be that of {signal.of!r}, {other!r}")
 
     def _check_protection(self) -> None:
-        """Raise ValueError for a header or data ids that `protection` doesn't have."""
+        """Raise ValueError if the number of header objects or the data ids don't fit `protection`.
+
+        Also for a signal that has the name of a part of the header.
+        """
         profile = PROFILES_BY_CODE.get(self.protection)
         objects = 0 if profile is None else profile.objects
         if len(self.header) != objects:
@@ -347,7 +353,7 @@ class ProfileSettings:
                 raise ValueError(f"pdo {pdo.message}: signal {taken[0]!r} has the name of a part of the header")
 
     def _check_scale(self) -> None:
-        """Raise ValueError for a missing or impossible scale, and for serial numbers that are not two."""
+        """Raise ValueError for a missing scale, too few increments, and unless there are 0 or 2 serial numbers."""
         if self.kind == "drive" and not (self.scale.increments_per_joint_rev and self.scale.velocity_rad_s):
             raise ValueError("scale: a drive needs increments_per_joint_rev and velocity_rad_s")
         if self.kind == "drive" and self.scale.increments_per_joint_rev < LEAST_INCREMENTS:
@@ -439,7 +445,7 @@ class PlacedDevice:
     def variable(self, name: ObjectName) -> EdsVariable:
         """Return an object of the EDS.
 
-        Raises ConfigError when it isn't listed, is a float, has no fixed size, or not the type of STANDARD_TYPES.
+        Raises ConfigError when it isn't listed, is a float or no number, or hasn't the type of STANDARD_TYPES.
         """
         found = find_variable(self.objects, name.index, name.sub)
         if found is None:

@@ -160,7 +160,7 @@ _PAIRS = ("q", "dq", "tau_J", "age_q", "age_tau_J")
 
 
 def _batch_of(states: list[ArmState]) -> ArmBatch:
-    """Return the states of n cycles as columns."""
+    """Return the states of n cycles as columns, with the shapes and types of ArmBatch; n may be 0."""
     columns = list(zip(*states, strict=True)) if states else [()] * len(ArmBatch._fields)
     return ArmBatch(
         *(
