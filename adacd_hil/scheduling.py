@@ -146,7 +146,10 @@ def request_realtime(request: RealtimeRequest | None = None) -> RealtimeGrant:
 
 
 def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
-    """Pin the process to one processor; return it (None: any) and the refusals."""
+    """Pin the process to the processor of `wish`; return it and the refusals.
+
+    None if any is wished, or the pinning is refused. cpus: processors that the process may use, for the remedy.
+    """
     if wish == ANY_CPU:
         return None, []
     isolated = isolated_cpus()
@@ -164,7 +167,10 @@ def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
 
 
 def _schedule(libc: ctypes.CDLL, request: RealtimeRequest) -> tuple[str, list[Refusal]]:
-    """Set the requested scheduler, or the best below it; return its name and the refusals."""
+    """Set the requested scheduler; return the name of the one in force and the refusals.
+
+    Without SCHED_DEADLINE, SCHED_FIFO is requested; without that, the present one stays.
+    """
     missing = []
     if request.scheduler == "other":
         return scheduler_name(), []
@@ -264,7 +270,7 @@ def frozen_garbage() -> Iterator[None]:
 
 
 def scheduler_name() -> str:
-    """Return the name of the scheduler that this process runs under."""
+    """Return the name of the scheduler that this process runs under, such as SCHED_OTHER; `policy N` if unknown."""
     names = {
         os.SCHED_OTHER: "SCHED_OTHER",
         os.SCHED_FIFO: "SCHED_FIFO",

@@ -73,7 +73,7 @@ def fold(text: str, width: int | None) -> str:
 
 
 def _parts(line: str, width: int) -> list[str]:
-    """Return a line folded as `fold` does, as its parts."""
+    """Return the lines into which `fold` folds a line; a space at its end, as of a prompt, stays."""
     if len(line.expandtabs()) <= width:
         return [line]
     field = _FIRST_FIELD.match(line, 0, width // 3)

@@ -64,7 +64,10 @@ class Distribution:
         self._range = (np.inf, -np.inf)
 
     def add_values(self, values: Values) -> None:
-        """Add values (k,) to the distribution; nan is left out."""
+        """Add values (k,) to the distribution; nan is left out.
+
+        Beyond the limit of exact values, all are counted in bins from now on.
+        """
         new = np.asarray(values, dtype=np.float64)
         new = new[~np.isnan(new)]
         if new.size == 0:
@@ -81,7 +84,7 @@ class Distribution:
                 self._sort_in(part)
 
     def _sort_in(self, values: NDArray[np.float64]) -> None:
-        """Count values (k,), without NaN, in their bins."""
+        """Count values (k,), without NaN, in their bins; make the bins at the first call."""
         size = np.minimum(np.abs(values), _HIGH)
         place = np.maximum(_code(size) - _FIRST + 1, 0)
         place = np.where(values < 0.0, -place, place)

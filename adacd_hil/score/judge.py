@@ -148,7 +148,8 @@ class Score:
 def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
     """Return for each contact (k,) the last instant at which it explains an alarm.
 
-    onsets, forgotten (k,): when each begins and is forgotten, in order; integers in any one unit.
+    It is just before the next one begins, or when all contacts so far are forgotten, if that is earlier. onsets,
+    forgotten (k,): when each begins and is forgotten, in order; integers in any one unit.
     """
     until: Times = np.maximum.accumulate(np.asarray(forgotten, np.int64))
     until[:-1] = np.minimum(until[:-1], np.asarray(onsets, np.int64)[1:] - 1)
@@ -243,7 +244,7 @@ def _judged(contacts: Sequence[TrueContact], found: dict[int, int]) -> tuple[Tru
 
 
 def contact_bounds(index: NDArray[Any], attempt: Times | None) -> list[tuple[int, int]]:
-    """Return the first row of each contact of a truth, and the row after its last; index, attempt (m,): of the rows.
+    """Return (first row, row after the last) of each contact of a truth; index, attempt (m,): of the truth's rows.
 
     A negative index is no contact. Another index is another contact, though the touch goes on. A contact that goes on
     as an attempt begins is another one, too: the scheme begins anew.
@@ -281,7 +282,10 @@ def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: f
 
 
 def true_contacts(truth: Truth | None, first_number: int = 1) -> tuple[TrueContact, ...]:
-    """Return the true contacts in a truth, numbered from `first_number`; () without a truth."""
+    """Return the true contacts in a truth, numbered from `first_number`; () without a truth.
+
+    Their cycles are the emulator's; their times on a run's clock are still 0.
+    """
     if truth is None:
         return ()
     found = []

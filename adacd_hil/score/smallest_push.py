@@ -53,7 +53,7 @@ class PushGatherer:
             self._threshold[joint].add_values(in_force[:, joint])
 
     def smallest_push(self) -> SmallestPush | None:
-        """Return the percentiles over all cycles gathered so far; None before the first."""
+        """Return the percentiles over all cycles gathered so far, by joint; None before the first."""
         if not self._push[0].count:
             return None
         seen_s = self._push[0].count * self._period_s

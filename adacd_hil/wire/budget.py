@@ -374,7 +374,10 @@ def _given(codec: Codec, attribute: str, chosen: int | None) -> int:
 
 
 def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, data_bitrate: int) -> FrameBudget:
-    """Return the budget of a message, still without response times. Raises CodecError for an unknown Trigger."""
+    """Return the budget of a message, still without response times. Raises CodecError for an unknown Trigger.
+
+    Deadline: the period for cyclic frames, the cycle time, if any, for event frames, none for requests.
+    """
     choices = list(message.dbc.attribute_definitions["Trigger"].choices or ()) if message.dbc else []
     value = read_attribute(message, "Trigger")
     chosen = choices[value] if isinstance(value, int) and 0 <= value < len(choices) else value

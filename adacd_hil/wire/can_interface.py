@@ -67,7 +67,10 @@ class CanInterface:
             return 0
 
     def problem(self, is_fd: bool) -> str:
-        """Return the reason why the interface can't be used, with the remedy, in one line; "" if it can be used."""
+        """Return the reason why the interface can't be used, with the remedy, in one line; "" if it can be used.
+
+        It is absent or down, or carries classic frames only although `is_fd`.
+        """
         present = can_interfaces()
         if self.name not in present:
             known = f"present: {', '.join(present)}" if present else "no CAN interface is present"
@@ -129,7 +132,10 @@ class CanInterface:
 
 
 def _queues() -> Iterator[tuple[int, int, int]]:
-    """Yield (interface, parent, frames waiting) of all queueing disciplines; a root's count includes the others'."""
+    """Yield (interface, parent, frames waiting) of all queueing disciplines; a root's count includes the others'.
+
+    interface: its index; parent: handle, _TC_H_ROOT for a root. Raises BusError if the kernel refuses.
+    """
     size = _NETLINK_HEAD.size + _TRAFFIC_HEAD.size
     request = _NETLINK_HEAD.pack(size, _RTM_GETQDISC, _NLM_F_REQUEST_DUMP, 1, 0) + _TRAFFIC_HEAD.pack(0, 0, 0, 0, 0)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as netlink:
@@ -158,7 +164,7 @@ def _netlink_messages(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _attributes(data: bytes) -> dict[int, bytes]:
-    """Return the contents of netlink attributes, by their type."""
+    """Return the contents of the netlink attributes in `data`, by their type; of one type the last counts."""
     found = {}
     position = 0
     while position < len(data):

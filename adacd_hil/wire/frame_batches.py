@@ -91,7 +91,10 @@ class FrameReceiver:
     """
 
     def __init__(self, opened: socket.socket, clock: Clock) -> None:
-        """Enable stamps and drop counts of the socket. Unless the clock is monotonic, frames carry the clock's time."""
+        """Enable stamps and drop counts of the socket.
+
+        With a clock other than MonotonicClock, frames carry that clock's time at `take_frames`. Raises OSError.
+        """
         opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         opened.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         self.frames_lost = 0

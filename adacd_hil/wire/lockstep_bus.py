@@ -125,7 +125,7 @@ class LockstepBus(Bus):
         self._queue.append((can_id, self._count, now_ns, data))
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Queue some frames at the clock's present time. Raises as `send`."""
+        """Queue some frames at the clock's present time, one by one if not all fit into the queue. Raises as `send`."""
         if not self._is_attached or len(self._queue) + len(frames) > self._queue_length:
             super().send_all(frames)
             return

@@ -90,7 +90,10 @@ class SocketCanBus(Bus):
         self._open()
 
     def _open(self) -> None:
-        """Open and bind a socket, and make its receiver and sender. Raises BusMissingError."""
+        """Open and bind a socket, and make its receiver and sender; drop received frames of an earlier one.
+
+        Raises BusMissingError if the interface can't be bound.
+        """
         opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         try:
             opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, self._filters)
@@ -145,7 +148,10 @@ class SocketCanBus(Bus):
         return _FD_FRAME.pack(can_id, len(data), CANFD_BRS, data)
 
     def _send_patiently(self, packed: bytes) -> None:
-        """Send a frame as soon as there is room for it. Raises TransmitQueueError after _SEND_PATIENCE_S."""
+        """Send a frame as soon as there is room for it, trying every 0.1 ms.
+
+        Raises TransmitQueueError after _SEND_PATIENCE_S, and as `_fail` for another error.
+        """
         patience = self._patience
         deadline_ns = patience.now_ns() + int(_SEND_PATIENCE_S * 1e9)
         while patience.now_ns() < deadline_ns:
@@ -185,7 +191,10 @@ class SocketCanBus(Bus):
         return frame
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return frames that are received together, up to `most`; [] after `timeout_s`. Raises as `receive`."""
+        """Return the frames of one batch, up to `most`; [] after `timeout_s`. An error frame is returned alone.
+
+        Raises as `receive`.
+        """
         received = self._received
         if not received or received[0].is_error:
             frame = self.receive(timeout_s)
@@ -303,7 +312,7 @@ def _pack_filters(can_ids: Iterable[int] | None) -> bytes:
 
 
 def _require_socketcan(channel: str) -> None:
-    """Raise BusMissingError unless the kernel has SocketCAN."""
+    """Raise BusMissingError, for `channel`, unless a raw socket of SocketCAN can be opened."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:
