@@ -37,7 +37,7 @@ class ConfigurationFindings(NamedTuple):
 
 
 def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
-    """Return errors and likely mistakes of a configuration, by its name or file; a configuration error raises nothing.
+    """Return errors and likely mistakes of a configuration, by its name or file, instead of raising ConfigError.
 
     profile: name of one of its `[profiles]` to apply. Checked in turn are the keys, the motion's limits, the device
     profiles, the contract; if one of these has errors, the later ones and the warnings are left out.

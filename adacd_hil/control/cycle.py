@@ -345,7 +345,7 @@ class Cycle:
         self._kept.serve((state,))
 
     def _is_over(self, output: SchemeOutput | None) -> bool:
-        """Return whether the loop ends: FAULT_LINGER_S after a fault, at a second interrupt, or when FINISH is done.
+        """Return whether the loop ends: FAULT_LINGER_S after a fault, else at a second interrupt or if FINISH is done.
 
         FINISH is done once the arm is parked, has no power, or hasn't parked within FINISH_S.
         """

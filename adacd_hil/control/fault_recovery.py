@@ -248,7 +248,10 @@ class CommissionReport(EventSource):
                     self._worst[joint, place] = max(self._worst.get((joint, place), 0.0), abs(value))
 
     def list_unrest(self) -> list[str]:
-        """Return a line for each counted reason, the most frequent first; empty if no cycle had one."""
+        """Return a line for each counted reason, the most frequent first; empty if no cycle had one.
+
+        After a reason of torque, a last line has the remedy if it is the arm's own weight.
+        """
         lines = [
             f"{self._text(cause)} in {count} of {self._cycles} cycles" for cause, count in self._causes.most_common()
         ]

@@ -144,7 +144,10 @@ def _difference(devices: Sequence[DeviceRecord], identities: Sequence[Identity],
 
 
 def read_history(path: Path) -> History:
-    """Return the history of a file. Raises ConfigError if it is missing, invalid, or its digests are wrong."""
+    """Return the history of a file.
+
+    Raises ConfigError if it is missing, invalid, or its digests are wrong; OSError if it can't be read.
+    """
     if not path.exists():
         raise ConfigError(f"history {path} does not exist; `adacd-hil run --history` makes one")
     return _parse(path, read_input(path))
@@ -218,8 +221,8 @@ class UsedHistory:
         """Append certificates of a run to the history file, in one step; return a summary.
 
         Read the file again first, so that certificates of another run are kept; make one if there is none. identities:
-        of the devices found. Raises ConfigError for an invalid file or one of another arm, OSError if it can't be
-        written.
+        of the devices found. Raises ConfigError for an invalid file or one of another arm, OSError if it can't be read
+        or written.
         """
         devices, records = tuple(DeviceRecord(*identity) for identity in identities), []
         if self.path.exists():
@@ -250,7 +253,8 @@ class Origin(NamedTuple):
 def use_history(path: Path, now_ns: int) -> UsedHistory:
     """Read the arm's history for a run; a missing file is a first run. now_ns: wall clock.
 
-    Raises ConfigError for an invalid file, a link to a missing one, and a certificate over 6 minutes in the future.
+    Raises ConfigError for an invalid file, a link to a missing one, and a certificate over 6 minutes in the future;
+    OSError if the file can't be read.
     """
     if (link := dangling_link(path)) is not None:  # the history was moved: the arm is known, not on its first run
         raise ConfigError(f"history {path}: link {link} leads to {link.readlink()}, which is not there")

@@ -234,7 +234,7 @@ class Reference(EventSource):
 
         REACT: the reaction. STOPPED: brake, if the reaction kept the path. ADAPT, CERTIFY, MONITOR: go on with the
         path, or go to the corner if the arm was on none or changes from excitation to trajectory. PAYLOAD: go to the
-        corner. Other states: no path. While parking, go on in all states with power.
+        corner. Other states: no path. While parking, go on in all states with power, unless from a reaction.
         """
         state, previous = output.state, self._state
         self._state = state

@@ -271,9 +271,10 @@ _MODE_POLL_S = 0.02
 
 
 def _enter_mode(slave: Slave, codec: Codec) -> None:
-    """Request cyclic synchronous torque. 0x6061 may show it later, once the drive is enabled: the cycle compares it.
+    """Request cyclic synchronous torque, if 0x6060 can be written; end a halt under which the drive refuses it.
 
-    If no frame shows the mode, 0x6061 must show it within `patience.mode_s`. Raises DeviceError.
+    0x6061 may show the mode later, once the drive is enabled: the cycle compares it. But if no frame carries it, 0x6061
+    must show it within `patience.mode_s`. Raises DeviceError if it doesn't, or as `Slave.read`; and BusError.
     """
     if not slave.can_write(0x6060):
         return

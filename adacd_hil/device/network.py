@@ -226,7 +226,7 @@ class Master(EventSource):
     def _set_up_sync(self, slave: Slave) -> None:
         """Write SYNC's period, and the overflow of its counter if the device counts.
 
-        Raise DeviceError if the device has another identifier of SYNC or doesn't take the values.
+        Raises DeviceError if the device has another identifier of SYNC or doesn't take the values; and BusError.
         """
         if slave.has(0x1005):
             identifier = slave.read(0x1005) & MAX_STANDARD_ID
@@ -259,9 +259,9 @@ class Master(EventSource):
             slave.write_checked(0x1015, 0, EMCY_INHIBIT_100US, "x 100 µs")
 
     def _set_up_heartbeats(self, slave: Slave) -> None:
-        """Write the period of the device's heartbeat, and its patience with the host's; warn if it can't be written.
+        """Write the period of the device's heartbeat; if the EDS doesn't allow that, warn that it isn't watched.
 
-        With `watch_host` False the device doesn't watch the host.
+        Write the device's patience with the host's heartbeat, if it has one; 0, never, if `watch_host` is False.
         """
         period_ms = self._settings.bus.heartbeat_ms
         if slave.device.is_heartbeat_known:
