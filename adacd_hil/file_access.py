@@ -95,7 +95,10 @@ def check_unused(path: Path) -> None:
 
 
 def _owner(descriptor: int) -> str:
-    """Return words for the process that holds the lock of a file; proc(5), /proc/locks."""
+    """Return words for the process that holds the lock of a file: `process` and its id, or `another process`.
+
+    Source: proc(5), /proc/locks.
+    """
     status = os.fstat(descriptor)
     place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
     with contextlib.suppress(OSError):
@@ -109,8 +112,7 @@ def _owner(descriptor: int) -> str:
 def write_new_file(path: Path, content: bytes) -> None:
     """Write a new file; do nothing if it exists with the same content.
 
-    Raises FileExistsError if it exists with other content or as a link or folder, and OSError; a file that can't be
-    written whole is removed.
+    Raises FileExistsError for anything else of that name, and OSError; a file that can't be written whole is removed.
     """
     try:
         descriptor = os.open(path, NEW, 0o666)

@@ -115,7 +115,8 @@ class SocketCanBus(Bus):
     def send(self, can_id: int, data: bytes) -> None:
         """Queue a frame for transmission; identifiers beyond 0x7FF are 29-bit ones.
 
-        Raises TransmitQueueError, InterfaceDownError, and BusError for data that the bus can't carry.
+        If the queue is full, wait for room, up to _SEND_PATIENCE_S. Raises TransmitQueueError then, InterfaceDownError,
+        and BusError, also for data that the bus can't carry.
         """
         packed = self._pack(can_id, data)
         try:
