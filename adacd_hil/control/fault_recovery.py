@@ -320,7 +320,7 @@ class Recovery:
         return False
 
     def _await_bus(self) -> bool:
-        """Try to empty the bus, each _RETRY_NS, until it is empty; return False if the run is interrupted before."""
+        """Try to empty the bus, each _RETRY_NS; return True once it is empty, False if the run is interrupted."""
         self._say("info", "fault acknowledged")
         while not self._is_interrupted():
             if self.empty():

@@ -195,7 +195,10 @@ class UsedHistory:
         return dataclasses.replace(settings, history=dataclasses.replace(known, offset_std_Nm=std_Nm))
 
     def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
-        """Compare the devices with the history's; return a summary as event. Raises DeviceError if they differ."""
+        """Compare the devices with the history's; return [event] with a summary, a warning in a first run.
+
+        Raises DeviceError if they differ.
+        """
         if self.history is None:
             return [Event("warning", "history", self.warnings[0])]
         if difference := _difference(self.history.devices, identities, self.path):

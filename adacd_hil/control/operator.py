@@ -64,7 +64,10 @@ class ScriptedOperator:
         return self._acknowledge(elapsed_s, state)
 
     def _acknowledge(self, elapsed_s: float, state: SchemeState) -> Request:
-        """Return ACKNOWLEDGE each time that the arm has been stopped for the settings' time, else NONE."""
+        """Return ACKNOWLEDGE each time that the arm has been STOPPED for `acknowledge_after_s`, else NONE.
+
+        0 s: never.
+        """
         if state is not SchemeState.STOPPED:
             self._stopped_since_s = None
             return Request.NONE

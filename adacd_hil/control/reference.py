@@ -165,7 +165,10 @@ class Reference(EventSource):
         return False
 
     def _begin_anew(self, arm: ArmState) -> None:
-        """Brake from the measured motion, then continue with the motion of the state."""
+        """Set the desired motion to the measured one; with a path, brake from there, then go to the corner.
+
+        While the arm reacts or is stopped, only brake.
+        """
         self._q_d[:], self._dq_d[:], self._ddq_d[:] = arm.q, arm.dq, 0.0
         if self._path is None:
             return

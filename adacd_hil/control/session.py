@@ -268,7 +268,7 @@ class Session:
                 self._stop(master, recorder, tap)
 
     def _stop(self, master: Master, recorder: Recorder, tap: Tap) -> None:
-        """Stop the devices by NMT, as far as the bus still carries it."""
+        """Stop the devices by NMT, and log the frames until then; log a BusError instead of raising it."""
         try:
             master.stop()
         except BusError as error:

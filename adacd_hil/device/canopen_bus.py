@@ -157,7 +157,10 @@ class CanopenBus:
         self._bus.send(NMT_ID, bytes((nmt_command, node_id)))
 
     def _send(self, can_id: int, data: bytes) -> None:
-        """Send a frame for canopen; after an SDO request, read the bus until its answer is in or overdue."""
+        """Send a frame for canopen; after an SDO request, read the bus until its answer is in or overdue.
+
+        Before a request, wait for the node's pause. Raises BusError.
+        """
         is_request = can_id & 0x780 == SDO_REQUEST_ID and data[0] != SDO_ABORT
         answer_s, pause_s = self._patience.get(can_id & 0x7F, (ANSWER_TIMEOUT_S, 0.0))
         if is_request and pause_s:
@@ -205,7 +208,7 @@ class CanopenBus:
 def as_device_error(name: str, node_id: int, what: str, answer_s: float = ANSWER_TIMEOUT_S) -> Iterator[None]:
     """Turn exceptions of canopen into a DeviceError of one line, an abort into RefusedError.
 
-    BusError and DeviceError pass. `what`: the request, in words. `answer_s`: the wait that a missing answer names.
+    BusError and DeviceError pass. The request, `what`, is in words. `answer_s`: the wait that a missing answer names.
     """
     try:
         yield

@@ -234,7 +234,8 @@ class Drive(CyclicDevice):
         """Return the next command frame: one state nearer to Operation enabled if `enable`, else disable voltage.
 
         `quick_stop` has precedence over both. Torque is zero unless the drive is enabled in cyclic synchronous torque,
-        `enable` is set and `quick_stop` is not. Each call advances the frame's alive counter.
+        `enable` is set and `quick_stop` is not. Each call advances the frame's alive counter, and notes the torque in
+        `recent_permille`.
         """
         is_wanted = enable and not quick_stop
         controlword = self._next_controlword() if is_wanted else Controlword.DISABLE_VOLTAGE

@@ -392,7 +392,7 @@ def _is_hex(text: str, digits: int) -> bool:
 
 
 class DeviceProfile(NamedTuple):
-    """A device profile with its name, and its EDS: the file's place and content."""
+    """A device profile with its name, the file's without suffix, and its EDS: path and content."""
 
     name: str
     eds: Path
