@@ -95,14 +95,14 @@ class Distribution:
         self._bins[_SIDE + low : _SIDE + low + counts.size] += counts
 
     def percentiles(self) -> dict[str, float]:
-        """Return p50, p99, p99.9 and max; empty without a value."""
+        """Return p50, p99, p99.9 and max by these names; {} without a value."""
         if self._bins is None:
             return percentiles(self._values())
         ranks = [int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
         return dict(zip(PERCENTILE_NAMES, map(self._at, ranks), strict=True))
 
     def low_percentiles(self) -> dict[str, float]:
-        """Return p50, p1, p0.1 and min, for values that must not be small; empty without a value."""
+        """Return p50, p1, p0.1 and min by these names, for values that must not be small; {} without a value."""
         if self._bins is None:
             return low_percentiles(self._values())
         ranks = [self.count - 1 - int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]

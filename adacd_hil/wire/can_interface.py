@@ -273,7 +273,7 @@ def parse_ip_link(link: dict[str, Any]) -> InterfaceState | None:
 
 
 def read_sysfs_link(folder: Path) -> InterfaceState | None:
-    """Return the state of an interface by sysfs, without bit timing; None if it is absent or not CAN."""
+    """Return the state of an interface by sysfs, without queue discipline and controller; None if absent or not CAN."""
     try:
         if (folder / "type").read_text().strip() != _ARPHRD_CAN:
             return None

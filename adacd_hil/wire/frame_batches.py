@@ -133,7 +133,10 @@ class FrameReceiver:
         return bool(found)
 
     def take_frames(self) -> list[Frame]:
-        """Return up to 64 received frames without waiting. Raises OSError, BlockingIOError if there is no frame."""
+        """Return up to 64 received frames without waiting. Raises OSError, BlockingIOError if there is no frame.
+
+        The frames behind a drop come with the next call, as `frames_lost` is then another number.
+        """
         if self._held:
             return self._take_held()
         count = _receive(self._descriptor, self._place, _FRAMES, _MSG_DONTWAIT, None)

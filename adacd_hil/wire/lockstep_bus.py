@@ -98,7 +98,10 @@ class LockstepBus(Bus):
 
     @property
     def waiting_frames(self) -> tuple[int, ...]:
-        """Identifiers of the host's frames that SYNC would overtake now, oldest first; in a fifo always empty."""
+        """Identifiers of the host's frames that SYNC would overtake now, oldest first; in a fifo always empty.
+
+        Frames that start before now are transmitted first.
+        """
         if self._is_fifo or not self._queue:
             return ()
         self._transmit_before(self._clock.now_ns())
