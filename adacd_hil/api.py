@@ -63,7 +63,10 @@ PLACES = {
 
 
 def __getattr__(name: str) -> object:
-    """Return a public name, imported only now: some modules compile functions, some import plot libraries."""
+    """Return a public name, imported only now: some modules compile functions, some import plot libraries.
+
+    Raises AttributeError for a name that isn't public.
+    """
     if name not in PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}; there are {', '.join(__all__)}")
     from importlib import import_module

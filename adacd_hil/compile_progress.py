@@ -76,7 +76,10 @@ class CompileCount:
         return bool(self._expected)
 
     def count_function(self, function: Any) -> None:
-        """Count a function that has been compiled, and all that it calls, if expected; then call the listeners."""
+        """Count a compiled function and all that it calls; call the listeners.
+
+        If functions are expected, only these are counted.
+        """
         self._done |= {
             name for name in functions_below([function], is_all=True) if not self._expected or name in self._expected
         }

@@ -53,7 +53,7 @@ def _imports(text: str) -> Iterator[str]:
 
 
 def all_sources(root: Path) -> dict[str, bytes]:
-    """Return the text of every module below `root`, by name."""
+    """Return the source of every module of both packages below `root`, as bytes, by dotted name."""
     texts = {}
     for package in _PACKAGES:
         for path in sorted((root / package).rglob("*.py")):
@@ -63,7 +63,10 @@ def all_sources(root: Path) -> dict[str, bytes]:
 
 
 def compiled_sources(root: Path) -> dict[str, bytes]:
-    """Return the text of every module below `root` that compiles functions and of all modules they import, by name."""
+    """Return the source of each module below `root` that compiles functions, and of all that it imports, by name.
+
+    Imports are followed through. Names are dotted; modules of other packages are left out.
+    """
     texts = all_sources(root)
     waiting = [name for name, text in texts.items() if name == __name__ or _USE.search(text)]
     found: set[str] = set()
@@ -76,12 +79,12 @@ def compiled_sources(root: Path) -> dict[str, bytes]:
 
 
 def source_digest() -> str:
-    """Return a digest of all sources that compiled code may depend on."""
+    """Return a digest, 16 hexadecimal digits, of all sources that compiled code may depend on."""
     return _digest(compiled_sources(_ROOT))
 
 
 def program_digest() -> str:
-    """Return a digest of all sources, for results that may depend on any of them."""
+    """Return a digest, 16 hexadecimal digits, of all sources, for results that may depend on any of them."""
     return _digest(all_sources(_ROOT))
 
 
@@ -221,7 +224,7 @@ class _Locator(_CacheLocator):
         return str(_FOLDER / self._module)
 
     def get_source_stamp(self) -> str:
-        """Return the state of the sources."""
+        """Return the digest of the sources, as `source_digest`."""
         return _DIGEST
 
     def get_disambiguator(self) -> str:
@@ -271,7 +274,10 @@ class _SharedCache(FunctionCache):
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return the code compiled for these types; None: this process has to compile it, then save it."""
+        """Return the code compiled for these types; None: this process has to compile it, then save it.
+
+        Wait, 120 s at most, while another process compiles it.
+        """
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         if found is None and _claims.claim(self._claim(sig)):
             found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
@@ -354,7 +360,10 @@ class _Compilation(event.Listener):
 
     @contextmanager
     def of(self, functions: Sequence[Any], on_first: Callable[[], None]) -> Iterator[None]:
-        """Count these functions in the block, unless a block around it counts already."""
+        """Count these functions in the block, and call `on_first` as the first one compiles.
+
+        Do neither if a block around it counts already.
+        """
         if self._on_first is not None or self._count.is_expecting:
             yield
             return

@@ -12,5 +12,5 @@ def format_date(t_ns: int) -> str:
 
 
 def date_ns(date_utc: str) -> int:
-    """Return the ns since 1970 of a date as `format_date` returns it. Raises ValueError."""
+    """Return the ns since 1970 of a date as `format_date` returns it. Raises ValueError for another form."""
     return int(datetime.strptime(date_utc, _DATE).replace(tzinfo=UTC).timestamp()) * _NS_PER_S

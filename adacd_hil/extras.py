@@ -17,7 +17,10 @@ def install_command(extra: str) -> str:
 
 
 def pip_command() -> str:
-    """Return the shortest command that runs this interpreter's pip."""
+    """Return the command that runs this interpreter's pip: `pip` beside it, else `-m pip`.
+
+    Its path is relative if it is below the working directory.
+    """
     executable = Path(sys.executable)
     pip = executable.with_name("pip")
     try:

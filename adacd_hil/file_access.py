@@ -21,7 +21,10 @@ _ANOTHER = "another one is there already, which is left as it is"
 
 
 def open_input(path: Path) -> BufferedReader:
-    """Return a regular file, open for reading. Raises OSError that names it."""
+    """Return a regular file, open for reading.
+
+    Raises OSError that names it if it can't be opened, or is a folder, FIFO, device or socket.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     except ValueError as error:  # a NUL in the name
@@ -39,7 +42,7 @@ def open_input(path: Path) -> BufferedReader:
 
 
 def read_input(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
-    """Return the whole content of a regular file of at most so many bytes. Raises OSError that names it."""
+    """Return the whole content of a regular file. Raises OSError as `open_input`, and for more than `most_bytes`."""
     with open_input(path) as file:
         data = file.read(most_bytes + 1)
     if data is None:  # as of /proc/kmsg, which is a regular file
@@ -92,7 +95,10 @@ def check_unused(path: Path) -> None:
 
 
 def _owner(descriptor: int) -> str:
-    """Return words for the process that holds the lock of a file; proc(5), /proc/locks."""
+    """Return words for the process that holds the lock of a file: `process` and its id, or `another process`.
+
+    Source: proc(5), /proc/locks.
+    """
     status = os.fstat(descriptor)
     place = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
     with contextlib.suppress(OSError):
@@ -104,7 +110,10 @@ def _owner(descriptor: int) -> str:
 
 
 def write_new_file(path: Path, content: bytes) -> None:
-    """Write a file unless it exists with the same content. Raises FileExistsError for other content, OSError."""
+    """Write a new file; do nothing if it exists with the same content.
+
+    Raises FileExistsError for anything else of that name, and OSError; a file that can't be written whole is removed.
+    """
     try:
         descriptor = os.open(path, NEW, 0o666)
     except FileExistsError:

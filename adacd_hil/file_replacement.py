@@ -32,7 +32,10 @@ class Replacement:
         self.beside = _create_beside(path)
 
     def commit(self, is_durable: bool = False) -> None:
-        """Rename the new file to `path`; is_durable: after its contents are on the disk. Raises OSError."""
+        """Rename the new file to `path`; is_durable: after its contents are on the disk.
+
+        Raises OSError; then the new file is removed, and `path` is as before.
+        """
         try:
             if is_durable:
                 with self.beside.open("rb") as file:
@@ -52,7 +55,7 @@ class Replacement:
 def replacing(path: Path, is_durable: bool = False) -> Iterator[Path]:
     """Yield the path of a new file that takes the place of `path` when the block ends without error.
 
-    See `Replacement`. Raises OSError.
+    It is removed if the block ends with one. Raises OSError as `Replacement`. is_durable: as of `commit`.
     """
     replacement = Replacement(path)
     try:
@@ -64,13 +67,16 @@ def replacing(path: Path, is_durable: bool = False) -> Iterator[Path]:
 
 
 def replace_file(path: Path, content: bytes | str) -> None:
-    """Write a whole file in one step, text as UTF-8; see `Replacement`. Raises OSError."""
+    """Write a whole file in one step, text as UTF-8; replace an old one. Raises OSError as `Replacement`."""
     with replacing(path) as beside:
         beside.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Path, ...]:
-    """Write whole files, by name, into a folder, which is made if missing; return their paths. Raises OSError."""
+    """Write whole files, by name, into a folder, which is made if missing; return their paths.
+
+    Each is replaced as by `replace_file`, one after the other. Raises OSError; files written before it stay.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
         replace_file(folder / name, content)
@@ -78,9 +84,9 @@ def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Pa
 
 
 def has_other_head(path: Path, head: bytes) -> bool:
-    """Return whether the file exists, isn't empty, and doesn't begin with `head`: then it may not be replaced.
+    """Return whether a file exists, isn't empty, and doesn't begin with `head`: then it may not be replaced.
 
-    Raises OSError.
+    False for a folder. Raises OSError if it can't be read.
     """
     if not path.is_file():
         return False

@@ -11,7 +11,7 @@ from typing import Any
 def plain_values(value: Any, digits: int | None = None) -> Any:
     """Return a value in JSON's types: a record by its fields, an array as lists, null for infinity and NaN.
 
-    digits: significant digits of floats; None: all.
+    A path becomes text; any other value is returned as it is. digits: significant digits of floats; None: all.
     """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}

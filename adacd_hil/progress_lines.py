@@ -48,9 +48,10 @@ class Progress:
         self._lines.put((line, self._has_cursor))
 
     def count(self, line: Callable[[], str]) -> None:
-        """Queue a count with the seconds since counting began, unless that or the last count is recent.
+        """Queue `line()` with the seconds since counting began, unless that or the last count is too recent.
 
-        On a terminal the next line overwrites it.
+        Too recent: less than COUNT_EVERY_NS ago on a terminal, LINES_EVERY_NS elsewhere. Counting begins anew after any
+        other line. On a terminal the next line overwrites the count.
         """
         now_ns = self._clock.now_ns()
         if not self._is_counting:

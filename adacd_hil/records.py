@@ -133,7 +133,10 @@ class CertifiedBlock(SchemeBlock):
 
 
 def block_sizes(parameter_count: int, further_count: int = 0, channel_count: int = 0) -> dict[str, int]:
-    """Return the sizes named in `SchemeBlock` and `CertifiedBlock`."""
+    """Return the sizes by the names that the annotations of `SchemeBlock` and `CertifiedBlock` give them.
+
+    channel_count: of the detector bank, per joint.
+    """
     return {
         "n": JOINTS,
         "p": parameter_count,

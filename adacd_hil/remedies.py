@@ -10,7 +10,7 @@ _LIKE = 0.66
 
 
 def nearest_name(word: str, known: Iterable[str]) -> str | None:
-    """Return the known name that is most like `word` in each of its dotted parts; None if none is like it.
+    """Return the known name that is most like `word` in each of its dotted parts; None if none has 0.66 of its letters.
 
     None, too, for a word of less than 2 or more than 64 letters. Case is ignored. Units may be missing: `threshold`
     stands for `threshold_Nm`. Of equally near names the first is returned.

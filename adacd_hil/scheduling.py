@@ -73,7 +73,8 @@ class RealtimeRequest:
 class RealtimeGrant:
     """The grant of the operating system.
 
-    `cpu`: the processor that the process stays on, None for any. `cpus`: processors that it was allowed before.
+    `scheduler`: its name, with the priority. `missing`: requests that were refused. `cpu`: the processor that the
+    process stays on, None for any. `cpus`: processors that it was allowed before.
     `is_awake`: idle states with a long wake-up are forbidden.
     """
 
@@ -145,7 +146,10 @@ def request_realtime(request: RealtimeRequest | None = None) -> RealtimeGrant:
 
 
 def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
-    """Pin the process to one processor; return it (None: any) and the refusals."""
+    """Pin the process to the processor of `wish`; return it and the refusals.
+
+    None if any is wished, or the pinning is refused. cpus: processors that the process may use, for the remedy.
+    """
     if wish == ANY_CPU:
         return None, []
     isolated = isolated_cpus()
@@ -163,7 +167,10 @@ def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
 
 
 def _schedule(libc: ctypes.CDLL, request: RealtimeRequest) -> tuple[str, list[Refusal]]:
-    """Set the requested scheduler, or the best below it; return its name and the refusals."""
+    """Set the requested scheduler; return the name of the one in force and the refusals.
+
+    Without SCHED_DEADLINE, SCHED_FIFO is requested; without that, the present one stays.
+    """
     missing = []
     if request.scheduler == "other":
         return scheduler_name(), []
@@ -183,7 +190,7 @@ def _schedule(libc: ctypes.CDLL, request: RealtimeRequest) -> tuple[str, list[Re
 
 
 def _request_deadline(libc: ctypes.CDLL, period_ns: int) -> int:
-    """Request SCHED_DEADLINE; return the error's number, 0 for none."""
+    """Request SCHED_DEADLINE with _DEADLINE_SHARE of each period; return the error's number, 0 if it is granted."""
     number = _SYS_SCHED_SETATTR.get(os.uname().machine)
     if number is None:
         return errno.ENOSYS
@@ -253,7 +260,7 @@ def freeze_garbage() -> None:
 
 @contextmanager
 def frozen_garbage() -> Iterator[None]:
-    """Collect garbage once; the collection is disabled while the block lasts, and enabled after it."""
+    """Collect garbage once; disable the collection while the block lasts, and enable it afterwards in any case."""
     freeze_garbage()
     try:
         yield
@@ -263,7 +270,7 @@ def frozen_garbage() -> Iterator[None]:
 
 
 def scheduler_name() -> str:
-    """Return the name of the scheduler that this process runs under."""
+    """Return the name of the scheduler that this process runs under, such as SCHED_OTHER; `policy N` if unknown."""
     names = {
         os.SCHED_OTHER: "SCHED_OTHER",
         os.SCHED_FIFO: "SCHED_FIFO",

@@ -38,10 +38,10 @@ _NUMBERS: dict[Any, type[np.generic]] = {float: np.float64, int: np.int64, bool:
 
 
 def described(kind: type[Any], sizes: Mapping[str, int]) -> Record:
-    """Return the description of a record of a class.
+    """Return numpy's description of a record of a class; of equal fields the same object.
 
-    sizes: of the dimensions that the class and the classes in it name. Raises ValueError for a field whose name is
-    numpy's own.
+    sizes: by the names of dimensions in the class and the classes in it. Raises ValueError for a field whose name is
+    numpy's own, KeyError for a dimension without a size.
     """
     return _described(
         tuple(_field_of(name, hint, sizes) for name, hint in get_type_hints(kind, include_extras=True).items())

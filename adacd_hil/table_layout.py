@@ -66,7 +66,10 @@ def _least_room(column: int, lines: Sequence[Sequence[str]]) -> int:
 
 
 def _parts(least: Sequence[int], width: int, names: int) -> list[list[int]]:
-    """Return the columns of each part: as many as fit."""
+    """Return the columns of each part of the table: the first `names`, then as many others as fit, one at least.
+
+    If there is no room for another column, only the first one is repeated.
+    """
     if _sum([*least[:names], max(least[names:], default=0)]) > width:
         names = 1
     parts = [list(range(names))]

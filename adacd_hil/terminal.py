@@ -73,7 +73,7 @@ def fold(text: str, width: int | None) -> str:
 
 
 def _parts(line: str, width: int) -> list[str]:
-    """Return a line folded as `fold` does, as its parts."""
+    """Return the lines into which `fold` folds a line; a space at its end, as of a prompt, stays."""
     if len(line.expandtabs()) <= width:
         return [line]
     field = _FIRST_FIELD.match(line, 0, width // 3)
@@ -230,7 +230,7 @@ class Terminal(io.TextIOBase):
                 view = view[os.write(self._descriptor, view if self._is_ready else view[:_PIECE]) :]
 
     def _leave(self) -> None:
-        """Write nothing more, and discard further output of other code to this descriptor."""
+        """Write nothing more, and lead the descriptor to /dev/null, so that other code's output is discarded, too."""
         self._is_gone = True
         with contextlib.suppress(OSError):
             nowhere = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)

@@ -27,7 +27,7 @@ _MOST_RAD = 2.0 * math.pi
 
 
 class ConfigurationFindings(NamedTuple):
-    """errors: reasons why it can't be used. warnings: likely mistakes. `settings`: None with errors."""
+    """errors: reasons why the configuration can't be used. warnings: likely mistakes. `settings`: None with errors."""
 
     errors: list[str]
     warnings: list[str]
@@ -37,9 +37,10 @@ class ConfigurationFindings(NamedTuple):
 
 
 def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
-    """Return all errors and likely mistakes of a configuration, by its name or file.
+    """Return errors and likely mistakes of a configuration, by its name or file, instead of raising ConfigError.
 
-    profile: name of one of its `[profiles]` to apply. The checks stop at the first kind of error.
+    profile: name of one of its `[profiles]` to apply. Checked in turn are the keys, the motion's limits, the device
+    profiles, the contract; if one of these has errors, the later ones and the warnings are left out.
     """
     try:
         layers = configuration_layers(name_or_file, profile)
@@ -65,7 +66,10 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
 
 
 def profile_guesses(settings: Settings) -> dict[str, float]:
-    """Return the values that device profiles list as assumed, by a key such as `my-drive.toml: scale.gear_ratio`."""
+    """Return the values that device profiles list as assumed, by a key such as `my-drive.toml: scale.gear_ratio`.
+
+    Raises ConfigError as `load_profile`.
+    """
     found = {}
     for kind, names in (("drive", settings.devices.drive), ("sensor", settings.devices.sensor)):
         for name in dict.fromkeys(names):
@@ -77,7 +81,10 @@ def profile_guesses(settings: Settings) -> dict[str, float]:
 
 
 def oddities(settings: Settings) -> list[str]:
-    """Return the likely mistakes that the settings alone show, a line each."""
+    """Return the likely mistakes that the settings alone show, a line each; [] without any.
+
+    They are values above their bounds, degrees that look like radians, and unknown keys in `assumed`.
+    """
     return [line for look in _LOOKS for line in look(settings)]
 
 
@@ -86,7 +93,10 @@ _MOST_NAMED = 4
 
 
 def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
-    """Return a line that names up to four guessed values of a configuration, without measured ones; "" if none."""
+    """Return a line that names up to four guessed values of a configuration; "" if none.
+
+    measured: keys that are guesses no longer.
+    """
     guesses = [f"`{key}`" for key in (*profile_guesses(settings), *settings.assumed) if key not in measured]
     more = f" and {len(guesses) - _MOST_NAMED} more" if len(guesses) > _MOST_NAMED else ""
     named = f"{', '.join(guesses[:_MOST_NAMED])}{more}"
@@ -95,7 +105,7 @@ def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
 
 
 def _device_problems(settings: Settings) -> list[str]:
-    """Return the errors of the drives' and sensors' device profiles, each once."""
+    """Return the errors of loading the configured device profiles, equal ones once; [] without any."""
     devices = settings.devices
     problems: dict[str, None] = {}
     for kind, names in (("drive", devices.drive), ("sensor", devices.sensor)):
@@ -126,7 +136,7 @@ def _over(settings: Settings) -> Iterator[str]:
 
 
 def _radians(settings: Settings) -> Iterator[str]:
-    """Yield a warning for each setting in degrees that is so small that radians were probably meant."""
+    """Yield a warning for each limit or amplitude in degrees whose largest value is at most 2 pi: radians, probably."""
     for key in ("arm.position_limit_deg", "trajectory.amplitude_deg", "arm.velocity_limit_deg_s"):
         values = value_of(settings, key)
         if 0.0 < max(values) <= _MOST_RAD:
@@ -147,9 +157,10 @@ _LOOKS: tuple[Callable[[Settings], Iterator[str]], ...] = (_over, _radians, _unk
 
 
 def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
-    """Yield a warning for the paper's scheme, and for each number of an emulated arm that an own arm inherits.
+    """Yield a warning if only `paper` sets the scheme, and for a CAD model or gains inherited from an emulated arm.
 
-    layers: the configuration and all that it extends, the base first.
+    The latter if a file of the user's describes arm or devices. None for a built-in configuration. layers: the
+    configuration and all that it extends, the base first.
     """
     own = [layer for layer in layers if layer.origin not in builtin_names() and "[profiles." not in layer.origin]
     if not own:
@@ -166,7 +177,7 @@ def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
 
 
 def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
-    """Return, by key such as `arm.sign`, the origin of the last of the layers that sets it, and so decides."""
+    """Return, by key such as `arm.sign`, the origin of the layer that decides its value: the last one that sets it."""
     found = {}
     for origin, table in layers:
         for section, content in table.items():
@@ -176,7 +187,7 @@ def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
 
 
 def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
-    """Yield a warning for each frame that can't carry the joint's rated torque, or its positions up to the limit."""
+    """Yield a warning for each frame whose range is less than the rated torque, or than position limit plus zero."""
     limits_deg, zeros_deg = settings.arm.position_limit_deg, settings.arm.zero_deg
     for joint, (limit_deg, zero_deg) in enumerate(zip(limits_deg, zeros_deg, strict=True)):
         message = codec.message(f"Drive{joint + 1}Feedback")

@@ -47,7 +47,10 @@ class Controller:
         self._cycles_left = self._handover_cycles
 
     def torque(self, q: Vector, dq: Vector, q_d: Vector, dq_d: Vector, ddq_d: Vector, tau_d: Vector) -> None:
-        """Fill the desired torque `tau_d` (2,), Nm, and advance the feedforward's blending by one cycle."""
+        """Fill the desired torque `tau_d` (2,), Nm, as `fill_torque` with the blended parameters.
+
+        Advance the blending by one cycle: call it once per cycle.
+        """
         if self._cycles_left > 0:
             self._cycles_left -= 1
             share = self._cycles_left / self._handover_cycles

@@ -64,7 +64,11 @@ _ENABLING = POWERED | {SchemeState.ENABLE}
 
 @dataclass(frozen=True)
 class RunResult:
-    """How a run ended. `fault`: NONE when it ended as asked. `data`: how much of the cyclic data came."""
+    """How an attempt ended. `fault`: NONE when it ended as asked. `data`: how much of the cyclic data came.
+
+    `cycles`: number of the last cycle + 1; `overruns`: skipped periods; both since the session's first cycle. `state`:
+    the last one.
+    """
 
     cycles: int
     overruns: int
@@ -75,7 +79,7 @@ class RunResult:
 
 
 class Cycle:
-    """Everything one cycle needs; `run` is the loop."""
+    """The loop of one attempt, with everything that a cycle needs: call `compile`, then `run`."""
 
     def __init__(
         self,
@@ -161,7 +165,8 @@ class Cycle:
     def run(self, recorder: Recorder) -> RunResult:
         """Run and log cycles until the run is finished, faulted or interrupted; disable the drives; return the result.
 
-        After a fault the cycles go on for FAULT_LINGER_S. Raises BusError, of it SilenceError in lockstep.
+        After a fault the cycles go on for FAULT_LINGER_S. Raises BusError, in lockstep its SilenceError if no device
+        answers; then the drives are not disabled here.
         """
         output = None
         self._pacer.resume()
@@ -203,20 +208,24 @@ class Cycle:
 
     @property
     def reached(self) -> tuple[int, SchemeState]:
-        """Return the number of cycles so far, and the present state."""
+        """Return the number of cycles so far, skipped ones included, and the present state."""
         return self._arm.cycle + 1, self._state
 
     def _look_after_devices(self, arm: ArmState, output: SchemeOutput) -> None:
-        """After a fault, stop drives that a command has not stopped; with power, read the devices' parameters again."""
+        """After a fault, stop drives by NMT that a command has not stopped; else, with power, step `ParameterWatch`.
+
+        Raises BusError.
+        """
         if self._faulted_cycle is not None:
             self._escalation.step(arm.cycle - self._faulted_cycle, arm.t_ns, output.fault)
         elif output.state in POWERED:
             self._master.parameters.step(arm.cycle, arm.t_ns)
 
     def _request(self, cycle: int) -> Request:
-        """Return this cycle's request for the scheme: an interruption's, a carried one, or the operator's.
+        """Return this cycle's request for the scheme: FINISH after an interruption, a carried one, or the operator's.
 
-        Store requests that wait to be served. On FINISH begin to park the arm.
+        An interruption requests once, a carried request is made as soon as the drives have been enabled. Store PAYLOAD
+        and FINISH until they are served. On FINISH begin to park the arm.
         """
         if self._interrupts and not self._is_finishing:
             return self._finish()
@@ -227,7 +236,10 @@ class Cycle:
         return self._finish() if request is Request.FINISH else request
 
     def _finish(self) -> Request:
-        """Begin to park the arm if its drives may have torque, and store when; return FINISH."""
+        """Return FINISH, and begin to park the arm if the state has power.
+
+        The first call stores the present cycle, from which FINISH_S counts.
+        """
         if not self._is_finishing:
             self._finish_cycle = self._arm.cycle
         self._is_finishing = True
@@ -236,7 +248,10 @@ class Cycle:
         return Request.FINISH
 
     def _follow(self, arm: ArmState, output: SchemeOutput) -> None:
-        """Fill the desired torque: that of the floating law while the arm floats, else that of the controller."""
+        """Fill `_tau_d` with the torque of the floating law while the arm floats, else with the controller's.
+
+        If the scheme's model is valid, first begin to blend the controller's feedforward to it.
+        """
         if output.is_model_valid:
             self._controller.feed_forward(output.theta_ff)
         if self._reference.is_floating:
@@ -248,8 +263,9 @@ class Cycle:
     def _limit(self, arm: ArmState, output: SchemeOutput, now_ns: int) -> tuple[ArmCommand, GateFlag]:
         """Return the command of this cycle, with the desired torque limited, and the gate's changes to the torque.
 
-        now_ns: time at which the command leaves. The torque is zero if that is too long after SYNC, for example because
-        the process was stopped: then the torque is stale.
+        The torque is zero unless the state has power and both drives are enabled, and if the command leaves, at
+        now_ns, more than `bus.max_age_cycles` periods after SYNC. It is a quick stop in FAULT, and for a desired torque
+        that is not finite.
         """
         is_stale = now_ns - self._exchange.sync_ns > self._stale_ns
         is_open = output.state in POWERED and arm.is_enabled and not is_stale
@@ -267,7 +283,10 @@ class Cycle:
         command: ArmCommand,
         flags: GateFlag,
     ) -> None:
-        """Hand messages and events of the cycle to the recorder, print those for the user, and store a new state."""
+        """Hand messages, frames and events of the cycle to the recorder, print those for the user, store a new state.
+
+        The events of all sources are taken, so that each is logged once.
+        """
         t_ns = arm.t_ns
         if self._first_cycle < 0:
             self._first_cycle = arm.cycle
@@ -295,7 +314,10 @@ class Cycle:
             self._narration.transition(t_ns, output, event.message)
 
     def _transition(self, output: SchemeOutput, arm: ArmState) -> Event:
-        """Return the event of a change of state, with the cause where the states' names don't show it."""
+        """Return the event of a change of state.
+
+        Its text has the causes of a fault, of a stop without a contact, and of a return to COMMISSION.
+        """
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is SchemeState.REACT and output.contact is None:
             late = f"{FaultReason.DEADLINE.name}; {self._watch.deadline.describe_misses()}"
@@ -311,7 +333,7 @@ class Cycle:
     def _follow_state(self, state: SchemeState, cycle: int) -> None:
         """Store a new state, and the cycle in which the drives were enabled or the fault came.
 
-        Compare the first certificate with the link lengths. Drop a request that the state serves.
+        At the first MONITOR compare the certificate with the link lengths. Drop a stored request that the state serves.
         """
         self._state = state
         if state in (SchemeState.ADAPT, SchemeState.REACT) and self._enabled_cycle is None:
@@ -323,7 +345,7 @@ class Cycle:
         self._kept.serve((state,))
 
     def _is_over(self, output: SchemeOutput | None) -> bool:
-        """Return whether the loop ends: FAULT_LINGER_S after a fault, at a second interrupt, or when FINISH is done.
+        """Return whether the loop ends: FAULT_LINGER_S after a fault, else at a second interrupt or if FINISH is done.
 
         FINISH is done once the arm is parked, has no power, or hasn't parked within FINISH_S.
         """
@@ -339,7 +361,10 @@ class Cycle:
         return is_overdue or self._state not in POWERED or self._reference.is_parked(output.cycle)
 
     def _disable(self, recorder: Recorder, quick_stop: bool) -> None:
-        """Send zero torque and the command to disable the drives for DISABLE_CYCLES cycles, without the scheme."""
+        """Send zero torque and the command to disable the drives for DISABLE_CYCLES cycles, without the scheme.
+
+        Log their frames, and the counts of the frame checks.
+        """
         self._tau_c[:] = 0.0
         command = ArmCommand(self._tau_c, enable=False, quick_stop=quick_stop)
         for _ in range(DISABLE_CYCLES):

@@ -81,7 +81,7 @@ _SCALES: Final = (0.5, 0.67, 0.8, 1.25, 1.5, 2.0)
 
 
 class TorqueRatio(NamedTuple):
-    """Sensed torque over the torque commanded to its own joint's drive, and to the other joint's."""
+    """Sensed torque over the torque commanded to its own joint's drive, and to the other's; standard deviations."""
 
     own: float
     other: float
@@ -90,9 +90,10 @@ class TorqueRatio(NamedTuple):
 
 
 class Reading(NamedTuple):
-    """One hypothesis. position, torque, motor: factors on measured and commanded values, by joint. kind: of its text.
+    """A hypothesis on how the devices are connected and scaled. kind: of its text, or "configured": no mistake.
 
-    is_turned: gravity acts in any direction.
+    position, torque, motor: factors on measured position and torque, and on commanded torque, by joint; -1: reversed.
+    is_turned: gravity acts in any direction, since the mounting is wrong.
     """
 
     kind: str
@@ -105,7 +106,7 @@ class Reading(NamedTuple):
 
     @property
     def joint(self) -> int:
-        """Return the joint, 0 or 1, whose factors this reading changes; 1 if it changes none."""
+        """Return the joint, 0 or 1, whose factors this reading changes; 0 if both joints', 1 if none."""
         return 0 if (self.position[0], self.torque[0], self.motor[0]) != (1.0, 1.0, 1.0) else 1
 
     def allows(self, found: Sequence[TorqueRatio | None], error: float) -> bool:
@@ -131,7 +132,7 @@ class Reading(NamedTuple):
 
     @property
     def row(self) -> tuple[float, ...]:
-        """Return numbers (7,) for `add_block`: two exchanges, factors on position and on torque, turned gravity."""
+        """Return its numbers (7,) for `add_block`: both exchanges, `position`, `torque`, `is_turned`."""
         return (self.is_drive_exchanged, self.is_sensor_exchanged, *self.position, *self.torque, self.is_turned)
 
 
@@ -171,7 +172,7 @@ def add_block(
     count: int,
     normals: Vector,
 ) -> None:
-    """Add a block's means (2,) to the normal equations (h, k, k) of each of the readings (h, 7).
+    """Add a block's means (2,) to the normal equations `normals` (h, k, k) of each of the readings, by rows (h, 7).
 
     k = p + 5, or p + 7 with gravity: theta (p = count), two offsets, two lags, a4 and a5 of another direction, torque.
     """
@@ -228,7 +229,10 @@ def solve_readings(normals: Vector, count: int, blocks: int, shares: Vector, sol
 
 
 class DeviceReadings:
-    """Fits all readings to the blocks of a motion, and returns and names those that the motion doesn't refute."""
+    """Fits the arm's equation to a motion under each hypothesis (`Reading`); names those that it doesn't refute.
+
+    The motion comes as means over blocks.
+    """
 
     def __init__(self, settings: Settings) -> None:
         """Prepare the normal equations of all readings, without blocks."""
@@ -257,10 +261,11 @@ class DeviceReadings:
         self._blocks += 1
 
     def judge_blocks(self, is_torque_known: bool) -> bool:
-        """Return whether the configuration is refuted: another reading was far better in several judgements in a row.
+        """Return whether the configuration is refuted: another reading was far better in three judgements in a row.
 
-        Judge at every fourth block, return False between. is_torque_known: the commanded torques have confirmed the
-        sensors' scales; without that a wrong scale of torque as the best reading doesn't count.
+        Far better: it leaves at most 0.2 of the configuration's unexplained share, and at most 0.004 of all. Judge at
+        every fourth block, return False between. is_torque_known: the commanded torques have confirmed the sensors'
+        scales; without that a wrong scale of torque as the best reading doesn't count.
         """
         if self._blocks < _FEWEST_BLOCKS or self._blocks % _JUDGED_EVERY:
             return False
@@ -296,15 +301,18 @@ class DeviceReadings:
         return list(texts.values())
 
     def is_unlike_an_arm(self) -> bool:
-        """Return whether the configured devices give an inertia that no arm has, or the blocks are too few to know."""
+        """Return whether the configured devices give an inertia that no arm has.
+
+        True also with fewer than _SUSPECT_BLOCKS blocks, which are too few to know. Solves all readings anew.
+        """
         self._solve(())
         return 0 < self._blocks < _SUSPECT_BLOCKS or not is_positive_definite(self._solutions[0])
 
     def name_causes(self, left: Sequence[Reading]) -> str:
         """Return a text of the causes left, their unexplained shares and remedies.
 
-        left: result of the method `left`. "" without a wrong reading, with too many, or if the best explains little:
-        then the cause is not among the readings, or there are several.
+        left: result of the method `left`. "" if it has no reading but the configured one, more than _MOST_NAMED, or
+        none that leaves at most _EXPLAINED unexplained: then the cause is not among the readings, or there are several.
         """
         wrong = [reading for reading in left if reading.kind != "configured"]
         places = [self._readings.index(reading) for reading in wrong]
@@ -379,7 +387,10 @@ class DeviceReadings:
 
     @property
     def _hangs_deg(self) -> float:
-        """Return the q1 at which link 1 points down, deg, by the reading of the mounting."""
+        """Return the q1, deg in [-180, 180), at which link 1 hangs down if the configured mounting is wrong.
+
+        It is the mounting's angle, turned as the last solution turns gravity.
+        """
         return (self._settings.mounting_deg[1] + self._turned_deg + 180.0) % 360.0 - 180.0
 
     @property
@@ -388,12 +399,15 @@ class DeviceReadings:
         return max(JOINTS * self._blocks - (self._normals.shape[1] - 1), 1)
 
     def _rank(self, place: int) -> float:
-        """Return the unexplained share of a reading; infinite if no arm has its inertia or it isn't distinct."""
+        """Return the unexplained share of a reading, by index; inf if no arm has its inertia or it isn't distinct."""
         is_right = self._is_distinct(place) and is_positive_definite(self._solutions[place])
         return float(self._shares[place]) if is_right else math.inf
 
     def _is_distinct(self, place: int) -> bool:
-        """Return whether a reading counts: all do, but turned gravity in a small motion, or turned by a small angle."""
+        """Return whether the data can distinguish a reading from the configuration, by its index.
+
+        False for turned gravity with fewer than _MOUNTING_BLOCKS blocks, or turned by less than _TURNED_DEG.
+        """
         if not self._readings[place].is_turned:
             return True
         return self._blocks >= _MOUNTING_BLOCKS and abs(self._turned_deg) >= _TURNED_DEG
@@ -405,7 +419,7 @@ class DeviceReadings:
         return math.degrees(math.atan2(mounted[-2:].sum(), mounted[A4 : A5 + 1].sum()))
 
     def _may_be_arms(self, places: Sequence[int]) -> list[bool]:
-        """Return for each place of a reading whether its inertia, within its error, is that of a possible arm."""
+        """Return for each index of a reading whether its inertia, within its error, is that of a possible arm."""
         normals = self._normals[list(places), :-1, :-1]
         size = np.sqrt(np.maximum(np.diagonal(normals, axis1=1, axis2=2), 1e-12))
         scaled = normals / (size[:, :, np.newaxis] * size[:, np.newaxis, :])
@@ -416,13 +430,13 @@ class DeviceReadings:
         return [may_be_arm(self._solutions[place], slack[row]) for row, place in enumerate(places)]
 
     def _solve(self, among: Iterable[int]) -> int:
-        """Update the solutions of all readings; return the index in `among` of the best one, 0 if `among` is empty."""
+        """Solve all readings anew; return the one of the indices `among` that leaves least unexplained, 0 if empty."""
         solve_readings(self._normals, self._count, max(self._blocks, 1), self._shares, self._solutions)
         return min(among, key=self._rank, default=0)
 
 
 def may_be_arm(theta: Vector, slack: Vector) -> bool:
-    """Return whether M(q) is positive definite for some parameters within `slack` of theta."""
+    """Return whether M(q) is positive definite, for all q, with some parameters within `slack` (p,) of theta (p,)."""
     a1, a2 = theta[A1] + slack[A1], max(abs(theta[A2]) - slack[A2], 0.0)
     a3 = min(max(0.5 * a1, theta[A3] - slack[A3]), theta[A3] + slack[A3])
     return bool(a3 > 0.0 and a3 * (a1 - a3) > a2**2)

@@ -18,7 +18,10 @@ class DeviceRecord:
     serial: int = setting(low=0, high=0xFFFF_FFFF, meaning="0x1018:4")
 
     def difference(self, found: Identity) -> str:
-        """Return the first difference to the device found, "" if it is the same. The revision may differ (firmware)."""
+        """Return the first difference to the device found, as text: vendor, product or serial number; "" without one.
+
+        Revision (firmware), name and node id may differ.
+        """
         for what, known, present in (
             ("vendor", self.vendor, found.vendor),
             ("product code", self.product, found.product),

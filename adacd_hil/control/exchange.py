@@ -52,9 +52,9 @@ class Exchange:
     def read(self, tick: Tick) -> ArmState:
         """Send SYNC, unless another host does, take the devices' frames until all are in, and return the arm's state.
 
-        Stop to wait after a share of the period; the missing values are then old ones.
+        Stop to wait after FEEDBACK_SHARE of the period; the missing values are then old ones.
 
-        Raises BusError, of it SilenceError in lockstep.
+        Raises BusError; in lockstep its SilenceError, if no device answers.
         """
         bus, arm = self._bus, self._arm
         for late in tick.late:

@@ -45,7 +45,7 @@ class SelfChecks:
     def __init__(
         self, settings: Settings, arm: Arm, parameters: ParameterWatch, q_d: Vector, first_motion: FirstMotion
     ) -> None:
-        """`q_d` (2,): the desired position, rad, at the beginning of the present cycle."""
+        """`q_d` (2,): memory of the desired position, rad; `judge` reads in it that of the cycle before."""
         self._first_motion = first_motion
         period_s = settings.bus.period_s
         self._arm, self._parameters, self._q_d = arm, parameters, q_d
@@ -59,9 +59,10 @@ class SelfChecks:
         self.line = ""
 
     def judge(self, arm: ArmState, state: SchemeState) -> Request:
-        """Check a cycle for changed parameters, wrong torque or motion; return the scheme's request to fault, or NONE.
+        """Return the request to fault for changed parameters, wrong torque, wrong configuration or lagging motion.
 
-        Store the first failure in `reason` and `line`. `state`: of the scheme after the previous cycle.
+        Else NONE, and while the drives are not enabled. Store the first failure in `reason` and `line`. `state`: of the
+        scheme after the previous cycle.
         """
         if not arm.is_enabled:
             return Request.NONE
@@ -76,7 +77,10 @@ class SelfChecks:
         return self._fail(FaultReason.FOLLOWING, Request.FAULT_FOLLOWING, line) if line else Request.NONE
 
     def suspicions(self, fault: FaultReason) -> list[str]:
-        """Return possible causes of a fault of an arm that ran away in its first motion; usually []."""
+        """Return [line] on likely wrong settings if the first motion suggests them and `fault` is LIMIT or FOLLOWING.
+
+        Else [].
+        """
         line = self._first_motion.suspicion() if fault in _RUN_AWAY else ""
         return [line] if line else []
 
@@ -92,7 +96,10 @@ class SelfChecks:
         return ""
 
     def _judge_motion(self, arm: ArmState) -> str:
-        """Return a line if the arm has been outside its following window for the timeout, else ""."""
+        """Return a line if the arm has been outside its following window for the timeout, else "".
+
+        The window, `controller.following_window_deg`, is around the desired position; one joint outside is enough.
+        """
         (q1, q2), (desired1, desired2), (window1, window2) = arm.q.tolist(), self._q_d.tolist(), self._window_rad
         errors = abs(q1 - desired1), abs(q2 - desired2)
         is_near = errors[0] <= window1 and errors[1] <= window2
@@ -108,7 +115,8 @@ class SelfChecks:
     def _judge_torque(self, cycle: int) -> str:
         """Return a line for a drive whose torque has been outside its recent commands' range for too long, else "".
 
-        Only statuses of this cycle are judged. Too long: TORQUE_STATUSES in a row, and TORQUE_S.
+        Outside: by more than `arm.torque_error_share` of its rated torque. Only statuses of this cycle are judged. Too
+        long: TORQUE_STATUSES in a row, and TORQUE_S.
         """
         for drive, rated_Nm in zip(self._arm.drives, self._arm.limits.rated_torque_Nm, strict=True):
             if drive.status_cycle != cycle or not drive.shows_torque:
@@ -129,9 +137,9 @@ class SelfChecks:
 
     @staticmethod
     def _excess(drive: Drive) -> float:
-        """Return by how much, per mille, a drive's torque is outside the range of its recent commands.
+        """Return by how much a drive's torque is outside the range of its recent commands, per mille of rated torque.
 
-        A drive that reports a limit of its own may have less.
+        0 within the range. A drive that reports a limit of its own may have less torque, down to zero.
         """
         low, high = min(drive.recent_permille), max(drive.recent_permille)
         if drive.is_limited:
@@ -169,7 +177,7 @@ class FaultReport:
         }
 
     def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
-        """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
+        """Count a cycle as `CommissionReport.count_cycle`."""
         self.commission.count_cycle(state, arm)
 
     def list_causes(self, fault: FaultReason) -> list[str]:
@@ -217,7 +225,10 @@ class CommissionReport(EventSource):
         self._worst: dict[tuple[int, int], float] = {}
 
     def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
-        """Count this cycle's conditions for leaving COMMISSION; state: of the scheme after the cycle before."""
+        """Count the reasons for which an arm in INIT or COMMISSION stays there in this cycle; else do nothing.
+
+        Add an event for each device with a value outside its bounds, once. state: of the scheme after the cycle before.
+        """
         if state not in _STATES:
             return
         self._cycles += 1
@@ -237,7 +248,10 @@ class CommissionReport(EventSource):
                     self._worst[joint, place] = max(self._worst.get((joint, place), 0.0), abs(value))
 
     def list_unrest(self) -> list[str]:
-        """Return a line for each counted cause, the most frequent first; empty if every cycle was good."""
+        """Return a line for each counted reason, the most frequent first; empty if no cycle had one.
+
+        After a reason of torque, a last line has the remedy if it is the arm's own weight.
+        """
         lines = [
             f"{self._text(cause)} in {count} of {self._cycles} cycles" for cause, count in self._causes.most_common()
         ]
@@ -277,7 +291,7 @@ class Recovery:
         self._is_interrupted = is_interrupted
 
     def empty(self) -> bool:
-        """Drop all queued frames of the bus; if that isn't possible yet, log the reason and return False."""
+        """Drop all queued frames of the bus and return True; if that isn't possible yet, log why and return False."""
         try:
             self._tap.recover()
         except BusError as error:
@@ -306,7 +320,7 @@ class Recovery:
         return False
 
     def _await_bus(self) -> bool:
-        """Try to empty the bus, each _RETRY_NS, until it is empty; return False if the run is interrupted before."""
+        """Try to empty the bus, each _RETRY_NS; return True once it is empty, False if the run is interrupted."""
         self._say("info", "fault acknowledged")
         while not self._is_interrupted():
             if self.empty():

@@ -81,7 +81,10 @@ def is_shown(event: Event) -> bool:
 
 
 class FirstMotion(EventSource):
-    """Judges the arm's first motion. `line`: the contradiction to the configuration, empty without one."""
+    """Compares the arm's first motion with the configured signs, order and scales of its devices.
+
+    `line`: the first contradiction, with its remedy; "" without one.
+    """
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         """Prepare to judge both joints; with `safety.first_motion_error` = 0, prepare to judge nothing."""
@@ -163,7 +166,7 @@ class FirstMotion(EventSource):
     def check_lengths(self, certificates: tuple[Certificate, ...]) -> None:
         """Compare the first certificate of the run, if any, with the configured lengths; add an event if they differ.
 
-        Another event tells that they can't be compared. Set `is_certified`, also without a certificate.
+        An info if torques can't check a length. Set `is_certified`, also without a certificate.
         """
         self.is_certified = True
         event = geometry_event(self._settings, certificates[0]) if certificates else None
@@ -171,7 +174,10 @@ class FirstMotion(EventSource):
             self.events.append(event)
 
     def suspicion(self) -> str:
-        """Return the likely causes of an arm that runs away in its first motion, as text; empty if none is likely."""
+        """Return the likely causes of an arm that runs away in its first motion, as text; TOO_SHORT for unknown ones.
+
+        "" if the motion fits the configuration, is no longer judged, or `line` is set already.
+        """
         if self._readings is None or self.line:
             return ""
         if scales := self._suspect_scales():
@@ -190,7 +196,10 @@ class FirstMotion(EventSource):
         return f"perhaps {text.removeprefix('either ')}" if text else TOO_SHORT
 
     def _left(self) -> list[Reading]:
-        """Return the device readings that agree with the arm's equation and with the commanded torques."""
+        """Return the device readings that neither the arm's equation nor the commanded torques refute, best first.
+
+        [] as of `DeviceReadings.left`, and if they are no longer judged.
+        """
         return [] if self._readings is None else self._readings.left(self._ratios(), self._error)
 
     def _ratios(self) -> list[TorqueRatio | None]:
@@ -201,9 +210,9 @@ class FirstMotion(EventSource):
         ]
 
     def _suspect_scales(self) -> str:
-        """Return a text on the joint whose sensor measures far more or less than its command, though in step with it.
+        """Return a text on a joint whose sensor measures 2.5 times its command or more, or 1 / 2.5 or less.
 
-        Empty if there is none.
+        "" without one. Torque and command must be correlated by _IN_SCALE. Of two joints the one that is further off.
         """
         _, tau_c, tau_J, _, _, _, both = self._pushed
         found = [
@@ -221,7 +230,10 @@ class FirstMotion(EventSource):
         )
 
     def _take_block(self, block: "_Block") -> None:
-        """Add a long block to the sums of positions, and of torques where a joint moves; judge each fifth block."""
+        """Add a long block to the sums by which positions are judged, and of a moving joint also torques.
+
+        Judge the joints at each fifth block.
+        """
         self._path += block.travel * block.way, block.way * block.way, block.travel * block.travel
         self._way_rad += np.abs(block.way)
         for joint in range(JOINTS):
@@ -237,7 +249,7 @@ class FirstMotion(EventSource):
             self._judge()
 
     def _give_up(self) -> None:
-        """Stop judging, and report the joints that are still unknown."""
+        """Stop judging joints and device readings; add a warning for each joint that is still unknown."""
         for joint in sorted(self._open):
             text = (
                 f"joint {joint + 1} is not known after {_LONGEST_S:g} s, since it moves too little, a drive is at a "
@@ -252,7 +264,10 @@ class FirstMotion(EventSource):
         self.line = self._judge_position() or self._judge_torque()
 
     def _judge_position(self) -> str:
-        """Return the contradiction of a joint's position to its velocity, a wrong scale or sign; "" without one."""
+        """Return the contradiction of a joint's position to its velocity, a wrong scale or sign; "" without one.
+
+        "" also for a way below _LEAST_WAY_RAD, and if no single scale explains the way.
+        """
         for joint in range(JOINTS):
             if self._way_rad[joint] < _LEAST_WAY_RAD:
                 continue
@@ -269,7 +284,11 @@ class FirstMotion(EventSource):
         return ""
 
     def _judge_torque(self) -> str:
-        """Return the contradiction of a torque sensor to the commands, "" without one; close joints that agree."""
+        """Return the contradiction of a torque sensor to the commands, "" without one; close joints that agree.
+
+        A contradiction: both sensors measure the other joint's torque, or a ratio is surely outside the tolerance of
+        `safety.first_motion_error`.
+        """
         found = self._ratios()
         first, second = found
         if first is not None and second is not None and is_of_other(first) and is_of_other(second):
@@ -290,7 +309,10 @@ class FirstMotion(EventSource):
         return ""
 
     def _close(self, joint: int, ratio: "TorqueRatio") -> None:
-        """Stop judging a joint that agrees with the configuration; warn if its torque ratio is off."""
+        """Stop judging a joint that agrees with the configuration; add an event with its torque ratio.
+
+        The event is a warning if the ratio is more than _WARNED away from 1.
+        """
         self._open.remove(joint)
         is_off = abs(ratio.own - 1.0) > _WARNED
         text = (
@@ -347,7 +369,7 @@ class _Block(NamedTuple):
 
 
 class _Blocks:
-    """Collects consecutive cycles into blocks."""
+    """Forms the means over blocks of consecutive cycles, each `span_s` long."""
 
     def __init__(self, span_s: float, period_s: float) -> None:
         self._period_s = period_s
@@ -383,7 +405,7 @@ class _Blocks:
 def is_of_other(ratio: TorqueRatio) -> bool:
     """Return whether the sensor measures the other joint's torque instead of its own; False while a ratio is uncertain.
 
-    Uncertain: a standard deviation of 2 _SURE or more.
+    Instead: |own| < 0.4 and |other| > 0.6. Uncertain: a standard deviation of 2 _SURE or more.
     """
     is_known = max(ratio.own_std, ratio.other_std) < 2.0 * _SURE
     return is_known and abs(ratio.own) < 0.4 and abs(ratio.other) > 0.6

@@ -72,7 +72,7 @@ class CertificateRecord:
         self.known(HistorySettings())
 
     def known(self, settings: HistorySettings) -> HistorySettings:
-        """Return the settings with this record as the last certificate. Raises ValueError if values are missing."""
+        """Return section `history` of the settings with this record's values. Raises ValueError if some are missing."""
         return dataclasses.replace(
             settings,
             date_utc=self.date_utc,
@@ -91,7 +91,10 @@ class CertificateRecord:
 
 @dataclass(frozen=True)
 class History:
-    """The certificates of one arm, the oldest first."""
+    """The certificates of one arm, the oldest first.
+
+    Raises ValueError when made without certificates, or with a wrong date or digest.
+    """
 
     format: int = setting(low=HISTORY_FORMAT, high=HISTORY_FORMAT, meaning="version of this file's layout")
     devices: tuple[DeviceRecord, ...] = setting(meaning="drives and sensors of the arm")
@@ -126,7 +129,7 @@ def _digest(text: str) -> str:
 
 
 def _difference(devices: Sequence[DeviceRecord], identities: Sequence[Identity], path: Path) -> str:
-    """Return the first found device that a history doesn't have, as text; "" if it has all.
+    """Return the first found device that a history doesn't have, or has as another one, as text; "" if none.
 
     devices: of the history in `path`. identities: of the devices found.
     """
@@ -141,7 +144,10 @@ def _difference(devices: Sequence[DeviceRecord], identities: Sequence[Identity],
 
 
 def read_history(path: Path) -> History:
-    """Return the history of a file. Raises ConfigError if it is missing, invalid, or its digests are wrong."""
+    """Return the history of a file.
+
+    Raises ConfigError if it is missing, invalid, or its digests are wrong; OSError if it can't be read.
+    """
     if not path.exists():
         raise ConfigError(f"history {path} does not exist; `adacd-hil run --history` makes one")
     return _parse(path, read_input(path))
@@ -189,7 +195,10 @@ class UsedHistory:
         return dataclasses.replace(settings, history=dataclasses.replace(known, offset_std_Nm=std_Nm))
 
     def check_devices(self, identities: Sequence[Identity]) -> list[Event]:
-        """Compare the devices with the history's; return a summary as event. Raises DeviceError if they differ."""
+        """Compare the devices with the history's; return [event] with a summary, a warning in a first run.
+
+        Raises DeviceError if they differ.
+        """
         if self.history is None:
             return [Event("warning", "history", self.warnings[0])]
         if difference := _difference(self.history.devices, identities, self.path):
@@ -212,9 +221,11 @@ class UsedHistory:
     def add_certificates(
         self, certificates: Sequence[Certificate], identities: Sequence[Identity], origin: "Origin"
     ) -> str:
-        """Append certificates of a run to the history file, in one step; return a summary. Raises OSError, ConfigError.
+        """Append certificates of a run to the history file, in one step; return a summary.
 
-        Read the file again first, so that certificates of another run are kept; identities: of the devices found.
+        Read the file again first, so that certificates of another run are kept; make one if there is none. identities:
+        of the devices found. Raises ConfigError for an invalid file or one of another arm, OSError if it can't be read
+        or written.
         """
         devices, records = tuple(DeviceRecord(*identity) for identity in identities), []
         if self.path.exists():
@@ -243,7 +254,11 @@ class Origin(NamedTuple):
 
 
 def use_history(path: Path, now_ns: int) -> UsedHistory:
-    """Read the arm's history for a run; a missing file is a first run. Raises ConfigError if it can't be used."""
+    """Read the arm's history for a run; a missing file is a first run. now_ns: wall clock.
+
+    Raises ConfigError for an invalid file, a link to a missing one, and a certificate over 6 minutes in the future;
+    OSError if the file can't be read.
+    """
     if (link := dangling_link(path)) is not None:  # the history was moved: the arm is known, not on its first run
         raise ConfigError(f"history {path}: link {link} leads to {link.readlink()}, which is not there")
     if not path.exists():

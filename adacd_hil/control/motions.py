@@ -16,7 +16,10 @@ from adacd_hil.settings.configuration import Settings
 def corner_to_corner(
     elapsed_s: float, amplitude: Vector, half_period_s: Vector, q: Vector, dq: Vector, ddq: Vector
 ) -> None:
-    """Fill q, dq, ddq (2,) of the endless motion between -amplitude and +amplitude; each joint has a half period."""
+    """Fill q, dq, ddq (2,) of the endless motion between -amplitude and +amplitude, by quintics from rest to rest.
+
+    It begins at -amplitude. half_period_s (2,): of one way, by joint. amplitude (2,): rad.
+    """
     for i in range(JOINTS):
         index = np.floor(elapsed_s / half_period_s[i])
         direction = 1.0 if index % 2.0 == 0.0 else -1.0
@@ -37,7 +40,10 @@ class QuinticMove:
     def __init__(
         self, start: Vector, end: Vector, speed_rad_s: Vector, acceleration_rad_s2: Vector, shortest_s: float
     ) -> None:
-        """Plan the move. start, end (2,): positions. speed, acceleration (2,): limits. shortest_s: least duration."""
+        """Plan the move; `duration_s` is the least that keeps all limits, and at least shortest_s.
+
+        start, end (2,): positions. speed, acceleration (2,): limits.
+        """
         self._start, self._end, self._travel = start.copy(), end.copy(), end - start
         distance = np.abs(self._travel)
         by_speed_s = QUINTIC_PEAK_SPEED * distance / speed_rad_s
@@ -103,7 +109,7 @@ class Pace:
         self.lag_s += (1.0 - self.share) * self._period_s
 
     def _phase_step(self, dq: Vector, ddq: Vector) -> float:
-        """Return the part of the present change of pace by which one period may advance it, within the limits."""
+        """Return by how much this period may advance the present change of pace, 1 in all, within the limits."""
         step, x = self._period_s / CHANGE_S, self._phase
         steepest = min(max(x, 0.5), x + step)  # where d(share)/dx is largest in this period
         slope = abs(self._to - self._from) * 6.0 * steepest * (1.0 - steepest)
@@ -134,7 +140,10 @@ class Excitation:
         self.is_on = bool(period_s and self._rad_s.size)
 
     def peaks_deg(self) -> tuple[Vector, Vector, Vector]:
-        """Return the largest |q|, |dq| and |ddq|, (2,) each, of 1000 points of a period, in deg, deg/s and deg/s²."""
+        """Return the largest |q|, |dq| and |ddq|, (2,) each, of 1000 points of a period, in deg, deg/s and deg/s².
+
+        Call it only if `is_on`.
+        """
         motion = np.zeros((1000, 3, JOINTS))
         for row, elapsed_s in zip(motion, np.linspace(0.0, 2.0 * np.pi / self._rad_s[0], len(motion)), strict=True):
             self.evaluate(float(elapsed_s), *row)
@@ -168,7 +177,10 @@ class Admittance:
         self._bound = (settings.arm.position_limit_rad - np.radians(wish.position_margin_deg)).tolist()
 
     def step(self, tau_ext_hat: Vector, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
-        """Advance q_d, dq_d, ddq_d (2,) in place by one period under the external torque, Nm."""
+        """Advance q_d, dq_d, ddq_d (2,) in place by one period under the external torque (2,), Nm.
+
+        Torque within the dead band counts as 0. The limits of the settings hold for each joint.
+        """
         for i in range(JOINTS):
             speed, tau = float(dq_d[i]), float(tau_ext_hat[i])
             push = math.copysign(max(abs(tau) - self._deadband[i], 0.0), tau)
@@ -189,7 +201,10 @@ TOLERANCE = 1e-3
 
 
 def motion_problems(settings: Settings) -> list[str]:
-    """Return a line for each of the arm's limits that trajectory or excitation exceeds; empty if none."""
+    """Return a line for each limit that trajectory or excitation exceeds by more than 0.1 %; empty if none.
+
+    Limits: the arm's positions and velocities, and the reaction's accelerations.
+    """
     arm, trajectory = settings.arm, settings.trajectory
     travel = 2.0 * np.array(trajectory.amplitude_deg)
     half_period_s = np.array(trajectory.half_period_s)

@@ -53,7 +53,10 @@ class ScriptedOperator:
         return FaultAnswer.RECOVER
 
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
-        """Return the script's next request if it is due, or ACKNOWLEDGE a given time after a stop, else NONE."""
+        """Return the script's next request if it is due, or ACKNOWLEDGE a given time after a stop, else NONE.
+
+        NONE before the drives are enabled, and in FAULT.
+        """
         if elapsed_s is None or state is SchemeState.FAULT:
             return Request.NONE
         if self._script and elapsed_s >= self._script[0].at_s:
@@ -61,7 +64,10 @@ class ScriptedOperator:
         return self._acknowledge(elapsed_s, state)
 
     def _acknowledge(self, elapsed_s: float, state: SchemeState) -> Request:
-        """Return ACKNOWLEDGE each time that the arm has been stopped for the settings' time, else NONE."""
+        """Return ACKNOWLEDGE each time that the arm has been STOPPED for `acknowledge_after_s`, else NONE.
+
+        0 s: never.
+        """
         if state is not SchemeState.STOPPED:
             self._stopped_since_s = None
             return Request.NONE
@@ -106,7 +112,7 @@ class RunNarration:
         self._enabled_ns: int | None = None
 
     def event(self, t_ns: int, text: str) -> None:
-        """Print a text with the time since the drives were enabled. t_ns: of its cycle."""
+        """Print a text after the time since the drives were enabled, blank before. t_ns: of its cycle."""
         since = "" if self._enabled_ns is None else f"{(t_ns - self._enabled_ns) * 1e-9:.2f} s"
         self._progress(f"{since:>9}  {text}")
 

@@ -110,7 +110,7 @@ class Reference(EventSource):
 
     @property
     def is_floating(self) -> bool:
-        """Return whether the arm yields to a push, reaction FLOAT, without a desired motion."""
+        """Return whether the arm yields to a push, by FLOAT: its desired motion is then the measured position."""
         return self._state in REACTING and self._reaction is Reaction.FLOAT
 
     def park(self) -> None:
@@ -120,7 +120,7 @@ class Reference(EventSource):
             self._approach()
 
     def is_parked(self, cycle: int) -> bool:
-        """Return whether the arm has settled in the corner after `park`; True, too, while it is stopped anywhere."""
+        """Return whether the arm has settled in the corner after `park`, or has been STOPPED, anywhere, after it."""
         if not self._is_parking or self._state is SchemeState.REACT:
             return False
         if self._state is SchemeState.STOPPED:
@@ -129,7 +129,10 @@ class Reference(EventSource):
         return self._arrival_cycle is not None and cycle >= self._arrival_cycle + settle_cycles
 
     def step(self, arm: ArmState, output: SchemeOutput) -> None:
-        """Fill `q_d`, `dq_d`, `ddq_d` for this cycle; leave them as they are while the feedback is old."""
+        """Fill `q_d`, `dq_d`, `ddq_d` for this cycle; leave them as they are while positions are older than OLD_CYCLES.
+
+        A new state or reaction begins its motion in any case.
+        """
         if output.state is not output.previous_state:
             self._enter(output, arm)
         elif self._waits(arm):
@@ -162,7 +165,10 @@ class Reference(EventSource):
         return False
 
     def _begin_anew(self, arm: ArmState) -> None:
-        """Brake from the measured motion, then continue with the motion of the state."""
+        """Set the desired motion to the measured one; with a path, brake from there, then go to the corner.
+
+        While the arm reacts or is stopped, only brake.
+        """
         self._q_d[:], self._dq_d[:], self._ddq_d[:] = arm.q, arm.dq, 0.0
         if self._path is None:
             return
@@ -171,9 +177,9 @@ class Reference(EventSource):
             self._approach()
 
     def _is_yielding(self, arm: ArmState, output: SchemeOutput) -> bool:
-        """Fill the desired motion of FLOAT and ADMITTANCE; return False for other reactions, which follow a path.
+        """Fill the desired motion of FLOAT or ADMITTANCE and return True; return False for reactions along a path.
 
-        If a blow has just thrown the arm, restart the reaction from the measured motion.
+        If a blow has just thrown the arm, restart the reaction, of any kind but FLOAT, from the measured motion.
         """
         if self._reaction is Reaction.FLOAT:
             self._stay(arm)
@@ -193,7 +199,10 @@ class Reference(EventSource):
         self._ddq_d[:] = 0.0
 
     def _advance(self, cycle: int) -> None:
-        """Fill the desired motion of the path, at the present pace."""
+        """Fill the desired motion of the path, at the present pace, after a change to the next path if one is due.
+
+        Advance the pace by a period.
+        """
         self._follow_on(cycle)
         path, pace, motion = self._path, self._pace, (self._q_d, self._dq_d, self._ddq_d)
         assert path is not None
@@ -224,7 +233,12 @@ class Reference(EventSource):
         self._start_cycle, self._arrival_cycle = self._arrival_cycle, None
 
     def _enter(self, output: SchemeOutput, arm: ArmState) -> None:
-        """Begin the motion of a new state: the reaction, braking, the way to the corner, or none; else go on."""
+        """Begin the motion of a new state.
+
+        REACT: the reaction. STOPPED: brake, if the reaction kept the path. ADAPT, CERTIFY, MONITOR: go on with the
+        path, or go to the corner if the arm was on none or changes from excitation to trajectory. PAYLOAD: go to the
+        corner. Other states: no path. While parking, go on in all states with power, unless from a reaction.
+        """
         state, previous = output.state, self._state
         self._state = state
         self._beyond.clear()
@@ -250,7 +264,10 @@ class Reference(EventSource):
             self._path, self._arrival_cycle, self._is_stopping = None, None, False
 
     def _react(self, output: SchemeOutput, arm: ArmState) -> None:
-        """Begin the reaction to a contact: brake, withdraw, or yield; NONE and SLOW_DOWN keep the path."""
+        """Begin the reaction to a contact: STOP brakes, WITHDRAW takes a new path, FLOAT and ADMITTANCE have none.
+
+        NONE and SLOW_DOWN keep the path. Store contact and external torque, by which `_is_thrown` judges.
+        """
         self._reaction = output.reaction
         self._contact_cycle = arm.cycle
         if self._reaction in _ON_PATH:
@@ -268,7 +285,7 @@ class Reference(EventSource):
             self._warn_beyond(self._stop_from(self._q_d, self._dq_d))
 
     def _is_thrown(self, arm: ArmState, tau_ext_hat: Vector) -> bool:
-        """Return whether an ending blow has made the arm faster than planned, away from the contact.
+        """Return whether an ending blow has made a joint faster than planned by THROWN_rad_s, away from the contact.
 
         During the push the controller resists. False while the arm learns, because an adaptation that restarts forgets
         a push that continues.
@@ -328,7 +345,10 @@ class Reference(EventSource):
             self._is_stopping = True
 
     def _go(self, cycle: int) -> None:
-        """Start the way from rest to the corner."""
+        """Start the way from rest at the desired position to the corner; store the cycle of arrival.
+
+        It takes SHORTEST_APPROACH_S or longer; a period or longer if the arm is in the corner already.
+        """
         shortest_s = SHORTEST_APPROACH_S
         if float(np.max(np.abs(self._corner - self._q_d))) < AT_CORNER_RAD:
             shortest_s = self._period_s

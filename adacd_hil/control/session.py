@@ -38,7 +38,7 @@ from adacd_hil.wire.codec import Codec
 
 @dataclass(frozen=True)
 class SessionSummary:
-    """Result of a session. `error`: empty, or the one line that ended the run early.
+    """Result of a session. `result`: of the last attempt, None if an error ended it; `error`: its line, or "".
 
     `has_started`: whether the devices were set to Operational, so that the arm may have moved. `reached`: cycles and
     state of the last attempt, however it ended. `recoveries`: number of acknowledged faults after which the run started
@@ -87,7 +87,7 @@ class Attempt(NamedTuple):
 
 
 class Ending(NamedTuple):
-    """End of an attempt. `error`: empty, or the one line that ended it."""
+    """End of an attempt: by itself with a `result`, or by an `error`, in one line; is_bus_failed: by a BusError."""
 
     result: RunResult | None
     error: str
@@ -103,6 +103,7 @@ class Ending(NamedTuple):
 class Session:
     """One run on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time.
 
+    `out`: folder of the log. `metadata`: further entries of the log. `files`: of the arm, checked against the devices.
     `viewer_files`: attached to the log and written beside it, by name. `on_started` is called when the devices are set
     to Operational for the first time. `touched_ns`: see `RunNarration`.
     """
@@ -240,7 +241,7 @@ class Session:
         return ending
 
     def _boot(self, master: Master, recorder: Recorder, tap: Tap) -> None:
-        """Reset and identify the devices, compare them with the files, and configure them. Raises DeviceError."""
+        """Reset and identify the devices, compare them with `files`, configure them. Raises DeviceError, BusError."""
         master.reset()
         self._identities = identities = tuple(master.identify())
         for identity in identities:
@@ -252,7 +253,10 @@ class Session:
         recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _run(self, cycle: Cycle, master: Master, recorder: Recorder, tap: Tap) -> RunResult:
-        """Set the devices to Operational, run the cycles, and stop the devices in any case; return the result."""
+        """Set the devices to Operational, run the cycles, and stop the devices in any case; return the result.
+
+        Raises BusError as `Cycle.run`.
+        """
         if not self._has_started:
             self._has_started = True
             self.on_started()
@@ -264,7 +268,7 @@ class Session:
                 self._stop(master, recorder, tap)
 
     def _stop(self, master: Master, recorder: Recorder, tap: Tap) -> None:
-        """Stop the devices by NMT, as far as the bus still carries it."""
+        """Stop the devices by NMT, and log the frames until then; log a BusError instead of raising it."""
         try:
             master.stop()
         except BusError as error:
@@ -272,7 +276,10 @@ class Session:
         recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
-        """Create the log with its attachments and metadata, and the files beside it; return its recorder."""
+        """Create the log with its attachments and metadata, and the files beside it; return its recorder.
+
+        Raises as `run` for the log.
+        """
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
         attachments = device_attachments(self.devices)
@@ -299,7 +306,10 @@ class Session:
         return recorder
 
     def _write_beside(self, recorder: Recorder) -> None:
-        """Write the viewers' files and the contract beside the log; the log contains them, too."""
+        """Write the viewers' files and the contract beside the log, which contains them, too.
+
+        A file that can't be written is reported and left out.
+        """
         writes: list[Callable[[], object]] = [
             partial(write_new_file, self.out / name, content) for name, content in self.viewer_files.items()
         ]
@@ -352,7 +362,7 @@ def write_contract(codec: Codec, folder: Path) -> Path:
 
 
 def git_commit() -> str:
-    """Return the commit of the source tree, empty if installed without one."""
+    """Return the commit of the source tree as `git describe` names it, `-dirty` for changed files; "" without one."""
     try:
         done = subprocess.run(
             ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],

@@ -111,7 +111,7 @@ class Tare:
 
 
 def read_tare(path: Path) -> Tare:
-    """Return the tare of a file. Raises ConfigError if it is missing or invalid."""
+    """Return the tare of a file. Raises ConfigError if it is missing, no TOML, or has an invalid key or value."""
     if not path.exists():
         raise ConfigError(f"tare {path} does not exist; `adacd-hil tare` makes one")
     table = read_toml(path, "tare")
@@ -122,7 +122,7 @@ def read_tare(path: Path) -> Tare:
 
 
 def write_tare(tare: Tare, path: Path) -> Path | None:
-    """Write a tare file in one step; copy the old one to `.1` and return the copy's path, or None. Raises OSError.
+    """Write a tare file in one step; copy an old one to `.1` and return the copy's path, else None. Raises OSError.
 
     At each moment the path holds a whole file.
     """
@@ -137,7 +137,7 @@ def write_tare(tare: Tare, path: Path) -> Path | None:
 
 
 def sensor_identities(identities: Sequence[Identity]) -> tuple[Identity, ...]:
-    """Return the torque sensors among the devices found at boot, in joint order."""
+    """Return the torque sensors among the devices found at boot, in joint order. Raises KeyError if one is missing."""
     found = {identity.name: identity for identity in identities}
     return tuple(found[f"Sensor{joint}"] for joint in range(1, JOINTS + 1))
 
@@ -160,7 +160,10 @@ class UsedTare:
         return dataclasses.replace(settings, arm=arm)
 
     def offset_std_Nm(self, drift: TareSettings) -> tuple[float, float]:
-        """Return the standard deviation of the offsets now, Nm: measured, plus drift since the tare."""
+        """Return the standard deviation of each offset now, Nm, at least SMALLEST_STD_NM.
+
+        It adds the tare's standard error, half the poses' spread, and the drift since.
+        """
         drifted = drift.drift_variance(self.age_s)
         first, second = (
             math.sqrt(error**2 + (spread / 2.0) ** 2 + drifted)

@@ -83,7 +83,7 @@ class AnswerClock:
         return newest if self._follows_lost_ones(newest - answered, offset_ns, position_error) else answered + 1
 
     def _is_newer(self, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
-        """Return whether a second frame without counter on one SYNC answers it, and the first one was late."""
+        """Return whether a second frame after one SYNC, without counter, answers it, so that the first one was late."""
         if not self._is_usual(offset_ns):
             return False
         return position_error is None or position_error(1) <= position_error(-1) + CLEAR_RAD
@@ -93,7 +93,10 @@ class AnswerClock:
         return not self._usual_count or offset_ns <= self._latest_ns + TOLERANCE_NS
 
     def _follows_lost_ones(self, owed: int, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
-        """Return whether a frame without counter answers the last SYNC: answers to earlier SYNCs were lost."""
+        """Return whether a frame without counter answers the last SYNC, so that answers to earlier SYNCs were lost.
+
+        `owed`: number of SYNCs since the last answered one. By the position if that decides, else by the time.
+        """
         advantage_rad = 0.0 if position_error is None else position_error(1) - position_error(owed)
         if abs(advantage_rad) > CLEAR_RAD:
             return advantage_rad > 0.0
@@ -146,9 +149,9 @@ class AnswerClock:
 
 
 def newest_sample(clocks: Sequence[AnswerClock], last: int, after: int) -> tuple[int, list[tuple[float, ...]]] | None:
-    """Return the newest SYNC that all devices have answered, and the values of each device; None without one.
+    """Return the ordinal of the newest SYNC that all devices have answered, and each device's values; None without one.
 
-    Only SYNCs after `after` and up to `last` count, of these the last KEPT.
+    Only the SYNCs with ordinals after `after` and up to `last` are considered, of these the last KEPT.
     """
     for ordinal in range(last, max(after, last - KEPT), -1):
         values = [found for clock in clocks if (found := clock.values_of(ordinal)) is not None]

@@ -38,7 +38,7 @@ class Arm:
     """Both joints on one bus. Per cycle: `synchronise`, `accept` each frame, `state`, `send_command`."""
 
     def __init__(self, settings: Settings, codec: Codec, devices: Sequence[PlacedDevice], bus: Bus) -> None:
-        """Take the devices in the order of `device_files`. Raises CodecError when the contract lacks a signal."""
+        """`devices`: Drive1, Drive2, Sensor1, Sensor2. Raises CodecError when the contract lacks a frame or signal."""
         period_s = settings.bus.period_s
         self.drives = tuple(_make_drive(settings, codec, device) for device in devices[:JOINTS])
         self.sensors = tuple(_make_sensor(codec, device, period_s) for device in devices[JOINTS:])
@@ -96,9 +96,10 @@ class Arm:
         return self._cycle
 
     def synchronise(self, cycle: int, t_ns: int, periods: int) -> None:
-        """Begin a cycle: every device samples on this SYNC, every drive takes its last command. Raises BusError.
+        """Begin a cycle: send SYNC, unless another host sends it, then the pipelined commands of `send_command`.
 
-        SYNC is sent here, unless another host sends it; pipelined commands leave behind it.
+        Before, count a miss of each device whose frame the ending cycle lacks. `cycle`, `t_ns`: of this SYNC.
+        `periods`: since the SYNC before. Raises BusError.
         """
         if self._cycle >= 0:
             if not self.has_all_frames:
@@ -131,16 +132,17 @@ class Arm:
                 device.miss()
 
     def _remember_gaps(self) -> None:
-        """Shift the cycle that ends now into each device's bits of `gaps`."""
+        """Shift each device's `gaps`; store in bit 0 whether the ending cycle had no usable frame of it."""
         for place, gaps in enumerate(self.gaps):
             self.gaps[place] = (gaps << 1 | ~self.received >> place & 1) & REMEMBERED_GAPS
         self._has_gaps = any(self.gaps)
 
     def accept(self, frame: Frame, is_late: bool = False) -> bool:
-        """Take one frame; return True for a cyclic or status frame, and for one that only this host may send.
+        """Take a frame; return True for a cyclic or status frame of the arm, and for one that only this host may send.
 
-        All others return False, EMCY, heartbeats and SDO answers of the arm included. A frame that fails a check is
-        ignored. `is_late`: it arrived before SYNC, so it answers an earlier one.
+        A cyclic or status frame that fails a check is True, too, but its values are not used. All others are False:
+        EMCY, whose code is kept, heartbeats, SDO answers, error frames. `is_late`: the frame arrived before SYNC, so it
+        answers an earlier one.
         """
         if frame.is_error:
             return False
@@ -157,11 +159,14 @@ class Arm:
 
     @property
     def open_answers(self) -> int:
-        """Number of cyclic frames that this cycle lacks, at least 1."""
+        """Number of cyclic frames that have not come in this cycle; 1 if all have come."""
         return max(len(self.devices) - self._seen.bit_count(), 1)
 
     def _answer(self, frame: Frame, place: int, newest: int) -> None:
-        """Take a cyclic frame for the SYNC that it answers; `newest`: the last one before it came."""
+        """Take a cyclic frame of device `place` as the answer to a SYNC, or refuse it if it answers none.
+
+        `newest`: ordinal of the last SYNC before the frame; -1: none was sent, and the frame is ignored.
+        """
         if newest < 0:
             return  # no SYNC was sent yet
         device, clock, data = self.devices[place], self._clocks[place], frame.data
@@ -192,22 +197,28 @@ class Arm:
             clock.set_answered(ordinal, newest, offset_ns, device.is_protected)
 
     def _find(self, place: int, newest: int, offset_ns: int, step: int | None, data: bytes) -> int | None:
-        """Return the ordinal of the SYNC that a frame answers, None without one; a drive's motion helps to decide."""
+        """Return the ordinal of the SYNC that a frame answers; None if all SYNCs up to `newest` are answered already.
+
+        `newest`, `offset_ns`, `step`: as of `AnswerClock.find`.
+        """
         if place >= JOINTS:
             return self._clocks[place].find(newest, offset_ns, step)
         error = partial(self.drives[place].position_error, data)
         return self._clocks[place].find(newest, offset_ns, step, error, self._soonest_ns(place))
 
     def _soonest_ns(self, place: int) -> int:
-        """Return how soon after SYNC a device can answer, ns: the least of its own and of those still awaited."""
+        """Return the least usual time from SYNC to an answer, ns, of this device and all whose frame is missing yet.
+
+        0 while one of these times is unknown.
+        """
         places = (bit for bit in range(len(self._clocks)) if bit == place or not self._seen >> bit & 1)
         return min(self._clocks[bit].earliest_ns for bit in places)
 
     def _refuse(self, frame: Frame, place: int, step: int | None, is_second: bool) -> None:
-        """Judge a frame that answers no SYNC; its values are not used.
+        """Count a frame that answers no SYNC as a repeat or a failed check, or report it; its values are not used.
 
-        A repeated frame or a counter that stands still carries no new value. A different frame that passes its check
-        and follows the answer to the same SYNC (`is_second`) comes from another sender, unless it is a straggler.
+        It is a repeat if it equals the last frame or has its counter (`step` 0). It is reported as another sender's if
+        the newest SYNC is answered already (`is_second`), the frame differs, passes its checks, and is no straggler.
         """
         device, data = self.devices[place], frame.data
         is_right = len(data) == device.cyclic_length and device.end_to_end.is_signed(data)
@@ -221,9 +232,9 @@ class Arm:
                 self.strangers.report_second_frame(frame, device.name, self._cycle)
 
     def _hear_emergency(self, frame: Frame) -> None:
-        """Keep the error code of a device's EMCY, unless it is tolerated, until the device resets its errors.
+        """Keep the error code of a device's EMCY, unless `safety.tolerated_emergencies` has it; ignore other frames.
 
-        Source: CiA 301, clause 7.2.7.
+        An EMCY with code 0x00xx, error reset, deletes the device's code. Source: CiA 301, clause 7.2.7.
         """
         device = self._emergency_ids.get(frame.can_id)
         if device is None or len(frame.data) != _EMERGENCY_BYTES:
@@ -250,9 +261,10 @@ class Arm:
         return [name for bit, name in enumerate(names) if not self.received & (1 << bit)]
 
     def state(self) -> ArmState:
-        """Return the state of this cycle; call it once per cycle, since a sample is new in one state only.
+        """Return the state of this cycle. Call it once per cycle, since it stores that the sample is used.
 
-        Its values are of the newest complete sample after the last one used, else the newest of each device.
+        Its values are those of the newest SYNC that all devices have answered, if no state had them yet. Else they are
+        the newest of each device, and `is_complete` is False.
         """
         cycle = self._cycle
         if self.received == _COMPLETE:
@@ -266,7 +278,11 @@ class Arm:
         )
 
     def _state_of(self, ordinal: int | None, values: Sequence[tuple[float, ...]], sampled: Sequence[int]) -> ArmState:
-        """Make the state of values sampled in given cycles; `ordinal`: of the SYNC of a complete sample."""
+        """Return the state from each device's values and the cycle of their sample, both in the order of `devices`.
+
+        `ordinal`: of the SYNC that all devices have answered, whose sample now counts as used; None: the sample is
+        incomplete.
+        """
         (q1, dq1), (q2, dq2), (tau1,), (tau2,) = values
         sign1, sign2 = self.sign
         zero1, zero2 = self.zero_rad
@@ -302,7 +318,11 @@ class Arm:
         )
 
     def _device_fault(self, is_enabled: bool) -> FaultReason:
-        """Return the arm's first fault: a drive that dropped out, a device's own, EMCY, another sender; else NONE."""
+        """Return the arm's first fault, NONE without one, and store whether the drives have been enabled.
+
+        In order: DRIVE if the drives are no longer enabled; a sensor's or drive's own fault; DRIVE or SENSOR for a kept
+        EMCY; FOREIGN_FRAMES for another sender.
+        """
         has_dropped_out = self.was_enabled and not is_enabled
         self.was_enabled |= is_enabled
         if has_dropped_out:
@@ -327,7 +347,7 @@ class Arm:
             self._bus.send_all(self._encode(*values))
 
     def _encode(self, tau_c: list[float], enable: bool, quick_stop: bool) -> tuple[tuple[int, bytes], ...]:
-        """Return identifier and data of both commands; each call advances their alive counters."""
+        """Return (identifier, data) of both drives' commands for `tau_c`, Nm; each call advances the alive counters."""
         (drive1, drive2), (ratio1, ratio2), (tau1, tau2) = self.drives, self._permille_per_Nm, tau_c
         return (
             (drive1.command_id, drive1.command(round(tau1 * ratio1), enable, quick_stop)),
@@ -335,7 +355,7 @@ class Arm:
         )
 
     def frame_checks(self) -> FrameChecks:
-        """Return the counts of the checks of all cyclic frames so far."""
+        """Return each device's counts so far: of end-to-end statuses, missing frames too, and frames not plausible."""
         return FrameChecks(
             self._cycle,
             tuple(tuple(device.end_to_end.counts) for device in self.devices),

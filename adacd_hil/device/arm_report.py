@@ -49,7 +49,7 @@ class DataShares:
 
 
 class DataWatch(EventSource):
-    """Counts missing and late data over one attempt, and reports shares that exceed their limit."""
+    """Counts missing and late data over one attempt; reports shares of a second that exceed their limit as events."""
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
         super().__init__()
@@ -71,7 +71,7 @@ class DataWatch(EventSource):
         self._has_rows = False
 
     def count_cycle(self, state: ArmState) -> None:
-        """Count a cycle's missing frames, and the cycle if it has no sample; judge the window if it is full.
+        """Count a cycle and its missing frames and sample; after each second, compare the shares with their limits.
 
         Call it once per cycle, after the cycle's last frame. A cycle without enabled drives is not counted.
         """
@@ -93,7 +93,7 @@ class DataWatch(EventSource):
             self._end_window()
 
     def _note_row(self) -> None:
-        """Count MOST_IN_A_ROW cycles without a sample; warn once, again only after a window without such a row."""
+        """Count a gap of MOST_IN_A_ROW cycles; warn of the first one, and of one after a window without any."""
         self._rows += 1
         if not self._has_rows:
             self._has_rows = True
@@ -101,7 +101,10 @@ class DataWatch(EventSource):
             self.events.append(Event("warning", "data", text))
 
     def _end_window(self) -> None:
-        """Judge the cycles of a window; report shares that now exceed their limit, and those that are back below."""
+        """Add an event for each share of the window that now exceeds its limit, or no longer does.
+
+        Add the window's counts to the totals, and begin the next window.
+        """
         repeats = [now - before for now, before in zip(self._arm.repeats, self._repeats_before, strict=True)]
         for name, count in zip(self._limits, [self._incomplete, *self._missing, *repeats], strict=True):
             share, limit = count / self._cycles, self._limits[name]
@@ -124,7 +127,10 @@ class DataWatch(EventSource):
         self._missing = [0] * len(self._names)
 
     def finish_shares(self) -> DataShares:
-        """End a last window that is long enough; return the shares of missing and late data over ended windows."""
+        """Return the shares of missing and late data over all ended windows; 0 if no window has ended.
+
+        The present window is ended first if it has at least SHORTEST_DATA_WINDOW of a whole one's cycles.
+        """
         if self._cycles >= SHORTEST_DATA_WINDOW * self._window_cycles:
             self._end_window()
         cycles = max(self._all_cycles, 1)
@@ -215,7 +221,7 @@ def describe_disabled(arm: Arm) -> list[str]:
 
 
 def describe_excess(arm: Arm) -> list[str]:
-    """Return a line per limit of the arm that a joint exceeds, with the joint's value; empty without an excess."""
+    """Return a line per position or velocity limit that a joint exceeds, with its value; empty without an excess."""
     lines = []
     for joint, (drive, sign) in enumerate(zip(arm.drives, arm.sign, strict=True)):
         position, velocity = drive.values

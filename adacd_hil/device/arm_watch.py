@@ -99,9 +99,9 @@ class ArmWatch:
         self._looks = Recurrence(_LOOKS * settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Return the arm's state of this cycle, with a fault or `is_late` set if a device or the host has failed.
+        """Return the arm's state with fault HEARTBEAT if a device's heartbeat fails; else as `DeadlineWatch.judge`.
 
-        Update `lost` when a look at the heartbeats is due. A fault that is set already stays.
+        A fault that is set already stays. `lost` is updated ten times in a heartbeat period.
         """
         if self._looks.take_turn(arm.cycle):
             self.lost = self._watch(arm.t_ns)
@@ -143,7 +143,7 @@ class HeartbeatWatch:
         self._since_ns: int | None = None
 
     def start(self) -> None:
-        """Expect OPERATIONAL from now on; forget earlier heartbeats."""
+        """Expect OPERATIONAL from now on; forget earlier failures, and count silence from the next `judge_nodes` on."""
         self._is_watching = True
         self._since_ns = None
         for node in self._nodes.values():
@@ -156,7 +156,7 @@ class HeartbeatWatch:
         self._is_watching = False
 
     def accept(self, frame: Frame) -> None:
-        """Take a heartbeat; ignore other frames."""
+        """Store the state and time of a watched node's heartbeat; ignore other frames."""
         node = self._nodes.get(frame.can_id)
         if node is None or frame.is_error or len(frame.data) != 1:
             return
@@ -217,7 +217,7 @@ class HeartbeatWatch:
 def watch_heartbeats(
     devices: Iterable[PlacedDevice], period_ms: int, report: Callable[[Event], None]
 ) -> HeartbeatWatch:
-    """Return a watch over the heartbeats of the devices whose EDS lets the host set their period."""
+    """Return a watch, not yet started, over the heartbeats of the devices whose EDS lets the host set their period."""
     return HeartbeatWatch(
         [(device.name, device.node_id) for device in devices if device.is_heartbeat_known], period_ms, report
     )
@@ -237,7 +237,10 @@ class DeadlineWatch:
         self._verdict = ""
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Count a cycle's misses; return its state, marked late or faulted if the host has missed too many periods."""
+        """Count a cycle's misses; return its state, changed if the host has missed `realtime.misses` periods or more.
+
+        Then `is_late` is set if `realtime.on_misses` is hold; else the fault is DEADLINE, unless there is another.
+        """
         misses = self._misses
         if arm.periods > 1:
             misses.append((arm.cycle, arm.periods - 1))
@@ -252,5 +255,5 @@ class DeadlineWatch:
         return arm._replace(fault=FaultReason.DEADLINE) if arm.fault is FaultReason.NONE else arm
 
     def describe_misses(self) -> str:
-        """Return the number of misses of the last verdict in words; empty without one."""
+        """Return in words how many periods were missed when they last were too many; "" if they never were."""
         return self._verdict

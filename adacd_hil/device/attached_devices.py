@@ -8,7 +8,10 @@ from adacd_hil.settings.toml_text import to_toml
 
 
 def device_attachments(devices: Iterable[PlacedDevice]) -> dict[str, bytes]:
-    """Return each device's profile, `Drive1.toml`, and the EDS that it names."""
+    """Return the content of each device's profile, by a name such as `Drive1.toml`, and of its EDS, by its file name.
+
+    If two devices have different EDS files of one name, the second gets another name, which its profile then names.
+    """
     attachments: dict[str, bytes] = {}
     for device in devices:
         eds = device.profile.eds_bytes
@@ -19,6 +22,6 @@ def device_attachments(devices: Iterable[PlacedDevice]) -> dict[str, bytes]:
 
 
 def _free_name(device: PlacedDevice, eds: bytes, attachments: Mapping[str, bytes]) -> str:
-    """Return the name of a device's EDS, or one of its own if another EDS has it."""
+    """Return the name of a device's EDS, after the device's name if `attachments` has another EDS of that name."""
     name = device.profile.eds.name
     return name if attachments.get(name, eds) == eds else f"{device.name}-{name}"

@@ -71,9 +71,9 @@ _SILENT = (
 
 
 class EdsVariable(NamedTuple):
-    """One object of an EDS. bits: its size in a PDO, 0 without a fixed size. is_writable: over SDO.
+    """One object of an EDS. bits: its size in a PDO, 0 if it is no number. default: None without an integer one.
 
-    is_mappable: whether a PDO may carry it.
+    is_writable: over SDO. is_mappable: whether a PDO may carry it.
     """
 
     name: str
@@ -86,7 +86,7 @@ class EdsVariable(NamedTuple):
 
 
 def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
-    """Return an object of an object dictionary; None when it isn't listed."""
+    """Return an object of canopen's object dictionary `objects`; None if index or sub-index isn't listed."""
     entry = objects.get(index)
     if entry is None:
         return None
@@ -139,10 +139,10 @@ class CanopenBus:
         answer_s: float = ANSWER_TIMEOUT_S,
         pause_s: float = 0.0,
     ) -> Any:
-        """Add a node with the objects of `read_eds`; return canopen's object of the node.
+        """Add a node; return canopen's object of it. `objects`: of `read_eds`; None: `node.sdo.upload` is its only SDO.
 
-        With None it has no objects, and SDO goes by index through `node.sdo.upload`. `answer_s`: longest wait for an
-        answer. `pause_s`: wait before each request, for a device that loses a request soon after its answer.
+        `on_emergency`: called with each EMCY of the node. `answer_s`: longest wait for an SDO answer. `pause_s`: wait
+        before each request, for a device that loses a request soon after its answer.
         """
         node = canopen.RemoteNode(node_id, canopen.ObjectDictionary() if objects is None else objects)  # type: ignore[no-untyped-call]
         self._network.add_node(node)
@@ -157,7 +157,10 @@ class CanopenBus:
         self._bus.send(NMT_ID, bytes((nmt_command, node_id)))
 
     def _send(self, can_id: int, data: bytes) -> None:
-        """Send a frame for canopen; after an SDO request, read the bus until its answer is in or overdue."""
+        """Send a frame for canopen; after an SDO request, read the bus until its answer is in or overdue.
+
+        Before a request, wait for the node's pause. Raises BusError.
+        """
         is_request = can_id & 0x780 == SDO_REQUEST_ID and data[0] != SDO_ABORT
         answer_s, pause_s = self._patience.get(can_id & 0x7F, (ANSWER_TIMEOUT_S, 0.0))
         if is_request and pause_s:
@@ -167,7 +170,7 @@ class CanopenBus:
             self.pump(lambda frame: frame.can_id == can_id - 0x80, answer_s)
 
     def pump(self, is_answer: Callable[[Frame], bool], timeout_s: float) -> bool:
-        """Read the bus until an answer is in; return whether it came.
+        """Read the bus until a frame is the answer; return whether it came. Each frame goes to canopen and `bystander`.
 
         False after a silence of `timeout_s`, `timeout_s` after the first of other frames, or after 10,000 of them.
         Raises BusError.
@@ -189,7 +192,10 @@ class CanopenBus:
         return False
 
     def accept(self, frame: Frame) -> None:
-        """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY. Drop and count unreadable frames."""
+        """Give canopen an SDO answer, heartbeat or EMCY; ignore error frames.
+
+        A frame that doesn't fit its service is dropped, and counted in `malformed_frames`.
+        """
         if frame.is_error:
             return
         try:
@@ -202,7 +208,7 @@ class CanopenBus:
 def as_device_error(name: str, node_id: int, what: str, answer_s: float = ANSWER_TIMEOUT_S) -> Iterator[None]:
     """Turn exceptions of canopen into a DeviceError of one line, an abort into RefusedError.
 
-    BusError and DeviceError pass.
+    BusError and DeviceError pass. The request, `what`, is in words. `answer_s`: the wait that a missing answer names.
     """
     try:
         yield
@@ -217,7 +223,10 @@ def as_device_error(name: str, node_id: int, what: str, answer_s: float = ANSWER
 
 
 def read_object(node: Any, index: int, subindex: int = 0) -> bytes | None:
-    """Read an object as the node sends it; None when the node has no such object. Raises DeviceError, BusError."""
+    """Return an object's bytes as the node sends them; None if the node answers that it has no such object.
+
+    Raises DeviceError if the node refuses or doesn't answer, and BusError.
+    """
     with as_device_error("node", node.id, f"object 0x{index:04X}:{subindex}"):
         try:
             return bytes(node.sdo.upload(index, subindex))
@@ -229,7 +238,7 @@ def read_object(node: Any, index: int, subindex: int = 0) -> bytes | None:
 
 @functools.cache
 def _emergency_names() -> dict[str, dict[int, str]]:
-    """Return the names of error codes, by code, and of their classes, by high byte."""
+    """Return the names of error codes by code (`codes`), and those of their classes by the high byte (`classes`)."""
     text = resources.files("adacd_hil.device").joinpath("emergency_codes.toml").read_text(encoding="utf-8")
     return {kind: {int(key, 16): name for key, name in names.items()} for kind, names in tomllib.loads(text).items()}
 
@@ -248,7 +257,7 @@ WATCHDOGS = {
 
 
 def name_error(code: int) -> str:
-    """Return the name of an error code: of its class if it isn't listed, "unknown" without a class."""
+    """Return the name of an EMCY error code; that of its class if the code isn't listed; "unknown" without a class."""
     names = _emergency_names()
     codes, classes = names["codes"], names["classes"]
     return codes.get(code) or classes.get(code >> 8) or classes.get((code >> 8) & 0xF0, "unknown")

@@ -56,7 +56,8 @@ class _DbcSignal(NamedTuple):
 class _DbcMessage:
     """One message of a composed DBC; its signals follow each other without gaps.
 
-    period_ms, delay_ms: GenMsgCycleTime, GenMsgDelayTime. values: names of values, by signal.
+    trigger: one of `_TRIGGERS`. period_ms, delay_ms: GenMsgCycleTime, GenMsgDelayTime. protection: end-to-end profile,
+    "" for none. data_ids: hexadecimal. values: names of values, by signal.
     """
 
     can_id: int
@@ -93,7 +94,7 @@ def load_contract(settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
     """Return the codec of the configured devices: from the DBC that `devices.contract` names, or composed.
 
     The DBC's node ids are moved as a whole to the configured ones. Raises ConfigError for an unknown contract, and for
-    a profile that can't be used or differs from the DBC; CodecError for a DBC that can't serve.
+    a profile that can't be used or differs from the DBC; CodecError for a DBC that can't be read, used or moved.
     """
     composed = compose(settings, devices)
     name = settings.devices.contract
@@ -105,7 +106,10 @@ def load_contract(settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
 
 
 def compose(settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
-    """Return the contract composed from the profiles of these devices. Raises ConfigError, CodecError."""
+    """Return the codec of a contract that is composed from the profiles of these devices.
+
+    Raises ConfigError for profiles that give no contract, such as two frames with one identifier, and CodecError.
+    """
     text = _write_dbc(settings, _messages(settings, devices))
     return parse_codec(text.encode(), Path(COMPOSED_NAME))
 
@@ -113,7 +117,7 @@ def compose(settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
 def find_contract(name: str) -> Path:
     """Return the file of the DBC that a name (`arm`) or a path stands for; a path with a suffix need not exist.
 
-    Raises ConfigError, with the nearest name if there is one.
+    Raises ConfigError for any other text, with the nearest name if there is one.
     """
     folder = contract_folder()
     if (folder / f"{name}.dbc").is_file():
@@ -128,9 +132,9 @@ def find_contract(name: str) -> Path:
 
 
 def _move(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
-    """Return a DBC with the host, and the devices if all lie equally far from its own, at the configured node ids.
+    """Return the contract with the host at its configured node id, and the devices if all move by the same number.
 
-    A DBC without the host's heartbeat is returned unchanged.
+    Otherwise the devices keep the DBC's node ids. A DBC without the host's heartbeat is returned unchanged.
     """
     offsets = {
         device.node_id - (codec.messages[name].can_id & NODE_MASK)
@@ -143,7 +147,10 @@ def _move(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> 
 
 
 def _compare(codec: Codec, composed: Codec, name: str) -> None:
-    """Raise ConfigError with the first message in which the DBC and the profiles differ."""
+    """Raise ConfigError, with the first differing message, unless the DBC has the layout of the composed contract.
+
+    `name`: of the DBC in the error.
+    """
     if codec.layout_digest == composed.layout_digest:
         return
     for message in composed.messages.values():
@@ -173,7 +180,10 @@ def _scales(message: MessageCodec) -> str:
 
 
 def _messages(settings: Settings, devices: Sequence[PlacedDevice]) -> list[_DbcMessage]:
-    """Return the messages of an arm, sorted by identifier. Raises ConfigError as `_pdo_message`, and for equal ones."""
+    """Return the messages of an arm, sorted by identifier.
+
+    Raises ConfigError as `_pdo_message`, and for two messages with the same identifier.
+    """
     names = tuple(device.name.upper() for device in devices)
     heartbeat_ms = settings.bus.heartbeat_ms
     nmt = (_DbcSignal("command", 8), _DbcSignal("node", 8))
@@ -220,7 +230,11 @@ def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], pe
 
 
 def _mapped(device: PlacedDevice, pdo: PdoSettings, name: ObjectName) -> EdsVariable:
-    """Return an object of a PDO. Raises ConfigError as `PlacedDevice.variable`, and if the EDS lets no PDO carry it."""
+    """Return an object of a PDO.
+
+    Raises ConfigError as `PlacedDevice.variable`, and if by the EDS no PDO may carry it, or the device receives it but
+    it is read-only.
+    """
     variable = device.variable(name)
     refused = "fits no PDO: PDOMapping=0" if not variable.is_mappable else ""
     if pdo.is_received and not variable.is_writable:
@@ -234,7 +248,11 @@ def _mapped(device: PlacedDevice, pdo: PdoSettings, name: ObjectName) -> EdsVari
 
 
 def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
-    """Return the message of a PDO. Raises ConfigError if its objects, header, bounds or length don't fit."""
+    """Return the message of a PDO.
+
+    Raises ConfigError if the EDS lacks the PDO or an object, the header has the wrong number of bits, a bound is
+    outside its value's range, or no CAN frame has the length.
+    """
     profile, name = device.settings, device.name.upper()
     for place in (ObjectName(pdo.communication_index, 1), ObjectName(pdo.mapping_index)):
         if not device.has(place.index, place.sub):
@@ -276,7 +294,7 @@ def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
 
 
 def _check_bounds(device: PlacedDevice, pdo: PdoSettings, signals: list[_DbcSignal]) -> None:
-    """Raise ConfigError for a bound that the value can't have, so that it never acts, or always."""
+    """Raise ConfigError for a bound outside the range of its value or difference: it would never act, or always."""
     found = {signal.name: signal for signal in signals}
     for signal in pdo.signals:
         low, high = found[signal.signal].limits

@@ -19,9 +19,9 @@ class CyclicDevice(ABC):
     """
 
     def __init__(self, codec: Codec, name: str, message: MessageCodec, main: str, period_s: float) -> None:
-        """Judge a frame of `message` without end-to-end header by its signal `main`.
+        """`message`: the cyclic frame. `main`: its signal that is checked for plausibility without end-to-end header.
 
-        Raises CodecError when the contract lacks a signal.
+        Raises CodecError when `message` lacks that signal.
         """
         self.name = name
         self.node_id = codec.node_id(message.name)
@@ -53,7 +53,7 @@ class CyclicDevice(ABC):
     def set_bounds(self, placed: PlacedDevice) -> None:
         """Take over the bounds of values and the period of the status from the device's profile.
 
-        The status may be 2.5 periods old. Raises CodecError when the contract lacks a signal.
+        The status may be 2.5 periods old. Raises CodecError when a frame lacks a bounded signal.
         """
         status, cyclic = placed.pdo("Status"), self._message.name.removeprefix(self.name)
         if status is not None and status.event_timer_ms:
@@ -63,7 +63,10 @@ class CyclicDevice(ABC):
         self.has_bounds = bool(self._cyclic_bounds or self._status_bounds)
 
     def accept_cyclic(self, data: bytes, cycle: int) -> bool:
-        """Take one cyclic frame of `cycle`; return False when a check fails: the frame is ignored."""
+        """Take one cyclic frame of `cycle`; return False for a wrong length or header, or no plausible main value.
+
+        Then the values in use stay. An unprotected frame is compared with the last one that came, usable or not.
+        """
         if len(data) != self.cyclic_length:
             self.implausible_frames += 1
             return False
@@ -83,7 +86,10 @@ class CyclicDevice(ABC):
         return True
 
     def accept_status(self, data: bytes, cycle: int) -> bool:
-        """Take one status frame of `cycle`; return False when its length or check is wrong: the frame is ignored."""
+        """Take one status frame of `cycle`; return False, and ignore it, if its length or end-to-end header is wrong.
+
+        False also for a device without a status frame.
+        """
         message, receiver = self.status_message, self._status_receiver
         if message is None or receiver is None or len(data) != message.length:
             return False
@@ -95,14 +101,14 @@ class CyclicDevice(ABC):
 
     @abstractmethod
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
-        """Return the device's fault in a cycle, NONE without one; `is_enabled`: whether all drives are."""
+        """Return the device's fault in a cycle, NONE without one; `is_enabled`: whether all drives are enabled."""
 
     def has_excess(self, cycle: int) -> bool:
-        """Return whether a bounded value is outside its bounds, or missing or old, in a cycle."""
+        """Return whether a bounded value is outside its bounds, or a status with bounded values missing or too old."""
         return self.has_bounds and (self._is_status_old(cycle) or any(self._excesses()))
 
     def describe_excess(self, cycle: int) -> list[str]:
-        """Return a line per bounded value that is outside its bounds, and one if such values are missing or old."""
+        """Return a line per bounded value outside its bounds, and one for a missing or old status with such values."""
         lines = self.describe_known_excess()
         if self._is_status_old(cycle):
             lines.append(f"{self.name}: no status for more than {self.status_age_limit:g} cycles")
@@ -116,7 +122,7 @@ class CyclicDevice(ABC):
         return bool(self._status_bounds) and cycle - self._status_came > self.status_age_limit
 
     def _excesses(self) -> Iterator[tuple[ValueBound, Sequence[float]]]:
-        """Yield the bounds that the newest values exceed, with these values."""
+        """Yield (bound, values of its frame) for each bound that the newest values exceed, if any came."""
         for bounds, values in (
             (self._cyclic_bounds, self._cyclic_values),
             (self._status_bounds, self._status_values),
@@ -127,15 +133,15 @@ class CyclicDevice(ABC):
 
     @abstractmethod
     def _is_plausible(self, values: Sequence[float], last: float, cycles: int) -> bool:
-        """Return whether a frame may come so many cycles after one with the main value `last`."""
+        """Return whether a frame's main value can follow `last`, that of the frame before, after so many cycles."""
 
     @abstractmethod
     def _use(self, data: bytes, values: Sequence[float], cycle: int) -> None:
-        """Bring the values of a checked cyclic frame into use."""
+        """Store the values of a checked cyclic frame, and its cycle, as those in use."""
 
     @abstractmethod
     def _use_status(self, values: Sequence[float], cycle: int) -> None:
-        """Bring the values of a checked status frame into use."""
+        """Store the status of a checked status frame as the one in use."""
 
     def miss(self) -> None:
         """Note a cycle in which no cyclic frame came."""

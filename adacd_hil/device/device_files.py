@@ -53,7 +53,11 @@ def load_profile(name_or_file: str, kind: str) -> DeviceProfile:
 
 
 def _read_profile(path: Path, depth: int = 0) -> tuple[dict[str, Any], list[Path]]:
-    """Read a profile and those that it extends; return the merged table, and their folders, its own first."""
+    """Return the table of a profile, merged with those that it extends, and the folders of all, its own first.
+
+    `depth`: number of profiles that extend this one. Raises ConfigError for a file that can't be read, and for
+    `extends` that is no name or goes deeper than _MOST_EXTENDED.
+    """
     table = read_toml(path, "device profile")
     extended = table.pop("extends", None)
     if extended is None:
@@ -77,20 +81,24 @@ def _read_profile(path: Path, depth: int = 0) -> tuple[dict[str, Any], list[Path
 
 
 def _message(pdo: object) -> object:
-    """Return which frame a `pdo` of a table is, None where it doesn't say."""
+    """Return the `message` of an entry of `pdo`; None if the entry has none or is no table."""
     return pdo.get("message") if isinstance(pdo, dict) else None
 
 
 def place_devices(settings: Settings) -> list[PlacedDevice]:
-    """Return all devices with their profiles: Drive1, Drive2, Sensor1, Sensor2, in this order. Raises ConfigError."""
+    """Return all devices with their profiles: Drive1, Drive2, Sensor1, Sensor2, in this order.
+
+    Raises ConfigError as `load_profile`, and for an EDS that can't be parsed.
+    """
     names = {"drive": settings.devices.drive, "sensor": settings.devices.sensor}
     return _placed(settings, lambda kind, joint: load_profile(names[kind][joint], kind))
 
 
 def logged_devices(settings: Settings, attachments: Mapping[str, bytes]) -> list[PlacedDevice] | None:
-    """Return the devices of a run by the profiles and EDS files attached to its log, in the same order.
+    """Return the devices of a run by the profiles and EDS files attached to its log, in the order of `place_devices`.
 
-    None if an attachment is missing, or is of a version that wrote other keys. Raises ConfigError.
+    None if an attachment is missing, or a profile has keys of another version. Raises ConfigError for an EDS that can't
+    be parsed.
     """
     try:
         return _placed(settings, lambda kind, joint: _logged_profile(device_name(kind, joint), attachments))
@@ -109,7 +117,10 @@ def _logged_profile(name: str, attachments: Mapping[str, bytes]) -> DeviceProfil
 
 
 def _placed(settings: Settings, profile_of: Callable[[str, int], DeviceProfile]) -> list[PlacedDevice]:
-    """Return all devices in order; profile_of: returns the profile by kind and joint from 0. Raises ConfigError."""
+    """Return all devices in the order of `place_devices`; profile_of: returns the profile by kind and joint from 0.
+
+    Raises ConfigError for an EDS that can't be parsed.
+    """
     chosen = settings.devices
     devices = []
     for kind, nodes in (("drive", chosen.drive_node), ("sensor", chosen.sensor_node)):

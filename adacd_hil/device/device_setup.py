@@ -34,7 +34,7 @@ class Slave:
     """A device of the arm on the bus, as its master sees it."""
 
     def __init__(self, device: PlacedDevice, node: Any, wait: Callable[[float], object] = lambda _: None) -> None:
-        """`wait`: lets so many seconds pass on the bus."""
+        """`node`: canopen's object of it. `wait`: lets so many seconds pass on the bus."""
         self.wait = wait
         self.device = device
         self.name = device.name
@@ -59,19 +59,25 @@ class Slave:
         return None if variable is None else variable.default
 
     def read(self, index: int, sub: int = 0) -> int:
-        """Read an object and return its number. Raises DeviceError, BusError."""
+        """Read an object over SDO and return its number.
+
+        Raises DeviceError if the EDS doesn't list it, or the device refuses or doesn't answer; and BusError.
+        """
         with as_device_error(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self.answer_s):
             return int(self._entry(index, sub).raw)
 
     def write_object(self, index: int, sub: int, value: int) -> None:
-        """Write a number to an object, and note it in `known`. Raises DeviceError, BusError."""
+        """Write a number to an object over SDO, and note it in `known`. Raises as `read`."""
         what = f"writing {self.name_object(index, sub)} = {_number(value)}"
         with as_device_error(self.name, self.node_id, what, self.answer_s):
             self._entry(index, sub).raw = value
         self.known[index, sub] = value
 
     def write_checked(self, index: int, sub: int, value: int, unit: str = "") -> None:
-        """Write a number to an object and read it back. Raises DeviceError, also if the two differ, and BusError."""
+        """Write a number to an object as `write_object`, and read it back. `unit`: for the error's text.
+
+        Raises DeviceError if the two differ, or as `read`.
+        """
         self.write_object(index, sub, value)
         found = self.read(index, sub)
         if found != value:
@@ -81,9 +87,9 @@ class Slave:
             )
 
     def compare(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False) -> str:
-        """Return an object's difference from its expected value in words, "" if equal; note that value in `known`.
+        """Read an object; return its difference from `expected` in words, "" if equal. Note `expected` in `known`.
 
-        Raises DeviceError, BusError.
+        `quantity`, `unit`, `is_hex`: name, unit and form of the value in that text. Raises as `read`.
         """
         found = self.read(index, sub)
         self.known[index, sub] = expected
@@ -93,7 +99,7 @@ class Slave:
         return f"{quantity} {ObjectName(index, sub)} = {values[0]}, {values[1]} expected"
 
     def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", remedy: str = "") -> None:
-        """Compare an object with its expected value. Raises DeviceError, also for a difference, and BusError."""
+        """Raise DeviceError, with the remedy, if an object differs from its expected value; else as `compare`."""
         if text := self.compare(index, sub, expected, quantity, unit):
             self.fail(text, remedy)
 
@@ -140,7 +146,8 @@ _TORQUE_UNITS = {1.0: "Nm", 1e-3: "mNm", 1e-6: "µNm"}
 def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequence[PlacedDevice]) -> list[str]:
     """Check the drive, write limits, option codes and mode; return values that could not be checked, a line each.
 
-    `drives`: of all joints. Raises DeviceError.
+    `drives`: of all joints. Raises DeviceError for a drive without cyclic synchronous torque, another rated torque,
+    gear or unit than configured, or a value that it doesn't take; and BusError.
     """
     joint, profile = slave.device.joint, slave.device.settings
     if slave.has(0x6502):
@@ -171,7 +178,10 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequenc
 
 
 def _check_rated_torque(slave: Slave, settings: Settings, drives: Sequence[PlacedDevice]) -> None:
-    """Compare the motor's rated torque, behind its gear, with that of the joint. Raises DeviceError."""
+    """Raise DeviceError if 0x6076, brought to the joint, differs by more than 0.5 % from the configured rated torque.
+
+    `drives`: of all joints, so that the error can name exchanged drives.
+    """
     found = slave.read(0x6076)
     slave.known[0x6076, 0] = found
     scale, joint = slave.device.settings.scale, slave.device.joint
@@ -212,9 +222,9 @@ def torque_unit(scale: ScaleSettings) -> str:
 
 
 def _check_units(slave: Slave, codec: Codec) -> list[str]:
-    """Compare the units of the drive, as far as its EDS has the objects, with the contract's.
+    """Raise DeviceError if increments, velocity unit or gear in the drive differ from the contract's and the profile's.
 
-    Return units that could not be compared, a line each. Raises DeviceError.
+    Objects that its EDS lacks are not compared. Return a line for increments of a factory value, which confirm nothing.
     """
 
     def number(index: int, sub: int) -> int | None:
@@ -261,9 +271,10 @@ _MODE_POLL_S = 0.02
 
 
 def _enter_mode(slave: Slave, codec: Codec) -> None:
-    """Request cyclic synchronous torque. 0x6061 may show it later, once the drive is enabled: the cycle compares it.
+    """Request cyclic synchronous torque, if 0x6060 can be written; end a halt under which the drive refuses it.
 
-    If no frame shows the mode, 0x6061 must show it within `patience.mode_s`. Raises DeviceError.
+    0x6061 may show the mode later, once the drive is enabled: the cycle compares it. But if no frame carries it, 0x6061
+    must show it within `patience.mode_s`. Raises DeviceError if it doesn't, or as `Slave.read`; and BusError.
     """
     if not slave.can_write(0x6060):
         return
@@ -303,7 +314,8 @@ PREFIX_SHIFT = 24  # of 0x6131: power of ten, signed
 def check_sensor(slave: Slave, codec: Codec) -> str:
     """Compare unit and decimal digits with the contract; return the status as text, empty for 0 and without 0x6150.
 
-    Objects that the EDS doesn't list are not compared. Raises DeviceError.
+    Objects that the EDS doesn't list are not compared. Raises DeviceError for a unit other than Nm, with any power of
+    ten, or other decimal digits.
     """
     torque = codec.message(f"{slave.name}Torque")
     scale = torque.values[torque.place("torque")].scale
@@ -332,7 +344,7 @@ def check_sensor(slave: Slave, codec: Codec) -> str:
 
 
 def _channel(slave: Slave) -> int:
-    """Return the channel of a sensor: the sub-index of the torque that its profile maps, 1 if that is 0."""
+    """Return the channel of a sensor: the sub-index of the torque that its profile maps, 1 if that is 0 or missing."""
     pdo = slave.device.pdo("Torque")
     signals = () if pdo is None else pdo.signals
     return next((signal.name.sub for signal in signals if signal.signal == "torque"), 0) or 1
@@ -342,7 +354,7 @@ _UPLOAD = 0x40
 
 
 class _KnownObject(NamedTuple):
-    """An object of a device, and the value that it has had since the set-up."""
+    """An object of a device, and the value that it was given or had at the set-up."""
 
     slave: Slave
     place: tuple[int, int]
@@ -378,7 +390,7 @@ class ParameterWatch(RateLimitedEvents):
         """The first object whose value differs from the set-up, in one line; empty without a difference."""
 
     def follow(self, slaves: Iterable[Slave]) -> None:
-        """Read again, from now on, the values that the set-up of these devices has written or compared."""
+        """Make the objects that the set-up of these devices has written or compared those that `step` reads."""
         found = [[_KnownObject(slave, place, value) for place, value in slave.known.items()] for slave in slaves]
         # By turns, so that no device waits for all objects of another.
         longest = max(map(len, found), default=0)
@@ -389,7 +401,10 @@ class ParameterWatch(RateLimitedEvents):
         }
 
     def step(self, cycle: int, t_ns: int) -> None:
-        """Send the request for the next object when it is due; warn of one that was not answered. Raises BusError."""
+        """Send the request for the next object if it is due and none is open; warn of one that got no answer in time.
+
+        Sends none if `devices.reread_ms` is 0. Raises BusError.
+        """
         asked = self._asked
         if asked is not None and cycle - self._asked_cycle > round(asked.slave.answer_s / self._period_s):
             text = f"{asked.name} is not answered"
@@ -409,7 +424,10 @@ class ParameterWatch(RateLimitedEvents):
         self._bus.send(SDO_REQUEST_ID + chosen.slave.node_id, request)
 
     def accept(self, frame: Frame) -> bool:
-        """Take the answer to the open request and compare it; return False for any other frame."""
+        """Take the answer to the open request and compare it; return False for any other frame.
+
+        After an abort, warn, and don't read that object again.
+        """
         asked, data = self._asked, frame.data
         if asked is None or frame.can_id != SDO_RESPONSE_ID + asked.slave.node_id or len(data) != 8:
             return False
@@ -428,7 +446,7 @@ class ParameterWatch(RateLimitedEvents):
         return True
 
     def _compare(self, asked: _KnownObject, found: int, size: int) -> None:
-        """Store the first difference of an object of `size` bytes from its value at set-up in `first_difference`."""
+        """Store in `first_difference`, if it is empty, that an object of `size` bytes is no longer as it was set up."""
         expected = asked.expected & (1 << 8 * size) - 1
         if found != expected and not self.first_difference:
             self.first_difference = f"{asked.name} is 0x{found:X}, 0x{expected:X} was set up"
@@ -440,10 +458,11 @@ _RECORDS = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 
 
 def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
-    """Bring all PDOs of a device into the form of its profile; write those that differ, or all if it says `rewritten`.
+    """Write the PDOs of a device that differ from its profile, or all if the profile's `mapping` is `rewritten`.
 
-    PDOs that the profile doesn't name are switched off. Raises DeviceError. `command_deadline_ms`: event timer of the
-    command PDO where the profile has the deadline there.
+    PDOs that the profile doesn't name are switched off. `command_deadline_ms`: event timer of the command PDO if the
+    profile's `command_watchdog` is `0x1400:5`. Raises DeviceError if a PDO still differs, or as `Slave.read`; and
+    BusError.
     """
     profile = slave.device.settings
     timers = {pdo.message: _event_timer(slave, pdo, command_deadline_ms) for pdo in profile.pdo}
@@ -464,13 +483,16 @@ def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
 
 
 def _event_timer(slave: Slave, pdo: PdoSettings, command_deadline_ms: int) -> int:
-    """Return the event timer that a PDO shall have, ms: the command deadline where the profile has it there."""
+    """Return the event timer that a PDO shall have, ms: by its profile, or the command deadline.
+
+    The latter for the command PDO if `command_watchdog` is `0x1400:5`.
+    """
     has_deadline = pdo.is_received and slave.device.settings.command_watchdog == "0x1400:5"
     return command_deadline_ms if has_deadline else pdo.event_timer_ms
 
 
 def _switch_off_others(slave: Slave) -> None:
-    """Make the PDOs of a device invalid that its profile doesn't name."""
+    """Make the PDOs of a device invalid that its profile doesn't name, if their identifier can be written."""
     used = {pdo.communication_index for pdo in slave.device.settings.pdo}
     for index in _RECORDS:
         if index in used or not slave.can_write(index, _COB_ID):
@@ -483,7 +505,8 @@ def _switch_off_others(slave: Slave) -> None:
 def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
     """Write the objects of a PDO that can be written: invalid first, valid last.
 
-    The mapping is emptied and written only if it differs, always if `rewritten`, never if `fixed`.
+    The mapping is emptied and written only if it differs, always if `rewritten`, never if `fixed`. Raises DeviceError
+    also for an inhibit time, event timer or mapped object for which the EDS has no sub-index.
     """
     index, mapping_index = pdo.communication_index, pdo.mapping_index
     kept = slave.read(index, _COB_ID) & RTR_NOT_ALLOWED
@@ -519,9 +542,9 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
 
 
 def pdo_differences(slave: Slave, command_deadline_ms: int) -> list[str]:
-    """Read the PDOs of a device again; return how they differ from its profile, a line each. Raises DeviceError.
+    """Read the PDOs of a device; return the first difference of each from its profile, a line each; empty without any.
 
-    `command_deadline_ms`: as of `set_up_pdos`.
+    `command_deadline_ms`: as of `set_up_pdos`. Raises as `Slave.read`.
     """
     found = [
         (pdo, _difference(slave, pdo, _event_timer(slave, pdo, command_deadline_ms)))
@@ -531,7 +554,10 @@ def pdo_differences(slave: Slave, command_deadline_ms: int) -> list[str]:
 
 
 def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
-    """Return the first difference between a PDO and its profile in words; empty without one."""
+    """Read a PDO; return its first difference from the profile in words, "" without one.
+
+    Note the expected values in `known`.
+    """
     index = pdo.communication_index
     identifier = slave.read(index, _COB_ID)
     found, expected = identifier & ~RTR_NOT_ALLOWED, slave.device.can_id(pdo)
@@ -550,7 +576,7 @@ def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
 
 
 def _mapping_difference(slave: Slave, pdo: PdoSettings) -> str:
-    """Return the first difference between the mapping of a PDO and its profile in words; empty without one."""
+    """Read the mapping of a PDO; return its first difference from the profile in words, "" without one."""
     mapping_index, entries = pdo.mapping_index, slave.device.mapping(pdo)
     text = slave.compare(mapping_index, 0, len(entries), "number of mapped objects")
     for sub, entry in enumerate(entries, 1):

@@ -92,7 +92,10 @@ _NO_STATUS = _StatusPlaces()
 
 
 def option_codes(settings: Settings, profile: ProfileSettings) -> tuple[int | None, int | None]:
-    """Return 0x605A and 0x605E: the configuration's, else the profile's, None where neither gives one."""
+    """Return the values for 0x605A (quick stop) and 0x605E (fault reaction): the configuration's, else the profile's.
+
+    None for a value that neither gives.
+    """
     chosen = settings.devices
     quick_stop, fault_reaction = chosen.quick_stop_option, chosen.fault_reaction_option
     return (
@@ -171,7 +174,10 @@ class Drive(CyclicDevice):
         self.error_code = 0
 
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
-        """Return DATA_AGE for a status too old for an enabled drive, DRIVE for a bounded value outside, else NONE."""
+        """Return DATA_AGE if the drives are enabled (`is_enabled`) and the status is older than `status_age_limit`.
+
+        Else DRIVE as of `has_excess`, else NONE. The drive's own FAULT state and `error_code` don't count here.
+        """
         if is_enabled and cycle - self.status_cycle > self.status_age_limit:
             return FaultReason.DATA_AGE
         return FaultReason.DRIVE if self.has_excess(cycle) else FaultReason.NONE
@@ -200,9 +206,9 @@ class Drive(CyclicDevice):
         return bool(self.statusword & _INTERNAL_LIMIT)
 
     def position_error(self, data: bytes, periods: int) -> float:
-        """Return the error of a frame's position, rad, if so many periods lie between it and the last frame.
+        """Return by how much a frame's position misses the last frame's plus `periods` of travel at its velocity, rad.
 
-        The error has no sign. 0 before the first frame, for a protected drive, and for a frame of another length.
+        At least 0; 0 before the first frame, for a protected drive, and for a wrong length. The frame is not stored.
         """
         if self._received is None or len(data) != self.cyclic_length:
             return 0.0
@@ -228,7 +234,8 @@ class Drive(CyclicDevice):
         """Return the next command frame: one state nearer to Operation enabled if `enable`, else disable voltage.
 
         `quick_stop` has precedence over both. Torque is zero unless the drive is enabled in cyclic synchronous torque,
-        `enable` is set and `quick_stop` is not. Each call advances the frame's alive counter.
+        `enable` is set and `quick_stop` is not. Each call advances the frame's alive counter, and notes the torque in
+        `recent_permille`.
         """
         is_wanted = enable and not quick_stop
         controlword = self._next_controlword() if is_wanted else Controlword.DISABLE_VOLTAGE
@@ -243,7 +250,11 @@ class Drive(CyclicDevice):
         return self._sender.protect(self._command_message.encode_raw(*raw))
 
     def _next_controlword(self) -> Controlword:
-        """Return the next command on the way to Operation enabled."""
+        """Return the controlword that leads one state nearer to Operation enabled; disable voltage if there is none.
+
+        In FAULT, fault reset and disable voltage alternate; in QUICK_STOP_ACTIVE, quick stop as long as the drive must
+        brake.
+        """
         if self.state is Cia402State.OPERATION_ENABLED:  # nearly always
             return Controlword.ENABLE_OPERATION
         if self.state is Cia402State.FAULT:  # the edge counts, so low and high alternate
@@ -255,7 +266,10 @@ class Drive(CyclicDevice):
 
     @property
     def _is_quick_stopping(self) -> bool:
-        """Whether the drive, in QUICK_STOP_ACTIVE, must be left to brake: disable voltage would let it coast."""
+        """Whether the drive, in QUICK_STOP_ACTIVE, must be left to brake: disable voltage would let it coast.
+
+        False if 0x605A is unknown, and for an option from 5 on once the drive stands still.
+        """
         option = self._quick_stop_option
         if option is None:
             return False
@@ -273,7 +287,7 @@ def _status_places(message: MessageCodec) -> _StatusPlaces:
 def _command_template(message: MessageCodec, max_torque_permille: int) -> tuple[list[int], int, int]:
     """Return the raw values of a command with the constant ones filled in, and where controlword and torque are.
 
-    Raises CodecError for a signal that the host can't fill.
+    Raises CodecError for a signal that the host can't fill, or if one of these two is missing.
     """
     constants = {
         "controlword": 0,

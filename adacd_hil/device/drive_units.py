@@ -52,12 +52,12 @@ class DriveUnits(NamedTuple):
 
     @property
     def has_increments(self) -> bool:
-        """Whether the increments may be a joint's, and not the factory's 1 : 1."""
+        """Whether `increments_per_joint_rev` is known and at least LEAST_INCREMENTS: fewer are the factory's 1 : 1."""
         return (self.increments_per_joint_rev or 0.0) >= LEAST_INCREMENTS
 
 
 def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
-    """Return the units of a drive by its objects. `gear_ratio`: the gear of a drive without 0x6091."""
+    """Return the units of a drive by its objects. `number` reads them. `gear_ratio`: used if 0x6091 is missing or 0."""
     encoder, motor_revs = number(0x608F, 1), number(0x608F, 2)
     gear_in, gear_out = number(0x6091, 1), number(0x6091, 2)
     feed, shaft_revs = number(0x6092, 1), number(0x6092, 2)

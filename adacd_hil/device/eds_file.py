@@ -31,12 +31,12 @@ _EDS_NUMBER = re.compile(r"(?i:\s*(?:\$NODEID\s*\+?)?\s*[-+]?\s*(?:0x[0-9a-f]+|[
 
 
 def read_eds(path: Path, node_id: int | None) -> Any:
-    """Return the object dictionary of an EDS file, as `parse_eds`. Raises ConfigError."""
+    """Return the object dictionary of an EDS file, as `parse_eds`. Raises ConfigError, also if it can't be read."""
     return parse_eds(eds_bytes(path), path, node_id)
 
 
 def eds_bytes(path: Path) -> bytes:
-    """Return the content of an EDS file. Raises ConfigError."""
+    """Return the content of an EDS file. Raises ConfigError if it can't be read."""
     try:
         return read_input(path)
     except OSError as error:
@@ -44,10 +44,10 @@ def eds_bytes(path: Path) -> bytes:
 
 
 def parse_eds(data: bytes, path: Path, node_id: int | None) -> Any:
-    """Return the object dictionary of an EDS; `$NODEID` in it becomes `node_id`, None: that of a DCF.
+    """Return canopen's object dictionary of an EDS; `$NODEID` in it becomes `node_id`; None: the node id of a DCF.
 
-    canopen drops values that it can't read as a number. An object without a default is not compared. Of the same data
-    the same dictionary is returned: don't change it. `path`: names it in errors. Raises ConfigError.
+    Values that canopen can't read as a number are dropped. The same data give the same object: don't change it. `path`:
+    names the EDS in errors. Raises ConfigError for an EDS that can't be parsed, or as `_check_eds`.
     """
     try:
         return _parse(data, node_id)
@@ -68,9 +68,9 @@ def _parse(data: bytes, node_id: int | None) -> Any:
 
 
 def _check_eds(text: str) -> None:
-    """Refuse control characters, and integers of standard objects that can't be read as numbers.
+    """Raise ConfigError for control characters, and for values of standard integer objects that are no numbers.
 
-    Raises ConfigError, configparser.Error.
+    Raises configparser.Error for a text that is no INI file.
     """
     if found := _EDS_CONTROL.search(text):
         line = text.count("\n", 0, found.start()) + 1

@@ -79,7 +79,7 @@ class Master(EventSource):
         self._canopen.bystander = self._heartbeats.accept
 
     def _on_emergency(self, name: str, error: Any) -> None:
-        """Report an EMCY as an event, and keep it as the device's last error; forget that one after an error reset."""
+        """Add an event for an EMCY, and keep it as the device's last error; an error reset deletes that instead."""
         slave = next(slave for slave in self.slaves if slave.name == name)
         text = describe_emergency(error.code, bytes(error.data), slave.device.can("watchdog_in_emcy"))
         if error.code >> 8:
@@ -89,7 +89,7 @@ class Master(EventSource):
         self.events.append(Event("warning" if error.code >> 8 else "info", name, text))
 
     def accept(self, frame: Frame) -> None:
-        """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY."""
+        """Take a frame that is not cyclic: SDO answer, heartbeat, EMCY. Ignore error frames, count malformed ones."""
         if self.parameters.accept(frame):
             return
         self._heartbeats.accept(frame)
@@ -100,7 +100,7 @@ class Master(EventSource):
         self._canopen.pump(lambda _: False, duration_s)
 
     def describe_checks(self) -> list[str]:
-        """Return in one line how many frames fitted no CANopen service and were dropped; empty without such frames."""
+        """Return [line] with the number of frames that fitted no CANopen service and were dropped; [] without any."""
         count = self._canopen.malformed_frames
         return [f"{count} frames dropped that are not what their identifier says"] if count else []
 
@@ -109,7 +109,11 @@ class Master(EventSource):
         return [f"{name}: {text}" for name, text in self._emergencies.items()]
 
     def reset(self) -> None:
-        """Reset the communication of the arm's nodes and wait until each has booted. Raises DeviceError, BusError."""
+        """Reset the communication of the arm's nodes and wait until each has booted.
+
+        Drop frames from before, forget kept errors, and stop watching heartbeats. Raises DeviceError if a node doesn't
+        boot within `devices.boot_timeout_s`; and BusError.
+        """
         for _ in range(_MOST_OLD_FRAMES):  # from before the reset; a full queue has no room for new frames
             if self._bus.receive(0.0) is None:
                 break
@@ -129,11 +133,15 @@ class Master(EventSource):
             raise DeviceError(f"no boot-up from {missing} on {self._bus.channel} within {timeout_s:g} s", _UNPOWERED)
 
     def identify(self) -> list[Identity]:
-        """Return each device's identity, compared with EDS, profile and DBC. Raises DeviceError, BusError."""
+        """Return each device's identity. Raises DeviceError if one differs from EDS, profile or DBC; and BusError."""
         return [self._identify(slave) for slave in self.slaves]
 
     def _identify(self, slave: Slave) -> Identity:
-        """Return a device's identity. Raises DeviceError if it differs from DBC, EDS or profile, and BusError."""
+        """Return a device's identity, 0 for entries that the EDS lacks.
+
+        Raises DeviceError for another node id than the DBC's, another device than the EDS's, another serial number than
+        the profile's, and another contract in 0x2000, as far as the profile has these; and BusError.
+        """
         profile = slave.device.settings
         by_contract = self._codec.node_id(f"{slave.name}Heartbeat")
         if slave.node_id != by_contract:
@@ -156,7 +164,10 @@ class Master(EventSource):
 
     @staticmethod
     def _check_identity(slave: Slave, device_type: int, read: dict[int, int]) -> None:
-        """Compare type, vendor, product and revision with the EDS; accept any value that the EDS leaves open."""
+        """Raise DeviceError if type, vendor or product isn't the EDS's, or the revision is none that the EDS covers.
+
+        Accept any value that the EDS leaves open. read: 0x1018 by sub-index.
+        """
         kind, name = slave.device.settings.kind, slave.device.profile.name
         another = (
             f"another device has this node id, or profile {name} is of another: `adacd-hil scan` lists the nodes; "
@@ -191,7 +202,11 @@ class Master(EventSource):
             )
 
     def configure(self) -> None:
-        """Write communication and application parameters; read important ones back. Raises DeviceError, BusError."""
+        """Set up all devices over SDO: SYNC, heartbeats, EMCY, PDOs, drives and sensors, the profiles' `setup`.
+
+        Afterwards `parameters` watches the written values. Remarks become events. Raises DeviceError if a device
+        refuses a value or differs from its profile or the configuration; and BusError.
+        """
         for slave in self.slaves:
             self._set_up_sync(slave)
             self._set_up_heartbeats(slave)
@@ -209,7 +224,10 @@ class Master(EventSource):
         self.parameters.follow(self.slaves)
 
     def _set_up_sync(self, slave: Slave) -> None:
-        """Compare the identifier of SYNC; write its period, and its counter's overflow if the device counts."""
+        """Write SYNC's period, and the overflow of its counter if the device counts.
+
+        Raises DeviceError if the device has another identifier of SYNC or doesn't take the values; and BusError.
+        """
         if slave.has(0x1005):
             identifier = slave.read(0x1005) & MAX_STANDARD_ID
             if identifier != SYNC_ID:
@@ -241,9 +259,9 @@ class Master(EventSource):
             slave.write_checked(0x1015, 0, EMCY_INHIBIT_100US, "x 100 µs")
 
     def _set_up_heartbeats(self, slave: Slave) -> None:
-        """Write the period of the device's heartbeat, and its patience with the host's; warn if it can't be written.
+        """Write the period of the device's heartbeat; if the EDS doesn't allow that, warn that it isn't watched.
 
-        With `watch_host` False the device doesn't watch the host.
+        Write the device's patience with the host's heartbeat, if it has one; 0, never, if `watch_host` is False.
         """
         period_ms = self._settings.bus.heartbeat_ms
         if slave.device.is_heartbeat_known:
@@ -257,7 +275,10 @@ class Master(EventSource):
             slave.write_checked(0x1016, 1, entry if self._watch_host else 0)
 
     def start(self) -> None:
-        """Let all nodes exchange cyclic frames, the sensors first by default. Raises BusError."""
+        """Watch heartbeats, and send NMT start: to all nodes at once if `devices.start` is all, else sensors first.
+
+        Raises BusError.
+        """
         self._heartbeats.start()
         if self._settings.devices.start == "all":
             self._command(START)

@@ -51,7 +51,10 @@ class ObjectName:
 
 
 def parse_object(text: str) -> ObjectName:
-    """Return the object that a text like `0x9130:1` or `0x6064` names. Raises ValueError."""
+    """Return the object that a text like `0x9130:1` or `0x6064` names.
+
+    Raises ValueError for another form, and outside 0x0001 to 0xFFFF:255.
+    """
     index, _, sub = text.partition(":")
     try:
         name = ObjectName(int(index, 16), int(sub or "0"))
@@ -274,7 +277,10 @@ class ProfileSettings:
         self._check_assumed()
 
     def _check_frames(self) -> None:
-        """Raise ValueError for missing, doubled or misplaced frames or signals, and for feedback apart from SYNC."""
+        """Raise ValueError unless all needed frames and signals are there once, in the right frame.
+
+        Each PDO has its own number. Signals of one sample or command share a frame, and feedback comes on every SYNC.
+        """
         wanted = {"drive": ("Feedback", "Command"), "sensor": ("Torque",)}[self.kind]
         found = [pdo.message for pdo in self.pdo]
         if missing := [name for name in wanted if name not in found]:
@@ -306,7 +312,7 @@ class ProfileSettings:
                 raise ValueError(f"pdo {pdo.message}: transmission = {pdo.transmission} must be 1, on every SYNC")
 
     def _check_bounds(self, pdo: PdoSettings) -> None:
-        """Raise ValueError for bounds of values that the host doesn't get, or wouldn't miss, or can't compare."""
+        """Raise ValueError for bounds in a command or in a status without event timer, and for a wrong `of`."""
         signals = {signal.signal: signal for signal in pdo.signals}
         for name, signal in signals.items():
             place = f"pdo {pdo.message}: signal {name!r}"
@@ -326,7 +332,10 @@ class ProfileSettings:
                 raise ValueError(f"{place}: unit = {unit!r} must be that of {signal.of!r}, {other!r}")
 
     def _check_protection(self) -> None:
-        """Raise ValueError for a header or data ids that `protection` doesn't have."""
+        """Raise ValueError if the number of header objects or the data ids don't fit `protection`.
+
+        Also for a signal that has the name of a part of the header.
+        """
         profile = PROFILES_BY_CODE.get(self.protection)
         objects = 0 if profile is None else profile.objects
         if len(self.header) != objects:
@@ -344,7 +353,7 @@ class ProfileSettings:
                 raise ValueError(f"pdo {pdo.message}: signal {taken[0]!r} has the name of a part of the header")
 
     def _check_scale(self) -> None:
-        """Raise ValueError for a missing or impossible scale, and for serial numbers that are not two."""
+        """Raise ValueError for a missing scale, too few increments, and unless there are 0 or 2 serial numbers."""
         if self.kind == "drive" and not (self.scale.increments_per_joint_rev and self.scale.velocity_rad_s):
             raise ValueError("scale: a drive needs increments_per_joint_rev and velocity_rad_s")
         if self.kind == "drive" and self.scale.increments_per_joint_rev < LEAST_INCREMENTS:
@@ -368,7 +377,7 @@ class ProfileSettings:
                 raise ValueError(f"assumed: {key!r} is no key of a profile{hint}")
 
     def unit_of(self, signal: SignalSettings) -> tuple[float, str]:
-        """Return the worth of one count and the unit of a signal."""
+        """Return (value of one count, unit) of a signal: by `scale` for position, velocity and torque, else its own."""
         if self.kind == "drive" and signal.signal == "position":
             return 2.0 * math.pi / self.scale.increments_per_joint_rev, "rad"
         if self.kind == "drive" and signal.signal == "velocity":
@@ -383,7 +392,7 @@ def _is_hex(text: str, digits: int) -> bool:
 
 
 class DeviceProfile(NamedTuple):
-    """A device profile with its name, and its EDS: the file's place and content."""
+    """A device profile with its name, the file's without suffix, and its EDS: path and content."""
 
     name: str
     eds: Path
@@ -436,7 +445,7 @@ class PlacedDevice:
     def variable(self, name: ObjectName) -> EdsVariable:
         """Return an object of the EDS.
 
-        Raises ConfigError when it isn't listed, is a float, fits no PDO, or has another type than its standard says.
+        Raises ConfigError when it isn't listed, is a float or no number, or hasn't the type of STANDARD_TYPES.
         """
         found = find_variable(self.objects, name.index, name.sub)
         if found is None:
@@ -457,7 +466,7 @@ class PlacedDevice:
         return found
 
     def mapping(self, pdo: PdoSettings) -> list[int]:
-        """Return the mapping entries of a PDO, CiA 301 figure 70: index, sub-index, bits. Raises ConfigError."""
+        """Return the mapping entries of a PDO, CiA 301 figure 70: index, sub-index, bits. Raises as `variable`."""
         names = [signal.name for signal in self.header(pdo)] + [signal.name for signal in pdo.signals]
         return [name.index << 16 | name.sub << 8 | self.variable(name).bits for name in names]
 
@@ -473,9 +482,9 @@ def _type(bits: int, is_signed: bool) -> str:
 
 
 def enable_timeout_s(settings: Settings, devices: Sequence[PlacedDevice]) -> float:
-    """Return how long ENABLE may take, s: the configuration's value, else by the drives' profiles.
+    """Return how long ENABLE may take, s: `safety.enable_timeout_s` if it is set, else by the drives' profiles.
 
-    By the profiles: the larger `enable_s` + `mode_s`, but at least `safety.phase_timeout_s`.
+    By the profiles: the largest `enable_s` + `mode_s`, but at least `safety.phase_timeout_s`.
     """
     if settings.safety.enable_timeout_s is not None:
         return settings.safety.enable_timeout_s

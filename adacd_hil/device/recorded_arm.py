@@ -62,7 +62,7 @@ class RecordedArm:
         self._begin()
 
     def _begin(self) -> None:
-        """Make a new arm and heartbeat watch, as at the start of an attempt."""
+        """Make a new arm and heartbeat watch, as at the start of an attempt; frames are dropped until `_start`."""
         settings = self._settings
         self._arm = Arm(settings, self._codec, self._devices, EmbeddedBus(VirtualClock()))  # with nobody on it
         self._heartbeats = watch_heartbeats(self._devices, settings.bus.heartbeat_ms, lambda _: None)
@@ -87,9 +87,9 @@ class RecordedArm:
         return _batch_of(states)
 
     def _bounds(self, ticks: Ticks, frames: NDArray[Any]) -> tuple[list[int], list[int]]:
-        """Return where the frames of n cycles begin and end, from SYNC on.
+        """Return the indices in `frames` at which the frames of each of n cycles begin, and those at which they end.
 
-        If SYNC was logged before a cycle's frames, the range begins with the first of these.
+        A cycle's frames begin with its SYNC; if SYNC was logged with the cycle before, with the first of its own.
         """
         cycle_t_ns, is_tx = frames["cycle_t_ns"], frames["is_tx"]
         is_sync = (frames["can_id"] == self._arm.sync_id) & (is_tx != self._is_following) & ~frames["is_error"]
@@ -101,7 +101,10 @@ class RecordedArm:
         return np.minimum(begin, end).tolist(), end.tolist()
 
     def _exchange(self, cycle: int, t_ns: int, periods: int, passed: _Passed) -> ArmState:
-        """Do to a cycle's frames as Exchange.read did, and judge the state as the cycle did."""
+        """Begin a cycle, take its received frames, and return its state with the faults of `ArmWatch`.
+
+        A frame stamped before SYNC counts as late. If no NMT start was logged before, the run counts as started.
+        """
         if not self._is_running:  # a log whose beginning was cut off
             self._start()
         arm = self._arm
@@ -112,7 +115,7 @@ class RecordedArm:
         return self._watch.judge(arm.state())
 
     def _pass(self, passed: _Passed) -> None:
-        """Take frames that passed before a SYNC, and the host's NMT commands among them."""
+        """Take received frames that passed between a cycle's end and the next SYNC, and follow sent NMT commands."""
         for is_sent, frame in passed:
             if not is_sent:
                 self._accept(frame)
@@ -120,7 +123,7 @@ class RecordedArm:
                 self._command(frame.data[0])
 
     def _command(self, nmt_command: int) -> None:
-        """Follow the host's NMT commands; the host sends them only at the beginning of an attempt and after its end."""
+        """Begin anew at an NMT reset of a running arm; start an arm that doesn't run at NMT start; else do nothing."""
         if nmt_command == RESET_COMMUNICATION and self._is_running:
             self._begin()
         elif nmt_command == START and not self._is_running:
@@ -157,7 +160,7 @@ _PAIRS = ("q", "dq", "tau_J", "age_q", "age_tau_J")
 
 
 def _batch_of(states: list[ArmState]) -> ArmBatch:
-    """Return the states of n cycles as columns."""
+    """Return the states of n cycles as columns, with the shapes and types of ArmBatch; n may be 0."""
     columns = list(zip(*states, strict=True)) if states else [()] * len(ArmBatch._fields)
     return ArmBatch(
         *(

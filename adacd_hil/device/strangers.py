@@ -38,7 +38,7 @@ _READING = (2, 3, 5)
 
 
 def host_frames(settings: Settings, codec: Codec, devices: Iterable[PlacedDevice]) -> dict[int, str]:
-    """Return, by identifier of each frame that only this host sends, a description of another sender's action."""
+    """Return, by identifier of each frame that only this host may send, words for another sender's action."""
     doing = {
         codec.message(HOST_HEARTBEAT).can_id: "sends this host's heartbeat",
         NMT_ID: "sends NMT commands",

@@ -69,7 +69,7 @@ class TorqueSensor(CyclicDevice):
         self._heard_bits = 0  # of the last status frame
 
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:  # noqa: ARG002 (as of all devices)
-        """Return SENSOR for a torque that isn't valid or a bounded value outside; NONE without a fault."""
+        """Return SENSOR if the status has NOT_VALID, or as of `has_excess`; else NONE, also for an overload."""
         if self.status not in USABLE or self.has_excess(cycle):
             return FaultReason.SENSOR
         return FaultReason.NONE

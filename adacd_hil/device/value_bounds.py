@@ -12,7 +12,7 @@ from adacd_hil.wire.codec import MessageCodec
 
 
 class ValueBound(NamedTuple):
-    """The bounds of one value: its places among a message's values, and `low` and `high` in `unit`."""
+    """The bounds of one value: its place among a message's values, `low` and `high` in `unit`, its name as text."""
 
     text: str
     unit: str
@@ -38,7 +38,10 @@ class ValueBound(NamedTuple):
 
 
 def value_bounds(pdo: PdoSettings | None, message: MessageCodec | None) -> tuple[ValueBound, ...]:
-    """Return the bounds that a profile sets to values of a frame; empty without such a frame. Raises CodecError."""
+    """Return the bounds that a profile sets to values of a frame; empty if `pdo` or `message` is None.
+
+    Raises CodecError when the message lacks a bounded signal.
+    """
     if pdo is None or message is None:
         return ()
     return tuple(

@@ -19,7 +19,7 @@ Values = NDArray[np.int64] | NDArray[np.float64]
 
 
 def percentiles(values: Values) -> dict[str, float]:
-    """Return p50, p99, p99.9 and max of values that occurred (no interpolation); empty without values."""
+    """Return p50, p99, p99.9 and max by these names, each a value that occurred (no interpolation); {} without any."""
     if values.size == 0:
         return {}
     found = np.percentile(values, PERCENTILES, method="higher")
@@ -27,7 +27,10 @@ def percentiles(values: Values) -> dict[str, float]:
 
 
 def low_percentiles(values: Values) -> dict[str, float]:
-    """Return p50, p1, p0.1 and min of values that occurred, for values that must not be small; empty without values."""
+    """Return p50, p1, p0.1 and min by these names, each a value that occurred; {} without any.
+
+    For values that must not be small.
+    """
     mirrored = percentiles(-values)
     return {name: -value for name, value in zip(LOW_PERCENTILE_NAMES, mirrored.values(), strict=False)}
 
@@ -61,7 +64,10 @@ class Distribution:
         self._range = (np.inf, -np.inf)
 
     def add_values(self, values: Values) -> None:
-        """Add values (k,) to the distribution; nan is left out."""
+        """Add values (k,) to the distribution; nan is left out.
+
+        Beyond the limit of exact values, all are counted in bins from now on.
+        """
         new = np.asarray(values, dtype=np.float64)
         new = new[~np.isnan(new)]
         if new.size == 0:
@@ -78,7 +84,7 @@ class Distribution:
                 self._sort_in(part)
 
     def _sort_in(self, values: NDArray[np.float64]) -> None:
-        """Count values (k,), without NaN, in their bins."""
+        """Count values (k,), without NaN, in their bins; make the bins at the first call."""
         size = np.minimum(np.abs(values), _HIGH)
         place = np.maximum(_code(size) - _FIRST + 1, 0)
         place = np.where(values < 0.0, -place, place)
@@ -89,14 +95,14 @@ class Distribution:
         self._bins[_SIDE + low : _SIDE + low + counts.size] += counts
 
     def percentiles(self) -> dict[str, float]:
-        """Return p50, p99, p99.9 and max; empty without a value."""
+        """Return p50, p99, p99.9 and max by these names; {} without a value."""
         if self._bins is None:
             return percentiles(self._values())
         ranks = [int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
         return dict(zip(PERCENTILE_NAMES, map(self._at, ranks), strict=True))
 
     def low_percentiles(self) -> dict[str, float]:
-        """Return p50, p1, p0.1 and min, for values that must not be small; empty without a value."""
+        """Return p50, p1, p0.1 and min by these names, for values that must not be small; {} without a value."""
         if self._bins is None:
             return low_percentiles(self._values())
         ranks = [self.count - 1 - int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
@@ -116,7 +122,10 @@ class Distribution:
         return self._kept[0]
 
     def _at(self, rank: int) -> float:
-        """Return the value of a rank from 0: the end of its bin that is nearer to 0."""
+        """Return the value of a rank from 0 in ascending order: the end of its bin that is nearer to 0.
+
+        The first and the last are exact. Call it only if the values are in bins.
+        """
         if rank in (0, self.count - 1):
             return self._range[rank != 0]
         assert self._bins is not None

@@ -58,8 +58,8 @@ _HELD: Final = 30_000
 class TruthTable(NamedTuple):
     """The truth in an emulator's log: kept rows on the emulator's own cycles, and its metadata.
 
-    problem: missing parts; is_complete: it is whole and no record was dropped on the way to it. span: None if the
-    emulator never cycled.
+    problem: missing parts, or ""; is_complete: it is whole and no record was dropped on the way to it. span: attempt
+    and cycle of the first and of the last record; None if the emulator never cycled.
     """
 
     rows: Truth
@@ -79,9 +79,9 @@ _MODEL: Final = ("payload", "theta")
 
 
 def read_truth(path: Path) -> TruthTable:
-    """Read the emulator's log: the cycles of contacts and the one after each, payload and parameters.
+    """Return the truth in the emulator's log: the cycles of contacts and the one after each, payload and parameters.
 
-    Raises LogError.
+    Of a long contact some cycles are left out, see the module. Raises LogError for a file that is no log.
     """
     stream = LogStream(path, (TRUTH.name,))
     rows = _TruthRows()
@@ -180,7 +180,7 @@ class _TruthRows:
             self._keep(middle[extreme_rows(series, np.arange(0, len(middle), _BUCKET))])
 
     def table(self, stream: LogStream) -> TruthTable:
-        """Return the kept rows as a truth, at the end of the log."""
+        """Return the kept rows as a truth, with metadata and problem of `stream`; call it once, at the log's end."""
         self._thin()
         rows = np.concatenate([np.zeros(0, _ROW), *self._kept, self._waiting])
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 1)), np.zeros((0, len(PARAMETER_NAMES)))
@@ -231,7 +231,7 @@ def foreign_truth(log: Path, truth: Path) -> str:
 
 
 def config_digest(config: str) -> str:
-    """Return the digest by which a truth names its host's configuration. Raises ConfigError.
+    """Return the digest by which a truth names its host's configuration. Raises ConfigError for a text that is no TOML.
 
     The digest leaves out `realtime`, which a session sets to the host's abilities, and `safety.enable_timeout_s`, which
     it sets by the devices' profiles.
@@ -251,7 +251,7 @@ def _digest(config: bytes) -> str | None:
 
 
 def _played(truth: Path) -> dict[str, str]:
-    """Return scenario and seed of a truth by name; old ones have them in an attachment alone."""
+    """Return the metadata of a truth; of an old one, scenario and seed from its attached scenario, if it has that."""
     said = run_metadata(truth)
     try:
         table = parse_toml(attachment(truth, SCENARIO_NAME) or b"")
@@ -273,7 +273,8 @@ class HostCycles(NamedTuple):
 def placed_contacts(contacts: Sequence[TrueContact], host: HostCycles, settings: Settings) -> list[TrueContact]:
     """Return the contacts that begin within the host's cycles, with their times on the host's clock.
 
-    contacts: their cycles are counted by the host. host: has the cycles that each onset and each end lies between.
+    contacts: their cycles are counted by the host. host: its cycles before and after each onset and end, others may be
+    left out.
     """
     contacts = [contact for contact in contacts if len(host.cycle) and contact.onset <= host.cycle[-1]]
     if not contacts:
@@ -295,8 +296,8 @@ def placed_contact(
 ) -> TrueContact:
     """Return a contact on the clock of a run, with the times in which it explains alarms.
 
-    times_ns: of onset and end. row: of the first of the host's cycles at the onset or after it. a_rad_s: cut-off of the
-    scheme's slowest filter.
+    times_ns: of onset and end. row: index of the first of the host's cycles at the onset or after it. a_rad_s: cut-off
+    of the scheme's slowest filter. Where detection is off, the threshold of the settings counts.
     """
     threshold = np.where(np.isfinite(host.threshold[row]), host.threshold[row], settings.detector.threshold_Nm)
     after_s = forgotten_after_s(contact.tau_ext, contact.cycle, settings.bus.period_s, a_rad_s, threshold)
@@ -316,8 +317,8 @@ KnownContacts = tuple[tuple[TrueContact, ...], EmulatorSpan]
 def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownContacts | None:
     """Return the true contacts of a log's run from truth.mcap beside it, and the cycles of which they are known.
 
-    None without that file. The truth of another run is left out, and `progress` gets a line with the reason. Raises
-    LogError.
+    None without that file, for a truth of another run, of which `progress` gets a line, and if the emulator never
+    cycled. Raises LogError for a log that can't be read.
     """
     truth = path.with_name(TRUTH_NAME)
     if not truth.exists():

@@ -34,8 +34,8 @@ Times = NDArray[np.int64]
 class Detection:
     """An alarm of a scheme. is_armed: raised by armed detection, in MONITOR; is_known: the truth covers that time.
 
-    row: of the run's cycles. first, last: its report at the alarm, and the newest one of the same contact; None
-    without a report.
+    row: index in the run's cycles, -1: unknown. first, last: its report at the alarm, and the newest one of the same
+    contact; None without a report.
     """
 
     t_ns: int
@@ -123,7 +123,7 @@ class Score:
 
     @property
     def missed(self) -> int:
-        """Number of contacts that armed detection did not find."""
+        """Number of contacts that began while detection was armed and that no alarm found."""
         return sum(contact.is_missed for contact in self.contacts)
 
     @property
@@ -148,7 +148,8 @@ class Score:
 def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
     """Return for each contact (k,) the last instant at which it explains an alarm.
 
-    onsets, forgotten (k,): when each begins and is forgotten, in order; integers in any one unit.
+    It is just before the next one begins, or when all contacts so far are forgotten, if that is earlier. onsets,
+    forgotten (k,): when each begins and is forgotten, in order; integers in any one unit.
     """
     until: Times = np.maximum.accumulate(np.asarray(forgotten, np.int64))
     until[:-1] = np.minimum(until[:-1], np.asarray(onsets, np.int64)[1:] - 1)
@@ -169,8 +170,8 @@ def contacts_of_alarms(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[An
 def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossings_ns: Sequence[int] = ()) -> Score:
     """Return which alarm found each true contact, and which alarms are false; contacts and alarms are in order.
 
-    crossings_ns: when some threshold is first exceeded, of a scheme replayed on a motion that is not its own: while it
-    still reacts, it can raise no alarm, and a crossing finds the contacts that begin meanwhile.
+    crossings_ns: times at which a scheme, replayed on another scheme's motion, first exceeds a threshold. While it
+    still reacts it can raise no alarm: then a crossing finds a contact that began meanwhile (`is_reacting`).
     """
     onsets, until = _bounds(contacts)
     about = contacts_of_alarms(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()
@@ -219,7 +220,7 @@ class StreamJudge:
             self._last_ns = int(false_ns[-1])
 
     def score(self, contacts: Sequence[TrueContact]) -> Score:
-        """Return the score of all samples so far; contacts: all true contacts."""
+        """Return the score of all samples so far; contacts: all true contacts, whose `detected_ns` is set anew."""
         judged = (replace(contact, detected_ns=self._found.get(contact.number)) for contact in contacts)
         return Score(tuple(judged), tuple(self._false))
 
@@ -243,7 +244,7 @@ def _judged(contacts: Sequence[TrueContact], found: dict[int, int]) -> tuple[Tru
 
 
 def contact_bounds(index: NDArray[Any], attempt: Times | None) -> list[tuple[int, int]]:
-    """Return the first row of each contact of a truth, and the row after its last; index, attempt (m,): of the rows.
+    """Return (first row, row after the last) of each contact of a truth; index, attempt (m,): of the truth's rows.
 
     A negative index is no contact. Another index is another contact, though the touch goes on. A contact that goes on
     as an attempt begins is another one, too: the scheme begins anew.
@@ -281,7 +282,10 @@ def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: f
 
 
 def true_contacts(truth: Truth | None, first_number: int = 1) -> tuple[TrueContact, ...]:
-    """Return the true contacts in a truth, numbered from `first_number`; () without a truth."""
+    """Return the true contacts in a truth, numbered from `first_number`; () without a truth.
+
+    Their cycles are the emulator's; their times on a run's clock are still 0.
+    """
     if truth is None:
         return ()
     found = []

@@ -20,7 +20,7 @@ PUSH_WITHIN = f"{1e3 * detect_margin.WITHIN_S:g} ms"
 
 @dataclass(frozen=True)
 class SmallestPush:
-    """Percentiles p50, p99, p99.9 and max of each joint's smallest push found and of its threshold, Nm.
+    """Percentiles p50, p99, p99.9 and max, by name, of each joint's smallest push found and of its threshold, Nm.
 
     hours: time in MONITOR without a touch. tail_rate_per_h: false alarms to be expected if all channels' residuals have
     the tail of a Gaussian.
@@ -53,7 +53,7 @@ class PushGatherer:
             self._threshold[joint].add_values(in_force[:, joint])
 
     def smallest_push(self) -> SmallestPush | None:
-        """Return the percentiles over all cycles gathered so far; None before the first."""
+        """Return the percentiles over all cycles gathered so far, by joint; None before the first."""
         if not self._push[0].count:
             return None
         seen_s = self._push[0].count * self._period_s

@@ -40,7 +40,7 @@ def with_todays_keys(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """Return two TOML tables merged, section by section; `over` wins."""
+    """Return two TOML tables merged, with tables within them, to any depth; `over` wins. Lists are replaced whole."""
     merged = dict(base)
     for key, value in over.items():
         if isinstance(value, dict) and isinstance(merged.get(key), dict):
@@ -61,7 +61,7 @@ def load_settings(name_or_file: str = "paper", profile: str | None = None) -> Se
     """Return the settings of a configuration: a built-in name, or a TOML file merged over the one it `extends`.
 
     A file without `extends` extends `paper`. `profile` picks the `[profiles.X]` table; None: `arm.profile` picks it.
-    Raises ConfigError.
+    Raises ConfigError as `configuration_layers` and `parse`.
     """
     return parse(Settings, resolved_table(configuration_layers(name_or_file, profile)))
 
@@ -72,9 +72,10 @@ def resolved_table(layers: Sequence[ConfigurationLayer]) -> dict[str, Any]:
 
 
 def configuration_layers(name_or_file: str, profile: str | None = None) -> list[ConfigurationLayer]:
-    """Return the layers of a configuration and of all that it extends, the base first. Raises ConfigError.
+    """Return the layers of a configuration and of all that it extends, the base first.
 
-    The profile's layers precede those of the files, whose keys override them.
+    The profile's layers precede those of the files, whose keys override them. Raises ConfigError for a file that can't
+    be read, wrong `extends`, and an unknown profile.
     """
     files = _load_chain(name_or_file)
     table = resolved_table(files)
@@ -105,7 +106,7 @@ def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
 
 
 def _find_beside(table: dict[str, Any], folder: Path) -> None:
-    """Put the configuration's folder before the paths of device and contract files that exist in it."""
+    """Change `table`: put `folder` before the names in `devices` of files, with a suffix, that exist in it."""
 
     def found(name: Any) -> Any:
         is_beside = isinstance(name, str) and Path(name).suffix and exists(folder / name)
@@ -121,9 +122,10 @@ def _find_beside(table: dict[str, Any], folder: Path) -> None:
 
 
 def _load_chain(name_or_file: str, seen: tuple[str, ...] = ()) -> list[ConfigurationLayer]:
-    """Return the files of a configuration and of all that it extends, the base first. Raises ConfigError.
+    """Return the files of a configuration and of all that it extends, the base first.
 
-    Relative paths start in the folder of the file that names them.
+    Relative paths start in the folder of the file that names them. `seen`: those that extend this one. Raises
+    ConfigError for a file that can't be read, and for `extends` that is no text, a circle or too long a chain.
     """
     if name_or_file in seen:
         raise ConfigError(f"configuration {name_or_file} extends itself")

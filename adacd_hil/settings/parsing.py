@@ -24,7 +24,7 @@ WITHDRAWN = {"detector.live": _OFFLINE, "detector.live_lag_s": _OFFLINE}
 
 
 def bounds_of(section: type, name: str) -> tuple[float, float]:
-    """Return the lowest and the highest value that a setting may have."""
+    """Return the lowest and the highest value that a setting of a section may have; infinite without a bound."""
     (metadata,) = (field.metadata for field in dataclasses.fields(section) if field.name == name)
     return metadata["low"], metadata["high"]
 
@@ -71,7 +71,11 @@ def _hints_of(section: type[Any]) -> dict[str, Any]:
 
 
 def _read_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
-    """Return a value of a TOML table converted to its type. Raises ConfigError."""
+    """Return a value of a TOML table converted to its type `hint`.
+
+    Raises ConfigError for another type or length, and for values outside their bounds or choices; of a list of tables
+    with all problems.
+    """
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         hint = next(option for option in typing.get_args(hint) if option is not type(None))
     if dataclasses.is_dataclass(hint):

@@ -49,7 +49,7 @@ def sections() -> Iterator[tuple[str, type[Any], str]]:
 
 
 def keys_of(section: type[Any], prefix: str) -> Iterator[KnownKey]:
-    """Yield the settings of a table, rows of its lists included; tables within it are sections of their own."""
+    """Yield the settings of a table and of the rows of its lists, `prefix` before each key; no tables within it."""
     hints = typing.get_type_hints(section)
     for field in dataclasses.fields(section):
         kind = hints[field.name]
@@ -129,7 +129,8 @@ _FACTS: Final = ("profile", "sign", "torque_offset_Nm", "torque_offset_std_Nm", 
 def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
     """Return the settings with some keys changed, each `section.key` to a TOML value.
 
-    Raises ConfigError; for an unknown key it names the nearest known one.
+    Raises ConfigError for an unknown key, as `explain_unknown`; a text that is no TOML value; a value that `parse`
+    refuses.
     """
     table = tomllib.loads(to_toml(settings))
     known = known_keys()
@@ -192,7 +193,10 @@ def keep_log_settings(own: Settings, other: Settings) -> Settings:
 
 
 def parse_changes(given: Sequence[str]) -> dict[str, str]:
-    """Return the value by key of `key=value` texts; of one key the last value counts. Raises ConfigError."""
+    """Return the value, still as text, by key of `key=value` texts; of one key the last value counts.
+
+    Raises ConfigError for a text without `=` or without a key.
+    """
     changes: dict[str, str] = {}
     for text in given:
         key, equals, value = text.partition("=")
@@ -203,7 +207,10 @@ def parse_changes(given: Sequence[str]) -> dict[str, str]:
 
 
 def parse_variations(given: Sequence[str]) -> list[dict[str, str]]:
-    """Return every combination of values of `key=a,b,c` texts, of one key each; [{}] without. Raises ConfigError."""
+    """Return every combination of values of `key=a,b,c` texts, each as text by key; [{}] without any text.
+
+    Raises ConfigError as `parse_changes`, and for a key in two texts.
+    """
     varied = parse_changes(given)
     if len(varied) < len(given):
         raise ConfigError(f"a key is varied twice: name all its values in one, such as {next(iter(varied))}=1,2,3")
@@ -230,7 +237,7 @@ def split_list(text: str) -> list[str]:
 
 
 def changed_keys(before: Settings, after: Settings) -> dict[str, tuple[str, str]]:
-    """Return the settings that differ, by key: both values as Python writes them; `unset` for an absent one."""
+    """Return the settings that differ, by dotted key: (before, after) as Python writes them; `unset` for None."""
     tables = [_flat(tomllib.loads(to_toml(settings)), "") for settings in (before, after)]
     keys = [*tables[0], *(key for key in tables[1] if key not in tables[0])]
     words = {key: (tables[0].get(key, "unset"), tables[1].get(key, "unset")) for key in keys}

@@ -36,7 +36,10 @@ def read_toml(path: Path, kind: str = "configuration") -> dict[str, Any]:
 
 
 def _instead(path: Path, kind: str) -> str:
-    """Return a hint: the file with the nearest name beside it, else the command that writes a configuration."""
+    """Return a hint for a missing file: the one with the nearest name beside it, else the command that writes it.
+
+    "" without a near name if `kind` is no configuration.
+    """
     try:
         beside = sorted(other.name for other in path.parent.glob("*.toml"))
     except OSError:

@@ -5,14 +5,17 @@ from typing import Any
 
 
 def to_toml(settings: Any) -> str:
-    """Return settings as TOML that `parse` reads back to the same value."""
+    """Return settings as TOML that `parse` reads back to the same value; those that are None are left out."""
     lines: list[str] = []
     _write_section(settings, "", lines)
     return "\n".join(lines).strip() + "\n"
 
 
 def to_short_toml(settings: Any) -> str:
-    """Return the settings that differ from their defaults as TOML that `parse` reads back, one row of a list a line."""
+    """Return the settings that differ from their defaults as TOML that `parse` reads back to the same settings.
+
+    Each row of a list of tables has a line.
+    """
     lines: list[str] = []
     _write_section(settings, "", lines, is_short=True)
     return "\n".join(lines).strip() + "\n"

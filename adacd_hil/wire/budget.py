@@ -94,7 +94,7 @@ def response_time(
 
 
 def is_overloaded(streams: Sequence[Stream]) -> bool:
-    """Return whether messages together need more than the whole bus."""
+    """Return whether the messages' durations over their intervals add up to more than 1, all of the bus's time."""
     common = math.lcm(*(stream.interval_ns for stream in streams))
     return sum(stream.duration_ns * (common // stream.interval_ns) for stream in streams) > common
 
@@ -108,7 +108,7 @@ def _waiting(
 
 
 def _exceeded(stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns: int, limit_ns: int) -> ResponseTime:
-    """Return a time that some frame of an endless busy period takes at least.
+    """Return, as unbounded, a response time that some frame of an endless busy period reaches at least.
 
     It is beyond `limit_ns`, unless all frames that are queued within the horizon take less.
     """
@@ -158,7 +158,7 @@ class FrameBudget:
     """Smallest interval between two of them that the budget assumes."""
     deadline_ns: int | None
     has_interval: bool
-    """Whether its rate is bounded, by its trigger or an inhibit time; a heartbeat's always is."""
+    """Whether its rate is bounded, by SYNC, a request or an inhibit time; a heartbeat's always is."""
     responses: dict[LoadCase, ResponseTime] = field(default_factory=dict)
 
     @property
@@ -178,7 +178,10 @@ class FrameBudget:
         return is_emcy_id and self.trigger is Trigger.EVENT
 
     def late_ns(self, traffic: LoadCase = LoadCase.OPERATION) -> int:
-        """Return the time by which the frame's response misses its deadline, ns (at least, if unbounded), 0 in time."""
+        """Return the time by which the frame's response misses its deadline, ns; at least that if it is unbounded.
+
+        0 if it is in time or has no deadline.
+        """
         response = self.responses[traffic]
         if self.deadline_ns is None:
             return 0
@@ -218,7 +221,7 @@ class Budget:
 
     @property
     def feedback_ns(self) -> int:
-        """Time from SYNC to the end of the last feedback frame."""
+        """Duration of SYNC and all feedback frames, one after the other."""
         return self._sum_ns(Trigger.SYNC)
 
     @property
@@ -244,12 +247,12 @@ class Budget:
 
     @property
     def cyclic_load(self) -> float:
-        """Share of the time that cyclic frames take at most."""
+        """Share of the period, 0 to 1 if they fit, that cyclic frames take at most."""
         return self.cyclic_ns / (self.period_us * 1000)
 
     @property
     def load(self) -> float:
-        """Share of the time in operation: cyclic frames and events, at worst, without requests and EMCY."""
+        """Share of the bus's time that cyclic frames and events take at worst, without requests and EMCY."""
         return sum(
             entry.duration_ns / entry.interval_ns for entry in self.frames if _is_sent(entry, LoadCase.OPERATION)
         )
@@ -266,7 +269,7 @@ class Budget:
 
     @property
     def line(self) -> str:
-        """The verdict in one line."""
+        """The verdict in one line: the time left for the host, or a frame that misses its deadline and by how much."""
         where = f"{self.name} at {self.period_us} µs"
         if self.is_fit:
             left = f"{format_us(self.host_ns)} µs left for the host"
@@ -302,7 +305,7 @@ class Budget:
         return tuple(notes)
 
     def _describe_traffic(self, traffic: LoadCase) -> str:
-        """Return the latest cyclic frame in a load case, and whether it is in time, as text."""
+        """Return as text the cyclic frame with the longest response time in a load case, and whether it is in time."""
         if not self.cyclic:
             return "no cyclic frames"
         last = max(self.cyclic, key=lambda entry: entry.responses[traffic].time_ns)
@@ -371,7 +374,10 @@ def _given(codec: Codec, attribute: str, chosen: int | None) -> int:
 
 
 def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, data_bitrate: int) -> FrameBudget:
-    """Return the budget of a message, still without response times. Raises CodecError for an unknown Trigger."""
+    """Return the budget of a message, still without response times. Raises CodecError for an unknown Trigger.
+
+    Deadline: the period for cyclic frames, the cycle time, if any, for event frames, none for requests.
+    """
     choices = list(message.dbc.attribute_definitions["Trigger"].choices or ()) if message.dbc else []
     value = read_attribute(message, "Trigger")
     chosen = choices[value] if isinstance(value, int) and 0 <= value < len(choices) else value
@@ -403,7 +409,7 @@ def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, d
 
 
 def _function(can_id: int, is_extended: bool) -> int:
-    """Return the function code of the predefined connection set; -1 for an extended frame."""
+    """Return an identifier without its node id, the function code of CiA 301; -1 for an extended frame."""
     return -1 if is_extended else can_id & ~NODE_MASK
 
 
@@ -432,7 +438,7 @@ def _share_bus(frames: list[FrameBudget], contract: str, arms: int) -> list[Fram
 
 
 def _is_sent(entry: FrameBudget, traffic: LoadCase) -> bool:
-    """Return whether a load case has the frame; none has NMT commands."""
+    """Return whether a load case has the frame on the bus; no case has NMT commands."""
     if entry.trigger is Trigger.REQUEST:
         return traffic is not LoadCase.OPERATION and entry.can_id != NMT_ID
     return not entry.is_emergency or traffic is LoadCase.EMERGENCIES
@@ -441,7 +447,10 @@ def _is_sent(entry: FrameBudget, traffic: LoadCase) -> bool:
 def _respond(
     entries: list[FrameBudget], place: int, traffic: LoadCase, bit_ns: int, period_ns: int, hosts: int
 ) -> ResponseTime:
-    """Return the response time of the frame at `place` in arbitration order; each host sends one request a period."""
+    """Return the response time in a load case of the frame at index `place` of all, in arbitration order.
+
+    Each of `hosts` sends one request a period. A frame that the load case lacks is judged as a single one.
+    """
     entry = entries[place]
     above = [other for other in entries[:place] if _is_sent(other, traffic)]
     below = [other for other in entries[place + 1 :] if _is_sent(other, traffic)]

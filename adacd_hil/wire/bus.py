@@ -66,16 +66,16 @@ class Bus(Protocol):
 
     @property
     def waiting_frames(self) -> tuple[int, ...]:
-        """Identifiers of sent frames that SYNC would overtake now, as far as this end can know."""
+        """Identifiers of frames handed over but not yet on the bus, which SYNC would overtake now; () if unknown."""
         return ()
 
     @property
     def frames_lost(self) -> int:
-        """Number of received frames dropped because this end didn't read them in time, as far as it knows."""
+        """Number of received frames so far that were dropped as this end didn't read them in time; 0 if unknown."""
         return 0
 
     def queue_bytes(self) -> QueueBytes:
-        """Read the fill of both queues; a system call if the kernel keeps them."""
+        """Return the fill of both queues, zeros if this end has none; a system call if the kernel keeps them."""
         return NOTHING_QUEUED
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -135,24 +135,27 @@ class Tap(Bus):
         return self._bus.frames_lost
 
     def queue_bytes(self) -> QueueBytes:
-        """Read the fill of the wrapped bus's queues."""
+        """Return the fill of the wrapped bus's queues."""
         return self._bus.queue_bytes()
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send and record a frame. Raises BusError."""
+        """Record and send a frame; it stays recorded if sending it fails. Raises BusError."""
         # Recorded before sending: on the embedded bus the answers come while `send` runs.
         t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
         self._passed.append((True, Frame(can_id, data, t_ns)))
         self._bus.send(can_id, data)
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Send and record several frames. Raises BusError."""
+        """Record and send several frames with one stamp; they stay recorded if sending fails. Raises BusError."""
         t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
         self._passed += [(True, Frame(can_id, data, t_ns)) for can_id, data in frames]
         self._bus.send_all(frames)
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None after `timeout_s`, and record it unless it was put back. Raises BusError."""
+        """Return the next frame, or None after `timeout_s`, and record it unless it was put back by `unread`.
+
+        Raises BusError; the error frame of a BusOffError is recorded, too.
+        """
         if self._unread is not None:
             unread, self._unread = self._unread, None
             return unread
@@ -166,7 +169,10 @@ class Tap(Bus):
         return frame
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return and record the frames that are received together; a frame that was put back alone. Raises BusError."""
+        """Return and record the next frames, up to `most`; [] after `timeout_s`; a frame that was put back alone.
+
+        Raises as `receive`.
+        """
         if self._unread is not None or most == 1:
             frame = self.receive(timeout_s)
             return [] if frame is None else [frame]
@@ -179,7 +185,7 @@ class Tap(Bus):
         return frames
 
     def unread(self, frame: Frame) -> None:
-        """Put a received frame back; the next `receive` returns it."""
+        """Put a received frame back, one at most; the next `receive` returns it and doesn't record it again."""
         self._unread = frame
 
     def take_passed(self) -> list[tuple[bool, Frame]]:

@@ -67,7 +67,10 @@ class CanInterface:
             return 0
 
     def problem(self, is_fd: bool) -> str:
-        """Return the reason why the interface can't be used, with the remedy, in one line; "" if it can be used."""
+        """Return the reason why the interface can't be used, with the remedy, in one line; "" if it can be used.
+
+        It is absent or down, or carries classic frames only although `is_fd`.
+        """
         present = can_interfaces()
         if self.name not in present:
             known = f"present: {', '.join(present)}" if present else "no CAN interface is present"
@@ -129,7 +132,10 @@ class CanInterface:
 
 
 def _queues() -> Iterator[tuple[int, int, int]]:
-    """Yield (interface, parent, frames waiting) of all queueing disciplines; a root's count includes the others'."""
+    """Yield (interface, parent, frames waiting) of all queueing disciplines; a root's count includes the others'.
+
+    interface: its index; parent: handle, _TC_H_ROOT for a root. Raises BusError if the kernel refuses.
+    """
     size = _NETLINK_HEAD.size + _TRAFFIC_HEAD.size
     request = _NETLINK_HEAD.pack(size, _RTM_GETQDISC, _NLM_F_REQUEST_DUMP, 1, 0) + _TRAFFIC_HEAD.pack(0, 0, 0, 0, 0)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as netlink:
@@ -158,7 +164,7 @@ def _netlink_messages(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _attributes(data: bytes) -> dict[int, bytes]:
-    """Return the contents of netlink attributes, by their type."""
+    """Return the contents of the netlink attributes in `data`, by their type; of one type the last counts."""
     found = {}
     position = 0
     while position < len(data):
@@ -224,7 +230,10 @@ class InterfaceState:
 
 
 def read_link(name: str) -> InterfaceState | None:
-    """Return the state of a CAN interface; None if there is no such interface or it is not CAN."""
+    """Return the state of a CAN interface; None if there is no such interface or it is not CAN.
+
+    By `ip` of iproute2; if that is missing or fails, by sysfs, with fewer fields.
+    """
     ip = shutil.which("ip", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")
     if ip is not None:
         with contextlib.suppress(OSError, subprocess.SubprocessError, ValueError, LookupError):
@@ -235,7 +244,10 @@ def read_link(name: str) -> InterfaceState | None:
 
 
 def parse_ip_link(link: dict[str, Any]) -> InterfaceState | None:
-    """Return the state in one entry of `ip -details -json link`; None if it is not CAN."""
+    """Return the state in one entry of `ip -details -json link`; None if it is not CAN.
+
+    Raises KeyError if name, flags or MTU are missing.
+    """
     if link.get("link_type") != "can":
         return None
     info = link.get("linkinfo", {})
@@ -261,7 +273,7 @@ def parse_ip_link(link: dict[str, Any]) -> InterfaceState | None:
 
 
 def read_sysfs_link(folder: Path) -> InterfaceState | None:
-    """Return the state of an interface by sysfs, without bit timing; None if it is absent or not CAN."""
+    """Return the state of an interface by sysfs, without queue discipline and controller; None if absent or not CAN."""
     try:
         if (folder / "type").read_text().strip() != _ARPHRD_CAN:
             return None

@@ -73,7 +73,7 @@ class MessageCodec(MessageTable):
         raise CodecError(f"{self.name} has no signal {name}")
 
     def sender(self) -> E2eSender:
-        """Return a new end-to-end sender of this message; without protection it leaves frames unchanged."""
+        """Return a new end-to-end sender of this message, its counter at 0; without protection it changes no frame."""
         return E2eSender(self.profile, self.data_ids)
 
     def receiver(self) -> E2eReceiver:
@@ -104,7 +104,7 @@ class MessageCodec(MessageTable):
         return super().decode(data)
 
     def decode_values(self, data: bytes) -> tuple[float, ...]:
-        """Return physical values of the signals in `values`, in this order; the length must be right."""
+        """Return physical values of the signals in `values`, in this order. Raises CodecError for a wrong length."""
         return self.decode(data)[len(self.signals) - len(self.values) :]
 
     def takes(self, length: int) -> bool:
@@ -112,7 +112,7 @@ class MessageCodec(MessageTable):
         return length == self.length
 
     def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
-        """Return (name, value, unit) of each signal behind the end-to-end header; the length must be right."""
+        """Return (name, value, unit) of each signal behind the end-to-end header. Raises as `decode`."""
         return tuple(
             (signal.name, value, signal.unit)
             for signal, value in zip(self.values, self.decode_values(data), strict=True)
@@ -121,7 +121,7 @@ class MessageCodec(MessageTable):
     def encode_raw(self, *raw: int) -> bytearray:
         """Return a frame of raw integers in the order of `values`, the end-to-end header left zero; for the hot path.
 
-        Raises CodecError if the message has bit fields. The integers must fit.
+        Raises CodecError if the message has bit fields, struct.error for an integer that doesn't fit its container.
         """
         if self._body is None:
             raise CodecError(f"{self.name} has bit fields: encode physical values instead")
@@ -172,7 +172,7 @@ class Codec:
 
 
 def _describe(messages: dict[str, MessageCodec]) -> str:
-    """Return the text whose CRC-32 is `Codec.layout_digest`: a line per message and per signal."""
+    """Return the text whose CRC-32 is `Codec.layout_digest`: a line per message and per signal, by identifier."""
     lines = []
     for message in sorted(messages.values(), key=lambda message: message.can_id):
         # A list of ids alone says Profile 2, as in a DBC.

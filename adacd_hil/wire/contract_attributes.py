@@ -19,7 +19,7 @@ def read_bitrates(codec: "Codec | DbcDecoder") -> tuple[int, int]:
 
 
 def read_attribute(owner: Database | Message, name: str) -> int | str:
-    """Return the value of an attribute, its default, or 0 if the DBC doesn't define it."""
+    """Return the value of an attribute of network or message, else its default; 0 if the DBC doesn't define it."""
     if owner.dbc is None or name not in owner.dbc.attribute_definitions:
         return 0
     attribute = owner.dbc.attributes.get(name)

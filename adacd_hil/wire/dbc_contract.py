@@ -47,9 +47,10 @@ def _check_length(message: Message) -> None:
 
 
 def _protection(message: Message) -> tuple[Protection, bytes]:
-    """Return the protection by E2EProfile, and the data ids by E2EDataIdList or E2EDataId. Raises CodecError.
+    """Return the protection by E2EProfile, and the data ids by E2EDataIdList or E2EDataId; b"" without protection.
 
-    A list alone means Profile 2.
+    A list alone means Profile 2. Raises CodecError for an unknown profile, missing or wrong data ids, or a message that
+    doesn't begin with the profile's header.
     """
     attributes = message.dbc.attributes if message.dbc else {}
     values = {name: attribute.value for name, attribute in attributes.items()}
@@ -74,7 +75,7 @@ def _protection(message: Message) -> tuple[Protection, bytes]:
 
 
 def _data_id_list(name: str, text: str, count: int) -> bytes:
-    """Return the data ids of a hexadecimal list. Raises CodecError unless they are `count` bytes."""
+    """Return the data ids of a hexadecimal list, a byte each. Raises CodecError for other text, or another count."""
     try:
         ids = bytes.fromhex(text)
     except ValueError:
@@ -111,7 +112,10 @@ def _in_order(message: Message) -> list[Signal]:
 
 
 def _lay_out(message: Message) -> tuple[SignalCodec, ...]:
-    """Return the signals, placed in containers on byte borders that cover the frame without gaps. Raises CodecError."""
+    """Return the signals, placed in containers on byte borders that cover the frame without gaps.
+
+    Raises CodecError for a layout that the module's text excludes, with the signal's name.
+    """
     end_bit = 0
     containers = 0
     codecs = []
@@ -141,7 +145,7 @@ def _lay_out(message: Message) -> tuple[SignalCodec, ...]:
 
 
 def _check_messages(database: Database) -> None:
-    """Raise CodecError for two messages of the same name or identifier, and for too many messages."""
+    """Raise CodecError for two messages of the same name or identifier, and for more than _MOST_MESSAGES."""
     by_name: dict[str, Message] = {}
     by_id: dict[tuple[int, bool], Message] = {}
     for message in database.messages:
@@ -178,12 +182,16 @@ def read_dbc(path: Path | None = None) -> tuple[bytes, Path]:
 
 
 def load_codec(path: Path | None = None) -> Codec:
-    """Return the codec of a DBC (default: the package's). Raises CodecError."""
+    """Return the codec of a DBC (default: the package's). Raises CodecError as `read_dbc` and `parse_codec`."""
     return parse_codec(*read_dbc(path))
 
 
 def parse_codec(text: bytes, path: Path) -> Codec:
-    """Return the codec of the text of a DBC; `path`: its file, existing or not. Raises CodecError."""
+    """Return the codec of the text of a DBC; `path`: its file, existing or not.
+
+    Raises CodecError, which begins with `path`, as `parse_database`; for a DBC without WireVersion, for messages with
+    one name or identifier, and for a message that no contract has.
+    """
     database = parse_database(text, path)
     try:
         _check_messages(database)
@@ -197,9 +205,10 @@ def parse_codec(text: bytes, path: Path) -> Codec:
 
 
 def parse_database(text: bytes, path: Path) -> Database:
-    """Return the messages of any DBC that cantools accepts, in UTF-8 or a Windows code page. Raises CodecError.
+    """Return the messages of any DBC that cantools accepts, in UTF-8 or a Windows code page.
 
-    A signal of more bits than the longest frame has is an error, too. `path`: as in `parse_codec`.
+    Raises CodecError if cantools can't read it, and for a signal of more bits than the longest frame has. `path`: as in
+    `parse_codec`. Equal texts share one object: don't change it.
     """
     for found in _SIGNAL_PLACE.finditer(text):  # cantools allocates a character for each bit
         if len(found["bits"]) > len(_MOST_BITS) or int(found["bits"]) > int(_MOST_BITS):

@@ -40,7 +40,8 @@ class MessageDecoder:
     def decode(self, data: bytes) -> dict[str, float]:
         """Return the values of the signals that a frame holds, by name; a short or multiplexed frame doesn't hold all.
 
-        If the DBC doesn't list the multiplexer's value, only the signals outside the multiplexer are decoded.
+        If the DBC doesn't list the multiplexer's value, only the signals outside the multiplexer are decoded, and the
+        frame is counted in `partly_decoded`.
         """
         try:
             values = self._message.decode_simple(data, decode_choices=False, allow_truncated=True)
@@ -50,7 +51,7 @@ class MessageDecoder:
         return {name: float(value) for name, value in values.items()}  # type: ignore[arg-type]
 
     def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
-        """Return (name, value, unit) of each signal that a frame holds."""
+        """Return (name, value, unit) of each signal that a frame holds, as `decode`."""
         return tuple((name, value, self.units[name]) for name, value in self.decode(data).items())
 
 
@@ -58,7 +59,7 @@ class DbcDecoder:
     """All messages of one DBC. Of several messages with one name the last counts, as for cantools."""
 
     def __init__(self, text: bytes, path: Path) -> None:
-        """Parse the text; `path`: its file, existing or not. Raises CodecError."""
+        """Parse the text; `path`: its file, existing or not. Raises CodecError as `parse_database`."""
         self.path = path
         self.database = parse_database(text, path)
         self.messages = {message.name: MessageDecoder(message, self.is_contract) for message in self.database.messages}
@@ -72,5 +73,5 @@ class DbcDecoder:
 
 
 def load_decoder(path: Path | None = None) -> DbcDecoder:
-    """Return the decoder of a DBC (default: the package's). Raises CodecError."""
+    """Return the decoder of a DBC (default: the package's). Raises CodecError as `read_dbc` and `parse_database`."""
     return DbcDecoder(*read_dbc(path))

@@ -74,7 +74,7 @@ class E2eStatus(IntEnum):
 
     @property
     def is_valid(self) -> bool:
-        """Whether the frame's values may be used."""
+        """Whether the frame's values may be used: OK or OK_SOME_LOST."""
         return self <= _LAST_VALID
 
 
@@ -162,7 +162,10 @@ class E2eSender:
         self._counter = 0
 
     def protect(self, frame: bytearray) -> bytes:
-        """Return `frame` as bytes; with a profile, fill in its counter and CRC. The sender's status stays."""
+        """Return `frame` as bytes; with a profile, first write counter and CRC into it, and advance the counter.
+
+        The sender's status in the header stays.
+        """
         profile = self._profile
         if profile is not None:
             profile.sign(frame, self._counter, self._data_ids)
@@ -185,7 +188,7 @@ class E2eReceiver:
         return 0
 
     def check(self, frame: bytes) -> E2eStatus:
-        """Check one frame and return its status; use its values only if the status is valid."""
+        """Check one frame; return, store and count its status. Use its values only if the status is valid."""
         status = self.status = self._judge(frame)
         self.counts[status] += 1
         return status
@@ -199,13 +202,13 @@ class E2eReceiver:
         return True
 
     def miss(self) -> E2eStatus:
-        """Count a cycle without a frame and return NO_NEW_DATA; the status of the last frame stays."""
+        """Count a cycle without a frame and return NO_NEW_DATA; `status`, that of the last frame, stays."""
         self._note_silence()
         self.counts[E2eStatus.NO_NEW_DATA] += 1
         return E2eStatus.NO_NEW_DATA
 
     def tally(self) -> list[tuple[E2eStatus, int]]:
-        """Return the number of frames by status, in NO_NEW_DATA of cycles without a frame."""
+        """Return (status, number of frames so far) of each status; of NO_NEW_DATA the cycles without a frame."""
         return list(zip(E2eStatus, self.counts, strict=True))
 
     def restart_sequence(self) -> None:
@@ -247,9 +250,9 @@ class ProtectedReceiver(E2eReceiver):
         return self._mask + 1
 
     def step_of(self, frame: bytes) -> int | None:
-        """Return the counter's step from the last frame; don't check the CRC.
+        """Return the counter's step from the last frame with a right CRC, modulo its range; 0: it stands still.
 
-        None before the first frame, or for another length.
+        None before the first frame, or for another length. This frame's CRC is not checked; nothing is stored.
         """
         if self._last is None or len(frame) != self._length:
             return None
@@ -268,7 +271,10 @@ class ProtectedReceiver(E2eReceiver):
         self._max_delta += self._profile.is_growing
 
     def _judge(self, frame: bytes) -> E2eStatus:
-        """Return the status of a frame by its length, CRC and counter, and advance the sequence."""
+        """Return the status of a frame by its length, CRC and counter, and advance the sequence.
+
+        A wrong length is WRONG_CRC, too.
+        """
         is_growing = self._profile.is_growing
         self._max_delta += is_growing
         if not self.is_signed(frame):
@@ -286,7 +292,7 @@ class ProtectedReceiver(E2eReceiver):
         return self._accept(delta) if is_in_sequence else self._lose_sequence()
 
     def _begin(self, counter: int) -> E2eStatus:
-        """Accept the first frame, the standard's INITIAL. Its values are used; silence before it is ignored."""
+        """Begin the sequence with the first frame, the standard's INITIAL, and return OK; ignore silence before it."""
         self._last, self._max_delta = counter, self._tolerance.max_delta
         self._missing = 0
         return E2eStatus.OK

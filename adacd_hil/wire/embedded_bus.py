@@ -22,7 +22,7 @@ class EmbeddedBus(Bus):
         self._device: Callable[[Frame], None] | None = None
 
     def attach(self, device: Callable[[Frame], None]) -> None:
-        """Register the function that receives the host's frames."""
+        """Register the function that receives the host's frames, in place of an earlier one."""
         self._device = device
 
     def deliver(self, can_id: int, data: bytes, is_error: bool = False) -> None:

@@ -113,7 +113,7 @@ def decode_error(frame: Frame) -> tuple[TroubleKind, str]:
 
 
 def _of_controller(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
-    """Return the errors of the controller and its driver in an error frame."""
+    """Return (kind, text) of each error of controller, driver or transceiver in an error frame; [] without any."""
     found = [
         (kind, kind.value)
         for bit, kind in (
@@ -133,7 +133,7 @@ def _of_controller(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
 
 
 def _of_bus(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
-    """Return the bus errors in an error frame: acknowledgement, protocol, arbitration."""
+    """Return (kind, text) of each bus error in an error frame: acknowledgement, protocol, arbitration."""
     found = []
     is_slot_empty = bool(classes & _PROTOCOL) and data[3] == _ACKNOWLEDGE_SLOT
     if classes & _ACKNOWLEDGE or is_slot_empty:

@@ -91,7 +91,10 @@ class FrameReceiver:
     """
 
     def __init__(self, opened: socket.socket, clock: Clock) -> None:
-        """Enable stamps and drop counts of the socket. Unless the clock is monotonic, frames carry the clock's time."""
+        """Enable stamps and drop counts of the socket.
+
+        With a clock other than MonotonicClock, frames carry that clock's time at `take_frames`. Raises OSError.
+        """
         opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         opened.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
         self.frames_lost = 0
@@ -114,9 +117,9 @@ class FrameReceiver:
         self._last_ns = 0
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until a frame can be received; return False after `timeout_s`. Raises OSError.
+        """Wait until `take_frames` has a frame; return False if there is none after `timeout_s`. Raises OSError.
 
-        A signal restarts the wait.
+        A signal restarts the whole wait.
         """
         if self._held:
             return True
@@ -130,7 +133,10 @@ class FrameReceiver:
         return bool(found)
 
     def take_frames(self) -> list[Frame]:
-        """Return up to 64 received frames without waiting. Raises OSError, BlockingIOError if there is no frame."""
+        """Return up to 64 received frames without waiting. Raises OSError, BlockingIOError if there is no frame.
+
+        The frames behind a drop come with the next call, as `frames_lost` is then another number.
+        """
         if self._held:
             return self._take_held()
         count = _receive(self._descriptor, self._place, _FRAMES, _MSG_DONTWAIT, None)
@@ -164,7 +170,7 @@ class FrameReceiver:
         return frames
 
     def _to_clock(self, wall_ns: int) -> int:
-        """Return a kernel stamp in CLOCK_MONOTONIC; the present time of any other clock of the frames instead."""
+        """Return a kernel stamp in CLOCK_MONOTONIC; if the frames have another clock, that clock's present time."""
         if self._clock is not None:
             return self._clock.now_ns()
         if not (wall_ns < self._trusted_ns and 0 <= wall_ns - self._last_ns < _STEP_NS):
@@ -186,7 +192,10 @@ class FrameSender:
         self._lengths = [0] * _FRAMES
 
     def send(self, frames: Sequence[bytes]) -> int:
-        """Send packed frames, the first 64, in one system call; return how many the kernel accepted, 0 on any error."""
+        """Send packed frames, the first 64, in one system call without waiting.
+
+        Return how many the kernel accepted, the first ones; 0 on any error.
+        """
         count = 0
         for count, packed in enumerate(frames[:_FRAMES], 1):
             slot, length = count - 1, len(packed)

@@ -53,14 +53,17 @@ def unstuffed_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
 
 
 def unstuffed_frame(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the bits of a frame, classic up to 8 bytes, without content-dependent stuff bits. Raises ValueError."""
+    """Return the bits of a frame, classic up to 8 bytes, without content-dependent stuff bits.
+
+    Raises ValueError for a length that no frame has.
+    """
     if length > CLASSIC_BYTES:
         return unstuffed_fd_bits(length, is_extended)
     return FrameBits(_stuffable_bits(length, is_extended) + TAIL_BITS)
 
 
 def worst_case_frame(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the most bits of a frame, classic up to 8 bytes. Raises ValueError.
+    """Return the most bits of a frame, classic up to 8 bytes. Raises ValueError for a length that no frame has.
 
     Classic frames have stuff bits up to the CRC's end, CAN FD up to the data's end. There, as many of them as possible
     are counted before the rate switch, where they take longest.

@@ -59,7 +59,10 @@ _CRC_15: Final = _crc_15()
 
 @compiled
 def _stuffed(head: int, head_bits: int, data: int, length: int) -> int:
-    """Count the bits of a classic frame to the end of its CRC, stuff bits included. data: bytes as one integer."""
+    """Return the bits of a classic frame to the end of its CRC, stuff bits included.
+
+    head: its first `head_bits` bits, up to the data. data: its `length` bytes as one integer, the first one highest.
+    """
     crc = state = added = 0  # after start of frame, one dominant bit
     left = head_bits - 1
     while left & 7:
@@ -82,7 +85,7 @@ def _stuffed(head: int, head_bits: int, data: int, length: int) -> int:
 
 @compiled
 def _classic_bits(can_id: int, data: int, length: int) -> int:
-    """Count the bits of a classic frame. data: bytes as one integer."""
+    """Return the bits of a classic frame, intermission included. data, length: as of `_stuffed`."""
     if can_id <= MAX_STANDARD_ID:
         return _stuffed(can_id << 7 | length, _HEAD_BITS, data, length) + TAIL_BITS
     head = ((can_id >> 18) << 2 | 3) << 25 | (can_id & 0x3FFFF) << 7 | length
@@ -91,7 +94,10 @@ def _classic_bits(can_id: int, data: int, length: int) -> int:
 
 @compiled
 def _fd_stuff_bits(head: int, head_bits: int, body: NDArray[np.uint8], code: int) -> tuple[int, int]:
-    """Count the dynamic stuff bits of an FD frame: up to BRS, and from there to the end of the data."""
+    """Return the dynamic stuff bits of an FD frame up to BRS, and from there to the end of the data.
+
+    head: its first `head_bits` bits, up to BRS. body: its data. code: data length code.
+    """
     run = 0
     last = -1
     before = 0

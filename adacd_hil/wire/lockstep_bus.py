@@ -63,7 +63,7 @@ class LockstepBus(Bus):
         queue_length: int = DEFAULT_QUEUE_LENGTH,
         is_fifo: bool = False,
     ) -> None:
-        """Take over a bus.
+        """Take over a bus, the one behind. frame_time: duration of a frame, ns. period_ns: between SYNCs.
 
         answers: identifiers that devices send on every SYNC. patience_s: by the wall clock, longest wait for devices
         that send no marks. queue_length: frames that wait at most while no node acknowledges. is_fifo: the host's
@@ -98,7 +98,10 @@ class LockstepBus(Bus):
 
     @property
     def waiting_frames(self) -> tuple[int, ...]:
-        """Identifiers of the host's frames that SYNC would overtake now, oldest first; in a fifo always empty."""
+        """Identifiers of the host's frames that SYNC would overtake now, oldest first; in a fifo always empty.
+
+        Frames that start before now are transmitted first.
+        """
         if self._is_fifo or not self._queue:
             return ()
         self._transmit_before(self._clock.now_ns())
@@ -125,7 +128,7 @@ class LockstepBus(Bus):
         self._queue.append((can_id, self._count, now_ns, data))
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Queue some frames at the clock's present time. Raises as `send`."""
+        """Queue some frames at the clock's present time, one by one if not all fit into the queue. Raises as `send`."""
         if not self._is_attached or len(self._queue) + len(frames) > self._queue_length:
             super().send_all(frames)
             return
@@ -192,12 +195,15 @@ class LockstepBus(Bus):
         self._bus.close()
 
     def _transmit_before(self, limit_ns: int) -> None:
-        """Let everything win the bus, in its turn, that starts before `limit_ns`."""
+        """Transmit in turn all waiting frames, of host and devices, that start before `limit_ns`."""
         while self._transmit_next(limit_ns):
             pass
 
     def _transmit_next(self, limit_ns: int) -> bool:
-        """Let the next frame win the bus, if one starts before `limit_ns`; else return False."""
+        """Transmit the next waiting frame of host or devices that starts before `limit_ns`; return False without one.
+
+        Before, the devices are asked for frames up to its start if they haven't lived that long yet.
+        """
         queue = self._queue
         if not self._offered:
             return bool(queue) and self._transmit_own(limit_ns)
@@ -247,14 +253,20 @@ class LockstepBus(Bus):
         return True
 
     def _forward(self, can_id: int, data: bytes) -> None:
-        """Give a frame that the host has transmitted to the devices; after SYNC take their answers."""
+        """Give a frame that the host has transmitted to the devices; after SYNC take their answers.
+
+        Raises SilenceError as `_take_answers`, and BusError.
+        """
         self._bus.send(can_id, data)
         if can_id == self._sync_id:
             self.sync_ns = self._free_ns
             self._take_answers()
 
     def _take_answers(self) -> None:
-        """Take the answers to this SYNC. Raises SilenceError when no frame comes."""
+        """Take the devices' answers to the SYNC just sent, until all are in, END comes, or the patience is over.
+
+        Raises SilenceError when answers are expected and no frame comes.
+        """
         count = missing = len(self._answers)
         came = self._bus.receive_some(self._patience_s, count) if count and not self._ahead else []
         if len(came) == count and {frame.can_id for frame in came} == self._answers:
@@ -283,7 +295,10 @@ class LockstepBus(Bus):
                 self._offer(frame, self.sync_ns)
 
     def _take_marked(self, mark: Frame) -> None:
-        """Take frames by their release, from a mark up to END."""
+        """Queue the devices' frames up to the mark END, or silence, each from its release on.
+
+        A release is the time after SYNC that the last mark RELEASE gave. `mark`: the first one.
+        """
         offset_ns = 0
         frame: Frame | None = mark
         while frame is not None:
@@ -306,7 +321,10 @@ class LockstepBus(Bus):
         return self._bus.receive(self._patience_s if timeout_s is None else timeout_s)
 
     def _line_up(self, came: list[Frame]) -> None:
-        """Send answers without competing frames one after the other, by identifier."""
+        """Store answers as received one after the other, by identifier, from when the bus is free.
+
+        Call it only if no other frames compete.
+        """
         came.sort()
         through_ns = self._free_ns
         for can_id, data, _, is_error in came:
@@ -318,7 +336,7 @@ class LockstepBus(Bus):
         self._free_ns = through_ns
 
     def _withdraw(self, now_ns: int) -> None:
-        """Take back the answers that have not begun: the host sends a frame that may come first."""
+        """Queue received answers again whose transmission begins at `now_ns` or later, to compete with a new frame."""
         while self._received:
             last = self._received[-1]
             start_ns = last.t_ns - (0 if last.is_error else self._frame_time(last.can_id, last.data))
@@ -337,11 +355,14 @@ class LockstepBus(Bus):
         self._offered.append((frame.can_id, self._count, t_ns, frame.data))
 
     def _is_cyclic(self, t_ns: int) -> bool:
-        """Return whether the devices live by SYNC at a time."""
+        """Return whether the last SYNC is so recent at a time, two periods, that the devices live by SYNC."""
         return t_ns - self.sync_ns < _CYCLIC_PERIODS * self._period_ns
 
     def _let_pass(self, limit_ns: int) -> bool:
-        """Ask the devices to let time pass; return whether that may have brought a frame."""
+        """Ask the devices to let time pass up to `limit_ns`; return False if no frame can come before.
+
+        Devices without marks are waited for by the wall clock. Soon after a SYNC, return False at once.
+        """
         now_ns = self._clock.now_ns()
         if self._is_cyclic(now_ns):
             return False
@@ -362,7 +383,10 @@ class LockstepBus(Bus):
         self._ask(self._clock.now_ns())
 
     def _await_grant(self) -> bool:
-        """Take frames until the devices grant time; return whether a frame came."""
+        """Queue frames until the devices grant time, or the patience is over; return whether a frame came.
+
+        Store whether the devices send marks, and the granted time.
+        """
         came: list[Frame] = []
         while (frame := self._receive()) is not None:
             if frame.can_id != DEVICE_MARK:
@@ -381,7 +405,10 @@ class LockstepBus(Bus):
         return bool(came)
 
     def _take_while(self, timeout_s: float) -> bool:
-        """Take frames of the bus behind, waiting `timeout_s` for the first; return whether one came."""
+        """Queue the frames of the bus behind, waiting `timeout_s` for the first; return whether one came.
+
+        Marks are not frames in this sense.
+        """
         has_come = False
         while (frame := self._receive(timeout_s)) is not None:
             timeout_s = 0.0
@@ -401,9 +428,9 @@ class LockstepBus(Bus):
 
 
 def make_lockstep_bus(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> LockstepBus:
-    """Return a modelled bus of a contract, as `settings.lockstep` says, at the rates of its DBC. Raises CodecError.
+    """Return a modelled bus of a contract, with the stuffing and queue of `settings.lockstep`, at the rates of its DBC.
 
-    A DBC without rates means 1 and 5 Mbit/s.
+    A DBC without rates means 1 and 5 Mbit/s. Raises CodecError for one without SYNC or a cyclic frame.
     """
     bitrate, data_bitrate = read_bitrates(codec)
     make = worst_time if settings.lockstep.stuffing == "worst" else exact_time

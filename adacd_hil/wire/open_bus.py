@@ -19,11 +19,11 @@ def open_bus(
 ) -> Bus:
     """Open one end of a real or virtual bus. Raises BusMissingError.
 
-    `can_ids` are filtered in the kernel on SocketCAN; other interfaces receive everything. `bitrate` in bit/s is for
-    interfaces that python-can configures; a SocketCAN interface has its own from `ip link`. Frames of more than 8 bytes
-    need `is_fd`. `is_shared`: other programs use the interface, too; it isn't taken down while the bus carries frames.
-    Identifiers beyond 0x7FF are 29-bit ones. Remote frames, and 29-bit identifiers that fit into 11 bits, are never
-    received.
+    `can_ids`: identifiers to receive, None: all; SocketCAN filters them in the kernel, other interfaces receive all.
+    `bitrate` in bit/s is for interfaces that python-can configures; a SocketCAN interface has its own from `ip link`.
+    Frames of more than 8 bytes need `is_fd`. `is_shared`: other programs use the interface, too; it isn't taken down
+    while the bus carries frames. Identifiers beyond 0x7FF are 29-bit ones. Remote frames, and 29-bit identifiers that
+    fit into 11 bits, are never received.
     """
     if interface == "socketcan":
         return SocketCanBus(channel, clock, can_ids, is_fd, is_shared)

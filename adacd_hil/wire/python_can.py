@@ -34,7 +34,7 @@ def interface_names() -> list[str]:
 
 
 def is_usable(interface: str) -> bool:
-    """Return whether python-can knows an interface and a cycle can run on it."""
+    """Return whether python-can knows an interface and it doesn't echo own frames, so that a cycle can run on it."""
     return interface in can.VALID_INTERFACES and interface not in _ECHOING_INTERFACES
 
 
@@ -44,7 +44,10 @@ class PythonCanBus(Bus):
     def __init__(
         self, interface: str, channel: str, clock: Clock, bitrate: int | None = None, is_fd: bool = False
     ) -> None:
-        """Open it, at `bitrate` bit/s if the interface sets one. Raises BusMissingError."""
+        """Open it, at `bitrate` bit/s if the interface sets one.
+
+        Raises BusMissingError for an interface that is unknown, echoes own frames or doesn't open.
+        """
         if interface in _ECHOING_INTERFACES:
             raise BusMissingError(f"interface {interface} echoes own frames and can't carry a cycle; use socketcan")
         if interface not in can.VALID_INTERFACES:
@@ -71,7 +74,7 @@ class PythonCanBus(Bus):
             raise BusMissingError(f"{where}: {_in_words(error)}{_remedy(self._interface, error)}") from None
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a frame. Raises BusError."""
+        """Send a frame, with more than 8 bytes as CAN FD with rate switch. Raises BusError, also without `is_fd`."""
         is_long = len(data) > CLASSIC_BYTES
         if is_long and not self._is_fd:
             raise BusError(f"sending on {self.channel}: {len(data)} data bytes need CAN FD")
@@ -89,7 +92,10 @@ class PythonCanBus(Bus):
             raise BusError(f"sending on {self.channel}: {_in_words(error)}") from None
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None after `timeout_s`. Raises BusError."""
+        """Return the next frame, with the clock's present time, or None after `timeout_s`. Raises BusError.
+
+        Remote frames, and 29-bit identifiers that fit into 11 bits, are dropped.
+        """
         deadline_ns = self._waiting.now_ns() + int(timeout_s * 1e9)
         while True:
             try:
@@ -105,7 +111,7 @@ class PythonCanBus(Bus):
             timeout_s = max(deadline_ns - self._waiting.now_ns(), 0) * 1e-9
 
     def recover(self) -> None:
-        """Empty the transmit buffer if the interface can, and open it again. Raises BusError."""
+        """Empty the transmit buffer if the interface can, and open it again. Raises BusError if it doesn't open."""
         # Few interfaces can empty a buffer, and a broken one fails: `_open` raises if the interface doesn't work.
         with contextlib.suppress(Exception):
             self._bus.flush_tx_buffer()

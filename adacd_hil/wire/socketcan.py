@@ -90,7 +90,10 @@ class SocketCanBus(Bus):
         self._open()
 
     def _open(self) -> None:
-        """Open and bind a socket, and make its receiver and sender. Raises BusMissingError."""
+        """Open and bind a socket, and make its receiver and sender; drop received frames of an earlier one.
+
+        Raises BusMissingError if the interface can't be bound.
+        """
         opened = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         try:
             opened.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, self._filters)
@@ -112,7 +115,8 @@ class SocketCanBus(Bus):
     def send(self, can_id: int, data: bytes) -> None:
         """Queue a frame for transmission; identifiers beyond 0x7FF are 29-bit ones.
 
-        Raises TransmitQueueError, InterfaceDownError, and BusError for data that the bus can't carry.
+        If the queue is full, wait for room, up to _SEND_PATIENCE_S. Raises TransmitQueueError then, InterfaceDownError,
+        and BusError, also for data that the bus can't carry.
         """
         packed = self._pack(can_id, data)
         try:
@@ -145,7 +149,10 @@ class SocketCanBus(Bus):
         return _FD_FRAME.pack(can_id, len(data), CANFD_BRS, data)
 
     def _send_patiently(self, packed: bytes) -> None:
-        """Send a frame as soon as there is room for it. Raises TransmitQueueError after _SEND_PATIENCE_S."""
+        """Send a frame as soon as there is room for it, trying every 0.1 ms.
+
+        Raises TransmitQueueError after _SEND_PATIENCE_S, and as `_fail` for another error.
+        """
         patience = self._patience
         deadline_ns = patience.now_ns() + int(_SEND_PATIENCE_S * 1e9)
         while patience.now_ns() < deadline_ns:
@@ -163,7 +170,10 @@ class SocketCanBus(Bus):
         )
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None after `timeout_s`. Raises BusOffError, InterfaceDownError, BusError."""
+        """Return the next frame, or None after `timeout_s`. Raises BusOffError, InterfaceDownError, BusError.
+
+        An error frame is returned like others, except for one of bus-off, which the BusOffError has.
+        """
         received = self._received
         if not received:
             if self._socket.fileno() < 0:
@@ -182,7 +192,10 @@ class SocketCanBus(Bus):
         return frame
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return frames that are received together, up to `most`; [] after `timeout_s`. Raises as `receive`."""
+        """Return the frames of one batch, up to `most`; [] after `timeout_s`. An error frame is returned alone.
+
+        Raises as `receive`.
+        """
         received = self._received
         if not received or received[0].is_error:
             frame = self.receive(timeout_s)
@@ -192,7 +205,7 @@ class SocketCanBus(Bus):
         return take_first(received, most)
 
     def _take(self, timeout_s: float) -> None:
-        """Fetch received frames; wait for the first up to `timeout_s`."""
+        """Fetch received frames into `_received`; wait for the first up to `timeout_s`. Raises as `_fail`."""
         try:
             if timeout_s <= 0.0 or self._receiver.wait(timeout_s):
                 self._received.extend(self._receiver.take_frames())
@@ -255,7 +268,7 @@ class SocketCanBus(Bus):
         self._open()
 
     def _carries_frames(self) -> bool:
-        """Return whether any frame is received within 0.25 s, including transmitted frames of other programs."""
+        """Return whether a frame passes within 0.25 s, from the bus or from another program of this machine."""
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as listener:
             listener.bind((self.channel,))
             return bool(select.select([listener], [], [], _LIVE_S)[0])
@@ -300,7 +313,7 @@ def _pack_filters(can_ids: Iterable[int] | None) -> bytes:
 
 
 def _require_socketcan(channel: str) -> None:
-    """Raise BusMissingError unless the kernel has SocketCAN."""
+    """Raise BusMissingError, for `channel`, unless a raw socket of SocketCAN can be opened."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:

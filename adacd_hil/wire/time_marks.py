@@ -50,7 +50,7 @@ def pack_mark(kind: MarkKind, t_ns: int = 0) -> bytes:
 
 
 def unpack_mark(data: bytes) -> tuple[MarkKind, int] | None:
-    """Return the kind of a mark and its time in ns; None for other data."""
+    """Return the kind of a mark and its time in ns; None for another length or kind."""
     if len(data) != _PACKING.size:
         return None
     (packed,) = _PACKING.unpack(data)
