@@ -81,7 +81,10 @@ class RecordingFinding(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """All samples of some recordings, (k, n), their times in the recording (k,), and the period."""
+    """All samples of some recordings (k, n), one recording after the other.
+
+    time_s (k,): since each recording's first row.
+    """
 
     time_s: Vector
     q: Vector
@@ -235,7 +238,7 @@ def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, 
 def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     """Report joints at rest or with dead encoders, noise, and one joint far beyond the URDF's limits.
 
-    Limits of position and of speed; far: `_BEYOND_LIMITS` times.
+    Far is over `_BEYOND_LIMITS` times a limit of position or speed.
     """
     n, urdf = described.joints, described.urdf
     travel = np.ptp(columns.q, axis=0)

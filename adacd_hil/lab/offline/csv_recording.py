@@ -140,7 +140,10 @@ def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[lis
 
 
 def _open_text(path: Path) -> TextIO:
-    """Open a text file. Raises LogError, with the way out, if its first bytes are those of another format."""
+    """Open a text file in UTF-8, with or without a byte-order mark; the caller closes it.
+
+    Raises LogError, with the remedy, if its first bytes are those of another format; OSError if it can't be opened.
+    """
     file = open_input(path)
     begin = file.peek(16)
     for magic, kind in _KINDS_OF_FILE:
@@ -184,7 +187,10 @@ def _time_column(path: Path, heads: list[str], cells: int, described: RecordingM
 
 
 def _place(path: Path, name: str, heads: list[str], cells: int) -> int:
-    """Return the index, from 0, of a column by its head, or by its number from 1. Raises ConfigError without one."""
+    """Return the index, from 0, of a column by its head, or else by its number from 1.
+
+    cells: number of columns. Raises ConfigError if the file has no such column.
+    """
     if name in heads:
         return heads.index(name)
     if name.isdecimal() and 1 <= int(name) <= cells:

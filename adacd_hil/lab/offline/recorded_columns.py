@@ -225,5 +225,5 @@ class RecordedRows:
 
 
 def _differences(rows: Vector) -> Vector:
-    """Return the size of each row's differences from the row before (k - 1, c), NaN where a value is not finite."""
+    """Return the absolute differences of each row from the row before (k - 1, c); NaN where a value is not finite."""
     return np.abs(np.diff(np.where(np.isfinite(rows), rows, np.nan), axis=0))

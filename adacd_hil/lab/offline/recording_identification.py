@@ -69,7 +69,10 @@ class Watched:
 
 @dataclass(frozen=True)
 class Identified(Fitted):
-    """A fit, its verdict, and the contacts found in the test and in further recordings."""
+    """A fit with its verdict. test: contacts found in the test, which should be none.
+
+    watched: those in further recordings.
+    """
 
     verdict: Verdict
     test: Watched

@@ -75,7 +75,7 @@ class ForeignRecording:
 
     @property
     def has_velocities(self) -> bool:
-        """Whether velocities were measured, not derived from the positions."""
+        """Whether velocities were measured, not derived from the positions: `blur_s` is 0."""
         return self.blur_s == 0.0
 
     @property
@@ -85,7 +85,7 @@ class ForeignRecording:
 
     @property
     def records(self) -> list[Record]:
-        """The samples of the stretches."""
+        """The samples as a list of `Record`, one per stretch, in their order."""
         return [stretch.record for stretch in self.stretches]
 
     @property

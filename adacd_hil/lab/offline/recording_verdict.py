@@ -173,7 +173,7 @@ def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
 
 
 def _shares(fit: Fitted) -> tuple[JointShare, ...]:
-    """Return each joint's result of the test: explained share of its torque, margin, rms, explained or not."""
+    """Return each joint's result of the test, in their order: explained share, margin, rms torque, explained or not."""
     parts = [offline.filtered(fit.model, record, fit.estimate, fit.settings) for record in fit.tested.records]
     torque, residual = (np.concatenate([getattr(part, name) for part in parts]) for name in ("torque", "residual"))
     unit = np.concatenate([part.unit for part in parts])
@@ -416,7 +416,7 @@ def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
 def _of_friction(fit: Fitted) -> Iterator[RecordingFinding]:
     """Report, as remarks, friction that drives a joint on, or whose viscous or Coulomb term is negative.
 
-    Only if it is so by more than `_SIGMAS` deviations.
+    It must be so by more than `_SIGMAS` deviations.
     """
     speed = np.abs(samples((fit.tested,), "dq"))
     theta, deviation = fit.estimate.theta, fit.deviation
