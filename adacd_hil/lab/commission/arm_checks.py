@@ -168,7 +168,8 @@ def boot_nodes(patient: ArmExamination) -> Finding:
 def check_contract(patient: ArmExamination) -> Finding:
     """Fail if a device's wire version or layout digest, 0x2000, isn't that of the host's DBC.
 
-    Skipped if a device lacks 0x2000 and none differs. Raises DeviceError if a device refuses or doesn't answer.
+    The check is skipped if a device lacks 0x2000 and none differs. Raises DeviceError if a device refuses or doesn't
+    answer.
     """
     codec = patient.codec
     lacking = []
@@ -214,7 +215,7 @@ def check_pdo_map(patient: ArmExamination) -> Finding:
 def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
     """Return a line on how a motor's rated torque, 0x6076, becomes that of its joint, `rated_Nm`.
 
-    A slave whose EDS lacks 0x6076 gets a line that says so. Reads the object. Raises DeviceError.
+    If the slave's EDS lacks 0x6076, the line is on that. Reads the object from the slave. Raises DeviceError.
     """
     if not slave.has(0x6076):
         return f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint"
@@ -361,7 +362,7 @@ def _by_joint(form: str, values: Vector) -> str:
 def check_rest(patient: ArmExamination) -> Finding:
     """Fail if a joint was faster than `safety.rest_velocity_rad_s` in the stored cycles.
 
-    Skipped if no cycle is complete.
+    The check is skipped if no cycle is complete.
     """
     dq = patient.joint_values("dq")
     if not len(dq):
@@ -377,7 +378,7 @@ def check_rest(patient: ArmExamination) -> Finding:
 def check_torque_zero(patient: ArmExamination) -> Finding:
     """Fail if a joint's mean torque at rest is above `safety.rest_torque_Nm`; warn above the detection threshold.
 
-    Skipped without complete cycles.
+    The check is skipped without complete cycles.
     """
     tau_J = patient.joint_values("tau_J")
     if not len(tau_J):
@@ -396,7 +397,7 @@ def check_torque_zero(patient: ArmExamination) -> Finding:
 def check_noise(patient: ArmExamination) -> Finding:
     """Warn if a torque never changed in the stored cycles, or three of its rms values exceed the detection threshold.
 
-    Skipped with fewer than two complete cycles.
+    The check is skipped with fewer than two complete cycles.
     """
     tau_J = patient.joint_values("tau_J")
     if len(tau_J) < 2:

@@ -253,7 +253,7 @@ def _with_hardware(check: Callable[[Host, InterfaceState], Finding]) -> Callable
 def check_bitrate(host: Host, link: InterfaceState) -> Finding:
     """Fail if the interface's bit rate, or with CAN FD its data bit rate, isn't the contract's.
 
-    Skipped if the kernel doesn't report it.
+    The check is skipped if the kernel doesn't report it.
     """
     if link.bitrate is None:
         return skipped("the kernel does not report it here; install iproute2")
@@ -303,7 +303,10 @@ def check_controller(_host: Host, link: InterfaceState) -> Finding:
 
 
 def check_queue(host: Host) -> Finding:
-    """Warn if the transmit queue holds `LONG_QUEUE_FRAMES` or more: outdated commands. Skipped without SocketCAN."""
+    """Warn if the transmit queue holds `LONG_QUEUE_FRAMES` or more, outdated commands after a dead bus.
+
+    The check is skipped without SocketCAN.
+    """
     if host.link is None:
         return skipped("no SocketCAN interface")
     length, name = host.link.txqueuelen, host.link.name
@@ -331,7 +334,7 @@ def check_mtu(host: Host) -> Finding:
 def check_permissions(host: Host) -> Finding:
     """Warn if this process lacks CAP_NET_ADMIN, with which it empties the interface's queue after a fault.
 
-    Skipped for an interface other than SocketCAN, or if /proc doesn't tell.
+    The check is skipped for an interface other than SocketCAN, or if /proc doesn't tell.
     """
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} has no queue in the kernel")

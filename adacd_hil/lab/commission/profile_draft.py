@@ -668,7 +668,7 @@ class _DriveWriter(_ProfileWriter):
     def _command(self) -> _Record:
         """Return the RPDO that can take controlword and target torque.
 
-        One of fixed mapping only if it has no object that the host can't fill. Raises ConfigError if there is none.
+        If its mapping is fixed, it has no object that the host can't fill. Raises ConfigError if there is no such RPDO.
         """
         wanted = ((0x6040, 0), (0x6071, 0))
         for record in self.records(is_received=True):
