@@ -69,7 +69,7 @@ class Chain(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Scratch arrays for one evaluation; the next one overwrites them."""
+    """Scratch arrays for one evaluation of an arm; each evaluation overwrites them. `new_scratch` makes them."""
 
     E: Vector  # (n, 3, 3), from the frame of the link before to the link's
     r: Vector  # (n, 3), the link's origin in the frame of the link before, m
@@ -160,9 +160,9 @@ def fill_regressor(
 
 @compiled
 def add_form(u: Vector, x: Vector, scale: float, row: Vector) -> None:
-    """Add `scale` times the coefficients of a link's parameters in u' I x to row (10,), in place.
+    """Add `scale` times the coefficients of a link's ten parameters in the form u' I x to row (10,), in place.
 
-    I: the link's spatial inertia. u, x (6,): motions, the angular part first.
+    I: the link's spatial inertia. u, x (6,): motions in the link's frame, the angular part first.
     """
     row[0] += scale * (u[3] * x[3] + u[4] * x[4] + u[5] * x[5])
     # first moment: u_v x x_w + x_v x u_w
@@ -277,7 +277,7 @@ def _carry(E: Vector, r: Vector, x: Vector, y: Vector) -> None:
 
 @compiled
 def _cross(v: Vector, u: Vector, y: Vector) -> None:
-    """Fill y (6,) with v x u, the rate of the motion u (6,) that moves along with v (6,); y may be u."""
+    """Write to y (6,) the product v x u of two motions (6,): the rate of u, which moves along with v; y may be u."""
     u0, u1, u2, u3, u4, u5 = u[0], u[1], u[2], u[3], u[4], u[5]
     y[0] = v[1] * u2 - v[2] * u1
     y[1] = v[2] * u0 - v[0] * u2

@@ -192,7 +192,7 @@ def with_payload(
 
 @dataclass(frozen=True)
 class OfflineCertificate:
-    """The frozen model on motion that was not used for the fit."""
+    """Result of the test of a frozen model on motion that was not used for the fit."""
 
     residual_rms_Nm: Vector  # (n,)
     residual_max_Nm: Vector  # (n,)
@@ -208,7 +208,10 @@ class OfflineCertificate:
 
 @dataclass(frozen=True)
 class FilteredTorque:
-    """Torque and residual (k, n) behind the filter of the fit, Nm. unit (k,): its output for a constant 1 Nm."""
+    """Measured torque and residual (k, n) of a record behind the filter of the fit, Nm.
+
+    unit (k,): the filter's output for a constant 1 Nm.
+    """
 
     torque: Vector
     residual: Vector  # measured minus predicted
@@ -313,7 +316,7 @@ def mass_terms(model: ArmModel, q: Vector, dq: Vector) -> Vector:
 
 
 def filtered_noise_Nm(settings: OfflineSettings) -> Vector:
-    """Return each torque sensor's noise behind the filter of the fit (n,), Nm."""
+    """Return the rms noise of each torque sensor (n,), Nm, behind the filter of the fit."""
     gains = _noise_gains(settings.fit_cutoff_rad_s, settings, is_smoothed=True)
     return gains.torque * np.array(settings.noise_Nm)
 
@@ -419,13 +422,13 @@ class _Memory(NamedTuple):
 
 
 def _new_memory(joints: int, count: int) -> _Memory:
-    """Return the memory before the first sample."""
+    """Return the memory before the first sample, all zeros. count: number of parameters, p."""
     columns, joint, parameter = (joints, count), (joints,), (count,)
     return _Memory(*(np.zeros(shape) for shape in (*(columns,) * 8, *(joint,) * 9, *(columns,) * 2, *(parameter,) * 2)))
 
 
 class _NoiseGains(NamedTuple):
-    """The filters' gains for white noise of 1: its standard deviation, and the cost of its correlation in a fit."""
+    """The filters' gains: standard deviation of their output for white noise of 1, and the cost of its correlation."""
 
     torque: float
     velocity: float  # of M delta_dq, 1/s
