@@ -27,11 +27,11 @@ class StreamDetector(Protocol):
     """A detector on one stream, from the stream's beginning; it keeps its state from one `take` to the next."""
 
     def take(self, z: Vector, held_Nm: Vector) -> Vector:
-        """Process N more samples; return the statistic of each sample and joint (N, n).
+        """Process N more samples of the stream; return the statistic of each sample and joint (N, n), finite.
 
-        z (N, n): the stream. held_Nm (N, n): the friction that may hold a standing joint. An alarm is a statistic above
-        its threshold. A statistic may depend on its sample and those before, but not on how the stream is cut into
-        pieces.
+        z (N, n): the stream, Nm. held_Nm (N, n): the friction that may hold a standing joint. An alarm is a statistic
+        above its threshold. A statistic may depend on its sample and those before, but not on how the stream is cut
+        into pieces.
         """
 
 
@@ -80,7 +80,7 @@ def _load(entry: importlib.metadata.EntryPoint, reserved: Collection[str]) -> No
 
 
 def forget_loaded() -> None:
-    """Remove the detectors of entry points, so that the next look-up loads them again."""
+    """Remove the detectors of entry points, so that the next look-up loads them again; those of `register` stay."""
     _LOADED.clear()
     for name in [name for name, found in _REGISTERED.items() if found.origin]:
         del _REGISTERED[name]
@@ -101,7 +101,7 @@ def add(name: str, make: Maker, reserved: Collection[str], origin: str = "") -> 
 
 
 def remove(name: str) -> None:
-    """Remove a registered detector. Raises KeyError if it was not registered."""
+    """Remove a registered detector by its name. Raises KeyError if there is none."""
     del _REGISTERED[name]
 
 

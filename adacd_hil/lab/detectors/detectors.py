@@ -203,7 +203,7 @@ class DetectorMemory:
 
 @dataclass(frozen=True)
 class DetectorConstants:
-    """The constants of the detectors: decay of each filter, band and gains of the observers, weights (n, N, L)."""
+    """The constants of the detectors: decay of each filter per period, gains of the observers, weights (n, N, L)."""
 
     period_s: float
     decay: Vector
@@ -240,9 +240,10 @@ def new_memory(constants: Structured) -> Structured:
 
 @compiled
 def step(constants: Structured, memory: Structured, z: Vector, held_Nm: Vector, statistics: Vector) -> None:
-    """Process one sample z (n,): update `memory` and fill `statistics` (channels, n), both in place.
+    """Process one sample z (n,), Nm: update `memory`, and overwrite `statistics` (channels, n), both in place.
 
-    held_Nm (n,): the friction that may hold each joint, F_c if it stands still, else 0.
+    The channels are the built-in ones. held_Nm (n,): the friction that may hold each joint, F_c if it stands still,
+    else 0.
     """
     c: DetectorConstants = constants[0]
     m: DetectorMemory = memory[0]

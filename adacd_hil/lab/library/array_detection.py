@@ -46,7 +46,7 @@ _UNITS: Final = {"t": "s", "q": "rad", "dq": "rad/s", "tau_J": "Nm"}
 
 
 class ArrayError(ValueError):
-    """Arrays or options that can't be used; one line: quantity, value, bound, unit."""
+    """Arrays or options can't be used; the message is one line: quantity, value, bound, unit."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +113,8 @@ class FittedModel:
     """A model fitted to free motion, and tested on other motion.
 
     names, theta, std: parameters (p,) and their standard deviations. margin: smallest threshold over residual in the
-    test; below 1 the model lacks more than noise. explained: share (n,) of each joint's torque that it explains in the
-    test, nan without torque. verdict: whether the torque is explained, the reasons if not, the next step.
+    test; below 1 the model lacks more than noise. explained: share (n,) of each joint's torque that the model explains
+    in the test, nan without torque. identified: fit, test and settings in full.
     """
 
     arm: OfflineArm
@@ -127,7 +127,7 @@ class FittedModel:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict: whether the torque is explained, with reasons, remarks and the next step."""
+        """The verdict of the test: whether the model explains the torque, with reasons, remarks and the next step."""
         return self.identified.verdict
 
     def __repr__(self) -> str:
@@ -136,9 +136,10 @@ class FittedModel:
 
 @dataclass(frozen=True)
 class ArrayDetection:
-    """The model, and for m samples at a fixed period: t_s (m,), tau_ext_hat and threshold (m, n) in Nm; the contacts.
+    """Contacts in arrays, and of m samples at a fixed period t_s (m,), tau_ext_hat and threshold (m, n), Nm.
 
-    The samples are those of the arrays if these have a fixed period; gaps split them, and short rests are left out.
+    The samples are those of the arrays if these have a fixed period; gaps split them, and parts of fewer than 50
+    samples are left out. Contacts are in the order of time.
     """
 
     model: FittedModel

@@ -79,7 +79,7 @@ class LoadedRun:
         return f"<LoadedRun {self.path}: {', '.join(found)}, {certified}{'; ' + self.problem if self.problem else ''}>"
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return an array by its name. Raises KeyError that names the nearest."""
+        """Return an array by its name. Raises KeyError, with the nearest name, for an unknown one."""
         if name not in self.arrays:
             near = nearest_name(name, self.arrays)
             hint = f"did you mean {near!r}?" if near else f"there are {', '.join(self.arrays)}"
@@ -119,7 +119,7 @@ class LoadedRun:
 
     @cached_property
     def settings(self) -> Settings:
-        """Settings of the run. Raises LogError if the log lacks them."""
+        """Settings of the run, from the log. Raises LogError if the log lacks them or they can't be read."""
         return settings_of(self.path, self.attachments)
 
     def columns(self) -> dict[str, NDArray[Any]]:
