@@ -183,7 +183,7 @@ def _intervals(scheme: Any, cycle: NDArray[np.int64], before: int | None, period
 
 
 def _spread(is_bad: Mask, samples: int) -> Mask:
-    """Return the mask of the samples with a bad one at most `samples` away."""
+    """Return the mask (n,) of the samples that are bad, or at most `samples` away from a bad one."""
     spread = maximum_filter1d(is_bad.view(np.uint8), 2 * samples + 1, mode="constant", cval=0)
     return np.asarray(spread.view(np.bool_))
 
@@ -220,7 +220,10 @@ def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
 
 
 def _windows(logs: Sequence[LoggedMotion]) -> list[Mask]:
-    """Return the mask (N,) of each log's samples to process: all, or windows with free motion, evenly spread."""
+    """Return the mask (N,) of each log's samples to process: all, or only windows with free motion, spread evenly.
+
+    All if they are at most `MOST_SAMPLES`; the windows have `WINDOW` samples.
+    """
     if sum(len(log.is_free) for log in logs) <= MOST_SAMPLES:
         return [np.ones(len(log.is_free), np.bool_) for log in logs]
     has_free = [np.logical_or.reduceat(log.is_free, np.arange(0, len(log.is_free), WINDOW)) for log in logs]

@@ -207,8 +207,8 @@ def calibrate_all(
 ) -> tuple[dict[str, tuple[Vector, TailCalibration]], tuple[str, ...]]:
     """Return each detector's thresholds and calibration for a rate of false alarms, and the names of those that failed.
 
-    As of `calibrate_detector`, by name. A detector fails if its tail can't be fitted. Raises TooLittleMotionError if
-    all fail.
+    They are by name, and as of `calibrate_detector`. A detector fails if its tail can't be fitted. Raises
+    TooLittleMotionError if all fail.
     """
     found: dict[str, tuple[Vector, TailCalibration]] = {}
     missing: list[str] = []
@@ -254,8 +254,8 @@ def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence
 def check_prediction(peaks: Vector) -> tuple[float, float] | None:
     """Calibrate a detector on every other tenth of the motion, and count its alarms in the rest; return both rates.
 
-    Per hour: the rate that it was calibrated for, such that the rest should have `_CHECKED_ALARMS`, and the counted
-    one. None if half of the motion is too short. peaks (B, channels, n).
+    The first is the rate, 1/h, that it was calibrated for, such that the rest should have `_CHECKED_ALARMS`; the second
+    is the counted one. None if half of the motion is too short. peaks (B, channels, n).
     """
     tenth = -(-len(peaks) // 10)
     is_first = np.arange(len(peaks)) // tenth % 2 == 0

@@ -148,7 +148,10 @@ def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: 
 
 
 def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
-    """Return the outcome of all logs' replays with one variant; contacts count where the logged scheme was armed."""
+    """Return the outcome of all logs' replays with one variant; contacts count where the logged scheme was armed.
+
+    replays: each log with its replay.
+    """
     took_s = [each for _, found in replays for each in found.adaptation_s]
     judged = [(found, found.score) for _, found in replays if found.score is not None]
     armed = {(log.path, window.number) for log, _ in replays for window in log.windows or () if window.is_armed}
@@ -273,7 +276,7 @@ def _plain(path: Path) -> str:
 
 
 def in_words(found: Found) -> str:
-    """Return a phrase on the effect of thresholds: false alarms, their rate, and contacts found."""
+    """Return the effect of thresholds as a phrase: false alarms, their rate, and contacts found if these are known."""
     text = rate_phrase(found.alarms, found.hours, found.rate_bound_per_h)
     if found.contacts is None:
         return text

@@ -5,7 +5,7 @@ residual is seen; the model is frozen while it does. The certified scheme keeps 
 threshold: it is replayed with its own thresholds, and its statistic is the largest ratio to them, which grow with
 `certified.noise_sigmas` and `certified.model_sigmas` (but for the friction that is allowed at standstill).
 
-Detectors (`scheme.detectors`) take the stream with theta_hat as it is in the log and the lag as identified from all
+Detectors (`lab.detectors`) take the stream with theta_hat as it is in the log and the lag as identified from all
 motion. Each contact is seen by detectors that were at rest `WARM_UP_S` before it.
 """
 
@@ -65,7 +65,7 @@ def candidates(settings: Settings) -> list[Changes]:
 def _filter(settings: Settings, factor: float) -> Changes:
     """Return the changed settings, as TOML by key, that multiply the filter's cut-offs by `factor`.
 
-    Of the paper's filter a and b, so its gain at rest stays.
+    In the paper's filter these are a and b, so its gain at rest stays.
     """
     if settings.scheme == "certified":
         return {"certified.cutoffs_rad_s": in_toml([factor * each for each in settings.certified.cutoffs_rad_s])}
@@ -139,7 +139,7 @@ def _show_to(shown: "Sequence[ShownLog]") -> Watch:
 
 
 def name_of(changes: Mapping[str, str]) -> str:
-    """Return the name of a candidate, its changed settings; "as it is" without a change."""
+    """Return the name of a candidate by its changed settings, "KEY=VALUE, …"; "as it is" without a change."""
     return ", ".join(f"{key}={value}" for key, value in changes.items() if key != "filter.b_rad_s") or "as it is"
 
 

@@ -138,9 +138,10 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class Choice:
-    """Thresholds (channels, n) for a wanted rate, chosen on one half and checked on the other.
+    """Thresholds (channels, n) for a wanted rate, chosen on one half of the motion and checked on the other.
 
-    calibration: the tail's, None where the motion is too short for one: then they are the largest values seen.
+    chosen, checked: their effect on each half. calibration: the tail's, None where the motion is too short for one:
+    then they are the largest values seen.
     """
 
     name: str
