@@ -678,8 +678,8 @@ class Drafting:
     def _ask_mounting(self) -> tuple[Pair, str]:
         """Return the tilt of the plane of motion and the q1 at which link 1 hangs down, deg, and their source.
 
-        By options, else by the user; `LEVEL_DEG` for a slight tilt. The source is "" for a guess. Raises CommandError
-        for options that exclude each other.
+        Options give them, else the user; a slight tilt gives `LEVEL_DEG`. The source is "" for a guess. Raises
+        CommandError for options that exclude each other.
         """
         options, interview = self.options, self.interview
         given = options.mounting

@@ -139,7 +139,10 @@ def _exit_code(test: CommunicationTest, fault: FaultReason, is_interrupted: bool
 
 
 def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection, achieved: dict[str, str]) -> Recorder:
-    """Open the log of a test in the folder `out`, with the contract and the settings attached. Raises LogError."""
+    """Create the log of a test in the folder `out`, and the folder; attach contract and settings; return its recorder.
+
+    achieved: metadata on the host. Raises LogError if it can't be created.
+    """
     out.mkdir(parents=True, exist_ok=True)
     return Recorder(
         out / LOG_NAME,
@@ -195,7 +198,7 @@ def write_page(out: Path, test: CommunicationTest, described: dict[str, Any]) ->
 
 
 def describe(test: CommunicationTest, settings: Settings, scheduler: str) -> dict[str, Any]:
-    """Return a test as a dictionary for JSON; times in µs. scheduler: granted to this process."""
+    """Return a finished test as a dictionary for JSON; times in µs. scheduler: name of that granted to this process."""
     evidence = _evidence(test, settings.bus.period_us)
     return {
         "verdict": test.verdict.value,

@@ -27,8 +27,8 @@ _LABELS = (
 def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> dict[str, Any]:
     """Search an excitation for a configuration; return the result by the keys of its JSON.
 
-    `present`, None without one, and `found`: figures of the configuration's excitation and of the one found; `limits`:
-    their bounds; `excitation`: the one found. seconds: after which no further climb is begun. out: file that the caller
+    `present`, None without one, and `found`: figures of the configuration's excitation and of the found one; `limits`:
+    their bounds; `excitation`: the found one. seconds: after which no further climb is begun. out: file that the caller
     will write, refused if it is the configuration. Raises ConfigError for a configuration that allows no search,
     CommandError for `out`, or if no motion keeps the limits.
     """

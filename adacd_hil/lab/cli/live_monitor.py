@@ -178,7 +178,7 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
 
 @contextlib.contextmanager
 def _decoding() -> Iterator[None]:
-    """Raise LogError in place of the block's decoding errors: the server doesn't serve a log of adacd-hil."""
+    """Raise LogError in place of the block's decoding errors: then the server doesn't serve a log of adacd-hil."""
     try:
         yield
     except (ValueError, LookupError, OverflowError, struct.error):

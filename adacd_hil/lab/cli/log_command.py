@@ -308,9 +308,9 @@ def export(
 
 
 def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
-    """Return text and path of a recording's DBC: the given one, else the one in an MCAP log, else the package's.
+    """Return text and path of a recording's DBC: of `dbc` if given, else from an MCAP log, else the package's.
 
-    Raises CodecError if it can't be read, LogError for an MCAP file that can't be.
+    Raises CodecError if the DBC can't be read, LogError for an MCAP file that can't be.
     """
     from adacd_hil.log.log_files import DBC_NAME
     from adacd_hil.log.log_walk import attachment

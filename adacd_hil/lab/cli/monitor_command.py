@@ -97,7 +97,8 @@ class Monitor:
     def describe(self) -> dict[str, Any]:
         """Return the traffic so far as a dictionary for JSON; its load is of the time since the previous call.
 
-        As of `BusView.describe`, with bus_state, "" for other than SocketCAN, and not_processed, None if unknown.
+        It has the keys of `BusView.describe`, bus_state, "" for other than SocketCAN, and not_processed, None if
+        unknown.
         """
         now_ns = self._clock.now_ns()
         if self._link_name is not None and now_ns - self._state_ns >= _LINK_S * 1e9:

@@ -234,7 +234,7 @@ def _run(
 
 
 def _as_text(described: dict[str, Any]) -> str:
-    """Format the result for people."""
+    """Return the result of `_run` as text for people: frames sent, withheld, not sendable, lateness, and a problem."""
     from adacd_hil.lab.logs.playback import LATE_NS
 
     late = described["lateness_us"]

@@ -171,7 +171,10 @@ def _files(logs: Sequence[Path]) -> list[Path]:
 
 
 def _seeds(text: str) -> range:
-    """Return the seeds A to B of the text `A:B`, or N alone of `N`. Raises CommandError."""
+    """Return the seeds A to B, both included, of the text "A:B", or N alone of "N".
+
+    Raises CommandError for other text.
+    """
     first, colon, last = text.partition(":")
     try:
         low, high = int(first), int(last if colon else first)

@@ -88,6 +88,9 @@ def tare_on_bus(
 
 
 def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:
-    """Return the settings with number of poses and time per pose replaced, unless None. Raises ConfigError."""
+    """Return the settings with `tare.poses` and `tare.window_s` replaced by number and seconds, unless None.
+
+    Raises ConfigError for a value out of bounds.
+    """
     given = {"tare.poses": poses, "tare.window_s": seconds}
     return apply_settings(settings, {key: repr(value) for key, value in given.items() if value is not None})
