@@ -123,7 +123,10 @@ class Verdict(Enum):
 
 
 def judge(share: float) -> Verdict:
-    """Return the verdict on a share 0…1 of periods with complete fresh data, by `SUFFICIENT_SHARE` and `GOOD_SHARE`."""
+    """Return the verdict on a share 0…1 of periods with complete fresh data.
+
+    NOT_SUFFICIENT is below 0.90, GOOD is from 0.95 on.
+    """
     if share < SUFFICIENT_SHARE:
         return Verdict.NOT_SUFFICIENT
     return Verdict.WARNING if share < GOOD_SHARE else Verdict.GOOD
@@ -218,7 +221,7 @@ class CommunicationTest:
         }
 
     def load_percent(self) -> float:
-        """Return the bus load, percent, over the last `_LOAD_CYCLES` cycles, sent and received; 0 without cycles."""
+        """Return the bus load, percent, over the last 1000 cycles, sent and received; 0 without cycles."""
         meter = LoadMeter(self.bitrate, self.data_bitrate, 0)
         for cycle in self._recent:
             for _, frame in cycle.frames:

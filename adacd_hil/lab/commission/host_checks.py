@@ -303,7 +303,7 @@ def check_controller(_host: Host, link: InterfaceState) -> Finding:
 
 
 def check_queue(host: Host) -> Finding:
-    """Warn if the transmit queue holds `LONG_QUEUE_FRAMES` or more, outdated commands after a dead bus.
+    """Warn if the transmit queue holds 100 frames or more, outdated commands after a dead bus.
 
     The check is skipped without SocketCAN.
     """
@@ -361,7 +361,7 @@ def request_scheduler(host: Host) -> Finding:
 
 
 def check_throttling(host: Host) -> Finding:
-    """Warn if the kernel lets real-time processes work for less than `_RT_SHARE` of the time; skipped if unknown."""
+    """Warn if the kernel lets real-time processes work for less than 90 % of the time; skipped if unknown."""
     folder = host.root / "proc/sys/kernel"
     try:
         runtime_us = int(_read(folder / "sched_rt_runtime_us"))

@@ -140,7 +140,7 @@ def measure_pose(q: Vector, dq: Vector, tau_J: Vector, settings: Settings) -> Po
 
 
 def _standard_error(tau_J: Vector) -> Vector:
-    """Return the standard error of the mean (2,): the larger of that by samples and that by `_BLOCKS` blocks.
+    """Return the standard error of the mean (2,): the larger of that by samples and that by 10 blocks.
 
     Blocks show coloured noise.
     """

@@ -175,7 +175,7 @@ def _fitted(
 ) -> FittedModel:
     """Fit a model to the free motion of a recording, and test it.
 
-    fit_s: its span in the arrays' time; None: the first `FIT_SHARE`. Raises ArrayError if that is too little motion or
+    fit_s: its span in the arrays' time; None: the first 40 %. Raises ArrayError if that is too little motion or
     no span, or `scheme` has an invalid setting.
     """
     start_s, end_s = _span(recording, fit_s)
@@ -311,7 +311,7 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
 
 
 def _numbers(name: str, given: ArrayLike) -> Vector:
-    """Return an array as float64 values of at most `LARGEST` in size; times may be larger, but finite.
+    """Return an array as float64 values of at most 1e6 in size; times may be larger, but finite.
 
     name: of the array, for the error. Raises ArrayError.
     """
@@ -332,7 +332,7 @@ def _numbers(name: str, given: ArrayLike) -> Vector:
 
 
 def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tuple[float, float]:
-    """Return the span of free motion, s since the recording's first row; by default the first `FIT_SHARE` of it.
+    """Return the span of free motion, s since the recording's first row; by default the first 40 % of it.
 
     Raises ArrayError if `fit_s` is no pair of times, or ends before it begins.
     """

@@ -143,7 +143,7 @@ def _trimmed(cells: list[str]) -> list[str]:
 
 
 def _begins(rows: list[list[str]], decimal: str) -> bool:
-    """Return whether these are `_FULL_ROWS` rows of equally many numbers, at least three each."""
+    """Return whether these are 4 rows of equally many numbers, at least three each."""
     count = len(rows[0]) if rows else 0
     return len(rows) == _FULL_ROWS and count >= 3 and all(len(row) == count and _is_full(row, decimal) for row in rows)
 

@@ -374,7 +374,7 @@ def _only(element: Element, tag: str, where: str) -> Element | None:
 def _number(element: Element, key: str, where: str, default: float | None = None) -> float:
     """Return an attribute as a finite number, `default` if it is missing.
 
-    Raises UrdfError if it is no such number, above `LARGEST`, or missing without a default. where: name in errors.
+    Raises UrdfError if it is no such number, above 1e18, or missing without a default. where: name in errors.
     """
     text = element.get(key)
     if text is None:
@@ -400,7 +400,7 @@ def _numbers(element: Element, key: str, where: str, default: float | None = Non
 
 
 def _parse(word: str, where: str) -> float:
-    """Return a word as a finite number of at most `LARGEST`. Raises UrdfError; where: name in errors."""
+    """Return a word as a finite number of at most 1e18. Raises UrdfError; where: name in errors."""
     try:
         value = float(word)
     except ValueError:

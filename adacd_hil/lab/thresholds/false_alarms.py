@@ -49,9 +49,9 @@ class TooLittleMotionError(LogError):
 
 
 def clusters(peaks: Vector, level: float) -> Vector:
-    """Return the largest value of each alarm (m,) in block maxima (B,) of `BLOCK_S`; NaN blocks don't count.
+    """Return the largest value of each alarm (m,) in block maxima (B,) of 0.1 s each; NaN blocks don't count.
 
-    Blocks above `level` that are at most `CLUSTER_S` apart are one alarm. Empty if there are none.
+    Blocks above `level` that are at most 0.5 s apart are one alarm. Empty if there are none.
     """
     above = np.flatnonzero(np.nan_to_num(peaks, nan=-np.inf) > level)
     if above.size == 0:

@@ -199,9 +199,10 @@ def check_together(logs: Sequence[LoggedMotion]) -> None:
 
 
 def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
-    """Return all motion of the logs, one after the other; of more than `MOST_SAMPLES` windows with free motion.
+    """Return all motion of the logs, one after the other; if it has over a million samples, only windows of it.
 
-    The windows are spread evenly. Raises LogError if a log can't be read, or the logs don't go together.
+    The windows have free motion and are spread evenly. Raises LogError if a log can't be read, or the logs don't go
+    together.
     """
     check_together(logs)
     chosen = _windows(logs)
@@ -222,7 +223,7 @@ def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
 def _windows(logs: Sequence[LoggedMotion]) -> list[Mask]:
     """Return the mask (N,) of each log's samples to process: all, or only windows with free motion, spread evenly.
 
-    All if they are at most `MOST_SAMPLES`; the windows have `WINDOW` samples.
+    All if they are at most a million; a window has 10,000 samples.
     """
     if sum(len(log.is_free) for log in logs) <= MOST_SAMPLES:
         return [np.ones(len(log.is_free), np.bool_) for log in logs]
