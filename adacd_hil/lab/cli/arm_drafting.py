@@ -444,7 +444,7 @@ class Drafting:
     def _ask_eds(self, kind: str, joint: int, device: RecognisedDevice) -> str:
         """Ask for the EDS of a device without a profile; draft that profile, and return its file name.
 
-        joint: 0 or 1.
+        joint: 0 or 1. The question is repeated while the EDS isn't there or can't be used.
         """
 
         def read(text: str) -> str:

@@ -63,7 +63,10 @@ _FILTER_OPTIONS = (  # last first: click lists them the other way round
 
 
 def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
-    """Return a command with added options that choose runs; it receives them as `asked`, a `RunFilter`."""
+    """Return a command with added options that choose runs; it receives them as `asked`, a `RunFilter`.
+
+    The command fails with a CommandError if --since is after --until.
+    """
 
     @functools.wraps(command)
     def chosen(

@@ -291,9 +291,9 @@ class Search:
         return np.asarray(np.linalg.eigvalsh(self._step_s * rows.T @ rows), dtype=np.float64)
 
     def _cost(self, free: Vector, penalty: float) -> float:
-        """Return the cost of a motion, smooth in its coefficients, with exceeded limits.
+        """Return the cost of a motion, smooth in its coefficients; it grows with the excess over the limits.
 
-        These cost `penalty` times the mean square of the excess, as share of the limit. free: as of `_complete`.
+        That is `penalty` times the mean square of the excess, as share of the limit. free: as of `_complete`.
         """
         motion = self.motion_of(*self._complete(free))
         W = self._regressors(motion)
