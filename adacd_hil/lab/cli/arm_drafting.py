@@ -65,7 +65,7 @@ _SHOWN_SHARE = 1e-5
 
 @dataclass(frozen=True)
 class InitOptions:
-    """Answers on the command line; None: not answered."""
+    """Answers on the command line, pairs for joint 1 and 2; None, () or False: not answered."""
 
     interface: str | None = None
     channel: str | None = None
@@ -99,21 +99,25 @@ class InitOptions:
 
 @dataclass
 class DraftFiles:
-    """Files to be written all at once, or not at all. Existing files stay unless `--force` is given."""
+    """Files to be written all together. Existing files stay unless `--force` is given, `is_forced`.
+
+    out: the configuration. contents: of the other files, by path.
+    """
 
     out: Path
     is_forced: bool
     contents: dict[Path, bytes] = field(default_factory=dict)
 
     def require_free(self, path: Path) -> None:
-        """Raise CommandError if the path exists, unless `--force` is given."""
+        """Raise CommandError if a file or link is at the path, unless `--force` is given."""
         if is_there(path) and not self.is_forced:
             raise CommandError(f"{path} exists; give another name, or --force to replace it", ExitCode.USAGE)
 
     def add_file(self, path: Path, content: str | bytes) -> None:
         """Add a file to those that `write_files` writes.
 
-        Raises CommandError if it has other content, in these files or, unless `--force` is given, on the disk.
+        Raises CommandError if the path has other content already: added before or, unless `--force` is given, on the
+        disk.
         """
         data = content.encode() if isinstance(content, str) else content
         if self.contents.get(path, data) != data:
@@ -123,9 +127,9 @@ class DraftFiles:
         self.contents[path] = data
 
     def examine(self, text: str) -> ConfigurationFindings:
-        """Check a configuration's text together with the other files, as `config check`; return the findings.
+        """Check a configuration's text together with the added files, as `config check`; return the findings.
 
-        Raises CommandError if it has errors.
+        Raises CommandError if it has errors. Writes to a temporary folder only.
         """
         with tempfile.TemporaryDirectory() as folder:
             for path, data in (self.contents | {self.out: text.encode()}).items():
@@ -137,7 +141,10 @@ class DraftFiles:
         return found
 
     def write_files(self, text: str) -> None:
-        """Write the configuration, `text`, to `out`, and the added files; make the folder. Raises CommandError."""
+        """Write the configuration, `text`, to `out`, and the added files; make the folder.
+
+        An existing file is replaced. Raises CommandError if one can't be written; earlier ones are then written.
+        """
         self.contents[self.out] = text.encode()
         try:
             self.out.parent.mkdir(parents=True, exist_ok=True)
@@ -148,7 +155,10 @@ class DraftFiles:
 
 
 class Drafting:
-    """State of one draft: devices found, answers, warnings, drafted profiles."""
+    """One draft of an arm's configuration: answers, devices found, drafted profiles.
+
+    bus: interface used, None without one. warnings: a line each. bitrate: of the bus, None if unknown.
+    """
 
     def __init__(self, options: InitOptions, interview: Interview, writing: DraftFiles) -> None:
         self.options, self.interview, self.writing = options, interview, writing
@@ -162,9 +172,11 @@ class Drafting:
         """Drafted and completed profiles, by kind and joint."""
 
     def draft(self) -> tuple[str, dict[str, Any]]:
-        """Scan the bus, ask the user, derive the other values; return the text of the configuration and a summary.
+        """Scan the bus, ask the user, derive the other values; return the text of a configuration, and a summary.
 
-        Writes no file; adds device profiles to `writing`.
+        The summary is for JSON. Writes no file; adds device profiles to `writing`. Raises CommandError without an
+        answer, for options that exclude each other, or if the configuration would have errors; ConfigError,
+        BusMissingError, BusError.
         """
         facts = self._gather()
         title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]}"
@@ -186,7 +198,7 @@ class Drafting:
         return text, summary
 
     def _gather(self) -> ArmFacts:
-        """Return devices, profiles, geometry and limits of the arm; ask the user for unknown ones."""
+        """Return devices, profiles, geometry and limits of the arm: by options, bus and URDF, else by the user."""
         options = self.options
         drives, sensors = self._find_devices()
         drive, sensor = self._profiles(drives, sensors)
@@ -234,9 +246,10 @@ class Drafting:
         )
 
     def _check_used(self, names: dict[str, Any]) -> None:
-        """Raise CommandError for a given value of a scale that a joint's profile doesn't have; names: profiles by kind.
+        """Raise CommandError for an option's value of a scale that a joint's profile doesn't have.
 
-        A unit is enough in one of both profiles; that of velocity counts as taken once it was asked for.
+        names: profiles by kind. A unit is enough in one of both profiles; that of velocity counts as used once it was
+        asked for.
         """
         for question in _QUESTIONS:
             if (given := question.given(self.options)) is None:
@@ -260,7 +273,10 @@ class Drafting:
                 )
 
     def _profile(self, kind: str, name: str, joint: int) -> ProfileSettings:
-        """Return a joint's profile: its draft, else the built-in one, else the file, from the output's folder."""
+        """Return the settings of a joint's profile: of its draft, else the built-in one, else the file.
+
+        joint: 0 or 1. A relative path counts from the output's folder.
+        """
         draft = self._drafts.get((kind, joint))
         if draft is not None:
             return draft.settings
@@ -269,7 +285,7 @@ class Drafting:
         return load_profile(there, kind).settings
 
     def _profile_guesses(self, facts: ArmFacts) -> list[str]:
-        """Return the guessed keys of the device profiles as "PROFILE: KEY", each once."""
+        """Return the guessed keys of drafted and built-in device profiles as "PROFILE: KEY", each once."""
         keys: dict[str, None] = {}
         for kind, names in ((DRIVE, facts.drive.value), (SENSOR, facts.sensor.value)):
             for joint, name in enumerate(names):
@@ -283,7 +299,10 @@ class Drafting:
     # -- devices
 
     def _find_devices(self) -> tuple[list[RecognisedDevice], list[RecognisedDevice]]:
-        """Scan the bus, if there is one; return drives and sensors of joint 1 and 2, [] without a bus."""
+        """Scan the bus, if there is one; return the drives and the sensors of joint 1 and 2, [] without a bus.
+
+        Sets `bus` and `bitrate`. Raises CommandError if fewer than two of a kind answer, BusMissingError, BusError.
+        """
         channel = self._ask_channel()
         if channel is None:
             return [], []
@@ -316,7 +335,10 @@ class Drafting:
         return chosen[0], chosen[1]
 
     def _ask_channel(self) -> str | None:
-        """Ask for the channel of the arm's bus; return it, None for an arm without hardware. Raises CommandError."""
+        """Return the channel of the arm's bus, by option or user; None for an arm without hardware.
+
+        Raises CommandError for options that exclude each other, or without an answer.
+        """
         options = self.options
         if options.is_busless and (options.channel or options.interface):
             raise CommandError("--no-bus and --interface or --channel exclude each other", ExitCode.USAGE)
@@ -348,9 +370,10 @@ class Drafting:
     def _choose_two(
         self, devices: Sequence[RecognisedDevice], kind: str, given: tuple[int, int] | None, channel: str
     ) -> list[RecognisedDevice]:
-        """Return the drives, or the sensors, of joint 1 and 2, asking for their node ids; warn if they are not given.
+        """Return the drives, or the sensors, of joint 1 and 2: as given, as the user answers, or by ascending node id.
 
-        kind: "drive" or "sensor". given: node ids of the option. Raises CommandError if fewer than two answer.
+        kind: "drive" or "sensor". given: node ids of the option. A proposal that was taken is added to `warnings`.
+        Raises CommandError if fewer than two answer.
         """
         known = {device.node.node_id: device for device in devices if device.kind == kind}
         option, nodes = f"--{kind}-node", " ".join(map(str, known)) or "none"
@@ -378,9 +401,10 @@ class Drafting:
         return answer
 
     def _profiles(self, drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]) -> tuple[Fact, Fact]:
-        """Return the names of the profiles of the drives and of the sensors, drafted from an EDS if needed.
+        """Return the names of the profiles of the drives and of the sensors, drafted from an EDS if one is given.
 
-        Raises CommandError if a device has neither a profile nor an EDS.
+        Without a bus and an EDS, they are the emulated devices' profiles, a guess. Raises CommandError if a device has
+        neither a profile nor an EDS.
         """
         options = self.options
         drafted = self._draft_profiles([*drives, *sensors])
@@ -418,7 +442,10 @@ class Drafting:
         return facts[0], facts[1]
 
     def _ask_eds(self, kind: str, joint: int, device: RecognisedDevice) -> str:
-        """Ask for the EDS of a device without a profile; draft that profile, and return its name. joint: 0 or 1."""
+        """Ask for the EDS of a device without a profile; draft that profile, and return its file name.
+
+        joint: 0 or 1. The question is repeated while the EDS isn't there or can't be used.
+        """
 
         def read(text: str) -> str:
             eds = Path(text)
@@ -430,9 +457,10 @@ class Drafting:
         return self.interview.ask("--eds FILE", None, question, read)[0]
 
     def beside(self, name: str, kind: str) -> str:
-        """Return a profile as the configuration names it: a built-in name, or a path relative to its folder.
+        """Return a profile's name as the configuration states it: a built-in name, or a path relative to its folder.
 
-        If profile or EDS are in that folder, they are added unchanged to the files to be written.
+        If profile or EDS are in that folder, they are added unchanged to the files to be written. Raises ConfigError if
+        the profile can't be read.
         """
         profile = load_profile(name, kind)
         if name in profile_names():
@@ -443,10 +471,10 @@ class Drafting:
         return os.path.relpath(name, self.writing.out.parent)
 
     def _draft_profiles(self, devices: Sequence[RecognisedDevice]) -> dict[tuple[str, int], str]:
-        """Draft profiles of each EDS, beside the configuration; return their names by kind and joint (0, 1).
+        """Draft profiles of each given EDS, beside the configuration; return their file names by kind and joint (0, 1).
 
         devices: found on the bus; [] without a bus: of two EDS of a kind, the first is of joint 1. Raises CommandError
-        for an EDS that fits none of them, or that fits one which has another EDS already.
+        for an EDS that fits no device, or a device that has another EDS already.
         """
         names: dict[tuple[str, int], str] = {}
         files = self._eds_files()
@@ -479,7 +507,7 @@ class Drafting:
         return names
 
     def _eds_files(self) -> list[tuple[Path, str]]:
-        """Return the EDS files with the kind of each, drive or sensor; ask if 0x1000 names neither."""
+        """Return the given EDS files with the kind of each, "drive" or "sensor"; ask if 0x1000 names neither."""
         options = self.options
         found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
         for eds in options.eds:
@@ -495,9 +523,10 @@ class Drafting:
         return found
 
     def _add_drafts(self, eds: Path, kind: str, ratings: dict[int, DeviceRatings]) -> dict[tuple[str, int], str]:
-        """Draft profiles of an EDS, asking for missing values; add them and the EDS to the files to be written.
+        """Draft profiles of an EDS; add them and the EDS to the files to be written.
 
-        ratings: by joint (0, 1) to draft for. Return the profiles' file names by kind and joint.
+        Asks for values that the EDS leaves open. ratings: by joint (0, 1) to draft for. Return the profiles' file names
+        by kind and joint; joints with equal drafts share one.
         """
         drafts = self._draft(eds, kind, ratings)
         folder, stem = self.writing.out.parent, f"{self.writing.out.stem}-{eds.stem}"
@@ -513,7 +542,10 @@ class Drafting:
         return names
 
     def _note(self, kind: str, joint: int, name: str, draft: ProfileDraft) -> None:
-        """Store a draft by kind and joint; add its guesses and remarks to the warnings. name: of its file."""
+        """Store a draft by kind and joint; add its guesses and remarks to the warnings, each once. name: of its file.
+
+        If a guess is `_ESSENTIAL`, add the name to `guessed`.
+        """
         self._drafts[kind, joint] = draft
         for line in (*draft.guesses, *draft.remarks):
             if (warning := f"{name}: {line}") not in self.warnings:
@@ -523,9 +555,9 @@ class Drafting:
     def _draft(
         self, eds: Path, kind: str, ratings: dict[int, DeviceRatings], among: Collection[str] | None = None
     ) -> dict[int, ProfileDraft]:
-        """Draft the profile of an EDS, asking for each guess, or only for those with keys in `among`.
+        """Return drafts of an EDS's profile by joint; ask for each guess, or only for those with keys in `among`.
 
-        ratings: by joint (0, 1) to draft for. Return the drafts by joint.
+        ratings: by joint (0, 1) to draft for. A question is asked once; later drafts take the same answer.
         """
         answers: dict[int, dict[str, float]] = {joint: {} for joint in ratings}
 
@@ -557,9 +589,10 @@ class Drafting:
         return drafts
 
     def _complete(self, kind: str, names: tuple[str, ...], devices: Sequence[RecognisedDevice]) -> tuple[str, ...]:
-        """Return the profiles' names, those of shipped ones replaced by extensions with known gear and encoder.
+        """Return the profiles' names; a shipped one with guesses is replaced by an extension if answers replace some.
 
-        The extensions are added to the files to be written.
+        The extensions are added to the files to be written. A shipped profile whose guesses all stay is added to
+        `guessed`.
         """
         completed, texts = list(names), dict[str, str]()
         for joint, name in enumerate(names):
@@ -587,7 +620,11 @@ class Drafting:
     # -- the arm
 
     def _ask_geometry(self) -> tuple[PlanarArm, str, str, str]:
-        """Ask for the geometry; return it, and the sources of lengths, masses, gravity's direction ("": a guess)."""
+        """Return the geometry, and the sources of lengths, masses and gravity's direction, "" for a guess.
+
+        It is the URDF's, else that of given or asked lengths and masses; without masses `cad_theta` is (). Raises
+        CommandError for options that exclude each other, or a URDF that can't be used.
+        """
         options, interview = self.options, self.interview
         urdf, arm = options.urdf, None
         if urdf is not None:
@@ -639,7 +676,11 @@ class Drafting:
         return arm, length_source, "given masses, as uniform rods", gravity_source
 
     def _ask_mounting(self) -> tuple[Pair, str]:
-        """Ask for tilt of the plane of motion, and q1 at which link 1 hangs down, deg; return both and their source."""
+        """Return the tilt of the plane of motion and the q1 at which link 1 hangs down, deg, and their source.
+
+        Options give them, else the user; a slight tilt gives `LEVEL_DEG`. The source is "" for a guess. Raises
+        CommandError for options that exclude each other.
+        """
         options, interview = self.options, self.interview
         given = options.mounting
         if options.is_upright is not None:
@@ -679,7 +720,8 @@ class Drafting:
     def _mount(self, urdf: Path, arm: PlanarArm) -> tuple[PlanarArm, str]:
         """Ask how a URDF's root is mounted, and read the URDF again with its root so turned.
 
-        Return the arm, and a description of the mounting; the arm unchanged if neither option nor user answers.
+        Return the arm, and a phrase on the mounting; the given arm if neither option nor user answers. Raises
+        CommandError for a wrong option.
         """
         interview, given = self.interview, self.options.mounting
         if given is None and not interview.is_asking:
@@ -695,7 +737,10 @@ class Drafting:
     def _rated(
         self, ratings: Sequence[DeviceRatings], profiles: Sequence[ProfileSettings], geometry: PlanarArm
     ) -> Fact:
-        """Return the rated torque at the joints with its source: the drives, their EDS, or the user's answer."""
+        """Return the rated torque at both joints, Nm, and its source: the option, drives, their EDS, or the user.
+
+        0x6076 of drives or EDS is taken only if no guess went into it; else it is a proposal.
+        """
         scales = [profile.scale for profile in profiles]
         by_drives = [rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False)]
         drafts = [self._drafts.get((DRIVE, joint)) for joint in range(2)]
@@ -719,7 +764,11 @@ class Drafting:
         return self._limit("rated_torque_Nm", "--rated-torque-nm", proposal)
 
     def _limit(self, key: str, option: str, proposal: Fact) -> Fact:
-        """Ask for the two values of `arm.KEY`, within its bounds; return them with their source."""
+        """Return the two values of `arm.KEY`, within its bounds, by option or user, with their source.
+
+        proposal: for the user, or taken with `--yes`. Raises ConfigError for a wrong option, CommandError without an
+        answer.
+        """
         given = getattr(self.options, option[2:].replace("-", "_"))
         meaning = known_keys()[f"arm.{key}"].meaning
         value, source = self.interview.ask(
@@ -733,7 +782,10 @@ class Drafting:
 
 
 def _numbers(value: Any, kind: type, option: str) -> tuple[Any, Any]:
-    """Return two numbers, typed as text or given as an option. option: name in errors. Raises ConfigError."""
+    """Return two numbers of type `kind`, from typed text or an option's values.
+
+    option: its name, for the error. Raises ConfigError if they aren't two numbers.
+    """
     words = value.replace(",", " ").split() if isinstance(value, str) else list(value)
     try:
         first, second = (kind(word) for word in words)
@@ -769,7 +821,10 @@ def _hanging(text: str) -> float:
 
 
 def _word_or_deg(option: str, text: str, words: dict[str, float], low: float, high: float) -> float:
-    """Return the angle, deg, that a text gives: by a word of `words`, or as a number. Raises ConfigError."""
+    """Return the angle, deg, that a text gives: by a word of `words`, or as a number from `low` to `high`.
+
+    option: its name, for the error. Raises ConfigError for any other text.
+    """
     if text.casefold() in words:
         return words[text.casefold()]
     try:
@@ -782,7 +837,7 @@ def _word_or_deg(option: str, text: str, words: dict[str, float], low: float, hi
 
 
 def _masses(value: Any) -> Pair | None:
-    """Return the masses of both links, kg; None for "-". Raises ConfigError for values out of bounds."""
+    """Return the masses of both links, kg, from text or a pair; None for "-". Raises ConfigError if out of bounds."""
     if value == "-":
         return None
     masses = _numbers(value, float, "--mass-kg")
@@ -794,7 +849,10 @@ def _masses(value: Any) -> Pair | None:
 
 
 def _read_urdf(path: Path, locked: Sequence[str], pitch_deg: float = 0.0) -> PlanarArm:
-    """Read a URDF. locked, pitch_deg: as of `planar_from_urdf`. Raises ConfigError."""
+    """Return the arm of a URDF. locked, pitch_deg: as of `planar_from_urdf`.
+
+    Raises ConfigError if the file can't be read, or isn't of an arm that the host can drive.
+    """
     try:
         return planar_from_urdf(read_input(path), locked, pitch_deg)
     except FileNotFoundError:
@@ -806,7 +864,10 @@ def _read_urdf(path: Path, locked: Sequence[str], pitch_deg: float = 0.0) -> Pla
 
 
 def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Fact:
-    """Return as proposed torque limits the smallest of 0x6072, the URDF's effort and the rated torque, per joint."""
+    """Return as proposed torque limits, Nm, the smallest of 0x6072, the URDF's effort and the rated torque, per joint.
+
+    Its source is "", a guess, if the rated torque's is.
+    """
     shares = [min(rating.torque_share or 1.0, 1.0) for rating in ratings] or [1.0, 1.0]
     efforts = geometry.effort_Nm or rated.value
     limit = tuple(min(rated.value[joint] * shares[joint], efforts[joint]) for joint in range(2))
@@ -815,7 +876,10 @@ def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: P
 
 
 def _limit_proposal(by_urdf: Pair | None, by_drives: list[float | None], source: str, default: Pair) -> Fact:
-    """Return as proposed limits the URDF's, else those of both drives, from `source`, else `default`, a guess."""
+    """Return as proposed limits the URDF's, else those of both drives, from `source`, else `default`, a guess.
+
+    by_drives: None for a drive that doesn't give one.
+    """
     if by_urdf is not None:
         return Fact(by_urdf, "the URDF's")
     if by_drives and None not in by_drives:
@@ -838,7 +902,10 @@ _TORQUE_UNITS_NM = {"mNm": 1e-3, "µNm": 1e-6, "uNm": 1e-6, "Nm": 1.0, "0.01Nm":
 
 @dataclass(frozen=True)
 class ScaleQuestion:
-    """A question about a value that an EDS may leave open. key: in a profile."""
+    """A question about a value that an EDS may leave open. kind: of the device.
+
+    key: in its profile, such as "scale.torque_Nm". units: for a question about a unit, the worth of each name.
+    """
 
     kind: str
     key: str
@@ -853,17 +920,23 @@ class ScaleQuestion:
         return "velocity_unit" if self.key == "scale.velocity_rad_s" else self.key.partition(".")[2]
 
     def given(self, options: InitOptions) -> Any:
-        """Return the option's value, None if it is absent."""
+        """Return the value of the question's option, None if the option is absent."""
         return getattr(options, self.option.split()[0].lstrip("-").replace("-", "_"))
 
     def propose(self, value: float) -> Any:
-        """Return a guess as an answer to the question: the name of its unit, else the same number for both joints."""
+        """Return a guessed value as an answer to the question: for both joints, or as the name of its unit.
+
+        A worth of no unit gives the first unit.
+        """
         if self.units:
             return next((name for name, worth in self.units.items() if worth == value), next(iter(self.units)))
         return (value, value)
 
     def read(self, value: Any) -> tuple[float, float]:
-        """Return an answer's values for joint 1 and 2; of a unit's name its worth, twice. Raises ConfigError."""
+        """Return an answer's values for joint 1 and 2; of a unit's name its worth, twice.
+
+        Raises ConfigError for an unknown unit, no two numbers, or a value that a profile doesn't accept.
+        """
         if not self.units:
             first, second = _numbers(value, float, self.option.split()[0])
         elif value in self.units:
@@ -942,7 +1015,10 @@ def _drive_or_sensor(text: str) -> str:
 
 
 def _extension(name: str, shipped: ScaleSettings, scale: ScaleSettings, left: Sequence[str]) -> str:
-    """Return the text of a profile that extends a shipped one by an arm's scale. left: keys that are still guesses."""
+    """Return the text of a profile that extends the shipped one `name` by an arm's scale.
+
+    shipped, scale: of that profile, and of the arm. left: keys that are still guesses.
+    """
     rows = [
         f"{key} = {value!r}" for key, value in vars(scale).items() if not math.isclose(value, getattr(shipped, key))
     ]

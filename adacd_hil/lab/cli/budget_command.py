@@ -31,10 +31,11 @@ def judge(
     data_bitrate: int | None,
     arms: int | None = None,
 ) -> tuple[Codec, Budget, list[str]]:
-    """Compute the budget of a contract; return its codec, the budget, and remarks. Raises CodecError, ConfigError.
+    """Compute the budget of a contract; return its codec, the budget, and remarks, a line each.
 
-    Without `dbc` it is that of the configuration's devices, loaded or composed. The configuration's period counts if
-    neither option nor DBC gives one; so does its number of arms on the bus.
+    dbc: name or file; None: the contract of the configuration's devices, loaded or composed. A value that is None comes
+    from the DBC, else from the configuration. Raises CodecError, ConfigError if contract or configuration can't be
+    used.
     """
     settings = load_settings(config)
     codec = load_contract(settings, place_devices(settings)) if dbc is None else load_codec(find_contract(dbc))
@@ -51,7 +52,7 @@ def judge(
 
 
 def as_text(codec: Codec, budget: Budget, notes: Sequence[str]) -> str:
-    """Format a budget for people, as wide as their terminal, else 120 letters."""
+    """Return a budget as text for people, as wide as their terminal, else 120 letters. notes: remarks."""
     rates = f"{budget.bitrate} bit/s" + (f", data {budget.data_bitrate} bit/s" if budget.data_bitrate else "")
     findings = [
         (

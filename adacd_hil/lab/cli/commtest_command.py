@@ -48,12 +48,14 @@ _BINS = 12
 def run_commtest(
     connection: Connection, seconds: float, is_enabling: bool, out: Path | None
 ) -> tuple[dict[str, Any], ExitCode]:
-    """Boot the arm, run cycles at zero torque, and judge the connection; return the result and the exit status.
+    """Boot the arm, run cycles at zero torque, and judge the connection; return the result for JSON, and exit status.
 
-    The exit status is FAILURE if the connection is not sufficient. is_enabling: enable the drives. out: folder for log
-    and pictures, None: neither.
+    The status is SAFETY_STOP after a fault, INTERRUPTED by the user, FAILURE if the connection is not sufficient,
+    PARTIAL if the log lacks data, else OK. is_enabling: enable the drives. out: folder for log and pictures, None:
+    neither.
 
-    Raises ConfigError, CodecError, BusMissingError, LogExistsError, LogError, CommandError.
+    Raises ConfigError, CodecError if configuration or contract can't be used, LogExistsError if `out` has a log,
+    LogError if a file can't be written, BusMissingError, and CommandError if the arm isn't found or the bus fails.
     """
     settings, codec, devices = connection.load()
     clock = MonotonicClock()
@@ -105,9 +107,9 @@ def run_commtest(
 def _run(
     loop: ZeroTorqueLoop, master: Master, test: CommunicationTest, recorder: Recorder | None, seconds: float
 ) -> FaultReason:
-    """Run the cycles of the test and log them; return the fault that ended them, NONE without one.
+    """Start the nodes, run the cycles of the test and log them; return the fault that ended them, NONE without one.
 
-    Raises CommandError if the bus fails. Stops the nodes at the end.
+    Stops the nodes at the end. Raises CommandError if the bus fails.
     """
     freeze_garbage()
 
@@ -137,7 +139,10 @@ def _exit_code(test: CommunicationTest, fault: FaultReason, is_interrupted: bool
 
 
 def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection, achieved: dict[str, str]) -> Recorder:
-    """Open the log of a test in the folder `out`, with the contract and the settings attached. Raises LogError."""
+    """Create the log of a test in the folder `out`, and the folder; attach contract and settings; return its recorder.
+
+    achieved: metadata on the host. Raises LogError if it can't be created.
+    """
     out.mkdir(parents=True, exist_ok=True)
     return Recorder(
         out / LOG_NAME,
@@ -164,8 +169,8 @@ def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection
 def write_page(out: Path, test: CommunicationTest, described: dict[str, Any]) -> list[Path]:
     """Write commtest.html into a folder, with tables and curves of the cycle's times as in the report of a run.
 
-    described: the result of `run_commtest`. Return the files that were written, [] without a cycle. Raises LogError if
-    they can't be written.
+    described: the result of `run_commtest`. Return the files that were written, [] if no cycle was run. Raises LogError
+    if they can't be written.
     """
     # Here and not above: they take a second to import, and memory that the test itself has no use for.
     from adacd_hil.lab.report.page import render_page
@@ -193,7 +198,7 @@ def write_page(out: Path, test: CommunicationTest, described: dict[str, Any]) ->
 
 
 def describe(test: CommunicationTest, settings: Settings, scheduler: str) -> dict[str, Any]:
-    """Return a test as a dictionary for JSON; times in µs. scheduler: granted to this process."""
+    """Return a finished test as a dictionary for JSON; times in µs. scheduler: name of that granted to this process."""
     evidence = _evidence(test, settings.bus.period_us)
     return {
         "verdict": test.verdict.value,
@@ -236,7 +241,7 @@ def _warnings(test: CommunicationTest, scheduler: str) -> list[str]:
 
 
 def as_text(described: dict[str, Any]) -> str:
-    """Return the result, as of `describe`, as text for people."""
+    """Return the result of `run_commtest` as text: counts, each device, histograms of times, and last the verdict."""
     lines = [
         f"cycles {described['cycles']}, complete {described['complete']}, overruns {described['overruns']}, "
         f"period {described['period_us']} µs, {described['scheduler']}, bus load {described['load_percent']:.1f} %"

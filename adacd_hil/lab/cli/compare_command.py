@@ -81,7 +81,7 @@ def _as_text(found: "LogComparison") -> str:
 
 
 def contact_in_words(contact: "Contact | None") -> str:
-    """Return the text of a contact in a cell of the table: time, link and force; "–" for None."""
+    """Return a contact as the text of a table's cell: time, link and, if it is known, force; "–" for None."""
     if contact is None:
         return "–"
     from adacd_hil.records import Location

@@ -28,9 +28,10 @@ def play(
 ) -> tuple["Report", ExitCode]:
     """Play a scenario with an emulated arm, and write log and report; return report and exit status.
 
-    out: folder; None: a new one by date. truth: how the real arm differs from the configuration. live: shows the run.
-
-    Raises ConfigError, CodecError, LogError, CommandError, OSError.
+    config, scenario_name, truth: names or files; truth: how the real arm differs from the configuration. profile, seed:
+    None: those of configuration and scenario. out: folder; None: a new one by date. live: shows the run. Raises
+    ConfigError, CodecError for names or files that can't be used, LogError, OSError if log or report can't be written,
+    CommandError for a run that failed.
     """
     cast = resolve(config, scenario_name, profile, seed, truth)
     settings, scenario = cast.settings, cast.scenario
@@ -64,7 +65,7 @@ def play(
 
 
 def next_of_report(html_path: Path) -> tuple[str, ...]:
-    """Return the commands to suggest after a demo."""
+    """Return the commands to suggest after a demo: to open the report, and to replay the log beside it."""
     log_path = html_path.with_name(LOG_NAME)
     return (
         f"xdg-open {quoted(html_path)}",
@@ -73,7 +74,7 @@ def next_of_report(html_path: Path) -> tuple[str, ...]:
 
 
 def _ending(summary: SessionSummary) -> str:
-    """Return a text on how a run ended whose report could not be written."""
+    """Return a phrase on how a run ended whose report could not be written: its error, fault or lossy log."""
     result = summary.result
     if summary.error or result is None:
         return summary.error or "no cycle was run"

@@ -27,11 +27,11 @@ _MARKS = {Status.OK: "ok", Status.WARNING: "WARNING", Status.FAILED: "FAILED", S
 
 
 def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], ExitCode]:
-    """Run all checks of configuration, host and arm; return their findings and the exit status, FAILURE if one failed.
+    """Run all checks of configuration, host and arm; return their findings and the exit status.
 
-    The drives stay disabled, the nodes end pre-operational. is_moving: ask the user to move joints by hand.
-
-    Raises ConfigError, CodecError.
+    The status is FAILURE if a check failed, else OK. The drives stay disabled, the nodes end pre-operational.
+    is_moving: ask the user, on a terminal, to move joints by hand. Raises ConfigError, CodecError if configuration or
+    contract can't be used.
     """
     settings, codec, devices = connection.load()
     bitrate, data_bitrate = read_bitrates(codec)

@@ -25,11 +25,12 @@ _LABELS = (
 
 
 def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> dict[str, Any]:
-    """Search an excitation for a configuration; return it by the keys of JSON.
+    """Search an excitation for a configuration; return the result by the keys of its JSON.
 
-    `present`, None without one, and `found`: figures of the configuration's excitation and of the one found; `limits`:
-    their bounds. seconds: duration of the search, about. out: file that the caller will write, refused if it is the
-    configuration. Raises ConfigError, CommandError.
+    `present`, None without one, and `found`: figures of the configuration's excitation and of the found one; `limits`:
+    their bounds; `excitation`: the found one. seconds: after which no further climb is begun. out: file that the caller
+    will write, refused if it is the configuration. Raises ConfigError for a configuration that allows no search,
+    CommandError for `out`, or if no motion keeps the limits.
     """
     if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
         raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
@@ -51,7 +52,7 @@ def search(config: str, profile: str | None, seconds: float, seed: int, out: Pat
 
 
 def as_toml(config: str, excitation: ExcitationSettings) -> str:
-    """Return an excitation as the TOML text of a configuration that extends `config`."""
+    """Return an excitation as the TOML text of a configuration that extends `config`, a name or file."""
     base = config if config in builtin_names() else str(Path(config).resolve())
     return f"extends = {json.dumps(base)}\n\n[excitation]\n{to_toml(excitation)}"
 

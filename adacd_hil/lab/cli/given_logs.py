@@ -12,7 +12,7 @@ from adacd_hil.log.log_parts import log_in
 def different_logs(given: Iterable[Path]) -> list[Path]:
     """Return the paths of logs; a folder stands for the run log in it.
 
-    Raises LogError as `log_in`, CommandError if one is given twice, as a link or a copy, too.
+    Raises LogError for a folder without one, CommandError if a log is given twice, even as a link or a copy.
     """
     paths = [log_in(each) for each in given]
     for first, second in itertools.combinations(paths, 2):

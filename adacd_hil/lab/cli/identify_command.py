@@ -90,9 +90,10 @@ def identify(
 
 
 def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
-    """Write the map of a recording by a URDF, and list its guesses; return OK. given: both files.
+    """Write the map of a recording by a URDF, and print its guesses; return OK. given: recording and URDF.
 
-    Raises CommandError for other files, or if another map is in the way.
+    map_path: file to write; None: map.toml beside the recording. Raises CommandError for other files, or if another map
+    is in the way; ConfigError, LogError if recording and URDF don't give a map.
     """
     from adacd_hil.lab.offline.map_draft import draft_map, map_text
     from adacd_hil.lab.offline.recording_map import read_map

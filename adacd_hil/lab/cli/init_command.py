@@ -117,7 +117,7 @@ def init(
 
 
 def as_text(summary: dict[str, Any]) -> str:
-    """Return a text on the written files, the warnings, and the guesses."""
+    """Return a draft's summary as text: written files, warnings, and guesses, a line each."""
     lines = [f"written: {', '.join(summary['written'])}"]
     lines += [f"warning: {line}" for line in summary["warnings"]]
     if summary["assumed"]:
@@ -126,7 +126,10 @@ def as_text(summary: dict[str, Any]) -> str:
 
 
 def next_of_init(file: str, bus: dict[str, Any] | None) -> tuple[str, ...]:
-    """Return the commands to suggest after a draft, up to the first run. bus: on which the arm was found."""
+    """Return the commands to suggest after a draft, from rehearsal to the first run. file: the configuration.
+
+    bus: interface, channel and bitrate on which the arm was found; None: socketcan's can0.
+    """
     from adacd_hil.cli.connection import Connection
 
     bus = bus or {"interface": "socketcan", "channel": "can0", "bitrate": None}

@@ -14,12 +14,15 @@ Answer = TypeVar("Answer")
 
 
 def is_terminal() -> bool:
-    """Return whether a user can type answers."""
+    """Return whether stdin is a terminal, on which a user can type answers."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 
 class Interview:
-    """Answers a question by its option, else (`--yes`) by the proposal, else asks; without a terminal it fails."""
+    """Answers a question by its option, else by the user on a terminal, or the proposal with `--yes`; else it fails.
+
+    is_asking: the user can be asked.
+    """
 
     def __init__(self, takes_proposals: bool) -> None:
         self.takes_proposals = takes_proposals
@@ -34,12 +37,13 @@ class Interview:
         proposal: tuple[Any, str] = (None, ""),
         explanation: str = "",
     ) -> tuple[Answer, str]:
-        """Return the option's answer, else ask the user on a terminal, else take the proposal if that is allowed.
+        """Return the answer to a question, and its source: "given" for option and user, else the proposal's.
 
-        The source is returned, too: "given" for option and user, else the proposal's, "" for a guess. given: the
+        The answer is the option's, else the user's on a terminal, else the proposal if `--yes` allows it. given: the
         option's value, None without one. read: makes an answer of that value, of typed text, or of the proposal's; if
-        it raises ConfigError for typed text, the question is repeated. proposal: value, None without one, and source.
-        explanation: printed on `?`. Raises ConfigError for a wrong option, CommandError without an answer.
+        it raises ConfigError for typed text, the question is repeated. proposal: value, None without one, and source,
+        "" for a guess. explanation: printed on `?`. Raises ConfigError for a wrong option, CommandError without an
+        answer.
         """
         if given is not None:
             return read(given), "given"
@@ -61,7 +65,10 @@ class Interview:
     def _prompt(
         self, question: str, read: Callable[[Any], Answer], proposal: tuple[Any, str], help_text: str
     ) -> tuple[Answer, str]:
-        """Ask on the terminal until an answer can be read; return it and its source. help_text: printed on `?`."""
+        """Ask on the terminal until an answer can be read; return it and its source, as of `ask`.
+
+        help_text: printed on `?`.
+        """
         value, source = proposal
         default = None if value is None else as_typed(value)
         while True:
@@ -77,14 +84,14 @@ class Interview:
                 tell(str(error))
 
     def confirm(self, answer: bool | None, question: str) -> bool:
-        """Return the option's answer, unless None; else ask yes or no on a terminal; elsewhere return False."""
+        """Return the option's answer, unless None; else ask yes or no on a terminal; False elsewhere."""
         if answer is not None:
             return answer
         return self.is_asking and click.confirm(in_line(question), default=False, err=True)
 
 
 def as_typed(value: Any) -> str:
-    """Format a value in the form in which the user types it."""
+    """Return a value in the form in which the user types it: the values of a pair with a space between."""
     if isinstance(value, tuple | list):
         return " ".join(f"{one:g}" if isinstance(one, float) else str(one) for one in value)
     return str(value)

@@ -39,7 +39,7 @@ _EVENTS, _CONTACTS = 8, 5
 
 
 class LiveMonitor:
-    """Keeps the latest messages of a live view, and describes them."""
+    """Keeps the latest messages of a live view, and describes them. messages: number of those of `TOPICS`."""
 
     def __init__(self, client: LiveClient) -> None:
         self.messages = 0
@@ -52,9 +52,9 @@ class LiveMonitor:
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
 
     def accept_message(self, message: LiveMessage) -> None:
-        """Store a message for `describe`: the last ones of events and contacts, the latest of /scheme and /cycle.
+        """Store a message for `describe`: the last few events and contacts, the latest of /scheme and /cycle.
 
-        Other topics are ignored.
+        Other topics are ignored. Raises LookupError, ValueError or struct.error for data that can't be decoded.
         """
         if message.topic not in TOPICS:
             return
@@ -73,7 +73,10 @@ class LiveMonitor:
             self._cycle = self._client.decode(message)
 
     def describe(self) -> dict[str, Any]:
-        """Return the latest values as a dictionary for JSON; times are since the first message."""
+        """Return the latest values as a dictionary for JSON; times are s since the first message.
+
+        The keys of /scheme, and "timing", are missing until a message of /scheme, or of /cycle, has come.
+        """
         begin_ns = self._log_ns if self._begin_ns is None else self._begin_ns
         described: dict[str, Any] = {"messages": self.messages, "t_s": round((self._log_ns - begin_ns) * 1e-9, 3)}
         if self._scheme is not None:
@@ -109,7 +112,10 @@ def _describe_scheme(scheme: Any) -> dict[str, Any]:
 
 
 def _shares(scheme: Any) -> Any:
-    """Return each joint's largest ratio of residual to threshold (2,); NaN: detection is off."""
+    """Return each joint's largest ratio of |external torque| to threshold (2,), over its channels.
+
+    NaN if detection is off.
+    """
     has_bank = "tau_ext_bank" in scheme.dtype.names
     torque, threshold = ("tau_ext_bank", "threshold_bank") if has_bank else ("tau_ext_hat", "threshold")
     shares = np.abs(scheme[torque]) / np.where(np.isfinite(scheme[threshold]), scheme[threshold], np.nan)
@@ -134,10 +140,10 @@ def _finite(value: float) -> float | None:
 
 
 def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
-    """Watch the live view of a run, and print its values at the end; return exit status OK.
+    """Watch the live view of a run at a URL, and print its values at the end; return exit status OK.
 
     seconds: None: until the user interrupts or the view ends. is_live: print them repeatedly meanwhile, too. Raises
-    LogError.
+    LogError if no view answers, or it doesn't serve a log of adacd-hil.
     """
     clock = MonotonicClock()
     screen = Screen(moves_cursor(sys.stdout) and is_live and not as_json, write_screen)
@@ -172,7 +178,7 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
 
 @contextlib.contextmanager
 def _decoding() -> Iterator[None]:
-    """Raise LogError in place of the block's decoding errors: the server doesn't serve a log of adacd-hil."""
+    """Raise LogError in place of the block's decoding errors: then the server doesn't serve a log of adacd-hil."""
     try:
         yield
     except (ValueError, LookupError, OverflowError, struct.error):
@@ -180,7 +186,10 @@ def _decoding() -> Iterator[None]:
 
 
 def as_text(described: dict[str, Any], is_cut: bool = False) -> str:
-    """Return the values of `describe` as text for people; is_cut: a line for each event, cut to the terminal."""
+    """Return the values of `LiveMonitor.describe` as text for people; one line if no /scheme has come.
+
+    is_cut: print one line for each event, cut to the terminal.
+    """
     if "state" not in described:
         return f"{described['messages']} messages, none of {SCHEME.name}"
     fault = "" if described["fault"] == FaultReason.NONE.name else f" by {described['fault']}"

@@ -150,7 +150,7 @@ def merge(logs: tuple[str, ...]) -> ExitCode:  # noqa: ARG001
 
 
 def info_as_text(info: "LogInfo") -> str:
-    """Format the contents of a log for people, the main facts first."""
+    """Return the contents of a log as text: main facts, errors and problems, then tables of topics and metadata."""
     ending = f", {info.ending}" if info.ending else ", without an end" if info.problems else ""
     parts = f"{info.files} parts, " if info.files > 1 else ""
     lines = [
@@ -188,7 +188,7 @@ def _bytes(count: int | None) -> str:
 
 
 def check_as_text(check: "LogCheck") -> str:
-    """Return the findings on a log, a line each, and then their number."""
+    """Return the findings on a log as text, a line each, and a last line with the verdict and their number."""
     lines = []
     for finding in check.findings:
         where = f"{finding.file}, byte {finding.offset}" if finding.offset >= 0 else finding.file
@@ -223,7 +223,7 @@ def _recovery(recovery: "LogRecovery") -> dict[str, Any]:
 
 
 def recovery_as_text(recovery: "LogRecovery") -> str:
-    """Return a text on the data that were saved from a damaged log, and on those lost."""
+    """Return a text on the data that were saved from a damaged log, and on those that were lost."""
     saved = f"{recovery.messages} messages, {recovery.attachments} attachments"
     lost = recovery.losses.describe()
     lines = [f"{recovery.out}: {saved}", *(f"  {note}" for note in recovery.losses.notes)]
@@ -244,17 +244,20 @@ _CONVERTED = (
 
 
 class TableFormat(click.Choice[str]):
-    """A format of tables; those of frames, which have left, name their successor."""
+    """The option's type for a format of tables; for a format of frames the error names the tool that makes it."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Return the format if it is one of the choices; else fail, and name the tool for a format of frames."""
+        """Return the format if it is one of the choices; else fail with a usage error.
+
+        For a format of frames the error names the tool that makes it.
+        """
         if str(value).lower() in _FRAMES:
             self.fail(_CONVERTED, param, ctx)
         return super().convert(value, param, ctx)
 
 
 def _refuse(ctx: click.Context, _param: click.Parameter, value: object) -> None:
-    """Fail if an option of the formats of frames is given; the error names the tool that makes them."""
+    """Fail if a value is given, of an option that only formats of frames had; the error names the tool for them."""
     if value:
         raise click.UsageError(_CONVERTED, ctx)
 
@@ -305,7 +308,10 @@ def export(
 
 
 def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
-    """Return text and path of a recording's DBC: the given one, else the one in the log, else the package's."""
+    """Return text and path of a recording's DBC: of `dbc` if given, else from an MCAP log, else the package's.
+
+    Raises CodecError if the DBC can't be read, LogError for an MCAP file that can't be.
+    """
     from adacd_hil.log.log_files import DBC_NAME
     from adacd_hil.log.log_walk import attachment
     from adacd_hil.wire.dbc_contract import read_dbc

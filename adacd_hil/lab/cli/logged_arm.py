@@ -39,9 +39,11 @@ _NOT_TAKEN = {
 def draft_from_log(
     log: Path, options: InitOptions, interview: Interview, files: DraftFiles
 ) -> tuple[str, dict[str, Any]]:
-    """Return the text of a configuration for the arm of a log, and a summary; write no file.
+    """Return the text of a configuration for the arm of a log, and a summary for JSON; write no file.
 
-    Adds profiles to `files`, and checks the configuration with them. Raises LogError, CommandError.
+    Adds the device profiles to `files`, and checks the configuration with them. Raises LogError if the log can't be
+    read or lacks settings, CommandError for options other than --drive and --sensor, a missing profile, or a
+    configuration with errors.
     """
     given = [name for name in options.__dataclass_fields__ if getattr(options, name) not in (None, (), False)]
     if further := [name for name in given if name not in ("drive", "sensor")]:
@@ -67,9 +69,10 @@ def draft_from_log(
 
 
 def _differences(settings: Settings, base: str, path: Path, warnings: list[str]) -> list[Entry]:
-    """Return the settings of a run that differ from the configuration `base`, and guessed ones; add to the warnings.
+    """Return the settings of a run that differ from the configuration `base`, and those that are guesses.
 
-    Settings of the run and not of the arm, `_NOT_TAKEN`, are left out.
+    Settings of the run and not of the arm, `_NOT_TAKEN`, are left out; lines on them are added to `warnings`. path: of
+    the log, for comments.
     """
     based = load_settings(base, settings.arm.profile)
     entries = []
@@ -94,7 +97,7 @@ def _is_unset(settings: Settings, key: str) -> bool:
 
 
 def _placed(entry: Entry, devices: Drafting, options: InitOptions) -> Entry:
-    """Return an entry of devices with paths relative to the new configuration's folder; any other unchanged.
+    """Return an entry with paths as seen from the new configuration's folder; one not of `devices` unchanged.
 
     A contract that isn't there is left out. Raises CommandError if a device profile isn't there.
     """

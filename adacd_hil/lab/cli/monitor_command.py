@@ -28,7 +28,7 @@ _HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 
 
 class Screen:
-    """Output of tables: redrawn in place on a terminal, one after the other elsewhere."""
+    """Output of tables: redrawn in place on a terminal, one after the other elsewhere. write: prints a text."""
 
     def __init__(self, is_terminal: bool, write: Callable[[str], None]) -> None:
         self.is_redrawn = is_terminal
@@ -38,7 +38,7 @@ class Screen:
         self._write = write
 
     def draw_table(self, text: str) -> None:
-        """Print a table; on a terminal in place of the previous one, and cut to its size."""
+        """Print a table; on a terminal in place of the previous one, and cut to its size, with a line on the rest."""
         text = plain(text)
         if not self.is_redrawn:
             self._write(text + "\n\n")
@@ -55,7 +55,10 @@ class Screen:
 
 
 class Monitor:
-    """Keeps a view of the traffic on a bus, and describes it."""
+    """Counts and checks the traffic on a bus from now on, and describes it.
+
+    node_id: describe this node only; None: all.
+    """
 
     def __init__(
         self, connection: Connection, codec: Codec | DbcDecoder, bus: Bus, clock: Clock, node_id: int | None
@@ -70,11 +73,11 @@ class Monitor:
         self.is_stopped = False
 
     def stop(self) -> None:
-        """Make the present `listen` end soon. Safe in a signal handler."""
+        """Make the present and later `listen`s end after a few frames. Safe in a signal handler."""
         self.is_stopped = True
 
     def listen(self, duration_s: float) -> None:
-        """Read frames from the bus into the view for a duration, or until `stop`. Raises BusError."""
+        """Read frames from the bus into the view for a duration; it ends earlier after `stop`. Raises BusError."""
         end_ns = self._clock.now_ns() + round(duration_s * 1e9)
         while (frame := receive_until(self._bus, self._clock, end_ns)) is not None:
             self._accept(frame)
@@ -92,7 +95,11 @@ class Monitor:
         self._view.accept(frame)
 
     def describe(self) -> dict[str, Any]:
-        """Return the traffic so far as a dictionary for JSON; its load is since the previous call."""
+        """Return the traffic so far as a dictionary for JSON; its load is of the time since the previous call.
+
+        It has the keys of `BusView.describe`, bus_state, "" for other than SocketCAN, and not_processed, None if
+        unknown.
+        """
         now_ns = self._clock.now_ns()
         if self._link_name is not None and now_ns - self._state_ns >= _LINK_S * 1e9:
             link = read_link(self._link_name)
@@ -104,7 +111,10 @@ class Monitor:
         return None if self._link_name is None else carried_frames(self._link_name)
 
     def _count_missed(self) -> int | None:
-        """Count frames that the interface carried and this process has not read: lost, or still queued."""
+        """Return the number of frames that the interface carried and this process has not read: lost, or still queued.
+
+        None if the interface doesn't count frames.
+        """
         now = self._count_carried()
         return None if now is None or self._carried is None else max(0, now - self._carried - self._view.frames)
 
@@ -113,7 +123,8 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
     """Listen on a bus, and print a table of its traffic at the end; return exit status OK, also if interrupted.
 
     seconds: None: until interrupted. is_live: print the table repeatedly meanwhile, too. node_id: show this node only.
-    Raises ConfigError, CodecError, BusMissingError, CommandError.
+    Raises ConfigError, CodecError if configuration or contract can't be used, BusMissingError, CommandError if the bus
+    fails.
     """
     clock = MonotonicClock()
     codec = connection.load_decoder()  # errors of the configuration come before errors of the bus
@@ -139,7 +150,10 @@ def watch(connection: Connection, node_id: int | None, seconds: float | None, is
 
 
 def as_text(described: dict[str, Any], is_cut: bool = False) -> str:
-    """Return the traffic as tables for people; is_cut: a line for each message, cut to the terminal."""
+    """Return the traffic, as of `Monitor.describe`, as tables for people.
+
+    is_cut: print one line for each message, cut to the terminal.
+    """
     parts = [_head(described)]
     if described["nodes"]:
         rows = [

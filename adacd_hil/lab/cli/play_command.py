@@ -34,7 +34,7 @@ _SWITCH_S = 50e-6
 
 
 def hex_id(text: str) -> int:
-    """Return a CAN identifier written in hexadecimal. Raises BadParameter if it isn't, or has more than 29 bits."""
+    """Return a CAN identifier written in hexadecimal. Raises BadParameter if it is none, or has more than 29 bits."""
     try:
         number = int(text, 16)
     except ValueError:
@@ -132,7 +132,11 @@ def play(
 
 @dataclass
 class Playback:
-    """A recording to be played, the choice of its frames, and counts of frames left out."""
+    """A recording to be played, the choice of its frames, and counts of frames left out.
+
+    unsendable: of kinds that can't be sent. withheld: left out as is_harmless is set. problem: defect of the recording,
+    "" until it was read to its end.
+    """
 
     log: Path
     choice: "FrameChoice"
@@ -143,7 +147,10 @@ class Playback:
     problem: str = ""
 
     def frames(self) -> "Iterator[PlayedFrame]":
-        """Yield the chosen frames, read ahead by a thread; count those left out. Raises LogError."""
+        """Yield the chosen frames, read ahead by a thread; add those left out to `unsendable` and `withheld`.
+
+        Raises LogError if the recording can't be read.
+        """
         from adacd_hil.lab.logs.playback import PlayedFrame
 
         for piece in _ahead(self._pieces()):
@@ -154,7 +161,10 @@ class Playback:
                     yield PlayedFrame(t_ns, can_id, data[:length].tobytes())
 
     def _pieces(self) -> "Iterator[NDArray[Any]]":
-        """Yield arrays of the chosen frames that are sent; count the others, and store the recording's problem."""
+        """Yield arrays of the chosen frames that are sent; add the others to the counts.
+
+        At the end, store `problem`.
+        """
         import numpy as np
 
         from adacd_hil.log.frames.frame_log import open_frames
@@ -177,8 +187,9 @@ def _run(
 ) -> tuple[dict[str, Any], ExitCode]:
     """Play a recording onto a bus, `times` times (0: until interrupted), and close the bus.
 
-    Return counts and lateness of the frames for JSON, and the exit status: INTERRUPTED, PARTIAL for a damaged
-    recording, else OK. Raises LogError, CommandError if the bus fails.
+    speed: factor on the recording's. longest_pause_s: to which pauses are cut; None: they stay. Return counts and
+    lateness of the frames for JSON, and the exit status: INTERRUPTED, PARTIAL for a damaged recording, else OK. Raises
+    LogError, CommandError if the bus fails.
     """
     from adacd_hil.cli.connection import on_interrupt
     from adacd_hil.lab.logs.playback import play as play_frames
@@ -223,7 +234,7 @@ def _run(
 
 
 def _as_text(described: dict[str, Any]) -> str:
-    """Format the result for people."""
+    """Return the result of `_run` as text for people: frames sent, withheld, not sendable, lateness, and a problem."""
     from adacd_hil.lab.logs.playback import LATE_NS
 
     late = described["lateness_us"]
@@ -243,12 +254,12 @@ def _as_text(described: dict[str, Any]) -> str:
 
 
 def may_move_an_arm(interface: str, channel: str) -> bool:
-    """Return whether real drives may receive frames on this channel: it isn't certainly virtual."""
+    """Return whether real drives may receive frames on this channel: True unless it is certainly virtual."""
     return not is_virtual(interface, channel)
 
 
 def _ahead(pieces: "Iterator[NDArray[Any]]") -> "Iterator[NDArray[Any]]":
-    """Yield the pieces; a thread reads the next one meanwhile. Errors of reading propagate."""
+    """Yield the pieces, unchanged, while a thread reads the next one; an error of reading is raised in its place."""
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, pieces, None)
         while (piece := following.result()) is not None:

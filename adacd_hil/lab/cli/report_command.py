@@ -19,13 +19,13 @@ from adacd_hil.settings.schema import ConfigError
 
 
 class Index(NamedTuple):
-    """Runs of a folder, each with its report, None if it can't be reported. path: of their index page."""
+    """Runs of a folder, each with its report, None if it can't be reported. path: of the page that lists them."""
 
     path: Path
     entries: list[tuple[ListedRun, Report | None]]
 
     def as_text(self) -> str:
-        """Return the index as text: a line for each run, with its verdict."""
+        """Return the index as text: the number of runs, a line for each with its verdict, and the page's path."""
         lines = [count_text([listed.run for listed, _ in self.entries]), ""]
         for listed, _ in self.entries:
             run = listed.run
@@ -43,7 +43,7 @@ def report_logs(
 
     Reports of several logs are in subfolders of `out`. A folder stands for the run log in it, or without one for the
     runs in its folders. An error doesn't stop the others. The exit status is PARTIAL if a report is incomplete, or a
-    run in a folder has none, else OK; the returned errors, those of given logs, don't count.
+    run in a folder has none, else OK; the returned errors, those of given logs, don't change it.
 
     Raises CommandError if two reports would go to one folder.
     """
@@ -69,7 +69,7 @@ def report_logs(
 
 
 def _runs_in(given: Path) -> tuple[Path, tuple[Path, ...]]:
-    """Return what was given, and the folders with a run below it: () for a file, or if the folder itself has a run.
+    """Return the given path, and the folders with a run below it, () for a file or a folder that itself has a run.
 
     Raises LogError for a folder without a run.
     """
@@ -82,7 +82,10 @@ def _runs_in(given: Path) -> tuple[Path, tuple[Path, ...]]:
 
 
 def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWindow, progress: Progress) -> Index:
-    """Write a report of each run of a folder, and an index page in `out`; a run that can't be read is listed, too."""
+    """Write a report of each run of a folder, and an index page of all in `out`; return the index.
+
+    A run that can't be read is listed with its problem. Raises LogError if the page can't be written.
+    """
     entries: list[tuple[ListedRun, Report | None]] = []
     for number, run in enumerate(runs, start=1):
         name = run.relative_to(given).as_posix()
@@ -104,7 +107,10 @@ def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWind
 
 
 def as_json(reported: Sequence[Reported]) -> list[dict[str, Any]]:
-    """Return the contents of each report.json; for a run that could not be reported its folder and the error."""
+    """Return the content of each report.json; in its place, for a run that can't be reported, its folder and problem.
+
+    The runs of an index are listed one by one.
+    """
     tables = []
     for each in reported:
         if isinstance(each, Report):

@@ -31,7 +31,10 @@ _DATE_FORMS = "2026-11-25, 2026-11-25T14:22 or 2026-11-25T14:22:33"
 
 
 def _local_date(text: str, of_a_day: timedelta = timedelta()) -> datetime:
-    """Return the time that a text gives in this machine's time zone; of_a_day: added to a date without a time."""
+    """Return the time that an ISO text gives in this machine's time zone, or in its own if it names one.
+
+    of_a_day: added to a date without a time. Raises BadParameter for any other text.
+    """
     try:
         found = datetime.fromisoformat(text)
         if len(text) <= len("2026-11-25"):
@@ -60,7 +63,10 @@ _FILTER_OPTIONS = (  # last first: click lists them the other way round
 
 
 def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
-    """Return a command with the options that choose runs added; it receives them as `asked`, a `RunFilter`."""
+    """Return a command with added options that choose runs; it receives them as `asked`, a `RunFilter`.
+
+    The command fails with a CommandError if --since is after --until.
+    """
 
     @functools.wraps(command)
     def chosen(
@@ -172,9 +178,10 @@ def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "R
 
 
 def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progress) -> list["RunSummary"]:
-    """Return the runs of a folder that meet the conditions `asked`, oldest first.
+    """Return the runs of a folder that meet the conditions `asked`, oldest first; [] if none does.
 
-    is_judging: judge runs without a report by their logs. Raises LogError, CommandError.
+    is_judging: judge runs without a report by their logs. Raises LogError for a folder without a run, CommandError if
+    no run is of an arm in `asked`.
     """
     from adacd_hil.lab.runs import run_table
     from adacd_hil.lab.runs.run_summary import NOT_JUDGED, find_runs, judged, summarise

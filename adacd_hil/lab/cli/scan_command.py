@@ -13,11 +13,11 @@ from adacd_hil.wire.codec import Codec
 
 
 def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], ExitCode]:
-    """Find the nodes on a bus, and compare them with the configuration; return the result and the exit status.
+    """Find the nodes on a bus, and compare them with the configuration; return the result, and the exit status.
 
-    The exit status is OK if all expected nodes are there and right, else BUS_MISSING. listen_s: time to listen.
-
-    Raises ConfigError, CodecError, BusMissingError, CommandError.
+    The result is of `describe`. The status is OK if all expected nodes are there and right, further ones or not, else
+    BUS_MISSING. listen_s: time to listen. Raises ConfigError, CodecError if configuration or contract can't be used,
+    BusMissingError, CommandError if the bus fails.
     """
     settings, codec, devices = connection.load()
     clock = MonotonicClock()
@@ -31,7 +31,10 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
 
 
 def describe(found: Survey, verdicts: dict[int, str], codec: Codec) -> dict[str, Any]:
-    """Return a survey as a dictionary for JSON. verdicts: of `compare`, by node id."""
+    """Return a survey as a dictionary for JSON: nodes found or expected, and other identifiers.
+
+    verdicts: by node id, of `compare`.
+    """
     nodes = {node.node_id: node for node in found.nodes}
     return {
         "duration_s": round(found.duration_s, 3),
@@ -136,7 +139,7 @@ def _talk_row(owner: str, talk: dict[str, Any]) -> tuple[str, ...]:
 
 
 def _contract(described: dict[str, Any]) -> str:
-    """Return a line on the expected contract, and the nodes that report the same or another layout digest."""
+    """Return a line on the expected contract, and on nodes that report its layout digest or another one."""
     contract = described["contract"]
     reporting = [node for node in described["nodes"] if node.get("layout_digest") is not None]
     same = [node["node"] for node in reporting if node["layout_digest"] == contract["layout_digest"]]

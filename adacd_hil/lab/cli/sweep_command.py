@@ -132,7 +132,10 @@ def _next(table: Path, failed: int) -> str:
 def _plan(
     logs: Sequence[Path], scenarios: Sequence[str], seeds: str, vary: Sequence[str], config: str, profile: str
 ) -> "Plan":
-    """Return the plan of a sweep. Raises ConfigError, CommandError for settings, scenarios or seeds that are wrong."""
+    """Return the plan of a sweep of logs or scenarios; check all settings, scenarios and seeds first.
+
+    Raises ConfigError, CommandError for one that is wrong, or a log that isn't there.
+    """
     from adacd_hil import __version__
     from adacd_hil.compiled import program_digest
     from adacd_hil.lab.tune.sweep import plan_logs, plan_scenarios
@@ -154,7 +157,10 @@ def _plan(
 
 
 def _files(logs: Sequence[Path]) -> list[Path]:
-    """Return the logs; a folder stands for every run.mcap below it. Raises CommandError if there is none."""
+    """Return the logs; a folder stands for every run.mcap below it.
+
+    Raises CommandError if a log or all of them are missing.
+    """
     found: list[Path] = []
     for given in logs:
         below = sorted(given.rglob(LOG_NAME)) if given.is_dir() else [given]
@@ -165,7 +171,10 @@ def _files(logs: Sequence[Path]) -> list[Path]:
 
 
 def _seeds(text: str) -> range:
-    """Return the seeds A to B of the text `A:B`, or N alone of `N`. Raises CommandError."""
+    """Return the seeds A to B, both included, of the text "A:B", or N alone of "N".
+
+    Raises CommandError for other text.
+    """
     first, colon, last = text.partition(":")
     try:
         low, high = int(first), int(last if colon else first)
@@ -177,9 +186,9 @@ def _seeds(text: str) -> range:
 
 
 def simulate_task(task: "Task") -> "list[Values]":
-    """Play the scenario of a task once for each row, with the row's settings; return the rows' results.
+    """Play a task's scenario with the settings of each row; return a row of results or of an error for each, in order.
 
-    The log of each run is replayed, and then deleted. The row of a failed run has the error.
+    The results are those of a replay of the run's log, which is then deleted.
     """
     return [_simulate(task, row) for row in task.rows]
 

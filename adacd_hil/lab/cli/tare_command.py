@@ -21,7 +21,10 @@ from adacd_hil.settings.setting_keys import apply_settings
 
 
 def as_text(tare: Tare, path: Path, backup: Path | None) -> str:
-    """Return a tare as text for people. path: its file. backup: copy of the file before, None without one."""
+    """Return a tare as text for people. path: its file.
+
+    backup: copy of the file that was there before, None without one.
+    """
     lines = [
         f"joint{joint}: offset {offset:+.4f} ± {error:.4f} Nm (was {old:+.4f}), spread of poses {spread:.4f} Nm, "
         f"sensor {sensor.serial}"
@@ -52,11 +55,11 @@ def tare_on_bus(
     seconds: float | None,
     is_auto_zeroing: bool,
 ) -> tuple[Tare, Path | None]:
-    """Tare the sensors of an arm on a bus, and write file `out`; return the tare, and the copy of the older file.
+    """Tare the sensors of an arm on a bus, and write file `out`; return the tare, and the copy of an older file.
 
-    poses, seconds: number of poses, and time per pose; None: those of the configuration.
-
-    Raises ConfigError, CodecError, BusError, CommandError, OSError.
+    The copy is None without one. poses, seconds: number of poses, and time per pose; None: those of the configuration.
+    Raises CommandError if the tare is refused or the arm not found; ConfigError, CodecError if configuration, contract
+    or an older file can't be used; BusError; OSError if the file can't be written.
     """
     interface, channel = connection.interface, connection.channel
     check_clock(clock_name, interface, channel)
@@ -85,6 +88,9 @@ def tare_on_bus(
 
 
 def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:
-    """Return the settings with number of poses and time per pose replaced, unless None. Raises ConfigError."""
+    """Return the settings with `tare.poses` and `tare.window_s` replaced by number and seconds, unless None.
+
+    Raises ConfigError for a value out of bounds.
+    """
     given = {"tare.poses": poses, "tare.window_s": seconds}
     return apply_settings(settings, {key: repr(value) for key, value in given.items() if value is not None})

@@ -15,9 +15,10 @@ from adacd_hil.progress_lines import Progress
 def find(
     logs: tuple[Path, ...], rate_per_h: float, is_compared: bool, stretch: TimeWindow = WHOLE
 ) -> tuple[Thresholds, Comparison | None]:
-    """Find the thresholds of all detectors for a rate of false alarms, from contact-free motion in logs.
+    """Return the thresholds of all detectors for a rate of false alarms, from contact-free motion in logs.
 
-    Return them, and a comparison of the detectors if is_compared, else None. Raises LogError, CommandError.
+    Return a comparison of the detectors, too, if is_compared, else None. Raises LogError if logs can't be used or have
+    too little motion, CommandError if one is given twice.
     """
     paths = different_logs(logs)
     with Progress() as progress:
@@ -32,7 +33,7 @@ def as_json(thresholds: Thresholds, comparison: Comparison | None) -> str:
 
 
 def as_text(thresholds: Thresholds, comparison: Comparison | None) -> str:
-    """Format thresholds and comparison as tables."""
+    """Return thresholds as tables for people, and the comparison's table unless it is None."""
     lines = [
         f"{thresholds.rate_per_h:g} false alarms per hour, from {thresholds.hours:.2f} h of contact-free motion"
         + (", extrapolated" if thresholds.is_extrapolated else "")

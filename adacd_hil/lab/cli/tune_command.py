@@ -92,7 +92,10 @@ def tune(
 
 
 def _next(log_path: Path, found: "Tuning", out: Path | None) -> tuple[str, ...]:
-    """Return the commands to suggest: first write the configuration, then try it on the log."""
+    """Return the command to suggest: to write the configuration, or to try the written one `out` on the log.
+
+    () if nothing is suggested.
+    """
     if found.best is None:
         return ()
     if out is None:
@@ -137,7 +140,10 @@ def _as_text(found: "Tuning") -> str:
 
 
 def _cells(checked: "Found") -> tuple[str, ...]:
-    """Return the cells of a detector's row: contacts found, their share, delays, alarms, bound of the alarm rate."""
+    """Return the cells of a detector's row, a dash for a value that is unknown.
+
+    Contacts found, their share, median, 90 % and largest delay, alarms, bound of the alarm rate.
+    """
     from adacd_hil.lab.score.report_wording import delay_figures
 
     low, high = checked.share_bounds

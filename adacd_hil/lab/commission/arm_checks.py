@@ -45,11 +45,12 @@ _PDOS = (0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500)
 
 @dataclass
 class ArmExamination:
-    """The arm that doctor examines, and the results of the checks so far.
+    """The arm that doctor examines, and the results of the checks so far. Call `connect` first, `leave` last.
 
-    open_bus: opens the bus without a filter. read_link: returns the interface's present state. ask: prints an
-    instruction to the user; None if no user can move the arm, for the reason in `no_move_reason`. cycle_s: duration of
-    the cycles. move_s: time for the user to move a joint.
+    open_bus: opens the bus without a filter. read_link: returns the interface's present state, None without SocketCAN.
+    ask: prints an instruction to the user; None if no user can move the arm, for the reason in `no_move_reason`.
+    cycle_s: duration of the cycles. move_s: time for the user to move a joint. cycles, traffic: of `play_cycles`, empty
+    before.
     """
 
     settings: Settings
@@ -70,7 +71,7 @@ class ArmExamination:
     traffic: Traffic = field(default_factory=Traffic)
 
     def connect(self) -> None:
-        """Open the bus; make arm and master on it. `leave` closes it. Raises BusMissingError."""
+        """Open the bus; make tap, arm and master on it. `leave` closes it. Raises BusMissingError."""
         self._bus = self.open_bus()
         self.tap = Tap(self._bus, self.clock)
         self.arm = Arm(self.settings, self.codec, self.devices, self.tap)
@@ -78,16 +79,22 @@ class ArmExamination:
 
     @cached_property
     def loop(self) -> ZeroTorqueLoop:
-        """The zero-torque loop of this examination; later runs continue its cycle count."""
+        """The zero-torque loop of this examination, made at its first use, after `connect`.
+
+        Later runs continue its cycle count.
+        """
         return ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
 
     def reset(self) -> None:
-        """Reset the nodes' communication, and let `leave` stop the nodes. Raises DeviceError, BusError."""
+        """Reset the communication of the nodes; from now on `leave` stops them. Raises DeviceError, BusError."""
         self._has_reset = True
         self.master.reset()
 
     def leave(self) -> str:
-        """Put the nodes back to pre-operational, if `reset` was called; close the bus; return an error's text or ""."""
+        """Put the nodes back to pre-operational, if `reset` was called, and close the bus, if it is open.
+
+        Return the text of the error that stopped the former, or "".
+        """
         trouble = ""
         if self._has_reset:
             try:
@@ -100,26 +107,29 @@ class ArmExamination:
         return trouble
 
     def communication(self) -> CommunicationTest:
-        """Return a communication test of the cycles so far."""
+        """Return a new communication test with the cycles that `play_cycles` has stored; without any before that."""
         test = CommunicationTest(self.settings, self.arm, self.bitrate, self.data_bitrate)
         for cycle in self.cycles:
             test.observe_cycle(cycle)
         return test
 
     def joint_values(self, name: str) -> NDArray[np.float64]:
-        """Return the values of the cycles with complete data (n, 2). name: "q", "dq" or "tau_J"."""
+        """Return a quantity of the stored cycles with complete data (n, 2), n = 0 if there are none.
+
+        name: "q", "dq" or "tau_J".
+        """
         values = [getattr(cycle.state, name) for cycle in self.cycles if cycle.state.is_complete]
         return np.array(values, dtype=np.float64).reshape(len(values), JOINTS)
 
 
 def open_arm_bus(patient: ArmExamination) -> Finding:
-    """Check that the bus opens; leave it open for the further checks."""
+    """Open the bus, and leave it open for the further checks. An error of the bus is raised."""
     patient.connect()
     return ok(f"{patient.tap.channel} is open")
 
 
 def check_other_masters(patient: ArmExamination) -> Finding:
-    """Listen for `LISTEN_S`, and check that no other master sends on the bus."""
+    """Listen for 0.5 s, and fail if a frame comes that only a host sends. NMT is allowed on a shared bus."""
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
     patient.tap.take_passed()
@@ -133,7 +143,7 @@ def check_other_masters(patient: ArmExamination) -> Finding:
 
 
 def check_nodes(patient: ArmExamination) -> Finding:
-    """Check that the expected nodes are there, with the expected identity; warn of further nodes."""
+    """Fail if an expected node is missing or has another identity; warn of nodes that the configuration lacks."""
     expected = expected_nodes(patient.master.slaves)
     found = survey(patient.tap, patient.clock, 0.0)
     verdicts = compare(found, expected)
@@ -147,13 +157,20 @@ def check_nodes(patient: ArmExamination) -> Finding:
 
 
 def boot_nodes(patient: ArmExamination) -> Finding:
-    """Reset the communication of the nodes, and check that each boots."""
+    """Reset the communication of the nodes, and wait until each has booted.
+
+    Raises DeviceError if one doesn't, BusError.
+    """
     patient.reset()
     return ok("all nodes booted after a reset of communication")
 
 
 def check_contract(patient: ArmExamination) -> Finding:
-    """Check that the devices' wire version and layout digest, 0x2000, are those of the host's DBC."""
+    """Fail if a device's wire version or layout digest, 0x2000, isn't that of the host's DBC.
+
+    The check is skipped if a device lacks 0x2000 and none differs. Raises DeviceError if a device refuses or doesn't
+    answer.
+    """
     codec = patient.codec
     lacking = []
     for name, node in patient.master.nodes.items():
@@ -174,14 +191,17 @@ def check_contract(patient: ArmExamination) -> Finding:
 
 
 def set_up_nodes(patient: ArmExamination) -> Finding:
-    """Identify and configure the nodes as at the start of a run; name SYNC period and heartbeat. Raises DeviceError."""
+    """Identify and configure the nodes as at the start of a run; name SYNC period and heartbeat.
+
+    Raises DeviceError if a node is another one than configured, or refuses a setting; BusError.
+    """
     patient.master.identify()
     patient.master.configure()
     return ok(f"SYNC period {patient.settings.bus.period_us} µs, heartbeat {patient.settings.bus.heartbeat_ms} ms")
 
 
 def check_pdo_map(patient: ArmExamination) -> Finding:
-    """Check that the devices' PDO parameters and mappings are those of the contract."""
+    """Read the devices' PDO parameters and mappings; fail if one differs from the contract. Raises DeviceError."""
     lines = []
     for slave in patient.master.slaves:
         lines += pdo_differences(slave, command_deadline_ms(patient.settings))
@@ -193,7 +213,10 @@ def check_pdo_map(patient: ArmExamination) -> Finding:
 
 
 def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
-    """Describe how a motor's rated torque, 0x6076, becomes that of its joint, `rated_Nm`. Raises DeviceError."""
+    """Return a line on how a motor's rated torque, 0x6076, becomes that of its joint, `rated_Nm`.
+
+    If the slave's EDS lacks 0x6076, the line is on that. Reads the object from the slave. Raises DeviceError.
+    """
     if not slave.has(0x6076):
         return f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint"
     scale = slave.device.settings.scale
@@ -206,7 +229,10 @@ def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
 
 
 def check_torque_scale(patient: ArmExamination) -> Finding:
-    """Describe the drives' rated torques at the joints, which the set-up has compared; warn if one has no 0x6076."""
+    """Describe how each drive's 0x6076 becomes the rated torque of its joint; warn if an EDS lacks 0x6076.
+
+    The set-up has compared the values already. Raises DeviceError.
+    """
     slaves = patient.master.slaves[:JOINTS]
     pairs = zip(slaves, patient.settings.arm.rated_torque_Nm, strict=True)
     text = "; ".join(describe_torque_scale(slave, rated_Nm) for slave, rated_Nm in pairs)
@@ -216,7 +242,7 @@ def check_torque_scale(patient: ArmExamination) -> Finding:
 
 
 def check_protection(patient: ArmExamination) -> Finding:
-    """Check that every cyclic frame has an end-to-end header; name those without one."""
+    """Warn of cyclic frames, PDOs of the contract, without an end-to-end header, by name."""
     names = [
         message.name
         for message in patient.codec.messages.values()
@@ -231,7 +257,10 @@ def check_protection(patient: ArmExamination) -> Finding:
 
 
 def play_cycles(patient: ArmExamination) -> Finding:
-    """Start the nodes, run cycles with disabled drives, and store the cycles for the further checks."""
+    """Start the nodes, run cycles for `cycle_s` with disabled drives; store cycles and received traffic for the checks.
+
+    Raises BusError, DeviceError.
+    """
     patient.tap.take_passed()
     patient.master.start()
     patient.loop.run(patient.cycle_s, patient.cycles.append)
@@ -243,7 +272,7 @@ def play_cycles(patient: ArmExamination) -> Finding:
 
 
 def check_rate(patient: ArmExamination) -> Finding:
-    """Check that enough of the stored cycles have complete fresh data; name the rates of SYNC and feedback."""
+    """Judge the share of periods with complete fresh data as `commtest` does; name the rates of SYNC and feedback."""
     report = patient.communication()
     elapsed_s = report.periods * patient.settings.bus.period_s
     rates = ", ".join(
@@ -262,7 +291,7 @@ def check_rate(patient: ArmExamination) -> Finding:
 
 
 def check_load(patient: ArmExamination) -> Finding:
-    """Check that the bus load is at most `HIGH_LOAD_PERCENT`, which leaves room for frames that are not cyclic."""
+    """Warn if the bus load of the stored cycles is above 80 %, too little room for other frames."""
     load = patient.communication().load_percent()
     text = f"{load:.1f} % at {patient.bitrate} bit/s"
     if load > HIGH_LOAD_PERCENT:
@@ -271,7 +300,10 @@ def check_load(patient: ArmExamination) -> Finding:
 
 
 def check_heartbeats(patient: ArmExamination) -> Finding:
-    """Check that each node whose heartbeat is watched sends it in state Operational, often enough."""
+    """Fail if a node sent no heartbeat in the stored cycles, or was not Operational; warn if it came too rarely.
+
+    A node whose heartbeat can't be set by its EDS isn't watched: warn of it.
+    """
     expected_Hz = 1e3 / patient.settings.bus.heartbeat_ms
     silent, odd, slow, unwatched = [], [], [], []
     for slave in patient.master.slaves:
@@ -301,7 +333,7 @@ def check_heartbeats(patient: ArmExamination) -> Finding:
 
 
 def check_devices(patient: ArmExamination) -> Finding:
-    """Check that no drive is in fault, no device reports an error, and bounded values are within their bounds."""
+    """Fail if a value is outside `low` and `high` of its device's profile; warn of drive faults and devices' errors."""
     lines = [line for line in describe_faults(patient.arm) if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
     text = "; ".join([*lines, *events])
@@ -313,7 +345,7 @@ def check_devices(patient: ArmExamination) -> Finding:
 
 
 def check_saturation(patient: ArmExamination) -> Finding:
-    """Check that no sensor is saturated or invalid."""
+    """Fail if a sensor's last status is not zero: saturated, not valid."""
     reported = {sensor.name: SensorStatus(sensor.status) for sensor in patient.arm.sensors if sensor.status}
     text = ", ".join(f"{name} {status!r}" for name, status in reported.items())
     if any(status & SensorStatus.NOT_VALID for status in reported.values()):
@@ -328,7 +360,10 @@ def _by_joint(form: str, values: Vector) -> str:
 
 
 def check_rest(patient: ArmExamination) -> Finding:
-    """Check that the arm stands still with its drives off."""
+    """Fail if a joint was faster than `safety.rest_velocity_rad_s` in the stored cycles.
+
+    The check is skipped if no cycle is complete.
+    """
     dq = patient.joint_values("dq")
     if not len(dq):
         return skipped("no complete cycle")
@@ -341,7 +376,10 @@ def check_rest(patient: ArmExamination) -> Finding:
 
 
 def check_torque_zero(patient: ArmExamination) -> Finding:
-    """Check that the torque at rest is near zero."""
+    """Fail if a joint's mean torque at rest is above `safety.rest_torque_Nm`; warn above the detection threshold.
+
+    The check is skipped without complete cycles.
+    """
     tau_J = patient.joint_values("tau_J")
     if not len(tau_J):
         return skipped("no complete cycle")
@@ -357,7 +395,10 @@ def check_torque_zero(patient: ArmExamination) -> Finding:
 
 
 def check_noise(patient: ArmExamination) -> Finding:
-    """Check that the torque signal changes, and that its noise is small."""
+    """Warn if a torque never changed in the stored cycles, or three of its rms values exceed the detection threshold.
+
+    The check is skipped with fewer than two complete cycles.
+    """
     tau_J = patient.joint_values("tau_J")
     if len(tau_J) < 2:
         return skipped("no complete cycles")
@@ -373,7 +414,7 @@ def check_noise(patient: ArmExamination) -> Finding:
 
 
 def check_bus_errors(patient: ArmExamination) -> Finding:
-    """Check that no error frame came during the cycles, and that the controller is in state ERROR-ACTIVE."""
+    """Warn if an error frame came during the cycles, or the controller's state is known and not ERROR-ACTIVE."""
     link = patient.read_link()
     errors = patient.traffic.error_frames
     counters = ""
@@ -385,7 +426,10 @@ def check_bus_errors(patient: ArmExamination) -> Finding:
 
 
 def _check_joint(joint: int) -> Callable[[ArmExamination], Finding]:
-    """Return the check of a joint's signs, for which the user moves the joint by hand; skipped without a user."""
+    """Return the check of a joint's signs, for which the user moves the joint by hand. joint: from 0.
+
+    The check is skipped if no user can be asked, or there are no complete cycles.
+    """
 
     def check(patient: ArmExamination) -> Finding:
         if patient.ask is None:
@@ -411,11 +455,10 @@ _DOMINANCE = 2.0
 
 
 class HandMotion:
-    """Judges the signs of joint `joint` (0, 1) while the user moves it toward +q, its drive disabled.
+    """Judges the signs of joint `joint` (0, 1) by cycles in which the user moves it toward +q, its drive disabled.
 
     The hand drives the arm, and the arm drives the idle motor through the sensor, so the sensed torque opposes the
-    motion: the work ∫ tau_J dq must be negative. q, dq, tau_J (2,) are in joint coordinates. `zero_Nm` (2,): torque at
-    rest.
+    motion: the work ∫ tau_J dq must be negative. `zero_Nm` (2,): torque at rest, which is subtracted.
     """
 
     WANTED_DEG = 10.0
@@ -430,11 +473,14 @@ class HandMotion:
 
     @property
     def is_done(self) -> bool:
-        """Whether any joint has moved by `WANTED_DEG`."""
+        """Whether any joint, the right one or not, is 10 degrees away from its first position."""
         return bool(np.abs(self._way).max() >= math.radians(self.WANTED_DEG))
 
     def observe_cycle(self, cycle: ZeroTorqueCycle) -> None:
-        """Add a cycle to the travel and the work of the joints; ignore an incomplete cycle."""
+        """Add a cycle to the travel and the work of the joints; ignore an incomplete one.
+
+        The first one is the beginning.
+        """
         state = cycle.state
         if not state.is_complete:
             return
@@ -446,7 +492,11 @@ class HandMotion:
         self._way = state.q - self._start
 
     def judge(self) -> Finding:
-        """Judge the motion so far: whether the right joint moved, and position and torque have the right signs."""
+        """Return the finding on the motion so far: whether the right joint moved, with the right signs.
+
+        The signs of position and of torque. A warning if it moved too little, with the other joint, or with too little
+        torque to tell the sign.
+        """
         joint, number = self._joint, self._joint + 1
         ways_deg = np.degrees(self._way)
         moved = int(np.argmax(np.abs(self._way)))

@@ -47,10 +47,11 @@ LEVEL_DEG: Pair = (0.0, 0.0)
 class PlanarArm(NamedTuple):
     """Description of an arm with two parallel axes.
 
-    cad_theta: parameters, empty if the masses are not known. mounting_deg: as `arm.mounting_deg`. sign, zero_deg: for
-    drives that count as the description. mass_kg, center_m, inertia_kg_m2: of each link, the inertia about its centre
-    of mass; the last two are None for rods. Other fields are None if the description lacks them. doubts: properties of
-    the description that the model can't represent, a line each.
+    cad_theta: parameters, () if the masses are not known. mounting_deg: as `arm.mounting_deg`. sign, zero_deg: settings
+    of drives that count as the description. mass_kg, center_m, inertia_kg_m2: of each link, the inertia about its
+    centre of mass; the last two are None for rods. is_tip_known: the length of link 2 is not derived from its centre of
+    mass. Other fields are None if the description lacks them. doubts: properties of the description that the model
+    can't represent, a line each.
     """
 
     link_length_m: Pair
@@ -71,22 +72,25 @@ class PlanarArm(NamedTuple):
 
     @property
     def has_gravity(self) -> bool:
-        """Whether gravity acts on the joints."""
+        """Whether gravity acts on the joints: the plane of motion is tilted by more than 2 degrees."""
         return self.mounting_deg[0] > SLIGHT_TILT_DEG
 
 
 def uniform_rods(link_length_m: Pair, mass_kg: Pair, mounting_deg: Pair) -> PlanarArm:
-    """Return the description of two uniform rods: centre of mass in the middle, inertia m l² / 12 about it."""
+    """Return the description of two uniform rods: centre of mass in the middle, inertia m l² / 12 about it.
+
+    mounting_deg: as `arm.mounting_deg`.
+    """
     (l1, l2), (m1, m2) = link_length_m, mass_kg
     theta = _theta((m1 * l1**2 / 3.0, m2 * l2**2 / 3.0), (m1 * l1 / 2.0, m2 * l2 / 2.0), m2, l1, mounting_deg)
     return PlanarArm(link_length_m, theta, mounting_deg, mass_kg=mass_kg)
 
 
 def _theta(inertia: Pair, moment_kg_m: Pair, outer_kg: float, l1: float, mounting_deg: Pair) -> tuple[float, ...]:
-    """Return the parameters a1 to a3, friction 0 and, unless the axes are vertical, a4 and a5 of two links.
+    """Return a1, a2, a3, four times 0 for friction and, unless the axes are vertical, a4 and a5 of two links.
 
     inertia: of each about its joint, kg m². moment_kg_m: mass times centre of mass, along the line of the link.
-    outer_kg: mass of link 2.
+    outer_kg: mass of link 2. mounting_deg: as `arm.mounting_deg`.
     """
     first, second = inertia
     theta = [first + outer_kg * l1**2 + second, l1 * moment_kg_m[1], second, 0.0, 0.0, 0.0, 0.0]
@@ -97,10 +101,11 @@ def _theta(inertia: Pair, moment_kg_m: Pair, outer_kg: float, l1: float, mountin
 
 
 def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float = 0.0) -> PlanarArm:
-    """Read an arm of two revolute joints with parallel axes. Raises UrdfError for any other.
+    """Read an arm of two revolute joints with parallel axes.
 
     locked: names of joints that count as fixed at 0. pitch_deg: rotation of the URDF's root about its y axis; 0: its z
-    axis points up, 90: its x axis down.
+    axis points up, 90: its x axis down. Raises UrdfError if the URDF can't be read, is of another arm, or has an
+    impossible inertia, or limits without 0.
     """
     pitch_rad = math.radians(pitch_deg)
     gravity = GRAVITY_M_S2 * math.sin(pitch_rad), 0.0, -GRAVITY_M_S2 * math.cos(pitch_rad)
@@ -164,12 +169,15 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float
 
 
 def _angle_deg(start: Vector, end: Vector, axis: Vector) -> float:
-    """Return the angle about `axis` from one direction to the other, deg."""
+    """Return the angle about `axis` from direction `start` to `end`, deg in [-180, 180]."""
     return math.degrees(math.atan2(float(np.cross(start, end) @ axis), float(start @ end)))
 
 
 def _mounting(chain: Chain, along: Vector) -> Pair:
-    """Return the tilt of the plane of motion, and the q1 at which link 1, `along` (3,), hangs down; deg."""
+    """Return the tilt of the plane of motion, and the q1 in (-180, 180] at which link 1 hangs down; deg.
+
+    along (3,): direction of link 1 at q1 = 0, in joint 1's frame. `LEVEL_DEG` for a slight tilt.
+    """
     axis, gravity = chain.axis[0], chain.rotation[0].T @ chain.gravity_m_s2
     downhill = gravity - (gravity @ axis) * axis
     tilt_deg = math.degrees(math.asin(min(float(np.linalg.norm(downhill)) / GRAVITY_M_S2, 1.0)))
@@ -180,7 +188,11 @@ def _mounting(chain: Chain, along: Vector) -> Pair:
 
 
 def _gravity_doubts(moment: Vector, along: Vector, axis: Vector, lever_kg_m: float) -> Iterator[str]:
-    """Describe the part of link 1's gravity that the model can't represent. moment (3,): of link 1, kg m."""
+    """Yield a line if the model can't represent link 1's gravity: a counterweight, or a centre of mass off its line.
+
+    moment (3,): of link 1, kg m; along, axis (3,): its direction and joint 1's; lever_kg_m: moment of the whole arm
+    along link 1.
+    """
     aside = abs(float(np.cross(axis, along) @ moment))
     if lever_kg_m <= 0.0:
         yield "link 1 has a counterweight heavier than link 2: the model has no gravity of that direction"
@@ -191,8 +203,9 @@ def _gravity_doubts(moment: Vector, along: Vector, axis: Vector, lever_kg_m: flo
 def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str]) -> tuple[Pair, Vector]:
     """Return the drives' positions at q = 0, deg, and the largest |q| (2,), deg, of an arm that is stretched at q2 = 0.
 
-    sign: 1, or -1 if joint 2 of the URDF turns against joint 1. bent_deg: the model's q2 at the URDF's zero. Adds a
-    line to `doubts` if the limits of joint 2 exclude the stretched arm.
+    sign: 1, or -1 if joint 2 of the URDF turns against joint 1. bent_deg: the model's q2 at the URDF's zero; up to 5
+    degrees count as 0. Adds a line to `doubts` if the limits of joint 2 exclude the stretched arm. Raises UrdfError for
+    limits without 0.
     """
     limits = _position_limits(arm)
     if abs(bent_deg) <= _BENT_DEG:
@@ -208,16 +221,20 @@ def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str])
 
 
 def _limit_about_stretched(arm: SerialArm, sign: int, bent_deg: float) -> float:
-    """Return the largest |q2| that joint 2's limits allow on both sides of the stretched arm, deg; 0 or less: none.
+    """Return the largest |q2| that joint 2's limits allow on both sides of the stretched arm, deg.
 
-    sign: URDF direction to model direction of joint 2. bent_deg: the model's q2 at the URDF's zero.
+    It is 0 or less if they exclude the stretched arm. sign: 1, or -1 if joint 2 of the URDF turns against joint 1.
+    bent_deg: the model's q2 at the URDF's zero.
     """
     first, second = (math.degrees(sign * float(end[1])) + bent_deg for end in (arm.position_low, arm.position_high))
     return round(min(-min(first, second), max(first, second)), 2)
 
 
 def _mass_doubts(arm: SerialArm) -> list[str]:
-    """Return a line on each link without an inertial. Raises UrdfError for an inertia that no body has."""
+    """Return a line on each link without an inertial.
+
+    Raises UrdfError for an inertia without a mass, or a mass without inertia about its joint.
+    """
     doubts = []
     links = arm.theta_full.reshape(JOINTS, PER_LINK)
     for name, link, axis in zip(arm.link_names, links, arm.chain.axis, strict=True):
@@ -237,9 +254,9 @@ def _mass_doubts(arm: SerialArm) -> list[str]:
 
 
 def _body(arm: SerialArm, mass_kg: Pair, moment_kg_m: Pair, inertia: Pair) -> dict[str, Pair]:
-    """Return the links' masses, centres of mass and inertias about them, and friction if any, by `PlanarArm`'s fields.
+    """Return masses, centres of mass and inertias about them of both links, by `PlanarArm`'s fields.
 
-    inertia: of each link about its joint.
+    Friction is added if the URDF has any. moment_kg_m: along each link. inertia: of each link about its joint.
     """
     center = [moment / mass for moment, mass in zip(moment_kg_m, mass_kg, strict=True)]
     own = [max(whole - mass * c * c, 0.0) for whole, mass, c in zip(inertia, mass_kg, center, strict=True)]
@@ -250,7 +267,7 @@ def _body(arm: SerialArm, mass_kg: Pair, moment_kg_m: Pair, inertia: Pair) -> di
 
 
 def _reach(arm: SerialArm) -> float:
-    """Return the distance of the farthest frame on link 2 from its axis, m."""
+    """Return the distance, m, from joint 2's axis to the farthest frame on link 2, such as a tip; 0 without one."""
     axis = arm.chain.axis[1]
     far = [0.0]
     for carrier, pose in arm.places.values():
@@ -260,13 +277,16 @@ def _reach(arm: SerialArm) -> float:
 
 
 def _about(link: Vector, axis: Vector) -> float:
-    """Return the inertia of a link about its joint's axis, kg m²."""
+    """Return the inertia of a link about its joint's axis, kg m².
+
+    link: its parameters (10,), axis (3,): unit vector.
+    """
     xx, xy, yy, xz, yz, zz = link[4:]
     return float(axis @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ axis)
 
 
 def _position_limits(arm: SerialArm) -> Vector:
-    """Return each joint's largest |q| (2,) within its limits on both sides, deg; inf without limits.
+    """Return each joint's largest |q| (2,) that its limits allow in both directions, deg; inf without limits.
 
     Raises UrdfError if 0 is not within the limits.
     """
@@ -278,7 +298,7 @@ def _position_limits(arm: SerialArm) -> Vector:
 
 
 def _plausible(key: str, values: Vector, doubts: list[str]) -> Pair | None:
-    """Return the values as a pair of limits; None if one is infinite or `arm.KEY` doesn't accept them.
+    """Return the values (2,) as a pair of limits; None if one is infinite or `arm.KEY` doesn't accept them.
 
     In the second case, add a line to `doubts`.
     """
@@ -335,14 +355,17 @@ _LEAST_TORQUE_SHARE = 0.3
 
 
 class Fact(NamedTuple):
-    """A value, mostly a pair, known or proposed. source: its origin; "" for a guess."""
+    """A value, mostly of both joints, and its source as text; "" for a guess."""
 
     value: Any
     source: str = ""
 
 
 class ArmFacts(NamedTuple):
-    """Known facts of an arm. The rest of its configuration follows from them."""
+    """Known or guessed facts of an arm, from which the rest of its configuration follows.
+
+    Each source is the origin of values as text, "" for a guess. data_bitrate, bitrate: None: not written.
+    """
 
     geometry: PlanarArm
     length_source: str
@@ -362,7 +385,10 @@ class ArmFacts(NamedTuple):
 
 
 class Entry(NamedTuple):
-    """One line of the file. value: None if unknown; the key is then written as a comment."""
+    """One line of the configuration. value: None if unknown; the key is then written as a comment.
+
+    is_assumed: the value is a guess.
+    """
 
     key: str
     value: Any
@@ -371,16 +397,17 @@ class Entry(NamedTuple):
 
 
 def draft_arm(facts: ArmFacts) -> tuple[list[Entry], list[str]]:
-    """Draft all settings of an arm's configuration from its facts; return them, and warnings.
+    """Draft an arm's configuration from its facts; return its lines, and warnings.
 
-    Warnings: abilities that the arm may lack, a line each.
+    Warnings: doubts of the description, and abilities that the arm may lack, a line each. Raises ConfigError for a
+    joint without torque.
     """
     warnings = list(facts.geometry.doubts)
     return [*_arm(facts), *_devices(facts), *_motion(facts, warnings)], warnings
 
 
 def assumed_keys(entries: Iterable[Entry]) -> list[str]:
-    """Return the keys whose values are guesses."""
+    """Return the keys, such as "arm.sign", whose values are guesses, in the order of the entries."""
     return [entry.key for entry in entries if entry.is_assumed]
 
 
@@ -436,7 +463,7 @@ def _devices(facts: ArmFacts) -> Iterator[Entry]:
 
 
 def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
-    """Draft trajectory, excitation, reaction, gains and the scheme's numbers; add to the warnings.
+    """Draft trajectory, excitation, reaction, gains and the scheme's numbers; add lines to `warnings`.
 
     Raises ConfigError for a joint without torque.
     """
@@ -487,7 +514,8 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
 def _fast_damping(Kd: Sequence[float], cad_theta: Sequence[float]) -> Iterator[str]:
     """Yield a warning for each joint that its damping stops too fast at q2 = 0 while the other joint turns freely.
 
-    Kd in Nm s/rad. The joint's inertia is then smaller than its element of M, with a heavy outer link far smaller.
+    Kd in Nm s/rad; cad_theta: a1, a2, a3 first. The joint's inertia is then smaller than its element of M, with a heavy
+    outer link far smaller.
     """
     a1, a2, a3 = cad_theta[:3]
     diagonal, coupling = (a1 + 2.0 * a2, a3), a3 + a2
@@ -502,7 +530,10 @@ def _fast_damping(Kd: Sequence[float], cad_theta: Sequence[float]) -> Iterator[s
 
 
 def _rest_torque(facts: ArmFacts) -> Entry:
-    """Draft the torque at rest so that gravity may load the sensors of an arm that its brakes hold."""
+    """Draft `safety.rest_torque_Nm` for an arm on which gravity acts: its load may then rest on the sensors.
+
+    A guess if the masses are not known.
+    """
     free = load_settings("certified").safety.rest_torque_Nm
     gravity = _gravity(facts, facts.position_limit_deg.value)[0]
     load, comment = 1.2 * gravity, f"gravity's {gravity:.3g} Nm on joint 1 and a fifth, which the arm's brakes hold"
@@ -513,7 +544,7 @@ def _rest_torque(facts: ArmFacts) -> Entry:
 
 
 def _certified(facts: ArmFacts) -> Iterator[Entry]:
-    """Draft the scheme's numbers that are torques or follow from the inertia, for an arm unlike P."""
+    """Yield the scheme's numbers that are torques or follow from the inertia, if they differ from the defaults."""
     base = load_settings("certified")
     found, inertia, rated = base.certified, _inertia(facts), facts.rated_torque_Nm.value
     scale = _torque_scale(facts)
@@ -553,9 +584,9 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
 
 
 def _torque_scale(facts: ArmFacts) -> float:
-    """Return the ratio of the rated torque to that of arm P, of the joint closer to P.
+    """Return the rated torque over that of the emulated arm P, for the joint where this is closer to 1.
 
-    1 unless both joints' ratios are above `_ALIKE`, or both below 1 / `_ALIKE`.
+    1 unless both joints' ratios are above 2, or both below 1/2.
     """
     ratios = [facts.rated_torque_Nm.value[i] / _MODEL_TORQUE_NM[i] for i in range(JOINTS)]
     if min(ratios) > _ALIKE:
@@ -564,14 +595,15 @@ def _torque_scale(facts: ArmFacts) -> float:
 
 
 def _scaled(by_kind: Sequence[float], scale: float) -> list[float]:
-    """Return numbers, one per kind of parameter, times `scale`; those of lags, which are not torques, unchanged."""
+    """Return `by_kind`, a number per kind of parameter, times `scale`; that of lags, no torques, as it is."""
     return [value if kind == _LAG else scale * value for kind, value in enumerate(by_kind)]
 
 
 def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) -> float:
     """Return the factor, at least 1, by which the motion must be slower than P's to fit speed, acceleration, torque.
 
-    Adds a warning if gravity leaves too little torque. Raises ConfigError for a joint without torque.
+    amplitude: of both joints, deg. Adds a line to `warnings` if gravity leaves too little torque. Raises ConfigError
+    for a joint without torque.
     """
     limit_Nm, speed = facts.torque_limit_Nm.value, facts.velocity_limit_deg_s.value
     inertia, gravity, slower = _inertia(facts), _gravity(facts, amplitude), 1.0
@@ -593,7 +625,7 @@ def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) 
 
 
 def _inertia(facts: ArmFacts) -> Pair:
-    """Return a1 and a3, known or guessed, kg m²."""
+    """Return a1 and a3, kg m², by the masses; if these are unknown, in proportion to the rated torque."""
     if theta := facts.geometry.cad_theta:
         return theta[0], theta[2]
     rated = facts.rated_torque_Nm.value
@@ -602,7 +634,10 @@ def _inertia(facts: ArmFacts) -> Pair:
 
 
 def _gravity(facts: ArmFacts, within_deg: Sequence[float]) -> Pair:
-    """Return gravity's largest torque on each joint within ± these positions, Nm; 0 if unknown or without gravity."""
+    """Return gravity's largest torque on each joint while |q| is within these bounds, Nm.
+
+    0 without gravity, and if the masses are unknown.
+    """
     geometry = facts.geometry
     if not (geometry.has_gravity and geometry.cad_theta):
         return 0.0, 0.0
@@ -625,7 +660,10 @@ _POSES = {
 
 
 def draw_arm(mounting_deg: Pair) -> str:
-    """Return a line of text that draws an arm at q = 0, joint 1 on the left, with an arrow along gravity."""
+    """Return a line of text that draws an arm at q = 0, joint 1 on the left, with an arrow along gravity.
+
+    mounting_deg: as `arm.mounting_deg`.
+    """
     tilt_deg, hangs_deg = mounting_deg
     arm = "at q = 0: [1]====[2]===>, +q counter-clockwise"
     if tilt_deg <= SLIGHT_TILT_DEG:
@@ -636,7 +674,7 @@ def draw_arm(mounting_deg: Pair) -> str:
 
 
 def _stated(key: str, fact: Fact, what: str) -> Entry:
-    """Return the entry of a fact, its meaning and source as comment; one without a source is a guess."""
+    """Return the entry of a fact with the comment "WHAT: SOURCE"; a fact without a source becomes a guess."""
     return Entry(key, fact.value, f"{what}: {fact.source or 'a guess'}", not fact.source)
 
 
@@ -653,7 +691,7 @@ extends = "{base}"
 
 
 def draft_as_toml(entries: Sequence[Entry], title: str, name: str, base: str = "certified") -> str:
-    """Return a draft as the text of a commented TOML file.
+    """Return a draft as the text of a commented TOML file; guesses are listed in `assumed`.
 
     title: its first comment. name: of the file, for the commands in its comments. base: configuration that it extends.
     """

@@ -35,7 +35,7 @@ from adacd_hil.wire.bus import Frame, Tap
 
 
 class ZeroTorqueCycle(NamedTuple):
-    """One cycle: the arm's state, the cycle's times, and its frames, with True for sent ones."""
+    """One cycle: the arm's state, the cycle's record for the log, and its frames, each with True if it was sent."""
 
     state: ArmState
     record: CycleRecord
@@ -43,7 +43,7 @@ class ZeroTorqueCycle(NamedTuple):
 
 
 class ZeroTorqueLoop:
-    """Runs cycles of an arm whose nodes are Operational. `is_enabling`: enable the drives, with zero torque."""
+    """Runs cycles at zero torque of an arm whose nodes are Operational. `is_enabling`: `run` enables the drives."""
 
     def __init__(
         self, settings: Settings, bus: Tap, clock: Clock, arm: Arm, master: Master, is_enabling: bool = False
@@ -59,7 +59,7 @@ class ZeroTorqueLoop:
         self._max_age_cycles = settings.bus.max_age_cycles
 
     def interrupt(self) -> None:
-        """Make `run` end after the present cycle. Safe in a signal handler."""
+        """Make `run` end after the present cycle, and every later `run` before its first. Safe in a signal handler."""
         self.is_interrupted = True
 
     def run(
@@ -68,9 +68,10 @@ class ZeroTorqueLoop:
         observe: Callable[[ZeroTorqueCycle], None],
         is_over: Callable[[], bool] = lambda: False,
     ) -> FaultReason:
-        """Run cycles for a duration, then disable the drives; return the fault that ended them, NONE without one.
+        """Run cycles for a duration, then disable the drives; return the fault that ended the cycles, NONE without one.
 
-        observe: called with each cycle. is_over: ends them earlier if it returns True. Raises BusError.
+        observe: called with each cycle but those that disable. is_over: ends the cycles earlier when it returns True.
+        Raises BusError.
         """
         last_ns = self._clock.now_ns() + round(duration_s * 1e9) - self._period_ns
         fault = FaultReason.NONE
@@ -82,7 +83,10 @@ class ZeroTorqueLoop:
         return fault
 
     def _fault(self, state: ArmState) -> FaultReason:
-        """Return the fault of a cycle, old data included; NONE if `is_enabling` is not set."""
+        """Return the fault of a cycle: the arm's, or DATA_AGE if it is enabled and a value is too old.
+
+        NONE without a fault, and always if the loop doesn't enable the drives.
+        """
         if not self._is_enabling:
             return FaultReason.NONE
         if state.is_enabled and max(*state.age_q, *state.age_tau_J) > self._max_age_cycles:
@@ -97,7 +101,8 @@ class ZeroTorqueLoop:
     def step(self, is_enabling: bool = False, quick_stop: bool = False) -> ZeroTorqueCycle:
         """Run one cycle at zero torque, and return it.
 
-        is_enabling, quick_stop: part of the command to the drives. Raises BusError, such as SilenceError in lockstep.
+        is_enabling, quick_stop: parts of the command to the drives; without either they are disabled. Raises BusError,
+        such as SilenceError in lockstep.
         """
         tick, arm = self._exchange.turn()
         self._exchange.leave()
@@ -118,7 +123,10 @@ class Verdict(Enum):
 
 
 def judge(share: float) -> Verdict:
-    """Return the verdict on a share of cycles with complete fresh data, 0…1."""
+    """Return the verdict on a share 0…1 of periods with complete fresh data.
+
+    NOT_SUFFICIENT is below 0.90, GOOD is from 0.95 on.
+    """
     if share < SUFFICIENT_SHARE:
         return Verdict.NOT_SUFFICIENT
     return Verdict.WARNING if share < GOOD_SHARE else Verdict.GOOD
@@ -126,9 +134,10 @@ def judge(share: float) -> Verdict:
 
 @dataclass
 class CommunicationTest:
-    """Collects the cycles of a test, and judges them: the loop calls `observe_cycle`.
+    """Collects the cycles of a test, by `observe_cycle`, and judges them.
 
-    complete: cycles with complete fresh data. overruns: periods that were skipped.
+    Bitrate, data_bitrate: bit/s, 0 without CAN FD. complete: number of cycles with complete fresh data. overruns:
+    number of skipped periods.
     """
 
     settings: Settings
@@ -143,7 +152,10 @@ class CommunicationTest:
     _recent: deque[ZeroTorqueCycle] = field(default_factory=lambda: deque(maxlen=_LOAD_CYCLES))
 
     def observe_cycle(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
-        """Add a cycle to the test; return its record for the log, with the overruns so far and `log_queue_bytes`."""
+        """Add a cycle to the test; return its record for the log, with the overruns so far and `log_queue_bytes`.
+
+        Periods skipped before the first cycle are not overruns.
+        """
         state = cycle.state
         ages = (*state.age_q, *state.age_tau_J)
         if self._ages:  # periods skipped before the first cycle don't count
@@ -158,7 +170,7 @@ class CommunicationTest:
 
     @property
     def cycles(self) -> int:
-        """Number of cycles."""
+        """Number of cycles observed so far, without skipped periods."""
         return len(self._ages)
 
     @property
@@ -178,14 +190,18 @@ class CommunicationTest:
 
     @cached_property
     def columns(self) -> CycleColumns:
-        """The columns of /cycle, to be asked for when the test is over; feedback_ns is -1 for an incomplete cycle."""
+        """The columns of /cycle, of the cycles at the first call, which stays: ask for it when the test is over.
+
+        feedback_ns is -1 for an incomplete cycle.
+        """
         return columns_of_records(self._t_ns, self._records)
 
     def devices(self) -> dict[str, dict[str, Any]]:
         """Return the results of each device, by its name and for JSON.
 
-        share: of the periods with a fresh value; ages: number of cycles by age of the value; never: cycles before the
-        first frame; checks: number of frames by result of the end-to-end check.
+        share: of the periods with a fresh value; ages: number of cycles by age of the value in cycles, the last for all
+        older ones; never: cycles before the first frame; checks: number of frames by result of the end-to-end check,
+        and implausible ones.
         """
         devices: tuple[Drive | TorqueSensor, ...] = (*self.arm.drives, *self.arm.sensors)
         ages = np.array(self._ages, dtype=np.int64).reshape(self.cycles, len(devices)).T
@@ -205,7 +221,7 @@ class CommunicationTest:
         }
 
     def load_percent(self) -> float:
-        """Return the bus load in the last cycles, percent."""
+        """Return the bus load, percent, over the last 1000 cycles, sent and received; 0 without cycles."""
         meter = LoadMeter(self.bitrate, self.data_bitrate, 0)
         for cycle in self._recent:
             for _, frame in cycle.frames:

@@ -31,7 +31,10 @@ from adacd_hil.wire.codec import CodecError
 
 
 class RecognisedDevice(NamedTuple):
-    """A drive or a sensor on the bus. profiles: built-in ones of its vendor and product; () for an unknown device."""
+    """A drive or a sensor on the bus. kind: "drive" or "sensor". ratings: values read from it.
+
+    profiles: names of built-in ones of its vendor and product, shortest first; () for an unknown device.
+    """
 
     node: Node
     kind: str
@@ -40,7 +43,7 @@ class RecognisedDevice(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Name, vendor, product and serial number."""
+        """Name, vendor, product and serial number as one line; "?" for a number that is unknown."""
         node = self.node
         identity = (("vendor", node.vendor), ("product", node.product))
         numbers = (f"{what} {'?' if value is None else f'0x{value:X}'}" for what, value in identity)
@@ -48,9 +51,10 @@ class RecognisedDevice(NamedTuple):
 
 
 def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int, str]) -> list[RecognisedDevice]:
-    """Return the drives and sensors among a survey's nodes, with the ratings read from them. Raises BusError.
+    """Return the drives and sensors among a survey's nodes that answer, with ratings read from them. Raises BusError.
 
-    `kinds`: drive or sensor by node id, for nodes whose 0x1000 names neither.
+    `kinds`: "drive" or "sensor" by node id, for nodes whose 0x1000 names neither. Sets `layout_digest` of a node if a
+    profile of its vendor and product has 0x2000.
     """
     canopen = CanopenBus(Tap(bus, clock))
     found = []
@@ -66,7 +70,10 @@ def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int,
 
 
 def fitting_profiles(node: Node, kind: str) -> tuple[str, ...]:
-    """Return names of the built-in profiles whose EDS has this node's vendor, and product if given; shortest first."""
+    """Return the names of the built-in profiles whose EDS is of this node's vendor and product, shortest name first.
+
+    An EDS without a product number fits all products of its vendor. () if there is none.
+    """
     names = []
     for name, profile in shipped_profiles(kind):
         identity = identity_of(profile.eds)
@@ -94,7 +101,7 @@ _OF_DRIVES = (
 
 
 def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> int | None:
-    """Return an object of a node as a number; None if it is missing, refused or too long."""
+    """Return an object of a node as a number; None if it is missing, refused, empty or longer than 8 bytes."""
     try:
         data = read_object(remote, index, sub)
     except DeviceError:  # it refuses the upload, or answers with another type
@@ -112,9 +119,10 @@ def _read_ratings(remote: Any, kind: str) -> DeviceRatings:
 def choose_family(
     drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the profiles of two drives and of two sensors: those whose layout digest the devices report (0x2000).
+    """Return the profiles of two drives and of two sensors: those whose contract has the layout digest that all report.
 
-    If the devices report no digest, several, or that of no profiles: the first profile that fits each; "" if none fits.
+    If the devices report no digest, several, or that of no profiles: the first profile of each device; "" if it has
+    none.
     """
     digests = {device.node.layout_digest for device in (*drives, *sensors)} - {None}
     combinations = itertools.product(drives[0].profiles or ("",), sensors[0].profiles or ("",))
@@ -131,7 +139,10 @@ def choose_family(
 
 
 def _digest_of(drive: str, sensor: str, drive_nodes: tuple[int, ...], sensor_nodes: tuple[int, ...]) -> int | None:
-    """Return the layout digest of the contract composed of two profiles, for both joints; None if there is none."""
+    """Return the layout digest of the contract composed of one drive's and one sensor's profile, for both joints.
+
+    None if the profiles can't be composed with these nodes.
+    """
     settings = load_settings("certified")
     devices = dataclasses.replace(
         settings.devices,

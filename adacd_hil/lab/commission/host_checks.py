@@ -31,7 +31,7 @@ class Status(Enum):
 
 
 class Finding(NamedTuple):
-    """Outcome of a check with its reason. name: of the check, "" before it is reported.
+    """Outcome of a check with its reason. name: of the check; "" until `diagnose` has set it.
 
     `remedy`: the user's next step; "" if none is needed.
     """
@@ -46,7 +46,10 @@ Examination = TypeVar("Examination")
 
 
 class Check(NamedTuple, Generic[Examination]):
-    """One line of the table. `needs`: names of earlier checks that must not have failed."""
+    """One line of a table of checks. `run`: returns the finding on the thing examined.
+
+    `needs`: names of earlier checks; if one has failed, this check is skipped.
+    """
 
     name: str
     run: Callable[[Examination], Finding]
@@ -59,17 +62,17 @@ def ok(reason: str) -> Finding:
 
 
 def warning(reason: str, remedy: str) -> Finding:
-    """Return the outcome for an arm that can run with reduced margin."""
+    """Return the outcome of a check after which the arm can run, but with less margin. remedy: the user's next step."""
     return Finding("", Status.WARNING, reason, remedy)
 
 
 def failed(reason: str, remedy: str) -> Finding:
-    """Return the outcome for an arm that must not or can't run."""
+    """Return the outcome of a check after which the arm must not or can't run. remedy: the user's next step."""
     return Finding("", Status.FAILED, reason, remedy)
 
 
 def skipped(reason: str) -> Finding:
-    """Return the outcome of a check that isn't possible here."""
+    """Return the outcome of a check that wasn't made; reason: why it isn't possible here."""
     return Finding("", Status.SKIPPED, reason)
 
 
@@ -79,10 +82,10 @@ def diagnose(
     report: Callable[[Finding], None],
     earlier: Sequence[Finding] = (),
 ) -> list[Finding]:
-    """Run the checks in order; call `report` with each finding, and return all findings.
+    """Run the checks in order; call `report` with each finding, and return all findings, with their names.
 
-    An error of the bus or a device fails its check. A check is skipped if a check that it needs has failed, here or
-    in `earlier`, the findings of another table.
+    A DeviceError or BusError fails its check. A check is skipped if a check that it needs has failed, or was skipped
+    for that reason, here or in `earlier`, the findings of another table.
     """
     findings: list[Finding] = []
     # failed or skipped check → the failed check that caused it
@@ -102,7 +105,7 @@ def diagnose(
 
 
 def _run(check: Check[Examination], examination: Examination) -> Finding:
-    """Return the finding of a check; an error of the bus or of a device becomes a failure."""
+    """Return the finding of a check; a DeviceError or BusError becomes a failure, other errors are raised."""
     try:
         return check.run(examination)
     except DeviceError as error:
@@ -112,13 +115,16 @@ def _run(check: Check[Examination], examination: Examination) -> Finding:
 
 
 def summarise(findings: Sequence[Finding]) -> str:
-    """Return a line with the number of findings of each status."""
+    """Return a line with the number of findings of each status, such as "3 ok, 1 warning, 0 failed, 0 skipped"."""
     counts = {status: sum(finding.status is status for finding in findings) for status in Status}
     return ", ".join(f"{count} {status.value}" for status, count in counts.items())
 
 
 def configuration_checks(settings: Settings) -> list[Check[Settings]]:
-    """Return doctor's checks of a configuration: its likely mistakes, and one check for each guessed value."""
+    """Return doctor's checks of a configuration: one of its likely mistakes, and one for each guessed value.
+
+    Guessed are keys in `assumed` of the configuration, and of its device profiles.
+    """
     known = known_keys()
     guesses = [key for key in settings.assumed if key in known]
     return [
@@ -129,7 +135,7 @@ def configuration_checks(settings: Settings) -> list[Check[Settings]]:
 
 
 def check_settings(settings: Settings) -> Finding:
-    """Check the configuration for likely mistakes."""
+    """Warn of likely mistakes in a configuration, as `config check` does; ok without any."""
     odd = oddities(settings)
     if odd:
         return warning("; ".join(odd), "correct the configuration; `adacd-hil config check` looks at it without a bus")
@@ -137,7 +143,7 @@ def check_settings(settings: Settings) -> Finding:
 
 
 def _asking_for(known: KnownKey) -> Callable[[Settings], Finding]:
-    """Return a check that always warns: the value of this key is a guess."""
+    """Return a check that always warns that the value of this key is a guess, with the value and its meaning."""
 
     def ask(settings: Settings) -> Finding:
         value = value_of(settings, known.key)
@@ -149,7 +155,7 @@ def _asking_for(known: KnownKey) -> Callable[[Settings], Finding]:
 
 
 def _asking_for_profile(value: float) -> Callable[[Settings], Finding]:
-    """Return a check that always warns: this value of a device profile is a guess."""
+    """Return a check that always warns that this value of a device profile is a guess."""
 
     def ask(_: Settings) -> Finding:
         remedy = "look it up or measure it, write it into that profile, and take the key off its `assumed`"
@@ -171,9 +177,11 @@ _RT_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Host:
-    """The host to examine. `link`: None if there is no such CAN interface. `root`: folder with /proc and /sys.
+    """The host to examine. `interface`: as of python-can, "socketcan" for the kernel's CAN. `channel`: such as "can0".
 
-    `cpu`: the setting `realtime.cpu`.
+    `link`: state of the channel; None if there is no such CAN interface. bitrate, data_bitrate: of the contract, bit/s,
+    the second 0 without CAN FD. `request_realtime`: requests the scheduler for this process. `cpu`: the setting
+    `realtime.cpu`. `root`: folder with proc and sys.
     """
 
     interface: str
@@ -187,19 +195,19 @@ class Host:
 
     @property
     def is_socketcan(self) -> bool:
-        """Whether the kernel carries the frames."""
+        """Whether the interface is the kernel's SocketCAN, not a driver of python-can's own."""
         return self.interface == "socketcan"
 
 
 def check_kernel(host: Host) -> Finding:
-    """Check that the kernel has SocketCAN and gives us raw sockets."""
+    """Fail if the kernel gives out no raw CAN socket; skipped for an interface other than SocketCAN."""
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} does not use the kernel's CAN")
     return look_for_socketcan()
 
 
 def look_for_socketcan() -> Finding:
-    """Check that this kernel gives out raw CAN sockets."""
+    """Open and close a raw CAN socket; fail if the kernel has no SocketCAN or refuses."""
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except OSError as error:
@@ -212,7 +220,7 @@ def look_for_socketcan() -> Finding:
 
 
 def check_interface(host: Host) -> Finding:
-    """Check that the interface exists and is up."""
+    """Fail if the CAN interface doesn't exist or is down; skipped for an interface other than SocketCAN."""
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} is python-can's own")
     name, link = host.channel, host.link
@@ -227,7 +235,10 @@ def check_interface(host: Host) -> Finding:
 
 
 def _with_hardware(check: Callable[[Host, InterfaceState], Finding]) -> Callable[[Host], Finding]:
-    """Return the check as one of a `Host`; without a SocketCAN interface, or on a virtual one, it is skipped."""
+    """Return a check of a `Host` that calls `check` with its interface's state.
+
+    It is skipped without a SocketCAN interface, or on a virtual one.
+    """
 
     def run(host: Host) -> Finding:
         if host.link is None:
@@ -240,7 +251,10 @@ def _with_hardware(check: Callable[[Host, InterfaceState], Finding]) -> Callable
 
 
 def check_bitrate(host: Host, link: InterfaceState) -> Finding:
-    """Check that the bit rates are the contract's."""
+    """Fail if the interface's bit rate, or with CAN FD its data bit rate, isn't the contract's.
+
+    The check is skipped if the kernel doesn't report it.
+    """
     if link.bitrate is None:
         return skipped("the kernel does not report it here; install iproute2")
     remedy = f"ip link set {link.name} down; ip link set {link.name} up type can bitrate {host.bitrate}"
@@ -254,7 +268,7 @@ def check_bitrate(host: Host, link: InterfaceState) -> Finding:
 
 
 def check_sample_point(_host: Host, link: InterfaceState) -> Finding:
-    """Check that the sample point is compatible with the devices'."""
+    """Warn of a sample point outside 70 to 90 %, which may not suit the devices; skipped if it is unknown."""
     if link.sample_point is None:
         return skipped("the kernel does not report it here; install iproute2")
     text = f"{100.0 * link.sample_point:.1f} %"
@@ -265,7 +279,7 @@ def check_sample_point(_host: Host, link: InterfaceState) -> Finding:
 
 
 def check_restart(_host: Host, link: InterfaceState) -> Finding:
-    """Check that the interface restarts by itself after bus-off."""
+    """Warn if the interface doesn't restart by itself after bus-off; skipped if the kernel doesn't report it."""
     if link.restart_ms is None:
         return skipped("the kernel does not report it here; install iproute2")
     if link.restart_ms == 0:
@@ -277,7 +291,7 @@ def check_restart(_host: Host, link: InterfaceState) -> Finding:
 
 
 def check_controller(_host: Host, link: InterfaceState) -> Finding:
-    """Check that the CAN controller is error-active, neither error-passive nor bus-off."""
+    """Fail if the CAN controller is in bus-off, warn if it isn't error-active; skipped if its state is unknown."""
     if link.state is None:
         return skipped("the kernel does not report it here; install iproute2")
     counters = f"{link.state}, error counters rx {link.rx_errors or 0}, tx {link.tx_errors or 0}"
@@ -289,7 +303,10 @@ def check_controller(_host: Host, link: InterfaceState) -> Finding:
 
 
 def check_queue(host: Host) -> Finding:
-    """Check that the transmit queue is short enough not to hold outdated commands."""
+    """Warn if the transmit queue holds 100 frames or more, outdated commands after a dead bus.
+
+    The check is skipped without SocketCAN.
+    """
     if host.link is None:
         return skipped("no SocketCAN interface")
     length, name = host.link.txqueuelen, host.link.name
@@ -304,7 +321,7 @@ def check_queue(host: Host) -> Finding:
 
 
 def check_mtu(host: Host) -> Finding:
-    """Check that CAN FD frames fit, if the contract has some."""
+    """Fail if the contract has CAN FD and the interface's MTU is too small for it; skipped without SocketCAN."""
     if host.link is None:
         return skipped("no SocketCAN interface")
     if not host.data_bitrate:
@@ -315,7 +332,10 @@ def check_mtu(host: Host) -> Finding:
 
 
 def check_permissions(host: Host) -> Finding:
-    """Check that this process may empty the interface's queue after a fault."""
+    """Warn if this process lacks CAP_NET_ADMIN, with which it empties the interface's queue after a fault.
+
+    The check is skipped for an interface other than SocketCAN, or if /proc doesn't tell.
+    """
     if not host.is_socketcan:
         return skipped(f"interface {host.interface} has no queue in the kernel")
     try:
@@ -332,7 +352,7 @@ def check_permissions(host: Host) -> Finding:
 
 
 def request_scheduler(host: Host) -> Finding:
-    """Request scheduler, processor, locked memory and shallow idle states, and check that they are granted."""
+    """Request scheduler, processor, locked memory and shallow idle states for this process; warn of those refused."""
     grant = host.request_realtime()
     if grant.missing:
         reasons, remedies = zip(*grant.missing, strict=True)
@@ -341,7 +361,7 @@ def request_scheduler(host: Host) -> Finding:
 
 
 def check_throttling(host: Host) -> Finding:
-    """Check that the kernel lets real-time processes work for at least `_RT_SHARE` of the time."""
+    """Warn if the kernel lets real-time processes work for less than 90 % of the time; skipped if unknown."""
     folder = host.root / "proc/sys/kernel"
     try:
         runtime_us = int(_read(folder / "sched_rt_runtime_us"))
@@ -358,7 +378,7 @@ def check_throttling(host: Host) -> Finding:
 
 
 def check_preemption(host: Host) -> Finding:
-    """Check that the kernel is PREEMPT_RT, so that it wakes real-time processes without delay."""
+    """Warn if the kernel isn't PREEMPT_RT, which wakes real-time processes without delay."""
     version = _read(host.root / "proc/version")
     if _read(host.root / "sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
         return ok("PREEMPT_RT")
@@ -367,7 +387,7 @@ def check_preemption(host: Host) -> Finding:
 
 
 def check_processor(host: Host) -> Finding:
-    """Check that the processors' clock is steady: governor `performance`."""
+    """Warn if a processor's frequency governor isn't `performance`; skipped without frequency scaling."""
     folder = host.root / "sys/devices/system/cpu"
     governors = sorted({_read(path) for path in folder.glob("cpu[0-9]*/cpufreq/scaling_governor")})
     if not governors:
@@ -379,7 +399,7 @@ def check_processor(host: Host) -> Finding:
 
 
 def check_isolation(host: Host) -> Finding:
-    """Check that the processor of the control cycle, `realtime.cpu`, is isolated."""
+    """Warn if the processor of the control cycle, `realtime.cpu`, isn't isolated, or isolated ones aren't used."""
     isolated = isolated_cpus(host.root / "sys/devices/system/cpu")
     names = ", ".join(map(str, isolated)) or "none"
     isolate = "isolcpus={0} nohz_full={0} rcu_nocbs={0} on the kernel's command line, and no interrupts there"

@@ -11,13 +11,16 @@ from adacd_hil.wire.frame_time import exact_frame
 
 
 class LoadMeter:
-    """Counts the bits of frames; `take_percent` returns the load since the last call. For `monitor`, not the cycle.
+    """Counts the bits of a bus's frames, and turns them into a load. For `monitor`, not for the control cycle.
 
     Error frames don't count: their duration is unknown. Identifiers above 0x7FF are extended ones.
     """
 
     def __init__(self, bitrate: int, data_bitrate: int, start_ns: int) -> None:
-        """Count at rates in bit/s, from `start_ns` on. Raises ValueError for a rate of 0."""
+        """Begin with no bits at `start_ns`; the rates are in bit/s, data_bitrate 0 without CAN FD.
+
+        Raises ValueError if `bitrate` is 0 or less.
+        """
         if bitrate <= 0:
             raise ValueError(f"bitrate = {bitrate} bit/s is not above 0 bit/s")
         exact_frame(0, bytes(FRAME_LENGTHS[-1] if data_bitrate else 0))  # compiled before the first frame comes
@@ -30,7 +33,7 @@ class LoadMeter:
     def count_frame(self, frame: Frame) -> None:
         """Add a frame's bits to the load; ignore an error frame.
 
-        Raises ValueError for an impossible length, or CAN FD without a data bit rate.
+        Raises ValueError for a length that no frame has, or a frame of CAN FD if no data bit rate was given.
         """
         if frame.is_error:
             return
@@ -42,9 +45,9 @@ class LoadMeter:
         self.bits = FrameBits(self.bits.nominal + bits.nominal, self.bits.data + bits.data)
 
     def take_percent(self, t_ns: int) -> float:
-        """Return the share of the time from the last call, or the beginning, until `t_ns` in which the bus was busy.
+        """Return the bus load, percent, since the last call, or since the begin, until `t_ns`; 0 for an empty interval.
 
-        In percent; 0 for an empty interval. Starts again from zero.
+        Then count from zero again, from `t_ns` on.
         """
         busy_s, interval_s = self.bits.duration_s(self._bitrate, self._data_bitrate), (t_ns - self._start_ns) * 1e-9
         self._start_ns, self.bits = t_ns, FrameBits(0, 0)

@@ -62,24 +62,30 @@ _SIGNAL_OBJECTS = {
 
 
 class DeviceRatings(NamedTuple):
-    """Values read from a device. numbers: by index and sub-index. torque_Nm: one count of a sensor."""
+    """Values read from a device. numbers: by (index, sub-index); an object that wasn't read is missing.
+
+    torque_Nm: one count of a torque sensor; None if unknown, and for a drive.
+    """
 
     numbers: Mapping[_Place, int] = {}
     torque_Nm: float | None = None
 
     @property
     def torque_share(self) -> float | None:
-        """0x6072: the largest torque over the rated one; None if unknown."""
+        """0x6072, the largest torque, over the rated one; None if it was not read or is 0."""
         permille = self.numbers.get((0x6072, 0))
         return permille * 1e-3 if permille else None
 
     def rated_torque_Nm(self, scale: ScaleSettings) -> float | None:
-        """Return the motor's rated torque at the joint, Nm, from 0x6076 as read; None if missing or 0."""
+        """Return the motor's rated torque at the joint, Nm, from 0x6076 as read; None if it was not read or is 0."""
         counts = self.numbers.get((0x6076, 0))
         return counts * scale.joint_torque_Nm if counts else None
 
     def position_limit_deg(self, scale: ScaleSettings) -> float | None:
-        """Return the largest |q| within 0x607D on both sides, deg; None if unknown or implausible for a joint."""
+        """Return the largest |q| within the limits 0x607D on both sides, deg.
+
+        None if they were not read, don't enclose 0, the scale is unknown, or the result is beyond any joint.
+        """
         low, high = self.numbers.get((0x607D, 1)), self.numbers.get((0x607D, 2))
         if low is None or high is None or min(-low, high) <= 0 or not scale.increments_per_joint_rev:
             return None
@@ -87,9 +93,9 @@ class DeviceRatings(NamedTuple):
         return degrees if _LEAST_LIMIT_DEG <= degrees <= _MOST_LIMIT_DEG else None
 
     def velocity_limit_deg_s(self, scale: ScaleSettings) -> float | None:
-        """Return the joint's largest speed from 0x6080, rpm of the motor, and the gear, deg/s.
+        """Return the joint's largest speed, deg/s, by 0x6080, rpm of the motor, and the gear, 0x6091 or `scale`'s.
 
-        None if missing or implausible, as a factory's 50000 rpm.
+        None if 0x6080 was not read, or the result is beyond any joint, as a factory's 50000 rpm.
         """
         rpm = self.numbers.get((0x6080, 0))
         gear = self.numbers.get((0x6091, 1), 0) / (self.numbers.get((0x6091, 2)) or 1) or scale.gear_ratio
@@ -98,7 +104,7 @@ class DeviceRatings(NamedTuple):
 
 
 class ProfileDraft(NamedTuple):
-    """The text of a profile, and its settings. guessed: by key, a guess and its reason as text.
+    """The text of a profile, and its settings. guessed: by key, such as "scale.gear_ratio", the value and its reason.
 
     remarks: limits of the device, a line each. rated_torque_Nm: at the joint, by 0x6076; None if unknown.
     is_rated_known: no guess went into it.
@@ -113,12 +119,15 @@ class ProfileDraft(NamedTuple):
 
     @property
     def guesses(self) -> tuple[str, ...]:
-        """The guesses as text, a line each."""
+        """The guesses as text, such as "gear_ratio = 50: the EDS has no 0x6091", a line each."""
         return tuple(f"{key.partition('.')[2]} = {text}" for key, (_, text) in self.guessed.items())
 
 
 def identity_of(eds: Path) -> tuple[int | None, int | None]:
-    """Return vendor and product of an EDS: 0x1018:1 and :2, else its head's, None if not given. Raises ConfigError."""
+    """Return vendor and product of an EDS: the defaults of 0x1018:1 and :2, else the numbers of its head.
+
+    Each is None if neither gives it. Raises ConfigError if the EDS can't be read.
+    """
     objects = read_eds(eds, 1)
     head = objects.device_information
     found = []
@@ -130,14 +139,18 @@ def identity_of(eds: Path) -> tuple[int | None, int | None]:
 
 
 def is_of(identity: tuple[int | None, int | None], node: tuple[int | None, int | None]) -> bool:
-    """Return whether an EDS of this vendor and product fits a node; a number that the EDS omits fits all."""
+    """Return whether an EDS of this vendor and product is of a node with these.
+
+    A number that the EDS lacks fits all.
+    """
     return all(expected in (None, found) for expected, found in zip(identity, node, strict=True))
 
 
 def kind_of(eds: Path) -> str:
-    """Return "drive" or "sensor" by 0x1000 of an EDS; "" for another profile.
+    """Return "drive" or "sensor" by 0x1000 of an EDS; "" if that names another device profile.
 
-    If 0x1000 names no profile: the kind of a shipped profile of the same maker, "" without one. Raises ConfigError.
+    If 0x1000 names no profile: the kind of a shipped profile of the same maker, "" without one. Raises ConfigError if
+    the EDS can't be read.
     """
     number = _profile_number(eds)
     if not number:
@@ -146,7 +159,10 @@ def kind_of(eds: Path) -> str:
 
 
 def describe_kind(eds: Path) -> str:
-    """Return a line on 0x1000 of an EDS that is neither a drive's nor a sensor's. Raises ConfigError."""
+    """Return the line "0x1000 of … names …, neither a drive's nor a sensor's", for an EDS of another kind.
+
+    Raises ConfigError if the EDS can't be read.
+    """
     number = _profile_number(eds)
     profile = f"names CiA {number}" if number else "names no profile"
     return f"0x1000 of {eds.name} {profile}, neither a drive's (CiA 402) nor a sensor's (CiA 404)"
@@ -163,10 +179,11 @@ def draft_profile(
     kind: str = "",
     answers: Mapping[str, float] | None = None,
 ) -> ProfileDraft:
-    """Draft the profile of the device that an EDS describes. Raises ConfigError if it lacks an object of the cycle.
+    """Draft the profile of the device that an EDS describes; write no file.
 
-    `kind`: drive or sensor, if 0x1000 doesn't name either. `answers`: given values of `scale`, by key; `velocity_unit`
-    is a code of 0x60A9.
+    `ratings`: values read from the device. `kind`: "drive" or "sensor", if 0x1000 names neither. `answers`: given
+    values of `scale`, by key; `velocity_unit` is a code of 0x60A9. Raises ConfigError if the EDS can't be read, its
+    kind is unknown, or it lacks an object or a PDO that a cycle needs.
     """
     kind = kind or kind_of(eds)
     if not kind:
@@ -184,9 +201,9 @@ def draft_profile(
 
 
 def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
-    """Return the settings of the shipped profile of the EDS's maker that has guesses, `assumed`; None without one.
+    """Return the settings of the shipped profile of the EDS's maker that has `assumed` keys; None if there is none.
 
-    Its values that are not `assumed` hold for all devices of this maker.
+    Its values that are not `assumed` hold for all devices of this maker. Raises ConfigError if the EDS can't be read.
     """
     vendor, _ = identity_of(eds)
     for _, profile in shipped_profiles(kind):
@@ -196,7 +213,7 @@ def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
 
 
 def shipped_profiles(kind: str) -> Iterator[tuple[str, DeviceProfile]]:
-    """Yield the shipped profiles of drives, or of sensors, with their names."""
+    """Yield each shipped profile of a kind, "drive" or "sensor", after its name."""
     for name in profile_names():
         with suppress(ConfigError):  # of the other kind
             yield name, load_profile(name, kind)
@@ -230,10 +247,10 @@ _MOST_OPTION = 8  # of 0x605A
 
 
 class _Record(NamedTuple):
-    """A PDO of a device. cob_id: without the node id. entries: the default mapping.
+    """A PDO of a device. number: from 1. cob_id: without the node id. entries: objects of the default mapping.
 
     room: most objects of its mapping; 0: the mapping is read-only. transmission, inhibit_100us, timer_ms: read-only
-    values; None and 0 if they can be written.
+    values; None, 0 and 0 if they can be written. has_timer: the event timer can be written.
     """
 
     number: int
@@ -250,12 +267,16 @@ class _Record(NamedTuple):
         return set(places) <= set(self.entries)
 
     def can_be(self, transmission: int) -> bool:
-        """Return whether the PDO has this transmission type or can be given it."""
+        """Return whether the PDO's transmission type is this one, or can be written."""
         return self.transmission in (None, transmission)
 
 
 class _ProfileWriter(ABC):
-    """Writes a device's profile by EDS, the user's answers, values read from the device, and the maker's profile."""
+    """Writes a device's profile by EDS, the user's answers, values read from the device, and the maker's profile.
+
+    `text` fills `guessed`, `remarks` and `rated_torque_Nm`. find: None for an object that the EDS lacks. default: 0 for
+    one without a default.
+    """
 
     kind = ""
     features = _SENSOR_FEATURES
@@ -283,22 +304,25 @@ class _ProfileWriter(ABC):
         return 0 if variable is None or variable.default is None else variable.default
 
     def number(self, index: int, sub: int) -> int | None:
-        """Return the value read from the device, else the EDS's default; None without either."""
+        """Return the value read from the device, else the EDS's default; None if there is neither."""
         if (index, sub) in self.ratings.numbers:
             return self.ratings.numbers[index, sub]
         variable = self.find((index, sub))
         return None if variable is None else variable.default
 
     def is_factory(self, index: int, sub: int) -> bool:
-        """Return whether a factory setting is all that is known of an object: it is writable, and was not read."""
+        """Return whether an object can be written and was not read: its default is a factory setting at best."""
         return (index, sub) not in self.ratings.numbers and self.can_write(index, sub)
 
     def refuse(self, reason: str) -> ConfigError:
-        """Return the error to raise for an EDS of which no profile can be made."""
+        """Return the ConfigError, with the EDS's path, to raise if no profile can be made."""
         return ConfigError(f"EDS {self.eds}: {reason}")
 
     def require(self, index: int, sub: int, what: str) -> None:
-        """Raise ConfigError if the EDS lacks an object, or it can't be mapped. what: its name in the error."""
+        """Raise ConfigError if the EDS lacks an object, or the object can't be mapped to a PDO.
+
+        what: its name in the error.
+        """
         name = f"{ObjectName(index, sub)} ({what})"
         variable = self.find((index, sub))
         if variable is None:
@@ -312,7 +336,7 @@ class _ProfileWriter(ABC):
         return not any(record.room for is_received in (False, True) for record in self.records(is_received))
 
     def records(self, is_received: bool) -> list[_Record]:
-        """Return the device's PDOs that can be switched on: RPDOs if is_received, else TPDOs."""
+        """Return the device's PDOs with a usable identifier and a mapping: RPDOs if is_received, else TPDOs."""
         base = _RECEIVED if is_received else _SENT
         found = []
         for number in range(1, _MOST_RECORDS + 1):
@@ -334,7 +358,10 @@ class _ProfileWriter(ABC):
         return found
 
     def _cob_id(self, index: int, number: int, is_received: bool) -> int | None:
-        """Return a PDO's identifier without the node id, by the EDS or else predefined; None if unusable."""
+        """Return a PDO's identifier without the node id, by the EDS, or else the predefined one that can be written.
+
+        None if the PDO is switched off for good, or no usable identifier can be set. number: of the PDO, from 1.
+        """
         by_eds = self.default(index, 1)
         if by_eds & NOT_VALID and not self.can_write(index, 1):
             return None
@@ -349,7 +376,10 @@ class _ProfileWriter(ABC):
         return predefined if self.can_write(index, 1) and predefined <= 0x57F else None
 
     def text(self) -> str:
-        """Return the profile as the text of a TOML file; store guesses and remarks. Raises ConfigError."""
+        """Return the profile as the text of a TOML file; store guesses and remarks.
+
+        Call it once. Raises ConfigError if the device lacks an object or a PDO that a cycle needs.
+        """
         features = [name for name, place in self.features.items() if self.can_write(*place)]
         frames = self.frames()
         scale = self.scale()
@@ -373,42 +403,48 @@ class _ProfileWriter(ABC):
         return "\n".join([*lines, *self.further(), *frames])
 
     def watchdog(self) -> list[str]:
-        """Return the profile's lines on the deadline of commands."""
+        """Return the profile's lines on the deadline of commands; [] for a device without commands."""
         return []
 
     def options(self, can_write: bool) -> list[str]:  # noqa: ARG002 (of a drive)
-        """Return the profile's lines on the reactions of a stop. can_write: the drive's option codes can be written."""
+        """Return the profile's lines on the drive's reactions to a stop. can_write: its option codes can be written."""
         return []
 
     def further(self) -> list[str]:
-        """Return the profile's further lines that hold for all devices of the maker, such as [patience]."""
+        """Return the profile's lines that hold for all devices of the maker, such as [patience]; [] without any."""
         return []
 
     @abstractmethod
     def scale(self) -> list[str]:
-        """Return the profile's lines on the scales of counts."""
+        """Return the lines of [scale]: the worth of a count of each value; store guesses."""
 
     @abstractmethod
     def frames(self) -> list[str]:
-        """Return the profile's lines on PDOs."""
+        """Return the lines of all [[pdo]] tables.
+
+        Raises ConfigError if the device lacks an object or a PDO that is needed.
+        """
 
     def fact(self, key: str) -> float | None:
-        """Return a value of `scale` that holds for all devices of this maker; None if unknown."""
+        """Return a value of `scale` that holds for all devices of this maker, by its shipped profile.
+
+        None if there is no such profile, the value is `assumed` in it, or 0.
+        """
         if self.facts is None or f"scale.{key}" in self.facts.assumed:
             return None
         value: float = getattr(self.facts.scale, key)
         return value or None
 
     def guess(self, key: str, value: float, text: str) -> str:
-        """Store a guess of `scale.KEY`; return the comment for the line above it."""
+        """Store a guess of `scale.KEY` with its reason, `text`; return the comment for the line above it."""
         self.guessed[f"scale.{key}"] = value, text
         return f"# A guess: {text}"
 
     def pdo(self, message: str, record: _Record, places: Sequence[_Place], transmission: int = 1) -> list[str]:
-        """Return the profile's lines on one PDO.
+        """Return the profile's lines on one PDO, with inhibit time and event timer where they are needed.
 
-        places: objects to map; a fixed mapping keeps the EDS's default objects. transmission: type if it can be
-        written; 1 is not printed. Adds inhibit time and event timer.
+        places: objects to map; a fixed mapping keeps the EDS's default objects. transmission: type to write, unless the
+        PDO's is read-only; 1 is not printed.
         """
         rows = [
             f'    {{ object = "{ObjectName(*place)}", {self.signal(place)} }},'
@@ -430,7 +466,10 @@ class _ProfileWriter(ABC):
         return [*head, "signals = [", *rows, "]", ""]
 
     def signal(self, place: _Place) -> str:
-        """Return the keys of a mapped object in a profile: the signal's name, and its unit if that is per mille."""
+        """Return the keys of a mapped object in a profile: `signal = "NAME"`, and `unit` if it counts per mille.
+
+        An object without a known name gets one by its index, such as "object_2031_0".
+        """
         index, sub = place
         if place in _TORQUE_OBJECTS:
             return 'signal = "torque"'
@@ -439,7 +478,10 @@ class _ProfileWriter(ABC):
         return f'signal = "{name or f"object_{index:04X}_{sub}"}"{unit}'
 
     def fill(self, places: Sequence[_Place], room: int) -> list[_Place]:
-        """Return the objects, in order, that can be mapped and fit into one PDO. room: most objects of the PDO."""
+        """Return the objects of `places`, in order, that can be mapped and fit together into one PDO of 8 bytes.
+
+        room: most objects of the PDO. An object that doesn't fit is left out; later ones may fit.
+        """
         kept: list[_Place] = []
         bits = 0
         for place in places:
@@ -457,7 +499,7 @@ class _DriveWriter(_ProfileWriter):
     features = _SENSOR_FEATURES | {"option_codes": (0x605A, 0), "torque_limits": (0x6072, 0)}
 
     def _check(self) -> None:
-        """Raise ConfigError if the drive lacks a function that a cycle needs."""
+        """Raise ConfigError if the EDS lacks an object of the cycle, or the drive lacks cyclic synchronous torque."""
         target = self.find((0x6071, 0))
         if target is None:
             raise self.refuse("no 0x6071 (target torque): it can't be commanded by torque")
@@ -511,7 +553,11 @@ class _DriveWriter(_ProfileWriter):
         return [*lines, *self._velocity(gear, increments), *gear_lines, *torque_lines]
 
     def _gear(self, motor_Nm: float) -> tuple[float, list[str]]:
-        """Return the gear ratio from the best source, and the profile's lines on it and its efficiency."""
+        """Return the gear ratio, and the profile's lines on it and its efficiency; store guesses.
+
+        motor_Nm: rated torque of the motor, 0 if unknown. The ratio is the user's answer, else the drive's own 0x6091,
+        else a guess.
+        """
         by_drive = read_drive_units(self.number).gear_ratio
         lines: list[str] = []
         if "gear_ratio" in self.answers:
@@ -531,9 +577,10 @@ class _DriveWriter(_ProfileWriter):
         return gear, text
 
     def _likely_gear(self, motor_Nm: float) -> float:
-        """Guess the gear ratio, rather too large, so that too little torque is commanded.
+        """Return a guess of the gear ratio, rather too large, so that too little torque is commanded.
 
-        A rated torque in a joint's range means no gear; a weak motor, or a velocity in rpm, means one.
+        It is the maker's, if known. A motor_Nm in a joint's range means no gear, a weaker motor, or a velocity in rpm,
+        means one. motor_Nm: 0 if unknown.
         """
         if self.facts is not None:
             return self.facts.scale.gear_ratio
@@ -542,7 +589,10 @@ class _DriveWriter(_ProfileWriter):
         return _LIKELY_GEAR if not motor_Nm and self.number(0x60A9, 0) in _RPM_UNITS else 1.0
 
     def _increments(self, gear: float) -> tuple[float, list[str]]:
-        """Return increments per revolution of the joint, from the best source, and the profile's lines on them."""
+        """Return the increments per revolution of the joint, and the profile's lines on them; store a guess.
+
+        They are the user's answer, else the maker's, else the drive's own, else a guess.
+        """
         units = read_drive_units(self._numbers_with_gear(), gear)
         found, text = units.increments_per_joint_rev, units.increments_text
         places = [place for place in ((0x608F, 1), (0x6092, 1)) if self.number(*place) is not None]
@@ -567,13 +617,20 @@ class _DriveWriter(_ProfileWriter):
         return increments, [*lines, f"increments_per_joint_rev = {increments:.16g}"]
 
     def _numbers_with_gear(self) -> Any:
-        """Return a reader of the drive's objects; 0x6091 is hidden if it is 1 : 1, or if the user gave a gear."""
+        """Return a function of index and sub-index that reads the drive's objects.
+
+        It hides 0x6091 if that is 1 : 1, or if the user gave a gear.
+        """
         by_drive = read_drive_units(self.number).gear_ratio
         is_set = by_drive not in (None, 1.0) and "gear_ratio" not in self.answers
         return lambda index, sub: None if index == 0x6091 and not is_set else self.number(index, sub)
 
     def _velocity(self, gear: float, increments: float) -> list[str]:
-        """Return the profile's lines on one count of velocity, in rad/s of the joint, from the best source."""
+        """Return the profile's lines on one count of velocity, in rad/s of the joint; store a guess.
+
+        It follows from the unit of the user's answer, else of 0x60A9, else it is the maker's, else one increment per
+        second.
+        """
         unit = self.answers.get("velocity_unit")
         code = int(unit) if unit is not None else self.number(0x60A9, 0)
         objects = {(0x60A9, 0): code, (0x608F, 1): 1}
@@ -590,7 +647,11 @@ class _DriveWriter(_ProfileWriter):
         return [self.guess("velocity_rad_s", rad_s, text), f"velocity_rad_s = {rad_s!r}"]
 
     def _torque(self) -> tuple[float, list[str]]:
-        """Return the motor's rated torque, Nm (0 if unknown), and the profile's lines on one count of it."""
+        """Return the motor's rated torque, Nm, 0 if unknown, and the profile's lines on the unit of 0x6076.
+
+        The unit is the user's answer, else the maker's, else mNm; µNm, stored as a guess, if the motor would be
+        implausibly strong.
+        """
         counts = self.number(0x6076, 0) or 0
         count_Nm, lines = self.answers.get("rated_torque_count_Nm", 1e-3), list[str]()
         if "rated_torque_count_Nm" not in self.answers:
@@ -605,7 +666,10 @@ class _DriveWriter(_ProfileWriter):
         return counts * count_Nm, lines
 
     def _command(self) -> _Record:
-        """Return the RPDO that can take controlword and target torque. Raises ConfigError without one."""
+        """Return the RPDO that can take controlword and target torque.
+
+        If its mapping is fixed, it has no object that the host can't fill. Raises ConfigError if there is no such RPDO.
+        """
         wanted = ((0x6040, 0), (0x6071, 0))
         for record in self.records(is_received=True):
             known = {_SIGNAL_OBJECTS[name] for name in HOST_SIGNALS}
@@ -667,7 +731,10 @@ class _SensorWriter(_ProfileWriter):
         ]
 
     def _by_eds(self) -> float | None:
-        """Return the torque of one count by read-only unit and digits; None if they are writable or missing."""
+        """Return the torque of one count, Nm, by unit and digits of the EDS, 0x6131 and 0x6132.
+
+        None if they are missing, or are writable and were not read, or the unit is no torque.
+        """
         if self.is_factory(0x6131, 1) or self.is_factory(0x6132, 1):
             return None
         return torque_of_count(self.number(0x6131, 1), self.number(0x6132, 1))
@@ -691,7 +758,10 @@ class _SensorWriter(_ProfileWriter):
 
 
 def torque_of_count(unit: int | None, digits: int | None) -> float | None:
-    """Return the torque of one count of a sensor by 0x6131 and 0x6132, Nm; None if the unit is not a torque."""
+    """Return the torque of one count of a sensor, Nm, by its unit, 0x6131, and its digits, 0x6132.
+
+    None if either is unknown, the unit is not newton metre, or the size is beyond any sensor.
+    """
     if unit is None or digits is None or unit & 0x00FFFFFF != NEWTON_METRE:
         return None
     prefix = unit >> PREFIX_SHIFT

@@ -67,10 +67,11 @@ def function_name(can_id: int) -> str:
 
 @dataclass
 class Node:
-    """One CANopen node. None: unknown (it didn't answer, or has no such object).
+    """One CANopen node. None: unknown, since it didn't answer or has no such object.
 
-    nmt_state: 0, 4, 5, 127 from its heartbeat or boot-up. emergencies: (error code, error register), oldest first.
-    answers: whether it answered SDO.
+    nmt_state: 0, 4, 5 or 127, of its last heartbeat or boot-up. has_pdos: it sent TPDOs. answers: it answered every SDO
+    request. emergencies: (error code, error register), oldest first. produces: identifiers that it sent, but SDO
+    responses.
     """
 
     node_id: int
@@ -91,7 +92,7 @@ class Node:
 
     @property
     def device_text(self) -> str:
-        """Describe 0x1000: the low 16 bits are the number of the device profile."""
+        """0x1000 as text, such as "CiA 402 drive"; "no profile", or "?" if it is unknown."""
         if self.device_type is None:
             return "?"
         profile = self.device_type & 0xFFFF
@@ -101,7 +102,7 @@ class Node:
 
     @property
     def state_text(self) -> str:
-        """Describe the NMT state by heartbeats, or by PDOs, which only an operational node sends."""
+        """The NMT state as text, by heartbeats, or by PDOs, which only an operational node sends."""
         if self.has_pdos and self.nmt_state in (None, 0):
             return "operational (sends PDOs)"
         if self.nmt_state is None:
@@ -111,7 +112,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Expected:
-    """A node that the configuration expects. None: its EDS doesn't give it, so any value will do."""
+    """A node that the configuration expects. None: any value will do."""
 
     name: str
     node_id: int
@@ -123,7 +124,10 @@ class Expected:
 
 @dataclass(frozen=True)
 class Survey:
-    """Nodes found. `others`: identifiers that belong to no node found; `duration_s`: length of the listening."""
+    """Nodes found, ascending by node id. `others`: identifiers that belong to none of them.
+
+    `duration_s`: length of the listening, without the reading of identities.
+    """
 
     nodes: list[Node]
     others: list[Talk]
@@ -141,7 +145,8 @@ def survey(
     """Ask all 127 node ids for 0x1000, listen for `duration_s`, and read the identity of each node that answers.
 
     contract_ids: ids of the nodes of which 0x2000, wire version and layout digest, is read, too. progress: called with
-    a line before each step. Raises BusError.
+    a line before each step. Silent nodes are found by heartbeat or EMCY. Takes about 0.4 s even if `duration_s` is 0.
+    Raises BusError.
     """
     tap = Tap(bus, clock)
     traffic = Traffic()
@@ -163,7 +168,10 @@ def survey(
 
 
 def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
-    """Return the nodes that answered SDO, or sent a heartbeat or an EMCY, by node id, ascending."""
+    """Return the nodes that answered SDO, or sent a heartbeat or an EMCY, by node id, ascending.
+
+    Takes the frames that have passed the tap.
+    """
     found: dict[int, Node] = {}
     for is_sent, frame in tap.take_passed():
         function, node_id = frame.can_id & 0x780, frame.can_id & 0x7F
@@ -187,9 +195,9 @@ def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
 
 
 def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
-    """Read a node's identity objects into its record; an object that the node lacks stays None.
+    """Read a node's identity into `node`; an object that the node lacks stays None. has_contract: read 0x2000, too.
 
-    If the node falls silent or refuses, its `answers` becomes False.
+    If the node falls silent or refuses, `answers` becomes False, and values read before stay.
     """
     remote = canopen.add_node(node.node_id, None, pause_s=BETWEEN_READS_S)
     try:
@@ -208,7 +216,10 @@ def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
 
 
 def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
-    """Add each identifier to `produces` of its node by the predefined connection set; return those of no node."""
+    """Add each identifier to `produces` of its node by the predefined connection set; return those of no node.
+
+    SDO responses, which are answers to us, are in neither.
+    """
     others = []
     for talk in traffic.sorted():
         node = nodes.get(talk.can_id & 0x7F) if talk.can_id <= MAX_STANDARD_ID else None
@@ -221,9 +232,9 @@ def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
 
 
 def expected_nodes(slaves: Iterable[Slave], codec: Codec | None = None) -> list[Expected]:
-    """Return the nodes that an arm's master expects, with vendor and product of the EDS, None where any will do.
+    """Return the nodes that an arm's master expects, with vendor and product of their EDS, None where any will do.
 
-    With a codec, entries also have its wire version and layout digest, for nodes that give them.
+    codec: if given, nodes whose profile has the object 0x2000 are expected with its wire version and layout digest.
     """
     expected = []
     for slave in slaves:
@@ -239,7 +250,10 @@ def expected_nodes(slaves: Iterable[Slave], codec: Codec | None = None) -> list[
 
 
 def compare(found: Survey, expected: list[Expected]) -> dict[int, str]:
-    """Return, by node id, how each node, found or expected, differs from the configuration: "" if it fits."""
+    """Return, by node id, how each node, found or expected, differs from the configuration.
+
+    "" if it fits, "unexpected" if the configuration lacks it, else a text such as "missing: NAME expected".
+    """
     wanted = {node.node_id: node for node in expected}
     present = {node.node_id: node for node in found.nodes}
     verdicts = {}
@@ -277,7 +291,7 @@ def _difference(node: Node, wanted: Expected) -> str:
 
 
 def message_name(codec: Codec | DbcDecoder, can_id: int) -> str:
-    """Return an identifier's name: the contract's message, else CiA 301's service in parentheses, else "unknown"."""
+    """Return an identifier's name: the contract's message, else CiA 301's service such as "(TPDO1)", else "unknown"."""
     message = codec.by_id.get(can_id)
     if message is not None:
         return message.name
@@ -290,7 +304,11 @@ _WINDOW_NS = 1_000_000_000
 
 
 class _Entry:
-    """Counts and checks of one identifier's frames so far. valid: data of the last frame that passed its checks."""
+    """Counts and checks of one identifier's frames so far. message: None if the contract lacks it.
+
+    receiver: of its end-to-end check, None if unprotected. valid: data of the last frame that passed its checks, None
+    before.
+    """
 
     def __init__(self, message: MessageCodec | MessageDecoder | None) -> None:
         self.message = message
@@ -328,7 +346,10 @@ class BusView:
     """Counts, checks and decodes the frames of a bus for a listener; `describe` returns the results."""
 
     def __init__(self, codec: Codec | DbcDecoder, bitrate: int, data_bitrate: int, t_ns: int) -> None:
-        """Begin at `t_ns`; the bit rates in bit/s are for the load."""
+        """Begin at `t_ns` without frames; the bit rates, in bit/s, are for the load.
+
+        Raises ValueError for a bit rate of 0.
+        """
         self.frames = 0
         self._codec = codec
         from adacd_hil.lab.commission.load_meter import LoadMeter
@@ -355,9 +376,9 @@ class BusView:
         entry.accept(frame)
 
     def restart_counters(self) -> None:
-        """Let the counters in protected frames jump once without being counted as lost frames.
+        """Let the counter of each protected message jump once without being counted as lost frames.
 
-        For frames that this computer has lost.
+        For frames that this computer has lost, not the bus.
         """
         for entry in self._entries.values():
             if entry.receiver is not None:
@@ -368,9 +389,9 @@ class BusView:
 
         node_id: return only nodes and messages of this node; counts and load are still of the whole bus.
         strange_frames: of a length that the contract's bus can't carry; the load leaves them out. A node's state: by
-        its last heartbeat, age_s since then. Of a message: lost: frames that a counter shows to be missing, as
-        occasions; errors: frames that failed a check, if is_protected; values: of the last frame that passed its
-        checks.
+        its last heartbeat, age_s since then. Of a message: rate_Hz: over the last one or two seconds; lost: frames that
+        a counter shows to be missing, as occasions; errors: frames of a wrong length, or that failed the end-to-end
+        check; values: of the last frame that passed its checks, empty before.
         """
         mark_ns, counts = self._marks[0]
         elapsed_s = (t_ns - mark_ns) * 1e-9

@@ -40,7 +40,7 @@ class ArmMovedError(TareRefusedError):
 
 @dataclass(frozen=True)
 class Pose:
-    """One pose, measured at rest: mean q; of tau_J, per joint, the mean, its standard error and its noise.
+    """One pose, measured at rest: the mean of q, and, for each torque, its mean, standard error and noise, all (2,).
 
     drift_Nm: mean of the second half of the window less that of the first.
     """
@@ -56,7 +56,10 @@ class Pose:
 
 @dataclass(frozen=True)
 class TareSolution:
-    """Solution of the poses. `gravity_Nm`: a4, a5; zeros with vertical axes. `condition`: of the poses' equations."""
+    """Solution of the poses. gravity_Nm (2,): a4, a5; zeros with vertical axes, of the CAD model if not estimated.
+
+    residual_Nm (N, 2): of each pose. condition: number of the poses' equations; 1 if gravity isn't estimated.
+    """
 
     offset_Nm: Vector
     standard_error_Nm: Vector
@@ -72,7 +75,7 @@ class TareSolution:
 
 
 def check_plan(settings: Settings) -> None:
-    """Raise ConfigError if these settings allow no tare, whatever is measured."""
+    """Raise ConfigError if these settings allow no tare: gravity needs a CAD model that is missing, or more poses."""
     tare = settings.tare
     if not settings.estimator.gravity:
         return
@@ -86,7 +89,10 @@ def check_plan(settings: Settings) -> None:
 
 
 def check_motion(q: Vector, dq: Vector, settings: Settings) -> None:
-    """Raise ArmMovedError if velocity or travel is beyond that of an arm at rest. q, dq: (2,) or (n, 2), n > 0."""
+    """Raise ArmMovedError for a speed above `safety.rest_velocity_rad_s` or a travel above `tare.creep_limit_deg`.
+
+    q, dq: (2,), or (n, 2) with n > 0; of one sample the travel is 0. NaN raises it, too.
+    """
     q, dq = np.atleast_2d(q), np.atleast_2d(dq)
     speed = np.abs(dq).max(axis=0)
     bound_rad_s = settings.safety.rest_velocity_rad_s
@@ -106,7 +112,11 @@ def check_motion(q: Vector, dq: Vector, settings: Settings) -> None:
 
 
 def measure_pose(q: Vector, dq: Vector, tau_J: Vector, settings: Settings) -> Pose:
-    """Return a pose: means and noise of a window of samples at rest (n, 2 each). Raises TareRefusedError if unfit."""
+    """Return a pose: means and noise of a window of samples at rest (n, 2 each).
+
+    Raises ArmMovedError if the arm moved, TareRefusedError for fewer than 20 samples, or noise or drift above the
+    limits.
+    """
     tare = settings.tare
     if len(tau_J) < 2 * _BLOCKS:
         raise TareRefusedError(f"{len(tau_J)} complete samples in a pose are below {2 * _BLOCKS}")
@@ -130,7 +140,10 @@ def measure_pose(q: Vector, dq: Vector, tau_J: Vector, settings: Settings) -> Po
 
 
 def _standard_error(tau_J: Vector) -> Vector:
-    """Estimate the standard error of the mean (2,), the larger of two: by samples, by blocks (for coloured noise)."""
+    """Return the standard error of the mean (2,): the larger of that by samples and that by 10 blocks.
+
+    Blocks show coloured noise.
+    """
     by_sample = tau_J.std(axis=0, ddof=1) / math.sqrt(len(tau_J))
     means = np.array([block.mean(axis=0) for block in np.array_split(tau_J, _BLOCKS)])
     larger: Vector = np.maximum(by_sample, means.std(axis=0, ddof=1) / math.sqrt(_BLOCKS))
@@ -138,7 +151,10 @@ def _standard_error(tau_J: Vector) -> Vector:
 
 
 def _bound(quantity: str, values: Vector, bound: float | Sequence[float], setting: str, remedy: str = "") -> None:
-    """Raise TareRefusedError if the size of a joint's value exceeds its bound, or is NaN."""
+    """Raise TareRefusedError if the size of a joint's value exceeds its bound, or is NaN.
+
+    bound: of both joints, or of each. quantity, setting, remedy: words of the message.
+    """
     bounds = np.broadcast_to(bound, JOINTS)
     for joint, name in enumerate(JOINT_NAMES):
         if not abs(values[joint]) <= bounds[joint]:
@@ -148,7 +164,7 @@ def _bound(quantity: str, values: Vector, bound: float | Sequence[float], settin
 
 
 def gravity_columns(q: Vector, level_rad: float) -> Vector:
-    """Return Y_g (2, 2): the torques at rest of a unit a4 and a unit a5, by the scheme's own regressor.
+    """Return Y_g (2, 2): the torques at rest of a unit a4, and of a unit a5, in pose q (2,).
 
     level_rad: q1 at which link 1 is level.
     """
@@ -158,7 +174,11 @@ def gravity_columns(q: Vector, level_rad: float) -> Vector:
 
 
 def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
-    """Solve the poses for the offsets; return the solution. Raises TareRefusedError if it exceeds a bound."""
+    """Return the least-squares solution of the poses: offsets, gravity, residuals.
+
+    Raises TareRefusedError if an offset, or the disagreement of the poses, exceeds its limit, or the poses don't
+    determine gravity.
+    """
     solution = _solve(poses, settings)
     tare = settings.tare
     if settings.estimator.gravity:
@@ -177,7 +197,10 @@ def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
 
 
 def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
-    """Solve the poses by least squares. Raises TareRefusedError if they don't determine gravity; checks no result."""
+    """Solve the poses by least squares, without limits of the result.
+
+    Raises TareRefusedError if gravity is estimated and the poses don't determine it.
+    """
     torque = np.array([pose.mean_Nm for pose in poses])
     matrix = np.tile(np.eye(JOINTS), (len(poses), 1))
     gravity, is_estimated = np.zeros(len(_GRAVITY)), False
@@ -199,7 +222,7 @@ def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
 
 
 def _errors_of_unknowns(matrix: NDArray[np.float64], poses: Sequence[Pose], residual: Vector) -> Vector:
-    """Return the standard errors of the unknowns, one per column of the matrix of equations.
+    """Return the standard error of each unknown, one per column of the matrix of equations (2 N, unknowns).
 
     An equation's error is the larger of two: the noise of its mean, and the disagreement of the poses.
     """
@@ -214,7 +237,10 @@ def _errors_of_unknowns(matrix: NDArray[np.float64], poses: Sequence[Pose], resi
 
 
 def _check_condition(matrix: NDArray[np.float64], poses: Sequence[Pose], settings: Settings) -> float:
-    """Return the condition number of the equations for (a4, a5, offsets). Raises TareRefusedError naming the motion."""
+    """Return the condition number of the equations for (a4, a5, offsets).
+
+    Raises TareRefusedError above `tare.condition_limit`; the message names the joint to move further.
+    """
     _, values, directions = np.linalg.svd(matrix)
     condition = float(values[0] / values[-1]) if values[-1] > 0.0 else math.inf
     bound = settings.tare.condition_limit

@@ -48,7 +48,11 @@ _OWN_VENDOR = int.from_bytes(b"ADAC", "big")
 
 @dataclass
 class TareSession:
-    """One tare on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time."""
+    """One tare on one bus. Raises ConfigError if the settings allow none, or none with is_auto_zeroing.
+
+    `clock` is a VirtualClock in lockstep and a MonotonicClock in real time. old_offset_Nm: offsets before, for the
+    record. is_auto_zeroing: the sensors set their own zero first. progress: called with a line at each step.
+    """
 
     settings: Settings
     codec: Codec
@@ -81,7 +85,8 @@ class TareSession:
     def run(self) -> Tare:
         """Boot the devices, measure the poses, solve for the offsets; return the tare. Writes no file.
 
-        Raises TareRefusedError, DeviceError, BusError, SilenceError; KeyboardInterrupt after `interrupt`.
+        Stops the nodes again, also after an error. Raises TareRefusedError for data or motion that allow no tare,
+        DeviceError, BusError, such as SilenceError; KeyboardInterrupt after `interrupt`.
         """
         self.progress(f"looking for the arm on {self.bus.channel}")
         self._master.reset()
@@ -101,7 +106,7 @@ class TareSession:
         return self._describe(poses, solve_tare(poses, self.settings), sensors, temperatures)
 
     def _read_temperature(self, node: Any, sensor: Identity) -> float | None:
-        """Read the sensor's temperature in °C; None for another maker's sensor, or without an answer."""
+        """Return the sensor's temperature, °C; None for another maker's sensor, or one that doesn't answer."""
         if sensor.vendor != _OWN_VENDOR:
             return None
         try:
@@ -112,7 +117,10 @@ class TareSession:
         return int.from_bytes(data[:2], "little", signed=True) * 0.01
 
     def _step(self) -> ArmState:
-        """Run one cycle; return the arm's state. Raises KeyboardInterrupt after `interrupt`, BusError."""
+        """Run one cycle at zero torque; return the arm's state.
+
+        Raises KeyboardInterrupt after `interrupt`, BusError.
+        """
         if self._is_interrupted:
             raise KeyboardInterrupt
         return self._loop.step().state
@@ -121,7 +129,10 @@ class TareSession:
         return max(1, round(duration_s / self._period_s))
 
     def _await_data(self) -> None:
-        """Wait for `safety.commission_s` of cycles with complete data. Raises TareRefusedError after a timeout."""
+        """Run cycles until those of `safety.commission_s` in a row have complete data.
+
+        Raises TareRefusedError if they haven't within `safety.phase_timeout_s` more.
+        """
         safety = self.settings.safety
         good, enough = 0, self._cycles(safety.commission_s)
         for _ in range(enough + self._cycles(safety.phase_timeout_s)):
@@ -149,7 +160,11 @@ class TareSession:
         return poses
 
     def _measure_next_pose(self, last: Pose, number: int) -> Pose:
-        """Wait until the arm has left the last pose and rests, then measure a pose; start again if the arm moves."""
+        """Ask the user to move the arm, wait until it has left the last pose and rests, and measure a pose.
+
+        If the arm moves meanwhile, wait again. Raises TareRefusedError after `tare.move_timeout_s` of waiting, or for
+        unfit data. number: of the pose, from 1.
+        """
         tare = self.settings.tare
         self.progress(
             f"pose {number} of {tare.poses}: move a joint by hand by more than {tare.move_deg:g} deg, then let go"
@@ -163,9 +178,9 @@ class TareSession:
                 self.progress(f"pose {number} of {tare.poses}: {reason}; let go of it")
 
     def _await_rest(self, last: Pose, number: int, cycles_left: int) -> int:
-        """Wait until the arm has left the last pose and rests for `tare.settle_s`; return the cycles then left.
+        """Wait until the arm has left the last pose and rests for `tare.settle_s`; return the cycles then left to wait.
 
-        Raises TareRefusedError if none is left.
+        cycles_left: most cycles to wait. Raises TareRefusedError when they are used up.
         """
         tare = self.settings.tare
         settle_cycles = self._cycles(tare.settle_s)
@@ -198,7 +213,10 @@ class TareSession:
         return state.is_complete
 
     def _measure(self) -> Pose:
-        """Run cycles for `tare.window_s`; return the pose. Raises TareRefusedError for motion or unfit data."""
+        """Run cycles for `tare.window_s`; return the pose.
+
+        Raises ArmMovedError for motion, TareRefusedError for unfit data.
+        """
         settings = self.settings
         cycles = self._cycles(settings.tare.window_s)
         states: list[ArmState] = []
@@ -218,7 +236,7 @@ class TareSession:
         return measure_pose(q, dq, tau_J, settings)
 
     def _check_data(self, state: ArmState) -> None:
-        """Raise TareRefusedError if a sensor marks its value as bad, or a value is too old."""
+        """Raise TareRefusedError if a sensor's status isn't zero, or a value is older than `bus.max_age_cycles`."""
         for sensor in self._arm.sensors:
             if sensor.status:
                 flags = ", ".join(str(flag.name) for flag in sensor.status)
@@ -230,7 +248,11 @@ class TareSession:
                 raise TareRefusedError(f"{name} has sent nothing usable for {age} cycles, bus.max_age_cycles = {bound}")
 
     def _auto_zero(self, nodes: list[Any], sensors: tuple[Identity, ...]) -> None:
-        """Let the sensors set their own zero at rest; check the torque left. Raises TareRefusedError, DeviceError."""
+        """Let the sensors set their own zero at rest, and measure before and after it.
+
+        Raises TareRefusedError if the arm isn't at rest and unloaded before, or torque is left after; DeviceError if a
+        sensor refuses.
+        """
         before = self._measure()
         solve_tare([before], self.settings)  # refuse if the arm is pushed
         for node, sensor in zip(nodes, sensors, strict=True):
@@ -322,7 +344,7 @@ def _describe_pose(pose: Pose) -> str:
 
 
 def _user() -> str:
-    """Return the name of the user who runs this; "" if the system has no name."""
+    """Return the name of the user who runs this; "" if the system doesn't know it."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):

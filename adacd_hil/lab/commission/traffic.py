@@ -11,7 +11,7 @@ _SLICE_S = 0.02
 
 @dataclass
 class Talk:
-    """Frames of one identifier so far."""
+    """Frames of one identifier so far. shortest, longest: number of data bytes. data: of the last frame."""
 
     can_id: int
     count: int
@@ -23,25 +23,25 @@ class Talk:
 
     @property
     def rate_Hz(self) -> float | None:
-        """Mean rate between the first and the last frame; None for a single frame."""
+        """Mean rate between the first and the last frame; None for a single frame, or if all came at the same time."""
         span_ns = self.last_ns - self.first_ns
         return (self.count - 1) * 1e9 / span_ns if span_ns > 0 else None
 
     @property
     def length(self) -> str:
-        """Number of data bytes, as a range if it changes."""
+        """Number of data bytes as text; a range such as "4-8" if it has changed."""
         return str(self.longest) if self.shortest == self.longest else f"{self.shortest}-{self.longest}"
 
 
 class Traffic:
-    """All identifiers seen so far. Error frames are counted apart."""
+    """The identifiers seen so far, each with its `Talk`, and the number of error frames, which have none."""
 
     def __init__(self) -> None:
         self.talks: dict[int, Talk] = {}
         self.error_frames = 0
 
     def count_frame(self, frame: Frame) -> None:
-        """Add a frame to the statistics of its identifier; an error frame to the number of error frames."""
+        """Add a frame to the statistics of its identifier; count an error frame in `error_frames` only."""
         if frame.is_error:
             self.error_frames += 1
             return
@@ -65,7 +65,7 @@ class Traffic:
 
 
 def receive_until(bus: Bus, clock: Clock, end_ns: int) -> Frame | None:
-    """Wait for a frame until `end_ns` of the clock, and return it; None if none came. Raises BusError."""
+    """Return the next frame; None if none came until `end_ns` of the clock, or that has passed. Raises BusError."""
     while (now_ns := clock.now_ns()) < end_ns:
         slice_ns = min(end_ns, now_ns + round(_SLICE_S * 1e9))
         frame = bus.receive((slice_ns - now_ns) * 1e-9)

@@ -24,14 +24,14 @@ _LONGEST_TEXT = 200
 
 
 class StreamDetector(Protocol):
-    """One detector on one stream, from its beginning."""
+    """A detector on one stream, from the stream's beginning; it keeps its state from one `take` to the next."""
 
     def take(self, z: Vector, held_Nm: Vector) -> Vector:
-        """Process N more samples; return the statistic of each sample and joint (N, n).
+        """Process N more samples of the stream; return the statistic of each sample and joint (N, n), finite.
 
-        z (N, n): the stream. held_Nm (N, n): the friction that may hold a standing joint. An alarm is a statistic above
-        its threshold. A statistic may depend on its sample and those before, but not on how the stream is cut into
-        pieces.
+        z (N, n): the stream, Nm. held_Nm (N, n): the friction that may hold a standing joint. An alarm is a statistic
+        above its threshold. A statistic may depend on its sample and those before, but not on how the stream is cut
+        into pieces.
         """
 
 
@@ -40,7 +40,7 @@ Maker = Callable[[float], StreamDetector]
 
 
 class Registered(NamedTuple):
-    """A registered detector. origin: its source, as text."""
+    """A registered detector. make: begins one. origin: package of its entry point; "" if `register` added it."""
 
     make: Maker
     origin: str
@@ -51,9 +51,10 @@ _LOADED: list[str] = []
 
 
 def registered(reserved: Collection[str]) -> Mapping[str, Registered]:
-    """Return all registered detectors by name, including entry points'. reserved: names of the built-in ones.
+    """Return all registered detectors by name; the first call loads the entry points.
 
-    Raises DetectorError for an entry point that can't be loaded, breaks the contract, or has a name that is taken.
+    reserved: names of the built-in ones. Raises DetectorError for an entry point that can't be loaded, breaks the
+    contract, or has a name that is taken; then the next call loads them again.
     """
     if not _LOADED:
         _LOADED.append(ENTRY_POINTS)
@@ -67,7 +68,10 @@ def registered(reserved: Collection[str]) -> Mapping[str, Registered]:
 
 
 def _load(entry: importlib.metadata.EntryPoint, reserved: Collection[str]) -> None:
-    """Register the detector of an entry point. Raises DetectorError if it can't be loaded or breaks the contract."""
+    """Register the detector of an entry point.
+
+    Raises DetectorError if it can't be loaded, breaks the contract, or its name is taken.
+    """
     package = f"package {entry.dist.name} {entry.dist.version}" if entry.dist is not None else entry.value
     try:
         add(entry.name, entry.load(), reserved, package)
@@ -76,17 +80,17 @@ def _load(entry: importlib.metadata.EntryPoint, reserved: Collection[str]) -> No
 
 
 def forget_loaded() -> None:
-    """Remove the detectors of entry points, so that the next look-up loads them again."""
+    """Remove the detectors of entry points, so that the next look-up loads them again; those of `register` stay."""
     _LOADED.clear()
     for name in [name for name, found in _REGISTERED.items() if found.origin]:
         del _REGISTERED[name]
 
 
 def add(name: str, make: Maker, reserved: Collection[str], origin: str = "") -> None:
-    """Check a detector's contract and register it. make: begins one on a stream.
+    """Check a detector's contract and register it. make: begins one on a stream of a given period, s.
 
-    origin: of an entry point, its package. reserved: names of the built-in ones. Raises ValueError for a name that is
-    taken, and for a detector that doesn't keep the contract.
+    origin: package of its entry point, "" without one. reserved: names of the built-in detectors and channels. Raises
+    ValueError for a name that is taken, and for a detector that doesn't keep the contract.
     """
     if name in _REGISTERED or name in reserved:
         known = _REGISTERED.get(name)
@@ -97,12 +101,16 @@ def add(name: str, make: Maker, reserved: Collection[str], origin: str = "") -> 
 
 
 def remove(name: str) -> None:
-    """Remove a registered detector. Raises KeyError if it was not registered."""
+    """Remove a registered detector by its name. Raises KeyError if there is none."""
     del _REGISTERED[name]
 
 
 def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> None:
-    """Run a detector on noise, whole and cut in two. Raises ValueError, with the reason, if it breaks the contract."""
+    """Run a detector on noise of two joints, whole and cut in two.
+
+    Raises ValueError if a statistic has another shape, isn't finite, or depends on the cut. Errors of the detector are
+    raised as they are.
+    """
     z = np.random.default_rng(0).standard_normal((_CHECK_SAMPLES, JOINTS))
     held_Nm = np.where(z > 1.0, 0.1, 0.0)
     first, parts = make(period_s), make(period_s)
@@ -122,6 +130,6 @@ def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> None:
 
 
 def describe_error(error: BaseException) -> str:
-    """Return an exception as text in one line."""
+    """Return an exception as one line, its type and at most 200 characters of its text."""
     text = " ".join(str(error).split())[:_LONGEST_TEXT]
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

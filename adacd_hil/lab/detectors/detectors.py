@@ -57,7 +57,7 @@ LIKELIHOOD: Final = "likelihood"
 
 
 def register(name: str, make: Maker) -> None:
-    """Register a detector under a name. make: begins one on a stream of a period, s.
+    """Register a detector under a name, for this process. make: begins one on a stream of a period, s.
 
     Raises ValueError for a name that is taken, and for a detector that breaks the contract of `detector_registry`.
     """
@@ -65,7 +65,7 @@ def register(name: str, make: Maker) -> None:
 
 
 def unregister(name: str) -> None:
-    """Remove a registered detector. Raises KeyError if it was not registered."""
+    """Remove a detector that `register` added. Raises KeyError if there is none of this name."""
     detector_registry.remove(name)
 
 
@@ -102,28 +102,37 @@ class DetectorBankSettings:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """Names of all channels, those of registered detectors last."""
+        """Names of all channels in the order of the statistics, those of registered detectors last.
+
+        Raises DetectorError.
+        """
         return (*self.own_channels, *self.registered)
 
     @property
     def registered(self) -> Mapping[str, Registered]:
-        """The registered detectors by name. Raises DetectorError."""
+        """The registered detectors by name; the first use loads entry points.
+
+        Raises DetectorError if one can't be used.
+        """
         return detector_registry.registered(self.built_in)
 
     @property
     def built_in(self) -> frozenset[str]:
-        """Names that no registered detector may have."""
+        """Names that no registered detector may have: those of built-in channels and detectors."""
         return frozenset((*self.own_channels, *self.own_detectors))
 
     @property
     def detectors(self) -> dict[str, tuple[int, ...]]:
-        """Indices of each detector's channels, by its name; a joint is over if one of its channels is over."""
+        """Indices in `channels` of each detector's channels, by its name, built-in ones first. Raises DetectorError.
+
+        A joint is over a detector's threshold if one of these channels is over its own.
+        """
         first = len(self.own_channels)
         return self.own_detectors | {name: (first + place,) for place, name in enumerate(self.registered)}
 
     @property
     def own_detectors(self) -> dict[str, tuple[int, ...]]:
-        """Indices of each built-in detector's channels, by its name."""
+        """Indices in `own_channels` of each built-in detector's channels, by its name."""
         count, gains, ages = len(self.cutoff_rad_s), len(self.observer_rad_s), len(self.onset_samples)
         detectors = {
             "paper": (0,),
@@ -148,7 +157,8 @@ def likelihood_windows(
     floor_Nm: slow errors of the model, added as a constant of unknown size; without them a window would trust averages
     longer than any model deserves.
 
-    Raises ValueError unless L is at least the largest age and the covariance is positive.
+    Raises ValueError unless L is at least the largest age and the variance, the covariance's first element, is
+    positive.
     """
     length = autocovariance.shape[0]
     if length < max(onset_samples):
@@ -168,7 +178,8 @@ def likelihood_windows(
 def autocovariance(z: Vector, length: int) -> Vector:
     """Return an estimate of the covariance (length,) of a zero-mean series (n,) with itself, at lags from 0.
 
-    Biased, so that it is positive. Raises ValueError if the series is shorter than ten times `length`.
+    The mean is not subtracted. Biased, so that it is positive semidefinite. Raises ValueError if the series is shorter
+    than ten times `length`.
     """
     if z.shape[0] < 10 * length:
         raise ValueError(f"{z.shape[0]} samples are too few for a covariance of {length}")
@@ -178,7 +189,7 @@ def autocovariance(z: Vector, length: int) -> Vector:
 
 
 class DetectorMemory:
-    """The memory of the detectors; last axis: x, allowance."""
+    """The memory of the detectors of n joints; last axis: x, and its allowance for friction."""
 
     low: Annotated[Vector, "filters n 2"]
     smooth: Annotated[Vector, "filters n 2"]
@@ -192,7 +203,7 @@ class DetectorMemory:
 
 @dataclass(frozen=True)
 class DetectorConstants:
-    """The constants of the detectors: decay of each filter, band and gains of the observers, weights (n, N, L)."""
+    """The constants of the detectors: decay of each filter per period, gains of the observers, weights (n, N, L)."""
 
     period_s: float
     decay: Vector
@@ -204,7 +215,7 @@ class DetectorConstants:
 
 
 def constants_of(settings: DetectorBankSettings, weights: Vector, period_s: float) -> Structured:
-    """Return the settings and the joints' likelihood weights (n, N, L) as the record that the compiled step reads."""
+    """Return the settings and the joints' likelihood weights (n, N, L) as the record that the compiled `step` reads."""
     return packed(
         DetectorConstants(
             period_s=period_s,
@@ -219,7 +230,7 @@ def constants_of(settings: DetectorBankSettings, weights: Vector, period_s: floa
 
 
 def new_memory(constants: Structured) -> Structured:
-    """Return the detectors' memory before the first sample: all zeros."""
+    """Return the detectors' memory before the first sample: all zeros. constants: of `constants_of`."""
     c: DetectorConstants = constants[0]
     joints = c.weights.shape[0]
     return zeros_of(
@@ -229,9 +240,10 @@ def new_memory(constants: Structured) -> Structured:
 
 @compiled
 def step(constants: Structured, memory: Structured, z: Vector, held_Nm: Vector, statistics: Vector) -> None:
-    """Process one sample z (n,): update `memory` and fill `statistics` (channels, n), both in place.
+    """Process one sample z (n,), Nm: update `memory`, and overwrite `statistics` (channels, n), both in place.
 
-    held_Nm (n,): the friction that may hold each joint, F_c if it stands still, else 0.
+    The channels are the built-in ones. held_Nm (n,): the friction that may hold each joint, F_c if it stands still,
+    else 0.
     """
     c: DetectorConstants = constants[0]
     m: DetectorMemory = memory[0]
@@ -284,7 +296,8 @@ def record(
 ) -> None:
     """Run `step` over N samples, and write the largest statistic of each block of samples to `peaks`.
 
-    z, held_Nm (N, n); peaks (ceil(N / block_samples), channels, n). One sample per block keeps everything.
+    z, held_Nm (N, n); peaks (ceil(N / block_samples), channels, n), overwritten. Updates `memory`. One sample per block
+    keeps every statistic.
     """
     statistics = np.empty((peaks.shape[1], peaks.shape[2]))
     for k in range(z.shape[0]):
@@ -297,20 +310,23 @@ def record(
 
 
 class DetectorBank:
-    """All detectors on one stream, from its beginning."""
+    """All detectors, built-in and registered, on one stream, from its beginning."""
 
     def __init__(self, settings: DetectorBankSettings, weights: Vector, period_s: float) -> None:
-        """Begin all detectors on one stream. weights (n, N, L): the joints' likelihood weights."""
+        """Begin all detectors on one stream of a period, s. weights (n, N, L): the joints' likelihood weights.
+
+        Raises DetectorError if a registered detector can't be used.
+        """
         self._constants = constants_of(settings, weights, period_s)
         self._memory = new_memory(self._constants)
         self._channels = len(settings.channels)
         self._registered = [found.make(period_s) for found in settings.registered.values()]
 
     def take_stream(self, z: Vector, held_Nm: Vector, block_samples: int = 1) -> Vector:
-        """Process N samples (N, n); return the largest statistic of each block, (ceil(N / block_samples), channels, n).
+        """Process N more samples (N, n); return the largest statistic of each block of them.
 
-        held_Nm (N, n): the friction that may hold a standing joint. One sample per block keeps everything. The next
-        call begins a new block.
+        The result has the shape (ceil(N / block_samples), channels, n). held_Nm (N, n): the friction that may hold a
+        standing joint. One sample per block keeps every statistic. The next call continues the stream with a new block.
         """
         count, joints = z.shape
         own = np.empty((-(-count // block_samples), self._channels - len(self._registered), joints))
@@ -335,7 +351,7 @@ def stream(
     z: Vector,
     held_Nm: Vector,
 ) -> None:
-    """Fill `z` and `held_Nm` (N, 2), the stream and the friction that may hold, of a recording.
+    """Write a recording's stream z, and the friction that may hold a standing joint, to `z` and `held_Nm` (N, 2), Nm.
 
     q, dq, tau_J (N, 2), theta (N, p), interval_s (N,). The first sample has z = 0, and so has one whose interval is not
     positive, because the motion before it is unknown. Both ends of an interval are judged by the theta of its end, so
@@ -373,10 +389,10 @@ def make_stream(
     lag_s: float = VELOCITY_LAG_S,
     standstill_rad_s: float = 2e-3,
 ) -> tuple[Vector, Vector]:
-    """Return the stream z and the friction that may hold, both (N, 2), Nm.
+    """Return the stream z of a recording, and the friction that may hold a standing joint, both (N, 2), Nm.
 
-    q, dq, tau_J (N, 2), q1 from the level; theta (p,) or (N, p), p = 7 or 9; interval_s (N,), 0 or less where
-    samples are missing before.
+    q, dq, tau_J (N, 2), q1 from the level; theta (p,), or (N, p) if it changes, p = 7 or 9; interval_s (N,): time since
+    the sample before, 0 or less where samples are missing between. lag_s: by which dq is older than tau_J.
     """
     z, held_Nm = np.zeros(q.shape), np.zeros(q.shape)
     every = np.ascontiguousarray(np.broadcast_to(theta, (q.shape[0], np.shape(theta)[-1])))
@@ -385,7 +401,11 @@ def make_stream(
 
 
 def likelihood_weights(z: Vector, settings: DetectorBankSettings, lag_s: float, period_s: float) -> Vector:
-    """Return the likelihood weights (n, N, L) of all joints, from a contact-free stream z (n_samples, n)."""
+    """Return the likelihood weights (n, N, L) of all joints, from a contact-free stream z (n_samples, n), Nm.
+
+    L is the largest age of `onset_samples` plus 16. Raises ValueError if z has fewer than 10 L samples, or a joint's
+    variance is 0.
+    """
     length = max(settings.onset_samples) + 16
     return np.array(
         [

@@ -46,7 +46,7 @@ _UNITS: Final = {"t": "s", "q": "rad", "dq": "rad/s", "tau_J": "Nm"}
 
 
 class ArrayError(ValueError):
-    """Arrays or options that can't be used; one line: quantity, value, bound, unit."""
+    """Arrays or options can't be used; the message is one line: quantity, value, bound, unit."""
 
 
 @dataclass(frozen=True)
@@ -65,17 +65,21 @@ class OfflineArm:
         locked: tuple[str, ...] = (),
         has_rotors: bool = False,
     ) -> Self:
-        """Return the arm that a URDF describes, a file or its text; inertias in it are not needed.
+        """Return the arm that a URDF describes; urdf: a file, or its text. Inertias in it are not needed.
 
         gravity_m_s2: in the axes of the root link. locked: joints that do not move, as of a gripper. has_rotors: the
-        torques are those of geared motors, which turn their rotors too. Raises UrdfError, a ValueError; OSError.
+        torques are those of geared motors, which turn their rotors too. Raises UrdfError, a ValueError, if it is no
+        usable URDF; OSError if the file can't be read.
         """
         text = urdf if isinstance(urdf, str) and "<" in urdf else read_input(Path(urdf))
         return cls(read_urdf(text, gravity_m_s2, locked), has_rotors)
 
     @classmethod
     def from_config(cls, config: str | Path, profile: str | None = None) -> Self:
-        """Return the two-joint arm of a configuration, a name or a TOML file. Raises ConfigError, a ValueError."""
+        """Return the two-joint arm of a configuration; config: a name or a TOML file, profile: of an emulated arm.
+
+        Raises ConfigError, a ValueError.
+        """
         return cls(read_urdf(robot_description(load_settings(str(config), profile))))
 
     def __repr__(self) -> str:
@@ -94,7 +98,10 @@ class OfflineArm:
 
 
 class ArrayContact(NamedTuple):
-    """A contact: time of detection, on the arrays' time; link from 1; sign of each joint's torque (n,)."""
+    """A contact: time of detection, on the arrays' time; link from 1; sign of each joint's external torque (n,).
+
+    A sign is 0 if that joint did not cross its threshold.
+    """
 
     t_s: float
     link: int
@@ -106,8 +113,8 @@ class FittedModel:
     """A model fitted to free motion, and tested on other motion.
 
     names, theta, std: parameters (p,) and their standard deviations. margin: smallest threshold over residual in the
-    test; below 1 the model lacks more than noise. explained: share (n,) of each joint's torque that it explains in the
-    test, nan without torque. verdict: whether the torque is explained, the reasons if not, the next step.
+    test; below 1 the model lacks more than noise. explained: share (n,) of each joint's torque that the model explains
+    in the test, nan without torque. identified: fit, test and settings in full.
     """
 
     arm: OfflineArm
@@ -120,7 +127,7 @@ class FittedModel:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict: whether the torque is explained, with reasons, remarks and the next step."""
+        """The verdict of the test: whether the model explains the torque, with reasons, remarks and the next step."""
         return self.identified.verdict
 
     def __repr__(self) -> str:
@@ -129,9 +136,10 @@ class FittedModel:
 
 @dataclass(frozen=True)
 class ArrayDetection:
-    """The model, and for m samples at a fixed period: t_s (m,), tau_ext_hat and threshold (m, n) in Nm; the contacts.
+    """Contacts in arrays, and of m samples at a fixed period t_s (m,), tau_ext_hat and threshold (m, n), Nm.
 
-    The samples are those of the arrays if these have a fixed period; gaps split them, and short rests are left out.
+    The samples are those of the arrays if these have a fixed period; gaps split them, and parts of fewer than 50
+    samples are left out. Contacts are in the order of time.
     """
 
     model: FittedModel
@@ -154,9 +162,10 @@ def fit(
     velocity_lag_s: float = 0.0,
     **scheme: Any,
 ) -> FittedModel:
-    """Fit a model to the free motion in arrays, and test it on the last 40 % of that motion.
+    """Fit a model to 60 % of the free motion in arrays, and test it on the last 40 % of that motion.
 
-    For the arguments see `detect`. Look at the model's `verdict` first: it tells whether the model explains the torque.
+    For the arguments and errors see `detect`. Look at the model's `verdict` first: it tells whether the model explains
+    the torque.
     """
     return _fitted(_taken(arrays, arm, velocity_lag_s), arm, fit_s, scheme)
 
@@ -164,7 +173,11 @@ def fit(
 def _fitted(
     recording: ForeignRecording, arm: OfflineArm, fit_s: tuple[float, float] | None, scheme: Mapping[str, Any]
 ) -> FittedModel:
-    """Fit a model to the free motion of a recording, and test it. Raises ArrayError if that is too little."""
+    """Fit a model to the free motion of a recording, and test it.
+
+    fit_s: its span in the arrays' time; None: the first 40 %. Raises ArrayError if that is too little motion or
+    no span, or `scheme` has an invalid setting.
+    """
     start_s, end_s = _span(recording, fit_s)
     described = _described(arm, recording.columns.values.shape[1] > 2 * arm.joints, scheme)
     try:
@@ -235,7 +248,10 @@ def detect(
 
 
 def _named(arrays: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
-    """Return the arrays by their canonical names. Raises ArrayError for one that is unknown, missing or given twice."""
+    """Return the arrays by the names `t`, `q`, `tau_J`, `dq` and `touched`, whatever synonym was given.
+
+    Raises ArrayError for one that is unknown, missing or given twice.
+    """
     named: dict[str, ArrayLike] = {}
     for given, values in arrays.items():
         name = _ALIASES.get(given, given)
@@ -254,7 +270,10 @@ def _named(arrays: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
 
 
 def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: float) -> ForeignRecording:
-    """Check arrays, and return them as a recording. Raises ArrayError."""
+    """Return arrays as a recording at a fixed period, velocities moved by `velocity_lag_s`.
+
+    Raises ArrayError if an array has a wrong shape, type or value, times don't grow, or the lag is out of its range.
+    """
     named = _named(arrays)
     t_s = _numbers("t", named["t"])
     if t_s.ndim != 1 or t_s.size < SHORTEST_SAMPLES:
@@ -292,7 +311,10 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
 
 
 def _numbers(name: str, given: ArrayLike) -> Vector:
-    """Return an array as finite float64 values; name: of the array, for the error. Raises ArrayError."""
+    """Return an array as float64 values of at most 1e6 in size; times may be larger, but finite.
+
+    name: of the array, for the error. Raises ArrayError.
+    """
     try:
         values = np.asarray(given)
         if values.dtype.kind not in "fiu":
@@ -310,7 +332,10 @@ def _numbers(name: str, given: ArrayLike) -> Vector:
 
 
 def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tuple[float, float]:
-    """Return the span of free motion in the recording's time, from 0. Raises ArrayError."""
+    """Return the span of free motion, s since the recording's first row; by default the first 40 % of it.
+
+    Raises ArrayError if `fit_s` is no pair of times, or ends before it begins.
+    """
     if fit_s is None:
         last = recording.stretches[-1]
         return 0.0, FIT_SHARE * (last.start_s + len(last.record.q) * recording.period_s)
@@ -324,7 +349,7 @@ def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tup
 
 
 def _described(arm: OfflineArm, has_dq: bool, scheme: Mapping[str, Any]) -> RecordingMap:
-    """Return a recording map for arrays, as a file would have.
+    """Return a recording map for arrays, as a file would have. has_dq: velocities are among them.
 
     Raises ArrayError for an invalid setting of the scheme.
     """

@@ -43,7 +43,7 @@ class RunEvent(NamedTuple):
 
 
 class RunContact(NamedTuple):
-    """A contact: time of detection, s since motion start, and its last report."""
+    """A contact. t_s: time of detection, s since motion start. report: the last one of this contact."""
 
     t_s: float
     report: ContactReport
@@ -79,7 +79,7 @@ class LoadedRun:
         return f"<LoadedRun {self.path}: {', '.join(found)}, {certified}{'; ' + self.problem if self.problem else ''}>"
 
     def __getitem__(self, name: str) -> NDArray[Any]:
-        """Return an array by its name. Raises KeyError that names the nearest."""
+        """Return an array by its name. Raises KeyError, with the nearest name, for an unknown one."""
         if name not in self.arrays:
             near = nearest_name(name, self.arrays)
             hint = f"did you mean {near!r}?" if near else f"there are {', '.join(self.arrays)}"
@@ -104,26 +104,29 @@ class LoadedRun:
 
     @property
     def motion(self) -> dict[str, Vector]:
-        """Arrays for `detect`: `t` (n,) s, `q`, `dq`, `tau_J` (n, 2)."""
+        """Arrays for `detect`: `t` (n,), s since motion start, `q`, `dq`, `tau_J` (n, 2)."""
         return {"t": self.t_s, **{name: self.arrays[name] for name in ("q", "dq", "tau_J")}}
 
     @cached_property
     def certificates(self) -> "tuple[Certificate, ...]":
-        """Certificates that were not taken back, in order; () in a log without its end."""
+        """Certificates that were not taken back, in order; () if there is none, or the log is cut before its end."""
         return tuple(certificates_in((event.name, event.message) for event in self.events))
 
     @property
     def certificate(self) -> "Certificate | None":
-        """The last certificate; None without one."""
+        """The last certificate that was not taken back; None without one."""
         return self.certificates[-1] if self.certificates else None
 
     @cached_property
     def settings(self) -> Settings:
-        """Settings of the run. Raises LogError if the log lacks them."""
+        """Settings of the run, from the log. Raises LogError if the log lacks them or they can't be read."""
         return settings_of(self.path, self.attachments)
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Return a column (n,) for each number of a cycle, such as `q_1` and `q_2`; `state` has the states' names."""
+        """Return a column (n,) for each number of a cycle, such as `q_1` and `q_2`; `state` has the states' names.
+
+        An array (n,) keeps its name.
+        """
         found: dict[str, NDArray[Any]] = {}
         for name, values in self.arrays.items():
             if values.ndim == 1:
@@ -136,19 +139,22 @@ class LoadedRun:
     def to_pandas(self) -> "pandas.DataFrame":
         """Return `columns` as a data frame with the index `t_s`.
 
-        Raises ImportError, which names the command for pandas.
+        Raises ImportError without pandas; it names the command that installs it.
         """
         frame: pandas.DataFrame = _extra("pandas").DataFrame(self.columns())
         return frame.set_index("t_s")
 
     def to_polars(self) -> "polars.DataFrame":
-        """Return `columns` as a data frame. Raises ImportError, which names the command that installs polars."""
+        """Return `columns` as a data frame.
+
+        Raises ImportError without polars; it names the command that installs it.
+        """
         frame: polars.DataFrame = _extra("polars").DataFrame(self.columns())
         return frame
 
 
 def _extra(name: str) -> Any:
-    """Import and return a library that an extra installs. Raises ImportError with the command."""
+    """Import and return a library, "pandas" or "polars". Raises ImportError with the command that installs it."""
     try:
         return import_module(name)
     except ImportError:
@@ -156,7 +162,7 @@ def _extra(name: str) -> Any:
 
 
 def load(run: str | Path) -> LoadedRun:
-    """Return the run in a log, all its parts as one; run: a folder with run.mcap, or the log's first part.
+    """Return the run in a log, all parts of the log as one. run: a folder with run.mcap, or the log's first part.
 
     A cut or damaged log is read as far as it is intact, see `problem`. Raises LogError, in one line, if it can't be
     read or has no cycle.
@@ -183,9 +189,9 @@ def load(run: str | Path) -> LoadedRun:
 
 
 def _arrays(log: RunLog) -> dict[str, NDArray[Any]]:
-    """Return the fields of /scheme, /control and /cycle, for the cycles that all three have.
+    """Return the fields of /scheme, /control and /cycle, and `t_ns`, for the cycles that all three have.
 
-    Raises LogError without any.
+    A topic without any record is left out, with its fields. Raises LogError if /scheme has none.
     """
     if not len(log.scheme):
         raise LogError(f"log {log.path} has no cycle" + (f": {log.problem}" if log.problem else ""))

@@ -21,7 +21,7 @@ def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
     """Read positions, efforts and, if all messages have them, velocities of the map's joints from a bag.
 
     span: as of `RecordedRows`. Raises LogError if the bag can't be read or has no efforts, ConfigError if it lacks a
-    topic or a joint.
+    topic or a joint, or the wanted stamps are all 0.
     """
     wanted = described.columns.q or described.urdf.joint_names
     with opened_bag(path) as (topics, read_messages):
@@ -43,7 +43,10 @@ def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
 
 
 def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
-    """Return the topic to read: `wanted`, else /joint_states, else the only one of JointState. Raises ConfigError."""
+    """Return the topic to read: `wanted`, else /joint_states, else the only one of JointState.
+
+    Raises ConfigError if the bag lacks `wanted`, has no topic of JointState, or has several and none is /joint_states.
+    """
     found = joint_state_topics(topics)
     if wanted:
         if wanted in found:
@@ -60,7 +63,7 @@ def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
 
 
 class _States:
-    """Finds the wanted joints in each message, whatever their order in it."""
+    """Finds the wanted joints in each message, whatever their order, and notes anything that the messages lack."""
 
     def __init__(self, path: Path, topic: str, wanted: tuple[str, ...]) -> None:
         self.has_velocities = True
@@ -74,7 +77,7 @@ class _States:
     def read(self, number: int, message: JointStateMessage, into: RecordedRows) -> list[float] | None:
         """Return positions, efforts and velocities of the wanted joints; None if the message lacks one of the joints.
 
-        Missing efforts or velocities are nan. A message with arrays of wrong lengths is dropped: None, counted in
+        Missing efforts or velocities are nan. A message with arrays of wrong lengths gives None, too, and is counted in
         `into`. number: of the message, from 1.
         """
         self._messages += 1
@@ -100,7 +103,11 @@ class _States:
         return row
 
     def check(self, is_stamped: bool) -> None:
-        """Raise LogError or ConfigError if all messages read lack the joints, efforts or, if is_stamped, stamps."""
+        """Raise LogError or ConfigError if the messages read so far can't be used. Call it after all `read`s.
+
+        LogError if there are no messages, none has all joints together, or a joint never has an effort; ConfigError if
+        no message names a joint, or if is_stamped and all stamps are 0.
+        """
         if not self._messages:
             raise LogError(f"{self._where} has no messages")
         if all(places is None for places in self._places.values()):
@@ -121,5 +128,5 @@ class _States:
             raise ConfigError(f'{self._where}: all stamps are 0; `bag.time` = "received" takes when it was recorded')
 
     def _find(self, names: tuple[str, ...]) -> list[int] | None:
-        """Return the places of the wanted joints among a message's names; None if one is missing."""
+        """Return the index of each wanted joint among a message's names; None if one is missing."""
         return [names.index(name) for name in self._wanted] if set(self._wanted) <= set(names) else None

@@ -63,9 +63,9 @@ CLIPPED_REMEDY: Final = "move slower, or raise the range of that sensor"
 class RecordingFinding(NamedTuple):
     """A finding on a recording, and the user's next step; "" if the user need not act.
 
-    is_against: a reason why the torque isn't explained; else a remark. Of columns: is_dead: no model can be fitted.
-    is_wrong: a fitted model is worthless, unless another interpretation of the map is found. With neither, the defect
-    is a possible reason of a bad fit.
+    is_against: a reason why the torque isn't explained; else a remark. is_dead: no model can be fitted to the column.
+    is_wrong: a fitted model is worthless, unless another interpretation of the map is found. With neither, a defect of
+    a column is a possible reason of a bad fit.
     """
 
     text: str
@@ -76,12 +76,15 @@ class RecordingFinding(NamedTuple):
 
     @property
     def is_harmless(self) -> bool:
-        """Whether contacts can be told in spite of it."""
+        """Whether contacts can be detected in spite of the finding: neither is_dead nor is_wrong."""
         return not (self.is_dead or self.is_wrong)
 
 
 class _Columns(NamedTuple):
-    """All samples of some recordings, (k, n), their times in the recording (k,), and the period."""
+    """All samples of some recordings (k, n), one recording after the other.
+
+    time_s (k,): since each recording's first row.
+    """
 
     time_s: Vector
     q: Vector
@@ -93,7 +96,10 @@ class _Columns(NamedTuple):
 def find_faults(
     described: RecordingMap, fitted: Sequence[ForeignRecording], tested: ForeignRecording
 ) -> tuple[RecordingFinding, ...]:
-    """Return the defects of the columns of the fitted and the tested recordings."""
+    """Return the defects of the columns of the fitted recordings and the tested one; () if there are none.
+
+    Velocities are checked only if all recordings have them.
+    """
     recordings = [*fitted, tested]
     found = list(column_faults(described, recordings))
     still = np.ptp(samples(recordings, "q"), axis=0) < STILL_RAD
@@ -105,7 +111,10 @@ def find_faults(
 
 
 def column_faults(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
-    """Yield the defects of torques and positions over some recordings."""
+    """Yield the defects of torques and positions over all these recordings together. Velocities are not checked.
+
+    recordings: at least one, with the same period, and with stretches.
+    """
     stretches = [stretch for recording in recordings for stretch in recording.stretches]
     period_s = recordings[0].period_s
     times = [stretch.start_s + period_s * np.arange(len(stretch.record.q)) for stretch in stretches]
@@ -119,14 +128,17 @@ def column_faults(described: RecordingMap, recordings: Sequence[ForeignRecording
 
 
 def joined_names(names: list[str], count: int) -> str:
-    """Join joints' names with commas and "and"; return "all joints" if these are all `count`, more than two."""
+    """Join joints' names with commas and "and"; return "all joints" if the names are as many as `count`, and over two.
+
+    names: at least one. count: number of joints of the arm.
+    """
     if len(names) == count > 2:
         return "all joints"
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
 def column_name(described: RecordingMap, key: str, joint: int) -> str:
-    """Return a joint's name, with its column in parentheses if the map names another. joint: from 0.
+    """Return a joint's name; if the map names its column otherwise, with the column in parentheses. joint: from 0.
 
     key: of `columns` in the map, such as "tau_J".
     """
@@ -135,7 +147,10 @@ def column_name(described: RecordingMap, key: str, joint: int) -> str:
 
 
 def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
-    """Report the first column whose rows as recorded alternate between two series, torques before positions."""
+    """Report the first column whose rows, as recorded, alternate between two series of values.
+
+    The torques of a recording are looked at before its positions. At most one finding.
+    """
     n = described.joints
     for recording in recordings:
         rows = recording.own_rows
@@ -155,7 +170,7 @@ def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording])
 
 
 def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report torques that are constant, stuck, clipped, or far beyond the URDF's efforts."""
+    """Report torques that are constant, stuck, clipped, or over 30 times the URDF's effort."""
     n = described.joints
     constant = [joint for joint in range(n) if np.ptp(columns.tau_J[:, joint]) == 0.0]
     if constant:
@@ -185,16 +200,16 @@ def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[Recordin
 
 
 def torques_and_limits(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
-    """Return each joint's 99 % quantile of |tau_J| (n,), and its effort in the URDF (n,), inf if unknown.
+    """Return each joint's 99 % quantile of |tau_J| (n,), and its effort in the URDF (n,), inf if missing or 0.
 
-    tau_J: (k, n).
+    tau_J: (k, n), where nan is left out.
     """
     effort = np.where(np.isfinite(arm.torque_limit) & (arm.torque_limit > 0.0), arm.torque_limit, np.inf)
     return np.nanquantile(np.abs(tau_J), 0.99, axis=0), effort
 
 
 def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report the torque that is farthest beyond the URDF's effort, if it is by far; of currents, none."""
+    """Report the torque that is farthest beyond 30 times the URDF's effort, if one is; no current."""
     largest, effort = torques_and_limits(columns.tau_J, described.urdf)
     is_over = largest > BEYOND_EFFORT * effort
     if "A" in described.units.tau_J or not is_over.any():
@@ -211,7 +226,7 @@ def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[Reco
 
 
 def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, is_meant: NDArray[np.bool_]) -> str:
-    """Return the line of the map that changes a unit: `units.KEY` if all joints are meant, else `scale.KEY`.
+    """Return the line of the map that corrects a unit, as text: `units.KEY` if all joints are meant, else `scale.KEY`.
 
     key: "q" or "tau_J". factor: on the scale of the joints meant. is_meant: (n,).
     """
@@ -221,7 +236,10 @@ def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, 
 
 
 def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report positions that never change, are noise, or are far beyond the URDF's limits of position or speed."""
+    """Report joints at rest or with dead encoders, noise, and one joint far beyond the URDF's limits.
+
+    Far is over 3 times a limit of position or speed.
+    """
     n, urdf = described.joints, described.urdf
     travel = np.ptp(columns.q, axis=0)
     still = [joint for joint in range(n) if travel[joint] < STILL_RAD]
@@ -279,7 +297,7 @@ def _stays(column: Vector) -> str:
 
 
 def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report single samples far from their neighbours, as of a corrupted frame."""
+    """Report, for each torque and position, single samples far from their neighbours, as of a corrupted frame."""
     for key, what, unit in (("tau_J", "torque", "Nm"), ("q", "position", "rad")):
         for joint, column in enumerate(getattr(columns, key).T):
             rows = _spikes(column)
@@ -293,9 +311,9 @@ def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[Recording
 
 
 def _of_jumps(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
-    """Report the joint whose position jumps and does not return, as of an encoder that is set to zero anew.
+    """Report the first joint whose position jumps and does not return, as of an encoder that is set to zero anew.
 
-    A column with more than `_MOST_JUMPS` is no position: other checks report it.
+    A joint with more than 3 jumps is passed over: other checks report such a column.
     """
     for joint in np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist():
         jumps = [jump for recording in recordings for jump in _jumps(recording, joint)]
@@ -311,7 +329,10 @@ def _of_jumps(described: RecordingMap, recordings: Sequence[ForeignRecording]) -
 
 
 def _jumps(recording: ForeignRecording, joint: int) -> Iterator[tuple[float, float]]:
-    """Yield the jumps of a joint's position: size, and time since the recording's first row, s."""
+    """Yield a joint's jumps of position, to which it does not return: signed size, rad, and s since the first row.
+
+    joint: from 0.
+    """
     for stretch in recording.stretches:
         q = stretch.record.q[:, joint]
         steps = q[2:] - q[:-2]  # over two samples: the row of a jump may lie between two samples
@@ -322,9 +343,9 @@ def _jumps(recording: ForeignRecording, joint: int) -> Iterator[tuple[float, flo
 
 
 def _spikes(column: Vector) -> NDArray[np.int64]:
-    """Return the rows of a column (k,) that are far from the median of the five around each.
+    """Return the indices of samples (k,) that are far from the median of the five around each.
 
-    Empty if over 0.5 % are, so always below 200 rows. The two rows at each end aren't checked.
+    Empty if they are over 0.5 % of the samples, so always below 200. The two samples at each end aren't checked.
     """
     if len(column) < _SPIKE_WINDOW:
         return np.zeros(0, np.int64)
@@ -337,7 +358,10 @@ def _spikes(column: Vector) -> NDArray[np.int64]:
 
 
 def _is_noise(column: Vector, period_s: float) -> bool:
-    """Return whether positions (k,) jump from sample to sample as white noise does; False for a long period."""
+    """Return whether positions (k,) jump from sample to sample as white noise does.
+
+    Always False for a period above 20 ms.
+    """
     return period_s <= _NOISE_PERIOD_S and float(np.mean(np.diff(column) ** 2)) > _NOISE_STEP * 2.0 * float(
         np.var(column)
     )
@@ -346,7 +370,10 @@ def _is_noise(column: Vector, period_s: float) -> bool:
 def _of_rest(
     described: RecordingMap, part: str, recordings: Sequence[ForeignRecording], still: NDArray[np.bool_]
 ) -> Iterator[RecordingFinding]:
-    """Report joints that rest in the fitted, or the tested, part although they move in the other one. still (n,)."""
+    """Report joints that rest in the fitted, or the tested, part although they move in the other one.
+
+    part: "fit" or "test", for the text. recordings: of this part. still (n,): joints that rest in both.
+    """
     rests = np.ptp(samples(recordings, "q"), axis=0) < STILL_RAD
     joints = np.flatnonzero(rests & ~still).tolist()
     if joints:
@@ -359,7 +386,10 @@ def _of_rest(
 
 
 def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) -> Iterator[RecordingFinding]:
-    """Report the first joint whose velocities are in another joint's column, or aren't the slope of its positions."""
+    """Report the first joint whose velocities are in another joint's column; else the first with a wrong slope.
+
+    A slope is wrong if the velocities correlate well with that of the positions, but have another sign or size.
+    """
     n = described.joints
     products = np.zeros((n, n))
     window = derivative_window(described, recordings[0].period_s)
@@ -398,17 +428,17 @@ def _of_velocities(described: RecordingMap, recordings: list[ForeignRecording]) 
 
 
 def _runs(column: Vector) -> NDArray[np.int64]:
-    """Return the runs of equal readings: first row, and the row after the last (r, 2)."""
+    """Return the runs of equal successive readings: index of the first, and of the reading after the last (r, 2)."""
     edges = np.flatnonzero(np.diff(column) != 0.0) + 1
     bounds = np.concatenate(([0], edges, [len(column)]))
     return np.column_stack([bounds[:-1], bounds[1:]])
 
 
 def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | None:
-    """Return first row and end row of the longest run of equal torques (k,) if the sensor is stuck, else None.
+    """Return the first and the end index of the longest run of equal torques (k,) if the sensor is stuck, else None.
 
-    The sensor is stuck if some joint of q (k, n) moves in the run and the other runs are far shorter: a coarse sensor
-    has many long runs.
+    The sensor is stuck if the run is long, some joint of q (k, n) moves in it, and the other runs are far shorter: a
+    coarse sensor has many long runs. Runs at the extreme readings are left out.
     """
     runs = _runs(torque)
     lengths = runs[:, 1] - runs[:, 0]
@@ -425,7 +455,8 @@ def clipped_torque(torque: Vector) -> tuple[float, float] | None:
     """Return the torque at which readings (k,) stop, as if clipped, and the share of readings there; None if none.
 
     Readings stop there if the band next to the extreme reading, as wide as the noise, holds far more of them than the
-    band beside it. A joint that overcomes only friction looks like this, too.
+    band beside it. A joint that overcomes only friction looks like this, too. Extreme readings that repeat exactly are
+    those of `_clipped_at`, and give None.
     """
     width, span = 2.0 * _PLATEAU_SIGMAS * float(white_noise(torque)), float(np.ptp(torque))
     if not 0.0 < width < _PLATEAU_WIDTH * span:
@@ -441,7 +472,10 @@ def clipped_torque(torque: Vector) -> tuple[float, float] | None:
 
 
 def _clipped_at(torque: Vector) -> Iterator[float]:
-    """Yield the smallest and the largest reading of a torque (k,), each only if it repeats as of a clipped sensor."""
+    """Yield the smallest and the largest reading of a torque (k,), each only if it repeats as of a clipped sensor.
+
+    A torque with fewer than 50 distinct readings yields none.
+    """
     levels = np.unique(torque)
     if len(levels) < _FEWEST_LEVELS:
         return

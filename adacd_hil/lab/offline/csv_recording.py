@@ -43,7 +43,10 @@ _KINDS_OF_FILE: Final = (
 
 
 class _Column(NamedTuple):
-    """A wanted column: name in errors, "" of times that there are not; index from 0; reader of a cell; unit."""
+    """A column to read. name: as in errors, "" for times that the file lacks. place: index from 0.
+
+    read: parses a cell, or raises ValueError. unit: as in the map.
+    """
 
     name: str
     place: int
@@ -54,7 +57,8 @@ class _Column(NamedTuple):
 def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> RecordedColumns:
     """Read the columns that a map names from a CSV file. span: as of `RecordedRows`.
 
-    Raises LogError if the file can't be read, ConfigError if it lacks a column.
+    Raises ConfigError if the map doesn't name positions or torques, or the file lacks a named column; LogError if the
+    file can't be read, or as `RecordedRows.columns`.
     """
     for key in ("q", "tau_J"):
         if not getattr(described.columns, key):
@@ -77,7 +81,10 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
 
 
 def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
-    """Return the cells of the first row, without empty ones at its end. Raises ConfigError for a wrong delimiter."""
+    """Return the stripped cells of the first row, without empty ones at its end and a "#" at its begin.
+
+    Raises ConfigError if the map's delimiter gives a head of one column, and another one gives more than two.
+    """
     while first and not first[-1].strip():  # a delimiter at the end of every row
         first = first[:-1]
     heads = [cell.strip() for cell in first]
@@ -91,7 +98,10 @@ def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
 
 
 def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
-    """Yield each row's number in the file, from 1, and its cells; skip empty rows, and comments below the first row."""
+    """Yield each row's number in the file, from 1, and its cells.
+
+    Empty rows, and comments below the first row, are skipped.
+    """
     form = described.csv
     with opened_text(path) as file:
         for _ in range(form.skip_rows):
@@ -104,7 +114,10 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
 
 @contextmanager
 def opened_text(path: Path) -> Iterator[TextIO]:
-    """Open a text file for the block. Raises LogError if it is no text in UTF-8, or can't be read."""
+    """Open a text file for the block.
+
+    Raises LogError if the file can't be read or has another format, and, from the block, if it is no text in UTF-8.
+    """
     try:
         with _open_text(path) as file:
             yield file
@@ -127,7 +140,10 @@ def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[lis
 
 
 def _open_text(path: Path) -> TextIO:
-    """Open a text file. Raises LogError, with the way out, if its first bytes are those of another format."""
+    """Open a text file in UTF-8, with or without a byte-order mark; the caller closes it.
+
+    Raises LogError, with the remedy, if its first bytes are those of another format; OSError if it can't be opened.
+    """
     file = open_input(path)
     begin = file.peek(16)
     for magic, kind in _KINDS_OF_FILE:
@@ -138,9 +154,10 @@ def _open_text(path: Path) -> TextIO:
 
 
 def _columns(path: Path, heads: list[str], cells: int, described: RecordingMap) -> list[_Column]:
-    """Return the wanted columns in the order time, positions, torques, velocities, touches.
+    """Return the columns to read in the order time, positions, torques, velocities, touches.
 
-    heads: the file's, [] without a header. cells: number of them in a row. Raises ConfigError if a column is missing.
+    heads: the file's, [] without a header. cells: number of them in a row. Raises ConfigError if the file lacks one of
+    the map's columns.
     """
     columns, units = described.columns, described.units
     number = partial(read_number, decimal=",") if described.csv.decimal == "," else float
@@ -152,7 +169,10 @@ def _columns(path: Path, heads: list[str], cells: int, described: RecordingMap) 
 
 
 def _time_column(path: Path, heads: list[str], cells: int, described: RecordingMap) -> _Column:
-    """Return the time column; without one, if the map gives a period, a nameless column. Raises ConfigError."""
+    """Return the time column. If the map gives a period and the file no such column, return one with the name "".
+
+    Raises ConfigError if the file lacks the column and the map gives no period, or the column's name looks misspelt.
+    """
     name, units = described.columns.time, described.units
     read = _time_reader(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
     has_period = described.sampling.period_s > 0.0
@@ -167,7 +187,10 @@ def _time_column(path: Path, heads: list[str], cells: int, described: RecordingM
 
 
 def _place(path: Path, name: str, heads: list[str], cells: int) -> int:
-    """Return the index, from 0, of a column by its head, or by its number from 1. Raises ConfigError without one."""
+    """Return the index, from 0, of a column by its head, or else by its number from 1.
+
+    cells: number of columns. Raises ConfigError if the file has no such column.
+    """
     if name in heads:
         return heads.index(name)
     if name.isdecimal() and 1 <= int(name) <= cells:
@@ -178,7 +201,7 @@ def _place(path: Path, name: str, heads: list[str], cells: int) -> int:
 
 
 class _RowReader:
-    """Reads the wanted cells of a row."""
+    """Reads the wanted cells of each row as numbers, and counts the rows, by which those without a time get one."""
 
     def __init__(self, path: Path, columns: list[_Column], described: RecordingMap, cells: int) -> None:
         self._path, self._columns, self._described, self._cells = path, columns, described, cells
@@ -188,9 +211,10 @@ class _RowReader:
         self._plain = [(column.place, column.read) for column in self._wanted]
 
     def read(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
-        """Return the numbers of a row, the time first; None for a skipped row.
+        """Return the numbers of a row, the time first; an empty cell is nan.
 
-        A bad row is counted in `into`, a row of units noted there. number: the row's in the file, from 1.
+        None for a bad row, and for a row of units. A bad row is counted in `into`, a row of units noted there. number:
+        the row's in the file, from 1. Raises ConfigError if a row of units differs from the map.
         """
         self._rows += 1
         self._first = self._first or number
@@ -210,9 +234,10 @@ class _RowReader:
         return row if self._has_time else [(self._rows - 1) * self._described.sampling.period_s, *row]
 
     def _read_unusual_row(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
-        """Return the numbers of a row, nan for empty cells; None for a row with a cell that is no number.
+        """Return the numbers of a row, nan for empty cells; None if a cell is no number.
 
-        A row of units is noted in `into`, an unreadable row counted there.
+        A first row of units is noted in `into`, any other unreadable row counted there. Raises ConfigError for units
+        that differ from the map's.
         """
         row, wrong = [], []
         for column in self._wanted:
@@ -233,7 +258,10 @@ class _RowReader:
         return None
 
     def _is_of_units(self, wrong: list[tuple[_Column, str]]) -> bool:
-        """Return whether a row names units. Raises ConfigError if one differs from the map's."""
+        """Return whether unreadable cells, with their columns, have no digits, as in a row of units.
+
+        Raises ConfigError if one of them is a unit other than the map's.
+        """
         for column, text in wrong:
             unit = unit_of(text)
             if unit and column.unit and unit != column.unit and not (column.unit == ISO):
@@ -253,14 +281,15 @@ class _RowReader:
 
 
 def read_number(text: str, decimal: str) -> float:
-    """Parse a number with this decimal sign. Raises ValueError."""
+    """Parse a number with this decimal sign, "." or ",". Raises ValueError if the text is none."""
     return float(text.replace(",", ".") if decimal == "," else text)
 
 
 def _time_reader(read: Callable[[str], Decimal], decimal: str) -> Callable[[str], float]:
-    """Return a function that parses times, and subtracts the first of them.
+    """Return a function that parses a time, and subtracts the first finite time that it has parsed.
 
-    Times in ns since 1970 have more digits than a float.
+    read: parses a text with a decimal point. The function raises ValueError for a text that is no time. Times in ns
+    since 1970 have more digits than a float.
     """
     first: Decimal | None = None
 
@@ -285,12 +314,12 @@ def _iso_seconds(text: str) -> Decimal:
 
 
 def is_number(text: str, decimal: str) -> bool:
-    """Return whether a text is a number with this decimal sign."""
+    """Return whether a text is a number with this decimal sign; nan and inf are numbers, too."""
     return _is_readable(text, partial(read_number, decimal=decimal))
 
 
 def is_iso_time(text: str) -> bool:
-    """Return whether a text is a date and time of ISO 8601."""
+    """Return whether a text is a date, or a date and time, of ISO 8601."""
     return _is_readable(text, _iso_seconds)
 
 

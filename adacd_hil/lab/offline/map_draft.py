@@ -30,7 +30,7 @@ _SEEN_MESSAGES: Final = 20_000
 
 
 class DraftedKey(NamedTuple):
-    """A key of the map, its value, and the reason of the guess; "" if it is certain."""
+    """A key of the map and its value. reason: why a guessed value was chosen; "" if the value is certain."""
 
     section: str
     key: str
@@ -50,9 +50,10 @@ def map_text(recording: Path, keys: Sequence[DraftedKey]) -> str:
 
 
 def draft_map(recording: Path, urdf: Path, map_path: Path) -> list[DraftedKey]:
-    """Return the keys of the map of a recording; write no file. Raises ConfigError, LogError.
+    """Return the keys of a map of a recording, for `map_text`; write no file.
 
-    map_path: file in which the caller will save the map; the URDF's path is relative to its folder.
+    map_path: file in which the caller will save the map; the URDF's path is relative to its folder. Raises ConfigError
+    if the URDF can't be read, or no columns or joints of the recording fit it; LogError if the recording can't be read.
     """
     arm, locked = _read_arm(urdf)
     where = Path(os.path.relpath(urdf.resolve(), map_path.resolve().parent)).as_posix()
@@ -63,9 +64,10 @@ def draft_map(recording: Path, urdf: Path, map_path: Path) -> list[DraftedKey]:
 
 
 def _read_arm(urdf: Path) -> tuple[SerialArm, tuple[str, ...]]:
-    """Read the arm of a URDF; return it, and the names of locked joints. Raises ConfigError.
+    """Read the arm of a URDF; return it, and the names of the joints that the map must lock.
 
-    Joints with names of a gripper's are locked if the URDF can't be read otherwise.
+    If the URDF can't be read otherwise, all joints with a name like a gripper's are locked; else (). Raises
+    ConfigError.
     """
     try:
         text = read_input(urdf)
@@ -84,7 +86,11 @@ def _read_arm(urdf: Path) -> tuple[SerialArm, tuple[str, ...]]:
 
 
 def _of_table(recording: Path, arm: SerialArm) -> list[DraftedKey]:
-    """Draft the keys of a CSV file. Raises ConfigError if no columns look like positions or torques, LogError."""
+    """Draft the keys of a CSV file.
+
+    Raises ConfigError if no columns look like positions, or like torques or currents; LogError if the file can't be
+    read.
+    """
     guess = guess_table(recording, arm.joint_names)
     n, form = len(arm.joint_names), guess.form
     for role, what in (("q", "positions"), ("tau_J", "torques or currents")):
@@ -108,7 +114,10 @@ def _of_table(recording: Path, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
-    """Draft the units that differ from the map's defaults; for currents `scale.tau_J` and `arm.has_rotors`, too."""
+    """Draft the units that differ from the map's defaults.
+
+    For currents, draft `scale.tau_J`, all 1, and `arm.has_rotors`, too.
+    """
     keys = []
 
     def add_unit(role: str, default: str, guessed: str, reason: str) -> str:
@@ -136,7 +145,10 @@ def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _angle_unit(q: Vector, arm: SerialArm) -> tuple[str, str]:
-    """Return the unit "deg" and the reason if positions go far beyond the URDF's limits in rad, else "rad"."""
+    """Return "deg" and the reason if a turning joint goes 1.5 times as far as the URDF allows in rad; else "rad", "".
+
+    A joint without limits may make a whole turn. q (k, n).
+    """
     bound = np.maximum(np.abs(arm.position_low), np.abs(arm.position_high))
     bound = np.where(np.isfinite(bound) & (bound > 0.0), bound, 2.0 * np.pi)
     reach = np.nanmax(np.abs(q), axis=0)
@@ -148,7 +160,7 @@ def _angle_unit(q: Vector, arm: SerialArm) -> tuple[str, str]:
 
 
 def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
-    """Return the unit in which velocities equal the slope of the positions; "rad/s" if none does.
+    """Return the unit in which velocities are within 10 % of the positions' slope; "rad/s" if there is none.
 
     angle: unit of the positions. step_s: interval of the rows.
     """
@@ -159,7 +171,10 @@ def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
 
 
 def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
-    """Return "mNm" and the reason if a torque is far beyond the effort of the URDF, else "Nm"."""
+    """Return "mNm" and the reason if a torque is over 5 times the URDF's effort of its joint, else "Nm", "".
+
+    tau (k, n).
+    """
     largest, effort = torques_and_limits(tau, arm)
     over = np.nan_to_num(largest / effort)
     joint = int(np.argmax(over))
@@ -169,7 +184,11 @@ def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
 
 
 def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
-    """Draft the keys of a bag that differ from the defaults: topic, stamp, names of joints, units. Raises LogError."""
+    """Draft the keys of a bag that differ from the defaults: topic, stamp, names of joints, units.
+
+    Only its first `_SEEN_MESSAGES` messages are read. Raises LogError if it can't be read or has no joint states,
+    ConfigError if its joints don't fit the arm's.
+    """
     keys = []
     with opened_bag(recording) as (topics, read_messages):
         found = joint_state_topics(topics)
@@ -204,9 +223,10 @@ def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _bag_names(recording: Path, names: list[str], arm: SerialArm) -> tuple[str, ...]:
-    """Return the bag's names of the arm's joints, in the arm's order. Raises ConfigError.
+    """Return the bag's names of the arm's joints, in the arm's order.
 
-    By equal names, else by endings; else, if there are as many, all names of the bag in the order of their numbers.
+    They are found by equal names, else by endings; else, if there are as many, all names of the bag in the order of
+    their numbers. Raises ConfigError if none of these ways fits.
     """
     if set(arm.joint_names) <= set(names):
         return arm.joint_names
@@ -226,6 +246,6 @@ def _bag_names(recording: Path, names: list[str], arm: SerialArm) -> tuple[str, 
 
 
 def _natural(name: str) -> list[tuple[bool, int, str]]:
-    """Return a sort key that orders names by their numbers."""
+    """Return a sort key that orders names by the numbers in them: joint2 before joint10."""
     parts = re.split(r"(\d+)", name)
     return [(part.isdigit(), int(part) if part.isdigit() else 0, part) for part in parts]

@@ -42,10 +42,11 @@ UNITS: Final = {"deg": "degrees", "rad": "radians"}
 
 
 class Reading(NamedTuple):
-    """A tried reading: its description and the key of the map, "" for the map's own.
+    """A tried interpretation of the recording's columns.
 
-    weight: number of differences from the map. unexplained: largest share of a joint's torque that it leaves in the
-    test. is_possible: an arm can have its parameters.
+    Text, remedy: its description and the key of the map to change. Both are "" for the map's own. weight: number of
+    differences from the map. unexplained: of the joint with the largest one, the share of torque that the fit leaves in
+    the test. is_possible: an arm can have the fitted parameters; False untested if too much is unexplained.
     """
 
     text: str
@@ -56,7 +57,11 @@ class Reading(NamedTuple):
 
 
 class _Motion(NamedTuple):
-    """A reading of the motion. T (n, n), R (n, n) of the torques: see above; R None: unchanged. turned: one joint."""
+    """An interpretation of the motion: q = T q_recorded, tau = R tau_recorded, each (n, n).
+
+    R None: torques as recorded. model: the arm's. turned: the joint whose position has the other sign, if that is the
+    only change. is_of_velocities: T turns the velocities, too.
+    """
 
     text: str
     remedy: str
@@ -68,7 +73,7 @@ class _Motion(NamedTuple):
 
 
 class _Torques(NamedTuple):
-    """A reading of torques: joint i has `factors[i]` times the column of joint `places[i]`.
+    """An interpretation of the torques: joint i has `factors[i]` times the torque in the column of joint `places[i]`.
 
     turned: the joints whose sign is not the map's.
     """
@@ -81,7 +86,11 @@ class _Torques(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Normal equations of fit or test: A (n, p, p), b (n, n, p), S (n, n) of torques; u (n,), U (1,) of a constant."""
+    """Normal equations of fit or test, by joint: A (n, p, p), b (n, n, p) with each torque column.
+
+    S (n, n): products of the torques. u (n,), U (1,): products of the filtered constant with the torques, and with
+    itself.
+    """
 
     A: Vector
     b: Vector
@@ -98,9 +107,10 @@ class _Equations(NamedTuple):
 def find_readings(
     described: RecordingMap, model: ArmModel, settings: OfflineSettings, fitted: list[Record], tested: list[Record]
 ) -> list[Reading]:
-    """Return the readings that explain the test far better than the map's, best first; [] if none does.
+    """Return the interpretations that explain the test's torque far better than the map does, best first.
 
-    Of nearly equal ones only those with the fewest differences from the map are returned.
+    Of nearly equal ones only those with the fewest differences from the map are returned. [] if there is none, or the
+    map's own can't be computed.
     """
     fitted, tested = _thinned(fitted, settings), _thinned(tested, settings)
     step = _step(settings)
@@ -124,7 +134,10 @@ def find_readings(
 
 
 def is_possible(model: ArmModel, theta: Vector, q: Vector, dq: Vector) -> bool:
-    """Return whether an arm can have these parameters: inertias are positive, friction dissipates. q, dq: (k, n)."""
+    """Return whether an arm can have these parameters: positive inertias in about 8 poses of q, and braking friction.
+
+    q, dq: (k, n).
+    """
     F_v, F_c = theta[model.place_of("F_v")], theta[model.place_of("F_c")]
     speed, square = np.abs(dq).mean(axis=0), (dq**2).mean(axis=0)
     idle = _IDLE_FRICTION * (np.abs(F_c).max() + np.abs(F_v).max() * speed.mean()) * speed
@@ -134,9 +147,9 @@ def is_possible(model: ArmModel, theta: Vector, q: Vector, dq: Vector) -> bool:
 
 
 def mass_rows(model: ArmModel, q: Vector, poses: int) -> Vector:
-    """Return the rows (m, n, p) whose product with theta is the inertia about each joint.
+    """Return the rows (m, n, p) whose product with theta is the inertia about each joint, kg m², or kg if it slides.
 
-    They are of about `poses` poses, spread evenly over q (k, n).
+    The m poses, about `poses`, are spread evenly over the samples q (k, n).
     """
     units = np.eye(model.joints)
     spread = q[:: max(1, len(q) // poses)]
@@ -144,12 +157,15 @@ def mass_rows(model: ArmModel, q: Vector, poses: int) -> Vector:
 
 
 def _step(settings: OfflineSettings) -> int:
-    """Return from how many samples one is used, so that these lie `_PERIOD_S` apart."""
+    """Return the distance, in samples, of those that are used: 10 ms or a little less, and at least 1."""
     return max(1, math.floor(_PERIOD_S / settings.period_s + 1e-9))
 
 
 def _thinned(records: list[Record], settings: OfflineSettings) -> list[Record]:
-    """Return the records with fewer samples, `_PERIOD_S` apart, and only the first `_MOST_S` of them in all."""
+    """Return the first 10 s of the records in all, with only every `_step`-th sample.
+
+    A record left with one sample is dropped.
+    """
     step, room = _step(settings), round(_MOST_S / settings.period_s)
     kept = []
     for record in records:
@@ -161,7 +177,10 @@ def _thinned(records: list[Record], settings: OfflineSettings) -> list[Record]:
 
 
 def _equations(records: list[Record], settings: OfflineSettings, motion: _Motion) -> _Equations | None:
-    """Return the sum of the normal equations of all records for a reading of the motion; None if numbers overflow."""
+    """Return the sum of all records' normal equations under an interpretation of the motion.
+
+    None if a record's filtered regressor isn't finite.
+    """
     model = motion.model
     n, p = model.joints, len(model.parameter_names)
     found = _Equations(*(np.zeros(shape) for shape in ((n, p, p), (n, n, p), (n, n), (n,), (1,))))
@@ -190,7 +209,7 @@ def _judge(
     torques: _Torques,
     fitted: list[Record],
 ) -> Reading:
-    """Fit the arm for a reading of motion and torques; return the reading, with its unexplained share in the test."""
+    """Fit the arm under an interpretation of motion and torques; return it with its unexplained share in the test."""
     factors, places, joints = torques.factors, list(torques.places), range(motion.model.joints)
     weight = 1.0 / (factors**2 * fit.spread[places])
     A = np.tensordot(weight, fit.A, axes=1)
@@ -218,7 +237,7 @@ def _judge(
 
 
 def _other_units(described: RecordingMap, tested: list[Record]) -> Iterator[tuple[int, float]]:
-    """Yield each joint with the factors 0.001 and 1000 by which no torque is far beyond the URDF's efforts."""
+    """Yield (joint, factor), factors 0.001 and 1000, that leave all torques within 30 times the effort."""
     largest, effort = torques_and_limits(np.concatenate([record.tau_J for record in tested]), described.urdf)
     for joint, factor in itertools.product(range(described.joints), (1e-3, 1e3)):
         scaled = np.where(np.arange(described.joints) == joint, factor * largest, largest)
@@ -227,9 +246,10 @@ def _other_units(described: RecordingMap, tested: list[Record]) -> Iterator[tupl
 
 
 def _torques(described: RecordingMap, most_turned: int, units: list[tuple[int, float]]) -> Iterator[_Torques]:
-    """Yield readings of torques: some or all with the other sign, one in another unit, two exchanged, all in reverse.
+    """Yield interpretations of the torques, the map's own first.
 
-    most_turned: most torques that have the other sign, unless all have. units: joints and factors on their torques.
+    The others have some or all turned, one in another unit, two exchanged, all in reverse order. most_turned: most
+    torques that have the other sign, unless all have. units: joints and the factors to try on their torques.
     """
     n, names = described.joints, described.urdf.joint_names
     straight, ones = tuple(range(n)), np.ones(n)
@@ -256,7 +276,7 @@ def _torques(described: RecordingMap, most_turned: int, units: list[tuple[int, f
 
 
 def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
-    """Yield readings of the motion, the map's first."""
+    """Yield interpretations of the motion, the map's own first, with texts ""."""
     n, straight, names = model.joints, np.eye(model.joints), described.urdf.joint_names
     yield _Motion("", "", model, straight)
     for unit, factor in (("deg", math.pi / 180.0), ("rad", 180.0 / math.pi)):
@@ -308,7 +328,7 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
 
 
 def _coupled(text: str, model: ArmModel, T: Vector) -> Iterator[_Motion]:
-    """Yield readings with the positions T q: with the torques as recorded, and with those that do the same power."""
+    """Yield interpretations with the positions T q: with torques as recorded, and with torques of the same power."""
     remedy = "record the joints' own positions and torques, or write them into new columns"
     yield _Motion(text, remedy, model, T)
     yield _Motion(f"{text}, and so do the torques", remedy, model, T, np.linalg.inv(T).T.astype(np.float64))
@@ -317,14 +337,14 @@ def _coupled(text: str, model: ArmModel, T: Vector) -> Iterator[_Motion]:
 def _moved(units: Sequence[float], places: Sequence[int]) -> Vector:
     """Return M (n, n) that gives joint i the column of joint places[i], in the unit that the map gives joint i.
 
-    units (n,): of the map, to which `scale` belongs; the columns have been read in their old places' units.
+    units (n,): factors of the map, unit and `scale`, with which each column was read in its old place.
     """
     sizes = np.array(units)
     return np.asarray(np.eye(len(sizes))[list(places)] * np.divide.outer(sizes, sizes))
 
 
 def _exchanged(n: int, i: int, j: int) -> list[int]:
-    """Return the places 0 to n - 1 with i and j exchanged."""
+    """Return the list 0 to n - 1 with i and j exchanged."""
     places = list(range(n))
     places[i], places[j] = j, i
     return places

@@ -39,10 +39,11 @@ _DOUBLED = "with the time of the row before"
 
 @dataclass(frozen=True)
 class RecordedColumns:
-    """Time (k,) s, increasing, that of the first row, and values (k, 2 n or 3 n) in SI units.
+    """The columns of a recording in SI units. time_s (k,): increasing.
 
-    values: positions, torques and, if present, velocities side by side; missing ones are not finite. touched (k,), if
-    known. notes: dropped rows and assumptions, a few words each.
+    begin_s: time of the file's first row, on the same scale. values (k, 2 n or 3 n): positions, torques and, if
+    present, velocities side by side; missing ones are not finite. touched (k,): whether the arm is touched; None if
+    unknown. notes: dropped rows and assumptions, a few words each.
     """
 
     time_s: Vector
@@ -53,13 +54,13 @@ class RecordedColumns:
 
 
 class RecordedRows:
-    """Collects the rows of a recording one by one, and makes columns of them."""
+    """Collects a recording's rows one by one, drops those out of order in time, and makes columns of the others."""
 
     def __init__(self, path: Path, width: int, time_unit_s: float, span: TimeWindow | None) -> None:
         """Start without rows.
 
-        width: numbers of a row, the time first. time_unit_s: one unit of these times, s. span: part to keep, in time
-        since the first row, of a file with more than `MOST_ROWS` rows; None: all.
+        width: numbers of a row, its time included. time_unit_s: one unit of these times, s. span: the part to keep of a
+        file with more than `MOST_ROWS` rows, in time since the first row; None: all. A shorter file is kept whole.
         """
         self.notes: list[str] = []
         self.count = 0
@@ -74,7 +75,10 @@ class RecordedRows:
         self._is_long = False  # only the span is kept
 
     def append(self, number: int, row: list[float]) -> None:
-        """Add a row, the time first. number: its place in the file, from 1. Raises LogError if there are too many."""
+        """Add a row, the time first. number: the row's in the file, from 1, for errors.
+
+        Rows are examined in blocks. Raises LogError if more than `MOST_ROWS` must be kept.
+        """
         self._block.append(number)
         self._block += row
         self.count += 1
@@ -82,9 +86,10 @@ class RecordedRows:
             self._flush()
 
     def drop(self, kind: str, first: str, count: int = 1) -> None:
-        """Count dropped rows by kind; keep the description of the first row of each kind.
+        """Count `count` rows that are left out, without adding them.
 
-        kind: text after the word "row". first: description of the first row of this call.
+        kind: text after the word "row", such as "cut short". first: description of the first of them; it is kept of the
+        first call with this kind only.
         """
         if count:
             self._drops[kind] += count
@@ -92,15 +97,18 @@ class RecordedRows:
 
     @property
     def is_past_span(self) -> bool:
-        """Whether the requested span has been read, of a file that is too long to be read whole."""
+        """Whether all of the requested span has been read, so that no further row is needed.
+
+        Always False without a span, and for a file with at most `MOST_ROWS` rows so far.
+        """
         return self._is_long and self._span is not None and self._latest_s - self._begin_s > self._span.end_s + _SPARE_S
 
     def columns(self, described: RecordingMap, names: list[str], has_touches: bool = False) -> RecordedColumns:
         """Return all kept rows as columns in SI units.
 
         names: of the value columns, for errors; more than 2 n include velocities. has_touches: the last number of a row
-        tells whether the arm is touched. Raises LogError for too few rows, too many bad ones, or a value above
-        `LARGEST`.
+        is not 0 while the arm is touched. Raises LogError for fewer than 50 rows, too many dropped
+        ones, rows of two sources, or a value above 1e6.
         """
         self._flush()
         table = np.concatenate(self._kept) if self._kept else np.empty((0, self._width))
@@ -124,9 +132,9 @@ class RecordedRows:
         return RecordedColumns(time_s, self._begin_s, values, touched, notes)
 
     def _flush(self) -> None:
-        """Drop the bad rows of the latest block, and keep the others; of a long file only those of the requested span.
+        """Drop rows of the latest block without a time, or whose time isn't later than all before; keep the others.
 
-        Raises LogError if more than `MOST_ROWS` are kept.
+        Of a long file only rows in the requested span are kept. Raises LogError if more than `MOST_ROWS` are kept.
         """
         if not self._block:
             return
@@ -151,13 +159,16 @@ class RecordedRows:
             raise LogError(f"recording {self._path} has more than {MOST_ROWS} rows: {remedy}")
 
     def _count_wrong_rows(self, table: Vector, is_wrong: NDArray[np.bool_], kind: str, words: str) -> None:
-        """Count the wrong rows of a table by `drop`; the table keeps them. words: of the first one, with {time}."""
+        """Count the wrong rows of a table by `drop`, without removing them.
+
+        words: of the first one, with {time} in it.
+        """
         for number, time in table[is_wrong, :2][:1].tolist():
             first = words.format(time=f"{time * self._unit_s:.9g} s")
             self.drop(kind, f"row {number:.0f}: {first}", int(np.count_nonzero(is_wrong)))
 
     def _within(self, table: Vector) -> Vector:
-        """Return the rows of a table within the requested span, widened by `_SPARE_S` on both sides."""
+        """Return the rows of a table in the requested span, widened by 1 s at both ends; all without a span."""
         if self._span is None:
             return table
         time_s = table[:, 1] * self._unit_s - self._begin_s
@@ -170,9 +181,9 @@ class RecordedRows:
         ]
 
     def _check_drops(self, kept: int) -> None:
-        """Raise LogError if more rows were dropped than `_FEW_ROWS` and `_FEW_SHARE` allow. kept: number of kept rows.
+        """Raise LogError if more rows were dropped than both 3 and 1 % of all rows.
 
-        A row with the time of the row before doesn't count.
+        kept: number of kept rows. Rows with the time of the row before are not included.
         """
         count = self._drops.total() - self._drops[_DOUBLED]
         if count > max(_FEW_ROWS, _FEW_SHARE * (kept + count)):
@@ -181,7 +192,11 @@ class RecordedRows:
             raise LogError(f"recording {self._path}, {first}; {number_of(most, 'row')} {kind} are too many")
 
     def _check_sources(self, values: Vector, names: list[str]) -> None:
-        """Raise LogError if rows with one time differ more than successive rows do. values: as recorded (k, c)."""
+        """Raise LogError if many rows have the time of the row before but other values, as of two sources in one table.
+
+        values: as recorded (k, c). Many are more than both 3 and 1 % of all rows. A column has other values if these
+        rows' mean difference is over 3 times that from one time to the next.
+        """
         apart = np.concatenate(self._doubled)[:, : len(names)]
         is_other = np.any(apart > 0.0, axis=1)
         count = int(np.count_nonzero(is_other))
@@ -196,7 +211,10 @@ class RecordedRows:
             )
 
     def _check_values(self, given: Vector, values: Vector, time_s: Vector, names: list[str]) -> None:
-        """Raise LogError for a value above `LARGEST`. given: as recorded, values: in SI units, (k, c)."""
+        """Raise LogError if a finite recorded value is above 1e6 in SI units.
+
+        given: values as recorded, values: in SI units, (k, c).
+        """
         too_large = np.argwhere(np.isfinite(given) & ~(np.abs(values) <= LARGEST))
         if len(too_large):
             row, column = too_large[0].tolist()
@@ -207,5 +225,5 @@ class RecordedRows:
 
 
 def _differences(rows: Vector) -> Vector:
-    """Return the size of each row's differences from the row before (k - 1, c), NaN where a value is not finite."""
+    """Return the absolute differences of each row from the row before (k - 1, c); NaN where a value is not finite."""
     return np.abs(np.diff(np.where(np.isfinite(rows), rows, np.nan), axis=0))

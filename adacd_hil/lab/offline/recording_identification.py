@@ -32,7 +32,10 @@ FIT_SHARE = 0.6
 
 
 class Spell(NamedTuple):
-    """A detected contact: times from the recording's start, link from 1, signs of each joint's torque (n,)."""
+    """A detected contact. start_s: since the recording's first row. link: from 1.
+
+    direction (n,): sign of each joint's external torque. is_true: whether the arm was touched then; None if unknown.
+    """
 
     start_s: float
     link: int
@@ -42,7 +45,11 @@ class Spell(NamedTuple):
 
 @dataclass(frozen=True)
 class Watched:
-    """External torques, thresholds and contacts in a recording that the model was not fitted to."""
+    """External torques, thresholds and contacts that the model shows in a recording to which it was not fitted.
+
+    touches, missed: numbers of touches, and of undetected ones; None if touches are unknown. delays_s: from the begin
+    of each detected touch to its detection.
+    """
 
     recording: ForeignRecording
     tau_ext_hat: tuple[Vector, ...]  # per stretch (k, n), Nm
@@ -56,13 +63,16 @@ class Watched:
 
     @property
     def false_contacts(self) -> int | None:
-        """Number of contacts without a touch; None if touches are unknown."""
+        """Number of detected contacts that belong to no touch; None if touches are unknown."""
         return None if self.touches is None else sum(contact.is_true is False for contact in self.contacts)
 
 
 @dataclass(frozen=True)
 class Identified(Fitted):
-    """A fit, its verdict, and the contacts found in the test and in further recordings."""
+    """A fit with its verdict. test: contacts found in the test, which should be none.
+
+    watched: those in further recordings.
+    """
 
     verdict: Verdict
     test: Watched
@@ -78,21 +88,24 @@ class Identified(Fitted):
 
     @property
     def notes(self) -> dict[Path, tuple[str, ...]]:
-        """Dropped rows and assumptions, by recording."""
+        """Dropped rows and assumptions, by path of the fitted and tested recordings; watched ones are left out."""
         return {recording.path: recording.notes for recording in (*self.fitted, self.tested)}
 
     @property
     def is_explained(self) -> bool:
-        """Whether the torque of the test is explained; see `recording_verdict`."""
+        """Whether the verdict is that the model explains the torque of the test; see `recording_verdict`."""
         return self.verdict.is_explained
 
     @property
     def explained(self) -> Vector:
-        """Share (n,) of each joint's torque that the model explains in the test; nan without torque."""
+        """Share (n,) of each joint's torque that the model explains in the test; negative if worse than a constant.
+
+        nan for a joint without torque.
+        """
         return np.array([joint.share for joint in self.verdict.joints])
 
     def by_key(self) -> dict[str, Any]:
-        """Return the result by the keys of identify.json."""
+        """Return the result by the keys of identify.json; values are numpy arrays, paths and tuples, too."""
         names, certificate, verdict = self.model.parameter_names, self.certificate, self.verdict
         return {
             "parameters": {
@@ -143,8 +156,9 @@ def identify(
 ) -> Identified:
     """Fit one model to all recordings, test it on another one, and detect contacts in further ones.
 
-    tested: None: of the last recording the first `FIT_SHARE` of its time is fitted, and the rest tested. Samples during
-    a known touch are neither fitted nor tested. Raises ConfigError, LogError.
+    tested: None: of the last recording the first 60 % of its time is fitted, and the rest tested. watched:
+    further recordings. Samples during a known touch are neither fitted nor tested. Raises LogError if there is too
+    little free motion to fit or to test, ConfigError for the map's settings of the scheme.
     """
     for recording in fitted:
         if not recording.stretches:
@@ -190,7 +204,10 @@ _MOST_OVER: Final = 0.5
 
 
 def _examined(described: RecordingMap, watched: Watched) -> Watched:
-    """Return a watched recording with the defects for which its contacts can't be told."""
+    """Return a watched recording with the defects for which its contacts can't be told, in `faults`.
+
+    Those are defects of columns that aren't harmless, else a torque over a threshold for more than half of the time.
+    """
     faults = [fault.text for fault in column_faults(described, [watched.recording]) if not fault.is_harmless]
     pairs = zip(watched.tau_ext_hat, watched.threshold, strict=True)
     is_over = np.concatenate([(np.abs(tau) > threshold).any(axis=1) for tau, threshold in pairs])
@@ -200,7 +217,11 @@ def _examined(described: RecordingMap, watched: Watched) -> Watched:
 
 
 def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> OfflineCertificate:
-    """Return one certificate of all stretches: means weighted by length, largest residual, smallest margins."""
+    """Return one certificate of all stretches of the tested recording from one certificate of each.
+
+    Thresholds are means, rms values are joined, both weighted by length; of residuals the largest, of margins the
+    smallest is taken.
+    """
     weights = np.array([len(record.q) for record in tested.records], np.float64)
     weights /= weights.sum()
     return OfflineCertificate(
@@ -221,7 +242,8 @@ def watch(
 ) -> Watched:
     """Detect contacts in a recording, and compare them with its touches if these are known.
 
-    lack_Nm: model error (n,), which widens the thresholds.
+    lack_Nm: model error (n,), by which the thresholds are widened; 0: thresholds from noise and covariance only.
+    `faults` of the result is empty: columns aren't checked.
     """
     detections = [offline.detect(model, part.record, estimate, settings, lack_Nm) for part in recording.stretches]
     spells: list[Spell] = []
@@ -253,9 +275,10 @@ def watch(
 def _touch_indices(
     stretch: RecordingStretch, samples: NDArray[np.int64], recording: ForeignRecording, settings: OfflineSettings
 ) -> NDArray[np.int64]:
-    """Return the index of the touch that each contact belongs to, -1 without one.
+    """Return the index of the touch to which each contact belongs, -1 without one.
 
-    samples: index of each contact's first sample. A touch may begin `blur_s` earlier than recorded.
+    samples: index of each contact's first sample. A touch explains contacts from `blur_s` before it, for derived
+    velocities, to `isolation_s` after it.
     """
     firsts, ends = np.array(stretch.touches, np.int64).reshape(-1, 2).T
     onsets = firsts - round(recording.blur_s / recording.period_s)
@@ -265,7 +288,10 @@ def _touch_indices(
 
 
 def draw_watched(identified: Identified, watched: Watched, name: str) -> Drawing:
-    """Draw a recording's external torques, thresholds, contacts and touches, a panel per joint. name: the drawing's."""
+    """Draw a recording's external torques, thresholds, contacts and touches over time, a panel per joint.
+
+    name: of the drawing.
+    """
     n = identified.model.joints
     with style():
         figure = Figure(figsize=(7.2, 0.9 + 1.3 * n), layout="constrained")

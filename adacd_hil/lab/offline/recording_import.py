@@ -37,7 +37,10 @@ _STEP_TO_SIGMA = 1.0 / np.sqrt(12.0)  # of the rounding to a step
 
 @dataclass(frozen=True)
 class RecordingStretch:
-    """Samples without a gap: time of the first, and, if known, for each whether the arm was touched (k,)."""
+    """Samples without a gap in time. start_s: time of the first, since the recording's first row.
+
+    is_touched (k,): whether the arm was touched at each sample; None if touches are unknown.
+    """
 
     start_s: float
     record: Record
@@ -45,16 +48,20 @@ class RecordingStretch:
 
     @property
     def touches(self) -> list[tuple[int, int]]:
-        """Index of each touch's first sample, and of the sample after its last; empty if touches are unknown."""
+        """Index of each touch's first sample, and of the sample after its last.
+
+        The list is empty if there are no touches or they are unknown.
+        """
         return [] if self.is_touched is None else _true_runs(self.is_touched)
 
 
 @dataclass(frozen=True)
 class ForeignRecording:
-    """A recording, time-first. `noise_Nm` (n,), `velocity_noise_rad_s`: estimated rms of its white noise.
+    """A recording as samples at a fixed period, in stretches without a gap, in SI units.
 
-    `blur_s`: half the window of a derived velocity. `columns`: as read from the file. `notes`: dropped rows and
-    assumptions, a few words each.
+    `noise_Nm` (n,), `velocity_noise_rad_s`: estimated rms of the white noise, of velocities that of the noisiest joint,
+    0 if they are derived. `blur_s`: half the window over which velocities were derived from positions; 0 if they were
+    measured. `columns`: rows as read from the file. `notes`: dropped rows and assumptions, a few words each.
     """
 
     path: Path
@@ -68,7 +75,7 @@ class ForeignRecording:
 
     @property
     def has_velocities(self) -> bool:
-        """Whether velocities were measured, not derived from the positions."""
+        """Whether velocities were measured, not derived from the positions: `blur_s` is 0."""
         return self.blur_s == 0.0
 
     @property
@@ -78,12 +85,15 @@ class ForeignRecording:
 
     @property
     def records(self) -> list[Record]:
-        """The samples of the stretches."""
+        """The samples as a list of `Record`, one per stretch, in their order."""
         return [stretch.record for stretch in self.stretches]
 
     @property
     def own_rows(self) -> Vector:
-        """The rows as recorded that have all values, from the first stretch to the end of the last (k, c)."""
+        """The rows of the file, in SI units (k, c), between the begin of the first stretch and the end of the last one.
+
+        Rows that lack a value are left out. Columns as of `RecordedColumns.values`. Empty without stretches.
+        """
         if not self.stretches:
             return self.columns.values[:0]
         last = self.stretches[-1]
@@ -93,20 +103,25 @@ class ForeignRecording:
         return rows[np.isfinite(rows).all(axis=1)]
 
     def between(self, start_s: float, end_s: float) -> "ForeignRecording":
-        """Return the part from one time to another, s since the recording's first row, without stretches too short."""
+        """Return the recording with its stretches cut to a span of time, s since the recording's first row.
+
+        Stretches left with fewer than 50 samples are dropped; there may be no stretch left. Noise,
+        columns and notes stay those of the whole recording.
+        """
         parts = [_cut(stretch, self.period_s, start_s, end_s) for stretch in self.stretches]
         kept = tuple(part for part in parts if len(part.record.q) >= SHORTEST_SAMPLES)
         return replace(self, stretches=kept)
 
     @property
     def free(self) -> "ForeignRecording":
-        """The part without touches; the whole recording if touches are unknown."""
+        """The recording without touched samples; unchanged if touches are unknown. It may have no stretches."""
         return replace(self, stretches=tuple(part for stretch in self.stretches for part in self._untouched(stretch)))
 
     def _untouched(self, stretch: RecordingStretch) -> list[RecordingStretch]:
-        """Return the untouched parts of a stretch that are long enough; the whole stretch if touches are unknown.
+        """Return the untouched parts of a stretch with at least 50 samples.
 
-        Samples whose derived velocity reaches into a touch are left out.
+        The whole stretch if touches are unknown. Samples whose derived velocity depends on touched samples are left
+        out, too.
         """
         if stretch.is_touched is None:
             return [stretch]
@@ -122,18 +137,21 @@ def _true_runs(is_true: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def samples(recordings: Iterable[ForeignRecording], name: str) -> Vector:
-    """Return all samples of the recordings, one recording after the other (k, n). name: "q", "dq" or "tau_J"."""
+    """Return a quantity's samples from all recordings, one recording after the other (k, n).
+
+    name: "q", "dq" or "tau_J". Raises ValueError if the recordings have no stretches.
+    """
     return np.concatenate([getattr(record, name) for recording in recordings for record in recording.records])
 
 
 def read_recording(
     path: Path, described: RecordingMap, period_s: float = 0.0, span: TimeWindow | None = None
 ) -> ForeignRecording:
-    """Read a CSV file, an MCAP file or a rosbag.
+    """Read a CSV file, an MCAP file or a rosbag into samples at a fixed period.
 
     period_s: of the samples, if the map gives none; 0: the median interval of the file's rows. span: the part to read
-    of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError if the file can't be read or is
-    too long, ConfigError if it lacks a column of the map.
+    of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError if the file can't be read, is
+    too long, or has no usable stretch; ConfigError if the map names a column, topic or joint that the file lacks.
     """
     read = read_bag if is_bag(path) else read_csv
     return recording_of(path, described, read(path, described, span), period_s)
@@ -142,9 +160,11 @@ def read_recording(
 def recording_of(
     path: Path, described: RecordingMap, given: RecordedColumns, period_s: float = 0.0
 ) -> ForeignRecording:
-    """Make a recording from columns: resample them at a fixed period, and split them at gaps. Raises LogError.
+    """Make a recording from columns: drop rows that lack a value, resample at a fixed period, and split at gaps.
 
-    path: of the recording, also named in errors. period_s: if the map gives none; 0: the median interval of the rows.
+    path: of the recording, named in errors. period_s: if the map gives none; 0: the median interval of the rows. Raises
+    LogError if no stretch without a gap has enough samples, the samples are more than `MOST_ROWS`, or the median
+    interval is outside 10 µs to 100 ms.
     """
     n = described.joints
     is_whole = np.isfinite(given.values).all(axis=1)
@@ -200,7 +220,11 @@ def recording_of(
 
 
 def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
-    """Return the median interval of the rows, s. Raises LogError, with the likely unit, if it is implausible."""
+    """Return the median interval of the rows, s.
+
+    Raises LogError if it is outside 10 µs to 100 ms; the error names the unit of times that
+    would fit.
+    """
     period_s = float(np.median(np.diff(time_s)))
     if SHORTEST_PERIOD_S <= period_s <= LONGEST_PERIOD_S:
         return period_s
@@ -213,7 +237,10 @@ def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
 
 
 def _jitter(time_s: Vector, period_s: float) -> str:
-    """Describe the variation of the intervals between rows; "" if it is small."""
+    """Return a note on intervals between rows that vary by over a quarter of a period; "" if they don't.
+
+    Their 5 % and 95 % quantiles are compared.
+    """
     short_s, long_s = np.quantile(np.diff(time_s), (0.05, 0.95)).tolist()
     if long_s - short_s < _JITTER * period_s:
         return ""
@@ -224,9 +251,9 @@ def _jitter(time_s: Vector, period_s: float) -> str:
 
 
 def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
-    """Return values and notes: without any velocities, with a note, if one never changes though its joint moves.
+    """Return the values without the velocities of any joint, and a note, if a moving joint's velocity is constant.
 
-    Some drivers leave velocities empty.
+    Otherwise the values as given, and no note. Some drivers leave velocities empty.
     """
     n = described.joints
     idle = np.ptp(values[:, 2 * n :], axis=0) == 0.0
@@ -240,9 +267,9 @@ def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[V
 
 
 def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
-    """Return the values with positions unwrapped that jump by a whole turn, and a note on each such joint.
+    """Return a copy of the values with unwrapped positions, and a note on each joint that was unwrapped.
 
-    Such a jump is at +180 degrees of a joint without end stops.
+    A turning joint is unwrapped if its steps above half a turn are all whole turns, within 0.8 rad.
     """
     notes = []
     values = values.copy()
@@ -257,17 +284,23 @@ def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, lis
 
 
 def derivative_window(described: RecordingMap, period_s: float) -> int:
-    """Return the number of samples, odd, in the window of a derived velocity."""
+    """Return the number of samples, odd and at least 5, in the window over which a velocity is derived."""
     return max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
 
 
 def derive(q: Vector, period_s: float, window: int) -> Vector:
-    """Derive velocities (k, n) from positions, without delay: the slope of a cubic over a window of samples."""
+    """Derive velocities (k, n) from positions, without delay: the slope of a cubic over `window` samples.
+
+    Raises ValueError if k is below `window`.
+    """
     return np.asarray(savgol_filter(q, window, _DEGREE, deriv=1, delta=period_s, axis=0), np.float64)
 
 
 def _noise(parts: list[Vector], given: Vector) -> list[float]:
-    """Estimate the rms of each joint's white noise, at least that of the rounding of the values as recorded (k, n)."""
+    """Return the estimated rms of each joint's white noise over all parts (k, n), at least that of rounding.
+
+    given: the values as recorded (k, n), by whose steps the rounding is found.
+    """
     rounding = [_STEP_TO_SIGMA * resolution(column) for column in given.T]
     noise: list[float] = np.maximum(white_noise(*parts), rounding).tolist()
     return noise

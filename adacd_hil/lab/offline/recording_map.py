@@ -34,12 +34,12 @@ _SPELLINGS = {
 
 
 def unit_of(text: str) -> str:
-    """Return the unit that a text names, as the map spells it; "" for any other text."""
+    """Return the unit that a text names, such as "[degrees]" or "msec", as the map spells it; "" for any other text."""
     return _SPELLINGS.get(text.strip(" []()").casefold(), "")
 
 
 def time_unit_of(step: float) -> str:
-    """Return the unit in which a step between two rows is a plausible period of a recording; "" without one."""
+    """Return the first of s, ms, us, ns in which a step between two rows is 0.2 to 100 ms; "" if it is in none."""
     low_s, high_s = _USUAL_PERIOD_S
     return next((unit for unit in ("s", "ms", "us", "ns") if low_s <= step * TIME_S[unit] <= high_s), "")
 
@@ -125,9 +125,10 @@ class SamplingSection:
 
 
 def units_by_slope(units: UnitsSection, factor: float) -> list[tuple[str, str]]:
-    """Return the changes of the map's units, (key, unit), of which each makes velocities equal the positions' slope.
+    """Return the single changes of the map's units that bring velocities within 10 % of the positions' slope.
 
-    factor: velocities over slope with the present units.
+    Each is (key, unit), those of dq before those of q; empty if none does. factor: velocities over slope with the
+    present units.
     """
     found = [("dq", unit) for unit, value in _SPEED.items() if _is_near(factor * value / _SPEED[units.dq], 1.0)]
     found += [("q", unit) for unit, value in _ANGLE.items() if _is_near(factor * _ANGLE[units.q] / value, 1.0)]
@@ -140,7 +141,7 @@ def _is_near(value: float, wanted: float) -> bool:
 
 @dataclass(frozen=True)
 class RecordingMap:
-    """A map, and the arm that it names."""
+    """A map, and the arm that it names. n, the number of moving joints, is the length of each list that isn't empty."""
 
     urdf: SerialArm
     arm: ArmSection
@@ -159,34 +160,40 @@ class RecordingMap:
 
     @property
     def time_s(self) -> float:
-        """One unit of time in s."""
+        """One unit of the recorded times in s; 1 for dates."""
         return TIME_S[self.units.time]
 
     @property
     def q_rad(self) -> tuple[float, ...]:
-        """One unit of each position in rad."""
+        """Factor from each recorded position to rad: unit times scale (n,)."""
         return tuple(_ANGLE[self.units.q] * factor for factor in self._factors(self.scale.q))
 
     @property
     def dq_rad_s(self) -> tuple[float, ...]:
-        """One unit of each velocity in rad/s."""
+        """Factor from each recorded velocity to rad/s: unit times the scale of positions (n,)."""
         return tuple(_SPEED[self.units.dq] * factor for factor in self._factors(self.scale.q))
 
     @property
     def tau_J_Nm(self) -> tuple[float, ...]:
-        """One unit of each torque in Nm."""
+        """Factor from each recorded torque or current to Nm: unit times scale (n,)."""
         return tuple(_TORQUE[self.units.tau_J] * factor for factor in self._factors(self.scale.tau_J))
 
     def _factors(self, given: tuple[float, ...]) -> tuple[float, ...]:
         return given or (1.0,) * self.joints
 
     def scaled(self, key: str, factors: Vector) -> str:
-        """Return the map's line `scale.KEY` with its present values times factors (n,). key: "q" or "tau_J"."""
+        """Return the map's line `scale.KEY` with its present values times factors (n,), as text.
+
+        key: "q" or "tau_J".
+        """
         values = np.array(self._factors(getattr(self.scale, key))) * factors
         return f"`scale.{key}` = [{', '.join(f'{value:g}' for value in values)}]"
 
     def settings(self, noise_Nm: tuple[float, ...], period_s: float, velocity_noise_rad_s: float) -> OfflineSettings:
-        """Return the scheme's settings: the recording's estimates, overridden by the map's keys. Raises ConfigError."""
+        """Return the scheme's settings: those of the map, else the given estimates, else the defaults.
+
+        Raises ConfigError for a key or a value that `OfflineSettings` doesn't allow.
+        """
         shown = {"noise_Nm": list(noise_Nm), "period_s": period_s, "velocity_noise_rad_s": velocity_noise_rad_s}
         return parse(OfflineSettings, shown | self.scheme, "scheme.")
 
@@ -203,7 +210,11 @@ _SECTIONS = {
 
 
 def read_map(path: Path) -> RecordingMap:
-    """Read a map and the URDF that it names. Raises ConfigError."""
+    """Read a map and the URDF that it names.
+
+    Raises ConfigError if a file can't be read, a section, key or value is wrong, or a list's length isn't the number of
+    moving joints.
+    """
     table = read_toml(path, "map")
     unknown = [key for key in table if key not in (*_SECTIONS, "scheme")]
     if unknown:
@@ -233,7 +244,7 @@ def _read_arm(folder: Path, arm: ArmSection) -> SerialArm:
 
 
 def _check_lengths(found: RecordingMap) -> None:
-    """Raise ConfigError for a list that is given and doesn't have a value per moving joint."""
+    """Raise ConfigError for a list that isn't empty and doesn't have a value per moving joint."""
     lists: dict[str, tuple[Any, ...]] = {
         "columns.q": found.columns.q,
         "columns.tau_J": found.columns.tau_J,

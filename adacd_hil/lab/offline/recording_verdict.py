@@ -62,7 +62,10 @@ _MOSTLY: Final = 0.8
 
 
 class JointShare(NamedTuple):
-    """Result of the test for a joint. share: nan without torque."""
+    """Result of the test for a joint. share: explained part of its torque, nan without torque.
+
+    margin: smallest ratio of threshold to residual.
+    """
 
     name: str
     share: float
@@ -73,7 +76,10 @@ class JointShare(NamedTuple):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the torque is explained. reasons: why not, remarks: further facts, a sentence each."""
+    """Whether the torque of the test is explained. headline: the result in one line. joints: results by joint.
+
+    reasons: why it isn't explained, remarks: further facts, a sentence each.
+    """
 
     is_explained: bool
     headline: str
@@ -88,9 +94,10 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fit with its recordings and its test, to be judged. before: the estimate that the fit began with.
+    """A fit with its recordings and its test, to be judged. described: the map.
 
-    estimate, deviation: parameters (p,) with P, and their standard deviations.
+    before: the estimate at the fit's begin. estimate, deviation: parameters (p,) with P, and their standard deviations
+    (p,).
     """
 
     described: RecordingMap
@@ -110,7 +117,10 @@ class Fitted:
 
 
 def judge_fit(fit: Fitted) -> Verdict:
-    """Return the verdict on a fit: whether the model explains the torque of the test, reasons if not, next step."""
+    """Return the verdict on a fit: whether the model explains the torque of the test, reasons if not, next step.
+
+    It isn't explained if a joint isn't, or a finding on columns, length, units or inertia is against it.
+    """
     joints = _shares(fit)
     columns = find_faults(fit.described, fit.fitted, fit.tested)
     plain = [found for found in columns if found.is_dead] or list(_of_length(fit))
@@ -131,10 +141,10 @@ def judge_fit(fit: Fitted) -> Verdict:
 
 
 def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[RecordingFinding]) -> list[RecordingFinding]:
-    """Return findings, first the likeliest cause of an unexplained torque, or of parameters that no arm has.
+    """Return findings on columns, scale, other interpretations and fit; the first is the likeliest cause, if any.
 
     columns: defects of columns as possible causes; remarks if the torque is explained, with a margin below 1 at least
-    `WHOLE` of it.
+    99 % of it.
     """
     remarks = [found._replace(is_against=False) for found in columns]
     scale = list(_of_scale(fit, joints))
@@ -157,13 +167,13 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Recor
 
 
 def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
-    """Return, per joint, whether its filtered torque is within `_NOISE_TIMES` the sensor's filtered noise."""
+    """Return, per joint, whether its filtered torque is at most 1.5 times the filtered noise of the settings."""
     noise = offline.filtered_noise_Nm(fit.settings)
     return [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
 
 
 def _shares(fit: Fitted) -> tuple[JointShare, ...]:
-    """Return each joint's result of the test: explained share of its torque, margin, rms, explained or not."""
+    """Return each joint's result of the test, in their order: explained share, margin, rms torque, explained or not."""
     parts = [offline.filtered(fit.model, record, fit.estimate, fit.settings) for record in fit.tested.records]
     torque, residual = (np.concatenate([getattr(part, name) for part in parts]) for name in ("torque", "residual"))
     unit = np.concatenate([part.unit for part in parts])
@@ -186,7 +196,7 @@ def _shares(fit: Fitted) -> tuple[JointShare, ...]:
 
 
 def percent(share: float) -> str:
-    """Format a share as a percentage; a negative one as 0 %, nan as "-"."""
+    """Format a share 0…1 as a percentage, such as "97.3 %"; a negative one as "0.0 %", nan as "-"."""
     if math.isnan(share):
         return "-"
     digits = 1 if share < 0.9995 else 2
@@ -208,7 +218,7 @@ def _headline(fit: Fitted, joints: Sequence[JointShare], is_explained: bool) -> 
 
 
 def _of_length(fit: Fitted) -> Iterator[RecordingFinding]:
-    """Report parts that are too short."""
+    """Report the lengths of fit and test if either is below its least length."""
     if fit.fit_s < _SHORTEST_FIT_S or fit.tested.duration_s < _SHORTEST_TEST_S:
         yield RecordingFinding(
             f"too short: {fit.fit_s:.2g} s fitted and {fit.tested.duration_s:.2g} s tested, {_SHORTEST_FIT_S:g} and "
@@ -218,7 +228,7 @@ def _of_length(fit: Fitted) -> Iterator[RecordingFinding]:
 
 
 def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[RecordingFinding]:
-    """Report the likeliest mistakes of the map, if correcting one explains at least the share `least` of the torque."""
+    """Report up to three mistakes of the map, if correcting one explains at least the share `least` of the torque."""
     fitted = [record for recording in fit.fitted for record in recording.records]
     readings = find_readings(fit.described, fit.model, fit.settings, fitted, fit.tested.records)
     if not readings or 1.0 - readings[0].unexplained < least:
@@ -233,7 +243,7 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
 
 
 def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
-    """Report torques that are noise, unrelated to the motion, or mostly noise."""
+    """Report unexplained torques: noise of a passive joint, noise, unrelated to the motion, or mostly noise."""
     related, is_noise = _related_to_motion(fit), _is_noise(fit, joints)
     empty = [
         i for i, joint in enumerate(joints) if not joint.share >= NOTHING and (is_noise[i] or related[i] < NOTHING)
@@ -280,8 +290,8 @@ def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFi
 def _related_to_motion(fit: Fitted) -> Vector:
     """Return the share (n,) of each torque that simple terms of the joint's own motion explain, whatever the model.
 
-    By least squares on fit or test, evaluated on the other, the better of the two; terms: filtered position, its sine
-    and cosine, velocity, its sign, and acceleration.
+    They are fitted to one of fit and test, and evaluated on the other, and the larger share is taken; terms: filtered
+    position, its sine and cosine, velocity, its sign, and acceleration.
     """
     period_s, cutoff = fit.settings.period_s, fit.settings.fit_cutoff_rad_s
     shares = []
@@ -301,9 +311,9 @@ def _related_to_motion(fit: Fitted) -> Vector:
 
 
 def _predicted_share(fitted: Vector, tested: Vector) -> float:
-    """Return the share of the last column of `tested` that a least-squares fit explains.
+    """Return the share of `tested`'s last column that its other columns explain with coefficients fitted to `fitted`.
 
-    The fit is of the last column of `fitted` by its other columns. Column 1: constant, filtered.
+    Both (k, c), with torque as last column and the filtered constant as column 1. Negative if worse than a constant.
     """
     coefficients = np.linalg.lstsq(fitted[:, :-1], fitted[:, -1], rcond=1e-6)[0]
     unit, torque = tested[:, 1], tested[:, -1]
@@ -313,7 +323,10 @@ def _predicted_share(fitted: Vector, tested: Vector) -> float:
 
 
 def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
-    """Report a unit by which torques differ from those of the URDF's masses, and an inertia beyond any arm's."""
+    """Report a unit of torques or angles by which the torques differ from the URDF's masses, or an impossible inertia.
+
+    A large ratio that no unit explains is a remark.
+    """
     scale, sigma = _scale_of_urdf(fit)
     mass_kg = _mass_at_reach(fit)
     units, least = fit.described.units, min(joint.share for joint in joints)
@@ -341,7 +354,7 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFi
 
 
 def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
-    """Return the probable unit of torques if the one of the map is wrong by a factor of 1000; "" if it isn't.
+    """Return the likely unit of torques if the map's is wrong by a factor of 1000, such as "mNm"; else "".
 
     scale: torques over those that the URDF's masses need. mass_kg: of `_mass_at_reach`.
 
@@ -356,7 +369,7 @@ def _milli(scale: float, mass_kg: float | None, unit: str) -> str:
 
 
 def _scale_of_urdf(fit: Fitted) -> tuple[float | None, float]:
-    """Return the ratio of the torques to those that the URDF's masses need, and its standard deviation.
+    """Return the ratio of the identified parameters to those of the URDF's masses, and its standard deviation.
 
     None and 0 if the URDF has no masses.
     """
@@ -373,7 +386,7 @@ def _scale_of_urdf(fit: Fitted) -> tuple[float | None, float]:
 
 
 def _mass_at_reach(fit: Fitted) -> float | None:
-    """Return the mass, kg, that has the inertia about joint 1 if it is at the outermost joint of the stretched arm.
+    """Return the mass, kg, that has joint 1's largest inertia if it is at the outermost joint of the stretched arm.
 
     None if the arm has no reach, a joint slides, or the inertia isn't positive.
     """
@@ -386,7 +399,7 @@ def _mass_at_reach(fit: Fitted) -> float | None:
 
 
 def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
-    """Report an inertia that no masses have: kinetic energy would be negative."""
+    """Report the most negative inertia, if it is so by more than 3 deviations: no masses have it."""
     urdf, rows = fit.described.urdf, mass_rows(fit.model, fit.tested.records[0].q, 16)
     inertia = rows @ fit.estimate.theta
     sigma = np.maximum(np.linalg.norm(rows * fit.deviation, axis=-1), 1e-300)
@@ -401,7 +414,10 @@ def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
 
 
 def _of_friction(fit: Fitted) -> Iterator[RecordingFinding]:
-    """Report friction that drives a joint on, or whose viscous or Coulomb term is negative."""
+    """Report, as remarks, friction that drives a joint on, or whose viscous or Coulomb term is negative.
+
+    It must be so by more than 3 deviations.
+    """
     speed = np.abs(samples((fit.tested,), "dq"))
     theta, deviation = fit.estimate.theta, fit.deviation
     mean, square = speed.mean(axis=0), (speed**2).mean(axis=0)
@@ -425,7 +441,10 @@ def _of_friction(fit: Fitted) -> Iterator[RecordingFinding]:
 
 
 def _of_excitation(fit: Fitted) -> Iterator[RecordingFinding]:
-    """Report parameters that the motion hardly determines, given the noise of the residual."""
+    """Report, as a remark, parameters that the motion hardly determines, given the noise of the residual.
+
+    They keep more than 30 % of their initial deviation.
+    """
     before, after = (np.sqrt(np.diag(estimate.P)) for estimate in (fit.before, fit.estimate))
     noise = np.maximum(fit.certificate.threshold_Nm / fit.settings.deviations, 1e-12)
     worse = max(1.0, float(np.max(fit.certificate.residual_rms_Nm / noise)))
@@ -440,7 +459,7 @@ def _of_excitation(fit: Fitted) -> Iterator[RecordingFinding]:
 
 
 def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
-    """Report each unexplained joint with its share and residual, whatever the cause."""
+    """Report each unexplained joint with torque: its share and residual, whatever the cause."""
     for i, joint in enumerate(joints):
         if joint.is_explained or math.isnan(joint.share):
             continue
@@ -474,7 +493,10 @@ def _times_threshold(margin: float) -> str:
 
 
 def _of_residual(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
-    """Report the smallest contacts that show, if the model lacks more than noise, or noise exceeds the torque."""
+    """Report, as remarks, the smallest contacts that show, on joints with a margin below 1, or with loud noise.
+
+    Loud: the threshold exceeds the rms torque.
+    """
     certificate = fit.certificate
     contact_Nm = np.hypot(certificate.threshold_Nm, fit.settings.deviations * certificate.lack_Nm)
     over = [i for i, joint in enumerate(joints) if joint.margin < 1.0]

@@ -56,9 +56,11 @@ _ALIKE: Final = 0.9
 
 @dataclass
 class TableGuess:
-    """The guess. columns, units: by role, from the heads. reasons: of guesses.
+    """A guess of a CSV file's form, and of the role of its columns.
 
-    heads: "1", "2" without a head; units_below: of a row below the head, "" without one.
+    heads: of all columns, "1", "2", … if the file has none. units_below: units in a row below the heads, "" where there
+    is none. is_iso: the first column has dates and times. columns, units, reasons: by role, "time", "q", "dq", "tau_J"
+    or "contact": the heads of its columns, their unit if the file gives one, and why an uncertain choice was made.
     """
 
     form: CsvSection
@@ -71,12 +73,12 @@ class TableGuess:
     reasons: dict[str, str] = field(default_factory=dict)
 
     def of(self, role: str) -> Vector:
-        """Return the values of a role (k, c)."""
+        """Return the values of a role's columns (k, c). Raises KeyError if the guess has no columns of this role."""
         return self.values[:, [self.heads.index(name) for name in self.columns[role]]]
 
 
 class _Head(NamedTuple):
-    """A column's head, split into words, joint number or index, and unit."""
+    """A column's head, split up. place: of the column, from 0. words: lower case, no numbers. unit: "" without one."""
 
     place: int
     words: tuple[str, ...]
@@ -85,9 +87,10 @@ class _Head(NamedTuple):
 
 
 def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
-    """Guess form and columns of a CSV file by its heads, or without heads by its values.
+    """Guess the form of a CSV file and the role of its columns, by their heads, or by their values if it has no heads.
 
-    Raises LogError without rows of numbers.
+    joint_names: of the arm, from the base; they also tell the number of joints. A role without fitting columns is
+    missing in the guess. Raises LogError if the file can't be read, or has no rows of numbers in its first 60 lines.
     """
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
@@ -106,7 +109,7 @@ def _split(path: Path, lines: list[str], delimiter: str) -> list[list[str]]:
 
 
 def _is_full(cells: list[str], decimal: str) -> bool:
-    """Return whether a row has numbers only, except perhaps a date in the first cell."""
+    """Return whether each cell of a row is a number; the first may be a date and time instead."""
     return all(is_number(cell, decimal) for cell in cells[1:]) and (
         is_number(cells[0], decimal) or is_iso_time(cells[0])
     )
@@ -117,7 +120,10 @@ _Form = tuple[CsvSection, tuple[str, ...], tuple[str, ...], int]
 
 
 def _form(path: Path, lines: list[str]) -> _Form:
-    """Return the form whose delimiter and decimal sign give the data the most columns. Raises LogError."""
+    """Return the form whose delimiter and decimal sign give the data the most columns, and where the data begin.
+
+    The line counts from 0. Raises LogError if no four successive rows of numbers lie in the first 60 lines.
+    """
     best: _Form | None = None
     for delimiter in DELIMITERS:
         for decimal in (".", ",") if delimiter != "," else (".",):
@@ -137,13 +143,17 @@ def _trimmed(cells: list[str]) -> list[str]:
 
 
 def _begins(rows: list[list[str]], decimal: str) -> bool:
-    """Return whether rows of equally many numbers begin here, at least three a row."""
+    """Return whether these are 4 rows of equally many numbers, at least three each."""
     count = len(rows[0]) if rows else 0
     return len(rows) == _FULL_ROWS and count >= 3 and all(len(row) == count and _is_full(row, decimal) for row in rows)
 
 
 def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) -> _Form:
-    """Return the form of a file whose data begin at a row: the head is above, perhaps with a row of units between."""
+    """Return the form of a file whose data begin at row `first`, from 0.
+
+    The head is the closest row above with as many cells; a row of units may lie between. Without such a row, the heads
+    are "1", "2", ….
+    """
     count = len(rows[first])
     above = [k for k in range(first) if len(rows[k]) == count and rows[k][0].removeprefix("#").strip()]
     units: tuple[str, ...] = ("",) * count
@@ -157,7 +167,10 @@ def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) ->
 
 
 def _values(rows: list[list[str]], count: int, decimal: str) -> tuple[Vector, bool]:
-    """Return the data (k, count), and whether the first column has dates, which are read as nan."""
+    """Return the cells as numbers (k, count), nan for other cells, and whether the first cell is a date and time.
+
+    Rows with fewer than `count` cells are left out; further cells of a row, and rows after `_SEEN_ROWS`, too.
+    """
     table: list[list[float]] = []
     is_iso = False
     for cells in rows[:_SEEN_ROWS]:
@@ -175,7 +188,10 @@ def _number(cell: str, decimal: str) -> float:
 
 
 def _by_heads(guess: TableGuess, joint_names: Sequence[str]) -> None:
-    """Set columns, units and reasons of a guess by the heads of the columns."""
+    """Set columns, units and reasons of a guess by the heads; a role without fitting columns stays unset.
+
+    Positions, velocities and torques need one column per joint. Currents are the torques if there are no torques.
+    """
     heads = [_taken_apart(place, text, joint_names) for place, text in enumerate(guess.heads)]
     heads = [head._replace(unit=guess.units_below[head.place] or head.unit) for head in heads]
     groups: dict[tuple[tuple[str, ...], str], list[_Head]] = {}
@@ -211,7 +227,11 @@ def _by_heads(guess: TableGuess, joint_names: Sequence[str]) -> None:
 
 
 def _taken_apart(place: int, text: str, joint_names: Sequence[str]) -> _Head:
-    """Split a head into words, number and unit."""
+    """Split a head into lower-case words, unit and order of the joint.
+
+    place: of the column, from 0. The order is the index in `joint_names` of a joint that the head names, else the
+    head's last number, else nan.
+    """
     unit, order = "", math.nan
     if match := re.search(r"[\[(]([^\])]*[^\])\d][^\])]*)[\])]", text):
         unit = unit_of(match[1])
@@ -231,7 +251,10 @@ def _taken_apart(place: int, text: str, joint_names: Sequence[str]) -> _Head:
 
 
 def _role(words: tuple[str, ...], unit: str) -> str:
-    """Return the role of a column with these words; "" if unknown."""
+    """Return "time", "q", "dq", "tau_J", "current" or "contact", by a head's words, else by its unit.
+
+    "" if neither tells the role, or a word is of another quantity, such as an acceleration.
+    """
     if any(word in _OTHERS for word in words):
         return ""
     found = (role for role, known in _ROLES.items() if any(word in known for word in words))
@@ -244,8 +267,9 @@ def _role(words: tuple[str, ...], unit: str) -> str:
 def _by_values(guess: TableGuess, n: int) -> None:
     """Set columns and reasons of a guess by the values of the columns; n: number of joints.
 
-    The first column is the time if it grows. Positions are n columns whose slope are n later ones, the velocities; the
-    next n are torques. Without such columns, the first n are positions, the next n torques.
+    The first column is the time if it grows. If n adjacent columns are the slopes of n earlier ones, the earlier ones
+    are the positions, the later ones the velocities, and the n after them the torques. Otherwise the first n columns
+    are the positions, the next n the torques. With too few columns, no role is set.
     """
     values, heads = guess.values, guess.heads
     grows = [place for place in range(values.shape[1]) if np.all(np.diff(values[:, place]) > 0.0)]
@@ -275,7 +299,11 @@ def _take(guess: TableGuess, role: str, block: tuple[int, ...], reason: str) -> 
 
 
 def _is_slope(time: Vector, q: Vector, dq: Vector) -> bool:
-    """Return whether dq (k, n) is the slope of q (k, n) over time (k,), in any unit."""
+    """Return whether dq (k, n) is, in any unit and with any sign, the slope of q (k, n) over time (k,).
+
+    For each moving joint the two must correlate by more than 0.9. False if no joint moves, or a moving one's dq is
+    constant.
+    """
     slope = np.gradient(q, axis=0) / np.gradient(time)[:, None]
     moving = np.ptp(q, axis=0) > 0.0
     if not moving.any() or np.any(np.ptp(dq[:, moving], axis=0) == 0.0):

@@ -69,7 +69,7 @@ class Chain(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """Scratch arrays for one evaluation; the next one overwrites them."""
+    """Scratch arrays for one evaluation of an arm; each evaluation overwrites them. `new_scratch` makes them."""
 
     E: Vector  # (n, 3, 3), from the frame of the link before to the link's
     r: Vector  # (n, 3), the link's origin in the frame of the link before, m
@@ -82,23 +82,24 @@ class Scratch(NamedTuple):
 
 
 def new_scratch(chain: Chain) -> Scratch:
-    """Return scratch arrays for one evaluation of an arm."""
+    """Return scratch arrays for evaluations of an arm, one after the other; each overwrites them."""
     n = chain.axis.shape[0]
     shapes = ((n, 3, 3), (n, 3), (n, 6), (n, 6), (6,), (6,), (6,), (PER_LINK,))
     return Scratch(*(np.zeros(shape) for shape in shapes))
 
 
 def all_columns(chain: Chain) -> Indices:
-    """Return a `place` (10 n,) for regressors with all of theta_full: every parameter has its own column."""
+    """Return the `place` (10 n,) of regressors with all of theta_full: parameter i has column i."""
     return np.arange(PER_LINK * chain.axis.shape[0], dtype=np.int64)
 
 
 @compiled
 def fill(chain: Chain, place: Indices, q: Vector, dq: Vector, scratch: Scratch, Y_p: Vector, Y_h: Vector) -> None:
-    """Fill Y_p and Y_h (n, p) of tau = d/dt (Y_p theta) + Y_h theta, in the columns of the inertial parameters.
+    """Write Y_p and Y_h (n, p) of tau = d/dt (Y_p theta) + Y_h theta, in the columns of the inertial parameters.
 
-    Friction is left out. place (10 n,): the column of each parameter of theta_full, or NOT_USED. Entries that are
-    always zero are left as they are.
+    Friction is left out; gravity is in. q, dq (n,). place (10 n,): the column of each parameter of theta_full, or
+    NOT_USED. A joint has no torque of the links before it: these entries, and other columns, stay as they are, so begin
+    with zeros. Overwrites `scratch`.
     """
     v, a, u, w, row = scratch.v, scratch.a, scratch.u, scratch.w, scratch.row
     _place_links(chain, q, scratch.E, scratch.r)
@@ -123,7 +124,10 @@ def fill(chain: Chain, place: Indices, q: Vector, dq: Vector, scratch: Scratch, 
 
 @compiled
 def fill_friction(dq: Vector, first_column: int, Y: Vector) -> None:
-    """Fill the columns of F_v, one per joint from `first_column` on, and those of F_c, which follow, in Y (n, p)."""
+    """Write dq to the columns of F_v, one per joint from `first_column` on, in Y (n, p), and sgn(dq) to those of F_c.
+
+    The columns of F_c follow. Only joint i's row is written in its columns; all other cells stay as they are.
+    """
     for i in range(dq.shape[0]):
         Y[i, first_column + i] = dq[i]
         Y[i, first_column + dq.shape[0] + i] = np.sign(dq[i])
@@ -133,7 +137,10 @@ def fill_friction(dq: Vector, first_column: int, Y: Vector) -> None:
 def fill_regressor(
     chain: Chain, place: Indices, q: Vector, dq: Vector, ddq: Vector, scratch: Scratch, W: Vector
 ) -> None:
-    """Fill the columns of the inertial parameters in W (n, p) of tau = W theta, friction left out; as `fill`."""
+    """Write W (n, p) of tau = W theta, friction left out, in the columns of the inertial parameters.
+
+    q, dq, ddq (n,). place, cells that stay, scratch: as of `fill`.
+    """
     v, a, u, w, row = scratch.v, scratch.a, scratch.u, scratch.w, scratch.row
     _place_links(chain, q, scratch.E, scratch.r)
     _move_links(chain, dq, scratch.E, scratch.r, v)
@@ -153,9 +160,9 @@ def fill_regressor(
 
 @compiled
 def add_form(u: Vector, x: Vector, scale: float, row: Vector) -> None:
-    """Add `scale` times the coefficients of a link's parameters in u' I x to row (10,), in place.
+    """Add `scale` times the coefficients of a link's ten parameters in the form u' I x to row (10,), in place.
 
-    I: the link's spatial inertia. u, x (6,): motions, the angular part first.
+    I: the link's spatial inertia. u, x (6,): motions in the link's frame, the angular part first.
     """
     row[0] += scale * (u[3] * x[3] + u[4] * x[4] + u[5] * x[5])
     # first moment: u_v x x_w + x_v x u_w
@@ -173,7 +180,7 @@ def add_form(u: Vector, x: Vector, scale: float, row: Vector) -> None:
 
 @compiled
 def _put(row: Vector, place: Indices, k: int, target: Vector) -> None:
-    """Write the coefficients (10,) of link k into their columns of `target` (p,)."""
+    """Write the coefficients (10,) of link k, from 0, into their columns of `target` (p,), if they have one."""
     for j in range(row.shape[0]):
         column = place[k * row.shape[0] + j]
         if column >= 0:
@@ -182,7 +189,10 @@ def _put(row: Vector, place: Indices, k: int, target: Vector) -> None:
 
 @compiled
 def _place_links(chain: Chain, q: Vector, E: Vector, r: Vector) -> None:
-    """Fill E (n, 3, 3) and r (n, 3), the pose of each link in the link before, at the joint positions q (n,)."""
+    """Write the pose of each link in the frame of the link before, at joint positions q (n,).
+
+    E (n, 3, 3): rotation from that frame to the link's. r (n, 3): the link's origin in that frame, m.
+    """
     for i in range(q.shape[0]):
         x, y, z = chain.axis[i, 0], chain.axis[i, 1], chain.axis[i, 2]
         angle = 0.0 if chain.is_prismatic[i] != 0.0 else q[i]
@@ -199,7 +209,7 @@ def _place_links(chain: Chain, q: Vector, E: Vector, r: Vector) -> None:
 
 @compiled
 def _move_links(chain: Chain, dq: Vector, E: Vector, r: Vector, v: Vector) -> None:
-    """Fill the velocities v (n, 6) of the links."""
+    """Write the velocity of each link, angular part first, in its own frame, to v (n, 6). E, r: of `_place_links`."""
     for i in range(dq.shape[0]):
         if i == 0:
             v[0, :] = 0.0
@@ -210,7 +220,7 @@ def _move_links(chain: Chain, dq: Vector, E: Vector, r: Vector, v: Vector) -> No
 
 @compiled
 def _lift_links(chain: Chain, E: Vector, a: Vector) -> None:
-    """Fill a (n, 6) with the upward acceleration that stands for gravity, seen from each link."""
+    """Write to a (n, 6) the upward acceleration that stands for gravity, in each link's frame. E: of `_place_links`."""
     for i in range(E.shape[0]):
         for row in range(3):
             a[i, row] = 0.0
@@ -224,7 +234,10 @@ def _lift_links(chain: Chain, E: Vector, a: Vector) -> None:
 def _accelerate_links(
     chain: Chain, dq: Vector, ddq: Vector, E: Vector, r: Vector, v: Vector, x: Vector, a: Vector
 ) -> None:
-    """Fill the accelerations a (n, 6) of the links; x (6,) is scratch."""
+    """Write the acceleration of each link, gravity as an upward one, in its own frame, to a (n, 6).
+
+    E, r: of `_place_links`; v: of `_move_links`; x (6,) is scratch.
+    """
     for i in range(dq.shape[0]):
         if i == 0:
             for j in range(3):
@@ -243,7 +256,7 @@ def _accelerate_links(
 
 @compiled
 def _add_along_axis(chain: Chain, i: int, amount: float, motion: Vector) -> None:
-    """Add `amount` of the motion of joint i to `motion` (6,)."""
+    """Add `amount` of a unit motion of joint i, from 0, to `motion` (6,), in its frame; rad/s or m/s, for example."""
     first = 3 if chain.is_prismatic[i] != 0.0 else 0
     for j in range(3):
         motion[first + j] += amount * chain.axis[i, j]
@@ -251,7 +264,10 @@ def _add_along_axis(chain: Chain, i: int, amount: float, motion: Vector) -> None
 
 @compiled
 def _carry(E: Vector, r: Vector, x: Vector, y: Vector) -> None:
-    """Fill y (6,) with the motion x (6,) of the link before, seen from this link's frame; y may be x."""
+    """Write to y (6,) the motion x (6,) of the link before, as the motion of this link in its frame; y may be x.
+
+    E (3, 3), r (3,): this link's pose, of `_place_links`.
+    """
     w0, w1, w2 = x[0], x[1], x[2]
     v0, v1, v2 = x[3] + w1 * r[2] - w2 * r[1], x[4] + w2 * r[0] - w0 * r[2], x[5] + w0 * r[1] - w1 * r[0]
     for row in range(3):
@@ -261,7 +277,7 @@ def _carry(E: Vector, r: Vector, x: Vector, y: Vector) -> None:
 
 @compiled
 def _cross(v: Vector, u: Vector, y: Vector) -> None:
-    """Fill y (6,) with v x u, the rate of the motion u (6,) that moves along with v (6,); y may be u."""
+    """Write to y (6,) the product v x u of two motions (6,): the rate of u, which moves along with v; y may be u."""
     u0, u1, u2, u3, u4, u5 = u[0], u[1], u[2], u[3], u[4], u[5]
     y[0] = v[1] * u2 - v[2] * u1
     y[1] = v[2] * u0 - v[0] * u2
@@ -272,7 +288,7 @@ def _cross(v: Vector, u: Vector, y: Vector) -> None:
 
 
 def regressor(chain: Chain, q: Vector, dq: Vector, ddq: Vector) -> Vector:
-    """Return W (n, 10 n) of tau = W theta_full, friction left out."""
+    """Return W (n, 10 n) of tau = W theta_full, friction left out. q, dq, ddq (n,)."""
     place = all_columns(chain)
     W = np.zeros((q.shape[0], place.size))
     fill_regressor(chain, place, q, dq, ddq, new_scratch(chain), W)
@@ -280,7 +296,7 @@ def regressor(chain: Chain, q: Vector, dq: Vector, ddq: Vector) -> Vector:
 
 
 def point_mass(mass_kg: float, at_m: Sequence[float] | Vector) -> Vector:
-    """Return the parameters (10,) that a point mass at `at_m` (3,), in the link's frame, adds to its link."""
+    """Return the parameters (10,) that a point mass at `at_m` (3,), in the link's frame, adds to those of its link."""
     x, y, z = at_m
     inertia = (y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y)
     return mass_kg * np.array([1.0, x, y, z, *inertia])
@@ -288,7 +304,10 @@ def point_mass(mass_kg: float, at_m: Sequence[float] | Vector) -> Vector:
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """A smallest set of parameters that determines the torque of an arm: theta_base = map @ theta_full."""
+    """A smallest set of parameters that determines the torque of an arm: theta_base = map @ theta_full.
+
+    Each parameter is one of theta_full, changed by others that can't be told from it.
+    """
 
     columns: Indices  # (n_base,), the chosen columns of theta_full, ascending
     place: Indices  # (10 n,), the column of each parameter of theta_full in the base, or NOT_USED
@@ -297,7 +316,7 @@ class BaseParameters:
 
 
 def find_base(chain: Chain) -> BaseParameters:
-    """Return a smallest set of parameters that determines the torque, from the regressor at random states.
+    """Return a smallest set of parameters that determines the torque without friction, by W at random states.
 
     By QR with pivoting. A combination that shows in no W shows neither in Y_p nor in Y_h: its M, and with it C, is
     zero, and its g. The states are the same at every call. Source: Gautier, Numerical calculation of the base inertial

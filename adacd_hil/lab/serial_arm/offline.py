@@ -83,7 +83,8 @@ class OfflineSettings:
 class Record:
     """A measurement, time-first (k, n), at a fixed period.
 
-    Raises ValueError if shapes differ or a value isn't finite.
+    Copies are made only of arrays that aren't contiguous float64. Raises ValueError if shapes differ or a value isn't
+    finite.
     """
 
     q: Vector
@@ -103,7 +104,10 @@ class Record:
 
 @dataclass(frozen=True)
 class ArmModel:
-    """The columns of an arm: base parameters of the links, F_v, F_c, the torque sensors' offsets, then the rotors."""
+    """The columns of an arm's regressor: base parameters of the links, F_v, F_c and torque offset of each joint.
+
+    With has_rotors, the inertia of each rotor comes last. `model_of` makes it.
+    """
 
     chain: Chain
     base: BaseParameters
@@ -122,14 +126,17 @@ class ArmModel:
         return (*self.base.names, *per_joint)
 
     def place_of(self, kind: str) -> slice:
-        """Return where in theta one kind of parameters is: "base", "F_v", "F_c", "offset" or, with rotors, "rotor"."""
+        """Return where in theta one kind of parameters is: "base", "F_v", "F_c", "offset" or "rotor".
+
+        "rotor" is valid only with has_rotors. Raises KeyError for another kind.
+        """
         first, n = self.base.columns.size, self.joints
         starts = {"F_v": first, "F_c": first + n, "offset": first + 2 * n, "rotor": first + 3 * n}
         return slice(0, first) if kind == "base" else slice(starts[kind], starts[kind] + n)
 
 
 def model_of(arm: Chain, has_rotors: bool = False) -> ArmModel:
-    """Return the model of an arm: the parameters that its torque shows; takes about 0.1 s for seven joints.
+    """Return the model of an arm, with the parameters that its torque shows; takes about 0.1 s for seven joints.
 
     has_rotors: torques are those of geared motors, which turn their rotors too; a link-side sensor doesn't see them.
     """
@@ -138,7 +145,7 @@ def model_of(arm: Chain, has_rotors: bool = False) -> ArmModel:
 
 @dataclass(frozen=True)
 class ModelEstimate:
-    """Parameters theta (p,) and their covariance P (p, p)."""
+    """Parameters theta (p,) and their covariance P (p, p), in the order of `ArmModel.parameter_names`."""
 
     theta: Vector
     P: Vector
@@ -155,8 +162,9 @@ def prior(
 ) -> ModelEstimate:
     """Return the estimate before any motion.
 
-    theta_full (10 n,): the designer's parameters, zero if unknown. deviation_full (10 n,): their standard deviations;
-    without, any link that a human could stand beside. F_v, F_c, offset_Nm, rotor_kg_m2: standard deviations from zero.
+    theta_full (10 n,): the designer's parameters; None: zero. deviation_full (10 n,): their standard deviations; None:
+    those of any link that a human could stand beside. F_v, F_c, offset_Nm, rotor_kg_m2: standard deviations from zero,
+    in Nm s/rad, Nm, Nm, kg m².
     """
     n = model.joints
     deviation = np.tile(_UNKNOWN_LINK, n) if deviation_full is None else deviation_full
@@ -171,7 +179,7 @@ def prior(
 def with_payload(
     model: ArmModel, estimate: ModelEstimate, mass_kg: float, at_m: tuple[float, float, float]
 ) -> ModelEstimate:
-    """Return the estimate after an unknown mass was mounted at a known place: one unknown, a rank-one increase of P.
+    """Return the estimate after an unknown mass was mounted at a known place: theta stays, P grows by one unknown.
 
     mass_kg: standard deviation of the mass, from zero. at_m: in the frame of the last link.
     """
@@ -184,7 +192,7 @@ def with_payload(
 
 @dataclass(frozen=True)
 class OfflineCertificate:
-    """The frozen model on motion that was not used for the fit."""
+    """Result of the test of a frozen model on motion that was not used for the fit."""
 
     residual_rms_Nm: Vector  # (n,)
     residual_max_Nm: Vector  # (n,)
@@ -194,13 +202,16 @@ class OfflineCertificate:
 
     @property
     def margin(self) -> float:
-        """The smallest margin of all joints."""
+        """The smallest of all joints' margins, threshold over residual; below 1: false alarms."""
         return float(np.min(self.margins))
 
 
 @dataclass(frozen=True)
 class FilteredTorque:
-    """Torque and residual (k, n) behind the filter of the fit, Nm. unit (k,): its output for a constant 1 Nm."""
+    """Measured torque and residual (k, n) of a record behind the filter of the fit, Nm.
+
+    unit (k,): the filter's output for a constant 1 Nm.
+    """
 
     torque: Vector
     residual: Vector  # measured minus predicted
@@ -211,8 +222,8 @@ class FilteredTorque:
 class OfflineDetection:
     """External torque and threshold of each sample and joint (k, n), Nm, and the contacts in order.
 
-    A contact: the sample of its detection; its link, from 0; the sign (n,) of tau_ext_hat of each joint when it
-    crossed its threshold, 0 if it did not.
+    A contact: index of the sample of its detection; its link, from 0; the sign (n,) of tau_ext_hat of each joint when
+    it crossed its threshold, 0 if it did not within the isolation window.
     """
 
     tau_ext_hat: Vector
@@ -221,9 +232,10 @@ class OfflineDetection:
 
 
 def identify(model: ArmModel, record: Record, before: ModelEstimate, settings: OfflineSettings) -> ModelEstimate:
-    """Return an estimate, corrected by a record of free motion. Raises ValueError if record and model differ in joints.
+    """Return the estimate `before`, corrected by a record of free motion; `before` stays as it is.
 
-    before: the estimate to correct; it stays as it is.
+    With noise of velocities, the record is fitted twice, see the module. Raises ValueError if record or `noise_Nm` and
+    model differ in their number of joints.
     """
     theta_M = before.theta
     for has_velocity_noise in (False, True) if settings.velocity_noise_rad_s else (True,):
@@ -241,7 +253,7 @@ def parameter_deviation(
     estimate: ModelEstimate,
     settings: OfflineSettings,
 ) -> Vector:
-    """Return the standard deviation (p,) of an estimate that `identify` made of records, from `before`.
+    """Return the standard deviation (p,) of an estimate that `identify` made of all records in turn, from `before`.
 
     The largest of three: P, by noise; the disagreement between parts of the records,
 
@@ -276,13 +288,16 @@ def parameter_deviation(
 
 
 def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredTorque:
-    """Return torque and residual of a record behind the filter of the fit. Raises as `identify`."""
+    """Return measured torque and residual of a record behind the filter of the fit. Raises ValueError as `identify`."""
     trace = _trace(model, record, estimate, settings, estimate.theta)
     return FilteredTorque(trace.tau_f, -trace.tau_ext_hat, trace.unit)
 
 
 def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tuple[Vector, Vector]:
-    """Return the samples that a fit uses: regressor (m, n, p) and torque (m, n), filtered. Raises as `identify`."""
+    """Return every `fit_every`-th sample behind the filter of the fit: regressor (m, n, p) and torque (m, n).
+
+    Raises ValueError as `identify`.
+    """
     count = len(record.q) // settings.fit_every
     shape = (count, model.joints, len(model.parameter_names))
     rows = np.zeros(shape), np.zeros(shape[:2])
@@ -292,7 +307,7 @@ def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tupl
 
 
 def mass_terms(model: ArmModel, q: Vector, dq: Vector) -> Vector:
-    """Return the row (p,) whose product with theta is dq' M(q) dq, twice the kinetic energy."""
+    """Return the row (p,) whose product with theta is dq' M(q) dq, twice the kinetic energy, rotors included."""
     n, p = model.joints, len(model.parameter_names)
     Y_p, Y_h = np.zeros((n, p)), np.zeros((n, p))
     chain.fill(model.chain, model.base.place, q, dq, chain.new_scratch(model.chain), Y_p, Y_h)
@@ -301,15 +316,15 @@ def mass_terms(model: ArmModel, q: Vector, dq: Vector) -> Vector:
 
 
 def filtered_noise_Nm(settings: OfflineSettings) -> Vector:
-    """Return each torque sensor's noise behind the filter of the fit (n,), Nm."""
+    """Return the rms noise of each torque sensor (n,), Nm, behind the filter of the fit."""
     gains = _noise_gains(settings.fit_cutoff_rad_s, settings, is_smoothed=True)
     return gains.torque * np.array(settings.noise_Nm)
 
 
 def certify(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> OfflineCertificate:
-    """Test a frozen estimate on a record of free motion that `identify` has not seen; return residuals and margins.
+    """Test an estimate on a record of free motion that `identify` has not seen; return residuals and margins.
 
-    Raises ValueError if record and model differ in joints.
+    Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
     """
     trace = _trace(model, record, estimate, settings)
     residual = np.abs(trace.tau_ext_hat)
@@ -329,9 +344,10 @@ def detect(
     settings: OfflineSettings,
     lack_Nm: Vector | None = None,
 ) -> OfflineDetection:
-    """Return external torque, thresholds and contacts of a record. Raises as `identify`.
+    """Return external torque, thresholds and contacts of a record, behind the filter of detection.
 
-    lack_Nm (n,): the model's lack, of `certify`; zero if not given.
+    lack_Nm (n,): the model's lack, of `certify`, which widens the thresholds; None: zero. Raises ValueError as
+    `identify`.
     """
     trace = _trace(model, record, estimate, settings)
     threshold = _threshold(trace, settings, np.zeros(model.joints) if lack_Nm is None else lack_Nm)
@@ -343,7 +359,8 @@ def find_contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[
     """Return the contacts in samples of external torque and threshold (k, n), as in `OfflineDetection`.
 
     window: samples from a detection until the link is isolated. A contact ends when every joint has stayed within
-    `ONSET_FRACTION` of its threshold for a whole window, so a push that sways around the threshold is one.
+    `ONSET_FRACTION` of its threshold for a whole window, so a push that sways around the threshold is one. NaN is over
+    the threshold.
     """
     over = ~(np.abs(tau_ext_hat) <= threshold)
     touched = np.flatnonzero(np.any(~(np.abs(tau_ext_hat) <= external_torque.ONSET_FRACTION * threshold), axis=1))
@@ -374,12 +391,12 @@ class _Trace(NamedTuple):
 
 
 def _threshold(trace: _Trace, settings: OfflineSettings, lack_Nm: Vector) -> Vector:
-    """Return the threshold of each sample and joint (k, n), Nm."""
+    """Return the threshold of each sample and joint (k, n), Nm. lack_Nm (n,): of the model."""
     return settings.deviations * np.sqrt(trace.deviation**2 + lack_Nm**2) + trace.friction
 
 
 class _Memory(NamedTuple):
-    """Memory from one sample to the next, and scratch."""
+    """Memory of filters from one sample to the next, and scratch. `_new_memory` has the shapes."""
 
     Y_p: Vector
     Y_h: Vector
@@ -405,13 +422,13 @@ class _Memory(NamedTuple):
 
 
 def _new_memory(joints: int, count: int) -> _Memory:
-    """Return the memory before the first sample."""
+    """Return the memory before the first sample, all zeros. count: number of parameters, p."""
     columns, joint, parameter = (joints, count), (joints,), (count,)
     return _Memory(*(np.zeros(shape) for shape in (*(columns,) * 8, *(joint,) * 9, *(columns,) * 2, *(parameter,) * 2)))
 
 
 class _NoiseGains(NamedTuple):
-    """The filters' gains for white noise of 1: its standard deviation, and the cost of its correlation in a fit."""
+    """The filters' gains: standard deviation of their output for white noise of 1, and the cost of its correlation."""
 
     torque: float
     velocity: float  # of M delta_dq, 1/s
@@ -419,10 +436,11 @@ class _NoiseGains(NamedTuple):
 
 
 def _noise_gains(cutoff_rad_s: float, settings: OfflineSettings, is_smoothed: bool) -> _NoiseGains:
-    """Return the gains from the filters' two states x: x_new = A x + B u, y = C x + D u.
+    """Return the gains for white noise of a torque sensor and of a velocity behind the filters of this cut-off.
 
-    Torque: y_1 = F u. Velocity: y_1 = a (u - F u). Behind both, where smoothed, a low-pass of the same cut-off. With
-    V = A V A' + B B' the variance of y is C V C' + D², its covariance over j samples C A^(j - 1) (A V C' + B D).
+    is_smoothed: behind the second low-pass, too. By the filters' two states x: x_new = A x + B u, y = C x + D u.
+    Torque: y_1 = F u. Velocity: y_1 = a (u - F u). With V = A V A' + B B' the variance of y is C V C' + D², its
+    covariance over j samples C A^(j - 1) (A V C' + B D).
     """
     hold = torque_filter.first_order_hold(cutoff_rad_s, cutoff_rad_s, settings.period_s)
     kept = hold.decay if is_smoothed else 0.0
@@ -458,8 +476,9 @@ def _trace(
 
     Returns external torque, deviation and friction of each sample. is_learning: correct theta and P of `estimate`,
     which must be contiguous, in place. theta_M (p,): of the mass matrix that carries the velocity's noise. scores (B,
-    p): gets the sums of `parameter_deviation`, `length` samples a part; at: samples that were before this record. rows:
-    gets the samples of the fit.
+    p): the sums of `parameter_deviation` are added to it, `length` samples a part; at: samples that were before this
+    record. rows: overwritten by regressor and torque of the samples that a fit uses. Raises ValueError if the numbers
+    of joints differ.
     """
     n = model.joints
     if record.q.shape[1] != n or len(settings.noise_Nm) != n:
@@ -534,11 +553,12 @@ def _run(
     length: int,
     rows: tuple[Vector, Vector],
 ) -> None:
-    """Filter a record, estimate the external torque of each sample, and correct theta and P if it learns.
+    """Filter a record, write each sample's external torque to `trace`, and correct theta and P if is_learning.
 
     smoothing: part that the second pole keeps over a period; 0 without one. noise_Nm (n,): of the filtered torque. R:
     variance of a sample of the fit in units of noise_Nm². passed_rad_s2: the velocity's noise behind the filter, still
-    to be multiplied by the mass matrix, of theta_M.
+    to be multiplied by the mass matrix, of theta_M. scores, at, length, rows: as of `_trace`; arrays of size 0 stay
+    unused, and so does an empty P.
     """
     n = q.shape[1]
     F_c = theta[friction_column + n : friction_column + 2 * n]
@@ -580,7 +600,10 @@ def _run(
 
 @compiled
 def _smooth(smoothing: float, m: _Memory) -> None:
-    """Advance torque and regressor over one period behind the second pole."""
+    """Advance torque and regressor, `tau` and `W` of the memory, by one sample behind the second pole.
+
+    smoothing 0 copies them.
+    """
     for i in range(m.W.shape[0]):
         m.tau[i] = m.tau_f[i] + smoothing * (m.tau[i] - m.tau_f[i])
         for j in range(m.W.shape[1]):
@@ -589,7 +612,7 @@ def _smooth(smoothing: float, m: _Memory) -> None:
 
 @compiled
 def _weigh(noise_Nm: Vector, R: float, passed_rad_s2: float, m: _Memory) -> None:
-    """Write torque and regressor of a sample, scaled to a variance of 1, to `tau_scaled` and `W_scaled`."""
+    """Write torque and regressor of a sample, divided by its standard deviation, to `tau_scaled` and `W_scaled`."""
     for i in range(m.W.shape[0]):
         weight = 1.0 / np.sqrt(R * noise_Nm[i] ** 2 + passed_rad_s2**2 * m.through[i])
         m.tau_scaled[i] = weight * m.tau[i]
@@ -599,7 +622,7 @@ def _weigh(noise_Nm: Vector, R: float, passed_rad_s2: float, m: _Memory) -> None
 
 @compiled
 def _add_score(theta: Vector, m: _Memory, score: Vector) -> None:
-    """Add the scaled regressor, times theta's residual of the scaled torque, to score (p,)."""
+    """Add W' r of a sample, both scaled by `_weigh`, to score (p,); r: residual with theta. Overwrites `tau_f_hat`."""
     external_torque.predict(m.W_scaled, theta, m.tau_f_hat)
     for i in range(m.W.shape[0]):
         for j in range(m.W.shape[1]):
@@ -619,7 +642,11 @@ def _fill_mass(
     Y_rest: Vector,
     through: Vector,
 ) -> None:
-    """Fill `through` (n,) with the diagonal of M M'; unit (n,), Y_unit and Y_rest (n, p) are scratch."""
+    """Write to `through` (n,) the diagonal of M M', with the mass matrix M of theta at q.
+
+    unit (n,), Y_unit and Y_rest (n, p) are scratch, overwritten; other columns of Y_unit than inertial ones must be
+    zero.
+    """
     through[:] = 0.0
     for j in range(q.shape[0]):
         unit[:] = 0.0
@@ -635,7 +662,10 @@ def _fill_mass(
 
 @compiled
 def _fill_rotors(dq: Vector, rotor_column: int, Y_p: Vector) -> None:
-    """Fill the columns of the rotors' inertia, one per joint from `rotor_column` on, if there are any."""
+    """Write dq to the columns of the rotors' inertia in Y_p, one per joint from `rotor_column` on.
+
+    NOT_USED: write nothing.
+    """
     if rotor_column != chain.NOT_USED:
         for i in range(dq.shape[0]):
             Y_p[i, rotor_column + i] = dq[i]
@@ -643,7 +673,10 @@ def _fill_rotors(dq: Vector, rotor_column: int, Y_p: Vector) -> None:
 
 @compiled
 def fill_deviation(W_f: Vector, P: Vector, noise_Nm: Vector, WP: Vector, deviation: Vector) -> None:
-    """Fill the standard deviation (n,) of tau_f - W_f theta: sqrt(noise² + w P w'). WP (n, p) is scratch."""
+    """Write the standard deviation (n,) of tau_f - W_f theta, sqrt(noise² + w P w'), to `deviation`.
+
+    WP (n, p) is scratch.
+    """
     np.dot(W_f, P, WP)
     for i in range(W_f.shape[0]):
         variance = noise_Nm[i] * noise_Nm[i]

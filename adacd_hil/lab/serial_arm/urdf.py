@@ -35,19 +35,22 @@ class UrdfError(ValueError):
 
 
 class FramePose(NamedTuple):
-    """Pose of a frame in another."""
+    """Pose of a frame in another one: p_other = rotation @ p + translation."""
 
     rotation: Vector  # (3, 3)
     translation: Vector  # (3,), m
 
     def then(self, other: "FramePose") -> "FramePose":
-        """Return `other`, a pose in this frame, as a pose in this frame's parent."""
+        """Return the pose of a third frame in this pose's outer frame; other: its pose in this pose's own frame."""
         return FramePose(self.rotation @ other.rotation, self.translation + self.rotation @ other.translation)
 
 
 @dataclass(frozen=True)
 class SerialArm:
-    """An arm as described by its URDF; n moving joints, from the base outward."""
+    """An arm as described by its URDF; n moving joints, from the base outward.
+
+    Limits are inf where the URDF has none or 0.
+    """
 
     name: str
     chain: Chain
@@ -66,7 +69,11 @@ class SerialArm:
 
     @property
     def theta_full(self) -> Vector:
-        """Parameters (10 n,) of the links, with all that is fixed to them. Raises UrdfError."""
+        """Parameters (10 n,) of the moving links, with all links that are fixed to them.
+
+        They are zero for a link without <inertial>. Raises UrdfError for an <inertial> without mass or inertia, with a
+        negative mass, or an impossible inertia.
+        """
         theta = np.zeros((len(self.joint_names), PER_LINK))
         for name, (carrier, pose) in self.places.items():
             if carrier != BASE and name in self.links:
@@ -76,7 +83,11 @@ class SerialArm:
 
 @dataclass(frozen=True)
 class _Joint:
-    """One joint as the URDF has it; of a fixed or locked one only its place counts."""
+    """One joint as the URDF has it. kind: one of `MOVING`, or "fixed", also for a locked one.
+
+    origin: the joint's frame in the parent link's. axis (3,): unit vector in the joint's frame. A fixed joint has
+    placeholders for axis, limits and friction.
+    """
 
     name: str
     kind: str
@@ -99,7 +110,9 @@ def read_urdf(
 ) -> SerialArm:
     """Read a serial arm from the text of a URDF.
 
-    gravity_m_s2: in the frame of the root link. Raises UrdfError.
+    gravity_m_s2: in the frame of the root link. locked: names of joints that count as fixed at their zero, with those
+    that mimic them. Raises UrdfError if the text is no URDF, a value is missing or impossible, no joint moves, or the
+    moving joints are no single chain.
     """
     try:
         robot = ElementTree.fromstring(text)
@@ -117,7 +130,7 @@ def read_urdf(
 
 
 def _held(joints: dict[str, Element], locked: Collection[str]) -> set[str]:
-    """Return the names of the locked joints, and of those that mimic them."""
+    """Return the names of the locked joints, and of those that mimic them, directly or through others."""
     held = set(locked)
     leaders = {name: mimic.get("joint") for name, joint in joints.items() if (mimic := joint.find("mimic")) is not None}
     while following := {name for name, leader in leaders.items() if leader in held} - held:
@@ -128,7 +141,10 @@ def _held(joints: dict[str, Element], locked: Collection[str]) -> set[str]:
 def _assemble(
     name: str, links: dict[str, Element], joints: list[_Joint], gravity_m_s2: tuple[float, float, float]
 ) -> SerialArm:
-    """Walk from the root outward and merge the links that are fixed to each other; return the arm."""
+    """Return the arm: walk from the root outward, and merge the links that are fixed to each other.
+
+    Raises UrdfError if there isn't one root, the joints branch or are a loop, or none moves.
+    """
     children: dict[str, list[_Joint]] = {link: [] for link in (*links, *(joint.parent for joint in joints))}
     carried: set[str] = set()
     for joint in joints:
@@ -198,9 +214,10 @@ def _merge(
     children: dict[str, list[_Joint]],
     places: dict[str, tuple[int, FramePose]],
 ) -> list[_Joint]:
-    """Add `link` and all links fixed to it to `places`; return the joints that move on them.
+    """Add `link`, and all links on fixed joints behind it, to `places`; return the joints that move on them.
 
-    index: of the joint that carries them, or BASE.
+    index: of the joint that carries these links, or BASE. A pose in `places` is in the frame of `link`. children:
+    joints by their parent link.
     """
     outward = []
     places[link] = (index, FramePose(np.eye(3), np.zeros(3)))
@@ -217,7 +234,7 @@ def _merge(
 
 
 def _moved(parameters: Vector, pose: FramePose) -> Vector:
-    """Return the parameters (10,) of a body seen from the frame in which `pose` places the body's own."""
+    """Return the parameters (10,) of a body in another frame; pose: of the body's frame in that one."""
     mass, moment, inertia = parameters[0], parameters[1:4], _symmetric(parameters[4:])
     at, turned = pose.translation, pose.rotation @ moment
     about = pose.rotation @ inertia @ pose.rotation.T
@@ -227,7 +244,7 @@ def _moved(parameters: Vector, pose: FramePose) -> Vector:
 
 
 def _symmetric(six: Vector) -> Vector:
-    """Return the matrix (3, 3) of (xx, xy, yy, xz, yz, zz)."""
+    """Return the symmetric matrix (3, 3) of its elements (xx, xy, yy, xz, yz, zz)."""
     xx, xy, yy, xz, yz, zz = six
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
@@ -238,7 +255,10 @@ def _six(matrix: Vector) -> Vector:
 
 
 def _read_inertial(link: Element, name: str) -> Vector:
-    """Return the parameters (10,) of a link in its own frame; zeros for a link without <inertial>."""
+    """Return the parameters (10,) of a link in its own frame; zeros for a link without <inertial>.
+
+    Raises UrdfError if mass or inertia are missing, no number or impossible.
+    """
     where = f'link "{name}"'
     inertial = _only(link, "inertial", where)
     if inertial is None:
@@ -257,7 +277,11 @@ def _read_inertial(link: Element, name: str) -> Vector:
 
 
 def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bool) -> _Joint:
-    """Read one joint; for a fixed or locked one only its place."""
+    """Read one joint; of a fixed or locked one only its place. links: names of all links.
+
+    Raises UrdfError for an unknown type or child link, a mimic that isn't locked, or a value that is no number or
+    impossible.
+    """
     where = f'joint "{name}"'
     kind = "fixed" if is_locked else joint.get("type", "")
     if kind != "fixed" and kind not in MOVING:
@@ -302,7 +326,10 @@ def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bo
 
 
 def _read_origin(element: Element, where: str) -> FramePose:
-    """Read <origin>; return the identity if it is missing."""
+    """Return <origin> as a pose, the identity if it is missing.
+
+    Raises UrdfError; where: the element's name in errors.
+    """
     origin = _only(element, "origin", where)
     if origin is None:
         return FramePose(np.eye(3), np.zeros(3))
@@ -319,7 +346,10 @@ def _read_origin(element: Element, where: str) -> FramePose:
 
 
 def _named(robot: Element, tag: str) -> dict[str, Element]:
-    """Return the elements of one kind by name."""
+    """Return the elements of one kind, "link" or "joint", by name.
+
+    Raises UrdfError for one without a name, two with the same name, or no link at all.
+    """
     found: dict[str, Element] = {}
     for element in robot.findall(tag):
         name = element.get("name")
@@ -334,7 +364,7 @@ def _named(robot: Element, tag: str) -> dict[str, Element]:
 
 
 def _only(element: Element, tag: str, where: str) -> Element | None:
-    """Return the one child element of a kind, or None. Raises UrdfError for more than one."""
+    """Return the one child element of a kind, None without one. Raises UrdfError for more; where: name in errors."""
     found = element.findall(tag)
     if len(found) > 1:
         raise UrdfError(f"{where}: more than one <{tag}>")
@@ -342,7 +372,10 @@ def _only(element: Element, tag: str, where: str) -> Element | None:
 
 
 def _number(element: Element, key: str, where: str, default: float | None = None) -> float:
-    """Read one finite number; an attribute that is missing is `default`, or an error if that is None."""
+    """Return an attribute as a finite number, `default` if it is missing.
+
+    Raises UrdfError if it is no such number, above 1e18, or missing without a default. where: name in errors.
+    """
     text = element.get(key)
     if text is None:
         if default is None:
@@ -352,7 +385,10 @@ def _number(element: Element, key: str, where: str, default: float | None = None
 
 
 def _numbers(element: Element, key: str, where: str, default: float | None = None) -> Vector:
-    """Read three finite numbers; as `_number`."""
+    """Return an attribute as three finite numbers (3,); three times `default` if it is missing.
+
+    Errors as of `_number`.
+    """
     text = element.get(key)
     if text is None:
         return np.full(3, _number(element, key, where, default))
@@ -364,7 +400,7 @@ def _numbers(element: Element, key: str, where: str, default: float | None = Non
 
 
 def _parse(word: str, where: str) -> float:
-    """Return a word as a finite number within the allowed size."""
+    """Return a word as a finite number of at most 1e18. Raises UrdfError; where: name in errors."""
     try:
         value = float(word)
     except ValueError:

@@ -5,7 +5,7 @@ of the velocity: 1 - (1 + x) e^-x with x = 2 t / lag, a critically damped tracki
 the statistics, so the sum equals the recording of a push, except for the motion that a push causes.
 
 A delay is from the onset to the sample at which the detector exceeds its threshold, in ms; the bus cycle until the host
-has that sample is not included. A step that is not found within `HORIZON_S` has a delay of more than that.
+has that sample is not included. A step that is not found within 0.1 s has a delay of more than that.
 """
 
 import math
@@ -37,7 +37,10 @@ _LATE: Final = math.inf
 
 @dataclass(frozen=True)
 class DelayRow:
-    """One detector and joint: median delay of each step of `STEPS_NM`, ms, and the share found within the horizon."""
+    """One detector and joint, from 1. delay_ms: median delay of each step of `STEPS_NM`; inf if half are not found.
+
+    found: share of each step's onsets found within 0.1 s.
+    """
 
     detector: str
     joint: int
@@ -48,7 +51,10 @@ class DelayRow:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All detectors at one rate of false alarms. The first of `ranking` is the best."""
+    """All detectors at one rate of false alarms. hours: of motion. rates_per_h: those of `DelayRow.roc`.
+
+    rows: one per detector and joint.
+    """
 
     rate_per_h: float
     hours: float
@@ -59,7 +65,10 @@ class Comparison:
 
     @property
     def ranking(self) -> tuple[str, ...]:
-        """Detectors by the geometric mean of their median delays over steps and joints; not found: ten horizons."""
+        """Names of the detectors, best first, by the geometric mean of their median delays over all steps and joints.
+
+        A step that is not found counts as 1 s.
+        """
         scores: dict[str, list[float]] = {}
         for row in self.rows:
             delays = np.minimum(np.maximum(row.delay_ms, 0.1), 1e4 * HORIZON_S)
@@ -81,7 +90,10 @@ class Comparison:
         }
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-        """Return head and rows of the table for a terminal, best detector first; a dash: median step not found."""
+        """Return head and rows of a table for a terminal, best detector first.
+
+        A dash stands for the delay of a step that is found in fewer than half of the cases.
+        """
         head = ("detector", "joint", *(f"{torque:g} Nm" for torque in STEPS_NM), f"found at {STEPS_NM[0]:g} Nm")
         order = {name: place for place, name in enumerate(self.ranking)}
         rows = [
@@ -97,9 +109,9 @@ class Comparison:
 
 
 def step_shape(samples: int, onset_s: float, period_s: float) -> Vector:
-    """Return a unit step of external torque as it appears in the stream (samples,), `onset_s` after sample 0.
+    """Return a unit step of external torque as it appears in the stream z (samples,), `onset_s` after sample 0.
 
-    The stream is the mean over the interval that ends with the sample.
+    Each sample of the stream is the mean over the interval that ends with it.
     """
     t = np.arange(-1, samples) * period_s - onset_s
     x = np.maximum(2.0 * t / LOOP_LAG_S, 0.0)
@@ -109,9 +121,10 @@ def step_shape(samples: int, onset_s: float, period_s: float) -> Vector:
 
 
 def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _ONSETS) -> Comparison:
-    """Calibrate all detectors for one rate and measure their delays to steps added to the stream.
+    """Calibrate all detectors for one rate of false alarms, and measure their delays to steps added to the stream.
 
-    Raises TooLittleMotionError if no detector can be calibrated or no stretch of motion is long enough.
+    onsets: number of random instants per step; the same at every call. Raises TooLittleMotionError if no detector can
+    be calibrated or no contact-free stretch is long enough.
     """
     found, missing = calibrate_all(statistics, rate_per_h)
     period_s = statistics.motion.period_s
@@ -159,8 +172,8 @@ def _ratios(
 ) -> Vector:
     """Return each detector's largest ratio of statistic to threshold since the onset (detectors, onsets, after, n).
 
-    found: as from `calibrate_all`. starts: first sample of each stretch of `before` samples without and `after`
-    samples with a step of `torque_Nm`; phases_s: time from the sample to the onset.
+    found: as from `calibrate_all`. starts: first sample of each stretch of `before` samples without and `after` samples
+    with a step of `torque_Nm`; phases_s: time from sample `before` of the stretch to the onset.
     """
     period_s = statistics.motion.period_s
     largest = np.zeros((len(found), len(starts), after, JOINTS))
@@ -177,7 +190,10 @@ def _ratios(
 
 
 def _delays_ms(ratios: Vector, phases_s: Vector, period_s: float) -> Vector:
-    """Return delays (..., onsets, n), ms, from the ratios since the onset (..., onsets, after, n); inf: not found."""
+    """Return delays (..., onsets, n), ms, from the largest ratios since the onset (..., onsets, after, n).
+
+    inf where the ratio never exceeds 1.
+    """
     over = ratios > 1.0
     first = over.argmax(axis=-2) * period_s - phases_s[:, None]
     return np.where(over[..., -1, :], np.maximum(first, 0.0) * 1e3, _LATE)
@@ -187,7 +203,7 @@ _LOOKS: Final = ("alarm", "cad", "identified", "joint1", "joint2", "bar", "besid
 
 
 def draw_comparison(comparison: Comparison) -> Drawing:
-    """Draw delay against step size and the share found against the rate of false alarms, a column per joint."""
+    """Draw median delay against step size, and the share found against the rate of false alarms, a column per joint."""
     with style():
         figure = Figure(figsize=(10.0, 7.2))
         grid = figure.subplots(2, JOINTS)
@@ -228,5 +244,8 @@ def draw_comparison(comparison: Comparison) -> Drawing:
 
 
 def write_comparison(comparison: Comparison, out_dir: Path) -> tuple[Path, ...]:
-    """Write detectors.json, .png and .svg into a folder. Raises LogError if they can't be written."""
+    """Write detectors.json, .png and .svg into a folder; return their paths.
+
+    Raises LogError if they can't be written.
+    """
     return write_figures(out_dir, NAME, comparison.by_key(), [draw_comparison(comparison)])

@@ -49,7 +49,10 @@ class TooLittleMotionError(LogError):
 
 
 def clusters(peaks: Vector, level: float) -> Vector:
-    """Return the largest value of each alarm above `level` (m,), of block maxima (B,); NaN blocks don't count."""
+    """Return the largest value of each alarm (m,) in block maxima (B,) of 0.1 s each; NaN blocks don't count.
+
+    Blocks above `level` that are at most 0.5 s apart are one alarm. Empty if there are none.
+    """
     above = np.flatnonzero(np.nan_to_num(peaks, nan=-np.inf) > level)
     if above.size == 0:
         return np.zeros(0)
@@ -70,26 +73,38 @@ class Tail:
     largest: float  # value observed
 
     def rate_at(self, threshold: float) -> float:
-        """Return the alarms per hour that the tail predicts at a threshold; `self.rate_per_h` below `self.level`."""
+        """Return the alarms per hour that the tail predicts at a threshold; `self.rate_per_h` at or below `self.level`.
+
+        0 beyond the end of a tail that ends.
+        """
         return float(_rates(threshold - self.level, self.scale, self.shape, self.rate_per_h))
 
     def threshold_at(self, rate_per_h: float) -> float:
-        """Return the threshold with this rate of alarms; `level` for a rate above `self.rate_per_h`."""
+        """Return the threshold at which the tail predicts this rate; `level` for a rate above `self.rate_per_h`."""
         return self.level + float(_excesses(rate_per_h, self.scale, self.shape, self.rate_per_h))
 
 
 def _rates(excess: float, scale: Vector | float, shape: Vector | float, rate_per_h: Vector | float) -> Vector:
-    """Return the alarms per hour that tails predict at an excess over their level; 0 past the end of a tail."""
+    """Return the alarms per hour that tails predict at an excess over their level; 0 past the end of a tail.
+
+    rate_per_h: at the level. A negative excess counts as 0.
+    """
     return np.asarray(np.nan_to_num(rate_per_h / inv_boxcox(max(excess, 0.0) / scale, shape)))
 
 
 def _excesses(wanted_per_h: float, scale: Vector | float, shape: Vector | float, rate_per_h: Vector | float) -> Vector:
-    """Return the excess over their level at which tails predict the wanted rate; 0 for a rate above the level's."""
+    """Return the excess over their level at which tails predict the wanted rate; 0 if it is above `rate_per_h`.
+
+    rate_per_h: at the level.
+    """
     return np.asarray(scale * boxcox(np.maximum(rate_per_h / wanted_per_h, 1.0), shape))
 
 
 def _moments_fit(excesses: Vector) -> tuple[Vector, Vector]:
-    """Return scale and shape of tails by probability-weighted moments; excesses (..., m): sorted along last axis."""
+    """Return scale and shape of tails by probability-weighted moments, the shape within `_SHAPES`.
+
+    excesses (..., m): over the level, ascending along the last axis.
+    """
     count = excesses.shape[-1]
     weights = 1.0 - (np.arange(1, count + 1) - 0.35) / count
     first = excesses.mean(axis=-1)
@@ -101,12 +116,15 @@ def _moments_fit(excesses: Vector) -> tuple[Vector, Vector]:
 
 
 def counted_hours(peaks: Vector) -> float:
-    """Return the time of the block maxima (B,), without the NaN blocks, h."""
+    """Return the time of those block maxima (B,) that are not NaN, h."""
     return float(np.count_nonzero(~np.isnan(peaks))) * BLOCK_S / _S_PER_H
 
 
 def threshold_by_count(peaks: Vector, alarms: float) -> float:
-    """Return the lowest threshold that gives at most `alarms` alarms in block maxima (B,)."""
+    """Return the lowest threshold above which block maxima (B,) have at most `alarms` alarms, by bisection.
+
+    NaN blocks don't count.
+    """
     low, high = float(np.nanmin(peaks)), float(np.nanmax(peaks))
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
@@ -118,9 +136,9 @@ def threshold_by_count(peaks: Vector, alarms: float) -> float:
 
 
 def fit_tail(peaks: Vector) -> Tail:
-    """Return the tail fitted to block maxima (B,), NaN where not free.
+    """Return the tail fitted to block maxima (B,), NaN in blocks that aren't free of contact.
 
-    Raises TooLittleMotionError if motion or separate alarms are too few.
+    Raises TooLittleMotionError for less than 50 s, values that are all equal, or too few separate alarms.
     """
     hours = counted_hours(peaks)
     least, most = FITTED_CLUSTERS
@@ -145,7 +163,7 @@ def fit_tail(peaks: Vector) -> Tail:
 
 @dataclass(frozen=True)
 class TailCalibration:
-    """A threshold for a wanted rate of alarms, with its confidence bounds and the tail that it comes from."""
+    """A threshold for a wanted rate of alarms, with its upper 95 % bounds, and the tail that it comes from."""
 
     threshold: float
     bound: float  # upper confidence bound of the threshold
@@ -156,9 +174,9 @@ class TailCalibration:
 
 
 def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
-    """Return the threshold for a rate of false alarms, with one-sided confidence bounds, from block maxima (B,).
+    """Return the threshold for a rate of false alarms, with upper 95 % bounds, from block maxima (B,), NaN if not free.
 
-    Raises TooLittleMotionError.
+    A rate above the tail's is counted, one below is predicted by the tail. Raises TooLittleMotionError as `fit_tail`.
     """
     tail = fit_tail(peaks)
     if rate_per_h >= tail.rate_per_h:
@@ -180,16 +198,18 @@ def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
 
 
 def largest_ratio(peaks: Vector, thresholds: Vector) -> Vector:
-    """Divide block maxima (B, channels, n) by thresholds (channels, n); return the largest of each block (B,)."""
+    """Return the largest ratio of each block (B,) of block maxima (B, channels, n) to thresholds (channels, n).
+
+    NaN if one of the block's values is.
+    """
     return np.asarray((peaks / thresholds).max(axis=(1, 2)))
 
 
 def calibrate_detector(peaks: Vector, rate_per_h: float) -> tuple[Vector, TailCalibration]:
     """Return a detector's thresholds (channels, n) for a rate of alarms on any channel and joint, and the calibration.
 
-    peaks (B, channels, n): block maxima.
-    The calibration is of all of them together: of the largest ratio of statistic to threshold; its `threshold` is 1.
-    Raises TooLittleMotionError.
+    peaks (B, channels, n): block maxima, NaN where not free. The calibration is of all channels and joints together, of
+    the largest ratio of statistic to threshold; its `threshold` is about 1. Raises TooLittleMotionError as `fit_tail`.
     """
     share = rate_per_h / (peaks.shape[1] * peaks.shape[2])
     thresholds = np.array(
@@ -201,9 +221,10 @@ def calibrate_detector(peaks: Vector, rate_per_h: float) -> tuple[Vector, TailCa
 
 
 def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[float, float]:
-    """Return the gains of a low-pass filter of the stream for white noise: of the torque, Nm per Nm, and the momentum.
+    """Return a low-pass filter's gains for white noise: of the torque, Nm per Nm, and of the momentum.
 
-    The second is in Nm per kg m² rad/s. The stream takes the mean of two torques minus lag times their slope.
+    The second is in Nm per kg m² rad/s. poles_rad_s: of the filter of the stream, () for none. The stream takes the
+    mean of two torques minus lag times their slope.
     """
     impulse = np.zeros(int(12.0 / min(poles_rad_s, default=math.inf) / period_s) + 3)  # until it has decayed
     impulse[0] = 1.0
@@ -214,7 +235,10 @@ def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[
 
 
 def peak_factor(rate_per_h: float, bandwidth_rad_s: float) -> float:
-    """Return the number of standard deviations that Gaussian noise exceeds `rate_per_h` times an hour (Rice)."""
+    """Return the number of standard deviations that Gaussian noise exceeds `rate_per_h` times an hour (Rice).
+
+    At least sqrt(2). bandwidth_rad_s: of the noise.
+    """
     crossings_per_h = 2.0 * bandwidth_rad_s / (2.0 * math.pi) * _S_PER_H
     return math.sqrt(2.0 * math.log(max(crossings_per_h / rate_per_h, math.e)))
 
@@ -242,9 +266,10 @@ def find_limits(
     lag_s: float,
     rate_per_h: float,
 ) -> tuple[dict[str, float], float]:
-    """Return the threshold of a joint's low-pass channel by cause, each alone, and with an exact model, Nm.
+    """Return the threshold of a joint's low-pass channel by cause, each alone, and that with an exact model, Nm.
 
-    From contact-free motion (N,). With exact model, lag and friction, only noise and resolution need a threshold.
+    From contact-free motion: z, tau_J, held_Nm (N,). With exact model, lag and friction, only noise and resolution need
+    a threshold.
 
     Random causes count with the height that Gaussian noise exceeds at the wanted rate. The rest of the stream while the
     joint moves is model error. An error of the lag counts with the steepest torque, one of the friction as it is;
@@ -272,5 +297,5 @@ def find_limits(
 
 
 def mean_square(x: Vector) -> float:
-    """Return the mean square of a series (n,), 0 for an empty one."""
+    """Return the mean square of a series (n,); 0 for an empty one."""
     return float(x @ x) / max(x.size, 1)

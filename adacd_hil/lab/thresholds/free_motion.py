@@ -42,7 +42,10 @@ Watch = Callable[[Series], None]
 
 @dataclass(frozen=True)
 class Motion:
-    """A recording of n samples; `is_free` (n,): the arm was not touched and the model was frozen."""
+    """Consecutive samples of a recording. `is_free` (n,): the arm was not touched and the model was frozen.
+
+    q, dq, tau_J (n, 2).
+    """
 
     q: Vector  # q1 from the level
     dq: Vector
@@ -58,9 +61,10 @@ _COLUMNS: Final = ("q", "dq", "tau_J", "theta", "interval_s")
 
 @dataclass(frozen=True)
 class LoggedMotion:
-    """Motion in a log, or in a stretch of it, read by `pieces`. is_free (N,): samples without contact.
+    """Motion in a log, or in a stretch of it; `pieces` reads it anew at each call.
 
-    parameters: number of columns of theta. bounds_ns: the stretch; None: all of the log.
+    is_free (N,): samples without contact. parameters: number of columns of theta. bounds_ns: the stretch; None: all of
+    the log.
 
     level_rad: q1 at which link 1 is level; 0 without gravity.
     """
@@ -73,7 +77,7 @@ class LoggedMotion:
     level_rad: float = 0.0
 
     def pieces(self) -> Iterator[Motion]:
-        """Yield the samples, read from the log piece by piece, in order. Raises LogError."""
+        """Yield the samples, read from the log piece by piece, in order. Raises LogError if the log can't be read."""
         place, before = 0, None
         for scheme in schemes(self.path, self.bounds_ns):
             end = place + len(scheme)
@@ -91,7 +95,10 @@ class LoggedMotion:
 
 
 def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
-    """Yield /scheme of a log, or its part between two times, in pieces that are not empty. Raises LogError."""
+    """Yield /scheme of a log, or its part between two times, in pieces that are not empty.
+
+    Raises LogError if the log can't be read.
+    """
     stream = LogStream(path, TOPICS)
     for piece in stream:
         scheme = piece.series[SCHEME.name]
@@ -106,11 +113,10 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
 def read_motion(
     path: Path, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None, watch: Watch = lambda _: None
 ) -> LoggedMotion:
-    """Return the motion in a log, or in a stretch of it, with its contact-free samples marked.
+    """Return the motion in a log, or in a stretch of it, with its contact-free samples marked; reads the log twice.
 
-    Raises LogError if none is free of contact.
-
-    watch: called with each piece of its /scheme.
+    watch: called with each piece of its /scheme. Raises LogError if the log can't be read, has no /scheme or no
+    measured period, or no sample is free of contact.
     """
     bounds_ns = None
     where = ""
@@ -140,13 +146,16 @@ def read_motion(
 
 
 def logged_settings(path: Path) -> Settings | None:
-    """Return the settings in a log, None if it has none. Raises LogError."""
+    """Return the settings in a log, None if the log has none. Raises LogError if they can't be read."""
     text = attachment(path, CONFIG_NAME)
     return None if text is None else settings_of(path, {CONFIG_NAME: text})
 
 
 def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:
-    """Return the median of the measured periods; of a long log those at its beginning."""
+    """Return the median of the measured periods, s; of a long log the median at its beginning.
+
+    where: text for errors. Raises LogError if there is no /scheme, or no period in it.
+    """
     measured: list[Vector] = []
     rows = 0
     for scheme in schemes(path, bounds_ns):
@@ -163,7 +172,10 @@ def _period(path: Path, bounds_ns: tuple[int, int] | None, where: str) -> float:
 
 
 def _intervals(scheme: Any, cycle: NDArray[np.int64], before: int | None, period_s: float) -> Vector:
-    """Return the time since the previous sample (n,), s; 0 if that is not of the previous cycle."""
+    """Return the time since the previous sample (n,), s; 0 after a missing cycle, or if it is far from `period_s`.
+
+    before: cycle of the last sample before these; None: they are the first, which gets 0.
+    """
     interval_s: Vector = scheme["period_s"].reshape(-1).copy()
     is_near = (interval_s >= SHORTEST_SHARE * period_s) & (interval_s <= LONGEST_SHARE * period_s)
     interval_s[~is_near | (np.diff(cycle, prepend=cycle[0] - 2 if before is None else before) != 1)] = 0.0
@@ -171,13 +183,13 @@ def _intervals(scheme: Any, cycle: NDArray[np.int64], before: int | None, period
 
 
 def _spread(is_bad: Mask, samples: int) -> Mask:
-    """Return the mask of the samples with a bad one at most `samples` away."""
+    """Return the mask (n,) of the samples that are bad, or at most `samples` away from a bad one."""
     spread = maximum_filter1d(is_bad.view(np.uint8), 2 * samples + 1, mode="constant", cval=0)
     return np.asarray(spread.view(np.bool_))
 
 
 def check_together(logs: Sequence[LoggedMotion]) -> None:
-    """Raise LogError unless all logs have the same period and parameters."""
+    """Raise LogError unless all logs have the same number of parameters, and periods within 2 % of the first's."""
     first = logs[0]
     for other in logs[1:]:
         if abs(other.period_s - first.period_s) > 0.02 * first.period_s:
@@ -187,9 +199,10 @@ def check_together(logs: Sequence[LoggedMotion]) -> None:
 
 
 def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
-    """Return all motion of the logs, one after the other; of more than `MOST_SAMPLES` windows with free motion.
+    """Return all motion of the logs, one after the other; if it has over a million samples, only windows of it.
 
-    The windows are spread evenly. Raises LogError.
+    The windows have free motion and are spread evenly. Raises LogError if a log can't be read, or the logs don't go
+    together.
     """
     check_together(logs)
     chosen = _windows(logs)
@@ -208,7 +221,10 @@ def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
 
 
 def _windows(logs: Sequence[LoggedMotion]) -> list[Mask]:
-    """Return the mask (N,) of each log's samples to process: all, or windows with free motion, evenly spread."""
+    """Return the mask (N,) of each log's samples to process: all, or only windows with free motion, spread evenly.
+
+    All if they are at most a million; a window has 10,000 samples.
+    """
     if sum(len(log.is_free) for log in logs) <= MOST_SAMPLES:
         return [np.ones(len(log.is_free), np.bool_) for log in logs]
     has_free = [np.logical_or.reduceat(log.is_free, np.arange(0, len(log.is_free), WINDOW)) for log in logs]
@@ -224,9 +240,9 @@ def _windows(logs: Sequence[LoggedMotion]) -> list[Mask]:
 
 
 def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
-    """Return the samples of `rows`; one whose predecessor is not among them is marked as after a gap and as not free.
+    """Return the samples of `rows`; the first of each run of them is marked as after a gap and as not free.
 
-    was_chosen: whether the sample before the motion was taken.
+    was_chosen: whether the sample before the motion was taken, so that a run may go on.
     """
     if rows.all() and was_chosen:
         return motion
@@ -238,9 +254,10 @@ def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
 def torque_streams(
     pieces: Iterable[Motion], lag_s: float, standstill_rad_s: float
 ) -> Iterator[tuple[Motion, tuple[Vector, Vector]]]:
-    """Yield each piece of a motion with the stream on which the detectors of `lab.detectors.detectors` run.
+    """Yield each piece of a motion, and its stream for the detectors: z, and the torque that friction may hold.
 
-    The stream: z, and the torque that friction may hold, (n, 2) each, Nm.
+    Both (n, 2), Nm. The stream goes on from piece to piece. lag_s: by which dq is older than tau_J. standstill_rad_s: a
+    slower joint stands still.
     """
     last: list[Vector] | None = None  # last sample of the previous piece
     for motion in pieces:

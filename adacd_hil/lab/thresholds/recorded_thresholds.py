@@ -54,9 +54,9 @@ _CHECKED_ALARMS: Final = 20.0  # alarms in the held-out half that are enough to 
 
 
 def find_lag(motion: Motion) -> tuple[float, Vector]:
-    """Return the velocity's lag behind the torque, s, from 0 to 5 ms: of both joints together, and of each (n,).
+    """Return by how much the velocity is older than the torque, s, 0 to 5 ms: of both joints together, of each (n,).
 
-    If the torque never changes, the default lag is returned.
+    If the torque never changes, all are `VELOCITY_LAG_S`.
     """
     z, _ = detectors.make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
     moving = motion.is_free & (np.abs(motion.dq) > 0.02).all(axis=1)
@@ -80,7 +80,7 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
 
 @dataclass(frozen=True)
 class Statistics:
-    """The detectors' statistics on contact-free motion, and N samples of it with the stream that they come from."""
+    """The detectors' statistics on contact-free motion, and N samples of it, or all, with the stream of them."""
 
     settings: detectors.DetectorBankSettings
     weights: Vector  # (n, ages, L), of the likelihood channels
@@ -94,14 +94,18 @@ class Statistics:
 
     @property
     def hours(self) -> float:
-        """Contact-free time, h."""
+        """Time of the blocks that are wholly free of contact, h."""
         return counted_hours(self.peaks[:, 0, 0])
 
 
 def run_detectors(
     logs: Sequence[LoggedMotion], settings: detectors.DetectorBankSettings, progress: Progress = lambda _: None
 ) -> Statistics:
-    """Run every detector over the motion of logs and return their statistics. Raises LogError, TooLittleMotionError."""
+    """Run every detector over the motion of logs; return their statistics, and the lag and weights that they used.
+
+    Raises LogError if a log can't be read or the logs don't go together, TooLittleMotionError if motion is too short
+    for the likelihood weights.
+    """
     motion = sample_of(logs)
     lag_s, lag_of_joint_s = find_lag(motion)
     _, (z, held_Nm) = next(torque_streams([motion], lag_s, settings.standstill_rad_s))
@@ -124,9 +128,9 @@ def _peaks(
     settings: detectors.DetectorBankSettings,
     progress: Progress,
 ) -> Vector:
-    """Return the largest statistic per block, channel and joint (B, channels, n) over the logs, one after the other.
+    """Return the largest statistic per block of 0.1 s, channel and joint (B, channels, n) over all logs in turn.
 
-    NaN in blocks that are not wholly free of contact.
+    NaN in blocks that are not wholly free of contact. A block may begin in one log and end in the next.
     """
     block = round(BLOCK_S / logs[0].period_s)
     free = np.concatenate([log.is_free for log in logs])
@@ -151,10 +155,10 @@ def _peaks(
 
 @dataclass(frozen=True)
 class ChannelRow:
-    """One channel of a detector, a row of the thresholds file, per joint.
+    """One channel of a detector, a row of the thresholds file; tuples have a value per joint.
 
-    threshold: Nm, but sigmas of likelihood and Nm s of cusum. limit: largest cause of its height; achievable_Nm: with
-    an exact model; both empty where the height can't be split.
+    threshold: Nm, but sigmas of likelihood and Nm s of cusum. limit: name of the cause that needs the largest
+    threshold; achievable_Nm: threshold with an exact model; both are () for other than low-pass channels.
     """
 
     detector: str
@@ -169,7 +173,8 @@ class DetectorRow:
     """Rates of a detector with all of its thresholds together, a row of the thresholds file.
 
     rate_bound_per_h: upper 95 % bound. bound_ratio: factor on the thresholds with which the bound is the wanted rate.
-    predicted_per_h: from one half of the motion, None if it is too short; measured_per_h: counted in the other half.
+    predicted_per_h, measured_per_h: rate predicted from one half of the motion, and counted in the other; None if it is
+    too short.
     """
 
     name: str
@@ -200,9 +205,10 @@ class Thresholds:
 def calibrate_all(
     statistics: Statistics, rate_per_h: float
 ) -> tuple[dict[str, tuple[Vector, TailCalibration]], tuple[str, ...]]:
-    """Find each detector's thresholds for a rate of false alarms; also return the names of detectors that failed.
+    """Return each detector's thresholds and calibration for a rate of false alarms, and the names of those that failed.
 
-    A detector fails if its tail can't be fitted. Raises TooLittleMotionError if all fail.
+    They are by name, and as of `calibrate_detector`. A detector fails if its tail can't be fitted. Raises
+    TooLittleMotionError if all fail.
     """
     found: dict[str, tuple[Vector, TailCalibration]] = {}
     missing: list[str] = []
@@ -218,7 +224,7 @@ def calibrate_all(
 
 
 def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence[str] = ()) -> Thresholds:
-    """Return thresholds of all detectors for a rate of false alarms, with bounds, checks and causes.
+    """Return thresholds of all detectors for a rate of false alarms, with bounds, checks and causes; write no file.
 
     logs: names of the logs, stored in the result. Raises TooLittleMotionError if no detector's tail can be fitted.
     """
@@ -246,10 +252,10 @@ def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence
 
 
 def check_prediction(peaks: Vector) -> tuple[float, float] | None:
-    """Calibrate a detector on every other tenth of the motion, and count its alarms in the rest.
+    """Calibrate a detector on every other tenth of the motion, and count its alarms in the rest; return both rates.
 
-    Returns the predicted rate, such that the rest has enough alarms, and the counted one, per hour. None if half of the
-    motion is too short.
+    The first is the rate, 1/h, that it was calibrated for, such that the rest should have 20 alarms; the second
+    is the counted one. None if half of the motion is too short. peaks (B, channels, n).
     """
     tenth = -(-len(peaks) // 10)
     is_first = np.arange(len(peaks)) // tenth % 2 == 0
@@ -266,7 +272,7 @@ def check_prediction(peaks: Vector) -> tuple[float, float] | None:
 
 
 def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple[tuple[str, ...], tuple[float, ...]]]:
-    """Return, by low-pass channel, the largest cause of its threshold, and the threshold with an exact model, Nm.
+    """Return, by name of a low-pass channel, its threshold's largest cause, and its threshold with an exact model, Nm.
 
     Both per joint.
     """
@@ -319,7 +325,10 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
 
 
 def _check_one_arm(logs: Sequence[LoggedMotion]) -> None:
-    """Raise LogError if a log is of another arm than the first; a tare and a zero make no other arm."""
+    """Raise LogError if a log has other `arm` settings than the first log with settings, but for tare and zero.
+
+    A log without settings isn't checked.
+    """
     known = [(log.path, settings) for log in logs if (settings := logged_settings(log.path)) is not None]
     for path, settings in known[1:]:
         differing = changed_keys(known[0][1], settings)
@@ -333,10 +342,10 @@ def _check_one_arm(logs: Sequence[LoggedMotion]) -> None:
 def thresholds_of_logs(
     paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None
 ) -> tuple[Thresholds, Statistics]:
-    """Return all detectors' thresholds from the contact-free motion of logs, or of a stretch of each, and statistics.
+    """Return all detectors' thresholds from the contact-free motion of logs, and the statistics that they come from.
 
-    Raises LogError for a log that can't be used or is of another arm than the first, TooLittleMotionError if all
-    together are too short.
+    stretch: part of each log. rate_per_h: wanted false alarms of each detector. Raises LogError for a log that can't be
+    used or is of another arm than the first, TooLittleMotionError if all together are too short.
     """
     logs = []
     for path in paths:

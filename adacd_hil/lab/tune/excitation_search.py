@@ -50,12 +50,17 @@ _SMALLEST = 1e-15
 
 
 class NoExcitationError(ValueError):
-    """No motion was found that keeps the limits; the message is one line."""
+    """The search found no motion that keeps the limits; the message is one line."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Figures:
-    """The information from a motion (smallest eigenvalues, Nm² s; their condition), and its peaks. Pairs are joints."""
+    """Figures of a motion.
+
+    Excitation_Nm2s, inertia_Nm2s: smallest eigenvalues of the information on all parameters, Nm² s. The second is of
+    the inertia alone, in the shortest fit of a payload. condition: largest over smallest eigenvalue. The others are
+    largest |q| and so on, of joint 1 and 2.
+    """
 
     excitation_Nm2s: float
     condition: float
@@ -68,12 +73,12 @@ class Figures:
 
     @property
     def cost(self) -> float:
-        """The quantity that the search minimises."""
+        """The cost of the module's formula, which the search minimises; may be negative."""
         return _cost_of(self.excitation_Nm2s, self.condition, self.inertia_Nm2s)
 
 
 class ExcitationLimits(NamedTuple):
-    """Limits of a motion; pairs are joints. travel: largest |q|; torque: infinite without a CAD model."""
+    """Limits of a motion, each (2,). travel_rad: largest |q|; torque_Nm: infinite without a CAD model."""
 
     travel_rad: Vector
     velocity_rad_s: Vector
@@ -81,7 +86,7 @@ class ExcitationLimits(NamedTuple):
     torque_Nm: Vector
 
     def by_figure(self) -> dict[str, list[float] | None]:
-        """Return the limits by the names of `Figures`, in their units; None: no limit."""
+        """Return the limits by the names of the peaks in `Figures`, in their units, in pairs; None: no limit."""
         degrees = zip(("travel_deg", "velocity_deg_s", "acceleration_deg_s2"), self[:3], strict=True)
         torque = self.torque_Nm.tolist() if np.all(np.isfinite(self.torque_Nm)) else None
         return {name: np.degrees(limit).tolist() for name, limit in degrees} | {"torque_Nm": torque}
@@ -89,13 +94,20 @@ class ExcitationLimits(NamedTuple):
 
 @compiled
 def _fill_regressors(q: Vector, dq: Vector, ddq: Vector, level_rad: float, W: Vector) -> None:
-    """Fill W (N, 2, p) with the regressor of each sample."""
+    """Write to W (N, 2, p) the regressor of each sample; p sets its number of columns.
+
+    level_rad: q1 at which link 1 is level.
+    """
     for n in range(W.shape[0]):
         W[n] = regressor(q[n], dq[n], ddq[n], W.shape[2], level_rad)
 
 
 class Search:
-    """The search for one configuration's excitation. Raises ConfigError where its trajectory does not move a joint."""
+    """The search for one configuration's excitation.
+
+    Raises ConfigError if its trajectory does not move a joint, or its excitation has fewer than 2 harmonics, or not
+    equally many for both joints.
+    """
 
     def __init__(self, settings: Settings) -> None:
         settings = dataclasses.replace(settings, scheme="certified")
@@ -141,7 +153,10 @@ class Search:
         self._cosine, self._sine = (wave(np.outer(elapsed_s, self._rad_s)) for wave in (np.cos, np.sin))
 
     def figures(self, excitation: ExcitationSettings) -> Figures:
-        """Return the figures of a motion. excitation: of the period and number of harmonics of this search."""
+        """Return the figures of a motion at the samples of the search.
+
+        excitation: with period and number of harmonics of this search.
+        """
         motion = self.motion_of(np.array(excitation.cosine), np.array(excitation.sine))
         W = self._regressors(motion)
         smallest, largest, inertia = self._shown(W)
@@ -157,7 +172,10 @@ class Search:
         )
 
     def overshoot(self, excitation: ExcitationSettings) -> float:
-        """Return by which share of a limit a motion exceeds it, at worst; 0 or less: the motion keeps all limits."""
+        """Return by which share of a limit a motion exceeds it, at the worst joint, sample and limit.
+
+        At most 0 if the motion keeps all limits.
+        """
         motion = self.motion_of(np.array(excitation.cosine), np.array(excitation.sine))
         return max(float(used.max()) for used in self._used(motion, self._regressors(motion))) - 1.0
 
@@ -168,10 +186,11 @@ class Search:
         progress: Callable[[str], None] = lambda _: None,
         iterations: int = ITERATIONS,
     ) -> ExcitationSettings:
-        """Search for an excitation; return the best motion found, never a worse one than the present.
+        """Return the best motion found, never a worse one than the configuration's, if that keeps the limits.
 
-        goes_on: asked with the number of climbs so far whether there is to be another; the first is always made. The
-        climbs are those of `seed`, in order, however many. Raises NoExcitationError.
+        goes_on: called with the number of climbs so far, returns whether there is to be another; the first is always
+        made. progress: called with a line for each better motion. iterations: most of one climb and penalty. The climbs
+        are those of `seed`, in order, however many. Raises NoExcitationError if no motion keeps the limits.
         """
         random = np.random.default_rng(seed)
         shape = (2, JOINTS, len(self._order) - 1)
@@ -199,7 +218,10 @@ class Search:
         return best
 
     def _climb(self, start: Vector, iterations: int) -> ExcitationSettings:
-        """Return the motion at the end of a climb; exceeded limits cost more and more. start: as in `_complete`."""
+        """Return the motion at the end of a climb, in which exceeded limits cost more and more; it may exceed some.
+
+        start: as `free` of `_complete`.
+        """
         found = start
         for penalty in _PENALTIES:
             found = minimize(self._cost, found, (penalty,), "L-BFGS-B", options={"maxiter": iterations}).x
@@ -208,7 +230,10 @@ class Search:
         return ExcitationSettings(self._period_s, *rows)  # type: ignore[arg-type]  # JOINTS rows each
 
     def _complete(self, free: Vector) -> tuple[Vector, Vector]:
-        """Return cosine and sine (2, K) of a motion from rest; free: its harmonics from the second on, flat."""
+        """Return cosine and sine coefficients (2, K) of a motion from rest.
+
+        free: flat cosine and sine coefficients of the harmonics from the second on (2 * 2 * (K - 1),).
+        """
         cosine, sine = free.reshape(2, JOINTS, -1)
         order = self._order[1:]
         return (
@@ -217,7 +242,7 @@ class Search:
         )
 
     def motion_of(self, cosine: Vector, sine: Vector) -> Vector:
-        """Compute q, dq and ddq (3, N, 2) of an excitation at all samples of the search.
+        """Return q, dq and ddq (3, N, 2) of an excitation at all samples of the search, rad, rad/s, rad/s².
 
         cosine, sine (2, K): coefficients, in amplitudes of the trajectory, as in `ExcitationSettings`.
         """
@@ -232,7 +257,7 @@ class Search:
         )
 
     def _regressors(self, motion: Vector) -> Vector:
-        """Return the regressors of the dynamic parameters (N, 2, base)."""
+        """Return the regressors of the dynamic parameters (N, 2, base) along a motion (3, N, 2)."""
         W = np.empty((motion.shape[1], JOINTS, self._base))
         _fill_regressors(motion[0], motion[1], motion[2], self._level_rad, W)
         return W
@@ -243,7 +268,7 @@ class Search:
         return parts if self._theta is None else [*parts, np.abs(W @ self._theta) / self.limits.torque_Nm]
 
     def _shown(self, dynamic: Vector) -> tuple[float, float, float]:
-        """Return smallest and largest eigenvalue of the fit's information, and the smallest of the inertia's.
+        """Return smallest and largest eigenvalue of the fit's information, and the smallest of the inertia's, Nm² s.
 
         dynamic (N, 2, base): from `_regressors`.
         """
@@ -261,12 +286,15 @@ class Search:
         return float(fit[0]), float(fit[-1]), float(inertia[0])
 
     def _eigenvalues(self, W_f: Vector, scale: Vector) -> Vector:
-        """Return the eigenvalues of the information of filtered regressors, ascending. scale: D, of the columns."""
+        """Return the eigenvalues of the information of filtered regressors (N, 2, c), ascending. scale (c,): D."""
         rows = (W_f * scale).reshape(-1, len(scale))
         return np.asarray(np.linalg.eigvalsh(self._step_s * rows.T @ rows), dtype=np.float64)
 
     def _cost(self, free: Vector, penalty: float) -> float:
-        """Return the cost of a motion, smooth in its coefficients, plus `penalty` times the excess over the limits."""
+        """Return the cost of a motion, smooth in its coefficients; it grows with the excess over the limits.
+
+        That is `penalty` times the mean square of the excess, as share of the limit. free: as of `_complete`.
+        """
         motion = self.motion_of(*self._complete(free))
         W = self._regressors(motion)
         over = sum(float(np.mean(np.maximum(used - 1.0, 0.0) ** 2)) for used in self._used(motion, W))

@@ -46,7 +46,10 @@ Changes = tuple[tuple[str, str], ...]
 
 
 class Subject(NamedTuple):
-    """The subject of one task: a log, or a scenario with a seed. `stamp`: the state of a log when the plan was made."""
+    """The subject of one task: a log, or a scenario with a seed; the others are "" and 0.
+
+    `stamp`: size and date of a log when the plan was made.
+    """
 
     log: str = ""
     stamp: str = ""
@@ -55,7 +58,10 @@ class Subject(NamedTuple):
 
 
 class SweepRow(NamedTuple):
-    """One row of the sweep: a run or replay of the subject with changed settings."""
+    """One row of the sweep: a run or replay of the subject with changed settings.
+
+    key: of all that the result depends on.
+    """
 
     key: str
     changes: Changes
@@ -63,7 +69,7 @@ class SweepRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Task:
-    """Rows about one subject: a worker opens it once for all of them."""
+    """Rows about one subject, which one worker computes together. profile: of an emulated arm, "" for the default."""
 
     subject: Subject
     config: str  # name or file; empty: the log's own
@@ -73,7 +79,10 @@ class Task:
 
 @dataclass(frozen=True)
 class Plan:
-    """A whole sweep. `version`: of the code, a part of every key."""
+    """A whole sweep: each subject with each variant of the settings. `config`, `profile`: as of `Task`.
+
+    `version`: of the package and its code, a part of every key.
+    """
 
     subjects: tuple[Subject, ...]
     variants: tuple[Changes, ...]
@@ -88,11 +97,11 @@ class Plan:
 
     @property
     def varied(self) -> tuple[str, ...]:
-        """Keys of the settings that are varied."""
+        """Keys of the settings that some variant changes, each once."""
         return tuple(dict.fromkeys(key for changes in self.variants for key, _ in changes))
 
     def tasks(self, done: frozenset[str], rows_per_task: int) -> Iterator[Task]:
-        """Yield the tasks whose rows are not done, lazily, subject by subject."""
+        """Yield tasks, subject by subject, for the rows whose keys are not in `done`, at most `rows_per_task` each."""
         for subject in self.subjects:
             rows = [SweepRow(self._key(subject, changes), changes) for changes in self.variants]
             rows = [row for row in rows if row.key not in done]
@@ -100,7 +109,7 @@ class Plan:
                 yield Task(subject, self.config, self.profile, tuple(rows[start : start + rows_per_task]))
 
     def row_keys(self) -> Iterator[str]:
-        """Yield the keys of all rows, one per subject and variant."""
+        """Yield the keys of all rows, done or not, in the order of the table."""
         return (self._key(subject, changes) for subject in self.subjects for changes in self.variants)
 
     def _key(self, subject: Subject, changes: Changes) -> str:
@@ -111,9 +120,10 @@ class Plan:
 def plan_logs(
     logs: Sequence[Path], variants: Sequence[Mapping[str, str]], config: str, profile: str, version: str
 ) -> Plan:
-    """Return the plan of a sweep that replays each log with each variant of the settings.
+    """Return the plan of a sweep that replays each log, each once, with each variant of the settings.
 
-    Raises OSError if a log's size and date can't be read.
+    variants: values as TOML, by key; none: the settings as they are. config: name or file, "" for the log's own.
+    version: of the code. Raises OSError if a log's size and date can't be read.
     """
     subjects = []
     for path in logs:
@@ -130,7 +140,10 @@ def plan_scenarios(
     profile: str,
     version: str,
 ) -> Plan:
-    """Return the plan of a sweep that runs the emulated arm with each scenario, seed and variant of the settings."""
+    """Return the plan of a sweep that runs the emulated arm with each scenario, seed and variant of the settings.
+
+    The arguments are as of `plan_logs`.
+    """
     subjects = (Subject(scenario=scenario, seed=seed) for scenario in scenarios for seed in seeds)
     return Plan(tuple(dict.fromkeys(subjects)), _tuples(variants), config, profile, version)
 
@@ -149,7 +162,10 @@ Values = dict[str, Value]
 
 
 def row_labels(subject: Subject, row: SweepRow) -> Values:
-    """Return the columns that identify a row: its key, its subject, and its varied settings."""
+    """Return the columns that identify a row: its key, its subject, and its varied settings as "set.KEY".
+
+    log, or scenario and seed, are None if they don't apply.
+    """
     changes: Mapping[str, str] = dict(row.changes)
     return {
         "key": row.key,
@@ -161,12 +177,15 @@ def row_labels(subject: Subject, row: SweepRow) -> Values:
 
 
 def failed(subject: Subject, row: SweepRow, error: str) -> Values:
-    """Return the row of a task that failed, with its error in one line."""
+    """Return the row of a task that failed: its labels, status "failed", and the error in one line."""
     return row_labels(subject, row) | {"status": "failed", "error": " ".join(error.split())}
 
 
 def replay_task(task: Task) -> list[Values]:
-    """Replay a log with the settings of each row; return a row of results or of an error for each, in order."""
+    """Replay a task's log with the settings of each row; return a row of results or of an error for each, in order.
+
+    Errors of `REFUSALS` become rows; others are raised.
+    """
     subject = task.subject
     path = Path(subject.log)
     found: dict[str, Values] = {}
@@ -190,7 +209,7 @@ def replay_task(task: Task) -> list[Values]:
 
 
 def _replay_all(path: Path, variants: list[Settings]) -> list[Replay | str]:
-    """Return the replay of a log with each of the settings, or the error's text in place of one that is refused."""
+    """Return the replay of a log with each of the settings; for one that is refused, the error's text."""
     try:
         return list(replay_many(path, variants))
     except REFUSALS as refusal:
@@ -200,7 +219,7 @@ def _replay_all(path: Path, variants: list[Settings]) -> list[Replay | str]:
 
 
 def finished(subject: Subject, row: SweepRow, found: Replay) -> Values:
-    """Return the row of results of a replay."""
+    """Return the row of results of a replay, status "ok"; None for values that it lacks, as without the truth."""
     score = found.score
     delays_ms = () if score is None else score.delays_ms
     took_s = found.adaptation_s
@@ -238,7 +257,10 @@ class SweepStore:
     """The folder of a sweep: parts, with rows as they come, and the table that joins them."""
 
     def __init__(self, folder: Path) -> None:
-        """Open or create it. Raises LogError where pyarrow is missing, OSError where it can't be written."""
+        """Open the folder, or create it; parts that are there stay.
+
+        Raises LogError if pyarrow is missing, OSError if the folder can't be made.
+        """
         self.folder = folder
         self._parts = folder / _PARTS
         self._parquet = _parquet()
@@ -246,7 +268,7 @@ class SweepStore:
         self._next = 1 + max((int(path.stem) for path in self._parts.glob("[0-9]*.parquet")), default=-1)
 
     def done(self) -> frozenset[str]:
-        """Return the keys of the rows that are there and didn't fail."""
+        """Return the keys of all rows in the parts with status "ok". Raises LogError if a part can't be read."""
         keys: set[str] = set()
         for path in self._paths():
             table = self._read(path, ["key", "status"])
@@ -258,16 +280,16 @@ class SweepStore:
         return frozenset(keys)
 
     def write_part(self, rows: Iterable[Values]) -> None:
-        """Write rows as the next part of the folder. Raises LogError."""
+        """Write rows as the next part of the folder, whole or not at all. Raises LogError if it can't be written."""
         path = self._parts / f"{self._next:06d}.parquet"
         self._next += 1
         _write(self._parquet, path, _table(list(rows)))
 
     def join(self, keys: Iterable[str], about: Mapping[str, str]) -> Path:
-        """Write the table of the rows with these keys, in this order, and the plan `about`; return the table's path.
+        """Write the table of the rows with these keys, in this order, and plan.json with `about`; return its path.
 
         Of several results of a row, the last good one counts, else the last. Keys without a result are left out.
-        Raises LogError.
+        Replaces the table before; the parts stay. Raises LogError if a part can't be read, or the table not be written.
         """
         rows: dict[str, Values] = {}
         for path in self._paths():
@@ -282,7 +304,7 @@ class SweepStore:
         return path
 
     def notes(self, table: Path) -> list[str]:
-        """Return a line for each log or scenario of a joined table and each note on its replays, each once."""
+        """Return a line "SUBJECT: NOTES" for each row of a joined table whose replay has notes, each text once."""
         rows = self._read(table).to_pylist()
         noted = (f"{row['log'] or row['scenario']}: {row['notes']}" for row in rows if row.get("notes"))
         return list(dict.fromkeys(noted))
@@ -313,7 +335,7 @@ def _table(rows: list[Values]) -> Any:
 
 
 def _write(parquet: Any, path: Path, table: Any) -> None:
-    """Write a table to `path`. Raises LogError."""
+    """Write a table to `path`, whole or not at all. Raises LogError."""
     try:
         with replacing(path) as beside:
             parquet.write_table(table, beside, compression="zstd")
@@ -331,7 +353,7 @@ Work = Callable[[Task], list[Values]]
 
 
 class SweepOutcome(NamedTuple):
-    """The outcome of a sweep: rows that were computed, found done before, and failed."""
+    """The outcome of a sweep. Numbers of rows: computed now, found done before, and, of the computed ones, failed."""
 
     computed: int
     found: int
@@ -347,9 +369,10 @@ def run_sweep(
     progress: Progress,
     rows_per_task: int = ROWS_PER_TASK,
 ) -> SweepOutcome:
-    """Compute the rows of a plan that the store lacks, and write them to it every few seconds.
+    """Compute the rows of a plan that the store lacks or that failed, and write them to it every few seconds.
 
-    Raises LogError if the cluster is lost or a part can't be written.
+    work: called by the workers with each task. If an error or Ctrl-C ends it, rows computed so far are written. Raises
+    LogError if the cluster is lost, or a part can't be read or written.
     """
     clock = MonotonicClock()
     begin_ns = written_ns = clock.now_ns()
@@ -377,7 +400,10 @@ def run_sweep(
 
 
 class _Flights:
-    """Tasks on their way through the workers: iterate for the rows of each, in the order in which they come back."""
+    """Tasks on their way through the workers.
+
+    Iterate once for the rows of each, in the order in which they come back.
+    """
 
     def __init__(self, tasks: Iterator[Task], work: Work, workers: Workers, progress: Progress) -> None:
         self._tasks = tasks
@@ -410,7 +436,10 @@ class _Flights:
                     yield from self._fail(task, f"{type(error).__name__}: {error}", self._again)
 
     def _launch(self) -> bool:
-        """Submit tasks until the workers are full; return whether any is in flight."""
+        """Submit tasks until the workers have as many as they have room for; return whether any is in flight.
+
+        If tasks were in flight as a worker died, submit these first, one at a time.
+        """
         if not self._flying:
             self._is_alone = bool(self._suspects)
         room = 1 if self._is_alone or self._suspects else self._workers.room
@@ -424,14 +453,17 @@ class _Flights:
         return bool(self._flying)
 
     def _next(self) -> Task | None:
-        """Return the next task: a suspect, else one to try again, else a new one; None if none is left."""
+        """Return the next task: one that was in flight as a worker died, else one that failed, else a new one.
+
+        None if none is left.
+        """
         for waiting in (self._suspects, self._again):
             if waiting:
                 return waiting.popleft()
         return next(self._tasks, None)
 
     def _land_broken(self) -> Iterator[list[Values]]:
-        """Replace dead workers, and queue the tasks that ended with them to be tried again.
+        """Replace dead workers, and queue the tasks that ended with them to be tried again, each alone.
 
         Yields the rows of a task that has failed too often.
         """
@@ -446,7 +478,7 @@ class _Flights:
             yield from self._fail(tasks[0], "the worker process died each time", self._suspects)
 
     def _fail(self, task: Task, error: str, again: deque[Task]) -> Iterator[list[Values]]:
-        """Queue a task in `again`; after RETRIES, yield its rows with the error instead."""
+        """Count a failure of a task, and queue it in `again`; after RETRIES, yield its rows with the error instead."""
         self._failures[task] += 1
         if self._failures[task] <= RETRIES:
             again.append(task)

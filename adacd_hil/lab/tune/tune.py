@@ -71,13 +71,14 @@ def tune(
     progress: Progress,
     stretch: TimeWindow = WHOLE,
 ) -> Tuning:
-    """Find thresholds, filter and gain for a rate of false alarms from logs.
+    """Find thresholds, filter and gain for a rate of false alarms from logs; write no file.
 
-    config: name or file of the settings to start from.
+    config: name or file of the settings to start from; None: the logs' own.
 
     stretch: of each log; the replays begin with the log, and only their results in the stretch count.
 
-    Raises LogError, ConfigError, CodecError, TooLittleMotionError.
+    Raises TooLittleMotionError if the half to choose on has no free motion with the settings to start from; else as
+    `read_logs`.
     """
     progress(f"reading {number_of(len(paths), 'log')}")
     logs = read_logs(paths, config, stretch, progress)
@@ -114,9 +115,10 @@ def _choices(
     progress: Progress,
     notes: list[str],
 ) -> tuple[list[Changes], list[Choice]]:
-    """Return filters and gains with the thresholds chosen for each; drop, with a note, those without free motion.
+    """Return the filters and gains of `tried` that show free motion, and the choice of thresholds for each.
 
-    Appends to `notes`. Raises TooLittleMotionError if the unchanged settings have none.
+    Those without are dropped, with a line in `notes`. Raises TooLittleMotionError if the unchanged settings, {}, have
+    none.
     """
     chosen: list[tuple[Changes, Choice]] = []
     for changes, observed in zip(tried, observe_candidates(logs, tried, progress), strict=True):
@@ -130,9 +132,10 @@ def _choices(
 
 
 def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: Progress) -> list[TuningOutcome]:
-    """Replay all logs with each variant of the settings; return the outcome of each.
+    """Replay all logs with each variant of the settings; return the outcome of each, in their order.
 
-    Raises LogError, ConfigError, CodecError.
+    variants: changed settings, {} for the logs' own. Raises LogError, ConfigError or CodecError if a log, a variant or
+    a contract can't be used.
     """
     results: list[list[tuple[TunedLog, Replay]]] = [[] for _ in variants]
     for log in logs:
@@ -145,7 +148,10 @@ def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: 
 
 
 def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
-    """Return the outcome of all logs' replays with one variant; contacts count where the logged scheme was armed."""
+    """Return the outcome of all logs' replays with one variant; contacts count where the logged scheme was armed.
+
+    replays: each log with its replay.
+    """
     took_s = [each for _, found in replays for each in found.adaptation_s]
     judged = [(found, found.score) for _, found in replays if found.score is not None]
     armed = {(log.path, window.number) for log, _ in replays for window in log.windows or () if window.is_armed}
@@ -169,7 +175,10 @@ def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
 
 
 def problems_of(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate_per_h: float) -> tuple[str, ...]:
-    """Return the reasons why a candidate is not fit; () if it is."""
+    """Return the reasons why a candidate is not fit, a few words each; () if it is.
+
+    own: outcome of the unchanged settings.
+    """
     problems = []
     if choice.calibration is None:
         problems.append("too little motion for a tail")
@@ -187,7 +196,8 @@ def problems_of(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate
 def best_of(judged: Sequence[Candidate]) -> Candidate | None:
     """Return the fit candidate with the smallest median delay in the half to choose on; None if none is fit.
 
-    If the rate is extrapolated more than FARTHEST-fold, only the first one is considered: the logs' filter and gain.
+    judged: at least one, that of the logs' filter and gain first. If the rate is extrapolated more than FARTHEST-fold,
+    only this one is considered.
     """
     looked_at = judged[:1] if judged[0].choice.extrapolation > FARTHEST else judged
     fit = [candidate for candidate in looked_at if not candidate.problems]
@@ -195,7 +205,10 @@ def best_of(judged: Sequence[Candidate]) -> Candidate | None:
 
 
 def _delays(candidate: Candidate) -> tuple[float, ...]:
-    """Return the sort key of a candidate: median, 90th percentile and largest delay, ms; inf without a contact."""
+    """Return the sort key of a candidate: median, 90th percentile and largest delay, ms, in the half to choose on.
+
+    inf if no contact was found.
+    """
     figures = delay_figures(candidate.choice.chosen.delays_ms)
     return tuple(math.inf if each is None else each for each in figures)
 
@@ -203,9 +216,8 @@ def _delays(candidate: Candidate) -> tuple[float, ...]:
 def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
     """Return name and settings of the configuration that a suggestion extends.
 
-    config: as the user named it; None: the log's own.
-
-    Raises ConfigError when the log's own isn't one that comes with the package.
+    config: as the user named it; None: the one that `settings` of the log name, with their arm's profile. Raises
+    ConfigError if that isn't built in, or a configuration can't be read.
     """
     name = settings.name if config is None else config
     if config is None and name not in builtin_names():
@@ -214,7 +226,7 @@ def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
 
 
 def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settings) -> str:
-    """Return a suggestion as TOML that `load_settings` reads, with its origin in comments.
+    """Return a suggestion as TOML that `load_settings` reads: the changed keys, with their origin in comments.
 
     base_name, base: of the configuration that it extends, as from `base_of`.
     """
@@ -259,12 +271,12 @@ def _provenance(tuning: Tuning, best: Candidate) -> list[str]:
 
 
 def _plain(path: Path) -> str:
-    """Return a path without anything that would end a comment."""
+    """Return a path as text, with "?" in place of letters that would end a comment."""
     return "".join(letter if letter.isprintable() else "?" for letter in str(path))
 
 
 def in_words(found: Found) -> str:
-    """Return a phrase on the effect of thresholds: false alarms, their rate, and contacts found."""
+    """Return the effect of thresholds as a phrase: false alarms, their rate, and contacts found if these are known."""
     text = rate_phrase(found.alarms, found.hours, found.rate_bound_per_h)
     if found.contacts is None:
         return text
@@ -272,7 +284,7 @@ def in_words(found: Found) -> str:
 
 
 def slowest_adaptation(outcome: TuningOutcome) -> str:
-    """Return the longest adaptation of the logs or of their stretches, s, as text; else why there is none."""
+    """Return the longest adaptation, s, as text such as "12.34"; "not finished" or "not looked at" if there is none."""
     if outcome.adaptation_s:
         return f"{max(outcome.adaptation_s):.2f}"
     return "not finished" if outcome.unfinished else "not looked at"
@@ -298,7 +310,7 @@ _LEAST_RATE: Final = 1e-6
 
 @contextmanager
 def _axes(title: str) -> Iterator[tuple[Figure, Axes]]:
-    """Yield a figure and its axes, with room for a legend at the right."""
+    """Yield a figure and its axes with a title; at the block's end, add a legend at the right."""
     with style():
         figure = Figure(figsize=(10.0, 4.6))
         axes = figure.subplots()
@@ -309,7 +321,10 @@ def _axes(title: str) -> Iterator[tuple[Figure, Axes]]:
 
 
 def _curves(tuning: Tuning) -> Iterator[tuple[Choice, dict[str, Any]]]:
-    """Yield each choice and its line style: the suggestion, else the logs' own filter, then the detectors."""
+    """Yield each choice and its line's style and label: the suggestion first, then the detectors.
+
+    Without a suggestion, the logs' own filter comes first.
+    """
     scheme = tuning.best or tuning.candidates[0]
     named = [(f"scheme: {scheme.name}", scheme.choice), *((choice.name, choice) for choice in tuning.detectors)]
     for (name, choice), colour in zip(named, ("alarm", *_LOOKS), strict=False):
@@ -317,7 +332,10 @@ def _curves(tuning: Tuning) -> Iterator[tuple[Choice, dict[str, Any]]]:
 
 
 def draw_roc(tuning: Tuning) -> Drawing:
-    """Draw the share of contacts found against the upper bound of the rate that was counted; without truth, rates."""
+    """Draw the share of contacts found against the bound of the false-alarm rate that was counted.
+
+    Without the truth, draw that bound against the factor on the thresholds.
+    """
     title = "False alarms and contacts found"
     with _axes(title) as (figure, axes):
         for place, (choice, look) in enumerate(_curves(tuning)):
@@ -351,7 +369,7 @@ def draw_roc(tuning: Tuning) -> Drawing:
 
 
 def draw_delays(tuning: Tuning) -> Drawing:
-    """Draw the share of all contacts that is found within a time, at the chosen thresholds."""
+    """Draw the share of all contacts that is found within a time, at the chosen thresholds. Needs the truth."""
     title = "Delay at the chosen thresholds"
     with _axes(title) as (figure, axes):
         for choice, look in _curves(tuning):
@@ -370,7 +388,10 @@ def _all_delays(choice: Choice) -> tuple[Sequence[float], int]:
 
 
 def write_tuning(tuning: Tuning, out_dir: Path) -> tuple[Path, ...]:
-    """Write tune.json, and the figures as PNG and SVG, into a folder. Raises LogError when they can't be written."""
+    """Write tune.json, and the figures as PNG and SVG, into a folder; return their paths.
+
+    Without a contact to choose on, the figure of delays is left out. Raises LogError if they can't be written.
+    """
     drawings = [draw_roc(tuning)]
     if tuning.candidates[0].choice.chosen.contacts:
         drawings.append(draw_delays(tuning))

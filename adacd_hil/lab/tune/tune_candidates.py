@@ -5,7 +5,7 @@ residual is seen; the model is frozen while it does. The certified scheme keeps 
 threshold: it is replayed with its own thresholds, and its statistic is the largest ratio to them, which grow with
 `certified.noise_sigmas` and `certified.model_sigmas` (but for the friction that is allowed at standstill).
 
-Detectors (`scheme.detectors`) take the stream with theta_hat as it is in the log and the lag as identified from all
+Detectors (`lab.detectors`) take the stream with theta_hat as it is in the log and the lag as identified from all
 motion. Each contact is seen by detectors that were at rest `WARM_UP_S` before it.
 """
 
@@ -42,7 +42,10 @@ Places = NDArray[np.int64]
 
 
 def candidates(settings: Settings) -> list[Changes]:
-    """Return the changes of filter and gain to try, {} first: the unchanged settings. Leaves out invalid settings."""
+    """Return the changes of filter and gain to try, {} first: the settings as they are.
+
+    Values are TOML, by key. Changes that the configuration's bounds refuse are left out.
+    """
     tried: list[Changes] = []
     for filter_factor in _FILTER_FACTORS:
         for gain_factor in _GAIN_FACTORS:
@@ -60,9 +63,9 @@ def candidates(settings: Settings) -> list[Changes]:
 
 
 def _filter(settings: Settings, factor: float) -> Changes:
-    """Return the changed settings that multiply the filter's cut-offs by `factor`.
+    """Return the changed settings, as TOML by key, that multiply the filter's cut-offs by `factor`.
 
-    The paper's filter: a and b, so its gain at rest stays.
+    In the paper's filter these are a and b, so its gain at rest stays.
     """
     if settings.scheme == "certified":
         return {"certified.cutoffs_rad_s": in_toml([factor * each for each in settings.certified.cutoffs_rad_s])}
@@ -71,7 +74,7 @@ def _filter(settings: Settings, factor: float) -> Changes:
 
 
 def _gain(settings: Settings, factor: float) -> Changes:
-    """Return the changed setting that weighs a sample `factor` times as much.
+    """Return the changed setting, as TOML by key, that weighs a sample `factor` times as much.
 
     Certified scheme: `residual_Nm` / sqrt(factor). Paper's scheme: factor * `P0`.
     """
@@ -106,7 +109,10 @@ def _within(value: float, bounds: tuple[float, float]) -> float:
 
 
 def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progress: Progress) -> list[Observed]:
-    """Replay the logs with every candidate; return the statistics of each. Raises LogError, ConfigError, CodecError."""
+    """Replay the logs with every candidate; return the statistics of each, in the order of `tried`.
+
+    Raises LogError, ConfigError or CodecError if a log, a candidate's settings or a contract can't be used.
+    """
     gathered: list[list[ShownLog]] = [[] for _ in tried]
     for log in logs:
         progress(f"replaying {log.path} with {len(tried)} filters and gains")
@@ -128,17 +134,20 @@ def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progr
 
 
 def _show_to(shown: "Sequence[ShownLog]") -> Watch:
-    """Return a function that passes a replayed stretch on to the `ShownLog` at the place of its variant."""
+    """Return a watcher for `replay_many` that gives each replayed stretch to the `ShownLog` of its variant."""
     return lambda place, ticks, batch: shown[place].take_stretch(ticks, batch)
 
 
 def name_of(changes: Mapping[str, str]) -> str:
-    """Return the name of a candidate, its changed settings; "as it is" without a change."""
+    """Return the name of a candidate by its changed settings, "KEY=VALUE, …"; "as it is" without a change."""
     return ", ".join(f"{key}={value}" for key, value in changes.items() if key != "filter.b_rad_s") or "as it is"
 
 
 def _monitoring(settings: Settings) -> Settings:
-    """Return settings of the paper's scheme with which it never reacts; those of the certified scheme as they are."""
+    """Return settings of the paper's scheme with thresholds that nothing exceeds, so that it never reacts.
+
+    Those of the certified scheme are returned unchanged.
+    """
     if settings.scheme == "certified":
         return settings
     thresholds = (_NOTHING_EXCEEDS_Nm, _NOTHING_EXCEEDS_Nm)
@@ -146,7 +155,10 @@ def _monitoring(settings: Settings) -> Settings:
 
 
 class ShownLog:
-    """The statistics of one candidate on one log of N cycles, gathered stretch by stretch."""
+    """The statistics of one candidate on one log of N cycles.
+
+    Call `take_stretch` for the replay in order, then `trials`.
+    """
 
     def __init__(self, log: TunedLog, settings: Settings) -> None:
         self._log = log
@@ -160,7 +172,10 @@ class ShownLog:
         self._trials: dict[int, Trial] = {}
 
     def take_stretch(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Add a replayed stretch to the peaks and to the contacts in it; skip cycles that the log lacks."""
+        """Add a replayed stretch to the peaks and to the contacts in it. Stretches come in the order of time.
+
+        Cycles that the log lacks are skipped.
+        """
         rows = np.minimum(np.searchsorted(self._log.t_ns, ticks.t_ns), len(self._log.t_ns) - 1)
         known = np.flatnonzero(self._log.t_ns[rows] == ticks.t_ns)
         if known.size == 0:
@@ -181,7 +196,10 @@ class ShownLog:
             self._close(window)
 
     def _take_window(self, window: Window, rows: Places, statistic: Vector, is_armed: NDArray[np.bool_]) -> None:
-        """Add a stretch's cycles that lie in a contact; skip a contact at whose onset the candidate isn't armed."""
+        """Add a stretch's cycles that lie in a contact. rows, statistic, is_armed: of the stretch, one per cycle.
+
+        A contact at whose onset the candidate isn't armed is skipped.
+        """
         first, end = np.searchsorted(rows, (window.first, window.last + 1)).tolist()
         if first < len(rows) and rows[first] == window.first and is_armed[first]:
             self._parts[window.number] = []
@@ -190,7 +208,10 @@ class ShownLog:
             self._parts[window.number].append((since_s, statistic[first:end].copy()))
 
     def _close(self, window: Window) -> None:
-        """Store the statistics of a contact that has ended."""
+        """Store a contact's statistics as a trial, and take it off the open contacts.
+
+        The trial is empty if the candidate wasn't armed.
+        """
         self._open.remove(window)
         parts = self._parts.pop(window.number, None) or [(np.zeros(0), np.zeros((0, 1, self._channels)))]
         since_s, statistic = (np.concatenate(columns) for columns in zip(*parts, strict=True))
@@ -208,21 +229,30 @@ class ShownLog:
         return np.asarray(np.abs(block[:, self._slices["tau_ext_hat"]]) - allowance)[:, None, :]
 
     def peaks(self) -> Vector:
-        """Return the largest statistic per block (B, 1, channels), NaN in blocks not wholly free or without MONITOR."""
+        """Return the largest statistic per block (B, 1, channels).
+
+        NaN in blocks that aren't wholly free of contact, or in which the candidate never was in MONITOR.
+        """
         peaks = np.where(np.isfinite(self._peaks), self._peaks, np.nan)
         whole = np.logical_and.reduceat(self._log.motion.is_free, np.arange(len(peaks)) * self._log.block)
         peaks[~whole] = np.nan
         return peaks
 
     def trials(self) -> list[Trial]:
-        """Return the statistics during each contact for which the log's scheme was armed; ends unfinished ones."""
+        """Return the statistics during each contact for which the logged scheme was armed, in the order of the log.
+
+        Call it after the last stretch: it ends contacts that are still open.
+        """
         for window in list(self._open):
             self._close(window)
         return [self._trials[window.number] for window in self._windows]
 
 
 def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: None) -> list[Observed]:
-    """Run all detectors over logs; return the statistics of each. Raises LogError, TooLittleMotionError."""
+    """Run all detectors over logs; return the statistics of each, in the order of `DetectorBankSettings.detectors`.
+
+    Raises LogError if a log can't be read or the logs don't go together, TooLittleMotionError if motion is too short.
+    """
     settings = detectors.DetectorBankSettings()
     statistics = run_detectors([log.motion for log in logs], settings, progress)
     is_chosen_on = chosen_blocks(logs)
@@ -239,13 +269,16 @@ def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: N
 
 
 def chosen_blocks(logs: Sequence[TunedLog]) -> NDArray[np.bool_]:
-    """Return, per block of the logs' joined motion (B,), whether thresholds are chosen on its first cycle."""
+    """Return, per block of the logs' joined motion (B,), whether its first cycle is in the half to choose on."""
     chosen = [np.repeat(log.is_chosen_on, log.block)[: len(log.motion.is_free)] for log in logs]
     return np.concatenate(chosen)[:: logs[0].block]
 
 
 def _trials(log: TunedLog, statistics: Statistics) -> Iterator[Trial]:
-    """Yield the detectors' statistics during each contact for which the log's scheme was armed."""
+    """Yield the statistics of all channels during each contact for which the logged scheme was armed, by its end.
+
+    Raises LogError if the log can't be read.
+    """
     waiting = sorted((window for window in log.windows or () if window.is_armed), key=lambda window: window.first)
     if not waiting:
         return

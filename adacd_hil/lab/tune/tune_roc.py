@@ -54,10 +54,11 @@ _LEAST: Final = 1e-9
 
 
 class Trial(NamedTuple):
-    """A trial of a detector, one true contact: since_s (k,) its onset, statistic (k, channels, n).
+    """A detector's statistics during one true contact. since_s (k,): time since its onset.
 
-    Both are empty where the detector was not armed, which counts as missed. Samples in which no statistic is larger
-    than before may be left out: no threshold is crossed there for the first time.
+    statistic: (k, channels, n). is_chosen_on: whether it is in the half that thresholds are chosen on. Both arrays are
+    empty where the detector was not armed, which counts as missed. Samples in which no statistic is larger than before
+    may be left out: no threshold is crossed there for the first time.
     """
 
     since_s: Vector
@@ -66,7 +67,10 @@ class Trial(NamedTuple):
 
 
 def rising(trial: Trial) -> Trial:
-    """Return a trial without the samples in which no statistic is larger than in all samples before."""
+    """Return a trial without the samples in which no statistic is larger than in all samples before.
+
+    `delay_ms` is the same of both.
+    """
     if not len(trial.since_s):
         return trial
     flat = trial.statistic.reshape(len(trial.since_s), -1)
@@ -77,9 +81,11 @@ def rising(trial: Trial) -> Trial:
 
 @dataclass(frozen=True)
 class Observed:
-    """A detector's statistics: peaks (B, channels, n) per block of 0.1 s, NaN unless free; is_chosen_on (B,).
+    """A detector's statistics.
 
-    trials: the contacts for which the logged scheme was armed; None if no log records the true contacts.
+    peaks (B, channels, n): largest per block of 0.1 s, NaN in blocks that aren't free of contact. is_chosen_on (B,):
+    whether a block is in the half that thresholds are chosen on. trials: the contacts for which the logged scheme was
+    armed; None if no log records the true contacts.
     """
 
     name: str
@@ -88,12 +94,15 @@ class Observed:
     trials: tuple[Trial, ...] | None
 
     def half(self, is_chosen_on: bool) -> Vector:
-        """Return the peaks of the half that thresholds are chosen on, or of the other one, NaN elsewhere."""
+        """Return the peaks (B, channels, n) of the half that thresholds are chosen on, or of the other; else NaN."""
         return np.where((self.is_chosen_on == is_chosen_on)[:, None, None], self.peaks, np.nan)
 
 
 class Found(NamedTuple):
-    """The effect of thresholds on part of the logs. Delays of the contacts found, ms. contacts: None without truth."""
+    """The effect of thresholds on part of the logs. hours: of contact-free motion. alarms: false ones.
+
+    contacts: number of trials, None if the true contacts are unknown. delays_ms: of the contacts found.
+    """
 
     hours: float
     alarms: int
@@ -102,12 +111,12 @@ class Found(NamedTuple):
 
     @property
     def rate_bound_per_h(self) -> float:
-        """Upper 95 % bound of the rate of false alarms."""
+        """Upper 95 % bound of the rate of false alarms, by counting."""
         return rate_bound_per_h(self.alarms, self.hours)
 
     @property
     def share_bounds(self) -> tuple[float, float]:
-        """The 95 % interval of the share of contacts that is found."""
+        """The 95 % interval, low and high, of the share of contacts that is found."""
         return share_bounds(len(self.delays_ms), self.contacts or 0)
 
     def by_key(self) -> dict[str, Any]:
@@ -129,9 +138,10 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class Choice:
-    """Thresholds (channels, n) for a wanted rate, chosen on one half and checked on the other.
+    """Thresholds (channels, n) for a wanted rate, chosen on one half of the motion and checked on the other.
 
-    calibration: the tail's, None where the motion is too short for one: then they are the largest values seen.
+    chosen, checked: their effect on each half. calibration: the tail's, None where the motion is too short for one:
+    then they are the largest values seen.
     """
 
     name: str
@@ -144,14 +154,17 @@ class Choice:
 
     @property
     def extrapolation(self) -> float:
-        """How far the wanted rate is below one alarm in the time thresholds are chosen on; infinite without a tail."""
+        """One alarm in the time that thresholds are chosen on, over the wanted rate; infinite without a tail.
+
+        Up to 1 nothing is extrapolated.
+        """
         if self.calibration is None:
             return math.inf
         return 1.0 / (self.calibration.rate_per_h * self.calibration.tail.hours)
 
     @property
     def method(self) -> str:
-        """A phrase that names the source of the thresholds."""
+        """A phrase that names the source of the thresholds, such as "tail model, extrapolated 12-fold"."""
         if self.calibration is None:
             return "the largest value seen: too little motion for a tail"
         if self.extrapolation <= 1.0:
@@ -206,7 +219,7 @@ def _predicted(calibration: TailCalibration | None, factor: float) -> float | No
 
 
 def _count(peaks: Vector, trials: tuple[Trial, ...] | None, thresholds: Vector) -> Found:
-    """Return the effect of thresholds: alarms in block maxima (B, channels, n), and contacts found in trials."""
+    """Return the effect of thresholds (channels, n): alarms in block maxima (B, channels, n), and delays in trials."""
     alarms = clusters(largest_ratio(peaks, thresholds), 1.0).size
     delays = [delay_ms(trial, thresholds) for trial in trials or ()]
     return Found(
@@ -218,7 +231,10 @@ def _count(peaks: Vector, trials: tuple[Trial, ...] | None, thresholds: Vector) 
 
 
 def delay_ms(trial: Trial, thresholds: Vector) -> float | None:
-    """Return the time from a contact's onset until some statistic is over its threshold, ms; None: never."""
+    """Return the time from a contact's onset to its first sample with a statistic over its threshold, ms.
+
+    None if no sample has one.
+    """
     over = np.flatnonzero((trial.statistic > thresholds).any(axis=(1, 2)))
     return float(trial.since_s[over[0]]) * 1e3 if over.size else None
 
@@ -227,7 +243,10 @@ _TENTHS = 10
 
 
 class Window(NamedTuple):
-    """The rows [first, last] of a log in which a true contact explains an alarm, see `score.judge`."""
+    """The rows [first, last] of a log in which a true contact explains an alarm, see `score.judge`.
+
+    number: the contact's.
+    """
 
     number: int
     first: int
@@ -238,9 +257,10 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class TunedLog:
-    """A log of N cycles, or N of them. windows: of the true contacts that begin in those, None if unknown.
+    """A log of N cycles, or N of them. digest: SHA-256 of the file. settings: those to start from.
 
-    is_chosen_on (B,): of its blocks of 0.1 s.
+    t_ns (N,): times. windows: of the true contacts that begin in those, None if unknown. is_chosen_on (B,): whether a
+    block of 0.1 s is in the half that thresholds are chosen on.
     """
 
     path: Path
@@ -254,7 +274,7 @@ class TunedLog:
 
     @property
     def block(self) -> int:
-        """Cycles of a block."""
+        """Number of cycles in a block of 0.1 s."""
         return round(BLOCK_S / self.motion.period_s)
 
 
@@ -266,9 +286,9 @@ def read_logs(
 ) -> list[TunedLog]:
     """Read logs, or a stretch of each, with contact-free motion and true contacts, for tuning.
 
-    config: name or file of the settings to start from, in place of the logs' own.
-
-    Raises LogError, ConfigError, CodecError; LogError also when their settings are not the same.
+    config: name or file of the settings to start from, in place of the logs' own. Raises LogError if a log can't be
+    read, has no free motion, or has other settings than the first; ConfigError or CodecError if settings or contract
+    can't be used.
     """
     logs = [_read(path, place, len(paths), config, stretch, progress) for place, path in enumerate(paths)]
     first = logs[0]
@@ -283,13 +303,16 @@ def read_logs(
 
 
 def _tunable(settings: Settings) -> Settings:
-    """Return the default settings with a log's values of those on which the scheme's numbers depend."""
+    """Return the default settings with the sections of `settings` on which the scheme's numbers depend."""
     names = ("scheme", "filter", "estimator", "termination", "detector", "certified")
     return dataclasses.replace(Settings(), **{name: getattr(settings, name) for name in names})
 
 
 def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeWindow, progress: Progress) -> TunedLog:
-    """Read a log, the one at `place` of `count`, by which its half is chosen. The others: as of `read_logs`."""
+    """Read a log for tuning. place, count: its index among the logs and their number, by which its half is chosen.
+
+    The other arguments, and errors, are as of `read_logs`.
+    """
     own = LogSource(path).settings
     parts = _Index()
     motion = read_motion(path, stretch, progress, parts.add_scheme)
@@ -317,14 +340,14 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeW
 
 
 class _Index:
-    """Gathers the cycles of a log in growing arrays: joining pieces at the end would need twice the memory."""
+    """Gathers the cycles of a log in growing arrays; joining pieces at the end would need twice the memory."""
 
     def __init__(self) -> None:
         self.attempts = AttemptBegins()
         self._cycle, self._t_ns, self._before, self._threshold = array("q"), array("q"), array("B"), array("d")
 
     def add_scheme(self, scheme: Series) -> None:
-        """Add the next piece of /scheme."""
+        """Add the next piece of /scheme, in the order of time. Not after `joined`."""
         self.attempts.add_cycles(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
         self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
         self._t_ns.frombytes(scheme.t_ns.tobytes())
@@ -342,7 +365,10 @@ class _Index:
 
 
 def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
-    """Return the first cycle of each attempt of a log, attempts before the stretch included."""
+    """Return the first cycle of each attempt of a log, attempts before its stretch included.
+
+    parts: to which the stretch's /scheme was added. Raises LogError if the log can't be read.
+    """
     attempts = parts.attempts
     if motion.bounds_ns is not None:
         attempts = AttemptBegins()
@@ -353,14 +379,21 @@ def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
 
 
 def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterator[TrueContact]:
-    """Yield the contacts with cycles counted as the host does, from `begins`; skip attempts that the log lacks."""
+    """Yield the contacts with cycles counted as the host does; skip those of attempts that the log lacks.
+
+    begins: first cycle of each attempt.
+    """
     for contact in contacts:
         if contact.attempt < len(begins):
             yield contact.counted_from(begins[contact.attempt])
 
 
 def _windows(contacts: Sequence[TrueContact], t_ns: Times, place: int | None) -> tuple[Window, ...]:
-    """Return each contact's rows in a log, and its half: by `place` of the log, or alternating if that is None."""
+    """Return the window of each contact in a log.
+
+    place: index of the log, by which all its contacts are in one half; None: they alternate by their number. t_ns (N,):
+    times of the log's cycles.
+    """
     onsets_ns = np.array([contact.onset_ns for contact in contacts], np.int64)
     until_ns = explained_until(onsets_ns, np.array([contact.forgotten_ns for contact in contacts], np.int64))
     firsts = np.searchsorted(t_ns, onsets_ns).tolist()
@@ -386,9 +419,11 @@ LIMITS: Final = (
 
 @dataclass(frozen=True)
 class TuningOutcome:
-    """The outcome of replays of all logs with the same settings. missed, false_alarms: None without the truth.
+    """The outcome of replays of all logs with the same settings.
 
-    armed_false_alarms: of them those in MONITOR, where the hours are counted.
+    adaptation_s: of finished ones, unfinished: number of others. missed, false_alarms: None without the truth. hours:
+    in MONITOR, of logs with the truth. delays_ms: of the contacts found for which the logged scheme was armed.
+    armed_false_alarms: of the false alarms those in MONITOR.
     """
 
     adaptation_s: tuple[float, ...]
@@ -404,7 +439,10 @@ class TuningOutcome:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A filter and a gain with the thresholds chosen for them, their outcome, and why they are not fit."""
+    """A filter and a gain with the thresholds chosen for them. changes: settings that differ, thresholds included.
+
+    outcome: of the replays with them. problems: why they are not fit, () if they are.
+    """
 
     name: str
     changes: Changes
@@ -415,7 +453,11 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Tuning:
-    """The result of tuning. detectors: those of `scheme.detectors`, empty where the motion is too short for them."""
+    """The result of tuning. own: outcome with the logs' own settings.
+
+    best: the suggestion, None if no candidate is fit. detectors: those of `lab.detectors`, () where the motion is too
+    short for them. notes: a line each.
+    """
 
     rate_per_h: float
     logs: tuple[TunedLog, ...]
@@ -427,17 +469,20 @@ class Tuning:
 
     @property
     def is_shown(self) -> bool:
-        """Whether the other half shows the wanted rate: its upper 95 % bound is not above it."""
+        """Whether the half to check on shows the wanted rate: the upper 95 % bound there is not above it.
+
+        False without a suggestion.
+        """
         return self.best is not None and self.best.choice.checked.rate_bound_per_h <= self.rate_per_h
 
 
 def free_hours(log: TunedLog) -> float:
-    """Return the contact-free time while the arm monitored, h."""
+    """Return the time of the log's contact-free samples, h, all in MONITOR."""
     return float(log.motion.is_free.sum()) * log.motion.period_s / 3600.0
 
 
 def tuning_by_key(found: Tuning) -> dict[str, Any]:
-    """Return the result by the keys of tune.json."""
+    """Return the result by the keys of tune.json; values are tuples, arrays and paths, too."""
 
     def candidate(each: Candidate) -> dict[str, Any]:
         return {

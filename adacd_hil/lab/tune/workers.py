@@ -40,11 +40,11 @@ NO_FILES: TlsFiles = dict.fromkeys(("tls_ca_file", "tls_client_cert", "tls_clien
 
 @contextlib.contextmanager
 def connect(scheduler: str, count: int, tls: TlsFiles = NO_FILES, preload: tuple[str, ...] = ()) -> Iterator["Workers"]:
-    """Yield the workers of a Dask scheduler at an address, or, if that is empty, `count` processes of this machine.
+    """Yield the workers of a Dask scheduler at an address, or, if that is "", `count` processes of this machine.
 
-    preload: modules that the processes import before their first task.
-
-    Raises ConfigError when the certificates can't be used, LogError when the scheduler doesn't answer.
+    Processes are ended, and the connection closed, at the block's end. preload: modules that the processes import
+    before their first task. Raises ConfigError if the certificates can't be used, LogError if dask is missing or the
+    scheduler doesn't answer.
     """
     if not scheduler:
         pool = ProcessWorkers(count, preload)
@@ -68,7 +68,7 @@ def connect(scheduler: str, count: int, tls: TlsFiles = NO_FILES, preload: tuple
 
 
 class DaskWorkers:
-    """The workers of a Dask scheduler. It gives the task of a worker that has died to another."""
+    """The workers of a Dask scheduler, which gives the task of a worker that has died to another."""
 
     def __init__(self, client: Any) -> None:
         self._client = client
@@ -76,20 +76,20 @@ class DaskWorkers:
 
     @property
     def room(self) -> int:
-        """How many tasks may be with them at a time."""
+        """Number of tasks that may be with the workers at a time."""
         return _IN_FLIGHT * max(1, len(self._client.scheduler_info(n_workers=-1)["workers"]))
 
     def submit(self, work: Callable[..., Any], task: Any) -> "Future[Any]":
-        """Send a task to a worker, which calls `work` with it; return the future result."""
+        """Send a task to a worker, which calls `work(task)`; return a future of the result, at once."""
         future: Future[Any] = self._executor.submit(work, task)
         return future
 
     def replace_dead(self) -> None:
-        """Do nothing: the scheduler restarts workers that have died."""
+        """Do nothing: the scheduler gives the tasks of dead workers to others."""
 
 
 class ProcessWorkers:
-    """Processes of this machine. They ignore Ctrl-C; this process ends them, and they end when it has gone."""
+    """Processes of this machine, at most `room`, for as many tasks. They ignore Ctrl-C, and end with this process."""
 
     def __init__(self, count: int, preload: tuple[str, ...]) -> None:
         self.room = count
@@ -104,19 +104,19 @@ class ProcessWorkers:
         return ProcessPoolExecutor(self.room, self._context, initializer=_begin)
 
     def submit(self, work: Callable[..., Any], task: Any) -> "Future[Any]":
-        """Send a task to a process, which calls `work` with it; return the future result.
+        """Send a task to a process, which calls `work(task)`; return a future of the result, at once.
 
-        The future, or this call, raises BrokenExecutor if a process has died.
+        The future, or this call, raises BrokenExecutor if a process has died; then call `replace_dead`.
         """
         return self._pool.submit(work, task)
 
     def replace_dead(self) -> None:
-        """End all processes and start new ones, after one has died."""
+        """End all processes and start new ones. Call it after one has died; tasks that were with them are lost."""
         self.end()
         self._pool = self._open()
 
     def end(self) -> None:
-        """End all processes, with or without a task."""
+        """End all processes, with or without a task, by force after 2 s; cancel waiting tasks."""
         processes: set[BaseProcess] = set(multiprocessing.active_children()) - self._others
         self._pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
@@ -143,13 +143,13 @@ def _ignoring_interrupts() -> Iterator[None]:
 
 
 def _begin() -> None:
-    """Prepare a process: at SIGTERM, and when its parent ends, it exits and cleans up."""
+    """Prepare a new worker process: at SIGTERM, and when its parent ends, it exits and cleans up."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
 
 
 def _end_with_parent() -> None:
-    """Wait until the parent process has ended; then end this one, by SIGTERM, and by force if that takes long."""
+    """Wait until the parent process has ended; then end this one by SIGTERM, or by force after 2 s."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
@@ -159,9 +159,9 @@ def _end_with_parent() -> None:
 
 
 def _security_of(scheduler: str, tls: TlsFiles) -> Any:
-    """Return Dask's security settings with the certificates for an address; None if it isn't a TLS address.
+    """Return Dask's security settings for a TLS address, with the certificates; None for another address.
 
-    Raises ConfigError.
+    Raises ConfigError if certificates are missing or can't be used, or are given for another address.
     """
     from distributed.security import Security
 
@@ -187,7 +187,10 @@ def _security_of(scheduler: str, tls: TlsFiles) -> Any:
 
 
 def _given(tls: TlsFiles) -> dict[str, str | None]:
-    """Return the given TLS files by Dask's names, to replace those of Dask's configuration. Raises ConfigError."""
+    """Return the given TLS files by Dask's names, to replace those of Dask's configuration.
+
+    A certificate without a key replaces the key by None. Raises ConfigError for a key without a certificate.
+    """
     if tls["tls_client_key"] is not None and tls["tls_client_cert"] is None:
         raise ConfigError("--tls-key needs --tls-cert, the certificate that it belongs to")
     given: dict[str, str | None] = {name: str(path) for name, path in tls.items() if path is not None}
