@@ -228,7 +228,7 @@ class _Locator(_CacheLocator):
         return _DIGEST
 
     def get_disambiguator(self) -> str:
-        """Return the line, which tells functions of one name apart."""
+        """Return the line of the function in its source, by which functions of one name have different files."""
         return self._line
 
 
@@ -286,7 +286,10 @@ class _SharedCache(FunctionCache):
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save compiled code, one process after the other. On a full disk it isn't saved; the next process compiles."""
+        """Save compiled code, one process after the other, and release the claim of `load_overload`.
+
+        On a full disk it isn't saved; the next process compiles.
+        """
         try:
             with contextlib.suppress(OSError), (_FOLDER / "lock").open("wb") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
@@ -347,7 +350,7 @@ class _Compilation(event.Listener):
         self._count.call_listeners()
 
     def on_end(self, event: Any) -> None:
-        """Resume garbage collection when the outermost function is compiled; count the function."""
+        """Count a compiled function; after the outermost one, resume garbage collection if it was on before."""
         self._depth -= 1
         if self._depth == 0 and self._was_collecting:
             gc.enable()

@@ -78,7 +78,7 @@ def create_file(path: Path) -> int:
 def check_unused(path: Path) -> None:
     """Raise InUseError if a process is writing a file that `create_file` made, with its process id where it is known.
 
-    A file that can't be opened passes.
+    A file that can't be opened passes, and so does each file on a file system without locks.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC)

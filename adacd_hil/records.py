@@ -76,7 +76,7 @@ class Layout:
 
     @cached_property
     def slices(self) -> dict[str, slice]:
-        """Map each field name to its place in the block."""
+        """The slice of each field in the block, by name, in order."""
         places: dict[str, slice] = {}
         start = 0
         for field in self.fields:
@@ -328,7 +328,10 @@ class Location(IntEnum):
     INCONSISTENT = 6  # no single normal force on link 2 fits: several contacts, as in a clamp, or friction
 
     def force_text(self, force_N: float) -> str:
-        """Return the text of a force in N, with "≥" before a lower bound; a dash where it is unknown."""
+        """Return the text of a force in N, with one decimal: of LINK_1 "≥" and its size; "–" where it is unknown.
+
+        It is known for KNOWN and UNCERTAIN.
+        """
         if self in (Location.KNOWN, Location.UNCERTAIN):
             return f"{force_N:.1f}"
         return f"≥ {abs(force_N):.1f}" if self is Location.LINK_1 else "–"

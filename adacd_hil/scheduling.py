@@ -97,7 +97,7 @@ class RealtimeGrant:
                 os.sched_setaffinity(0, {self.cpu})
 
     def describe(self) -> dict[str, str]:
-        """Return the grant in words, for a log's metadata."""
+        """Return the grant in words, by `scheduler`, `cpu`, `memory` and `idle_states`, for a log's metadata."""
         return {
             "scheduler": self.scheduler,
             "cpu": ANY_CPU if self.cpu is None else str(self.cpu),

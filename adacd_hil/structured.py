@@ -54,9 +54,9 @@ def zeros_of(kind: type[Any], sizes: Mapping[str, int]) -> Structured:
 
 
 def packed(values: Any) -> Structured:
-    """Return one record (1,) of an instance of a dataclass, all float64.
+    """Return one record (1,) with copies of the fields of an instance of a dataclass, all float64.
 
-    Its fields are numbers, arrays and such instances.
+    Its fields are numbers, arrays and such instances, which become records in it.
     """
     record = np.zeros(1, _described_as(values))
     _fill(record[0], values)

@@ -28,8 +28,9 @@ def fit_table(
 ) -> list[str]:
     """Return lines of cells as aligned text; columns in `right` to the right. Each cell is escaped to text of one line.
 
-    No line is wider than `width`, of at least 20; None: no limit. is_cut: each row is one line, its cells cut.
-    names: number of columns that identify a row; each part begins with them, if they leave room for others.
+    No line is wider than `width`, of at least 20; None: no limit. A wider table is returned in parts, an empty line
+    between them. is_cut: each row is one line, its cells cut. names: number of columns that identify a row; each part
+    begins with them, if they leave room for others. [] without lines.
     """
     if not lines:
         return []

@@ -103,7 +103,10 @@ def wrap_words(text: str, width: int, indent: str, is_breaking: bool = False) ->
 
 
 def keep_units(text: str, gap: str, most: int | None = None) -> str:
-    """Return a text with `gap` between a number and its unit, unless the two have more than `most` letters."""
+    """Return a text with `gap`, in place of a space, between each number and its unit of _UNITS.
+
+    most: longest number and unit together, letters, that are treated so; None: no limit.
+    """
     return _QUANTITY.sub(
         lambda found: found[0] if most and len(found[0]) > most else f"{found[1]}{gap}{found[2]}", text
     )
@@ -129,17 +132,20 @@ def for_people(text: str, stream: "TextIO | Terminal") -> str:
 
 
 def painted(text: str, stream: "TextIO | Terminal") -> str:
-    """Return an escaped text, its marks coloured if the stream has colours."""
+    """Return an escaped text; if the stream has colours, marks that begin a line, such as `error:`, are coloured."""
     if not has_colour(stream):
         return text
     return _MARK.sub(lambda found: f"{found[1]}\x1b[{_MARKS[found[2]]}m{found[2]}\x1b[0m", text)
 
 
 class Terminal(io.TextIOBase):
-    """A standard stream without a buffer."""
+    """A standard stream without a buffer, safe for threads. Once its reader has gone, writes are dropped."""
 
     def __init__(self, descriptor: int, name: str, is_needed: bool) -> None:
-        """Write to `descriptor`. is_needed: a full disk behind it raises an error; otherwise it is ignored."""
+        """Write to `descriptor`. is_needed: an error of writing, as of a full disk, is raised; otherwise it is ignored.
+
+        name: of the stream, in errors.
+        """
         self.name = name
         self._descriptor = descriptor
         self._is_needed = is_needed
@@ -176,7 +182,7 @@ class Terminal(io.TextIOBase):
     def write(self, text: str) -> int:
         """Write a text with control characters escaped; return its length. Raises OSError as `write_raw`.
 
-        Where the stream isn't needed, `for_people` lays the text out.
+        If the stream isn't needed, `for_people` lays the text out.
         """
         if not isinstance(text, str):
             raise TypeError(f"{self.name} takes text, not {type(text).__name__}")
@@ -208,7 +214,7 @@ class Terminal(io.TextIOBase):
         self._patience = _PATIENCE_POLLS
 
     def _acquire(self) -> bool:
-        """Take the lock once no other thread writes, and return True; return False if the wait is given up."""
+        """Take the lock once no other thread writes, and return True; after `hurry`, False if that takes 0.5 s."""
         polls = 0
         while not self._lock.acquire(timeout=_POLL_MS / 1000):
             polls += 1
@@ -217,7 +223,10 @@ class Terminal(io.TextIOBase):
         return True
 
     def _put(self, view: memoryview) -> None:
-        """Write all bytes, and wait while the output blocks; give up when the patience is over. Raises OSError."""
+        """Write all bytes, and wait while the output blocks: forever, or after `hurry` half a second. Raises OSError.
+
+        After giving up, `_is_gone` is True.
+        """
         poll = select.poll()
         poll.register(self._descriptor, select.POLLOUT)
         polls = 0
@@ -256,7 +265,7 @@ def write_screen(text: str, stream: TextIO | None = None) -> None:
 
 
 def write_result(text: str) -> None:
-    """Write a result and a line end to standard output, laid out by `for_people`."""
+    """Write a result and a line end to standard output, laid out by `for_people`. Raises OSError as `write_raw`."""
     write_screen(for_people(f"{text}\n", sys.stdout))
 
 

@@ -263,9 +263,9 @@ class Cycle:
     def _limit(self, arm: ArmState, output: SchemeOutput, now_ns: int) -> tuple[ArmCommand, GateFlag]:
         """Return the command of this cycle, with the desired torque limited, and the gate's changes to the torque.
 
-        The torque is zero unless the state has power and both drives are enabled, and if the command leaves, at
-        now_ns, more than `bus.max_age_cycles` periods after SYNC. It is a quick stop in FAULT, and for a desired torque
-        that is not finite.
+        The torque is zero unless the state has power, both drives are enabled, and the command leaves, at now_ns, no
+        more than `bus.max_age_cycles` periods after SYNC. The command is a quick stop in FAULT, and for a desired
+        torque that is not finite.
         """
         is_stale = now_ns - self._exchange.sync_ns > self._stale_ns
         is_open = output.state in POWERED and arm.is_enabled and not is_stale

@@ -131,7 +131,7 @@ class Reference(EventSource):
     def step(self, arm: ArmState, output: SchemeOutput) -> None:
         """Fill `q_d`, `dq_d`, `ddq_d` for this cycle; leave them as they are while positions are older than OLD_CYCLES.
 
-        A new state or reaction begins its motion in any case.
+        A new state begins its motion in any case.
         """
         if output.state is not output.previous_state:
             self._enter(output, arm)

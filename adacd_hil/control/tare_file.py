@@ -162,7 +162,8 @@ class UsedTare:
     def offset_std_Nm(self, drift: TareSettings) -> tuple[float, float]:
         """Return the standard deviation of each offset now, Nm, at least SMALLEST_STD_NM.
 
-        It adds the tare's standard error, half the poses' spread, and the drift since.
+        Its square is the sum of the squares of the tare's standard error, of half the poses' spread, and of the drift
+        since.
         """
         drifted = drift.drift_variance(self.age_s)
         first, second = (

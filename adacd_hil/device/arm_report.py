@@ -93,7 +93,10 @@ class DataWatch(EventSource):
             self._end_window()
 
     def _note_row(self) -> None:
-        """Count a gap of MOST_IN_A_ROW cycles; warn of the first one, and of one after a window without any."""
+        """Count MOST_IN_A_ROW cycles in a row without a sample; add a warning, unless the last one still holds.
+
+        It holds until a window has ended in which this didn't happen.
+        """
         self._rows += 1
         if not self._has_rows:
             self._has_rows = True

@@ -99,7 +99,10 @@ class Slave:
         return f"{quantity} {ObjectName(index, sub)} = {values[0]}, {values[1]} expected"
 
     def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", remedy: str = "") -> None:
-        """Raise DeviceError, with the remedy, if an object differs from its expected value; else as `compare`."""
+        """Compare an object as `compare`; raise DeviceError, with the remedy, if it differs from `expected`.
+
+        Raises as `read`, too.
+        """
         if text := self.compare(index, sub, expected, quantity, unit):
             self.fail(text, remedy)
 

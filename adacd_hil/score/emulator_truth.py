@@ -297,7 +297,7 @@ def placed_contact(
     """Return a contact on the clock of a run, with the times in which it explains alarms.
 
     times_ns: of onset and end. row: index of the first of the host's cycles at the onset or after it. a_rad_s: cut-off
-    of the scheme's slowest filter. Where detection is off, the threshold of the settings counts.
+    of the scheme's slowest filter. While detection is off, the threshold of the settings counts.
     """
     threshold = np.where(np.isfinite(host.threshold[row]), host.threshold[row], settings.detector.threshold_Nm)
     after_s = forgotten_after_s(contact.tau_ext, contact.cycle, settings.bus.period_s, a_rad_s, threshold)

@@ -189,8 +189,8 @@ def load_codec(path: Path | None = None) -> Codec:
 def parse_codec(text: bytes, path: Path) -> Codec:
     """Return the codec of the text of a DBC; `path`: its file, existing or not.
 
-    Raises CodecError, which begins with `path`, as `parse_database`; for a DBC without WireVersion, for messages with
-    one name or identifier, and for a message that no contract has.
+    Raises CodecError, with `path` first, as `parse_database`; for a DBC without WireVersion, for two messages with the
+    same name or identifier, and for a message of a length, layout or protection that no contract has.
     """
     database = parse_database(text, path)
     try:
