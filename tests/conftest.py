@@ -34,12 +34,11 @@ def _ordinary_priority() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _writer_thread() -> Iterator[None]:
-    """Let threads write the logs of lockstep, and this process its messages in two pieces: see writer_thread.py."""
-    from writer_thread import started, write_message
+    """Let threads write the logs of lockstep: see writer_thread.py."""
+    from writer_thread import started
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(STARTS_WRITER, started)
-        patch.setattr("mcap.records.Message.write", write_message)
         yield
 
 

@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
@@ -28,9 +27,11 @@ class Piece:
         return f"{self.page.relative_to(ROOT)}:{self.line}"
 
 
-class Document(NamedTuple):
-    """What one page shows: fenced blocks, and inline code."""
+@dataclass(frozen=True)
+class Document:
+    """One page."""
 
+    path: Path
     blocks: tuple[Piece, ...]
     spans: tuple[Piece, ...]
 
@@ -53,7 +54,7 @@ def parse_document(path: Path, text: str) -> Document:
             continue
         head = _first_cell(tokens, number)
         spans += [Piece(path, line, child.content, head=head) for child in _flat(token) if child.type == "code_inline"]
-    return Document(tuple(blocks), tuple(spans))
+    return Document(path, tuple(blocks), tuple(spans))
 
 
 def _flat(token: Token) -> Iterator[Token]:

@@ -113,9 +113,14 @@ def shell_complaints(block: Piece, folder: Path) -> list[str]:
     commands = check.split_commands(typed(block))
     if not commands:
         return ["nothing is typed in it: a line of a console begins with `$ `"]
-    bare = [words[0] for words in commands if re.fullmatch(r"(tools|tests)/\S+\.py", words[0])]
-    lines = [f"{program}: the system's Python lacks its packages; say python" for program in bare]
-    return lines + [line for words in commands for line in check.command_complaints(words)]
+    bare = [
+        f"{words[0]}: the system's Python lacks its packages; say python" for words in commands if _is_bare(words[0])
+    ]
+    return bare + [line for words in commands for line in check.command_complaints(words)]
+
+
+def _is_bare(program: str) -> bool:
+    return re.fullmatch(r"(tools|tests)/\S+\.py", program) is not None
 
 
 def toml_complaints(block: Piece, folder: Path) -> list[str]:

@@ -7,26 +7,12 @@ the fixture `writer_process`.
 import os
 import pickle
 import socket
-import struct
 import subprocess
 import threading
 from collections.abc import Sequence
 
-from mcap.data_stream import RecordBuilder
-from mcap.opcode import Opcode
-from mcap.records import Message
-
 from adacd_hil.log.recording.processes import WriterSetup, start_module
 from adacd_hil.log.recording.writer import write_log
-
-_HEAD = struct.Struct("<BQHIQQ")
-
-
-def write_message(message: Message, stream: RecordBuilder) -> None:
-    """Write a message in two pieces, for which `mcap` takes nine: a tenth of a played run's time."""
-    numbers = message.channel_id, message.sequence, message.log_time, message.publish_time
-    stream.write(_HEAD.pack(Opcode.MESSAGE, 22 + len(message.data), *numbers))
-    stream.write(message.data)
 
 
 class WriterThread(threading.Thread):
