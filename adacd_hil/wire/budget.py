@@ -252,7 +252,10 @@ class Budget:
 
     @property
     def load(self) -> float:
-        """Share of the bus's time that cyclic frames and events take at worst, without requests and EMCY."""
+        """Share of the bus's time that cyclic frames and events take at worst, over 1 if they don't fit.
+
+        Requests and EMCY don't count.
+        """
         return sum(
             entry.duration_ns / entry.interval_ns for entry in self.frames if _is_sent(entry, LoadCase.OPERATION)
         )

@@ -143,10 +143,10 @@ class FaultPlan:
     def advance(self, scenario_ns: int, since_power_on_ns: int = _BEFORE_NS) -> list[FaultEdge]:
         """Set the time, begin and end the faults that are due, queue their actions.
 
-        Return beginnings and ends in order.
+        Return the beginnings and ends, fault by fault in the order of the plan; empty if none is due.
 
         scenario_ns: since both drives were enabled, negative before. since_power_on_ns: negative if no time counts from
-        there. Neither may go back.
+        there. Neither may go back; this is not checked.
         """
         self._scenario_ns, self._power_ns = scenario_ns, since_power_on_ns
         is_due = scenario_ns >= self._next_scenario_ns or since_power_on_ns >= self._next_power_ns

@@ -105,9 +105,9 @@ class SensorNode(Application):
         self._error_bits = bits
 
     def poll(self, t_ns: int) -> int:
-        """Act on timers that are due, and send event-driven frames; return when the next timer is due.
+        """Act on timers that are due, send event-driven frames of new values; return when the next timer is due.
 
-        Both times are ns of the bench.
+        Both times are ns of the bench, not of the node's own clock.
         """
         clock = self.device.clock
         t_ns = clock.own_ns(t_ns)

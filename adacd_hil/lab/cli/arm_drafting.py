@@ -782,7 +782,7 @@ class Drafting:
 
 
 def _numbers(value: Any, kind: type, option: str) -> tuple[Any, Any]:
-    """Return two numbers of type `kind`, from typed text or an option's values.
+    """Return two numbers of type `kind`, from words parted by spaces or a comma, or from an option's values.
 
     option: its name, for the error. Raises ConfigError if they aren't two numbers.
     """

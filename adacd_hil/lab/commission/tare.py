@@ -197,9 +197,10 @@ def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
 
 
 def _solve(poses: Sequence[Pose], settings: Settings) -> TareSolution:
-    """Solve the poses by least squares, without limits of the result.
+    """Find the torque offsets, and gravity if it is estimated, by least squares; don't compare them with limits.
 
-    Raises TareRefusedError if gravity is estimated and the poses don't determine it.
+    Gravity is else that of the CAD model, or 0 for a flat arm, and the condition is 1. Raises TareRefusedError if
+    gravity is estimated and the poses don't determine it.
     """
     torque = np.array([pose.mean_Nm for pose in poses])
     matrix = np.tile(np.eye(JOINTS), (len(poses), 1))

@@ -105,5 +105,8 @@ def read_header(path: Path) -> Header | None:
 
 
 def chunk_crc(record: RawRecord) -> int:
-    """Return the CRC of its decompressed records that a chunk stores; 0 if it stores none."""
+    """Return the CRC that a chunk stores, that of its decompressed records; 0 if it stores none.
+
+    A record that is too short gives another number or 0.
+    """
     return int.from_bytes(record.body[24:28], "little")

@@ -99,7 +99,10 @@ def in_order(runs: Iterable[RunSummary]) -> list[RunSummary]:
 
 
 def count_text(runs: Sequence[RunSummary]) -> str:
-    """Return a phrase with the number of runs, and of those that are not good or broken, not judged, and running."""
+    """Return a phrase such as "5 runs, 2 not good, 1 running"; "5 runs, all good"; "no run" without one.
+
+    Broken runs count as not good. Counts of 0 are left out.
+    """
     text = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
     bad = sum(run.status not in (GOOD, NOT_JUDGED, RUNNING) for run in runs)
     parts = [f"{bad} not good"] if bad else []

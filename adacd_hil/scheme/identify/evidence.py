@@ -46,11 +46,12 @@ BELIEF_SIGMAS = 3.5
 
 
 def constants_of(settings: Settings, prior_std: Vector) -> EvidenceConstants:
-    """Return the constants of evidence. prior_std (p,): deviations of the prior.
+    """Return the constants by which sources of evidence, such as an earlier certificate, bound a fit's quantities.
 
-    columns: each quantity in parameters; columns_prior: its variance in the prior. torque_Nm: largest torque of one
-    unit of the quantity on the trajectory; 0 for viscous friction, which is contained in the friction at its speeds.
-    less_counts: 1 if a fit with less of the quantity contradicts the source, too.
+    A quantity is a joint's friction at one speed, an inertia, a torque offset, or a viscous friction. Each is a
+    combination of the p parameters, its row of `columns`; columns_prior: its variance in the prior, by prior_std (p,).
+    torque_Nm: largest torque of one unit of it on the trajectory; 0 for viscous friction, which the friction at a speed
+    contains. sigmas: deviations that each source allows. less_counts: 1 if too little of it contradicts the source too.
     """
     unit = np.eye(prior_std.size)
     base = len(settings.estimator.parameter_names)

@@ -102,7 +102,7 @@ def keep_columns(m: Memory, slot: int) -> None:
 
 @compiled
 def clear(k: Constants, m: Memory) -> None:
-    """Set the sums and the torque found before to 0, and let the next check be the first one.
+    """Set the sums, the torque found before and its rms to 0; the next check waits for as many samples as the first.
 
     Call it for another arm or payload, or with a new certificate.
     """

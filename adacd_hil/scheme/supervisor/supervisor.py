@@ -315,9 +315,11 @@ def _enter(m: SupervisorMemory, state: int, event: int) -> None:
 def _event(
     k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
 ) -> int:
-    """Return the event of this cycle: a fault, a contact, or progress of the state, in this order; else NONE.
+    """Return the event of this cycle: a fault, else a contact, else progress of the state; else NONE.
 
-    If there is none, a state that has lasted too long is a fault. Store the reason of a fault in `m.fault`.
+    Faults of arm and finding count in the states that are checked; without any event, a state that has lasted too long
+    is a fault. Contact and progress change `m` also in a cycle with a fault. Store the fault's reason in `m.fault`;
+    without a fault keep it. observation: bits found. is_reporting, goes_on: as of `supervise`.
     """
     fault = 0
     if _IS_CHECKED[m.state]:
