@@ -189,8 +189,8 @@ def load_codec(path: Path | None = None) -> Codec:
 def parse_codec(text: bytes, path: Path) -> Codec:
     """Return the codec of the text of a DBC; `path`: its file, existing or not.
 
-    Raises CodecError, with `path` first, as `parse_database`; for a DBC without WireVersion, for two messages with the
-    same name or identifier, and for a message of a length, layout or protection that no contract has.
+    Raises CodecError, with `path` first, as `parse_database`; for a WireVersion that is missing or no number, for two
+    messages with the same name or identifier, and for a message of a length, layout or protection that no contract has.
     """
     database = parse_database(text, path)
     try:
@@ -199,7 +199,10 @@ def parse_codec(text: bytes, path: Path) -> Codec:
         attributes = database.dbc.attributes if database.dbc else {}
         if WIRE_VERSION not in attributes:
             raise CodecError("the DBC has no WireVersion attribute")
-        return Codec(messages, int(attributes[WIRE_VERSION].value), database, path, text)
+        version = attributes[WIRE_VERSION].value
+        if not isinstance(version, int | float):
+            raise CodecError(f"attribute {WIRE_VERSION} is {version!r}, not a number")
+        return Codec(messages, int(version), database, path, text)
     except CodecError as error:
         raise CodecError(f"DBC {path}: {error}") from None
 

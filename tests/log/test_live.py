@@ -273,8 +273,10 @@ def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_waits_for_nobo
         '{"op": "advertise", "channels": 7}',
         5000 * "[",
         struct.pack("<BIQ", 1, 99, 5),
+        struct.pack("<BQ", 2, 5),  # the time, without end
     ],
 )
-def test_a_server_that_is_none_of_ours_is_one_line(word):
+def test_a_server_that_is_none_of_ours_is_one_line(word, monkeypatch):
+    monkeypatch.setattr("adacd_hil.lab.live.client.OPEN_TIMEOUT_S", 0.05)
     with pytest.raises(LogError, match=r"^it does not serve a log of adacd-hil$"):
         LiveClient(OtherEnd(word), None)

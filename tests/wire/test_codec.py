@@ -128,6 +128,11 @@ def test_a_signed_bit_field_keeps_its_sign() -> None:
 
 
 REFUSED = {
+    "version in words": (
+        'BA_DEF_ "WireVersion" INT 1 65535;\nBA_DEF_',
+        'BA_DEF_ "WireVersion" STRING;\nBA_DEF_',
+        r"attribute WireVersion is '1', not a number",
+    ),
     "big endian": (
         "controlword : 16|16@1+",
         "controlword : 23|16@0+",

@@ -77,20 +77,20 @@ class LiveClient:
     def receive(self, timeout_s: float) -> LiveMessage | None:
         """Return the next message, a waiting one at once; None after the timeout, or at the server's end.
 
-        At the end `is_open` is False. The server's other messages, such as its time, restart the timeout. Raises
-        LogError for data that is no log of adacd-hil.
+        At the end `is_open` is False. Raises LogError for data that is no log of adacd-hil.
         """
         return self._waiting.popleft() if self._waiting else self._receive(timeout_s)
 
     def _receive(self, timeout_s: float) -> LiveMessage | None:
         """Return the next message from the connection; None after the timeout or at the server's end.
 
-        The server's other messages are obeyed on the way; each of them restarts the timeout. Raises LogError for data
-        that is no log of adacd-hil.
+        The server's other messages are obeyed on the way. Raises LogError for data that is no log of adacd-hil.
         """
+        clock = MonotonicClock()
+        end_ns = clock.now_ns() + round(timeout_s * 1e9)
         while self.is_open:
             try:
-                data = self._connection.recv(timeout=timeout_s)
+                data = self._connection.recv(timeout=max(0.0, (end_ns - clock.now_ns()) * 1e-9))
             except TimeoutError:
                 break
             except ConnectionClosed:
@@ -104,6 +104,8 @@ class LiveClient:
                     return LiveMessage(self._names[number], log_ns, data[SHOWN_HEAD.size :])
             except (ValueError, KeyError, TypeError, RecursionError):
                 raise LogError("it does not serve a log of adacd-hil") from None
+            if clock.now_ns() >= end_ns:
+                break
         return None
 
     def _obey(self, word: dict[str, Any]) -> None:
