@@ -10,10 +10,11 @@ _LIKE = 0.66
 
 
 def nearest_name(word: str, known: Iterable[str]) -> str | None:
-    """Return the known name that is most like `word` in each of its dotted parts; None if none has 0.66 of its letters.
+    """Return the known name that is most like `word` in each of its dotted parts; None if none is like it.
 
-    None, too, for a word of less than 2 or more than 64 letters. Case is ignored. Units may be missing: `threshold`
-    stands for `threshold_Nm`. Of equally near names the first is returned.
+    A name is like it if it has a share of at least `_LIKE` of its letters. None, too, for a word of less than 2 or more
+    than 64 letters. Case is ignored. Units may be missing: `threshold` stands for `threshold_Nm`. Of equally near
+    names the first is returned.
     """
     if not _SHORTEST <= len(word) <= _LONGEST:
         return None
