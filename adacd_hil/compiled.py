@@ -276,7 +276,7 @@ class _SharedCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Return the code compiled for these types; None: this process has to compile it, then save it.
 
-        Wait, 120 s at most, while another process compiles it.
+        Wait, for `_MOST_POLLS` times `_POLL_S` at most, while another process compiles it.
         """
         found = super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         if found is None and _claims.claim(self._claim(sig)):

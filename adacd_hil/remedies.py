@@ -12,9 +12,9 @@ _LIKE = 0.66
 def nearest_name(word: str, known: Iterable[str]) -> str | None:
     """Return the known name that is most like `word` in each of its dotted parts; None if none is like it.
 
-    Like it: each part has a share of common letters of at least 0.66. None, too, for a word of less than 2 or more than
-    64 letters. Case is ignored. Units may be missing: `threshold` stands for `threshold_Nm`. Of equally near names the
-    first is returned.
+    Like it: each part has a share of common letters of at least `_LIKE`. None, too, for a word that is shorter
+    than `_SHORTEST` or longer than `_LONGEST`. Case is ignored. Units may be missing: `threshold` stands for
+    `threshold_Nm`. Of equally near names the first is returned.
     """
     if not _SHORTEST <= len(word) <= _LONGEST:
         return None

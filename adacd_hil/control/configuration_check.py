@@ -136,7 +136,7 @@ def _over(settings: Settings) -> Iterator[str]:
 
 
 def _radians(settings: Settings) -> Iterator[str]:
-    """Yield a warning for each limit or amplitude in degrees whose largest value is at most 2 pi: radians, probably."""
+    """Yield a warning for each limit or amplitude in degrees with values up to `_MOST_RAD`: radians, probably."""
     for key in ("arm.position_limit_deg", "trajectory.amplitude_deg", "arm.velocity_limit_deg_s"):
         values = value_of(settings, key)
         if 0.0 < max(values) <= _MOST_RAD:

@@ -261,11 +261,11 @@ class DeviceReadings:
         self._blocks += 1
 
     def judge_blocks(self, is_torque_known: bool) -> bool:
-        """Return whether the configuration is refuted: another reading was far better in three judgements in a row.
+        """Return whether the configuration is refuted: another reading was far better `_ROUNDS` times in a row.
 
-        Far better: it leaves at most 0.2 of the configuration's unexplained share, and at most 0.004 of all. Judge at
-        every fourth block, return False between. is_torque_known: the commanded torques have confirmed the sensors'
-        scales; without that a wrong scale of torque as the best reading doesn't count.
+        Far better: it leaves at most `_BETTER` of the configuration's unexplained share, and at most `_EXPLAINED` of
+        all. Judge at every fourth block, return False between. is_torque_known: the commanded torques have confirmed
+        the sensors' scales; without that a wrong scale of torque as the best reading doesn't count.
         """
         if self._blocks < _FEWEST_BLOCKS or self._blocks % _JUDGED_EVERY:
             return False

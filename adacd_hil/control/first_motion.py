@@ -210,7 +210,7 @@ class FirstMotion(EventSource):
         ]
 
     def _suspect_scales(self) -> str:
-        """Return a text on a joint whose sensor measures 2.5 times its command or more, or 1 / 2.5 or less.
+        """Return a text on a joint whose sensor measures `_FAR` times its command or more, or 1 / `_FAR` or less.
 
         "" without one. Torque and command must be correlated by _IN_SCALE. Of two joints the one that is further off.
         """

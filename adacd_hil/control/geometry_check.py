@@ -66,7 +66,7 @@ def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:
     """Compare the length of link 1 by inertia over gravity with the configured one; return an event if they differ.
 
     An info if link 1 seems longer, as a smaller tilt has the same effect; a warning if it seems shorter. None if they
-    agree within 12 %, or a2 or a5 is 0.
+    agree within a share of `_LONGER`, or a2 or a5 is 0.
     """
     configured_m, configured_tilt_deg = settings.arm.link_length_m[0], settings.mounting_deg[0]
     if theta[A2] == 0.0 or theta[A5] == 0.0:
@@ -90,8 +90,8 @@ def _by_gravity(settings: Settings, theta: tuple[float, ...]) -> Event | None:
 def _by_cad(theta: tuple[float, ...], cad: tuple[float, ...], lengths: tuple[float, float]) -> Event | None:
     """Return a warning if the inertias differ from the CAD model's as if one link had another length; else None.
 
-    theta, cad: identified parameters, and those of the CAD model. The length must differ by more than 12 %, and the
-    inertias fit it within 8 %.
+    theta, cad: identified parameters, and those of the CAD model. The length must differ by more than a share of
+    `_LONGER`, and the inertias fit it within a share of `_ALIKE`.
     """
     cross, near, far = (
         _ratio(theta[A2], cad[A2]),

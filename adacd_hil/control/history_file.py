@@ -256,7 +256,7 @@ class Origin(NamedTuple):
 def use_history(path: Path, now_ns: int) -> UsedHistory:
     """Read the arm's history for a run; a missing file is a first run. now_ns: wall clock.
 
-    Raises ConfigError for an invalid file, a link to a missing one, and a certificate over 6 minutes in the future;
+    Raises ConfigError for an invalid file, a link to a missing one, and a certificate over `_FUTURE_NS` in the future;
     OSError if the file can't be read.
     """
     if (link := dangling_link(path)) is not None:  # the history was moved: the arm is known, not on its first run

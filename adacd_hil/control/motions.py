@@ -201,7 +201,7 @@ TOLERANCE = 1e-3
 
 
 def motion_problems(settings: Settings) -> list[str]:
-    """Return a line for each limit that trajectory or excitation exceeds by more than 0.1 %; empty if none.
+    """Return a line for each limit that trajectory or excitation exceeds by a share of over `TOLERANCE`; empty if none.
 
     Limits: the arm's positions and velocities, and the reaction's accelerations.
     """

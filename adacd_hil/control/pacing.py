@@ -266,9 +266,9 @@ class FollowingPacer:
         return max(periods, 1)
 
     def _judge(self, period_ns: float) -> None:
-        """Add a period; raise BusError if the median of the first 101 is over 10 % away from the configured one.
+        """Add a period; raise BusError if the median of the first `_JUDGED_SYNCS` isn't the configured one.
 
-        Later periods are not judged.
+        It may be a share of `_PERIOD_TOLERANCE` away. Later periods are not judged.
         """
         if len(self._periods_ns) == _JUDGED_SYNCS:
             return
@@ -286,7 +286,8 @@ class FollowingPacer:
 def calibrate(clock: Clock, period_ns: int, cpu_count: int) -> SpinCalibration:
     """Measure how late this process wakes up from sleeps of 0.2 to 1 ms, and choose how long to spin; takes 30 ms.
 
-    The spin covers 95 % of the sleeps, but is at most 0.1 ms and 10 % of the period; 0 with one processor.
+    The spin covers a share `_SPIN_SHARE` of the sleeps, but is at most `_MOST_SPIN_NS`, and `_MOST_SPIN_SHARE` of the
+    period; 0 with one processor.
 
     cpu_count: processors that others can use while this process spins. With one, spinning blocks all other work, even
     the kernel's threads that hand over received frames: the time gained at SYNC would be lost at the feedback.

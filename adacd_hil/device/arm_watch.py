@@ -101,7 +101,7 @@ class ArmWatch:
     def judge(self, arm: ArmState) -> ArmState:
         """Return the arm's state with fault HEARTBEAT if a device's heartbeat fails; else as `DeadlineWatch.judge`.
 
-        A fault that is set already stays. `lost` is updated ten times in a heartbeat period.
+        A fault that is set already stays. `lost` is updated every `_LOOKS` of a heartbeat period.
         """
         if self._looks.take_turn(arm.cycle):
             self.lost = self._watch(arm.t_ns)

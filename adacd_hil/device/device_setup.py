@@ -181,8 +181,9 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequenc
 
 
 def _check_rated_torque(slave: Slave, settings: Settings, drives: Sequence[PlacedDevice]) -> None:
-    """Raise DeviceError if 0x6076, brought to the joint, differs by more than 0.5 % from the configured rated torque.
+    """Raise DeviceError if 0x6076, brought to the joint, differs from the configured rated torque.
 
+    It differs if it is away by a share of over `_ROUNDED_SHARE`.
     `drives`: of all joints, so that the error can name exchanged drives.
     """
     found = slave.read(0x6076)

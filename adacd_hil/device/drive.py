@@ -268,7 +268,7 @@ class Drive(CyclicDevice):
     def _is_quick_stopping(self) -> bool:
         """Whether the drive, in QUICK_STOP_ACTIVE, must be left to brake: disable voltage would let it coast.
 
-        False if 0x605A is unknown, and for an option from 5 on once the drive stands still.
+        False if 0x605A is unknown, and for an option from `_FIRST_STAYING_OPTION` on once the drive stands still.
         """
         option = self._quick_stop_option
         if option is None:

@@ -26,7 +26,7 @@ class TimeWindow(NamedTuple):
     def bounds_ns(self, start_ns: int) -> tuple[int, int]:
         """Return begin and end of the window, ns; start_ns: the time of the log's first message, on the same clock.
 
-        An infinite bound is 3.2e9 s away.
+        An infinite bound is `_CENTURY_S` away.
         """
         first_ns, end_ns = (start_ns + round(min(max(bound_s, -_CENTURY_S), _CENTURY_S) * 1e9) for bound_s in self)
         return first_ns, end_ns

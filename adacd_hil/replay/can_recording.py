@@ -45,7 +45,7 @@ class CanRecording(NamedTuple):
 
     frames (m,); owner (m,): number of the cycle in which the host met each, ascending, and below the first one before
     that; since (m,), offset_ns (m,): number of the cycle whose SYNC came before it on the bus, and the time since then.
-    number (n,), t_ns (n,): of each SYNC, the cycle and the time. is_realtime: the SYNCs keep the period within 10 %.
+    number (n,), t_ns (n,): of each SYNC, the cycle and the time. is_realtime: their interval is within `_REALTIME`.
     """
 
     frames: NDArray[Any]

@@ -355,7 +355,7 @@ class LockstepBus(Bus):
         self._offered.append((frame.can_id, self._count, t_ns, frame.data))
 
     def _is_cyclic(self, t_ns: int) -> bool:
-        """Return whether the last SYNC is so recent at a time, two periods, that the devices live by SYNC."""
+        """Return whether the last SYNC is so recent at a time, `_CYCLIC_PERIODS`, that the devices live by SYNC."""
         return t_ns - self.sync_ns < _CYCLIC_PERIODS * self._period_ns
 
     def _let_pass(self, limit_ns: int) -> bool:

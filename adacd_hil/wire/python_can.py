@@ -74,7 +74,7 @@ class PythonCanBus(Bus):
             raise BusMissingError(f"{where}: {_in_words(error)}{_remedy(self._interface, error)}") from None
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a frame, with more than 8 bytes as CAN FD with rate switch. Raises BusError, also without `is_fd`."""
+        """Send a frame, beyond `CLASSIC_BYTES` as CAN FD with rate switch. Raises BusError, also without `is_fd`."""
         is_long = len(data) > CLASSIC_BYTES
         if is_long and not self._is_fd:
             raise BusError(f"sending on {self.channel}: {len(data)} data bytes need CAN FD")

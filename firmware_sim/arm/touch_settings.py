@@ -213,7 +213,7 @@ class BodyRegion(NamedTuple):
 
     @property
     def transient_force_N(self) -> float | None:
-        """Force limit of transient contact, N, twice the quasi-static one; None if the standard gives none."""
+        """Force limit of transient contact, N, `TRANSIENT_FACTOR` times the quasi-static one; None without one."""
         return TRANSIENT_FACTOR * self.force_N if self.has_transient_limit else None
 
 

@@ -118,7 +118,7 @@ class Bench:
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether, for 50 ms, the arm has stood still by the drives' velocities and no drive has powered its motor.
+        """Whether, for a while, the arm has stood still by the drives' velocities and no drive has powered its motor.
 
         Motion between two calls is missed.
         """

@@ -157,7 +157,7 @@ class BenchTime:
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether, for 50 ms, the arm has stood still by the drives' velocities and no drive has powered its motor.
+        """Whether the arm has stood still by the drives' velocities, and no drive has had power, for `_REST_NS`.
 
         Motion between two calls is missed.
         """
@@ -317,9 +317,9 @@ class BenchTime:
             self._nodes.move_arm(tick_count)
 
     def _has_rested(self, now_ns: int) -> bool:
-        """Return whether the arm has stood still for 50 ms and no drive could move it; call it often while it may move.
+        """Return whether the arm has stood still for `_REST_NS` and no drive could move it.
 
-        Each call with a moving arm or a powered drive restarts the 50 ms.
+        Call it often while the arm may move: each call with a moving arm or a powered drive restarts that time.
         """
         is_powered = any(drive.motor_mode for drive in self._nodes.drives)
         if is_powered or max(map(abs, self._arm.drive_velocity_rad_s)) > REST_RAD_S:

@@ -359,9 +359,9 @@ class Body:
 
     @property
     def motor_error_code(self) -> tuple[int, int]:
-        """Error code 0x603F by joint: 0x4310 if too hot, else 0x2310 if I²t is spent and that is a fault, else 0.
+        """Error code 0x603F by joint, as `error_code`: too hot, or I²t is spent and that is a fault; else 0.
 
-        A code stays until the winding has cooled below the derating start, or I²t's effort has fallen by a tenth.
+        A code stays until the winding has cooled below the derating start, or a part of I²t's effort has gone.
         """
         if self.has_ideal_motors:
             return 0, 0

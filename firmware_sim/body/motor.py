@@ -174,7 +174,7 @@ def heat_motor(numbers: np.void, state: np.void, joint: int, tau_Nm: float) -> N
 
 
 def error_code(is_overheated: float, is_overloaded: float) -> int:
-    """Return the error code 0x603F of a motor: 0x4310 if overheated, else 0x2310 if overloaded, else 0.
+    """Return 0x603F of a motor: EXCESS_TEMPERATURE if overheated, else CONTINUOUS_OVER_CURRENT if overloaded, or 0.
 
     is_overloaded: I²t is spent, and the drive's reaction to that is a fault.
     """

@@ -504,7 +504,7 @@ CONTRACTS = {
 def contract_of(codec: Codec) -> EmulatedContract:
     """Return the emulated contract with a DBC's file name.
 
-    For other names return `arm`, or `arm_fd` if a frame is longer than 8 bytes.
+    For other names return `arm`, or `arm_fd` if a frame is longer than `CLASSIC_BYTES`.
     """
     return CONTRACTS.get(codec.path.stem, CONTRACTS["arm_fd" if is_fd(codec) else "arm"])
 
@@ -530,10 +530,10 @@ def playable_contract(codec: Codec) -> EmulatedContract:
 
 
 def is_fd(codec: Codec) -> bool:
-    """Return whether some frame of the contract is longer than the 8 bytes of classic CAN."""
+    """Return whether some frame of the contract is longer than `CLASSIC_BYTES`."""
     return any(message.length > CLASSIC_BYTES for message in codec.messages.values())
 
 
 def longest_pdo(codec: Codec) -> int:
-    """Return the longest PDO of this contract's bus, bytes: 8, or 64 if it has frames of CAN FD."""
+    """Return the longest PDO of this contract's bus, bytes: `CLASSIC_BYTES`, with CAN FD the last of `FD_LENGTHS`."""
     return FD_LENGTHS[-1] if is_fd(codec) else CLASSIC_BYTES

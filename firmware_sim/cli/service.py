@@ -49,7 +49,8 @@ class Service:
     ) -> None:
         """`departure`: where the bench puts its frames.
 
-        `is_once`: end also when the host has started the nodes and then stops or resets them, or is silent for 2 s.
+        `is_once`: end also when the host has started the nodes and then stops or resets them, or is silent for
+        `_SILENCE_NS`.
         """
         self._bench = bench
         self._bus = bus
@@ -106,7 +107,7 @@ class Service:
         return frame
 
     def _await_interface(self) -> None:
-        """Try every 50 ms to recover the interface, until it is back or a stop is requested."""
+        """Try every `_LONGEST_WAIT_NS` to recover the interface, until it is back or a stop is requested."""
         while not self._stop.is_made:
             try:
                 self._bus.recover()
@@ -118,7 +119,7 @@ class Service:
     def _patience_s(self) -> float:
         """Return how long to wait for a frame, s.
 
-        By SYNC it is 10 ms; by wall clock the time to the bench's next timer, 50 ms at most.
+        By SYNC it is `_IDLE_NS`; by wall clock the time to the bench's next timer, `_LONGEST_WAIT_NS` at most.
         """
         if not self._is_wall:
             return _IDLE_NS * 1e-9
@@ -126,9 +127,10 @@ class Service:
         return max(0, min(due_ns, _LONGEST_WAIT_NS)) * 1e-9
 
     def _pass_time(self, now_ns: int, is_idle: bool) -> None:
-        """Pass the time to the bench: by wall clock if no frame came, by SYNC if no SYNC has come for 10 ms.
+        """Pass the time to the bench: by wall clock if no frame came, by SYNC if no SYNC has come for `_IDLE_NS`.
 
-        A host in lockstep sends the time itself. After 2 s of silence the bench outlives the host, and lockstep ends.
+        A host in lockstep sends the time itself. After a silence of `_SILENCE_NS` the bench outlives the host, and
+        lockstep ends.
         """
         is_silent = now_ns - self._heard_ns > _SILENCE_NS
         if is_silent:
@@ -150,9 +152,9 @@ class Service:
         return self._has_been_operational and (is_silent or not self._bench.is_operational)
 
     def _is_settled(self) -> bool:
-        """Return whether the arm of a host that has gone is at rest, or 5 s have passed since by wall clock.
+        """Return whether the arm of a host that has gone is at rest, or has had its time by wall clock.
 
-        In clock mode `sync` the first call lets the arm come to rest.
+        That time is `LONGEST_ORPHANAGE_NS`. In clock mode `sync` the first call lets the arm come to rest.
         """
         self._bench.outlive_host()
         self._departure.send_waiting()

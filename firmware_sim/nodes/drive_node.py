@@ -161,7 +161,7 @@ class DriveNode(Application):
 
     @property
     def is_ready(self) -> bool:
-        """Whether the drive is in Operation enabled and shows mode 10, so that a master may command torque."""
+        """Whether a master may command torque: the drive is in Operation enabled and shows that mode."""
         return self.is_enabled and (not self._has_habits or self._shown_mode == CYCLIC_SYNCHRONOUS_TORQUE)
 
     @property
@@ -555,7 +555,7 @@ class DriveNode(Application):
         return self._patience.is_command_missing or self._pdos.find_late(t_ns)
 
     def _watch_standstill(self, t_ns: int) -> None:
-        """End the braking once the motor has stood still for 10 ms, or after 1 s.
+        """End the braking once the motor stands still, or after the longest time, see `Standstill.is_reached`.
 
         The state then changes, except in a quick stop that stays.
         """

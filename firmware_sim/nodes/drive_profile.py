@@ -172,7 +172,7 @@ FAULT_REACTIONS = {code: QUICK_STOPS[code] for code in (0, 1, 2, 3)}
 
 
 class Standstill:
-    """Finds whether a braking motor has stood still for 10 ms, or has braked for 1 s."""
+    """Finds whether a braking motor has stood still for `_REST_NS`, or has braked for `_LONGEST_BRAKING_NS`."""
 
     def __init__(self) -> None:
         self._since_ns = self._moving_ns = 0
@@ -182,9 +182,9 @@ class Standstill:
         self._since_ns = self._moving_ns = t_ns
 
     def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:
-        """Return whether the motor has stood still (0.02 rad/s) for 10 ms, or has braked for 1 s.
+        """Return whether the motor has stood still for `_REST_NS`, or has braked for `_LONGEST_BRAKING_NS`.
 
-        Call it often while it brakes.
+        Up to `REST_RAD_S` it stands still. Call it often while it brakes.
         """
         if abs(velocity_rad_s) > REST_RAD_S:
             self._moving_ns = t_ns

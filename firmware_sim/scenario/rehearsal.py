@@ -360,8 +360,8 @@ def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
 def _sensors(rated: Pair, counts: DeviceCounts, said: dict[str, Any], assumed: list[str]) -> dict[str, Any]:
     """Return the scenario's sensor settings, `said`, completed by range, noise and encoder bits.
 
-    Appends a line to `assumed` for each addition. Raises ConfigError if the frames carry less than a tenth of rated
-    torque.
+    Appends a line to `assumed` for each addition. Raises ConfigError if the frames carry less than
+    `_LEAST_RANGE_SHARE` of rated torque.
     """
     sensors = dict(said)
     for joint, (rated_Nm, most_Nm) in enumerate(zip(rated, counts.torque_range_Nm, strict=True)):

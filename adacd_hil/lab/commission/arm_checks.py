@@ -129,7 +129,7 @@ def open_arm_bus(patient: ArmExamination) -> Finding:
 
 
 def check_other_masters(patient: ArmExamination) -> Finding:
-    """Listen for 0.5 s, and fail if a frame comes that only a host sends. NMT is allowed on a shared bus."""
+    """Listen for `LISTEN_S`, and fail if a frame comes that only a host sends. NMT is allowed on a shared bus."""
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
     patient.tap.take_passed()
@@ -291,7 +291,7 @@ def check_rate(patient: ArmExamination) -> Finding:
 
 
 def check_load(patient: ArmExamination) -> Finding:
-    """Warn if the bus load of the stored cycles is above 80 %, too little room for other frames."""
+    """Warn if the bus load of the stored cycles is above `HIGH_LOAD_PERCENT`, too little room for other frames."""
     load = patient.communication().load_percent()
     text = f"{load:.1f} % at {patient.bitrate} bit/s"
     if load > HIGH_LOAD_PERCENT:
@@ -473,7 +473,7 @@ class HandMotion:
 
     @property
     def is_done(self) -> bool:
-        """Whether any joint, the right one or not, is 10 degrees away from its first position."""
+        """Whether any joint, the right one or not, is `WANTED_DEG` away from its first position."""
         return bool(np.abs(self._way).max() >= math.radians(self.WANTED_DEG))
 
     def observe_cycle(self, cycle: ZeroTorqueCycle) -> None:

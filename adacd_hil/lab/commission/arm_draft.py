@@ -72,7 +72,7 @@ class PlanarArm(NamedTuple):
 
     @property
     def has_gravity(self) -> bool:
-        """Whether gravity acts on the joints: the plane of motion is tilted by more than 2 degrees."""
+        """Whether gravity acts on the joints: the plane of motion is tilted by more than `SLIGHT_TILT_DEG`."""
         return self.mounting_deg[0] > SLIGHT_TILT_DEG
 
 
@@ -203,9 +203,9 @@ def _gravity_doubts(moment: Vector, along: Vector, axis: Vector, lever_kg_m: flo
 def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str]) -> tuple[Pair, Vector]:
     """Return the drives' positions at q = 0, deg, and the largest |q| (2,), deg, of an arm that is stretched at q2 = 0.
 
-    sign: 1, or -1 if joint 2 of the URDF turns against joint 1. bent_deg: the model's q2 at the URDF's zero; up to 5
-    degrees count as 0. Adds a line to `doubts` if the limits of joint 2 exclude the stretched arm. Raises UrdfError for
-    limits without 0.
+    sign: 1, or -1 if joint 2 of the URDF turns against joint 1. bent_deg: the model's q2 at the URDF's zero; up to
+    `_BENT_DEG` counts as 0. Adds a line to `doubts` if the limits of joint 2 exclude the stretched arm. Raises
+    UrdfError for limits without 0.
     """
     limits = _position_limits(arm)
     if abs(bent_deg) <= _BENT_DEG:
@@ -586,7 +586,7 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
 def _torque_scale(facts: ArmFacts) -> float:
     """Return the rated torque over that of the emulated arm P, for the joint where this is closer to 1.
 
-    1 unless both joints' ratios are above 2, or both below 1/2.
+    1 unless both joints' ratios are above `_ALIKE`, or both below 1 / `_ALIKE`.
     """
     ratios = [facts.rated_torque_Nm.value[i] / _MODEL_TORQUE_NM[i] for i in range(JOINTS)]
     if min(ratios) > _ALIKE:

@@ -125,7 +125,7 @@ class Verdict(Enum):
 def judge(share: float) -> Verdict:
     """Return the verdict on a share 0…1 of periods with complete fresh data.
 
-    NOT_SUFFICIENT is below 0.90, GOOD is from 0.95 on.
+    NOT_SUFFICIENT is below `SUFFICIENT_SHARE`, GOOD is from `GOOD_SHARE` on.
     """
     if share < SUFFICIENT_SHARE:
         return Verdict.NOT_SUFFICIENT
@@ -221,7 +221,7 @@ class CommunicationTest:
         }
 
     def load_percent(self) -> float:
-        """Return the bus load, percent, over the last 1000 cycles, sent and received; 0 without cycles."""
+        """Return the bus load, percent, over the last `_LOAD_CYCLES`, sent and received; 0 without cycles."""
         meter = LoadMeter(self.bitrate, self.data_bitrate, 0)
         for cycle in self._recent:
             for _, frame in cycle.frames:

@@ -268,7 +268,7 @@ def check_bitrate(host: Host, link: InterfaceState) -> Finding:
 
 
 def check_sample_point(_host: Host, link: InterfaceState) -> Finding:
-    """Warn of a sample point outside 70 to 90 %, which may not suit the devices; skipped if it is unknown."""
+    """Warn of a sample point outside `_SAMPLE_POINT`, which may not suit the devices; skipped if it is unknown."""
     if link.sample_point is None:
         return skipped("the kernel does not report it here; install iproute2")
     text = f"{100.0 * link.sample_point:.1f} %"
@@ -303,7 +303,7 @@ def check_controller(_host: Host, link: InterfaceState) -> Finding:
 
 
 def check_queue(host: Host) -> Finding:
-    """Warn if the transmit queue holds 100 frames or more, outdated commands after a dead bus.
+    """Warn if the transmit queue holds `LONG_QUEUE_FRAMES` or more, outdated commands after a dead bus.
 
     The check is skipped without SocketCAN.
     """
@@ -361,7 +361,7 @@ def request_scheduler(host: Host) -> Finding:
 
 
 def check_throttling(host: Host) -> Finding:
-    """Warn if the kernel lets real-time processes work for less than 90 % of the time; skipped if unknown."""
+    """Warn if the kernel lets real-time processes work for less than `_RT_SHARE` of the time; skipped if unknown."""
     folder = host.root / "proc/sys/kernel"
     try:
         runtime_us = int(_read(folder / "sched_rt_runtime_us"))

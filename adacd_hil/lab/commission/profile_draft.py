@@ -478,7 +478,7 @@ class _ProfileWriter(ABC):
         return f'signal = "{name or f"object_{index:04X}_{sub}"}"{unit}'
 
     def fill(self, places: Sequence[_Place], room: int) -> list[_Place]:
-        """Return the objects of `places`, in order, that can be mapped and fit together into one PDO of 8 bytes.
+        """Return the objects of `places`, in order, that can be mapped and together fit a PDO of `CLASSIC_BYTES`.
 
         room: most objects of the PDO. An object that doesn't fit is left out; later ones may fit.
         """

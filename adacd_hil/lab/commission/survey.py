@@ -145,8 +145,8 @@ def survey(
     """Ask all 127 node ids for 0x1000, listen for `duration_s`, and read the identity of each node that answers.
 
     contract_ids: ids of the nodes of which 0x2000, wire version and layout digest, is read, too. progress: called with
-    a line before each step. Silent nodes are found by heartbeat or EMCY. Takes about 0.4 s even if `duration_s` is 0.
-    Raises BusError.
+    a line before each step. Silent nodes are found by heartbeat or EMCY. It listens for at least `_ANSWER_S` after its
+    requests, even if `duration_s` is 0. Raises BusError.
     """
     tap = Tap(bus, clock)
     traffic = Traffic()
@@ -389,9 +389,9 @@ class BusView:
 
         node_id: return only nodes and messages of this node; counts and load are still of the whole bus.
         strange_frames: of a length that the contract's bus can't carry; the load leaves them out. A node's state: by
-        its last heartbeat, age_s since then. Of a message: rate_Hz: over the last one or two seconds; lost: frames that
-        a counter shows to be missing, as occasions; errors: frames of a wrong length, or that failed the end-to-end
-        check; values: of the last frame that passed its checks, empty before.
+        its last heartbeat, age_s since then. Of a message: rate_Hz: over the last one or two `_WINDOW_NS`; lost: frames
+        that a counter shows to be missing, as occasions; errors: frames of a wrong length, or that failed the
+        end-to-end check; values: of the last frame that passed its checks, empty before.
         """
         mark_ns, counts = self._marks[0]
         elapsed_s = (t_ns - mark_ns) * 1e-9

@@ -114,8 +114,8 @@ def check_motion(q: Vector, dq: Vector, settings: Settings) -> None:
 def measure_pose(q: Vector, dq: Vector, tau_J: Vector, settings: Settings) -> Pose:
     """Return a pose: means and noise of a window of samples at rest (n, 2 each).
 
-    Raises ArmMovedError if the arm moved, TareRefusedError for fewer than 20 samples, or noise or drift above the
-    limits.
+    Raises ArmMovedError if the arm moved, TareRefusedError for fewer than 2 `_BLOCKS` samples, or noise or drift above
+    the limits.
     """
     tare = settings.tare
     if len(tau_J) < 2 * _BLOCKS:
@@ -140,7 +140,7 @@ def measure_pose(q: Vector, dq: Vector, tau_J: Vector, settings: Settings) -> Po
 
 
 def _standard_error(tau_J: Vector) -> Vector:
-    """Return the standard error of the mean (2,): the larger of that by samples and that by 10 blocks.
+    """Return the standard error of the mean (2,): the larger of that by samples and that by `_BLOCKS` blocks.
 
     Blocks show coloured noise.
     """

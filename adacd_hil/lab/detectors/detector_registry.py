@@ -130,6 +130,6 @@ def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> None:
 
 
 def describe_error(error: BaseException) -> str:
-    """Return an exception as one line, its type and at most 200 characters of its text."""
+    """Return an exception as one line, its type and at most `_LONGEST_TEXT` characters of its text."""
     text = " ".join(str(error).split())[:_LONGEST_TEXT]
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

@@ -138,8 +138,8 @@ class FittedModel:
 class ArrayDetection:
     """Contacts in arrays, and of m samples at a fixed period t_s (m,), tau_ext_hat and threshold (m, n), Nm.
 
-    The samples are those of the arrays if these have a fixed period; gaps split them, and parts of fewer than 50
-    samples are left out. Contacts are in the order of time.
+    The samples are those of the arrays if these have a fixed period; gaps split them, and parts of fewer than
+    `SHORTEST_SAMPLES` are left out. Contacts are in the order of time.
     """
 
     model: FittedModel
@@ -162,7 +162,7 @@ def fit(
     velocity_lag_s: float = 0.0,
     **scheme: Any,
 ) -> FittedModel:
-    """Fit a model to 60 % of the free motion in arrays, and test it on the last 40 % of that motion.
+    """Fit a model to the first part of the free motion in arrays, and test it on the last 40 % of that motion.
 
     For the arguments and errors see `detect`. Look at the model's `verdict` first: it tells whether the model explains
     the torque.
@@ -175,8 +175,8 @@ def _fitted(
 ) -> FittedModel:
     """Fit a model to the free motion of a recording, and test it.
 
-    fit_s: its span in the arrays' time; None: the first 40 %. Raises ArrayError if that is too little motion or
-    no span, or `scheme` has an invalid setting.
+    fit_s: its span in the arrays' time; None: the first `FIT_SHARE` of it. Raises ArrayError if that is too little
+    motion or no span, or `scheme` has an invalid setting.
     """
     start_s, end_s = _span(recording, fit_s)
     described = _described(arm, recording.columns.values.shape[1] > 2 * arm.joints, scheme)
@@ -311,7 +311,7 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
 
 
 def _numbers(name: str, given: ArrayLike) -> Vector:
-    """Return an array as float64 values of at most 1e6 in size; times may be larger, but finite.
+    """Return an array as float64 values of at most `LARGEST` in size; times may be larger, but finite.
 
     name: of the array, for the error. Raises ArrayError.
     """
@@ -332,7 +332,7 @@ def _numbers(name: str, given: ArrayLike) -> Vector:
 
 
 def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tuple[float, float]:
-    """Return the span of free motion, s since the recording's first row; by default the first 40 % of it.
+    """Return the span of free motion, s since the recording's first row; by default the first `FIT_SHARE` of it.
 
     Raises ArrayError if `fit_s` is no pair of times, or ends before it begins.
     """

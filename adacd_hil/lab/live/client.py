@@ -47,8 +47,8 @@ class LiveClient:
     def __init__(self, connection: ClientConnection, topics: Collection[str] | None) -> None:
         """Subscribe to `topics`, None: to all, and wait until the server confirms it by the arm's description.
 
-        Raises LogError after 5 s, or for data that is no log of adacd-hil. The messages received so far are returned by
-        `receive`.
+        Raises LogError after OPEN_TIMEOUT_S, or for data that is no log of adacd-hil. The messages received so far are
+        returned by `receive`.
         """
         self.topics: dict[str, LiveTopic] = {}
         """By name."""

@@ -99,7 +99,7 @@ class LiveFeed:
         """Start the view's process, and wait until it listens on the address of `live`.
 
         setup: of the log. ids: the file's number of each channel, by ours. start_ns: log time before the first message.
-        Raises LogError if the process can't start or listen, or doesn't answer within 30 s.
+        Raises LogError if the process can't start or listen, or doesn't answer within `START_TIMEOUT_S`.
         """
         self.hidden = 0
         self._is_watched = False
@@ -132,7 +132,10 @@ class LiveFeed:
         self._socket.setblocking(False)
 
     def _hear(self) -> dict[str, str]:
-        """Return the first word of the view's process, within 30 s: its "url" with an empty "error", or an "error"."""
+        """Return the first word of the view's process: its "url" with an empty "error", or an "error".
+
+        It is an "error" if none comes within `START_TIMEOUT_S`.
+        """
         self._socket.settimeout(START_TIMEOUT_S)
         try:
             received = self._socket.recv(processes.MOST_BYTES)
@@ -188,7 +191,7 @@ EVERY_MESSAGE = 0
 
 
 def rate_of(topic: str) -> int:
-    """Return the rate at which a topic is shown, Hz; EVERY_MESSAGE (0) if all its messages are."""
+    """Return the rate at which a topic is shown, Hz; EVERY_MESSAGE if all its messages are."""
     return DECODED_RATE_HZ if topic.startswith(DECODED) else RATES_HZ.get(topic, EVERY_MESSAGE)
 
 
@@ -201,7 +204,7 @@ class Decimator:
         self._first_ns = -1  # the first cycle of the slot
 
     def takes(self, cycle_ns: int) -> bool:
-        """Return whether the next message is shown; at a rate of 0 always.
+        """Return whether the next message is shown; at the rate EVERY_MESSAGE always.
 
         cycle_ns: time of the message's cycle, which never runs backwards.
         """

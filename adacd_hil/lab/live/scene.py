@@ -216,7 +216,7 @@ def draw_joints(state: SchemeState, tau_ext_hat: Vector, threshold: Vector) -> t
 
 
 def draw_contact(shape: Shape, report: ContactReport) -> Entity:
-    """Return an entity with the arrow and text of a report's force, which viewers show for 2 s.
+    """Return an entity with the arrow and text of a report's force, which viewers show for `ARROW_LIFETIME_NS`.
 
     It is at the touched place of link 2 if that is known, else at the link's end. "≥" stands before a force that is not
     known.

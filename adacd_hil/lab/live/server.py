@@ -187,7 +187,7 @@ class LiveServer:
         self._show_some()
 
     def _show_some(self) -> None:
-        """Show 256 KiB of the ring's packets; the rest follows after other tasks."""
+        """Show `_AT_ONCE_BYTES` of the ring's packets; the rest follows after other tasks."""
         for batch in split(self._ring.take_packets(_AT_ONCE_BYTES)):
             self._show(batch)
         if self._ring.waiting:
@@ -203,7 +203,7 @@ class LiveServer:
         self._tell_time(self._topics.latest_ns)
 
     def _tell_time(self, log_ns: int) -> None:
-        """Queue the log time for all viewers if 10 ms of it have passed since the last time."""
+        """Queue the log time for all viewers if `_TIME_STEP_NS` of it have passed since the last time."""
         if log_ns - self._time_ns >= _TIME_STEP_NS:
             self._time_ns = log_ns
             for viewer in self._viewers:
@@ -330,7 +330,7 @@ class LiveServer:
         self._tell_writer()
 
     async def _end(self, server: Server) -> None:
-        """Stop listening, send the rest for at most 1 s, then close all connections."""
+        """Stop listening, send the rest for at most `LINGER_S`, then close all connections."""
         for listening in server.sockets:  # before it closes: asyncio drops, unclosed, whom it accepts while it does
             asyncio.get_running_loop().remove_reader(listening)
         server.close(close_connections=False)

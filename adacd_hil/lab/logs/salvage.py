@@ -43,7 +43,7 @@ class Losses:
     """The records that could not be saved.
 
     `bytes`: in gaps and in lost records. `messages`: None if their number is unknown. `is_cut`: the file has no end.
-    `notes`: a line for each damage, the first 20.
+    `notes`: a line for each damage, the first `_NOTES`.
     """
 
     chunks: int = 0

@@ -170,7 +170,7 @@ def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording])
 
 
 def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report torques that are constant, stuck, clipped, or over 30 times the URDF's effort."""
+    """Report torques that are constant, stuck, clipped, or over `BEYOND_EFFORT` times the URDF's effort."""
     n = described.joints
     constant = [joint for joint in range(n) if np.ptp(columns.tau_J[:, joint]) == 0.0]
     if constant:
@@ -209,7 +209,7 @@ def torques_and_limits(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
 
 
 def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report the torque that is farthest beyond 30 times the URDF's effort, if one is; no current."""
+    """Report the torque that is farthest beyond `BEYOND_EFFORT` times the URDF's effort, if one is; no current."""
     largest, effort = torques_and_limits(columns.tau_J, described.urdf)
     is_over = largest > BEYOND_EFFORT * effort
     if "A" in described.units.tau_J or not is_over.any():
@@ -238,7 +238,7 @@ def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, 
 def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     """Report joints at rest or with dead encoders, noise, and one joint far beyond the URDF's limits.
 
-    Far is over 3 times a limit of position or speed.
+    Far is over `_BEYOND_LIMITS` times a limit of position or speed.
     """
     n, urdf = described.joints, described.urdf
     travel = np.ptp(columns.q, axis=0)
@@ -313,7 +313,7 @@ def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[Recording
 def _of_jumps(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
     """Report the first joint whose position jumps and does not return, as of an encoder that is set to zero anew.
 
-    A joint with more than 3 jumps is passed over: other checks report such a column.
+    A joint with more than `_MOST_JUMPS` is passed over: other checks report such a column.
     """
     for joint in np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist():
         jumps = [jump for recording in recordings for jump in _jumps(recording, joint)]
@@ -360,7 +360,7 @@ def _spikes(column: Vector) -> NDArray[np.int64]:
 def _is_noise(column: Vector, period_s: float) -> bool:
     """Return whether positions (k,) jump from sample to sample as white noise does.
 
-    Always False for a period above 20 ms.
+    Always False for a period above `_NOISE_PERIOD_S`.
     """
     return period_s <= _NOISE_PERIOD_S and float(np.mean(np.diff(column) ** 2)) > _NOISE_STEP * 2.0 * float(
         np.var(column)
@@ -474,7 +474,7 @@ def clipped_torque(torque: Vector) -> tuple[float, float] | None:
 def _clipped_at(torque: Vector) -> Iterator[float]:
     """Yield the smallest and the largest reading of a torque (k,), each only if it repeats as of a clipped sensor.
 
-    A torque with fewer than 50 distinct readings yields none.
+    A torque with fewer than `_FEWEST_LEVELS` distinct readings yields none.
     """
     levels = np.unique(torque)
     if len(levels) < _FEWEST_LEVELS:

@@ -145,9 +145,9 @@ def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _angle_unit(q: Vector, arm: SerialArm) -> tuple[str, str]:
-    """Return "deg" and the reason if a turning joint goes 1.5 times as far as the URDF allows in rad; else "rad", "".
+    """Return "deg" and the reason if a turning joint goes far beyond what the URDF allows in rad; else "rad", "".
 
-    A joint without limits may make a whole turn. q (k, n).
+    Far beyond is over `_BEYOND` times as far. A joint without limits may make a whole turn. q (k, n).
     """
     bound = np.maximum(np.abs(arm.position_low), np.abs(arm.position_high))
     bound = np.where(np.isfinite(bound) & (bound > 0.0), bound, 2.0 * np.pi)
@@ -171,7 +171,7 @@ def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
 
 
 def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
-    """Return "mNm" and the reason if a torque is over 5 times the URDF's effort of its joint, else "Nm", "".
+    """Return "mNm" and the reason if a torque is over `_BEYOND_EFFORT` times the URDF's effort, else "Nm", "".
 
     tau (k, n).
     """

@@ -157,12 +157,12 @@ def mass_rows(model: ArmModel, q: Vector, poses: int) -> Vector:
 
 
 def _step(settings: OfflineSettings) -> int:
-    """Return the distance, in samples, of those that are used: 10 ms or a little less, and at least 1."""
+    """Return the distance, in samples, of those that are used: `_PERIOD_S` or a little less, and at least 1."""
     return max(1, math.floor(_PERIOD_S / settings.period_s + 1e-9))
 
 
 def _thinned(records: list[Record], settings: OfflineSettings) -> list[Record]:
-    """Return the first 10 s of the records in all, with only every `_step`-th sample.
+    """Return the first `_MOST_S` of the records in all, with only every `_step`-th sample.
 
     A record left with one sample is dropped.
     """
@@ -237,7 +237,7 @@ def _judge(
 
 
 def _other_units(described: RecordingMap, tested: list[Record]) -> Iterator[tuple[int, float]]:
-    """Yield (joint, factor), factors 0.001 and 1000, that leave all torques within 30 times the effort."""
+    """Yield (joint, factor), factors 0.001 and 1000, that leave all torques within `BEYOND_EFFORT` times the effort."""
     largest, effort = torques_and_limits(np.concatenate([record.tau_J for record in tested]), described.urdf)
     for joint, factor in itertools.product(range(described.joints), (1e-3, 1e3)):
         scaled = np.where(np.arange(described.joints) == joint, factor * largest, largest)

@@ -107,8 +107,8 @@ class RecordedRows:
         """Return all kept rows as columns in SI units.
 
         names: of the value columns, for errors; more than 2 n include velocities. has_touches: the last number of a row
-        is not 0 while the arm is touched. Raises LogError for fewer than 50 rows, too many dropped
-        ones, rows of two sources, or a value above 1e6.
+        is not 0 while the arm is touched. Raises LogError for fewer than `SHORTEST_SAMPLES` rows, too many dropped
+        ones, rows of two sources, or a value above `LARGEST`.
         """
         self._flush()
         table = np.concatenate(self._kept) if self._kept else np.empty((0, self._width))
@@ -168,7 +168,7 @@ class RecordedRows:
             self.drop(kind, f"row {number:.0f}: {first}", int(np.count_nonzero(is_wrong)))
 
     def _within(self, table: Vector) -> Vector:
-        """Return the rows of a table in the requested span, widened by 1 s at both ends; all without a span."""
+        """Return the rows of a table in the requested span, widened by `_SPARE_S` at both ends; all without a span."""
         if self._span is None:
             return table
         time_s = table[:, 1] * self._unit_s - self._begin_s
@@ -181,7 +181,7 @@ class RecordedRows:
         ]
 
     def _check_drops(self, kept: int) -> None:
-        """Raise LogError if more rows were dropped than both 3 and 1 % of all rows.
+        """Raise LogError if more rows were dropped than both `_FEW_ROWS` and a share `_FEW_SHARE` of all rows.
 
         kept: number of kept rows. Rows with the time of the row before are not included.
         """
@@ -194,8 +194,8 @@ class RecordedRows:
     def _check_sources(self, values: Vector, names: list[str]) -> None:
         """Raise LogError if many rows have the time of the row before but other values, as of two sources in one table.
 
-        values: as recorded (k, c). Many are more than both 3 and 1 % of all rows. A column has other values if these
-        rows' mean difference is over 3 times that from one time to the next.
+        values: as recorded (k, c). Many are more than both `_FEW_ROWS` and a share `_FEW_SHARE` of all rows. A column
+        has other values if these rows' mean difference is over `_OTHER_TIMES` that from one time to the next.
         """
         apart = np.concatenate(self._doubled)[:, : len(names)]
         is_other = np.any(apart > 0.0, axis=1)
@@ -211,7 +211,7 @@ class RecordedRows:
             )
 
     def _check_values(self, given: Vector, values: Vector, time_s: Vector, names: list[str]) -> None:
-        """Raise LogError if a finite recorded value is above 1e6 in SI units.
+        """Raise LogError if a finite recorded value is above `LARGEST` in SI units.
 
         given: values as recorded, values: in SI units, (k, c).
         """

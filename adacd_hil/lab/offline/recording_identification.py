@@ -156,7 +156,7 @@ def identify(
 ) -> Identified:
     """Fit one model to all recordings, test it on another one, and detect contacts in further ones.
 
-    tested: None: of the last recording the first 60 % of its time is fitted, and the rest tested. watched:
+    tested: None: of the last recording the first `FIT_SHARE` of its time is fitted, and the rest tested. watched:
     further recordings. Samples during a known touch are neither fitted nor tested. Raises LogError if there is too
     little free motion to fit or to test, ConfigError for the map's settings of the scheme.
     """
@@ -206,7 +206,7 @@ _MOST_OVER: Final = 0.5
 def _examined(described: RecordingMap, watched: Watched) -> Watched:
     """Return a watched recording with the defects for which its contacts can't be told, in `faults`.
 
-    Those are defects of columns that aren't harmless, else a torque over a threshold for more than half of the time.
+    Those are defects of columns that aren't harmless, else a torque over a threshold for over `_MOST_OVER` of the time.
     """
     faults = [fault.text for fault in column_faults(described, [watched.recording]) if not fault.is_harmless]
     pairs = zip(watched.tau_ext_hat, watched.threshold, strict=True)

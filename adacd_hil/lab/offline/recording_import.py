@@ -105,7 +105,7 @@ class ForeignRecording:
     def between(self, start_s: float, end_s: float) -> "ForeignRecording":
         """Return the recording with its stretches cut to a span of time, s since the recording's first row.
 
-        Stretches left with fewer than 50 samples are dropped; there may be no stretch left. Noise,
+        Stretches left with fewer than `SHORTEST_SAMPLES` are dropped; there may be no stretch left. Noise,
         columns and notes stay those of the whole recording.
         """
         parts = [_cut(stretch, self.period_s, start_s, end_s) for stretch in self.stretches]
@@ -118,7 +118,7 @@ class ForeignRecording:
         return replace(self, stretches=tuple(part for stretch in self.stretches for part in self._untouched(stretch)))
 
     def _untouched(self, stretch: RecordingStretch) -> list[RecordingStretch]:
-        """Return the untouched parts of a stretch with at least 50 samples.
+        """Return the untouched parts of a stretch with at least `SHORTEST_SAMPLES`.
 
         The whole stretch if touches are unknown. Samples whose derived velocity depends on touched samples are left
         out, too.
@@ -164,7 +164,7 @@ def recording_of(
 
     path: of the recording, named in errors. period_s: if the map gives none; 0: the median interval of the rows. Raises
     LogError if no stretch without a gap has enough samples, the samples are more than `MOST_ROWS`, or the median
-    interval is outside 10 µs to 100 ms.
+    interval is outside `SHORTEST_PERIOD_S` to `LONGEST_PERIOD_S`.
     """
     n = described.joints
     is_whole = np.isfinite(given.values).all(axis=1)
@@ -222,7 +222,7 @@ def recording_of(
 def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
     """Return the median interval of the rows, s.
 
-    Raises LogError if it is outside 10 µs to 100 ms; the error names the unit of times that
+    Raises LogError if it is outside `SHORTEST_PERIOD_S` to `LONGEST_PERIOD_S`; the error names the unit of times that
     would fit.
     """
     period_s = float(np.median(np.diff(time_s)))
@@ -237,7 +237,7 @@ def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
 
 
 def _jitter(time_s: Vector, period_s: float) -> str:
-    """Return a note on intervals between rows that vary by over a quarter of a period; "" if they don't.
+    """Return a note on intervals between rows that vary by over `_JITTER` of a period; "" if they don't.
 
     Their 5 % and 95 % quantiles are compared.
     """
@@ -269,7 +269,7 @@ def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[V
 def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
     """Return a copy of the values with unwrapped positions, and a note on each joint that was unwrapped.
 
-    A turning joint is unwrapped if its steps above half a turn are all whole turns, within 0.8 rad.
+    A turning joint is unwrapped if its steps above half a turn are all whole turns, within `_MOST_BESIDE_JUMP_RAD`.
     """
     notes = []
     values = values.copy()
@@ -284,7 +284,7 @@ def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, lis
 
 
 def derivative_window(described: RecordingMap, period_s: float) -> int:
-    """Return the number of samples, odd and at least 5, in the window over which a velocity is derived."""
+    """Return the number of samples, odd and at least `_DEGREE` + 2, in the window over which a velocity is derived."""
     return max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
 
 

@@ -39,7 +39,7 @@ def unit_of(text: str) -> str:
 
 
 def time_unit_of(step: float) -> str:
-    """Return the first of s, ms, us, ns in which a step between two rows is 0.2 to 100 ms; "" if it is in none."""
+    """Return the first of s, ms, us, ns in which a step between rows is within `_USUAL_PERIOD_S`; "" without one."""
     low_s, high_s = _USUAL_PERIOD_S
     return next((unit for unit in ("s", "ms", "us", "ns") if low_s <= step * TIME_S[unit] <= high_s), "")
 

@@ -144,7 +144,7 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Recor
     """Return findings on columns, scale, other interpretations and fit; the first is the likeliest cause, if any.
 
     columns: defects of columns as possible causes; remarks if the torque is explained, with a margin below 1 at least
-    99 % of it.
+    `WHOLE` of it.
     """
     remarks = [found._replace(is_against=False) for found in columns]
     scale = list(_of_scale(fit, joints))
@@ -167,7 +167,7 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Recor
 
 
 def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
-    """Return, per joint, whether its filtered torque is at most 1.5 times the filtered noise of the settings."""
+    """Return, per joint, whether its filtered torque is at most `_NOISE_TIMES` the filtered noise of the settings."""
     noise = offline.filtered_noise_Nm(fit.settings)
     return [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
 
@@ -399,7 +399,7 @@ def _mass_at_reach(fit: Fitted) -> float | None:
 
 
 def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
-    """Report the most negative inertia, if it is so by more than 3 deviations: no masses have it."""
+    """Report the most negative inertia, if it is so by more than `_SIGMAS` deviations: no masses have it."""
     urdf, rows = fit.described.urdf, mass_rows(fit.model, fit.tested.records[0].q, 16)
     inertia = rows @ fit.estimate.theta
     sigma = np.maximum(np.linalg.norm(rows * fit.deviation, axis=-1), 1e-300)
@@ -416,7 +416,7 @@ def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
 def _of_friction(fit: Fitted) -> Iterator[RecordingFinding]:
     """Report, as remarks, friction that drives a joint on, or whose viscous or Coulomb term is negative.
 
-    It must be so by more than 3 deviations.
+    It must be so by more than `_SIGMAS` deviations.
     """
     speed = np.abs(samples((fit.tested,), "dq"))
     theta, deviation = fit.estimate.theta, fit.deviation
@@ -443,7 +443,7 @@ def _of_friction(fit: Fitted) -> Iterator[RecordingFinding]:
 def _of_excitation(fit: Fitted) -> Iterator[RecordingFinding]:
     """Report, as a remark, parameters that the motion hardly determines, given the noise of the residual.
 
-    They keep more than 30 % of their initial deviation.
+    They keep more than `_UNKNOWN` of their initial deviation.
     """
     before, after = (np.sqrt(np.diag(estimate.P)) for estimate in (fit.before, fit.estimate))
     noise = np.maximum(fit.certificate.threshold_Nm / fit.settings.deviations, 1e-12)

@@ -90,7 +90,7 @@ def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
     """Guess the form of a CSV file and the role of its columns, by their heads, or by their values if it has no heads.
 
     joint_names: of the arm, from the base; they also tell the number of joints. A role without fitting columns is
-    missing in the guess. Raises LogError if the file can't be read, or has no rows of numbers in its first 60 lines.
+    missing in the guess. Raises LogError if the file can't be read, or its first `_HEAD_ROWS` hold no rows of numbers.
     """
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
@@ -122,7 +122,8 @@ _Form = tuple[CsvSection, tuple[str, ...], tuple[str, ...], int]
 def _form(path: Path, lines: list[str]) -> _Form:
     """Return the form whose delimiter and decimal sign give the data the most columns, and where the data begin.
 
-    The line counts from 0. Raises LogError if no four successive rows of numbers lie in the first 60 lines.
+    The line counts from 0. Raises LogError unless `_FULL_ROWS` successive rows of numbers lie in the first
+    `_HEAD_ROWS`.
     """
     best: _Form | None = None
     for delimiter in DELIMITERS:
@@ -143,7 +144,7 @@ def _trimmed(cells: list[str]) -> list[str]:
 
 
 def _begins(rows: list[list[str]], decimal: str) -> bool:
-    """Return whether these are 4 rows of equally many numbers, at least three each."""
+    """Return whether these are `_FULL_ROWS` rows of equally many numbers, at least three each."""
     count = len(rows[0]) if rows else 0
     return len(rows) == _FULL_ROWS and count >= 3 and all(len(row) == count and _is_full(row, decimal) for row in rows)
 
@@ -301,7 +302,7 @@ def _take(guess: TableGuess, role: str, block: tuple[int, ...], reason: str) -> 
 def _is_slope(time: Vector, q: Vector, dq: Vector) -> bool:
     """Return whether dq (k, n) is, in any unit and with any sign, the slope of q (k, n) over time (k,).
 
-    For each moving joint the two must correlate by more than 0.9. False if no joint moves, or a moving one's dq is
+    For each moving joint the two must correlate by more than `_ALIKE`. False if no joint moves, or a moving one's dq is
     constant.
     """
     slope = np.gradient(q, axis=0) / np.gradient(time)[:, None]

@@ -90,7 +90,7 @@ def stays_of(run: Run) -> list[Stay]:
 def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
     """Return warnings, errors, faults and false alarms in order of time.
 
-    Of more than 300, warnings are left out first.
+    Of more than `_MOST_NOTICES`, warnings are left out first.
     """
     notices = [
         Notice((t_ns - run.zero_ns) * 1e-9, event.level == "error", f"{event.name}: {event.message}")

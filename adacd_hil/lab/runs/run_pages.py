@@ -84,7 +84,7 @@ def trend_page(found: Sequence[Trend]) -> str:
 def _track_of(trend: Trend, name: str) -> Track:
     """Return a track with the curves of thresholds, friction, offsets and margins over the dates of the runs.
 
-    Runs without a date are left out; dashed curves are two deviations apart from a value.
+    Runs without a date are left out; dashed curves are `_SIGMAS` deviations apart from a value.
     """
     dated = [row for row, run in enumerate(trend.runs) if run.started is not None]
     at_s = [run.started.timestamp() for run in trend.runs if run.started is not None]

@@ -165,8 +165,8 @@ def _columns(pairs: Sequence[tuple[float, float] | None]) -> Vector:
 def _changes(runs: Sequence[RunSummary], values: Vector, std: Vector, share: float | None) -> tuple[TrendChange, ...]:
     """Return the runs whose value differs too much from the first one since the last change, joint by joint.
 
-    share: of that first value, a quarter of it if settings of the detection differ from the run before; None: compare
-    by standard deviations `std`, more than LAST_SIGMAS of both.
+    share: of that first value, times `_MEANT_SHARE` if settings of the detection differ from the run before; None:
+    compare by standard deviations `std`, more than LAST_SIGMAS of both.
     """
     found: list[TrendChange] = []
     for joint in range(JOINTS):

@@ -47,7 +47,7 @@ def doubling_bins(values: Values, first: float, count: int) -> list[tuple[float,
 def bar_chart(labels: Sequence[str], counts: Sequence[int]) -> list[str]:
     """Return a line of text per bin: label, bar, count, share.
 
-    The largest count has a bar of 40 signs, any other but 0 at least one sign.
+    The largest count has a bar of `_BAR` signs, any other but 0 at least one sign.
     """
     total, largest = sum(counts), max(counts, default=0)
     width = max((len(label) for label in labels), default=0)

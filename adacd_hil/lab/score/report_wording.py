@@ -110,7 +110,7 @@ def score_sentence(score: Score) -> str:
 def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
     """Return a clause with the number of false alarms, and the upper bound of their rate.
 
-    A bound above 3 per hour is replaced by words that the time is too short.
+    A bound above `_TELLING_PER_H` is replaced by words that the time is too short.
     """
     count = number_of(false_alarms, "false alarm") if false_alarms else "No false alarms"
     if bound_per_h > _TELLING_PER_H:
@@ -143,7 +143,7 @@ def share_phrase(delays_ms: Sequence[float], contacts: int, bounds: tuple[float,
 
 
 def rate_phrase(alarms: int, hours: float, bound_per_h: float) -> str:
-    """Return a phrase with the number of false alarms, the hours, and the 95 % bound of their rate."""
+    """Return a phrase with the number of false alarms, the hours, and the `CONFIDENCE_TEXT` bound of their rate."""
     return f"{alarms} false alarms in {hours:.4f} h, {CONFIDENCE_TEXT} bound {bound_per_h:.3g} per hour"
 
 

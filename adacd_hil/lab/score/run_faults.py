@@ -48,7 +48,7 @@ def find_faults(run: Run) -> tuple[Fault, ...]:
 def _cause(run: Run, t_ns: int) -> str:
     """Return the supervisor's words for the fault at `t_ns`, without state and reason.
 
-    "" if the log has no event of it within 2 ms.
+    "" if the log has no event of it within `_NEAR_NS`.
     """
     for logged in run.events:
         event = logged.event

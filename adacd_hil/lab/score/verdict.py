@@ -98,7 +98,7 @@ _HEADLINE_LETTERS: Final = 160
 
 
 def headlines(metrics: Metrics) -> list[str]:
-    """Return the findings as lines for a first screen, the bad ones first, each cut at 160 letters.
+    """Return the findings as lines for a first screen, the bad ones first, each cut at `_HEADLINE_LETTERS`.
 
     Findings on the paper's scheme beside, and on cyclic data without a loss, are left out.
     """

@@ -5,7 +5,7 @@ of the velocity: 1 - (1 + x) e^-x with x = 2 t / lag, a critically damped tracki
 the statistics, so the sum equals the recording of a push, except for the motion that a push causes.
 
 A delay is from the onset to the sample at which the detector exceeds its threshold, in ms; the bus cycle until the host
-has that sample is not included. A step that is not found within 0.1 s has a delay of more than that.
+has that sample is not included. A step that is not found within `HORIZON_S` has a delay of more than that.
 """
 
 import math
@@ -39,7 +39,7 @@ _LATE: Final = math.inf
 class DelayRow:
     """One detector and joint, from 1. delay_ms: median delay of each step of `STEPS_NM`; inf if half are not found.
 
-    found: share of each step's onsets found within 0.1 s.
+    found: share of each step's onsets found within `HORIZON_S`.
     """
 
     detector: str
@@ -67,7 +67,7 @@ class Comparison:
     def ranking(self) -> tuple[str, ...]:
         """Names of the detectors, best first, by the geometric mean of their median delays over all steps and joints.
 
-        A step that is not found counts as 1 s.
+        A step that is not found counts as ten times `HORIZON_S`.
         """
         scores: dict[str, list[float]] = {}
         for row in self.rows:

@@ -49,9 +49,9 @@ class TooLittleMotionError(LogError):
 
 
 def clusters(peaks: Vector, level: float) -> Vector:
-    """Return the largest value of each alarm (m,) in block maxima (B,) of 0.1 s each; NaN blocks don't count.
+    """Return the largest value of each alarm (m,) in block maxima (B,) of `BLOCK_S` each; NaN blocks don't count.
 
-    Blocks above `level` that are at most 0.5 s apart are one alarm. Empty if there are none.
+    Blocks above `level` that are at most `CLUSTER_S` apart are one alarm. Empty if there are none.
     """
     above = np.flatnonzero(np.nan_to_num(peaks, nan=-np.inf) > level)
     if above.size == 0:
@@ -138,7 +138,8 @@ def threshold_by_count(peaks: Vector, alarms: float) -> float:
 def fit_tail(peaks: Vector) -> Tail:
     """Return the tail fitted to block maxima (B,), NaN in blocks that aren't free of contact.
 
-    Raises TooLittleMotionError for less than 50 s, values that are all equal, or too few separate alarms.
+    Raises TooLittleMotionError for less motion than the fewest `FITTED_CLUSTERS` need, values that are all equal,
+    or too few separate alarms.
     """
     hours = counted_hours(peaks)
     least, most = FITTED_CLUSTERS
@@ -163,7 +164,7 @@ def fit_tail(peaks: Vector) -> Tail:
 
 @dataclass(frozen=True)
 class TailCalibration:
-    """A threshold for a wanted rate of alarms, with its upper 95 % bounds, and the tail that it comes from."""
+    """A threshold for a wanted rate of alarms, its upper bounds by `CONFIDENCE`, and the tail that it comes from."""
 
     threshold: float
     bound: float  # upper confidence bound of the threshold
@@ -174,9 +175,10 @@ class TailCalibration:
 
 
 def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
-    """Return the threshold for a rate of false alarms, with upper 95 % bounds, from block maxima (B,), NaN if not free.
+    """Return the threshold for a rate of false alarms, with upper bounds, from block maxima (B,), NaN if not free.
 
-    A rate above the tail's is counted, one below is predicted by the tail. Raises TooLittleMotionError as `fit_tail`.
+    The bounds hold with `CONFIDENCE`. A rate above the tail's is counted, one below is predicted by the tail. Raises
+    TooLittleMotionError as `fit_tail`.
     """
     tail = fit_tail(peaks)
     if rate_per_h >= tail.rate_per_h:

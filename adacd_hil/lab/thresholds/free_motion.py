@@ -223,7 +223,7 @@ def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
 def _windows(logs: Sequence[LoggedMotion]) -> list[Mask]:
     """Return the mask (N,) of each log's samples to process: all, or only windows with free motion, spread evenly.
 
-    All if they are at most a million; a window has 10,000 samples.
+    All if they are at most `MOST_SAMPLES`; a window has `WINDOW` samples.
     """
     if sum(len(log.is_free) for log in logs) <= MOST_SAMPLES:
         return [np.ones(len(log.is_free), np.bool_) for log in logs]

@@ -128,7 +128,7 @@ def _peaks(
     settings: detectors.DetectorBankSettings,
     progress: Progress,
 ) -> Vector:
-    """Return the largest statistic per block of 0.1 s, channel and joint (B, channels, n) over all logs in turn.
+    """Return the largest statistic per block of `BLOCK_S`, channel and joint (B, channels, n) over all logs in turn.
 
     NaN in blocks that are not wholly free of contact. A block may begin in one log and end in the next.
     """
@@ -254,8 +254,8 @@ def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence
 def check_prediction(peaks: Vector) -> tuple[float, float] | None:
     """Calibrate a detector on every other tenth of the motion, and count its alarms in the rest; return both rates.
 
-    The first is the rate, 1/h, that it was calibrated for, such that the rest should have 20 alarms; the second
-    is the counted one. None if half of the motion is too short. peaks (B, channels, n).
+    The first is the rate, 1/h, that it was calibrated for, such that the rest should have `_CHECKED_ALARMS`; the
+    second is the counted one. None if half of the motion is too short. peaks (B, channels, n).
     """
     tenth = -(-len(peaks) // 10)
     is_first = np.arange(len(peaks)) // tenth % 2 == 0

@@ -274,7 +274,7 @@ class TunedLog:
 
     @property
     def block(self) -> int:
-        """Number of cycles in a block of 0.1 s."""
+        """Number of cycles in a block of `BLOCK_S`."""
         return round(BLOCK_S / self.motion.period_s)
 
 

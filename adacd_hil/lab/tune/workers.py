@@ -116,7 +116,7 @@ class ProcessWorkers:
         self._pool = self._open()
 
     def end(self) -> None:
-        """End all processes, with or without a task, by force after 2 s; cancel waiting tasks."""
+        """End all processes, with or without a task, by force after `_PATIENCE_S`; cancel waiting tasks."""
         processes: set[BaseProcess] = set(multiprocessing.active_children()) - self._others
         self._pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
@@ -149,7 +149,7 @@ def _begin() -> None:
 
 
 def _end_with_parent() -> None:
-    """Wait until the parent process has ended; then end this one by SIGTERM, or by force after 2 s."""
+    """Wait until the parent process has ended; then end this one by SIGTERM, or by force after `_PATIENCE_S`."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -112,8 +112,8 @@ def observe(limits: Limits, nominal_s: float, block: Structured, steps: int, too
 def is_filled(steps: int, period_s: float, nominal_s: float, most: int) -> bool:
     """Return whether the samples missing before a sample may be interpolated; True also if none is missing.
 
-    steps: periods since the sample before. period_s: measured time since then, which must be 0.5 to 1.5 times steps *
-    nominal_s. most: largest number of missing samples.
+    steps: periods since the sample before. period_s: measured time since then, which must be `SHORTEST_SHARE` to
+    `LONGEST_SHARE` of steps * nominal_s. most: largest number of missing samples.
     """
     if not 1 <= steps <= most + 1:
         return False

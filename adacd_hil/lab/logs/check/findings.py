@@ -36,7 +36,7 @@ class LogFinding(NamedTuple):
 
 @dataclass
 class Findings:
-    """The findings of one file. `found` has the first ten of each rule."""
+    """The findings of one file. `found` has the first `_TOLD` of each rule."""
 
     file: str
     found: list[LogFinding] = field(default_factory=list)
