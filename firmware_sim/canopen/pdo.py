@@ -340,7 +340,10 @@ class Pdos:
         return self._act(self._waiting, t_ns) or is_commanded
 
     def act_at_once(self, pdo: ReceivePdo, t_ns: int) -> None:
-        """Write the received values of an event-driven RPDO, and call `act`."""
+        """Write the received values of an event-driven RPDO to their objects, then call `self.act`.
+
+        At the next SYNC a command among them counts as one that has come.
+        """
         self._is_commanded |= self._act((pdo,), t_ns)
         self.act(t_ns)
 

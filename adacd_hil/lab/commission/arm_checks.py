@@ -86,7 +86,10 @@ class ArmExamination:
         return ZeroTorqueLoop(self.settings, self.tap, self.clock, self.arm, self.master)
 
     def reset(self) -> None:
-        """Reset the communication of the nodes; from now on `leave` stops them. Raises DeviceError, BusError."""
+        """Reset the communication of the nodes; from now on `leave` stops them, even if this fails.
+
+        Raises DeviceError for a node that doesn't come back, BusError for the bus.
+        """
         self._has_reset = True
         self.master.reset()
 

@@ -125,7 +125,10 @@ def _margin_text(evidence: CertifiedEvidence | None) -> str:
 
 
 def _fault_texts(faults: tuple[Fault, ...]) -> list[str]:
-    """Return texts of the first fault and of the last one, with the number of faults; [] without a fault."""
+    """Return a text of the first fault and, if there are more, one of the last; [] without a fault.
+
+    From three faults on, the first text begins with their number.
+    """
     if not faults:
         return []
     last = faults[-1]

@@ -83,7 +83,10 @@ class Sink:
         return len(data)
 
     def begin_file(self, path: Path) -> None:
-        """Switch to a new file, or empty and restart the present one, once earlier data are written or have failed."""
+        """Ask for a new file, or for the present one to be emptied and begun anew; return at once.
+
+        The switch follows once earlier data are written or have failed.
+        """
         self._position = 0
         with self._changed:
             self._tasks.append(path)

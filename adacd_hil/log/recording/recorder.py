@@ -214,9 +214,10 @@ class Recorder:
         self._ring.close()
 
     def _summarise(self, word: dict[str, str] | None) -> LogSummary:
-        """Return the summary, after the end of the writer's process.
+        """Wait for the end of the writer's process, and return the summary.
 
-        word: its last message, None if it died or is silent.
+        word: its last message, None if it died or is silent. Without it the writer is ended, the log is incomplete, its
+        counts are 0, and the packets that it had not written count as dropped.
         """
         error = ""
         if word is None:
@@ -232,7 +233,10 @@ class Recorder:
         return LogSummary(self.path, 0, 0, self.dropped, False, error, max(1, len(find_parts(self.path))), peak)
 
     def _end_writer(self) -> str:
-        """Wait DEATH_TIMEOUT_S for the end of a writer that doesn't answer, then kill it; return the error in words."""
+        """Return the error of a silent writer in words: its exit status if it ends within DEATH_TIMEOUT_S.
+
+        Else it is killed, without waiting for its end.
+        """
         try:
             return f"the writer died (exit status {self._process.wait(DEATH_TIMEOUT_S)})"
         except subprocess.TimeoutExpired:

@@ -372,7 +372,10 @@ def _weighed(m: Memory, waited_s: float, now_s: float) -> _Weighed:
 
 
 def _explained(contacts: list[_Weighed], h: int) -> float:
-    """Return how much of the contacts' squared residuals cause h explains, Nm²."""
+    """Return how much of the contacts' squared residuals cause h explains, Nm²; 0.0 without contacts.
+
+    A contact that the cause does not touch adds 0.
+    """
     return float(sum(contact.rw[h] ** 2 / contact.ww[h] for contact in contacts if contact.ww[h] > 0.0))
 
 

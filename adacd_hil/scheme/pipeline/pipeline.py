@@ -211,9 +211,10 @@ class Pipeline(ABC):
         )
 
     def _finish(self, asked: int, samples: Structured, decisions: Structured, place: int) -> ContactReport | None:
-        """Run the tasks that the compiled cycle leaves to Python, and end the cycle; return a due report, or None.
+        """Run the tasks that the compiled cycle leaves to Python; return a due report, or None.
 
-        asked: bits of the tasks. place: index of the cycle in samples and decisions, whose decision is completed.
+        asked: bits of the tasks. With BEFORE_CONTACT the cycle is not over: its rest runs here, completes the decision
+        in place and gives the tasks still to do. place: index of the cycle in samples and decisions.
         """
         cycle = int(samples["cycle"][place])
         if asked & BEFORE_CONTACT:

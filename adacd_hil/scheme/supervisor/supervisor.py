@@ -341,7 +341,8 @@ def _event(
 def _touch(m: SupervisorMemory, arm: Sample, observation: int) -> int:
     """Return COLLISION or CONTACT if a joint is over its threshold and this state reacts to it; else NONE.
 
-    NONE also while the drives aren't enabled: an arm without torque can't react.
+    COLLISION goes before CONTACT, also where the state reacts to CONTACT alone. NONE also while the drives aren't
+    enabled: an arm without torque can't react. observation: bits of the findings.
     """
     if observation & ANY_CONTACT == 0 or arm.is_enabled == 0:
         return SchemeEvent.NONE
