@@ -427,6 +427,14 @@ def test_torques_in_the_columns_of_positions_are_no_jumps_and_no_degrees_where_t
     assert verdict.remedy == CORRECT_UNITS
 
 
+def test_noise_of_two_levels_is_not_two_sources(tmp_path, upright):
+    """By this seed just over half of the rows differ from the next one, and just under half from the one after it."""
+    level = np.random.default_rng(9).integers(0, 2, len(upright.tau))
+    flickering = replace(upright, tau=np.column_stack([upright.tau[:, 0], 0.1 * level]))
+    reasons = judged(tmp_path, flickering).verdict.reasons
+    assert not any("to and fro" in reason for reason in reasons)
+
+
 def test_what_is_named_makes_the_recording_explained(tmp_path, upright):
     turned = replace(upright, q=upright.q * TURNED, dq=upright.dq * TURNED, tau=1e3 * upright.tau * TURNED)
     keys = '[units]\ntau_J = "mNm"\n[scale]\nq = [1, -1]\ntau_J = [1, -1]\n'

@@ -172,9 +172,10 @@ def arm_with(**changes) -> Settings:
     ("changes", "error", "words"),
     [
         ({"link_length_m": (0.5, 0.3)}, LogError, r"a.mcap and b.mcap are of two arms: arm.link_length_m is .*0.5"),
-        ({"zero_deg": (3.0, 0.0), "torque_offset_Nm": (0.1, 0.0)}, TooLittleMotionError, "too few"),
+        ({"mass_kg": (2.0, 1.0)}, LogError, r"arm.mass_kg is unset and .*2.0"),
+        ({"zero_deg": (3.0, 0.0), "torque_limit_Nm": (8.0, 4.0)}, TooLittleMotionError, "too few"),
     ],
-    ids=["another arm", "another tare"],
+    ids=["another arm", "another emulated arm", "another zero, another limit"],
 )
 def test_logs_of_two_arms_are_refused(monkeypatch, changes, error, words):
     found = {"a.mcap": Settings(), "b.mcap": arm_with(**changes)}

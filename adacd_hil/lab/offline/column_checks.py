@@ -46,7 +46,7 @@ _JUMP_RAD, _JUMP_TIMES, _MOST_JUMPS = 0.05, 10.0, 3
 """Least step of a position that is a jump, its ratio to the steps just before and after (no joint starts and stops
 within two samples), and most jumps of an encoder."""
 _TO_AND_FRO_TIMES: Final = 3.0
-"""Ratio of the usual step to the next row to that to the row after it: 1 for noise, less for motion."""
+"""Ratio of the mean step to the next row to that to the row after it: 1 for noise, less for motion."""
 _TURNS_THOUGH_STILL_RAD: Final = 0.3
 """Travel by the velocities, for a joint at rest by its positions, that velocity noise and offset can't explain."""
 _WELL_CORRELATED: Final = 0.8
@@ -156,7 +156,7 @@ def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording])
         rows = recording.own_rows
         if len(rows) < 3:
             continue
-        next_row, row_after = (np.median(np.abs(rows[step:] - rows[:-step]), axis=0) for step in (1, 2))
+        next_row, row_after = (np.mean(np.abs(rows[step:] - rows[:-step]), axis=0) for step in (1, 2))
         is_double = next_row > _TO_AND_FRO_TIMES * row_after
         for key, what, unit, first in (("tau_J", "torque", "Nm", n), ("q", "position", "rad", 0)):
             for joint in np.flatnonzero(is_double[first : first + n])[:1].tolist():

@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.control.tare_file import TARED
 from adacd_hil.lab.detectors import detectors
 from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
 from adacd_hil.lab.thresholds.false_alarms import (
@@ -48,8 +47,14 @@ from adacd_hil.settings.setting_keys import changed_keys
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0
 """Corner frequency below which the model's errors exceed the noise."""
-_OF_ONE_ARM: Final = frozenset({*TARED, "arm.zero_deg"})
-"""Settings of `arm` that may differ between the runs of one arm."""
+_ARM_KEYS: Final = tuple(
+    f"arm.{name}"
+    for name in (
+        *("profile", "link_length_m", "rated_torque_Nm", "mounting_deg"),
+        *("mass_kg", "center_m", "inertia_kg_m2", "viscous_Nm_s", "coulomb_Nm"),
+    )
+)
+"""Settings that another arm has otherwise; limits, signs and zeros may differ between the runs of one arm."""
 _CHECKED_ALARMS: Final = 20.0  # alarms in the held-out half that are enough to compare with the prediction
 
 
@@ -325,14 +330,14 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
 
 
 def _check_one_arm(logs: Sequence[LoggedMotion]) -> None:
-    """Raise LogError if a log has other `arm` settings than the first log with settings, but for tare and zero.
+    """Raise LogError if a log has other values of `_ARM_KEYS` than the first log with settings.
 
     A log without settings isn't checked.
     """
     known = [(log.path, settings) for log in logs if (settings := logged_settings(log.path)) is not None]
     for path, settings in known[1:]:
         differing = changed_keys(known[0][1], settings)
-        if keys := [key for key in differing if key.startswith("arm.") and key not in _OF_ONE_ARM]:
+        if keys := [key for key in _ARM_KEYS if key in differing]:
             raise LogError(
                 f"logs {known[0][0]} and {path} are of two arms: {keys[0]} is {' and '.join(differing[keys[0]])}; find "
                 "their thresholds apart"
