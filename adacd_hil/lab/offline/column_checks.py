@@ -19,6 +19,8 @@ from adacd_hil.lab.signal_noise import white_noise
 from adacd_hil.records import Vector
 from adacd_hil.score.wording import number_of
 
+_MEASURED: Final = (("tau_J", "torque", "Nm"), ("q", "position", "rad"))
+"""Key of `columns`, word and unit of the columns that every recording has."""
 _STUCK_S: Final = 0.5
 _STUCK_TRAVEL: Final = 0.2
 """Share of its whole travel that a joint makes during equal readings of a stuck torque."""
@@ -158,7 +160,7 @@ def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording])
             continue
         next_row, row_after = (np.mean(np.abs(rows[step:] - rows[:-step]), axis=0) for step in (1, 2))
         is_double = next_row > _TO_AND_FRO_TIMES * row_after
-        for key, what, unit, first in (("tau_J", "torque", "Nm", n), ("q", "position", "rad", 0)):
+        for (key, what, unit), first in zip(_MEASURED, (n, 0), strict=True):
             for joint in np.flatnonzero(is_double[first : first + n])[:1].tolist():
                 yield RecordingFinding(
                     f"the {what} of {column_name(described, key, joint)} goes to and fro from row to row, by "
@@ -298,7 +300,7 @@ def _stays(column: Vector) -> str:
 
 def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
     """Report, for each torque and position, single samples far from their neighbours, as of a corrupted frame."""
-    for key, what, unit in (("tau_J", "torque", "Nm"), ("q", "position", "rad")):
+    for key, what, unit in _MEASURED:
         for joint, column in enumerate(getattr(columns, key).T):
             rows = _spikes(column)
             if len(rows):

@@ -120,7 +120,9 @@ def find_readings(
     for motion in _motions(described, model):
         fit, test = (_equations(part, settings, motion) for part in (fitted, tested))
         if fit is not None and test is not None:
-            for torques in _torques(described, 1, []) if motion.text else _torques(described, model.joints, units):
+            # Beside another motion, one torque or all may be turned, and no unit differs.
+            most_turned, other_units = (1, []) if motion.text else (model.joints, units)
+            for torques in _torques(described, most_turned, other_units):
                 tried.append(_judge(described, fit, test, motion, torques, fitted))
     of_map = next((each for each in tried if each.weight == 0), None)
     if of_map is None:
