@@ -80,7 +80,7 @@ class Drawing:
     figure: Figure
 
     def png(self) -> bytes:
-        """Return the figure as PNG, on white, 150 dots per inch."""
+        """Return the figure as PNG, on white, with `_DOTS_PER_INCH`."""
         out = io.BytesIO()
         with style():
             canvas: Any = FigureCanvasAgg(self.figure)

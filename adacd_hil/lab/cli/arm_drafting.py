@@ -65,7 +65,10 @@ _SHOWN_SHARE = 1e-5
 
 @dataclass(frozen=True)
 class InitOptions:
-    """Answers on the command line, pairs for joint 1 and 2; None, () or False: not answered."""
+    """Values of the options of `init`, pairs for joint 1 and 2; None, () or False: not given.
+
+    is_busless: --no-bus. locked: --lock. Other fields have the name of their option.
+    """
 
     interface: str | None = None
     channel: str | None = None
@@ -157,7 +160,8 @@ class DraftFiles:
 class Drafting:
     """One draft of an arm's configuration: answers, devices found, drafted profiles.
 
-    bus: interface used, None without one. warnings: a line each. bitrate: of the bus, None if unknown.
+    bus: interface, channel and bitrate used, None without a bus. warnings: a line each. bitrate: of the bus, None if
+    unknown.
     """
 
     def __init__(self, options: InitOptions, interview: Interview, writing: DraftFiles) -> None:
@@ -175,8 +179,8 @@ class Drafting:
         """Scan the bus, ask the user, derive the other values; return the text of a configuration, and a summary.
 
         The summary is for JSON. Writes no file; adds device profiles to `writing`. Raises CommandError without an
-        answer, for options that exclude each other, or if the configuration would have errors; ConfigError,
-        BusMissingError, BusError.
+        answer, for options that exclude each other, or if the configuration would have errors; ConfigError for a URDF,
+        EDS or value that can't be used, BusMissingError if the bus can't be opened, BusError if it fails.
         """
         facts = self._gather()
         title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]}"
@@ -246,10 +250,10 @@ class Drafting:
         )
 
     def _check_used(self, names: dict[str, Any]) -> None:
-        """Raise CommandError for an option's value of a scale that a joint's profile doesn't have.
+        """Raise CommandError if an option gives a value of `scale` other than a joint's profile has.
 
-        names: profiles by kind. A unit is enough in one of both profiles; that of velocity counts as used once it was
-        asked for.
+        The option would be without effect. names: profiles by kind. A unit may differ in one of both profiles; that of
+        velocity counts as used once it was asked for.
         """
         for question in _QUESTIONS:
             if (given := question.given(self.options)) is None:
@@ -301,7 +305,8 @@ class Drafting:
     def _find_devices(self) -> tuple[list[RecognisedDevice], list[RecognisedDevice]]:
         """Scan the bus, if there is one; return the drives and the sensors of joint 1 and 2, [] without a bus.
 
-        Sets `bus` and `bitrate`. Raises CommandError if fewer than two of a kind answer, BusMissingError, BusError.
+        Sets `bus` and `bitrate`. Raises CommandError if fewer than two of a kind answer, BusMissingError if the bus
+        can't be opened, BusError if it fails.
         """
         channel = self._ask_channel()
         if channel is None:
@@ -372,8 +377,8 @@ class Drafting:
     ) -> list[RecognisedDevice]:
         """Return the drives, or the sensors, of joint 1 and 2: as given, as the user answers, or by ascending node id.
 
-        kind: "drive" or "sensor". given: node ids of the option. A proposal that was taken is added to `warnings`.
-        Raises CommandError if fewer than two answer.
+        kind: "drive" or "sensor". given: node ids of the option. channel: of the bus, for the error. A proposal that
+        was taken is added to `warnings`. Raises CommandError if fewer than two answer.
         """
         known = {device.node.node_id: device for device in devices if device.kind == kind}
         option, nodes = f"--{kind}-node", " ".join(map(str, known)) or "none"
@@ -591,8 +596,8 @@ class Drafting:
     def _complete(self, kind: str, names: tuple[str, ...], devices: Sequence[RecognisedDevice]) -> tuple[str, ...]:
         """Return the profiles' names; a shipped one with guesses is replaced by an extension if answers replace some.
 
-        The extensions are added to the files to be written. A shipped profile whose guesses all stay is added to
-        `guessed`.
+        An extension is a profile that `extends` it by the answers. The extensions are added to the files to be written.
+        A shipped profile whose guesses all stay is added to `guessed`.
         """
         completed, texts = list(names), dict[str, str]()
         for joint, name in enumerate(names):
@@ -720,8 +725,8 @@ class Drafting:
     def _mount(self, urdf: Path, arm: PlanarArm) -> tuple[PlanarArm, str]:
         """Ask how a URDF's root is mounted, and read the URDF again with its root so turned.
 
-        Return the arm, and a phrase on the mounting; the given arm if neither option nor user answers. Raises
-        CommandError for a wrong option.
+        arm: read with the root's z axis up. Return the arm as mounted, and a phrase on the mounting; the given arm if
+        neither option nor user answers. Raises CommandError for a wrong option.
         """
         interview, given = self.interview, self.options.mounting
         if given is None and not interview.is_asking:
@@ -739,7 +744,8 @@ class Drafting:
     ) -> Fact:
         """Return the rated torque at both joints, Nm, and its source: the option, drives, their EDS, or the user.
 
-        0x6076 of drives or EDS is taken only if no guess went into it; else it is a proposal.
+        0x6076 of drives or EDS is taken only if no guess went into it; else it is a proposal, as is the effort of
+        `geometry`.
         """
         scales = [profile.scale for profile in profiles]
         by_drives = [rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False)]
@@ -904,7 +910,8 @@ _TORQUE_UNITS_NM = {"mNm": 1e-3, "µNm": 1e-6, "uNm": 1e-6, "Nm": 1.0, "0.01Nm":
 class ScaleQuestion:
     """A question about a value that an EDS may leave open. kind: of the device.
 
-    key: in its profile, such as "scale.torque_Nm". units: for a question about a unit, the worth of each name.
+    key: in its profile, such as "scale.torque_Nm". option: that answers it, with the names of its values, such as
+    "--gear A B". explanation: printed on `?`. units: for a question about a unit, the worth of each name.
     """
 
     kind: str
@@ -1017,7 +1024,8 @@ def _drive_or_sensor(text: str) -> str:
 def _extension(name: str, shipped: ScaleSettings, scale: ScaleSettings, left: Sequence[str]) -> str:
     """Return the text of a profile that extends the shipped one `name` by an arm's scale.
 
-    shipped, scale: of that profile, and of the arm. left: keys that are still guesses.
+    shipped, scale: of that profile, and of the arm. Only values that differ are written. left: keys that are still
+    guesses.
     """
     rows = [
         f"{key} = {value!r}" for key, value in vars(scale).items() if not math.isclose(value, getattr(shipped, key))

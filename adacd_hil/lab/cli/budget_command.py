@@ -31,11 +31,11 @@ def judge(
     data_bitrate: int | None,
     arms: int | None = None,
 ) -> tuple[Codec, Budget, list[str]]:
-    """Compute the budget of a contract; return its codec, the budget, and remarks, a line each.
+    """Compute whether the frames of a contract meet their deadlines; return its codec, the budget, and remarks.
 
     dbc: name or file; None: the contract of the configuration's devices, loaded or composed. A value that is None comes
-    from the DBC, else from the configuration. Raises CodecError, ConfigError if contract or configuration can't be
-    used.
+    from the DBC, else from the configuration. arms: number of arms on the bus. Raises CodecError, ConfigError if
+    contract or configuration can't be used.
     """
     settings = load_settings(config)
     codec = load_contract(settings, place_devices(settings)) if dbc is None else load_codec(find_contract(dbc))

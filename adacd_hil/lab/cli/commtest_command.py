@@ -52,10 +52,9 @@ def run_commtest(
 
     The status is SAFETY_STOP after a fault, INTERRUPTED by the user, FAILURE if the connection is not sufficient,
     PARTIAL if the log lacks data, else OK. is_enabling: enable the drives. out: folder for log and pictures, None:
-    neither.
-
-    Raises ConfigError, CodecError if configuration or contract can't be used, LogExistsError if `out` has a log,
-    LogError if a file can't be written, BusMissingError, and CommandError if the arm isn't found or the bus fails.
+    neither. Raises ConfigError, CodecError if configuration or contract can't be used, LogExistsError if `out` has a
+    log, LogError if a file can't be written, BusMissingError if the bus can't be opened, CommandError if the arm isn't
+    found or the bus fails.
     """
     settings, codec, devices = connection.load()
     clock = MonotonicClock()
@@ -198,7 +197,10 @@ def write_page(out: Path, test: CommunicationTest, described: dict[str, Any]) ->
 
 
 def describe(test: CommunicationTest, settings: Settings, scheduler: str) -> dict[str, Any]:
-    """Return a finished test as a dictionary for JSON; times in µs. scheduler: name of that granted to this process."""
+    """Return a finished test as a dictionary for JSON: verdict, counts, load, warnings, devices, times with histograms.
+
+    Times are in µs. scheduler: name of that granted to this process.
+    """
     evidence = _evidence(test, settings.bus.period_us)
     return {
         "verdict": test.verdict.value,

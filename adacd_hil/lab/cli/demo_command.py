@@ -29,9 +29,9 @@ def play(
     """Play a scenario with an emulated arm, and write log and report; return report and exit status.
 
     config, scenario_name, truth: names or files; truth: how the real arm differs from the configuration. profile, seed:
-    None: those of configuration and scenario. out: folder; None: a new one by date. live: shows the run. Raises
-    ConfigError, CodecError for names or files that can't be used, LogError, OSError if log or report can't be written,
-    CommandError for a run that failed.
+    None: those of configuration and scenario. clock_name: "lockstep" or "realtime". out: folder; None: a new one by
+    date. live: shows the run. Raises ConfigError, CodecError for names or files that can't be used, LogError, OSError
+    if log or report can't be written, CommandError for a run that failed.
     """
     cast = resolve(config, scenario_name, profile, seed, truth)
     settings, scenario = cast.settings, cast.scenario

@@ -82,7 +82,7 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
 
 
 def as_json(findings: list[Finding]) -> dict[str, Any]:
-    """Return the findings and their summary as a dictionary for JSON."""
+    """Return the findings under "checks", and their summary, a line, under "summary", for JSON."""
     checks = [finding._asdict() | {"status": finding.status.value} for finding in findings]
     return {"checks": checks, "summary": summarise(findings)}
 

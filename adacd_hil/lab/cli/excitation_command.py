@@ -28,9 +28,9 @@ def search(config: str, profile: str | None, seconds: float, seed: int, out: Pat
     """Search an excitation for a configuration; return the result by the keys of its JSON.
 
     `present`, None without one, and `found`: figures of the configuration's excitation and of the found one; `limits`:
-    their bounds; `excitation`: the found one. seconds: after which no further climb is begun. out: file that the caller
-    will write, refused if it is the configuration. Raises ConfigError for a configuration that allows no search,
-    CommandError for `out`, or if no motion keeps the limits.
+    their bounds; `excitation`: the found one. seed: of the starting points of climbs. seconds: after which no further
+    climb is begun. out: file that the caller will write, refused if it is the configuration. Raises ConfigError for a
+    configuration that allows no search, CommandError for `out`, or if no motion keeps the limits.
     """
     if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
         raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)

@@ -142,8 +142,8 @@ def _finite(value: float) -> float | None:
 def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
     """Watch the live view of a run at a URL, and print its values at the end; return exit status OK.
 
-    seconds: None: until the user interrupts or the view ends. is_live: print them repeatedly meanwhile, too. Raises
-    LogError if no view answers, or it doesn't serve a log of adacd-hil.
+    seconds: None: until the user interrupts or the view ends. is_live: print them repeatedly meanwhile, too, unless
+    as_json is set. as_json: print JSON. Raises LogError if no view answers, or it doesn't serve a log of adacd-hil.
     """
     clock = MonotonicClock()
     screen = Screen(moves_cursor(sys.stdout) and is_live and not as_json, write_screen)
@@ -178,7 +178,10 @@ def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) ->
 
 @contextlib.contextmanager
 def _decoding() -> Iterator[None]:
-    """Raise LogError in place of the block's decoding errors: then the server doesn't serve a log of adacd-hil."""
+    """Return a context manager that turns decoding errors of its block into a LogError.
+
+    The server then doesn't serve a log of adacd-hil.
+    """
     try:
         yield
     except (ValueError, LookupError, OverflowError, struct.error):

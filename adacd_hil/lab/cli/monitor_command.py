@@ -77,7 +77,10 @@ class Monitor:
         self.is_stopped = True
 
     def listen(self, duration_s: float) -> None:
-        """Read frames from the bus into the view for a duration; it ends earlier after `stop`. Raises BusError."""
+        """Read frames from the bus into the view for a duration; it ends earlier after `stop`.
+
+        Raises BusError if the bus fails.
+        """
         end_ns = self._clock.now_ns() + round(duration_s * 1e9)
         while (frame := receive_until(self._bus, self._clock, end_ns)) is not None:
             self._accept(frame)
@@ -97,8 +100,8 @@ class Monitor:
     def describe(self) -> dict[str, Any]:
         """Return the traffic so far as a dictionary for JSON; its load is of the time since the previous call.
 
-        It has the keys of `BusView.describe`, bus_state, "" for other than SocketCAN, and not_processed, None if
-        unknown.
+        It has the keys of `BusView.describe`; bus_state, of the controller, "" for other than SocketCAN; and
+        not_processed: frames that the interface carried and this process has not read, None if unknown.
         """
         now_ns = self._clock.now_ns()
         if self._link_name is not None and now_ns - self._state_ns >= _LINK_S * 1e9:
@@ -122,9 +125,9 @@ class Monitor:
 def watch(connection: Connection, node_id: int | None, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
     """Listen on a bus, and print a table of its traffic at the end; return exit status OK, also if interrupted.
 
-    seconds: None: until interrupted. is_live: print the table repeatedly meanwhile, too. node_id: show this node only.
-    Raises ConfigError, CodecError if configuration or contract can't be used, BusMissingError, CommandError if the bus
-    fails.
+    seconds: None: until interrupted. is_live: print the table repeatedly meanwhile, too, unless as_json is set.
+    as_json: print JSON. node_id: show this node only. Raises ConfigError, CodecError if configuration or contract can't
+    be used, BusMissingError if the bus can't be opened, CommandError if it fails.
     """
     clock = MonotonicClock()
     codec = connection.load_decoder()  # errors of the configuration come before errors of the bus

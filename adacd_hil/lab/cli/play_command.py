@@ -189,7 +189,7 @@ def _run(
 
     speed: factor on the recording's. longest_pause_s: to which pauses are cut; None: they stay. Return counts and
     lateness of the frames for JSON, and the exit status: INTERRUPTED, PARTIAL for a damaged recording, else OK. Raises
-    LogError, CommandError if the bus fails.
+    LogError if the recording can't be read, CommandError if the bus fails.
     """
     from adacd_hil.cli.connection import on_interrupt
     from adacd_hil.lab.logs.playback import play as play_frames

@@ -17,7 +17,7 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
 
     The result is of `describe`. The status is OK if all expected nodes are there and right, further ones or not, else
     BUS_MISSING. listen_s: time to listen. Raises ConfigError, CodecError if configuration or contract can't be used,
-    BusMissingError, CommandError if the bus fails.
+    BusMissingError if the bus can't be opened, CommandError if it fails.
     """
     settings, codec, devices = connection.load()
     clock = MonotonicClock()

@@ -134,7 +134,8 @@ def _plan(
 ) -> "Plan":
     """Return the plan of a sweep of logs or scenarios; check all settings, scenarios and seeds first.
 
-    Raises ConfigError, CommandError for one that is wrong, or a log that isn't there.
+    seeds: "N" or "A:B". vary: "KEY=A,B,..." of each setting. Raises ConfigError, CommandError for one that is wrong, or
+    a log that isn't there.
     """
     from adacd_hil import __version__
     from adacd_hil.compiled import program_digest

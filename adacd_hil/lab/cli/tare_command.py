@@ -58,8 +58,9 @@ def tare_on_bus(
     """Tare the sensors of an arm on a bus, and write file `out`; return the tare, and the copy of an older file.
 
     The copy is None without one. poses, seconds: number of poses, and time per pose; None: those of the configuration.
-    Raises CommandError if the tare is refused or the arm not found; ConfigError, CodecError if configuration, contract
-    or an older file can't be used; BusError; OSError if the file can't be written.
+    clock_name: "lockstep" or "realtime". is_auto_zeroing: the sensors set their own zero first. Raises CommandError if
+    the tare is refused or the arm not found; ConfigError, CodecError if configuration, contract or an older file can't
+    be used; BusError if the bus fails; OSError if the file can't be written.
     """
     interface, channel = connection.interface, connection.channel
     check_clock(clock_name, interface, channel)

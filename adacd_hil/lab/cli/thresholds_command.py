@@ -17,8 +17,9 @@ def find(
 ) -> tuple[Thresholds, Comparison | None]:
     """Return the thresholds of all detectors for a rate of false alarms, from contact-free motion in logs.
 
-    Return a comparison of the detectors, too, if is_compared, else None. Raises LogError if logs can't be used or have
-    too little motion, CommandError if one is given twice.
+    rate_per_h: false alarms of a detector per hour. stretch: part of each log to use. Return a comparison of the
+    detectors, too, if is_compared, else None. Raises LogError if logs can't be used or have too little motion,
+    CommandError if one is given twice.
     """
     paths = different_logs(logs)
     with Progress() as progress:

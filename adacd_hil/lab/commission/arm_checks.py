@@ -71,7 +71,10 @@ class ArmExamination:
     traffic: Traffic = field(default_factory=Traffic)
 
     def connect(self) -> None:
-        """Open the bus; make tap, arm and master on it. `leave` closes it. Raises BusMissingError."""
+        """Open the bus; make tap, arm and master on it. `leave` closes it.
+
+        Raises BusMissingError if the bus can't be opened.
+        """
         self._bus = self.open_bus()
         self.tap = Tap(self._bus, self.clock)
         self.arm = Arm(self.settings, self.codec, self.devices, self.tap)
@@ -88,7 +91,7 @@ class ArmExamination:
     def reset(self) -> None:
         """Reset the communication of the nodes; from now on `leave` stops them, even if this fails.
 
-        Raises DeviceError for a node that doesn't come back, BusError for the bus.
+        Raises DeviceError for a node that doesn't come back, BusError if the bus fails.
         """
         self._has_reset = True
         self.master.reset()
@@ -96,7 +99,7 @@ class ArmExamination:
     def leave(self) -> str:
         """Put the nodes back to pre-operational, if `reset` was called, and close the bus, if it is open.
 
-        Return the text of the error that stopped the former, or "".
+        Return the text of the bus's error if the nodes could not be put back, else "".
         """
         trouble = ""
         if self._has_reset:
@@ -162,7 +165,7 @@ def check_nodes(patient: ArmExamination) -> Finding:
 def boot_nodes(patient: ArmExamination) -> Finding:
     """Reset the communication of the nodes, and wait until each has booted.
 
-    Raises DeviceError if one doesn't, BusError.
+    Raises DeviceError if one doesn't, BusError if the bus fails.
     """
     patient.reset()
     return ok("all nodes booted after a reset of communication")
@@ -194,9 +197,10 @@ def check_contract(patient: ArmExamination) -> Finding:
 
 
 def set_up_nodes(patient: ArmExamination) -> Finding:
-    """Identify and configure the nodes as at the start of a run; name SYNC period and heartbeat.
+    """Identify and configure the nodes as at the start of a run.
 
-    Raises DeviceError if a node is another one than configured, or refuses a setting; BusError.
+    The finding names SYNC period and heartbeat. Raises DeviceError if a node is another one than configured, or refuses
+    a setting, BusError if the bus fails.
     """
     patient.master.identify()
     patient.master.configure()
@@ -204,7 +208,10 @@ def set_up_nodes(patient: ArmExamination) -> Finding:
 
 
 def check_pdo_map(patient: ArmExamination) -> Finding:
-    """Read the devices' PDO parameters and mappings; fail if one differs from the contract. Raises DeviceError."""
+    """Read the devices' PDO parameters and mappings; fail if one differs from the contract.
+
+    Raises DeviceError if a device refuses a read or doesn't answer.
+    """
     lines = []
     for slave in patient.master.slaves:
         lines += pdo_differences(slave, command_deadline_ms(patient.settings))
@@ -218,7 +225,8 @@ def check_pdo_map(patient: ArmExamination) -> Finding:
 def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
     """Return a line on how a motor's rated torque, 0x6076, becomes that of its joint, `rated_Nm`.
 
-    If the slave's EDS lacks 0x6076, the line is on that. Reads the object from the slave. Raises DeviceError.
+    If the slave's EDS lacks 0x6076, the line is on that. Reads the object from the slave. Raises DeviceError if it
+    refuses or doesn't answer.
     """
     if not slave.has(0x6076):
         return f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint"
@@ -234,7 +242,7 @@ def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
 def check_torque_scale(patient: ArmExamination) -> Finding:
     """Describe how each drive's 0x6076 becomes the rated torque of its joint; warn if an EDS lacks 0x6076.
 
-    The set-up has compared the values already. Raises DeviceError.
+    The set-up has compared the values already. Raises DeviceError if a drive refuses a read or doesn't answer.
     """
     slaves = patient.master.slaves[:JOINTS]
     pairs = zip(slaves, patient.settings.arm.rated_torque_Nm, strict=True)
@@ -262,7 +270,7 @@ def check_protection(patient: ArmExamination) -> Finding:
 def play_cycles(patient: ArmExamination) -> Finding:
     """Start the nodes, run cycles for `cycle_s` with disabled drives; store cycles and received traffic for the checks.
 
-    Raises BusError, DeviceError.
+    Raises BusError if the bus fails.
     """
     patient.tap.take_passed()
     patient.master.start()
@@ -275,7 +283,10 @@ def play_cycles(patient: ArmExamination) -> Finding:
 
 
 def check_rate(patient: ArmExamination) -> Finding:
-    """Judge the share of periods with complete fresh data as `commtest` does; name the rates of SYNC and feedback."""
+    """Fail or warn if too few periods have complete fresh data, by the bounds of `commtest`.
+
+    The finding names the rates of SYNC and of each device's fresh values, and the number of skipped periods.
+    """
     report = patient.communication()
     elapsed_s = report.periods * patient.settings.bus.period_s
     rates = ", ".join(
@@ -336,7 +347,10 @@ def check_heartbeats(patient: ArmExamination) -> Finding:
 
 
 def check_devices(patient: ArmExamination) -> Finding:
-    """Fail if a value is outside `low` and `high` of its device's profile; warn of drive faults and devices' errors."""
+    """Fail if a value is outside `low` and `high` of its device's profile, or missing; warn of other faults.
+
+    Others are faults of the drives, and EMCYs and other events of the devices.
+    """
     lines = [line for line in describe_faults(patient.arm) if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
     text = "; ".join([*lines, *events])
@@ -398,9 +412,10 @@ def check_torque_zero(patient: ArmExamination) -> Finding:
 
 
 def check_noise(patient: ArmExamination) -> Finding:
-    """Warn if a torque never changed in the stored cycles, or three of its rms values exceed the detection threshold.
+    """Warn if a torque never changed in the stored cycles, or is so noisy that it looks like a contact.
 
-    The check is skipped with fewer than two complete cycles.
+    Noisy: three times its standard deviation exceeds the detection threshold. The check is skipped with fewer than two
+    complete cycles.
     """
     tau_J = patient.joint_values("tau_J")
     if len(tau_J) < 2:

@@ -48,10 +48,10 @@ class PlanarArm(NamedTuple):
     """Description of an arm with two parallel axes.
 
     cad_theta: parameters, () if the masses are not known. mounting_deg: as `arm.mounting_deg`. sign, zero_deg: settings
-    of drives that count as the description. mass_kg, center_m, inertia_kg_m2: of each link, the inertia about its
-    centre of mass; the last two are None for rods. is_tip_known: the length of link 2 is not derived from its centre of
-    mass. Other fields are None if the description lacks them. doubts: properties of the description that the model
-    can't represent, a line each.
+    of drives that count as the description. effort_Nm: torque limits. mass_kg, center_m, inertia_kg_m2: of each link,
+    the inertia about its centre of mass; the last two are None for rods. is_tip_known: the length of link 2 is not
+    derived from its centre of mass. Other fields are None if the description lacks them. doubts: properties of the
+    description that the model can't represent, a line each.
     """
 
     link_length_m: Pair
@@ -90,7 +90,7 @@ def _theta(inertia: Pair, moment_kg_m: Pair, outer_kg: float, l1: float, mountin
     """Return a1, a2, a3, four times 0 for friction and, unless the axes are vertical, a4 and a5 of two links.
 
     inertia: of each about its joint, kg m². moment_kg_m: mass times centre of mass, along the line of the link.
-    outer_kg: mass of link 2. mounting_deg: as `arm.mounting_deg`.
+    outer_kg: mass of link 2. l1: length of link 1, m. mounting_deg: as `arm.mounting_deg`.
     """
     first, second = inertia
     theta = [first + outer_kg * l1**2 + second, l1 * moment_kg_m[1], second, 0.0, 0.0, 0.0, 0.0]
@@ -364,7 +364,8 @@ class Fact(NamedTuple):
 class ArmFacts(NamedTuple):
     """Known or guessed facts of an arm, from which the rest of its configuration follows.
 
-    Each source is the origin of values as text, "" for a guess. data_bitrate, bitrate: None: not written.
+    Each source is the origin of values as text, "" for a guess. drive, sensor: names of both profiles. drive_node,
+    sensor_node: both node ids. data_bitrate, bitrate: None: not written.
     """
 
     geometry: PlanarArm
@@ -387,7 +388,7 @@ class ArmFacts(NamedTuple):
 class Entry(NamedTuple):
     """One line of the configuration. value: None if unknown; the key is then written as a comment.
 
-    is_assumed: the value is a guess.
+    key: such as "arm.sign". comment: written above the line. is_assumed: the value is a guess.
     """
 
     key: str
@@ -512,10 +513,10 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
 
 
 def _fast_damping(Kd: Sequence[float], cad_theta: Sequence[float]) -> Iterator[str]:
-    """Yield a warning for each joint that its damping stops too fast at q2 = 0 while the other joint turns freely.
+    """Yield a warning for each joint whose Kd over its inertia exceeds `_MOST_DAMPING_RAD_S`, so that it may vibrate.
 
-    Kd in Nm s/rad; cad_theta: a1, a2, a3 first. The joint's inertia is then smaller than its element of M, with a heavy
-    outer link far smaller.
+    Kd in Nm s/rad; cad_theta: a1, a2, a3 first. The inertia is that at q2 = 0 while the other joint turns freely, less
+    than the element of M.
     """
     a1, a2, a3 = cad_theta[:3]
     diagonal, coupling = (a1 + 2.0 * a2, a3), a3 + a2
@@ -530,9 +531,10 @@ def _fast_damping(Kd: Sequence[float], cad_theta: Sequence[float]) -> Iterator[s
 
 
 def _rest_torque(facts: ArmFacts) -> Entry:
-    """Draft `safety.rest_torque_Nm` for an arm on which gravity acts: its load may then rest on the sensors.
+    """Return `safety.rest_torque_Nm` for an arm with gravity, whose load may rest on the sensors.
 
-    A guess if the masses are not known.
+    It is the default plus gravity's largest torque on joint 1 and a fifth; if the masses are not known, the default
+    plus the larger torque limit, as a guess.
     """
     free = load_settings("certified").safety.rest_torque_Nm
     gravity = _gravity(facts, facts.position_limit_deg.value)[0]
@@ -544,7 +546,10 @@ def _rest_torque(facts: ArmFacts) -> Entry:
 
 
 def _certified(facts: ArmFacts) -> Iterator[Entry]:
-    """Yield the scheme's numbers that are torques or follow from the inertia, if they differ from the defaults."""
+    """Yield the keys of `certified`, and `detector.collision_Nm`, that differ from the defaults for this arm.
+
+    They are the defaults, scaled by the arm's rated torque, inertia and gravity.
+    """
     base = load_settings("certified")
     found, inertia, rated = base.certified, _inertia(facts), facts.rated_torque_Nm.value
     scale = _torque_scale(facts)

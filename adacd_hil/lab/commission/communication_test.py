@@ -70,8 +70,8 @@ class ZeroTorqueLoop:
     ) -> FaultReason:
         """Run cycles for a duration, then disable the drives; return the fault that ended the cycles, NONE without one.
 
-        observe: called with each cycle but those that disable. is_over: ends the cycles earlier when it returns True.
-        Raises BusError.
+        observe: called with each cycle but those that disable. is_over: ends the cycles earlier when it returns True. A
+        fault counts only if the loop enables the drives. Raises BusError if the bus fails.
         """
         last_ns = self._clock.now_ns() + round(duration_s * 1e9) - self._period_ns
         fault = FaultReason.NONE
@@ -94,15 +94,18 @@ class ZeroTorqueLoop:
         return state.fault
 
     def disable(self, quick_stop: bool = False) -> None:
-        """Run `DISABLE_CYCLES` cycles that disable the drives; quick_stop: by a quick stop. Raises BusError."""
+        """Run `DISABLE_CYCLES` cycles that disable the drives; quick_stop: by a quick stop.
+
+        Raises BusError if the bus fails.
+        """
         for _ in range(DISABLE_CYCLES):
             self.step(quick_stop=quick_stop)
 
     def step(self, is_enabling: bool = False, quick_stop: bool = False) -> ZeroTorqueCycle:
         """Run one cycle at zero torque, and return it.
 
-        is_enabling, quick_stop: parts of the command to the drives; without either they are disabled. Raises BusError,
-        such as SilenceError in lockstep.
+        is_enabling, quick_stop: parts of the command to the drives; without either they are disabled. Raises BusError
+        if the bus fails, in lockstep SilenceError if no device answers.
         """
         tick, arm = self._exchange.turn()
         self._exchange.leave()
@@ -154,7 +157,8 @@ class CommunicationTest:
     def observe_cycle(self, cycle: ZeroTorqueCycle, log_queue_bytes: int = 0) -> CycleRecord:
         """Add a cycle to the test; return its record for the log, with the overruns so far and `log_queue_bytes`.
 
-        Periods skipped before the first cycle are not overruns.
+        Periods skipped before the first cycle are not overruns. log_queue_bytes: size of the records that wait for the
+        log's writer.
         """
         state = cycle.state
         ages = (*state.age_q, *state.age_tau_J)
@@ -190,7 +194,7 @@ class CommunicationTest:
 
     @cached_property
     def columns(self) -> CycleColumns:
-        """The columns of /cycle, of the cycles at the first call, which stays: ask for it when the test is over.
+        """The cycles as columns of /cycle, made at the first use and then kept: use it when the test is over.
 
         feedback_ns is -1 for an incomplete cycle.
         """

@@ -51,10 +51,10 @@ class RecognisedDevice(NamedTuple):
 
 
 def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int, str]) -> list[RecognisedDevice]:
-    """Return the drives and sensors among a survey's nodes that answer, with ratings read from them. Raises BusError.
+    """Return the drives and sensors among a survey's nodes that answer, with ratings read from them.
 
     `kinds`: "drive" or "sensor" by node id, for nodes whose 0x1000 names neither. Sets `layout_digest` of a node if a
-    profile of its vendor and product has 0x2000.
+    profile of its vendor and product has 0x2000. Raises BusError if the bus fails.
     """
     canopen = CanopenBus(Tap(bus, clock))
     found = []
@@ -101,7 +101,10 @@ _OF_DRIVES = (
 
 
 def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> int | None:
-    """Return an object of a node as a number; None if it is missing, refused, empty or longer than 8 bytes."""
+    """Read an object of a node as a number; None if it is missing, refused, empty or longer than 8 bytes.
+
+    is_signed: it is in two's complement.
+    """
     try:
         data = read_object(remote, index, sub)
     except DeviceError:  # it refuses the upload, or answers with another type

@@ -46,7 +46,7 @@ Examination = TypeVar("Examination")
 
 
 class Check(NamedTuple, Generic[Examination]):
-    """One line of a table of checks. `run`: returns the finding on the thing examined.
+    """One line of a table of checks. `run`: returns the finding on the examined settings, host or arm.
 
     `needs`: names of earlier checks; if one has failed, this check is skipped.
     """

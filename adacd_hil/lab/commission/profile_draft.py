@@ -263,7 +263,7 @@ class _Record(NamedTuple):
     timer_ms: int
 
     def carries(self, *places: _Place) -> bool:
-        """Return whether the PDO's default mapping has all these objects."""
+        """Return whether the PDO's default mapping has all these objects, (index, sub-index)."""
         return set(places) <= set(self.entries)
 
     def can_be(self, transmission: int) -> bool:
@@ -361,6 +361,7 @@ class _ProfileWriter(ABC):
         """Return a PDO's identifier without the node id, by the EDS, or else the predefined one that can be written.
 
         None if the PDO is switched off for good, or no usable identifier can be set. number: of the PDO, from 1.
+        is_received: it is an RPDO, else a TPDO.
         """
         by_eds = self.default(index, 1)
         if by_eds & NOT_VALID and not self.can_write(index, 1):
@@ -443,8 +444,8 @@ class _ProfileWriter(ABC):
     def pdo(self, message: str, record: _Record, places: Sequence[_Place], transmission: int = 1) -> list[str]:
         """Return the profile's lines on one PDO, with inhibit time and event timer where they are needed.
 
-        places: objects to map; a fixed mapping keeps the EDS's default objects. transmission: type to write, unless the
-        PDO's is read-only; 1 is not printed.
+        message: its name, such as "Feedback". places: objects to map, (index, sub-index); a fixed mapping keeps the
+        EDS's default objects. transmission: type to write, unless the PDO's is read-only; 1 is not printed.
         """
         rows = [
             f'    {{ object = "{ObjectName(*place)}", {self.signal(place)} }},'
@@ -468,7 +469,7 @@ class _ProfileWriter(ABC):
     def signal(self, place: _Place) -> str:
         """Return the keys of a mapped object in a profile: `signal = "NAME"`, and `unit` if it counts per mille.
 
-        An object without a known name gets one by its index, such as "object_2031_0".
+        An object without a known name gets one by its index, such as "object_2031_0". place: (index, sub-index).
         """
         index, sub = place
         if place in _TORQUE_OBJECTS:
@@ -478,9 +479,10 @@ class _ProfileWriter(ABC):
         return f'signal = "{name or f"object_{index:04X}_{sub}"}"{unit}'
 
     def fill(self, places: Sequence[_Place], room: int) -> list[_Place]:
-        """Return the objects of `places`, in order, that can be mapped and together fit a PDO of `CLASSIC_BYTES`.
+        """Return the objects of `places` that can be mapped and together fit a PDO of `CLASSIC_BYTES`.
 
-        room: most objects of the PDO. An object that doesn't fit is left out; later ones may fit.
+        places: (index, sub-index), most important first. room: most objects of the PDO. An object that doesn't fit is
+        left out; later ones may fit.
         """
         kept: list[_Place] = []
         bits = 0

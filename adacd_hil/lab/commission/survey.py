@@ -102,7 +102,10 @@ class Node:
 
     @property
     def state_text(self) -> str:
-        """The NMT state as text, by heartbeats, or by PDOs, which only an operational node sends."""
+        """The NMT state as text, by the last heartbeat or boot-up, else by PDOs, which only an operational node sends.
+
+        "? (no heartbeat)" if neither came.
+        """
         if self.has_pdos and self.nmt_state in (None, 0):
             return "operational (sends PDOs)"
         if self.nmt_state is None:
@@ -112,7 +115,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Expected:
-    """A node that the configuration expects. None: any value will do."""
+    """A node that the configuration expects. None: any value will do, also a missing one."""
 
     name: str
     node_id: int
@@ -146,7 +149,7 @@ def survey(
 
     contract_ids: ids of the nodes of which 0x2000, wire version and layout digest, is read, too. progress: called with
     a line before each step. Silent nodes are found by heartbeat or EMCY. It listens for at least `_ANSWER_S` after its
-    requests, even if `duration_s` is 0. Raises BusError.
+    requests, even if `duration_s` is 0. Raises BusError if the bus fails.
     """
     tap = Tap(bus, clock)
     traffic = Traffic()

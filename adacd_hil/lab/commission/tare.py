@@ -42,7 +42,7 @@ class ArmMovedError(TareRefusedError):
 class Pose:
     """One pose, measured at rest: the mean of q, and, for each torque, its mean, standard error and noise, all (2,).
 
-    drift_Nm: mean of the second half of the window less that of the first.
+    samples: their number. drift_Nm: mean of the second half of the window less that of the first.
     """
 
     q: Vector
@@ -56,9 +56,10 @@ class Pose:
 
 @dataclass(frozen=True)
 class TareSolution:
-    """Solution of the poses. gravity_Nm (2,): a4, a5; zeros with vertical axes, of the CAD model if not estimated.
+    """Torque offsets solved from the poses, their standard errors (2,), and gravity.
 
-    residual_Nm (N, 2): of each pose. condition: number of the poses' equations; 1 if gravity isn't estimated.
+    gravity_Nm (2,): a4, a5; zeros with vertical axes, of the CAD model if not estimated. residual_Nm (N, 2): of each
+    pose. condition: number of the poses' equations; 1 if gravity isn't estimated.
     """
 
     offset_Nm: Vector

@@ -86,7 +86,8 @@ class TareSession:
         """Boot the devices, measure the poses, solve for the offsets; return the tare. Writes no file.
 
         Stops the nodes again, also after an error. Raises TareRefusedError for data or motion that allow no tare,
-        DeviceError, BusError, such as SilenceError; KeyboardInterrupt after `interrupt`.
+        DeviceError if a device is missing or refuses its set-up, BusError if the bus fails, KeyboardInterrupt after
+        `interrupt`.
         """
         self.progress(f"looking for the arm on {self.bus.channel}")
         self._master.reset()
@@ -106,7 +107,7 @@ class TareSession:
         return self._describe(poses, solve_tare(poses, self.settings), sensors, temperatures)
 
     def _read_temperature(self, node: Any, sensor: Identity) -> float | None:
-        """Return the sensor's temperature, °C; None for another maker's sensor, or one that doesn't answer."""
+        """Read the sensor's temperature, °C; None for another maker's sensor, or one that refuses or doesn't answer."""
         if sensor.vendor != _OWN_VENDOR:
             return None
         try:
@@ -119,7 +120,7 @@ class TareSession:
     def _step(self) -> ArmState:
         """Run one cycle at zero torque; return the arm's state.
 
-        Raises KeyboardInterrupt after `interrupt`, BusError.
+        Raises KeyboardInterrupt after `interrupt`, BusError if the bus fails.
         """
         if self._is_interrupted:
             raise KeyboardInterrupt
@@ -162,8 +163,8 @@ class TareSession:
     def _measure_next_pose(self, last: Pose, number: int) -> Pose:
         """Ask the user to move the arm, wait until it has left the last pose and rests, and measure a pose.
 
-        If the arm moves meanwhile, wait again. Raises TareRefusedError after `tare.move_timeout_s` of waiting, or for
-        unfit data. number: of the pose, from 1.
+        If the arm moves meanwhile, wait again. Raises TareRefusedError after `tare.move_timeout_s` of waiting, or as
+        `_measure`. number: of the pose, from 1.
         """
         tare = self.settings.tare
         self.progress(
@@ -215,7 +216,7 @@ class TareSession:
     def _measure(self) -> Pose:
         """Run cycles for `tare.window_s`; return the pose.
 
-        Raises ArmMovedError for motion, TareRefusedError for unfit data.
+        Raises ArmMovedError for motion, TareRefusedError for missing or old values, a sensor's error, noise or drift.
         """
         settings = self.settings
         cycles = self._cycles(settings.tare.window_s)

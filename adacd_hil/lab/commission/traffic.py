@@ -65,7 +65,10 @@ class Traffic:
 
 
 def receive_until(bus: Bus, clock: Clock, end_ns: int) -> Frame | None:
-    """Return the next frame; None if none came until `end_ns` of the clock, or that has passed. Raises BusError."""
+    """Return the next frame; None if none came until `end_ns` of the clock, or that has passed.
+
+    Raises BusError if the bus fails.
+    """
     while (now_ns := clock.now_ns()) < end_ns:
         slice_ns = min(end_ns, now_ns + round(_SLICE_S * 1e9))
         frame = bus.receive((slice_ns - now_ns) * 1e-9)
@@ -76,7 +79,7 @@ def receive_until(bus: Bus, clock: Clock, end_ns: int) -> Frame | None:
 
 
 def listen(bus: Bus, clock: Clock, duration_s: float, traffic: Traffic) -> None:
-    """Receive frames for a duration, and add them to `traffic`; send nothing. Raises BusError."""
+    """Receive frames for a duration, and add them to `traffic`; send nothing. Raises BusError if the bus fails."""
     end_ns = clock.now_ns() + round(duration_s * 1e9)
     while (frame := receive_until(bus, clock, end_ns)) is not None:
         traffic.count_frame(frame)

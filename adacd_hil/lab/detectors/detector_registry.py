@@ -108,8 +108,8 @@ def remove(name: str) -> None:
 def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> None:
     """Run a detector on noise of two joints, whole and cut in two.
 
-    Raises ValueError if a statistic has another shape, isn't finite, or depends on the cut. Errors of the detector are
-    raised as they are.
+    make: begins it on a stream of period_s. Raises ValueError if a statistic has another shape, isn't finite, or
+    depends on the cut. Errors of the detector are raised as they are.
     """
     z = np.random.default_rng(0).standard_normal((_CHECK_SAMPLES, JOINTS))
     held_Nm = np.where(z > 1.0, 0.1, 0.0)

@@ -65,7 +65,7 @@ def register(name: str, make: Maker) -> None:
 
 
 def unregister(name: str) -> None:
-    """Remove a detector that `register` added. Raises KeyError if there is none of this name."""
+    """Remove a registered detector from this process by its name. Raises KeyError if there is none."""
     detector_registry.remove(name)
 
 
@@ -104,7 +104,7 @@ class DetectorBankSettings:
     def channels(self) -> tuple[str, ...]:
         """Names of all channels in the order of the statistics, those of registered detectors last.
 
-        Raises DetectorError.
+        Raises DetectorError if one of these can't be used.
         """
         return (*self.own_channels, *self.registered)
 
@@ -123,9 +123,10 @@ class DetectorBankSettings:
 
     @property
     def detectors(self) -> dict[str, tuple[int, ...]]:
-        """Indices in `channels` of each detector's channels, by its name, built-in ones first. Raises DetectorError.
+        """Indices in `channels` of each detector's channels, by its name, built-in ones first.
 
-        A joint is over a detector's threshold if one of these channels is over its own.
+        A joint is over a detector's threshold if one of these channels is over its own. Raises DetectorError if a
+        registered detector can't be used.
         """
         first = len(self.own_channels)
         return self.own_detectors | {name: (first + place,) for place, name in enumerate(self.registered)}
@@ -153,12 +154,10 @@ def likelihood_windows(
 
     N: number of `onset_samples`, the ages of the steps. With the covariance R of the last L samples and the step's
     shape s, w = R^-1 s / sqrt(s' R^-1 s): noise of this covariance comes out with a standard deviation of 1, and no
-    other window gives the step more. The shape is the response of a critically damped loop of that lag to a step.
-    floor_Nm: slow errors of the model, added as a constant of unknown size; without them a window would trust averages
-    longer than any model deserves.
-
-    Raises ValueError unless L is at least the largest age and the variance, the covariance's first element, is
-    positive.
+    other window gives the step more. The shape is the response of a critically damped loop to a step. lag_s: of that
+    loop. floor_Nm: slow errors of the model, added as a constant of unknown size; without them a window would trust
+    averages longer than any model deserves. Raises ValueError unless L is at least the largest age and the variance,
+    the covariance's first element, is positive.
     """
     length = autocovariance.shape[0]
     if length < max(onset_samples):
@@ -189,7 +188,10 @@ def autocovariance(z: Vector, length: int) -> Vector:
 
 
 class DetectorMemory:
-    """The memory of the detectors of n joints; last axis: x, and its allowance for friction."""
+    """The memory of the detectors of n joints; last axis: x, and its allowance for friction.
+
+    ring: the last L samples, the newest at index head. up, down: sums of cusum for torques toward +q and -q.
+    """
 
     low: Annotated[Vector, "filters n 2"]
     smooth: Annotated[Vector, "filters n 2"]
@@ -203,7 +205,11 @@ class DetectorMemory:
 
 @dataclass(frozen=True)
 class DetectorConstants:
-    """The constants of the detectors: decay of each filter per period, gains of the observers, weights (n, N, L)."""
+    """The constants of the detectors of n joints on one stream.
+
+    decay, smoothing, band: share of the old value that each low-pass keeps after one period. gain: of the observers,
+    rad/s. weights (n, N, L): of the likelihood, newest sample first. drift_Nm: torque that cusum ignores.
+    """
 
     period_s: float
     decay: Vector
@@ -356,7 +362,8 @@ def stream(
     q, dq, tau_J (N, 2), theta (N, p), interval_s (N,). The first sample has z = 0, and so has one whose interval is not
     positive, because the motion before it is unknown. Both ends of an interval are judged by the theta of its end, so
     that a change of theta is not a torque. q1 counts from the level, for the direction of gravity; the rest is
-    independent of its zero. first_coulomb: column of joint 1's Coulomb friction in theta.
+    independent of its zero. lag_s, standstill_rad_s: as of `make_stream`. first_coulomb: column of joint 1's Coulomb
+    friction in theta.
     """
     count, joints = q.shape
     Y_p = np.zeros((2, joints, theta.shape[1]))
@@ -393,6 +400,7 @@ def make_stream(
 
     q, dq, tau_J (N, 2), q1 from the level; theta (p,), or (N, p) if it changes, p = 7 or 9; interval_s (N,): time since
     the sample before, 0 or less where samples are missing between. lag_s: by which dq is older than tau_J.
+    standstill_rad_s: a slower joint stands still.
     """
     z, held_Nm = np.zeros(q.shape), np.zeros(q.shape)
     every = np.ascontiguousarray(np.broadcast_to(theta, (q.shape[0], np.shape(theta)[-1])))
@@ -403,8 +411,8 @@ def make_stream(
 def likelihood_weights(z: Vector, settings: DetectorBankSettings, lag_s: float, period_s: float) -> Vector:
     """Return the likelihood weights (n, N, L) of all joints, from a contact-free stream z (n_samples, n), Nm.
 
-    L is the largest age of `onset_samples` plus 16. Raises ValueError if z has fewer than 10 L samples, or a joint's
-    variance is 0.
+    lag_s: as of `likelihood_windows`. L is the largest age of `onset_samples` plus 16. Raises ValueError if z has fewer
+    than 10 L samples, or a joint's variance is 0.
     """
     length = max(settings.onset_samples) + 16
     return np.array(

@@ -78,7 +78,7 @@ class OfflineArm:
     def from_config(cls, config: str | Path, profile: str | None = None) -> Self:
         """Return the two-joint arm of a configuration; config: a name or a TOML file, profile: of an emulated arm.
 
-        Raises ConfigError, a ValueError.
+        Raises ConfigError, a ValueError, if it can't be used.
         """
         return cls(read_urdf(robot_description(load_settings(str(config), profile))))
 
@@ -136,10 +136,10 @@ class FittedModel:
 
 @dataclass(frozen=True)
 class ArrayDetection:
-    """Contacts in arrays, and of m samples at a fixed period t_s (m,), tau_ext_hat and threshold (m, n), Nm.
+    """Contacts in arrays, in the order of time, and external torques with their thresholds of m samples.
 
-    The samples are those of the arrays if these have a fixed period; gaps split them, and parts of fewer than
-    `SHORTEST_SAMPLES` are left out. Contacts are in the order of time.
+    t_s (m,), s; tau_ext_hat, threshold (m, n), Nm. Their period is fixed; if that of the arrays is, they are the
+    samples of the arrays. Gaps split them, and parts of fewer than `SHORTEST_SAMPLES` are left out.
     """
 
     model: FittedModel
@@ -270,9 +270,10 @@ def _named(arrays: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
 
 
 def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: float) -> ForeignRecording:
-    """Return arrays as a recording at a fixed period, velocities moved by `velocity_lag_s`.
+    """Return arrays as a recording at a fixed period, velocities moved to the torques' times.
 
-    Raises ArrayError if an array has a wrong shape, type or value, times don't grow, or the lag is out of its range.
+    velocity_lag_s: time by which velocities are older than torques. Raises ArrayError if an array has a wrong shape,
+    type or value, times don't grow, or the lag is out of its range.
     """
     named = _named(arrays)
     t_s = _numbers("t", named["t"])
@@ -313,7 +314,7 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
 def _numbers(name: str, given: ArrayLike) -> Vector:
     """Return an array as float64 values of at most `LARGEST` in size; times may be larger, but finite.
 
-    name: of the array, for the error. Raises ArrayError.
+    name: of the array, for the error. Raises ArrayError for other values, or for no real numbers.
     """
     try:
         values = np.asarray(given)

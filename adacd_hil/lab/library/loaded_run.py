@@ -109,7 +109,10 @@ class LoadedRun:
 
     @cached_property
     def certificates(self) -> "tuple[Certificate, ...]":
-        """Certificates that were not taken back, in order; () if there is none, or the log is cut before its end."""
+        """Certificates that were not taken back, oldest first.
+
+        () if there is none, or the log is cut before its end.
+        """
         return tuple(certificates_in((event.name, event.message) for event in self.events))
 
     @property

@@ -111,7 +111,7 @@ class LiveClient:
     def _obey(self, word: dict[str, Any]) -> None:
         """Subscribe to the wanted channels that the server advertises, and last to the arm's description.
 
-        The description ends `_wait`. Other words have no effect.
+        The description ends `_wait`. word: a message of the server, decoded from JSON; other kinds have no effect.
         """
         if word["op"] != "advertise":
             return

@@ -132,7 +132,7 @@ class LiveFeed:
         self._socket.setblocking(False)
 
     def _hear(self) -> dict[str, str]:
-        """Return the first word of the view's process: its "url" with an empty "error", or an "error".
+        """Return the first message of the view's process: its "url" with an empty "error", or an "error".
 
         It is an "error" if none comes within `START_TIMEOUT_S`.
         """

@@ -178,7 +178,7 @@ class Shape(NamedTuple):
 
 
 def about_z(angle_rad: float) -> Quaternion:
-    """Return the quaternion of a rotation by an angle about z."""
+    """Return the quaternion (x, y, z, w) of a rotation by an angle about z."""
     return (0.0, 0.0, math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad))
 
 

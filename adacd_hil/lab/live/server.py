@@ -109,7 +109,7 @@ class Viewer:
         return not self._waiting
 
     async def send_all(self) -> None:
-        """Send queued data to the viewer until the task is cancelled. Raises ConnectionClosed."""
+        """Send queued data to the viewer until the task is cancelled. Raises ConnectionClosed if the viewer is gone."""
         while True:
             await self._has_some.wait()
             self._has_some.clear()
@@ -120,7 +120,7 @@ class Viewer:
 
 
 class LiveServer:
-    """Serves the messages of a ring to viewers until the writer ends or dies."""
+    """Serves viewers the messages of a ring buffer that the log's writer fills, until the writer ends or dies."""
 
     def __init__(self, setup: LiveView, topics: LiveTopics, ring: RingReader, writer: socket.socket) -> None:
         self._setup = setup
@@ -170,9 +170,9 @@ class LiveServer:
     # -- the writer -----------------------------------------------------------------------------------------------
 
     def _hear(self) -> None:
-        """Receive all waiting words of the writer, of which END or a closed socket ends the server.
+        """Receive the writer's waiting messages from its socket; END or a closed socket ends the server.
 
-        Then show packets of the ring.
+        Then queue packets of the ring for the viewers.
         """
         word: bytes | None = None
         with contextlib.suppress(BlockingIOError):
@@ -187,7 +187,7 @@ class LiveServer:
         self._show_some()
 
     def _show_some(self) -> None:
-        """Show `_AT_ONCE_BYTES` of the ring's packets; the rest follows after other tasks."""
+        """Queue about `_AT_ONCE_BYTES` of the ring's packets for the viewers; the rest follows after other tasks."""
         for batch in split(self._ring.take_packets(_AT_ONCE_BYTES)):
             self._show(batch)
         if self._ring.waiting:
@@ -210,7 +210,7 @@ class LiveServer:
                 viewer.put(_TIME.pack(_TIME_DATA, log_ns))
 
     def _tell_writer(self) -> None:
-        """Send the writer a word if the first subscription has begun or the last one ended."""
+        """Send the writer WATCHED when the first subscription has begun, ALONE when the last one has ended."""
         is_watched = any(viewer.subscriptions for viewer in self._viewers)
         if is_watched != self._is_watched:
             self._is_watched = is_watched
@@ -220,7 +220,10 @@ class LiveServer:
     # -- viewers --------------------------------------------------------------------------------------------------
 
     def _counted(self, *given: Any, **named: Any) -> ServerConnection:
-        """Return a connection that is counted while it lasts, and aborted if there are too many."""
+        """Return a connection that is counted while it lasts, and aborted if there are too many.
+
+        Too many are more than the admitted viewers and `OPENING`. given, named: arguments of ServerConnection.
+        """
         return _CountedConnection(
             self._connections, self._admitted, self._setup.most_viewers + OPENING, *given, **named
         )
@@ -305,7 +308,7 @@ class LiveServer:
     def _subscribe(self, viewer: Viewer, asked: list[tuple[int, int]]) -> bool:
         """Add subscriptions, and answer invalid ones with an error; return False if they are too many.
 
-        A subscription to the arm's description gets it at once.
+        asked: number of each subscription, and its channel. A subscription to the arm's description gets it at once.
         """
         for number, channel in asked:
             if len(viewer.subscriptions) >= _SUBSCRIPTIONS_PER_TOPIC * len(self._topics.advertised):
@@ -418,7 +421,7 @@ def url_of(setup: LiveView, listening: socket.socket) -> str:
 
 
 def make_server(told: ServerSetup, ring: RingReader, writer: socket.socket) -> LiveServer:
-    """Return the server of a log's live view. told: setup from the writer; writer: socket to it."""
+    """Return the server of a log's live view. told: setup from the writer; ring: its messages; writer: socket to it."""
     topics = LiveTopics(told.live, told.setup.channels, told.ids, told.start_ns)
     return LiveServer(told.live, topics, ring, writer)
 

@@ -47,8 +47,9 @@ def cut(
 ) -> int:
     """Copy a time window of the log whose first part is `path` to the new log `out`; return its number of messages.
 
-    Attachments and metadata are copied whole. topics: those that are copied; (): all. Raises LogError if the log is
-    damaged, lacks a topic, has no message in the window, or is `out` itself.
+    Attachments and metadata are copied whole. stretch: its times are s since the first message. topics: those that are
+    copied; (): all. progress: called with a line per part. Raises LogError if the log is damaged, lacks a topic, has no
+    message in the window, or is `out` itself.
     """
     log = SalvagedLog(path, progress)
     known = set()

@@ -32,7 +32,7 @@ class FrameChoice:
     end_ns: int | None = None
 
     def pieces(self, source: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-        """Yield the chosen frames of each piece of a recording; pieces without any are skipped."""
+        """Yield the chosen frames of each array of a recording's frames, in turn; arrays without any are skipped."""
         first_ns = None
         for frames in source:
             if first_ns is None and len(frames):
@@ -64,7 +64,7 @@ class FrameChoice:
 
 
 def sides(codec: Codec | DbcDecoder) -> tuple[frozenset[int], frozenset[int]]:
-    """Return the identifiers that a contract's host sends, and those that its devices send."""
+    """Return the identifiers that a contract's host sends, and all others: those that its devices send."""
     return (
         _ids(message.can_id for message in codec.messages.values() if HOST in message.senders),
         _ids(message.can_id for message in codec.messages.values() if HOST not in message.senders),

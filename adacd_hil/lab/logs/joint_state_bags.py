@@ -36,7 +36,7 @@ def is_bag(path: Path) -> bool:
 
 @contextmanager
 def opened_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag while the block lasts; yields its topics with types, and a function that reads one topic.
+    """Open a bag while the block lasts; yield its topics with types, and a function that reads one topic.
 
     Raises LogError for any error of its reader, also within the block; a LogError or ConfigError of the block passes.
     """

@@ -31,7 +31,7 @@ class JointStateMessage(NamedTuple):
 
 
 def decode_joint_state(payload: bytes, is_ros1: bool = False) -> JointStateMessage:
-    """Return a message of ROS 2 (CDR), or of ROS 1, decoded. Raises LogError if it is invalid."""
+    """Return a decoded message of ROS 2 (CDR), or with is_ros1 of ROS 1. Raises LogError if it is invalid."""
     from rosbags.serde import SerdeError
 
     store = _store(is_ros1)

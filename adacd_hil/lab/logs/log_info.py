@@ -59,8 +59,9 @@ class TopicInfo(NamedTuple):
 class LogInfo:
     """The content of a log, over all its parts. start_ns, end_ns: log times of the first and last message.
 
-    frames: on the bus. ending: why the log ended, "" if unknown. collisions: those of the contacts that were one.
-    problems: a line each.
+    frames: on the bus. dropped: packets that never reached the log. ending: why the log ended, "" if unknown.
+    collisions: those of the contacts that were one. faults: texts of the events of level "error". events: number by
+    level. attachments: sizes, bytes. problems: a line each.
     """
 
     path: Path

@@ -70,7 +70,7 @@ def play(
     """Send frames at their times until they end or `is_stopped` returns True; return how late they were sent.
 
     speed: 2 plays twice as fast. longest_pause_ns: longer pauses of the recording are shortened to this; None: none is.
-    A frame with an earlier time than the one before is sent with it. Raises BusError.
+    A frame with an earlier time than the one before is sent with it. Raises BusError if the bus fails.
     """
     lateness = Lateness()
     for due_ns, group in _grouped(_scheduled(frames, clock, speed, longest_pause_ns)):
@@ -86,9 +86,10 @@ def play(
 
 
 def repeat(frames: Callable[[], Iterable[PlayedFrame]], times: int) -> Iterator[PlayedFrame]:
-    """Yield the frames of a recording `times` times in a row, with times that go on; times 0: forever.
+    """Yield the frames of a recording `times` times in a row, with times that continue; 0: forever.
 
-    Ends at once if the recording is empty. `frames` is called for each repetition.
+    Each repetition begins `LOOP_PAUSE_NS` after the last frame before. Ends at once if the recording is empty. `frames`
+    is called for each repetition.
     """
     shift_ns, end_ns, done = 0, None, 0
     while not times or done < times:
@@ -121,7 +122,7 @@ def _scheduled(
 
 
 def _grouped(scheduled: Iterable[tuple[int, PlayedFrame]]) -> Iterator[tuple[int, list[PlayedFrame]]]:
-    """Yield due time and frames of each group with the same due time, 64 frames at most."""
+    """Yield due time and frames of each group with the same due time, `_MOST_AT_ONCE` frames at most."""
     group: list[PlayedFrame] = []
     group_ns = 0
     for due_ns, frame in scheduled:

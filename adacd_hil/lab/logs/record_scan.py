@@ -55,7 +55,7 @@ def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap]:
 def _head(file: IO[bytes], position: int, size: int) -> tuple[int, int] | None:
     """Return opcode and length of the record at `position` of a file of `size` bytes.
 
-    None if none with a right shape is there.
+    None if no record is there whose contents fit its kind and length.
     """
     head = read_bytes(file, position, HEAD.size)
     if len(head) < HEAD.size:

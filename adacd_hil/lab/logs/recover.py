@@ -36,9 +36,8 @@ def default_out(path: Path) -> Path:
 def recover(path: Path, out: Path | None = None, progress: Callable[[str], None] = lambda _: None) -> LogRecovery:
     """Save the trusted records of all parts of a log to the new log `out`. path: the log's first part.
 
-    out: None: `default_out`.
-
-    Raises LogError if no record can be trusted, a file can't be read or written, or `out` is the log itself.
+    out: None: `default_out`. progress: called with a line per part. Raises LogError if no record can be trusted, a file
+    can't be read or written, or `out` is the log itself.
     """
     out = out or default_out(path)
     log = SalvagedLog(path, progress)

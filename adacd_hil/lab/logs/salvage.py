@@ -42,8 +42,10 @@ _NOTES = 20
 class Losses:
     """The records that could not be saved.
 
-    `bytes`: in gaps and in lost records. `messages`: None if their number is unknown. `is_cut`: the file has no end.
-    `notes`: a line for each damage, the first `_NOTES`.
+    `bytes`: in gaps and in lost records. `messages`: None if their number is unknown. `unvouched`: messages that were
+    saved though no CRC vouches for them. `is_cut`: the file has no end. `is_doubtful`: the data section fails its CRC,
+    though no damage was found. `holes_s`: gaps in time between saved messages. `notes`: a line for each damage, the
+    first `_NOTES`.
     """
 
     chunks: int = 0
@@ -84,7 +86,7 @@ class Losses:
         return ", ".join(word for word, is_said in (*head, holes, *tail) if is_said)
 
     def add_note(self, text: str) -> None:
-        """Add a line on a damage to `notes`, unless it has 20 already."""
+        """Add a line on a damage to `notes`, unless it has `_NOTES` already."""
         if len(self.notes) < _NOTES:
             self.notes.append(text)
 
@@ -105,7 +107,10 @@ class Losses:
 
 
 class Salvage:
-    """One file: iterate once for its trusted records; then `losses` is filled. `definitions` fill up on the way."""
+    """One file: iterate once for its trusted attachments, metadata records and messages; then `losses` is filled.
+
+    `definitions`, of schemas and channels, fill up on the way.
+    """
 
     def __init__(self, path: Path) -> None:
         """Read the summary of a file, and find which CRCs it has. Raises LogError if it can't be read."""
@@ -217,9 +222,10 @@ class Salvage:
         yield from self._give(contents, is_vouched)
 
     def _give(self, contents: Contents, is_vouched: bool) -> Iterator[Contents]:
-        """Yield messages.
+        """Yield messages, and count them for the losses.
 
-        Count those saved, unvouched or without a channel, and add the gap in time before them, if any.
+        is_vouched: a CRC vouches for them. Counts those saved, unvouched or without a channel, and adds the gap in time
+        before them if something was lost in it.
         """
         known = np.isin(contents.channels, list(self.definitions.channels))
         self._left_out += int(np.count_nonzero(~known))

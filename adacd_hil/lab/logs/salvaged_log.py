@@ -64,7 +64,8 @@ class SalvagedLog:
     def _is_foreign(self, item: Metadata, is_vouched: bool) -> bool:
         """Return whether a part's metadata show that it is of another run.
 
-        A single entry that differs counts only if CRCs vouch for both, since it may be damaged.
+        item: the metadata; is_vouched: a CRC vouches for them. A single entry that differs counts only if CRCs vouch
+        for both, since it may be damaged.
         """
         if item.name != RUN_METADATA:
             return False

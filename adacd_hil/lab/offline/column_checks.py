@@ -331,9 +331,9 @@ def _of_jumps(described: RecordingMap, recordings: Sequence[ForeignRecording]) -
 
 
 def _jumps(recording: ForeignRecording, joint: int) -> Iterator[tuple[float, float]]:
-    """Yield a joint's jumps of position, to which it does not return: signed size, rad, and s since the first row.
+    """Yield size, rad with sign, and time, s since the first row, of each lasting jump of a joint's position.
 
-    joint: from 0.
+    A jump is a step above `_JUMP_RAD` and `_JUMP_TIMES` the steps just before and after. joint: from 0.
     """
     for stretch in recording.stretches:
         q = stretch.record.q[:, joint]
@@ -345,9 +345,10 @@ def _jumps(recording: ForeignRecording, joint: int) -> Iterator[tuple[float, flo
 
 
 def _spikes(column: Vector) -> NDArray[np.int64]:
-    """Return the indices of samples (k,) that are far from the median of the five around each.
+    """Return the indices of samples (k,) that are far from the median of the `_SPIKE_WINDOW` around each.
 
-    Empty if they are over 0.5 % of the samples, so always below 200. The two samples at each end aren't checked.
+    Far: by more than `_SPIKE_SIGMAS` of the noise and `_SPIKE_SPAN` of the usual span. Empty if they are over a share
+    `_SPIKES_SHARE` of the samples, so always with few samples. The two samples at each end aren't checked.
     """
     if len(column) < _SPIKE_WINDOW:
         return np.zeros(0, np.int64)
@@ -362,7 +363,8 @@ def _spikes(column: Vector) -> NDArray[np.int64]:
 def _is_noise(column: Vector, period_s: float) -> bool:
     """Return whether positions (k,) jump from sample to sample as white noise does.
 
-    Always False for a period above `_NOISE_PERIOD_S`.
+    Their mean square step is then over `_NOISE_STEP` times twice their variance. Always False for a period above
+    `_NOISE_PERIOD_S`.
     """
     return period_s <= _NOISE_PERIOD_S and float(np.mean(np.diff(column) ** 2)) > _NOISE_STEP * 2.0 * float(
         np.var(column)
@@ -439,8 +441,8 @@ def _runs(column: Vector) -> NDArray[np.int64]:
 def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | None:
     """Return the first and the end index of the longest run of equal torques (k,) if the sensor is stuck, else None.
 
-    The sensor is stuck if the run is long, some joint of q (k, n) moves in it, and the other runs are far shorter: a
-    coarse sensor has many long runs. Runs at the extreme readings are left out.
+    The sensor is stuck if the run lasts `_STUCK_S`, some joint of q (k, n) moves in it, and the other runs are
+    `_STUCK_TIMES` shorter: a coarse sensor has many long runs. Runs at the extreme readings are left out.
     """
     runs = _runs(torque)
     lengths = runs[:, 1] - runs[:, 0]
@@ -474,9 +476,10 @@ def clipped_torque(torque: Vector) -> tuple[float, float] | None:
 
 
 def _clipped_at(torque: Vector) -> Iterator[float]:
-    """Yield the smallest and the largest reading of a torque (k,), each only if it repeats as of a clipped sensor.
+    """Yield the smallest and the largest reading of a torque (k,), each only if the sensor seems clipped there.
 
-    A torque with fewer than `_FEWEST_LEVELS` distinct readings yields none.
+    Then many readings equal it, some in a long run, and more than lie in the band beside it. A torque with fewer than
+    `_FEWEST_LEVELS` distinct readings yields none.
     """
     levels = np.unique(torque)
     if len(levels) < _FEWEST_LEVELS:

@@ -66,8 +66,8 @@ def draft_map(recording: Path, urdf: Path, map_path: Path) -> list[DraftedKey]:
 def _read_arm(urdf: Path) -> tuple[SerialArm, tuple[str, ...]]:
     """Read the arm of a URDF; return it, and the names of the joints that the map must lock.
 
-    If the URDF can't be read otherwise, all joints with a name like a gripper's are locked; else (). Raises
-    ConfigError.
+    If the URDF can't be read otherwise, all joints with a name like a gripper's are locked; else (). Raises ConfigError
+    if it can't be read so either.
     """
     try:
         text = read_input(urdf)

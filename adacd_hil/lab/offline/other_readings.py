@@ -86,10 +86,10 @@ class _Torques(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Normal equations of fit or test, by joint: A (n, p, p), b (n, n, p) with each torque column.
+    """Normal equations of fit or test, by joint, from its filtered rows w (p,) and torques.
 
-    S (n, n): products of the torques. u (n,), U (1,): products of the filtered constant with the torques, and with
-    itself.
+    A (n, p, p): sums of w w'. b (n, n, p): sums of w times each torque column. S (n, n): products of the torques. u
+    (n,), U (1,): products of the filtered constant with the torques, and with itself.
     """
 
     A: Vector
@@ -109,8 +109,9 @@ def find_readings(
 ) -> list[Reading]:
     """Return the interpretations that explain the test's torque far better than the map does, best first.
 
-    Of nearly equal ones only those with the fewest differences from the map are returned. [] if there is none, or the
-    map's own can't be computed.
+    They explain `EXPLAINED` of it, and leave at most `_BETTER` of the share that the map leaves unexplained, unless no
+    arm can have the map's parameters. Of nearly equal ones only those with the fewest differences from the map are
+    returned. [] if there is none, or the map's own can't be computed.
     """
     fitted, tested = _thinned(fitted, settings), _thinned(tested, settings)
     step = _step(settings)
@@ -278,7 +279,11 @@ def _torques(described: RecordingMap, most_turned: int, units: list[tuple[int, f
 
 
 def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
-    """Yield interpretations of the motion, the map's own first, with texts ""."""
+    """Yield interpretations of the motion, the map's own first, with texts "".
+
+    The others: positions in another unit, a joint turned, two exchanged, all in reverse order, sums or differences of
+    joints, torques with or without rotors, gravity along another axis or none.
+    """
     n, straight, names = model.joints, np.eye(model.joints), described.urdf.joint_names
     yield _Motion("", "", model, straight)
     for unit, factor in (("deg", math.pi / 180.0), ("rad", 180.0 / math.pi)):

@@ -161,7 +161,7 @@ class RecordedRows:
     def _count_wrong_rows(self, table: Vector, is_wrong: NDArray[np.bool_], kind: str, words: str) -> None:
         """Count the wrong rows of a table by `drop`, without removing them.
 
-        words: of the first one, with {time} in it.
+        table: number and time of each row first. words: of the first one, with {time} in it.
         """
         for number, time in table[is_wrong, :2][:1].tolist():
             first = words.format(time=f"{time * self._unit_s:.9g} s")

@@ -47,8 +47,8 @@ class Spell(NamedTuple):
 class Watched:
     """External torques, thresholds and contacts that the model shows in a recording to which it was not fitted.
 
-    touches, missed: numbers of touches, and of undetected ones; None if touches are unknown. delays_s: from the begin
-    of each detected touch to its detection.
+    tau_ext_hat, threshold: of each stretch (k, n), Nm. touches, missed: numbers of touches, and of undetected ones;
+    None if touches are unknown. delays_s: from the begin of each detected touch to its detection.
     """
 
     recording: ForeignRecording
@@ -158,7 +158,7 @@ def identify(
 
     tested: None: of the last recording the first `FIT_SHARE` of its time is fitted, and the rest tested. watched:
     further recordings. Samples during a known touch are neither fitted nor tested. Raises LogError if there is too
-    little free motion to fit or to test, ConfigError for the map's settings of the scheme.
+    little free motion to fit or to test, ConfigError if the map's settings of the scheme are invalid.
     """
     for recording in fitted:
         if not recording.stretches:

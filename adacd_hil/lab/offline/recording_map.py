@@ -141,7 +141,10 @@ def _is_near(value: float, wanted: float) -> bool:
 
 @dataclass(frozen=True)
 class RecordingMap:
-    """A map, and the arm that it names. n, the number of moving joints, is the length of each list that isn't empty."""
+    """A map, and the arm that it names. n, the number of moving joints, is the length of each list that isn't empty.
+
+    scheme: keys of `OfflineSettings` with the map's values.
+    """
 
     urdf: SerialArm
     arm: ArmSection

@@ -64,7 +64,8 @@ _MOSTLY: Final = 0.8
 class JointShare(NamedTuple):
     """Result of the test for a joint. share: explained part of its torque, nan without torque.
 
-    margin: smallest ratio of threshold to residual.
+    margin: smallest ratio of threshold to residual. torque_Nm: rms behind the filter of the fit, about its best
+    constant. is_explained: by share and margin.
     """
 
     name: str
@@ -78,7 +79,7 @@ class JointShare(NamedTuple):
 class Verdict:
     """Whether the torque of the test is explained. headline: the result in one line. joints: results by joint.
 
-    reasons: why it isn't explained, remarks: further facts, a sentence each.
+    reasons: why it isn't explained, remarks: further facts, a sentence each. remedy: the user's next step, "" for none.
     """
 
     is_explained: bool
@@ -96,8 +97,8 @@ class Verdict:
 class Fitted:
     """A fit with its recordings and its test, to be judged. described: the map.
 
-    before: the estimate at the fit's begin. estimate, deviation: parameters (p,) with P, and their standard deviations
-    (p,).
+    before: the estimate at the fit's begin. certificate: of the test. estimate, deviation: parameters (p,) with P, and
+    their standard deviations (p,).
     """
 
     described: RecordingMap

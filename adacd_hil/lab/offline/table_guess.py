@@ -59,8 +59,9 @@ class TableGuess:
     """A guess of a CSV file's form, and of the role of its columns.
 
     heads: of all columns, "1", "2", … if the file has none. units_below: units in a row below the heads, "" where there
-    is none. is_iso: the first column has dates and times. columns, units, reasons: by role, "time", "q", "dq", "tau_J"
-    or "contact": the heads of its columns, their unit if the file gives one, and why an uncertain choice was made.
+    is none. is_iso: the first column has dates and times: its first cell is no number. columns, units, reasons: by
+    role, "time", "q", "dq", "tau_J" or "contact": the heads of its columns, their unit if the file gives one, and why
+    an uncertain choice was made.
     """
 
     form: CsvSection
@@ -78,7 +79,10 @@ class TableGuess:
 
 
 class _Head(NamedTuple):
-    """A column's head, split up. place: of the column, from 0. words: lower case, no numbers. unit: "" without one."""
+    """A column's head, split up. place: of the column, from 0. words: lower case, no numbers. unit: "" without one.
+
+    order: the joint's number or index; nan without one.
+    """
 
     place: int
     words: tuple[str, ...]
@@ -120,10 +124,10 @@ _Form = tuple[CsvSection, tuple[str, ...], tuple[str, ...], int]
 
 
 def _form(path: Path, lines: list[str]) -> _Form:
-    """Return the form whose delimiter and decimal sign give the data the most columns, and where the data begin.
+    """Return form, heads, units below them and first data line, from 0, by the first lines of a CSV file.
 
-    The line counts from 0. Raises LogError unless `_FULL_ROWS` successive rows of numbers lie in the first
-    `_HEAD_ROWS`.
+    Of all delimiters and decimal signs those are taken that give the data the most columns. Raises LogError unless
+    `_FULL_ROWS` successive rows of numbers lie in the first `_HEAD_ROWS`.
     """
     best: _Form | None = None
     for delimiter in DELIMITERS:
@@ -168,9 +172,10 @@ def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) ->
 
 
 def _values(rows: list[list[str]], count: int, decimal: str) -> tuple[Vector, bool]:
-    """Return the cells as numbers (k, count), nan for other cells, and whether the first cell is a date and time.
+    """Return the cells as numbers (k, count), nan for other cells, and whether the first column has dates.
 
-    Rows with fewer than `count` cells are left out; further cells of a row, and rows after `_SEEN_ROWS`, too.
+    It has if the first cell of the first row with all cells is no number. Rows with fewer than `count` cells are left
+    out; further cells of a row, and rows after `_SEEN_ROWS`, too.
     """
     table: list[list[float]] = []
     is_iso = False

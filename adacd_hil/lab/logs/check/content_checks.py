@@ -100,7 +100,8 @@ class DefinitionCheck:
     def _place(self, kind: str, number: int, is_known: bool, offset: int, is_summary: bool) -> None:
         """Note a definition that only the summary has.
 
-        Add a finding, once per number, for one that the data section repeats.
+        Add a finding, once per number, for one that the data section repeats. kind: "schema" or "channel". is_known:
+        the data section has defined the number. is_summary: this definition is in the summary.
         """
         name = f"{kind} {number}"
         if is_summary and not is_known:

@@ -46,7 +46,10 @@ class Findings:
     """Parts of the file that have no CRC, by kind."""
 
     def add_finding(self, rule: str, text: str, offset: int = -1) -> None:
-        """Count a finding of a rule of `RULES`; keep it in `found` if it is one of the rule's first ten."""
+        """Count a finding of a rule of `RULES`; keep it in `found` if it is one of the rule's first `_TOLD`.
+
+        offset: byte of the file, -1 for the file as a whole.
+        """
         self.counts[rule] += 1
         if self.counts[rule] <= _TOLD:
             self.found.append(LogFinding(self.file, RULES[rule], rule, text, offset))

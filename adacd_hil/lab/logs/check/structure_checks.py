@@ -32,7 +32,11 @@ from adacd_hil.log.mcap.record_layout import HEAD, INDEX_ENTRY
 
 @dataclass
 class ChunkFacts:
-    """Facts on a chunk, with which its index in the summary is compared. The first ones have mcap's names."""
+    """Facts on a chunk, with which its index in the summary is compared. The first ones have mcap's names.
+
+    channels: numbers of its messages' channels, uint16 each. message_index_offsets: as of `pack_offsets`. is_indexed:
+    the summary has an index of it.
+    """
 
     chunk_length: int
     message_start_time: int
