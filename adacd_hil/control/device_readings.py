@@ -301,7 +301,7 @@ class DeviceReadings:
         return list(texts.values())
 
     def is_unlike_an_arm(self) -> bool:
-        """Return whether the configured devices give an inertia that no arm has.
+        """Return whether the configured devices give an inertia that no arm has: one that isn't positive definite.
 
         True also with fewer than _SUSPECT_BLOCKS blocks, which are too few to know. Solves all readings anew.
         """
@@ -399,7 +399,10 @@ class DeviceReadings:
         return max(JOINTS * self._blocks - (self._normals.shape[1] - 1), 1)
 
     def _rank(self, place: int) -> float:
-        """Return the unexplained share of a reading, by index; inf if no arm has its inertia or it isn't distinct."""
+        """Return the unexplained share of a reading, by index, of the last solution; the lower the better.
+
+        inf if its inertia isn't positive definite, or it can't be distinguished from the configuration.
+        """
         is_right = self._is_distinct(place) and is_positive_definite(self._solutions[place])
         return float(self._shares[place]) if is_right else math.inf
 

@@ -54,7 +54,7 @@ class Exchange:
 
         Stop to wait after FEEDBACK_SHARE of the period; the missing values are then old ones.
 
-        Raises BusError; in lockstep its SilenceError, if no device answers.
+        Raises BusError if sending or receiving fails; in lockstep its SilenceError, if no device answers.
         """
         bus, arm = self._bus, self._arm
         for late in tick.late:
@@ -125,7 +125,7 @@ class Exchange:
             self._pass_on(frame)
 
     def _pass_on(self, frame: Frame) -> None:
-        """Report an error frame; give any other frame to the CANopen master.
+        """Report an error frame as an event; give any other frame to the CANopen master.
 
         Call it with frames that the arm has not taken.
         """
@@ -142,7 +142,7 @@ class Exchange:
     def end(self, tick: Tick, arm: ArmState, command: ArmCommand, log_queue_bytes: int = 0) -> CycleRecord:
         """Send the commands, and a heartbeat if one is due; return the record of the cycle's times and counts.
 
-        `log_queue_bytes`: bytes that wait for the log's writer. Raises BusError.
+        `log_queue_bytes`: bytes that wait for the log's writer. Raises BusError if a frame can't be sent.
         """
         self._arm.send_command(command)
         record = self._record(tick, arm, log_queue_bytes)

@@ -122,8 +122,9 @@ class FirstMotion(EventSource):
     def add_cycle(self, arm: ArmState, state: SchemeState, tau_c: Vector) -> None:
         """Add a cycle to the blocks, and judge the joints; put a contradiction in `line`, remarks in `events`.
 
-        `tau_c` (2,): its commanded torque, Nm. `state`: of the scheme after the cycle before. Stop judging after 60 s
-        with power.
+        `tau_c` (2,): its commanded torque, Nm. `state`: of the scheme after the cycle before. A cycle without power,
+        with missing data, or with a drive at a limit discards the unfinished blocks. Stop judging after _LONGEST_S with
+        power.
         """
         if not self.is_on:
             return
@@ -198,7 +199,8 @@ class FirstMotion(EventSource):
     def _left(self) -> list[Reading]:
         """Return the device readings that neither the arm's equation nor the commanded torques refute, best first.
 
-        [] as of `DeviceReadings.left`, and if they are no longer judged.
+        [] with few blocks, if the right reading isn't among them (`DeviceReadings.left`), or if they are no longer
+        judged.
         """
         return [] if self._readings is None else self._readings.left(self._ratios(), self._error)
 
@@ -384,7 +386,7 @@ class _Blocks:
     def add_cycle(self, arm: ArmState, acting: Vector) -> _Block | None:
         """Add a cycle; return the block that it completes, or None. That cycle also begins the next block.
 
-        acting (2,): commanded torque that acts in this cycle, Nm.
+        arm: for q, dq and tau_J. acting (2,): commanded torque that acts in this cycle, Nm.
         """
         last = np.array((arm.q, arm.dq, arm.tau_J, acting))
         if self._seen == 0:

@@ -217,7 +217,7 @@ class Reference(EventSource):
 
     @property
     def _wanted_share(self) -> float:
-        """Return the pace that the arm shall reach: 0 while stopping, less than 1 for SLOW_DOWN, else 1."""
+        """Return the wanted share of the planned speed: 0 while stopping, `slow_share` for SLOW_DOWN, else 1."""
         if self._is_stopping:
             return 0.0
         return self._slow_share if self._reaction is Reaction.SLOW_DOWN and self._state in REACTING else 1.0
@@ -287,8 +287,8 @@ class Reference(EventSource):
     def _is_thrown(self, arm: ArmState, tau_ext_hat: Vector) -> bool:
         """Return whether an ending blow has made a joint faster than planned by THROWN_rad_s, away from the contact.
 
-        During the push the controller resists. False while the arm learns, because an adaptation that restarts forgets
-        a push that continues.
+        Ending: the external torque has fallen below a share of ENDING of its peak; until then the controller resists.
+        False while the arm learns, because an adaptation that restarts forgets a push that continues.
         """
         if not self._has_model:
             return False

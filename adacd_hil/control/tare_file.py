@@ -122,9 +122,9 @@ def read_tare(path: Path) -> Tare:
 
 
 def write_tare(tare: Tare, path: Path) -> Path | None:
-    """Write a tare file in one step; copy an old one to `.1` and return the copy's path, else None. Raises OSError.
+    """Write a tare file in one step; copy an old one to its name with `.1` and return the copy's path, else None.
 
-    At each moment the path holds a whole file.
+    At each moment the path holds a whole file. Raises OSError if a file can't be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     backup = path.with_name(f"{path.name}.1") if path.exists() else None
