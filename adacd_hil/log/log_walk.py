@@ -102,9 +102,9 @@ def run_metadata(path: Path) -> dict[str, str]:
 
 
 def _read_items(path: Path, is_ahead: bool = True) -> Iterator[Item]:
-    """Yield the contents of a file from front to end; is_ahead: as for `read_blocks`.
+    """Yield the contents of a file from front to end: blocks of chunks, attachments, metadata, problems.
 
-    Raises LogError as `read_head`.
+    is_ahead: a thread decompresses chunks in advance. Raises LogError if the file can't be read or isn't MCAP.
     """
     with failing_as(f"log {path} can't be read"), open_input(path) as file:
         yield from read_blocks(file, str(path), is_ahead=is_ahead)
@@ -144,9 +144,9 @@ class LogWalk:
         return None
 
     def _find_parts(self) -> None:
-        """Plan the walk: the readable parts in order, and a problem for each missing, unreadable or foreign one.
+        """Plan the walk: readable parts by ascending number, a problem for each missing, unreadable or foreign one.
 
-        Raises the first part's LogError if no part can be read.
+        Foreign: of another log. Raises the first part's LogError if no part can be read.
         """
         parts = parts_of(self.path)
         self._is_alone = list(parts) == [0]
@@ -193,8 +193,8 @@ class LogWalk:
     def pieces(self, cycles: int, epoch_ns: int, is_ahead: bool = True) -> Iterator[RawPiece]:
         """Yield the messages of all parts in pieces of `cycles` cycles; topics, summary and problem grow meanwhile.
 
-        epoch_ns: offset of the times in the file from those of frames. is_ahead: a thread opens chunks in advance. Each
-        call begins with the first part and clears summary and problem.
+        epoch_ns: offset of the times in the file from those of frames. is_ahead: a thread decompresses chunks in
+        advance. Each call begins with the first part and clears summary and problem.
         """
         builder = PieceBuilder(cycles, epoch_ns)
         self._problems, self.summary, self.parts = [], {}, 0
@@ -255,7 +255,10 @@ class _PartWalk:
         self.problem = self.problem or problem
 
     def pieces(self, is_ahead: bool) -> Iterator[RawPiece]:
-        """Read the file; yield a piece whenever enough cycles are gathered; keep attachments, metadata and problems."""
+        """Read the file; yield a piece whenever enough cycles are gathered; keep attachments, metadata and problems.
+
+        is_ahead: a thread decompresses chunks in advance.
+        """
         for item in _read_items(self._path, is_ahead):
             if isinstance(item, Block):
                 yield from self._take_block(item)

@@ -114,7 +114,7 @@ def viewer_layout(robot: bytes = b"") -> bytes:
 
 
 def _stack(first: str, *others: str) -> Any:
-    """Return panels of equal height, one below the other."""
+    """Return the layout of panels, by their names, one below the other with equal heights; of one panel its name."""
     if not others:
         return first
     share = 100.0 / (1 + len(others))

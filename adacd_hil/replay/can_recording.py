@@ -174,7 +174,7 @@ class RecordingAgainstLog(LogSource):
     def _piece(self, piece: Piece) -> Piece:
         """Return a piece of the log with the recording's frames, without the cycles that the recording lacks.
 
-        Those are counted. Call it for all pieces, in order.
+        Count the latter. Call it for all pieces, in the order of the log.
         """
         cycles = piece.series[self._partner]
         number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns

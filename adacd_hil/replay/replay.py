@@ -64,10 +64,10 @@ def replay(
 ) -> Replay:
     """Replay a log with its own settings, or with others, and return the outcome.
 
-    With its own settings, each decision is compared with the log. tolerance: of the comparison; None: exact, or
-    `TOLERANCE` where the log's numbers were computed on another kind of machine. script_of: plays the user of a
-    configuration; with it, the requests of a run without typed requests are compared. Raises LogError, ConfigError or
-    CodecError if the log, its attachments or a device can't be read.
+    With its own settings, each decision is compared with the log. progress: prints a line about the work. tolerance: of
+    the comparison; None: exact, or `TOLERANCE` where the log's numbers were computed on another kind of machine.
+    script_of: plays the user of a configuration; with it, the requests of a run without typed requests are compared.
+    Raises LogError, ConfigError or CodecError if the log, its attachments or a device can't be read.
     """
     source = LogSource(path)
     return replay_source(
@@ -126,9 +126,9 @@ class _Player:
         self._cycles: dict[int, int] = {}
 
     def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool = True) -> SchemeBatch:
-        """Run the scheme on a stretch of a part; gather and return its decisions.
+        """Run the scheme on a stretch of a part; gather its decisions for the outcome, and return them.
 
-        is_told: the stretch is reported: compare and count its cycles, too.
+        arms: the arm's states in it (n,). is_told: the stretch is reported: compare and count its cycles, too.
         """
         ticks = stretch.ticks
         if stretch.is_begin:
@@ -242,9 +242,10 @@ def replay_source(
 ) -> list[Replay]:
     """Replay a source, once for each of the settings; shown: mismatches that are kept.
 
-    truth: the true contacts, None if unknown. stretch: the part that is compared and reported; watch sees all from the
-    beginning of the log on. by_frames: decode the frames and compare each state with the log's. Raises LogError if the
-    source can't be read, or no cycle of the stretch can be replayed; ConfigError if a device can't be loaded.
+    truth: the true contacts, None if unknown. tolerance, script_of: as for `replay`. stretch: the part that is compared
+    and reported; watch sees all from the beginning of the log on. by_frames: decode the frames and compare each state
+    with the log's. Raises LogError if the source can't be read, or no cycle of the stretch can be replayed; ConfigError
+    if a device can't be loaded.
     """
     bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
@@ -376,7 +377,10 @@ class _ArmReader:
         self._arms: dict[Any, RecordedArm] = {}
 
     def read(self, stretch: CycleStretch) -> list[ArmBatch]:
-        """Return the arm's states in a stretch, for each of the variants. Call it for all stretches in order."""
+        """Return the arm's states in a stretch, for each of the variants.
+
+        Call it for all stretches in the order of the log.
+        """
         if stretch.is_begin:
             self._arms = {
                 key: RecordedArm(settings, self._source.codec, self._devices[key])

@@ -78,9 +78,10 @@ class Recorder:
     ) -> None:
         """Create the file, which must not exist (see run_folder.py), and start the writer.
 
-        messages: of the DBC, by default the package's. epoch_ns: added to t_ns for the log's times; 0 in lockstep.
-        blocking: lockstep. channels: of a log that is no run's. live: live view to open. Raises LogExistsError if a log
-        is there already, LogError if the file or the writer can't be made.
+        messages: of the DBC, by default the package's. The counts: see `run_channels`. attachments, metadata: at the
+        file's beginning. epoch_ns: added to t_ns for the log's times; 0 in lockstep. blocking: lockstep. channels: of a
+        log that is no run's. settings: sizes of parts and buffer. live: live view to open. Raises LogExistsError if a
+        log is there already, LogError if the file or the writer can't be made.
         """
         settings = settings or LogSettings()
         own = {
@@ -130,7 +131,10 @@ class Recorder:
         self._socket.setblocking(True)
 
     def _wait_until_ready(self) -> None:
-        """Wait until the writer is ready. If it fails, remove the file and raise LogError."""
+        """Wait until the writer is ready, and store the address of its live view.
+
+        If it reports an error, or sends nothing within START_TIMEOUT_S, end it, remove the file and raise LogError.
+        """
         word = self._hear(START_TIMEOUT_S)
         error = "the writer did not start" if word is None else word["error"]
         if error:
@@ -216,8 +220,8 @@ class Recorder:
     def _summarise(self, word: dict[str, str] | None) -> LogSummary:
         """Wait for the end of the writer's process, and return the summary.
 
-        word: its last message, None if it died or is silent. Without it the writer is ended, the log is incomplete, its
-        counts are 0, and the packets that it had not written count as dropped.
+        word: the writer's last message, None if it died or is silent. Without it the writer is ended, the log is
+        incomplete, its counts are 0, and the packets that it had not written count as dropped.
         """
         error = ""
         if word is None:

@@ -37,9 +37,9 @@ class Topic(NamedTuple):
 
     @property
     def has_tail(self) -> bool:
-        """Whether a payload ends after the number of bytes of `data` in its `count`.
+        """Whether the topic is of FD frames, whose payloads end after as many bytes of `data` as their `count`.
 
-        Records of it are padded with zeros.
+        Their records are padded with zeros.
         """
         return self.type_name == FD_FRAME.name
 
