@@ -87,7 +87,7 @@ class Filters:
 
 
 class Wide:
-    """External torques of the widest filter, from which the filter is undone: written by `external_torque`."""
+    """The last external torques by the filter that is undone, newest first: written by `external_torque`."""
 
     history: Annotated[Vector, "wide n"]
 

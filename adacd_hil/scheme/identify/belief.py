@@ -68,7 +68,7 @@ def freeze(k: Constants, m: Memory) -> None:
 
 @compiled
 def certify(k: Constants, m: Memory) -> None:
-    """Store the model in use as the certified one, set `promotions` to 0, and hold the lags."""
+    """Store the model in use as the certified one, set `promotions` to 0, and stop learning the lags."""
     m.models.promotions = 0.0
     _certify(m)
     hold_lags(k, m)

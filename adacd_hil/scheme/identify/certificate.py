@@ -57,8 +57,9 @@ class Certificate(NamedTuple):
 def last_of(settings: Settings) -> tuple[Vector, Vector, Vector]:
     """Return value, variance and slack (Q,) of the last certificate per quantity of `evidence`.
 
-    The variance is inf for the torque offsets, and for all quantities without a last certificate. A viscous friction is
-    computed from two frictions. Their deviations count as independent, which overestimates its own.
+    slack: size up to which a difference is ignored. The variance is inf for the torque offsets, and for all quantities
+    without a last certificate. A viscous friction is computed from two frictions. Their deviations count as
+    independent, which overestimates its own.
     """
     history = settings.history
     counts = (FRICTIONS, INERTIAS, JOINTS, JOINTS)

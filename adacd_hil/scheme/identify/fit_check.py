@@ -67,7 +67,7 @@ SMALLEST_UNIT = 0.1
 
 
 def step_samples_of(settings: Settings) -> int:
-    """Return the number of learnt samples from one step to the next."""
+    """Return the number of learnt samples between two steps, at which the fit's present belief is stored."""
     return max(round(STEP_S / (settings.bus.period_s * settings.certified.learn_every)), 1)
 
 
@@ -132,9 +132,10 @@ def _keep_sample(m: Memory, W_f: Vector, tau_f: Vector) -> None:
 
 @compiled
 def unit_of(square: float, rows: float) -> float:
-    """Return u for the worst moments of residuals: HARD times their mean square, within SMALLEST_UNIT and LARGEST_UNIT.
+    """Return u, a factor on a belief's variances, by its fit's residuals: HARD times their mean square, within bounds.
 
-    square: sum of the residuals' squares over their variances. rows: number of residuals.
+    square: sum of the residuals' squares over their variances. rows: number of residuals. The bounds: SMALLEST_UNIT and
+    LARGEST_UNIT.
     """
     return min(max(HARD * square / max(rows, 1.0), SMALLEST_UNIT), LARGEST_UNIT)
 

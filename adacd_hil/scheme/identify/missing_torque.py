@@ -82,7 +82,7 @@ def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
     """Advance the filtered columns X (n, PLACE_TERMS) over one period, by the filter `LEARNT` and the pole behind it.
 
     is_seen: False after a gap, when that filter keeps its values. rates (3,): its coefficients for one period, see
-    `torque_filter.FirstOrderHold`; smoothing: of the pole.
+    `torque_filter.FirstOrderHold`; smoothing: share of the pole's old output that stays after one period.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]
     X, X_old, X_f, X_learnt = m.regressor.X, m.missing_torque.X_old, m.missing_torque.X_f, m.missing_torque.X_learnt

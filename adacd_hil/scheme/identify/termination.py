@@ -40,7 +40,7 @@ def is_quiet(tau_ext_hat: Vector, beta_Nm: float) -> bool:
 
 @compiled
 def begin_fit(m: Memory) -> None:
-    """Clear the evidence of the fit before in the certified scheme: motion, excitation, condition."""
+    """Clear the evidence that the fit is complete, as a new one begins: motion, excitation, condition."""
     begin(m.motion)
     m.fit.excitation = 0.0
     m.fit.condition = np.inf

@@ -101,7 +101,10 @@ def begin_test(constants: Structured, memory: Structured) -> None:
 
 @compiled
 def begin_refinement(constants: Structured, memory: Structured) -> None:
-    """Store the model in use as certified, begin to test candidates, and drop kept beliefs and missing torque."""
+    """Store the model in use as certified, and begin to test candidates for a better one.
+
+    Drop the beliefs kept from before a touch, and the evidence of a torque that the model lacks.
+    """
     k, m = constants[0], memory[0]
     belief.certify(k, m)
     refinement.begin(m)
