@@ -93,7 +93,10 @@ class Cycle:
         clock: Clock,
         touched_ns: Callable[[], int | None] = lambda: None,
     ) -> None:
-        """Make the cycle's objects. `clock`: measures durations within a cycle. `touched_ns`: see `RunNarration`."""
+        """Make the cycle's objects. `clock`: measures durations within a cycle.
+
+        `touched_ns`: returns the time since which the arm is touched, None if unknown.
+        """
         self._period_s = settings.bus.period_s
         self._frame_checks = Recurrence(FRAME_CHECKS_S, self._period_s)
         self._progress = progress

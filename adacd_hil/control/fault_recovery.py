@@ -62,7 +62,7 @@ class SelfChecks:
         """Return the request to fault for changed parameters, wrong torque, wrong configuration or lagging motion.
 
         Else NONE, and while the drives are not enabled. Store the first failure in `reason` and `line`. `state`: of the
-        scheme after the previous cycle.
+        scheme after the previous cycle. Call it once per cycle.
         """
         if not arm.is_enabled:
             return Request.NONE
@@ -294,7 +294,7 @@ class Recovery:
         self._is_interrupted = is_interrupted
 
     def empty(self) -> bool:
-        """Drop all queued frames of the bus and return True; if that isn't possible yet, log why and return False."""
+        """Drop all frames that wait to be received or sent; return whether that was possible, and if not log why."""
         try:
             self._tap.recover()
         except BusError as error:

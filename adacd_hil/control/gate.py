@@ -35,7 +35,7 @@ class Gate:
 
         is_open: False makes it zero at once; after that it rises at the limited rate. A `tau_d` that isn't finite makes
         it zero, too. `age`: of the feedback in cycles; beyond 1 the torque can't grow, beyond MOST_BLIND_CYCLES it
-        fades.
+        fades. Call it once per cycle.
         """
         desired = tau_d.tolist()
         if not all(map(math.isfinite, desired)):

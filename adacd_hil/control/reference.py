@@ -63,7 +63,10 @@ class Reference(EventSource):
     """
 
     def __init__(self, settings: Settings, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
-        """Prepare the motions. Raises ConfigError if trajectory or excitation leave the arm's limits."""
+        """Prepare the motions, to be written to q_d, dq_d, ddq_d (2,).
+
+        Raises ConfigError if trajectory or excitation leave the arm's limits.
+        """
         super().__init__()
         if problems := motion_problems(settings):
             raise ConfigError("; ".join(problems))
@@ -120,7 +123,7 @@ class Reference(EventSource):
             self._approach()
 
     def is_parked(self, cycle: int) -> bool:
-        """Return whether the arm has settled in the corner after `park`, or has been STOPPED, anywhere, after it."""
+        """Return whether the arm has settled in the corner after `park`, or is STOPPED, anywhere, after it."""
         if not self._is_parking or self._state is SchemeState.REACT:
             return False
         if self._state is SchemeState.STOPPED:
@@ -131,7 +134,7 @@ class Reference(EventSource):
     def step(self, arm: ArmState, output: SchemeOutput) -> None:
         """Fill `q_d`, `dq_d`, `ddq_d` for this cycle; leave them as they are while positions are older than OLD_CYCLES.
 
-        A new state begins its motion in any case.
+        A new state begins its motion in any case. Call it once per cycle.
         """
         if output.state is not output.previous_state:
             self._enter(output, arm)

@@ -103,9 +103,10 @@ class Ending(NamedTuple):
 class Session:
     """One run on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time.
 
-    `out`: folder of the log. `metadata`: further entries of the log. `files`: of the arm, checked against the devices.
-    `viewer_files`: attached to the log and written beside it, by name. `on_started` is called when the devices are set
-    to Operational for the first time. `touched_ns`: see `RunNarration`.
+    `out`: folder of the log. `interface`: name of the bus's kind, for the log. `metadata`: further entries of the log.
+    `progress`: prints a line for the user. `files`: of the arm, checked against the devices. `viewer_files`: attached
+    to the log and written beside it, by name. `live`: None for no live view. `on_started` is called when the devices
+    are set to Operational for the first time. `touched_ns`: see `RunNarration`.
     """
 
     settings: Settings

@@ -144,7 +144,7 @@ def sensor_identities(identities: Sequence[Identity]) -> tuple[Identity, ...]:
 
 @dataclass(frozen=True)
 class UsedTare:
-    """A tare file that a run uses. `text`: its contents. `warnings`: remarks for the log, such as its age."""
+    """A tare file that a run uses. `text`: its contents. `age_s`: of the tare. `warnings`: remarks, as on its age."""
 
     path: Path
     text: bytes
@@ -188,7 +188,7 @@ class UsedTare:
         return {TARE_NAME: self.text}
 
     def metadata(self) -> dict[str, str]:
-        """Return file, date, offsets and sensors of the tare for the log's metadata."""
+        """Return file, date, offsets and sensors of the tare for the log's metadata, by keys like `tare_date_utc`."""
         return {
             "tare": str(self.path),
             "tare_date_utc": self.tare.date_utc,
