@@ -271,7 +271,10 @@ class _PartWalk:
                 self._note(item.text)
 
     def _take_block(self, block: Block) -> Iterator[RawPiece]:
-        """Gather the messages of a block, each by the definitions before it; yield full pieces, and note problems."""
+        """Gather the messages of some chunks, `block`, each by the definitions before it; yield full pieces.
+
+        Note the chunks' problems: damage, and messages of another length than their schema says.
+        """
         contents = block.contents
         marks: list[tuple[int, RawRecord | None]] = [(record.offset, record) for record in contents.definitions]
         marks += [(place, None) for place in contents.breaks]
@@ -292,7 +295,7 @@ class _PartWalk:
             self._note("a message is not as long as its schema says")
 
     def _take_messages(self, block: Block, messages: slice) -> Iterator[RawPiece]:
-        """Gather the messages of a block in a slice; yield full pieces.
+        """Gather consecutive messages of some chunks, the slice `messages` of those in `block`; yield full pieces.
 
         Of a channel that isn't defined yet, search the definition in the file's summary first.
         """
@@ -305,7 +308,7 @@ class _PartWalk:
         yield from self._builder.add_messages(block.contents, messages, slots)
 
     def _define(self, record: RawRecord | None) -> None:
-        """Keep a schema, or a channel with its slot.
+        """Keep a schema, or a channel with the slot of its topic in the builder.
 
         Raises LogError for an invalid record, and for None, which stands for one.
         """

@@ -167,7 +167,7 @@ class SchemeComparison:
             self.first()
 
     def first(self) -> tuple[Mismatch, ...]:
-        """Return the `shown` earliest mismatches, by cycle; drop the others."""
+        """Return those mismatches with the lowest cycle numbers, `shown` at most, in their order; drop the rest."""
         self.mismatches = sorted(self.mismatches, key=lambda mismatch: mismatch.cycle)[: self._shown]
         return tuple(self.mismatches)
 

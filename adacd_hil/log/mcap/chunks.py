@@ -227,7 +227,7 @@ def read_chunks(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> C
 
 
 def _indexed(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents | None:
-    """Return the contents, with the beginnings of messages from the indexes.
+    """Return the contents of chunks, with the beginnings of messages from the indexes; arguments as for `read_chunks`.
 
     None if the indexes are missing, or don't fill the chunks exactly with messages.
     """
@@ -249,7 +249,10 @@ def _indexed(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Cont
 
 
 def _walk_through(data: bytes, ends: Sequence[int]) -> Contents:
-    """Find the records of chunks one by one, and return them."""
+    """Find the records of chunks one by one, each by the length of the one before, and return them.
+
+    ends: offset at which each chunk ends.
+    """
     definitions: list[RawRecord] = []
     strangers: list[int] = []
     breaks: list[int] = []

@@ -104,7 +104,7 @@ class WriterProcess:
             return processes.NOTHING
 
     def _take(self) -> None:
-        """Take all packets waiting in the ring; in real time, flush by the clock."""
+        """Take and write all packets waiting in the ring; in real time also write a chunk that is due by the clock."""
         while True:
             self._write(self._ring.take_packets(TAKEN_BYTES))
             if not self._setup.is_blocking:
