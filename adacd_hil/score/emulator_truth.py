@@ -174,7 +174,7 @@ class _TruthRows:
         self._kept_rows += len(rows)
 
     def _thin(self) -> None:
-        """Of a contact's rows that are still undecided, keep those with extreme torque or force, and drop the others.
+        """From a contact's rows that are still undecided keep those with extreme torque or force, and drop the rest.
 
         The last _ENDING of them stay undecided, since they may be the contact's end.
         """

@@ -110,7 +110,10 @@ class TrueContact:
 
 @dataclass(frozen=True)
 class Score:
-    """True contacts with their detections, in the order of time, and false alarms; unjudged: those beyond the truth."""
+    """True contacts, in the order of time, with their detections, and false alarms.
+
+    unjudged: alarms at times that the truth doesn't cover.
+    """
 
     contacts: tuple[TrueContact, ...]
     false_alarms: tuple[Detection, ...]

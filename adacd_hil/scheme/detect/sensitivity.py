@@ -88,10 +88,10 @@ _SMOOTHED_FALL_RAD_S = 600.0
 
 
 def noise_constants(certified: CertifiedSettings, period_s: float) -> NoiseConstants:
-    """Return the constants of noise: variances by channel (2 C - 1,), and a sample's weights in running means.
+    """Return the constants by which noise enters the thresholds: variances by channel (2 C - 1,), weights of a sample.
 
-    torque_variance: (k_tau sigma_tau)², Nm²; torque_gain: the same for a noise of 1 Nm; velocity_variance: nu²,
-    rad²/s⁴.
+    The weights (`_share`, `_loss`) are those of one sample in running means. torque_variance: (k_tau sigma_tau)², Nm²;
+    torque_gain: the same for a noise of 1 Nm; velocity_variance: nu², rad²/s⁴.
     """
     a, s = np.array(certified.cutoffs_rad_s), certified.smoothing_rad_s
     width = np.concatenate([a * s / (a + s), a[1:]])

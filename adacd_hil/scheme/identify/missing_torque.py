@@ -96,7 +96,10 @@ def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
 
 @compiled
 def keep_columns(m: Memory, slot: int) -> None:
-    """Put the filtered columns of this sample into a slot of the ring, where they wait with the sample's regressor."""
+    """Put the filtered columns of this sample into the ring, where they wait with the sample's regressor.
+
+    slot: index in the ring.
+    """
     m.missing_torque.ring_X[slot] = m.missing_torque.X_learnt
 
 
@@ -125,9 +128,9 @@ def _clear_sums(m: Memory) -> None:
 
 @compiled
 def add(k: Constants, m: Memory, slot: int, joint: int) -> None:
-    """Add a joint's row, which the belief learns now from a slot of the ring, to the sums.
+    """Add to the sums a joint's row that the belief learns now from the ring; skip it if the joint was slow or at rest.
 
-    Skip the row if the joint was slow or at rest. joint: from 0.
+    slot: index in the ring. joint: from 0.
     """
     own = m.missing_torque
     if m.ring.still[slot, joint] > STILL:

@@ -182,6 +182,6 @@ _MOTIONS = {
 
 
 def _motion_for(name: str) -> str:
-    """Return the text of a motion by which the parameter `name` is learnt."""
+    """Return the text of a motion by which the parameter `name` is learnt, such as "accelerate joint 2 harder"."""
     found = (text for key, text in _MOTIONS.items() if name.startswith(key))
     return next(found, "move joint {} slowly, and with dwells").format(name[-1])

@@ -151,7 +151,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
 
 @compiled
 def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
-    """Advance the bank to this sample, missing samples interpolated, and fill the torques of the block.
+    """Advance all filters to this sample, missing samples interpolated, and fill the torques of the block.
 
     steps: periods since the fresh sample before. Return False after a gap, when the filters resume from the sample; a
     moving arm then doesn't learn for `settle_cycles`.
@@ -196,7 +196,7 @@ def _take_sample(
     is_seen: bool,
     tau_ext_wide_hat: Vector,
 ) -> None:
-    """Advance the bank by one period to a sample, and compare it with the model in use.
+    """Advance all filters by one period to a sample, and compare it with the model in use.
 
     is_seen: False after a gap: the filters resume from the sample. Fill tau_ext_wide_hat (2,), and the residuals,
     channels, standstill, velocity noise and friction at rest of `m`.

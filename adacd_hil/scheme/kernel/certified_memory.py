@@ -241,7 +241,7 @@ def new_memory(settings: Settings) -> Structured:
 
 
 def new_block(settings: Settings) -> Structured:
-    """Return a block before the first sample: zeros, and infinite thresholds."""
+    """Return the values that a cycle fills and logs (1,), before the first sample: zeros, infinite thresholds."""
     base = len(settings.estimator.parameter_names)
     further = len(parameter_names(settings)) - base
     block = zeros_of(CertifiedBlock, block_sizes(base, further, settings.channel_count))

@@ -156,7 +156,7 @@ def new_memory(parameter_count: int) -> Structured:
 
 
 def new_block(parameter_count: int) -> Structured:
-    """Return a block before the first sample: zeros, and infinite thresholds."""
+    """Return the values that a cycle fills and logs (1,), before the first sample: zeros, infinite thresholds."""
     block = zeros_of(SchemeBlock, block_sizes(parameter_count))
     block["threshold"] = np.inf
     return block
