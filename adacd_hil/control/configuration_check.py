@@ -66,9 +66,9 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
 
 
 def profile_guesses(settings: Settings) -> dict[str, float]:
-    """Return the values that device profiles list as assumed, by a key such as `my-drive.toml: scale.gear_ratio`.
+    """Return the values that the device profiles list as assumed, by keys such as `my-drive.toml: scale.gear_ratio`.
 
-    Raises ConfigError as `load_profile`.
+    Raises ConfigError for a profile that is missing, invalid or of another kind, or whose EDS can't be read.
     """
     found = {}
     for kind, names in (("drive", settings.devices.drive), ("sensor", settings.devices.sensor)):
@@ -93,9 +93,10 @@ _MOST_NAMED = 4
 
 
 def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
-    """Return a line that names up to four guessed values of a configuration; "" if none.
+    """Return a line that names up to _MOST_NAMED guessed values of a configuration, and the command to confirm them.
 
-    measured: keys that are guesses no longer.
+    "" if there are none. Guessed: listed in `assumed`, of the settings or of a device profile. measured: keys of the
+    settings that are guesses no longer.
     """
     guesses = [f"`{key}`" for key in (*profile_guesses(settings), *settings.assumed) if key not in measured]
     more = f" and {len(guesses) - _MOST_NAMED} more" if len(guesses) > _MOST_NAMED else ""
@@ -105,7 +106,7 @@ def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
 
 
 def _device_problems(settings: Settings) -> list[str]:
-    """Return the errors of loading the configured device profiles, equal ones once; [] without any."""
+    """Return the errors of loading the configured device profiles, each text once; [] without any."""
     devices = settings.devices
     problems: dict[str, None] = {}
     for kind, names in (("drive", devices.drive), ("sensor", devices.sensor)):
@@ -187,7 +188,10 @@ def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
 
 
 def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
-    """Yield a warning for each frame whose range is less than the rated torque, or than position limit plus zero."""
+    """Yield a warning for each frame whose range of values is less than the rated torque or the largest position.
+
+    The latter is `arm.position_limit_deg` plus the size of `arm.zero_deg`.
+    """
     limits_deg, zeros_deg = settings.arm.position_limit_deg, settings.arm.zero_deg
     for joint, (limit_deg, zero_deg) in enumerate(zip(limits_deg, zeros_deg, strict=True)):
         message = codec.message(f"Drive{joint + 1}Feedback")

@@ -71,7 +71,10 @@ def fill_torque(
     level_rad: float,
     tau_d: Vector,
 ) -> None:
-    """Fill tau_d (2,) = Kp (q_d - q) + Kd (dq_d - dq) + W(q_d, dq_d, ddq_d) theta, Nm."""
+    """Fill tau_d (2,) = Kp (q_d - q) + Kd (dq_d - dq) + W(q_d, dq_d, ddq_d) theta, Nm.
+
+    W: regressor of the arm's model. level_rad: q1 at which link 1 is level, for gravity.
+    """
     feedforward = inverse_dynamics(q_d, dq_d, ddq_d, theta, level_rad)
     for i in range(JOINTS):
         tau_d[i] = Kp[i] * (q_d[i] - q[i]) + Kd[i] * (dq_d[i] - dq[i]) + feedforward[i]

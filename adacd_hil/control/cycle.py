@@ -93,7 +93,10 @@ class Cycle:
         clock: Clock,
         touched_ns: Callable[[], int | None] = lambda: None,
     ) -> None:
-        """Make the cycle's objects. `clock`: measures durations within a cycle. `touched_ns`: see `RunNarration`."""
+        """Make the cycle's objects. `clock`: measures durations within a cycle.
+
+        `touched_ns`: returns the time since which the arm is touched, None if unknown.
+        """
         self._period_s = settings.bus.period_s
         self._frame_checks = Recurrence(FRAME_CHECKS_S, self._period_s)
         self._progress = progress
@@ -148,7 +151,7 @@ class Cycle:
 
     @property
     def certificates(self) -> tuple[Certificate, ...]:
-        """Return the certificates of this attempt that were not taken back, in order."""
+        """Return the certificates of this attempt that were not taken back, the oldest first."""
         return self._pipeline.certificates
 
     def compile(self) -> None:
@@ -165,8 +168,8 @@ class Cycle:
     def run(self, recorder: Recorder) -> RunResult:
         """Run and log cycles until the run is finished, faulted or interrupted; disable the drives; return the result.
 
-        After a fault the cycles go on for FAULT_LINGER_S. Raises BusError, in lockstep its SilenceError if no device
-        answers; then the drives are not disabled here.
+        After a fault the cycles go on for FAULT_LINGER_S. Raises BusError if sending or receiving fails, in lockstep
+        its SilenceError if no device answers; then the drives are not disabled here.
         """
         output = None
         self._pacer.resume()
@@ -208,13 +211,16 @@ class Cycle:
 
     @property
     def reached(self) -> tuple[int, SchemeState]:
-        """Return the number of cycles so far, skipped ones included, and the present state."""
+        """Return the number of the last cycle + 1, and the present state.
+
+        Skipped cycles and those of earlier attempts count, too; 0 before the attempt's first cycle.
+        """
         return self._arm.cycle + 1, self._state
 
     def _look_after_devices(self, arm: ArmState, output: SchemeOutput) -> None:
-        """After a fault, stop drives by NMT that a command has not stopped; else, with power, step `ParameterWatch`.
+        """After a fault, stop drives by NMT that a quick stop has not stopped; else, with power, step `ParameterWatch`.
 
-        Raises BusError.
+        The latter reads the devices' parameters again. Raises BusError if a frame can't be sent.
         """
         if self._faulted_cycle is not None:
             self._escalation.step(arm.cycle - self._faulted_cycle, arm.t_ns, output.fault)
@@ -363,7 +369,8 @@ class Cycle:
     def _disable(self, recorder: Recorder, quick_stop: bool) -> None:
         """Send zero torque and the command to disable the drives for DISABLE_CYCLES cycles, without the scheme.
 
-        Log their frames, and the counts of the frame checks.
+        quick_stop: the command is a quick stop instead of Disable voltage. Log their frames, and the counts of the
+        frame checks.
         """
         self._tau_c[:] = 0.0
         command = ArmCommand(self._tau_c, enable=False, quick_stop=quick_stop)

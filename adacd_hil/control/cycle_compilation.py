@@ -22,8 +22,8 @@ _MODULE = "adacd_hil.control.cycle_compilation"
 def compiling_cycle(settings: Settings, further: Sequence[Any] = ()) -> Iterator[None]:
     """Report the progress of compiling the cycle's functions, and `further` ones, while the `with` block compiles them.
 
-    With a second processor and anything to compile, start a second process that compiles the longest ones; end it
-    with the block.
+    further: compiled functions. With a second processor and anything to compile, start a second process that compiles
+    the longest ones; end it with the block.
     """
     helpers: list[subprocess.Popen[bytes]] = []
 

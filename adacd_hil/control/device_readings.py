@@ -106,13 +106,13 @@ class Reading(NamedTuple):
 
     @property
     def joint(self) -> int:
-        """Return the joint, 0 or 1, whose factors this reading changes; 0 if both joints', 1 if none."""
+        """Return the joint, 0 or 1, whose factors this hypothesis changes; 0 if both joints', 1 if none."""
         return 0 if (self.position[0], self.torque[0], self.motor[0]) != (1.0, 1.0, 1.0) else 1
 
     def allows(self, found: Sequence[TorqueRatio | None], error: float) -> bool:
-        """Return whether the reading predicts the found ratios of sensed to commanded torque, by node; None: unknown.
+        """Return whether this hypothesis predicts the found ratios of sensed to commanded torque, by node.
 
-        error: possible relative error of a torque constant or a scale, 0 to 1.
+        None: unknown. error: possible relative error of a torque constant or a scale, 0 to 1.
         """
         for i in range(JOINTS):
             drive, sensor = 1 - i if self.is_drive_exchanged else i, 1 - i if self.is_sensor_exchanged else i
@@ -132,7 +132,7 @@ class Reading(NamedTuple):
 
     @property
     def row(self) -> tuple[float, ...]:
-        """Return its numbers (7,) for `add_block`: both exchanges, `position`, `torque`, `is_turned`."""
+        """Return the hypothesis as numbers (7,) for `add_block`: both exchanges, `position`, `torque`, `is_turned`."""
         return (self.is_drive_exchanged, self.is_sensor_exchanged, *self.position, *self.torque, self.is_turned)
 
 
@@ -172,9 +172,10 @@ def add_block(
     count: int,
     normals: Vector,
 ) -> None:
-    """Add a block's means (2,) to the normal equations `normals` (h, k, k) of each of the readings, by rows (h, 7).
+    """Add a block's means (2,) to the normal equations (h, k, k) of each hypothesis on the devices, `readings` (h, 7).
 
-    k = p + 5, or p + 7 with gravity: theta (p = count), two offsets, two lags, a4 and a5 of another direction, torque.
+    `normals`: these equations. k = p + 5, or p + 7 with gravity: theta (p = count), two offsets, two lags, a4 and a5 of
+    another direction, torque.
     """
     size = normals.shape[1]
     position, velocity, acceleration, row = np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(size)
@@ -202,7 +203,7 @@ def add_block(
 
 @compiled
 def solve_readings(normals: Vector, count: int, blocks: int, shares: Vector, solutions: Vector) -> None:
-    """Solve the normal equations (h, k, k) of each reading; fill `shares` (h,) and `solutions` (h, k - 1) in place.
+    """Solve the normal equations (h, k, k) of each hypothesis; fill `shares` (h,), `solutions` (h, k - 1) in place.
 
     count: parameters p. blocks: number in the equations. shares: unexplained part of the torques' squares. By Cholesky
     factors of the equations, scaled to a diagonal of ones.
@@ -235,7 +236,7 @@ class DeviceReadings:
     """
 
     def __init__(self, settings: Settings) -> None:
-        """Prepare the normal equations of all readings, without blocks."""
+        """Prepare the normal equations of all hypotheses, without blocks; with gravity also of a wrong mounting."""
         self._settings = settings
         self._level_rad = settings.level_rad
         self._count = len(settings.estimator.parameter_names)
@@ -256,16 +257,16 @@ class DeviceReadings:
         is_positive_definite(self._solutions[0])
 
     def add_means(self, q: Vector, dq: Vector, ddq: Vector, tau_J: Vector, dtau_J: Vector) -> None:
-        """Add the means of a block, (2,) each, to the equations of all readings."""
+        """Add the means of a block of cycles, (2,) each, to the normal equations of all hypotheses."""
         add_block(self._rows, q, dq, ddq, tau_J, dtau_J, self._level_rad, self._count, self._normals)
         self._blocks += 1
 
     def judge_blocks(self, is_torque_known: bool) -> bool:
-        """Return whether the configuration is refuted: another reading was far better `_ROUNDS` times in a row.
+        """Return whether the configuration is refuted: another hypothesis was far better `_ROUNDS` times in a row.
 
         Far better: it leaves at most `_BETTER` of the configuration's unexplained share, and at most `_EXPLAINED` of
         all. Judge at every fourth block, return False between. is_torque_known: the commanded torques have confirmed
-        the sensors' scales; without that a wrong scale of torque as the best reading doesn't count.
+        the sensors' scales; without that a wrong scale of torque as the best hypothesis doesn't count.
         """
         if self._blocks < _FEWEST_BLOCKS or self._blocks % _JUDGED_EVERY:
             return False
@@ -276,11 +277,11 @@ class DeviceReadings:
         return self._refuted >= _ROUNDS and (is_torque_known or self._readings[best].kind != "torque")
 
     def left(self, found: Sequence[TorqueRatio | None], error: float) -> list[Reading]:
-        """Return the readings that neither equation nor torques refute, best first; the best of each kind and joint.
+        """Return the hypotheses that neither equation nor torques refute, best first; the best of each kind and joint.
 
         found: ratios of the torque sensors, by node; None: unknown. error: possible relative error of a scale. Empty
-        with fewer than _SUSPECT_BLOCKS blocks, or if the best reading of all is refuted but explains far more than the
-        others: then the right one is not among them.
+        with fewer than _SUSPECT_BLOCKS blocks, or if the best hypothesis of all is refuted but explains far more than
+        the others: then the right one is not among them.
         """
         if self._blocks < _SUSPECT_BLOCKS:
             return []
@@ -301,9 +302,10 @@ class DeviceReadings:
         return list(texts.values())
 
     def is_unlike_an_arm(self) -> bool:
-        """Return whether the configured devices give an inertia that no arm has.
+        """Return whether the configured devices give an inertia that no arm has: one that isn't positive definite.
 
-        True also with fewer than _SUSPECT_BLOCKS blocks, which are too few to know. Solves all readings anew.
+        True also with fewer than _SUSPECT_BLOCKS blocks, which are too few to know. Solves the equations of all
+        hypotheses anew.
         """
         self._solve(())
         return 0 < self._blocks < _SUSPECT_BLOCKS or not is_positive_definite(self._solutions[0])
@@ -311,8 +313,9 @@ class DeviceReadings:
     def name_causes(self, left: Sequence[Reading]) -> str:
         """Return a text of the causes left, their unexplained shares and remedies.
 
-        left: result of the method `left`. "" if it has no reading but the configured one, more than _MOST_NAMED, or
-        none that leaves at most _EXPLAINED unexplained: then the cause is not among the readings, or there are several.
+        left: hypotheses, the result of the method `left`. "" if they are none but the configuration, more than
+        _MOST_NAMED, or none that leaves at most _EXPLAINED unexplained: then the cause is not among them, or there are
+        several.
         """
         wrong = [reading for reading in left if reading.kind != "configured"]
         places = [self._readings.index(reading) for reading in wrong]
@@ -335,7 +338,7 @@ class DeviceReadings:
         return f"either {texts}; the motion can't distinguish them ({unexplained})"
 
     def _text(self, reading: Reading) -> str:
-        """Return the text of one cause: the mistake and its remedy."""
+        """Return the text of one cause, by the hypothesis's kind and joint: the mistake, and the way to correct it."""
         sign, joint = list(self._settings.arm.sign), reading.joint
         drives, sensors = list(self._settings.devices.drive_node), list(self._settings.devices.sensor_node)
         drive, sensor = f"devices.drive_node[{joint}]", f"devices.sensor_node[{joint}]"
@@ -399,12 +402,15 @@ class DeviceReadings:
         return max(JOINTS * self._blocks - (self._normals.shape[1] - 1), 1)
 
     def _rank(self, place: int) -> float:
-        """Return the unexplained share of a reading, by index; inf if no arm has its inertia or it isn't distinct."""
+        """Return the unexplained share of a hypothesis, by index, of the last solution; the lower the better.
+
+        inf if its inertia isn't positive definite, or it can't be distinguished from the configuration.
+        """
         is_right = self._is_distinct(place) and is_positive_definite(self._solutions[place])
         return float(self._shares[place]) if is_right else math.inf
 
     def _is_distinct(self, place: int) -> bool:
-        """Return whether the data can distinguish a reading from the configuration, by its index.
+        """Return whether the data can distinguish a hypothesis from the configuration, by its index.
 
         False for turned gravity with fewer than _MOUNTING_BLOCKS blocks, or turned by less than _TURNED_DEG.
         """
@@ -419,7 +425,7 @@ class DeviceReadings:
         return math.degrees(math.atan2(mounted[-2:].sum(), mounted[A4 : A5 + 1].sum()))
 
     def _may_be_arms(self, places: Sequence[int]) -> list[bool]:
-        """Return for each index of a reading whether its inertia, within its error, is that of a possible arm."""
+        """Return for each index of a hypothesis whether its inertia, within its error, is that of a possible arm."""
         normals = self._normals[list(places), :-1, :-1]
         size = np.sqrt(np.maximum(np.diagonal(normals, axis1=1, axis2=2), 1e-12))
         scaled = normals / (size[:, :, np.newaxis] * size[:, np.newaxis, :])
@@ -430,7 +436,7 @@ class DeviceReadings:
         return [may_be_arm(self._solutions[place], slack[row]) for row, place in enumerate(places)]
 
     def _solve(self, among: Iterable[int]) -> int:
-        """Solve all readings anew; return the one of the indices `among` that leaves least unexplained, 0 if empty."""
+        """Solve all hypotheses anew; return that of the indices `among` that leaves least unexplained, 0 if empty."""
         solve_readings(self._normals, self._count, max(self._blocks, 1), self._shares, self._solutions)
         return min(among, key=self._rank, default=0)
 

@@ -54,7 +54,7 @@ class Exchange:
 
         Stop to wait after FEEDBACK_SHARE of the period; the missing values are then old ones.
 
-        Raises BusError; in lockstep its SilenceError, if no device answers.
+        Raises BusError if sending or receiving fails; in lockstep its SilenceError, if no device answers.
         """
         bus, arm = self._bus, self._arm
         for late in tick.late:
@@ -88,7 +88,8 @@ class Exchange:
     def _await_feedback(self, last_ns: int) -> int:
         """Take frames until all of this cycle are in, their time is over, or another host's next SYNC comes.
 
-        Return that moment, ns. `last_ns`: time of the last frame taken so far.
+        Return the time of the last frame, ns, or the present time if some are missing. `last_ns`: time of the last
+        frame taken so far.
         """
         bus, arm, sync_ns = self._bus, self._arm, self.sync_ns
         patience_s = self._patience_s
@@ -112,7 +113,7 @@ class Exchange:
         return self._clock.now_ns()
 
     def _take_late_frames(self) -> None:
-        """Take frames that the cycle before lacks and that have arrived by now."""
+        """Take the frames that have arrived by now, before this cycle's SYNC: they belong to the cycle before."""
         for _ in range(MOST_FRAMES):
             late = self._bus.receive(0.0)
             if late is None:
@@ -125,7 +126,7 @@ class Exchange:
             self._pass_on(frame)
 
     def _pass_on(self, frame: Frame) -> None:
-        """Report an error frame; give any other frame to the CANopen master.
+        """Report an error frame as an event; give any other frame to the CANopen master.
 
         Call it with frames that the arm has not taken.
         """
@@ -142,7 +143,7 @@ class Exchange:
     def end(self, tick: Tick, arm: ArmState, command: ArmCommand, log_queue_bytes: int = 0) -> CycleRecord:
         """Send the commands, and a heartbeat if one is due; return the record of the cycle's times and counts.
 
-        `log_queue_bytes`: bytes that wait for the log's writer. Raises BusError.
+        `log_queue_bytes`: bytes that wait for the log's writer. Raises BusError if a frame can't be sent.
         """
         self._arm.send_command(command)
         record = self._record(tick, arm, log_queue_bytes)
@@ -151,7 +152,10 @@ class Exchange:
         return record
 
     def _record(self, tick: Tick, arm: ArmState, log_queue_bytes: int) -> CycleRecord:
-        """Return the record of a cycle whose commands have just left; report frames that the kernel has dropped."""
+        """Return the record of a cycle whose commands have just left: times since SYNC and counts of missing frames.
+
+        Report frames that the kernel has dropped since the last report.
+        """
         command_ns = self._clock.now_ns()
         frames_lost = self._bus.frames_lost
         if frames_lost != self._said_lost and self.events.is_due("lost", command_ns):

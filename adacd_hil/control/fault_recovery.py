@@ -62,7 +62,7 @@ class SelfChecks:
         """Return the request to fault for changed parameters, wrong torque, wrong configuration or lagging motion.
 
         Else NONE, and while the drives are not enabled. Store the first failure in `reason` and `line`. `state`: of the
-        scheme after the previous cycle.
+        scheme after the previous cycle. Call it once per cycle.
         """
         if not arm.is_enabled:
             return Request.NONE
@@ -177,7 +177,10 @@ class FaultReport:
         }
 
     def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
-        """Count a cycle as `CommissionReport.count_cycle`."""
+        """Count the reasons for which an arm in INIT or COMMISSION stays there in this cycle; else do nothing.
+
+        state: of the scheme after the cycle before.
+        """
         self.commission.count_cycle(state, arm)
 
     def list_causes(self, fault: FaultReason) -> list[str]:
@@ -291,7 +294,7 @@ class Recovery:
         self._is_interrupted = is_interrupted
 
     def empty(self) -> bool:
-        """Drop all queued frames of the bus and return True; if that isn't possible yet, log why and return False."""
+        """Drop all frames that wait to be received or sent; return whether that was possible, and if not log why."""
         try:
             self._tap.recover()
         except BusError as error:
@@ -363,10 +366,10 @@ class StopEscalation(RateLimitedEvents):
         self._due = 0
 
     def step(self, cycles: int, t_ns: int, fault: FaultReason) -> None:
-        """Send NMT pre-operational to each drive that is still enabled so long after FAULT, and report it.
+        """Send NMT pre-operational to each drive that is still enabled PATIENCE_CYCLES after FAULT, and report it.
 
-        `cycles`: since FAULT; due after PATIENCE_CYCLES, and again after as many. Raises BusError. After FOREIGN_FRAMES
-        it is due in the next cycle: another node may command the drive against the quick stop.
+        `cycles`: since FAULT. Repeat after as many cycles. After FOREIGN_FRAMES begin in the next cycle: another node
+        may command the drive against the quick stop. Raises BusError if a frame can't be sent.
         """
         patience = 1 if fault is FaultReason.FOREIGN_FRAMES else PATIENCE_CYCLES
         if cycles < max(self._due, patience):

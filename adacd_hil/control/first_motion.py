@@ -87,7 +87,10 @@ class FirstMotion(EventSource):
     """
 
     def __init__(self, settings: Settings, arm: Arm) -> None:
-        """Prepare to judge both joints; with `safety.first_motion_error` = 0, prepare to judge nothing."""
+        """Prepare to judge both joints; with `safety.first_motion_error` = 0, prepare to judge nothing.
+
+        arm: for its drives' limits and gear ratios.
+        """
         super().__init__()
         self._arm = arm
         self._settings = settings
@@ -111,19 +114,20 @@ class FirstMotion(EventSource):
 
     @property
     def is_on(self) -> bool:
-        """Return whether a joint, or the device readings, are still to be judged, without a contradiction so far."""
+        """Return whether joints or hypotheses on the devices are still to be judged, without a contradiction so far."""
         return bool(self._open or self._readings) and not self.line
 
     def compile_readings(self) -> None:
-        """Compile the functions of the device readings that `add_cycle` calls."""
+        """Compile the functions of `DeviceReadings` that `add_cycle` calls."""
         if self._readings is not None:
             self._readings.compile_readings()
 
     def add_cycle(self, arm: ArmState, state: SchemeState, tau_c: Vector) -> None:
         """Add a cycle to the blocks, and judge the joints; put a contradiction in `line`, remarks in `events`.
 
-        `tau_c` (2,): its commanded torque, Nm. `state`: of the scheme after the cycle before. Stop judging after 60 s
-        with power.
+        `tau_c` (2,): its commanded torque, Nm. `state`: of the scheme after the cycle before. A cycle without power,
+        with missing data, or with a drive at a limit discards the unfinished blocks. Stop judging after _LONGEST_S with
+        power.
         """
         if not self.is_on:
             return
@@ -146,9 +150,9 @@ class FirstMotion(EventSource):
         self._read(self._short.add_cycle(arm, acting), state)
 
     def _read(self, block: "_Block | None", state: SchemeState) -> None:
-        """Add a short block, if any, to the device readings; put the causes in `line` if they refute the configuration.
+        """Add a short block, if any, to the hypotheses on the devices; if they refute the settings, fill `line`.
 
-        Drop the readings in MONITOR.
+        Drop the hypotheses in MONITOR.
         """
         readings = self._readings
         if readings is None or self.line:
@@ -196,9 +200,9 @@ class FirstMotion(EventSource):
         return f"perhaps {text.removeprefix('either ')}" if text else TOO_SHORT
 
     def _left(self) -> list[Reading]:
-        """Return the device readings that neither the arm's equation nor the commanded torques refute, best first.
+        """Return the hypotheses on the devices that neither the arm's equation nor torques refute, best first.
 
-        [] as of `DeviceReadings.left`, and if they are no longer judged.
+        [] with few blocks, if the right one isn't among them (`DeviceReadings.left`), or if they are no longer judged.
         """
         return [] if self._readings is None else self._readings.left(self._ratios(), self._error)
 
@@ -249,7 +253,7 @@ class FirstMotion(EventSource):
             self._judge()
 
     def _give_up(self) -> None:
-        """Stop judging joints and device readings; add a warning for each joint that is still unknown."""
+        """Stop judging joints and hypotheses on the devices; add a warning for each joint that is still unknown."""
         for joint in sorted(self._open):
             text = (
                 f"joint {joint + 1} is not known after {_LONGEST_S:g} s, since it moves too little, a drive is at a "
@@ -324,7 +328,7 @@ class FirstMotion(EventSource):
         self.events.append(Event("warning" if is_off else "info", "first motion", text))
 
     def _scales(self, joint: int) -> str:
-        """Return, as text, the settings that scale a joint's torque."""
+        """Return, as text, the settings that scale a joint's torque, most with their values."""
         gear, rated_Nm = self._arm.gear_ratios[joint], self._settings.arm.rated_torque_Nm[joint]
         gear_text = f"scale.gear_ratio = {gear:g} of devices.drive[{joint}]"
         text = f"scale.torque_Nm of devices.sensor[{joint}], arm.rated_torque_Nm[{joint}] = {rated_Nm:g} Nm"
@@ -384,7 +388,7 @@ class _Blocks:
     def add_cycle(self, arm: ArmState, acting: Vector) -> _Block | None:
         """Add a cycle; return the block that it completes, or None. That cycle also begins the next block.
 
-        acting (2,): commanded torque that acts in this cycle, Nm.
+        arm: for q, dq and tau_J. acting (2,): commanded torque that acts in this cycle, Nm.
         """
         last = np.array((arm.q, arm.dq, arm.tau_J, acting))
         if self._seen == 0:

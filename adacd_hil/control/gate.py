@@ -33,8 +33,9 @@ class Gate:
     def limit(self, tau_d: Vector, is_open: bool, tau_c: Vector, age: int = 0) -> GateFlag:
         """Fill `tau_c` (2,) with the commanded torque for `tau_d` (2,), Nm; return the changes that were made.
 
-        Torque drops to zero at once when the gate closes, and rises from zero at the limited rate when it opens. `age`:
-        of the feedback in cycles; beyond 1 the torque can't grow, beyond MOST_BLIND_CYCLES it fades.
+        is_open: False makes it zero at once; after that it rises at the limited rate. A `tau_d` that isn't finite makes
+        it zero, too. `age`: of the feedback in cycles; beyond 1 the torque can't grow, beyond MOST_BLIND_CYCLES it
+        fades. Call it once per cycle.
         """
         desired = tau_d.tolist()
         if not all(map(math.isfinite, desired)):

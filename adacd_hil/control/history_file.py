@@ -215,7 +215,7 @@ class UsedHistory:
         return {} if self.is_first_run else {HISTORY_NAME: self.text}
 
     def metadata(self) -> dict[str, str]:
-        """Return file and number of certificates for the log's metadata."""
+        """Return file and number of certificates for the log's metadata, as `history` and `history_certificates`."""
         return {"history": str(self.path), "history_certificates": self._count()}
 
     def add_certificates(

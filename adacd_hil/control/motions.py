@@ -96,7 +96,8 @@ class Pace:
     def step(self, wanted: float, dq: Vector, ddq: Vector) -> None:
         """Move `share` one period closer to the wanted share, and update `change` and `lag_s`.
 
-        dq, ddq (2,): planned velocity and acceleration at the present place of the path.
+        wanted: 0 for rest, 1 for the planned speed. dq, ddq (2,): planned velocity and acceleration at the present
+        place of the path.
         """
         if wanted != self._to:
             self._from, self._to, self._phase = self.share, wanted, 0.0
@@ -109,7 +110,10 @@ class Pace:
         self.lag_s += (1.0 - self.share) * self._period_s
 
     def _phase_step(self, dq: Vector, ddq: Vector) -> float:
-        """Return by how much this period may advance the present change of pace, 1 in all, within the limits."""
+        """Return the part, 0 to 1, of the present change of pace that the acceleration limits allow in this period.
+
+        dq, ddq (2,): planned velocity and acceleration.
+        """
         step, x = self._period_s / CHANGE_S, self._phase
         steepest = min(max(x, 0.5), x + step)  # where d(share)/dx is largest in this period
         slope = abs(self._to - self._from) * 6.0 * steepest * (1.0 - steepest)

@@ -112,12 +112,18 @@ class RunNarration:
         self._enabled_ns: int | None = None
 
     def event(self, t_ns: int, text: str) -> None:
-        """Print a text after the time since the drives were enabled, blank before. t_ns: of its cycle."""
+        """Print a text after the time from the enabling of the drives to t_ns, that of the event's cycle.
+
+        Until they are enabled, blanks stand for the time.
+        """
         since = "" if self._enabled_ns is None else f"{(t_ns - self._enabled_ns) * 1e-9:.2f} s"
         self._progress(f"{since:>9}  {text}")
 
     def transition(self, t_ns: int, output: SchemeOutput, logged: str) -> None:
-        """Print a change of state. logged: its line in the log, with both states' names and the details."""
+        """Print a change of state in words for the user, with the states' names and the details of its line in the log.
+
+        logged: that line. The first change to ADAPT begins the time that `event` prints.
+        """
         names, _, details = logged.partition(": ")
         if output.state is SchemeState.ADAPT and self._enabled_ns is None:
             self._enabled_ns = t_ns
@@ -125,7 +131,11 @@ class RunNarration:
         self.event(t_ns, f"{words}  [{names}]{': ' if details else ''}{details}")
 
     def _words(self, t_ns: int, output: SchemeOutput) -> str:
-        """Return the text of a new state."""
+        """Return the words that tell the user the present state of `output`, just entered.
+
+        In REACT those of the touch, or "stops" without a contact; else those of `_STATES`, or of the change, as from
+        CERTIFY to MONITOR.
+        """
         contact = output.contact
         if output.state is SchemeState.REACT:
             return self._touch(t_ns, output) if contact is not None else "stops"

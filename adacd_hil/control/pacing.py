@@ -198,7 +198,8 @@ class FollowingPacer:
     def next(self) -> Tick:
         """Wait for SYNC and return the cycle that it begins.
 
-        Raises BusError if it doesn't come within the timeout, or as `_judge`.
+        Raises BusError if it doesn't come within the timeout, or if the first `_JUDGED_SYNCS` come at another period
+        than configured.
         """
         frames, place = self._receive()
         sync = frames[place]
@@ -253,7 +254,10 @@ class FollowingPacer:
         return frame.can_id == self._sync_id and not frame.is_error
 
     def _count(self, sync: Frame) -> int:
-        """Return the periods since the SYNC before, at least 1; 0 for the first. Raises BusError as `_judge`."""
+        """Return the periods since the SYNC before, at least 1; 0 for the first.
+
+        Raises BusError if the first `_JUDGED_SYNCS` come at another period than configured.
+        """
         last = self._last
         if last is None:
             return 0
@@ -266,7 +270,7 @@ class FollowingPacer:
         return max(periods, 1)
 
     def _judge(self, period_ns: float) -> None:
-        """Add a period; raise BusError if the median of the first `_JUDGED_SYNCS` isn't the configured one.
+        """Add a period, ns; raise BusError if the median of the first `_JUDGED_SYNCS` isn't the configured one.
 
         It may be a share of `_PERIOD_TOLERANCE` away. Later periods are not judged.
         """
@@ -324,7 +328,10 @@ def prepare_spin(pacer: Pacer, settings: Settings, clock: Clock, grant: Realtime
 
 
 def make_pacer(settings: Settings, clock: Clock, tap: Tap, sync_id: int) -> Pacer:
-    """Return the pacer: one that follows SYNC by the settings, or one on a grid, with latency for a VirtualClock."""
+    """Return the pacer: one that follows SYNC by the settings, or one on a grid, with latency for a VirtualClock.
+
+    sync_id: CAN identifier of SYNC, for a pacer that follows it.
+    """
     bus = settings.bus
     if bus.follows:
         return FollowingPacer(tap, clock, bus.period_ns, sync_id, bus.sync_timeout_ms * 1_000_000)

@@ -63,7 +63,10 @@ class Reference(EventSource):
     """
 
     def __init__(self, settings: Settings, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
-        """Prepare the motions. Raises ConfigError if trajectory or excitation leave the arm's limits."""
+        """Prepare the motions, to be written to q_d, dq_d, ddq_d (2,).
+
+        Raises ConfigError if trajectory or excitation leave the arm's limits.
+        """
         super().__init__()
         if problems := motion_problems(settings):
             raise ConfigError("; ".join(problems))
@@ -120,7 +123,7 @@ class Reference(EventSource):
             self._approach()
 
     def is_parked(self, cycle: int) -> bool:
-        """Return whether the arm has settled in the corner after `park`, or has been STOPPED, anywhere, after it."""
+        """Return whether the arm has settled in the corner after `park`, or is STOPPED, anywhere, after it."""
         if not self._is_parking or self._state is SchemeState.REACT:
             return False
         if self._state is SchemeState.STOPPED:
@@ -131,7 +134,7 @@ class Reference(EventSource):
     def step(self, arm: ArmState, output: SchemeOutput) -> None:
         """Fill `q_d`, `dq_d`, `ddq_d` for this cycle; leave them as they are while positions are older than OLD_CYCLES.
 
-        A new state begins its motion in any case.
+        A new state begins its motion in any case. Call it once per cycle.
         """
         if output.state is not output.previous_state:
             self._enter(output, arm)
@@ -217,7 +220,7 @@ class Reference(EventSource):
 
     @property
     def _wanted_share(self) -> float:
-        """Return the pace that the arm shall reach: 0 while stopping, less than 1 for SLOW_DOWN, else 1."""
+        """Return the wanted share of the planned speed: 0 while stopping, `slow_share` for SLOW_DOWN, else 1."""
         if self._is_stopping:
             return 0.0
         return self._slow_share if self._reaction is Reaction.SLOW_DOWN and self._state in REACTING else 1.0
@@ -287,8 +290,8 @@ class Reference(EventSource):
     def _is_thrown(self, arm: ArmState, tau_ext_hat: Vector) -> bool:
         """Return whether an ending blow has made a joint faster than planned by THROWN_rad_s, away from the contact.
 
-        During the push the controller resists. False while the arm learns, because an adaptation that restarts forgets
-        a push that continues.
+        Ending: the external torque has fallen below a share of ENDING of its peak; until then the controller resists.
+        False while the arm learns, because an adaptation that restarts forgets a push that continues.
         """
         if not self._has_model:
             return False

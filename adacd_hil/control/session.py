@@ -62,7 +62,7 @@ class LiveView(Protocol):
     """Options of a live view that the user requested."""
 
     def server(self, settings: Settings) -> LiveService:
-        """Return the server of the view for an arm."""
+        """Return the service by which the log's writer opens the view. settings: of the arm that it shows."""
 
 
 class ArmFile(Protocol):
@@ -103,9 +103,10 @@ class Ending(NamedTuple):
 class Session:
     """One run on one bus. `clock` is a VirtualClock in lockstep and a MonotonicClock in real time.
 
-    `out`: folder of the log. `metadata`: further entries of the log. `files`: of the arm, checked against the devices.
-    `viewer_files`: attached to the log and written beside it, by name. `on_started` is called when the devices are set
-    to Operational for the first time. `touched_ns`: see `RunNarration`.
+    `out`: folder of the log. `interface`: name of the bus's kind, for the log. `metadata`: further entries of the log.
+    `progress`: prints a line for the user. `files`: of the arm, checked against the devices. `viewer_files`: attached
+    to the log and written beside it, by name. `live`: None for no live view. `on_started` is called when the devices
+    are set to Operational for the first time. `touched_ns`: see `RunNarration`.
     """
 
     settings: Settings
@@ -204,7 +205,10 @@ class Session:
         return request_realtime(self.settings.realtime_request)
 
     def _prepare(self, tap: Tap, pacer: Pacer) -> Attempt:
-        """Make and compile the objects of a new attempt, and return them; pass on an interruption so far."""
+        """Make and compile the objects of a new attempt, and return them.
+
+        If the run has been interrupted already, interrupt the new cycle, too.
+        """
         arm = Arm(self.settings, self.codec, self.devices, tap)
         master = Master(self.settings, self.codec, self.devices, tap, watch_host=not self.is_lockstep)
         cycle = Cycle(self.settings, tap, arm, master, pacer, self.operator, self.progress, self.clock, self.touched_ns)
@@ -241,7 +245,11 @@ class Session:
         return ending
 
     def _boot(self, master: Master, recorder: Recorder, tap: Tap) -> None:
-        """Reset and identify the devices, compare them with `files`, configure them. Raises DeviceError, BusError."""
+        """Reset and identify the devices, compare them with `files`, configure them; log their identities and remarks.
+
+        Raises DeviceError if one doesn't answer, is another device than configured or in a file, or refuses a value;
+        BusError if sending or receiving fails.
+        """
         master.reset()
         self._identities = identities = tuple(master.identify())
         for identity in identities:
@@ -255,7 +263,7 @@ class Session:
     def _run(self, cycle: Cycle, master: Master, recorder: Recorder, tap: Tap) -> RunResult:
         """Set the devices to Operational, run the cycles, and stop the devices in any case; return the result.
 
-        Raises BusError as `Cycle.run`.
+        Raises BusError if sending or receiving fails, in lockstep if no device answers.
         """
         if not self._has_started:
             self._has_started = True
@@ -278,7 +286,8 @@ class Session:
     def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
         """Create the log with its attachments and metadata, and the files beside it; return its recorder.
 
-        Raises as `run` for the log.
+        spin: entries for the metadata. Raises LogExistsError if there is a log already, LogError if it can't be
+        created.
         """
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep

@@ -122,9 +122,9 @@ def read_tare(path: Path) -> Tare:
 
 
 def write_tare(tare: Tare, path: Path) -> Path | None:
-    """Write a tare file in one step; copy an old one to `.1` and return the copy's path, else None. Raises OSError.
+    """Write a tare file in one step; copy an old one to its name with `.1` and return the copy's path, else None.
 
-    At each moment the path holds a whole file.
+    At each moment the path holds a whole file. Raises OSError if a file can't be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     backup = path.with_name(f"{path.name}.1") if path.exists() else None
@@ -144,7 +144,7 @@ def sensor_identities(identities: Sequence[Identity]) -> tuple[Identity, ...]:
 
 @dataclass(frozen=True)
 class UsedTare:
-    """A tare file that a run uses. `text`: its contents. `warnings`: remarks for the log, such as its age."""
+    """A tare file that a run uses. `text`: its contents. `age_s`: of the tare. `warnings`: remarks, as on its age."""
 
     path: Path
     text: bytes
@@ -188,7 +188,7 @@ class UsedTare:
         return {TARE_NAME: self.text}
 
     def metadata(self) -> dict[str, str]:
-        """Return file, date, offsets and sensors of the tare for the log's metadata."""
+        """Return file, date, offsets and sensors of the tare for the log's metadata, by keys like `tare_date_utc`."""
         return {
             "tare": str(self.path),
             "tare_date_utc": self.tare.date_utc,

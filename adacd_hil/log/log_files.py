@@ -70,7 +70,7 @@ def is_part_name(path: Path) -> bool:
 
 
 def find_parts(path: Path) -> dict[int, Path]:
-    """Return the paths of the existing parts of the log `path`, by number and in order; {} without any.
+    """Return the paths of the existing parts of the log `path`, by number in ascending order; {} without any.
 
     Raises OSError if the folder can't be listed.
     """

@@ -102,9 +102,9 @@ def run_metadata(path: Path) -> dict[str, str]:
 
 
 def _read_items(path: Path, is_ahead: bool = True) -> Iterator[Item]:
-    """Yield the contents of a file from front to end; is_ahead: as for `read_blocks`.
+    """Yield the contents of a file from front to end: blocks of chunks, attachments, metadata, problems.
 
-    Raises LogError as `read_head`.
+    is_ahead: a thread decompresses chunks in advance. Raises LogError if the file can't be read or isn't MCAP.
     """
     with failing_as(f"log {path} can't be read"), open_input(path) as file:
         yield from read_blocks(file, str(path), is_ahead=is_ahead)
@@ -144,9 +144,9 @@ class LogWalk:
         return None
 
     def _find_parts(self) -> None:
-        """Plan the walk: the readable parts in order, and a problem for each missing, unreadable or foreign one.
+        """Plan the walk: readable parts by ascending number, a problem for each missing, unreadable or foreign one.
 
-        Raises the first part's LogError if no part can be read.
+        Foreign: of another log. Raises the first part's LogError if no part can be read.
         """
         parts = parts_of(self.path)
         self._is_alone = list(parts) == [0]
@@ -193,8 +193,8 @@ class LogWalk:
     def pieces(self, cycles: int, epoch_ns: int, is_ahead: bool = True) -> Iterator[RawPiece]:
         """Yield the messages of all parts in pieces of `cycles` cycles; topics, summary and problem grow meanwhile.
 
-        epoch_ns: offset of the times in the file from those of frames. is_ahead: a thread opens chunks in advance. Each
-        call begins with the first part and clears summary and problem.
+        epoch_ns: offset of the times in the file from those of frames. is_ahead: a thread decompresses chunks in
+        advance. Each call begins with the first part and clears summary and problem.
         """
         builder = PieceBuilder(cycles, epoch_ns)
         self._problems, self.summary, self.parts = [], {}, 0
@@ -255,7 +255,10 @@ class _PartWalk:
         self.problem = self.problem or problem
 
     def pieces(self, is_ahead: bool) -> Iterator[RawPiece]:
-        """Read the file; yield a piece whenever enough cycles are gathered; keep attachments, metadata and problems."""
+        """Read the file; yield a piece whenever enough cycles are gathered; keep attachments, metadata and problems.
+
+        is_ahead: a thread decompresses chunks in advance.
+        """
         for item in _read_items(self._path, is_ahead):
             if isinstance(item, Block):
                 yield from self._take_block(item)
@@ -268,7 +271,10 @@ class _PartWalk:
                 self._note(item.text)
 
     def _take_block(self, block: Block) -> Iterator[RawPiece]:
-        """Gather the messages of a block, each by the definitions before it; yield full pieces, and note problems."""
+        """Gather the messages of some chunks, `block`, each by the definitions before it; yield full pieces.
+
+        Note the chunks' problems: damage, and messages of another length than their schema says.
+        """
         contents = block.contents
         marks: list[tuple[int, RawRecord | None]] = [(record.offset, record) for record in contents.definitions]
         marks += [(place, None) for place in contents.breaks]
@@ -289,7 +295,7 @@ class _PartWalk:
             self._note("a message is not as long as its schema says")
 
     def _take_messages(self, block: Block, messages: slice) -> Iterator[RawPiece]:
-        """Gather the messages of a block in a slice; yield full pieces.
+        """Gather consecutive messages of some chunks, the slice `messages` of those in `block`; yield full pieces.
 
         Of a channel that isn't defined yet, search the definition in the file's summary first.
         """
@@ -302,7 +308,7 @@ class _PartWalk:
         yield from self._builder.add_messages(block.contents, messages, slots)
 
     def _define(self, record: RawRecord | None) -> None:
-        """Keep a schema, or a channel with its slot.
+        """Keep a schema, or a channel with the slot of its topic in the builder.
 
         Raises LogError for an invalid record, and for None, which stands for one.
         """

@@ -70,9 +70,10 @@ def host_cycles(cycle: Cycles, attempt: Cycles, begins: Cycles) -> Cycles:
 
 
 def host_span(span: EmulatorSpan, begins: Cycles) -> Span:
-    """Return the emulator's first and last cycle in the host's numbers; begins: as for `host_cycles`.
+    """Return the emulator's first and last cycle in the host's numbers.
 
-    The last cycle is unbounded if the emulator's last attempt is not in the log.
+    begins: the host's number of the first cycle of each attempt (k,). The last cycle is unbounded if the emulator's
+    last attempt is not in the log.
     """
     attempts, cycles = (np.array(column) for column in zip(*span, strict=True))
     first, last = host_cycles(cycles, attempts, begins).tolist()
@@ -117,7 +118,7 @@ class Truth:
         return self.span is None or bool(self.span.covers(np.array(cycle)))
 
     def model_row(self, cycle: int) -> int | None:
-        """Return the index, in `payload_kg` and `theta`, of the values that hold in a cycle.
+        """Return the index, in `payload_kg` and `theta`, of the values that hold in a cycle, in the truth's own count.
 
         None if the truth is empty. 0 for a cycle before the first.
         """

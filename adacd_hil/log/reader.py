@@ -205,7 +205,8 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
 def topic_bytes(path: str | Path, topic: str) -> bytes:
     """Return the payloads of a topic, one after the other: equal for two logs that hold the same, bit for bit.
 
-    path: as for `read_log`. Raises LogError if no part can be read, or if the log lacks the topic.
+    path: the first part of a log, or the folder of a run. Raises LogError if no part can be read, or if the log lacks
+    the topic.
     """
     walk = LogWalk(log_in(path), (topic,))
     found = [payload for piece in walk.pieces(_EVERY_CYCLE, 0) for payload in piece.payloads.get(topic, ())]
@@ -283,9 +284,9 @@ def check_states(scheme: Series) -> None:
 
 
 def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
-    """Return for each report of /contact, in order, when it was made, ns on the clock of the run, and the report.
+    """Return each report of /contact, in the order of the log, as a pair: the time at which it was made, the report.
 
-    Raises LogError for an unknown level, kind, reaction or location.
+    Times in ns on the clock of the run. Raises LogError for an unknown level, kind, reaction or location.
     """
     contacts = []
     for t_ns, record in zip(series.t_ns.tolist(), series.records, strict=True):
@@ -313,7 +314,7 @@ def each_once(reports: Iterable[tuple[Time, ContactReport]]) -> list[tuple[Time,
 
 
 class Piece(NamedTuple):
-    """A stretch of a log that ends with whole cycles: consecutive pieces have all of it, in order.
+    """A stretch of a log that ends with whole cycles: consecutive pieces have all of it, in the order of the file.
 
     The records of a cycle are those with one publish time, one after the other in the file. An event that happens
     between two cycles counts as one.
@@ -342,8 +343,9 @@ class LogStream(LogWalk):
     ) -> None:
         """Open the log whose first part is `path`. topics: those whose messages are read; None: all.
 
-        A folder stands for the run's log in it. is_ahead: a thread opens chunks ahead, for a caller without a thread of
-        its own for the reading. Raises LogError if no part of it can be read.
+        A folder stands for the run's log in it. cycles_per_piece: most cycles in a piece of the iteration. is_ahead: a
+        thread opens chunks ahead, for a caller without a thread of its own for the reading. Raises LogError if no part
+        of it can be read.
         """
         super().__init__(log_in(path), topics)
         self.epoch_ns = _number(self.metadata, EPOCH_KEY, 0)

@@ -14,7 +14,7 @@ SCENE_TOPIC = "/scene"
 
 
 def _titled(title: str, panel: dict[str, Any]) -> dict[str, Any]:
-    """Return a panel with its title: each of the two viewers has a key of its own."""
+    """Return a panel with its title under the key of each of the two viewers."""
     return {"lichtblickPanelTitle": title, "foxglovePanelTitle": title, **panel}
 
 
@@ -38,7 +38,10 @@ def _both_joints(topic: OwnTopic, field: str) -> tuple[str, str]:
 
 
 def _scene(robot: bytes) -> dict[str, Any]:
-    """Return the 3-D panel. The URDF is part of the layout: a log can't serve files, and a server isn't needed."""
+    """Return the 3-D panel with the arm and a grid. robot: the arm's URDF.
+
+    The URDF is part of the layout: a log can't serve files, and a server isn't needed.
+    """
     arm = {
         "instanceId": "arm",
         "layerId": "foxglove.Urdf",
@@ -114,7 +117,7 @@ def viewer_layout(robot: bytes = b"") -> bytes:
 
 
 def _stack(first: str, *others: str) -> Any:
-    """Return panels of equal height, one below the other."""
+    """Return the layout of panels, by their names, one below the other with equal heights; of one panel its name."""
     if not others:
         return first
     share = 100.0 / (1 + len(others))

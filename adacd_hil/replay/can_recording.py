@@ -174,7 +174,7 @@ class RecordingAgainstLog(LogSource):
     def _piece(self, piece: Piece) -> Piece:
         """Return a piece of the log with the recording's frames, without the cycles that the recording lacks.
 
-        Those are counted. Call it for all pieces, in order.
+        Count the latter. Call it for all pieces, in the order of the log.
         """
         cycles = piece.series[self._partner]
         number, t_ns = cycles["cycle"].astype(np.int64), cycles.t_ns
@@ -260,11 +260,11 @@ class RecordingAlone:
 
     @property
     def start_ns(self) -> int:
-        """Time of the first SYNC, ns; where the bus was in lockstep, by its cycle's number."""
+        """Time of the first SYNC, ns; where the bus was in lockstep, its cycle's number times the period."""
         return int(self._t_ns()[0])
 
     def _t_ns(self) -> Places:
-        """Return the time of each cycle (n,): of its SYNC, or where the bus was in lockstep by its number."""
+        """Return the time of each cycle's SYNC (n,), ns; where the bus was in lockstep, its number times the period."""
         recording = self._recording
         return recording.t_ns if recording.is_realtime else recording.number * self.settings.bus.period_ns
 
@@ -277,7 +277,10 @@ class RecordingAlone:
         yield Part(list(self._stretches()), {}, (), frozenset())
 
     def _stretches(self) -> Iterator[CycleStretch]:
-        """Yield each attempt as one stretch, without the cycles at its end that disable the drives."""
+        """Yield the cycles of each attempt, without those at its end that disable the drives.
+
+        An attempt begins with the host's reset of the devices' communication.
+        """
         recording = self._recording
         number, t_ns = recording.number, self._t_ns()
         frames = recording.in_time(number, t_ns, slice(None))

@@ -57,7 +57,7 @@ class CycleStretch(NamedTuple):
 
 
 class AttemptSplitter:
-    """Splits the pieces of a log, in order, into stretches of its attempts.
+    """Splits the pieces of a log, given in its order, into stretches of its attempts.
 
     /arm says with which cycle an attempt began, and how many periods were skipped. Without it, an attempt begins with
     the host's reset of communication, and skipped periods follow from /cycle's overruns and the counters of SYNC.
@@ -143,7 +143,10 @@ class AttemptSplitter:
         return np.asarray(is_new)
 
     def _shown_begins(self, scheme: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return whether the scheme, by its states, begins anew in each cycle, after a fault or with the log (n,)."""
+        """Return for each cycle (n,) whether the scheme begins anew there: from INIT, after FAULT or with the log.
+
+        Used for logs without /arm.
+        """
         before = np.concatenate(([self._state], scheme["state"][:-1])) if len(scheme) else scheme["state"]
         is_anew = (scheme["previous_state"] == SchemeState.INIT) & (scheme["state"] <= SchemeState.COMMISSION)
         is_after_fault = before == SchemeState.FAULT
@@ -244,7 +247,7 @@ class AttemptSplitter:
 
 
 def _sync_counters(frames: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the counters of the SYNCs among some frames, in order; a SYNC without data is left out."""
+    """Return the counters of the SYNCs among some frames, in the frames' order; SYNCs without data are left out."""
     is_sync = (frames["can_id"] == SYNC_ID) & ~frames["is_error"] & (frames["length"] > 0)
     return np.asarray(frames["data"][is_sync, 0])
 
@@ -321,7 +324,7 @@ class LogSource:
         return place_devices(settings) if own is None else own
 
     def parts(self, with_frames: bool) -> Iterator[Part]:
-        """Yield the content of the log in parts, in order; each call begins with the first.
+        """Yield the content of the log piece by piece from front to end; each call begins with the first piece.
 
         with_frames: read the frames, too; else stretches have none.
         """
@@ -385,7 +388,7 @@ def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
 
 
 def contact_records(series: Series) -> dict[int, dict[str, Any]]:
-    """Return the fields of each logged contact report, by the time at which it was made, ns."""
+    """Return the fields of each logged contact report, values by name, by the time at which it was made, ns."""
     names = [name for name in ContactReport._fields if name in series.fields]
     rows = zip(series.t_ns.tolist(), series.records, strict=True)
     return {t_ns: {name: record[name].tolist() for name in names} for t_ns, record in rows}

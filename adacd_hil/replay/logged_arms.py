@@ -55,7 +55,7 @@ def logged_arms(scheme: NDArray[Any], arm: NDArray[Any], ticks: Ticks) -> ArmBat
 
 
 def arm_at(arms: ArmBatch, row: int) -> ArmState:
-    """Return the state of one cycle of a batch, by its index `row`; its vectors are views."""
+    """Return the arm's state in one cycle of a batch, by the cycle's index `row`; its vectors are views."""
     age_q, age_tau_J = arms.age_q[row].tolist(), arms.age_tau_J[row].tolist()
     return ArmState(
         cycle=int(arms.cycle[row]),

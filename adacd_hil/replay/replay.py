@@ -64,10 +64,10 @@ def replay(
 ) -> Replay:
     """Replay a log with its own settings, or with others, and return the outcome.
 
-    With its own settings, each decision is compared with the log. tolerance: of the comparison; None: exact, or
-    `TOLERANCE` where the log's numbers were computed on another kind of machine. script_of: plays the user of a
-    configuration; with it, the requests of a run without typed requests are compared. Raises LogError, ConfigError or
-    CodecError if the log, its attachments or a device can't be read.
+    With its own settings, each decision is compared with the log. progress: prints a line about the work. tolerance: of
+    the comparison; None: exact, or `TOLERANCE` where the log's numbers were computed on another kind of machine.
+    script_of: plays the user of a configuration; with it, the requests of a run without typed requests are compared.
+    Raises LogError, ConfigError or CodecError if the log, its attachments or a device can't be read.
     """
     source = LogSource(path)
     return replay_source(
@@ -85,8 +85,9 @@ def replay_many(
 ) -> list[Replay]:
     """Replay a log, or a stretch of it, once for each of the settings; the log is read and decoded once.
 
-    watch: called with the decisions of each variant. Raises LogError, ConfigError or CodecError if the log, its
-    attachments or a device can't be read; LogError also if no cycle of the stretch can be replayed.
+    progress: prints a line about the work. watch: called with the decisions of each variant. Raises LogError,
+    ConfigError or CodecError if the log, its attachments or a device can't be read; LogError also if no cycle of the
+    stretch can be replayed.
     """
     return replay_source(
         LogSource(path), variants, contacts_beside(path, progress), progress, watch=watch, stretch=stretch
@@ -126,9 +127,9 @@ class _Player:
         self._cycles: dict[int, int] = {}
 
     def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool = True) -> SchemeBatch:
-        """Run the scheme on a stretch of a part; gather and return its decisions.
+        """Run the scheme on the cycles of `stretch`, in piece `part` of the log; gather and return its decisions.
 
-        is_told: the stretch is reported: compare and count its cycles, too.
+        arms: the arm's states in these cycles (n,). is_told: the cycles are reported: compare and count them, too.
         """
         ticks = stretch.ticks
         if stretch.is_begin:
@@ -155,9 +156,10 @@ class _Player:
         part: Part,
         events: Sequence[Event],
     ) -> None:
-        """Compare a stretch with the log; do nothing if the log lacks its decisions, or earlier cycles of the attempt.
+        """Compare the decisions about a stretch's cycles with the log, and the requests, contacts and events in them.
 
-        asked: requests of the script (n,); None: each logged one that is a Request is believed.
+        Do nothing if the log lacks its decisions, or earlier cycles of the attempt. asked: requests of the script (n,);
+        None: each logged one that is a Request is believed.
         """
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
@@ -213,7 +215,7 @@ class _Player:
 
 
 def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
-    """Return the decisions of single cycles as columns."""
+    """Return the outputs of single cycles as one batch, in which each field is an array."""
     states = (("state", np.uint8), ("previous_state", np.uint8), ("fault", np.uint8), ("reaction", np.uint8))
     wholes = (("cycle", np.int64), ("contact_joints", np.int64), ("is_model_valid", np.bool_), *states)
     columns: dict[str, Any] = {
@@ -242,9 +244,10 @@ def replay_source(
 ) -> list[Replay]:
     """Replay a source, once for each of the settings; shown: mismatches that are kept.
 
-    truth: the true contacts, None if unknown. stretch: the part that is compared and reported; watch sees all from the
-    beginning of the log on. by_frames: decode the frames and compare each state with the log's. Raises LogError if the
-    source can't be read, or no cycle of the stretch can be replayed; ConfigError if a device can't be loaded.
+    truth: the true contacts, None if unknown. progress, tolerance, script_of: as for `replay`. stretch: the part that
+    is compared and reported; watch sees all from the beginning of the log on. by_frames: decode the frames and compare
+    each state with the log's. Raises LogError if the source can't be read, or no cycle of the stretch can be replayed;
+    ConfigError if a device can't be loaded.
     """
     bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
@@ -306,7 +309,10 @@ def _replay_part(
     bounds_ns: tuple[int, int],
     watch: Watch | None,
 ) -> int:
-    """Replay a part with each player; return its number of cycles. bounds_ns: time of the reported cycles."""
+    """Replay the cycles of a piece of the log with each player; return their number.
+
+    bounds_ns: time of the reported cycles. watch: called with each player's decisions.
+    """
     exact: list[tuple[int, int]] = []
     cycles, (part, arms_of_part) = 0, decoded
     for stretch, all_arms in zip(part.stretches, arms_of_part, strict=True):
@@ -376,7 +382,10 @@ class _ArmReader:
         self._arms: dict[Any, RecordedArm] = {}
 
     def read(self, stretch: CycleStretch) -> list[ArmBatch]:
-        """Return the arm's states in a stretch, for each of the variants. Call it for all stretches in order."""
+        """Return the arm's states in a stretch, for each of the variants.
+
+        Call it for all stretches in the order of the log.
+        """
         if stretch.is_begin:
             self._arms = {
                 key: RecordedArm(settings, self._source.codec, self._devices[key])
@@ -413,7 +422,10 @@ def _decoding_key(settings: Settings) -> Any:
 def _result(
     player: _Player, source: ReplaySource, source_notes: Sequence[str], tolerance: float, first_ns: int
 ) -> Replay:
-    """Return a player's outcome; contacts, changes of state and adaptations before first_ns are left out."""
+    """Return a player's outcome, after the end of its last attempt, with notes on all that was not compared or judged.
+
+    first_ns: contacts, changes of state and adaptations before this time are left out.
+    """
     gatherer, comparison, notes = player.gatherer, player.comparison, list(source_notes)
     gatherer.end_attempt()
     score = gatherer.score()

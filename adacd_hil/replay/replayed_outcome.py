@@ -80,7 +80,8 @@ class OutcomeGatherer:
     def add_stretch(self, ticks: Ticks, batch: SchemeBatch, follows_gap: bool = False) -> None:
         """Gather states, contacts and alarms of the next cycles, from the scheme's decisions in them.
 
-        follows_gap: the log lacks cycles before them, so that an alarm may stem from the jump.
+        follows_gap: the log lacks cycles of the attempt before them; the times of their alarms then also go into
+        `behind_gap_ns`, as they may stem from the jump.
         """
         count = len(batch.cycle)
         if count == 0:
@@ -117,9 +118,9 @@ class OutcomeGatherer:
         self.state = SchemeState(batch.state[-1])
 
     def _keep(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Keep the host's cycles next to the begin and end of each true contact, and the first and the last one.
+        """Keep the host's cycles next to the begin and end of each true contact, and the first and last of the stretch.
 
-        Do nothing if the truth is unknown.
+        Of each: number, time, state before it, thresholds. Do nothing if the truth is unknown.
         """
         if self._truth is None:
             return

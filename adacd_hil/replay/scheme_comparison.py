@@ -38,9 +38,9 @@ _HEAD: Final = ("cycle", "state", "previous_state", "fault", "contact_joints", "
 
 
 def different_arithmetic(metadata: Mapping[str, str]) -> list[str]:
-    """Return the items of `arithmetic` that differ from a log's metadata, as texts; [] if all bits must be equal.
+    """Return, as texts, which of architecture, Python, numpy and numba differ between a log's metadata and here.
 
-    An item that the log doesn't name counts as equal. Of the machine, only the architecture counts.
+    [] if all bits must be equal. An item that the log doesn't name counts as equal.
     """
     different = []
     for key, here in arithmetic().items():
@@ -144,7 +144,7 @@ class SchemeComparison:
         replayed: NDArray[Any],
         ticks: Ticks,
     ) -> None:
-        """Count the differing values, of (n,) or (n, k), and keep the first of them."""
+        """Count the values of (n,) or (n, k) that differ, where is_other is True; keep the first `shown` of them."""
         is_other, logged, replayed = (each.reshape(len(each), -1) for each in (is_other, logged, replayed))
         rows, columns = np.nonzero(is_other)
         self.count += len(rows)
@@ -167,7 +167,7 @@ class SchemeComparison:
             self.first()
 
     def first(self) -> tuple[Mismatch, ...]:
-        """Return the `shown` earliest mismatches, by cycle; drop the others."""
+        """Return those mismatches with the lowest cycle numbers, `shown` at most, in their order; drop the rest."""
         self.mismatches = sorted(self.mismatches, key=lambda mismatch: mismatch.cycle)[: self._shown]
         return tuple(self.mismatches)
 
@@ -201,9 +201,9 @@ class SchemeComparison:
         return is_real and abs(logged - replayed) <= self._tolerance * max(1.0, abs(logged))
 
     def compare_events(self, logged: Sequence[LoggedEvent], replayed: Sequence[Event], cycle: int) -> None:
-        """Compare, in order, the scheme's own events of a stretch; count and keep the mismatches.
+        """Compare the scheme's own events of a stretch, logged and replayed, pair by pair in the order of time.
 
-        An event without a counterpart is one. cycle: the stretch's first.
+        Count and keep the mismatches; an event without a counterpart is one. cycle: the stretch's first.
         """
         for theirs, ours in itertools.zip_longest(logged, replayed):
             if theirs is not None and theirs.event == ours:
@@ -239,7 +239,7 @@ def _contact_values(logged: Mapping[str, Any], replayed: ContactReport) -> Itera
 
 
 def _place_names(settings: Settings, layout: Layout) -> dict[str, tuple[str, ...]]:
-    """Return the names of the values of each field of the block, by field."""
+    """Return the names of the values of each field of the block, by field, such as a1 or joint 1; see `_names_of`."""
     parameters, further = settings.estimator.parameter_names, settings.further_names
     named = {
         "theta_hat": parameters,
@@ -323,7 +323,7 @@ class Asking:
     def requests(self, ticks: Ticks, batch: SchemeBatch) -> NDArray[np.uint8]:
         """Return the script's requests in a stretch (n,), given the scheme's states in it.
 
-        NONE until the drives are enabled. Call it for all stretches of an attempt, in order.
+        NONE until the drives are enabled. Call it for all stretches of an attempt, in the order of time.
         """
         asked = np.zeros(len(ticks.cycle), np.uint8)
         if self._enabled is None:

@@ -87,7 +87,7 @@ class Filters:
 
 
 class Wide:
-    """External torques of the widest filter, from which the filter is undone: written by `external_torque`."""
+    """The last external torques by the filter that is undone, newest first: written by `external_torque`."""
 
     history: Annotated[Vector, "wide n"]
 
@@ -177,8 +177,10 @@ class Sensitivity:
     """Noise, standstill, friction at rest, missing samples, and the thresholds by them: written by `sensitivity`.
 
     still, still_smooth, low_speed: shares of standstill and of low speed in a filter's memory. h: thresholds; h_model:
-    without standstill and the tail's floor. roughness, velocity_roughness: noise over that of the settings, squared.
-    unit, strain: factors on variances and on thresholds. wide: of the torque with a filter undone.
+    without standstill and the tail's floor. doubt: deviation by the model's uncertainty. hold, held: torque that
+    friction may hold at rest. lost: variance by missing samples. roughness, velocity_roughness: noise over that of the
+    settings, squared. unit, strain: factors on variances and on thresholds. used, peak_share: largest residual over its
+    threshold. wide: of the torque with a filter undone.
     """
 
     still: EachFilter
@@ -235,7 +237,11 @@ class Margin:
 
 
 class Evidence:
-    """Each source's value of each quantity, and the fit's difference from it: written by `evidence`."""
+    """Each source's value of each quantity, and the fit's difference from it: written by `evidence`.
+
+    floor, slack: least allowed difference, and one that is added. difference, limit: of the last comparison; without
+    one 0 and inf. fitted: values of the model that is judged.
+    """
 
     value: Annotated[Vector, "sources quantities"]
     variance: Annotated[Vector, "sources quantities"]
@@ -318,8 +324,9 @@ class Doubt:
 class MissingTorque:
     """Evidence for torque that the model lacks: sums of `missing_torque`, which writes them.
 
-    X_f, X_learnt: filtered columns by position. basic, full: coefficients of the fits without and with these. M, row,
-    scale: scratch. samples, wanted: learnt since the last check, and before the next.
+    X_f, X_learnt: filtered columns by position. basic, full: coefficients of the fits without and with these. yy,
+    weight: Σ r²/R and, by joint, Σ 1/R. ways: samples by joint and direction. M, row, scale: scratch. samples, wanted:
+    learnt since the last check, and before the next.
     """
 
     X_old: PlaceColumns

@@ -33,9 +33,10 @@ Rows = NDArray[np.int64]
 
 
 def extreme_rows(series: Iterable[Vector], starts: Rows) -> Rows:
-    """Return the rows in which a series (n,) is smallest or largest in its bucket, the first of equal ones, ascending.
+    """Return the rows in which a series is smallest or largest in its bucket, the first of equal ones, ascending.
 
-    starts: where the buckets begin, from 0, ascending. NaN is chosen nowhere.
+    series: arrays (n,), each judged by itself. starts: where the buckets begin, from 0, ascending. NaN is chosen
+    nowhere.
     """
     chosen: list[Rows] = [np.empty(0, np.int64)]
     for values in series:
@@ -173,7 +174,10 @@ class _TruthRows:
         self._kept_rows += len(rows)
 
     def _thin(self) -> None:
-        """Keep the extreme rows of those that wait, and drop the others; the last ones still wait."""
+        """From a contact's rows that are still undecided keep those with extreme torque or force, and drop the rest.
+
+        The last _ENDING of them stay undecided, since they may be the contact's end.
+        """
         middle, self._waiting = self._waiting[:-_ENDING], self._waiting[-_ENDING:].copy()
         if len(middle):
             series = (middle["tau_ext"][:, 0], middle["tau_ext"][:, 1], middle["contact_force"])

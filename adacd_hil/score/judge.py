@@ -110,7 +110,10 @@ class TrueContact:
 
 @dataclass(frozen=True)
 class Score:
-    """True contacts in order with their detections, and false alarms; unjudged: alarms beyond the truth."""
+    """True contacts, in the order of time, with their detections, and false alarms.
+
+    unjudged: alarms at times that the truth doesn't cover.
+    """
 
     contacts: tuple[TrueContact, ...]
     false_alarms: tuple[Detection, ...]
@@ -149,7 +152,7 @@ def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
     """Return for each contact (k,) the last instant at which it explains an alarm.
 
     It is just before the next one begins, or when all contacts so far are forgotten, if that is earlier. onsets,
-    forgotten (k,): when each begins and is forgotten, in order; integers in any one unit.
+    forgotten (k,): when each begins and is forgotten, onsets ascending; integers in any one unit.
     """
     until: Times = np.maximum.accumulate(np.asarray(forgotten, np.int64))
     until[:-1] = np.minimum(until[:-1], np.asarray(onsets, np.int64)[1:] - 1)
@@ -168,7 +171,7 @@ def contacts_of_alarms(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[An
 
 
 def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossings_ns: Sequence[int] = ()) -> Score:
-    """Return which alarm found each true contact, and which alarms are false; contacts and alarms are in order.
+    """Return which alarm found each true contact, and which alarms are false; contacts, alarms in the order of time.
 
     crossings_ns: times at which a scheme, replayed on another scheme's motion, first exceeds a threshold. While it
     still reacts it can raise no alarm: then a crossing finds a contact that began meanwhile (`is_reacting`).
@@ -204,10 +207,10 @@ class StreamJudge:
     def add_samples(
         self, contacts: Sequence[TrueContact], t_ns: Times, is_over: NDArray[np.bool_], is_judged: NDArray[np.bool_]
     ) -> None:
-        """Judge the next samples (n,); is_over: where the statistic is above its threshold.
+        """Judge the next samples (n,), in the order of time; is_over: where the statistic is above its threshold.
 
-        is_judged: where an alarm that no contact explains counts as false. contacts: in order, those at least that
-        begin before the last sample and aren't forgotten before the first.
+        is_judged: where an alarm that no contact explains counts as false. contacts: in the order of time, those at
+        least that begin before the last sample and aren't forgotten before the first.
         """
         rows = np.flatnonzero(is_over)
         about = contacts_of_alarms(t_ns[rows], *_bounds(contacts))

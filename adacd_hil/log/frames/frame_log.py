@@ -54,7 +54,7 @@ def open_frames(path: Path) -> "McapFrames | PythonCanFrames":
 def read_frames(path: Path) -> FrameLog:
     """Return all frames of a recording, the names of its channels, its epoch, and its problem, "" without one.
 
-    Raises LogError as `open_frames` and its iteration.
+    Raises LogError for an unknown suffix, a missing package, or a file that can't be read.
     """
     source = open_frames(path)
     pieces = [np.zeros(0, RECORDED_FRAME_DTYPE), *source]

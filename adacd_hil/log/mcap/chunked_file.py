@@ -77,7 +77,11 @@ class ChunkedFile:
         return self._writer.register_channel(topic, message_encoding, schema, metadata)
 
     def add_message(self, channel: int, log_ns: int, payload: bytes, publish_ns: int, sequence: int = 0) -> None:
-        """Add a message to the chunk in progress."""
+        """Add a message to the chunk in progress.
+
+        channel: its number from `define_channel`. log_ns, publish_ns: its times in the file. sequence: the publisher's
+        count; 0 for none.
+        """
         self._writer.add_message(channel, log_ns, payload, publish_ns, sequence)
         self.messages += 1
         self.record_bytes += MESSAGE_HEAD + len(payload)
@@ -104,7 +108,7 @@ class ChunkedFile:
     def _pass_on(self, packets: int = 0) -> bool:
         """Write to the target all bytes that mcap's writer has made since the last call.
 
-        Return False if there are none.
+        Return False if there are none. packets: number of log packets that are complete with them.
         """
         data = self._stream.take()
         if data:

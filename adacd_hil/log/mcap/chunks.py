@@ -64,8 +64,8 @@ class Opening:
     def open_chunk(self, chunk: Chunk) -> bytes:
         """Decompress a chunk, add it to the counts, and return its records.
 
-        Raises ChunkError as `decompress` and `add_chunk`, and for another CRC, or without a CRC for another size than
-        stated.
+        Raises ChunkError for an unknown compression, damaged data, too many bytes (`add_chunk`), and another CRC than
+        stored, or without a CRC another size than stated.
         """
         data = decompress(chunk.compression, chunk.data)
         self.add_chunk(len(chunk.data), len(data))
@@ -227,7 +227,7 @@ def read_chunks(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> C
 
 
 def _indexed(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Contents | None:
-    """Return the contents, with the beginnings of messages from the indexes.
+    """Return the contents of chunks, with the beginnings of messages from the indexes; arguments as for `read_chunks`.
 
     None if the indexes are missing, or don't fill the chunks exactly with messages.
     """
@@ -249,7 +249,10 @@ def _indexed(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Cont
 
 
 def _walk_through(data: bytes, ends: Sequence[int]) -> Contents:
-    """Find the records of chunks one by one, and return them."""
+    """Find the records of chunks one by one, each by the length of the one before, and return them.
+
+    ends: offset at which each chunk ends.
+    """
     definitions: list[RawRecord] = []
     strangers: list[int] = []
     breaks: list[int] = []
@@ -375,9 +378,10 @@ def _pack(file: IO[bytes], name: str, block_bytes: int) -> Iterator[list[_Packed
 
 
 def _look_at(record: RawRecord | Problem, opening: Opening, crc: int) -> _Packed | RawRecord | Problem | None:
-    """Return a record in the form in which it is passed on; None: it is skipped.
+    """Return a chunk, message, schema or channel as `_packed` does; an attachment, metadata or Problem as it is.
 
-    A DataEnd becomes a Problem if its CRC is neither 0 nor `crc`, that of all bytes before it.
+    Return None for any other record, which is skipped, but a DataEnd becomes a Problem if its CRC is neither 0 nor
+    `crc`, that of all bytes before it.
     """
     if isinstance(record, Problem) or record.opcode in _OTHERS:
         return record

@@ -140,7 +140,10 @@ class Problem(NamedTuple):
 
 
 def name_of(opcode: int) -> str:
-    """Return the name of a kind of record as in the specification, such as ChunkIndex."""
+    """Return the name of a kind of record as in the specification, such as ChunkIndex.
+
+    Of an unknown kind return its number, such as "record 0x2a".
+    """
     if opcode not in set(Opcode):
         return f"record 0x{opcode:02x}"
     return "".join(word.capitalize() for word in Opcode(opcode).name.split("_"))
@@ -264,7 +267,10 @@ def read_end(file: IO[bytes]) -> FileEnd | None:
 
 
 def _has_shape(record: RawRecord) -> bool:
-    """Return whether a record is of a kind that repeats its length, and does so."""
+    """Return whether the lengths in a record add up to the size of its body.
+
+    False for a kind of record without lengths in its body, such as a message.
+    """
     body = record.body
     return has_shape(record.opcode) and fits(record.opcode, len(body), lambda place, count: body[place : place + count])
 
@@ -354,7 +360,10 @@ class Definitions:
         return definition
 
     def add_records(self, records: Iterable[RawRecord]) -> None:
-        """Add the schemas and channels among some records. Raises LogError as `add_record` does."""
+        """Add the schemas and channels among some records; ignore the others.
+
+        Raises LogError for one that can't be parsed, or that gives a known number another meaning.
+        """
         for record in records:
             if record.opcode in DEFINITIONS:
                 self.add_record(record)

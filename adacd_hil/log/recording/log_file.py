@@ -126,7 +126,7 @@ class Sink:
         self._thread.join()
 
     def _work(self) -> None:
-        """Write data and begin files, task by task, until `close_file`; then close the file."""
+        """Run the sink's thread: write data and begin files, task by task, until `close_file`; then close the file."""
         while (task := self._next()) is not None:
             if isinstance(task, Path):
                 self._open(task)
@@ -135,7 +135,10 @@ class Sink:
         self._close()
 
     def _next(self) -> tuple[bytes, int] | Path | None:
-        """Wait for a task and return it: data with their packets, a file to begin, or None for the end."""
+        """Wait in the sink's thread for a task, and return it: data with their packets, or a file to begin.
+
+        None: the file is to be closed.
+        """
         with self._changed:
             self._is_idle = True
             self._changed.notify_all()
@@ -227,7 +230,7 @@ class McapFile(ChunkedFile):
         """Bytes before the first chunk."""
 
     def _define(self, channels: tuple[LogChannel, ...]) -> None:
-        """Define schemas and channels; the first chunk begins with them."""
+        """Define schemas and channels, with which the first chunk begins; store the channels' numbers in `ids`."""
         schemas: dict[str, int] = {}
         for channel in channels:
             name, text = channel.type.name, channel.type.text

@@ -33,7 +33,7 @@ _MAX_TEXT = 4096
 
 @functools.cache
 def _table(frame_count: int, message_count: int) -> struct.Struct:
-    """Return the struct of a packet without its bodies."""
+    """Return the struct of a cycle's packet up to its bodies: the head, then so many frames, then so many messages."""
     return struct.Struct("<" + _HEAD_FORMAT + _FRAME_FORMAT * frame_count + _MESSAGE_FORMAT * message_count)
 
 

@@ -78,9 +78,11 @@ class Recorder:
     ) -> None:
         """Create the file, which must not exist (see run_folder.py), and start the writer.
 
-        messages: of the DBC, by default the package's. epoch_ns: added to t_ns for the log's times; 0 in lockstep.
-        blocking: lockstep. channels: of a log that is no run's. live: live view to open. Raises LogExistsError if a log
-        is there already, LogError if the file or the writer can't be made.
+        messages: of the DBC, by default the package's. The counts: see `run_channels`; by default those of the paper's
+        scheme. attachments, metadata: at the file's beginning. epoch_ns: added to t_ns for the log's times; 0 in
+        lockstep. blocking: lockstep. channels: of a log that is no run's. settings: sizes of parts and buffer. live:
+        live view to open. Raises LogExistsError if a log is there already, LogError if the file or the writer can't be
+        made.
         """
         settings = settings or LogSettings()
         own = {
@@ -130,7 +132,10 @@ class Recorder:
         self._socket.setblocking(True)
 
     def _wait_until_ready(self) -> None:
-        """Wait until the writer is ready. If it fails, remove the file and raise LogError."""
+        """Wait until the writer is ready, and store the address of its live view.
+
+        If it reports an error, or sends nothing within START_TIMEOUT_S, end it, remove the file and raise LogError.
+        """
         word = self._hear(START_TIMEOUT_S)
         error = "the writer did not start" if word is None else word["error"]
         if error:
@@ -176,7 +181,10 @@ class Recorder:
             self._socket.send(processes.WAKE, socket.MSG_DONTWAIT)
 
     def _put(self, data: bytes) -> None:
-        """Put a packet into the ring; if that fails, count it in `dropped`. In lockstep, wake the writer at times."""
+        """Put a packet into the ring; if that is full, wait in lockstep, in real time count the packet in `dropped`.
+
+        In lockstep wake the writer after each WAKE_BYTES. Count also a packet that the writer can't take any more.
+        """
         if not self._ring.put_packet(data) and not (self._is_blocking and self._put_patiently(data)):
             self.dropped += 1
             self._ring.count_dropped(self.dropped)
@@ -216,8 +224,8 @@ class Recorder:
     def _summarise(self, word: dict[str, str] | None) -> LogSummary:
         """Wait for the end of the writer's process, and return the summary.
 
-        word: its last message, None if it died or is silent. Without it the writer is ended, the log is incomplete, its
-        counts are 0, and the packets that it had not written count as dropped.
+        word: the writer's last message, None if it died or is silent. Without it the writer is ended, the log is
+        incomplete, its counts are 0, and the packets that it had not written count as dropped.
         """
         error = ""
         if word is None:

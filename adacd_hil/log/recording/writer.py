@@ -79,7 +79,10 @@ class WriterProcess:
         self._end(self._finish("closed" if word == processes.END else "control process died"))
 
     def _end(self, summary: dict[str, str]) -> None:
-        """Close the last file, remove it if it has no chunk because of an error, and send the summary."""
+        """Close the last file and send the summary; end the live view.
+
+        Remove the file if it is a further part that has no chunk because of an error.
+        """
         self._sink.close_file()
         path = part_path(self._setup.path, self._part)
         if self._part and self._sink.error and self._sink.path == path and not self._has_chunks:
@@ -101,7 +104,7 @@ class WriterProcess:
             return processes.NOTHING
 
     def _take(self) -> None:
-        """Take all packets waiting in the ring; in real time, flush by the clock."""
+        """Take and write all packets waiting in the ring; in real time also write a chunk that is due by the clock."""
         while True:
             self._write(self._ring.take_packets(TAKEN_BYTES))
             if not self._setup.is_blocking:
@@ -151,7 +154,10 @@ class WriterProcess:
         return 0 < part_bytes <= self._file.record_bytes or 0 < part_ns <= last_ns - first_ns
 
     def _begin_part(self, is_next: bool) -> None:
-        """Begin the next part, or the present one again; skip names that other files have taken meanwhile."""
+        """Begin the next part, or, with is_next False, the present one again from empty.
+
+        Skip names that other files have taken meanwhile.
+        """
         self._part += is_next
         self._parts += is_next
         while self._sink.path != (path := part_path(self._setup.path, self._part)) and is_there(path):

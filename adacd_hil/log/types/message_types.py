@@ -126,7 +126,7 @@ def foreign_type(name: str) -> MessageType:
 
 
 def number_type(name: str, members: Iterable[Member]) -> MessageType:
-    """Return a message type of a stamp and the members, numbers, in order. name: "package/msg/Type".
+    """Return a message type whose fields are a stamp, then the members, all numbers. name: "package/msg/Type".
 
     Raises LogError if two fields have the same name in ROS, or one is named stamp.
     """
@@ -255,8 +255,8 @@ def pack_can_frame(
 ) -> bytes:
     """Return a frame as a payload of can_msgs/Frame.
 
-    stamp: a packed builtin_interfaces/Time. data: up to 8 bytes, of which `dlc` count. is_extended: it has a 29-bit
-    identifier; None: if it is above 0x7FF.
+    stamp: a packed builtin_interfaces/Time. data: up to 8 bytes, of which `dlc` count. is_error, is_remote: its flags.
+    is_extended: it has a 29-bit identifier; None: if it is above 0x7FF.
     """
     is_extended = can_id > MAX_STANDARD_ID if is_extended is None else is_extended
     body = _CAN_FRAME_BODY.pack(can_id, is_remote, is_extended, is_error, dlc, data)
@@ -266,8 +266,8 @@ def pack_can_frame(
 def pack_fd_frame(stamp: bytes, can_id: int, data: bytes, is_error: bool, is_extended: bool | None = None) -> bytes:
     """Return an FD frame as a payload of ros2_socketcan_msgs/FdFrame.
 
-    stamp: a packed builtin_interfaces/Time. data: up to 64 bytes. is_extended: it has a 29-bit identifier; None: if it
-    is above 0x7FF.
+    stamp: a packed builtin_interfaces/Time. data: up to 64 bytes. is_error: its flag. is_extended: it has a 29-bit
+    identifier; None: if it is above 0x7FF.
     """
     length = len(data)
     is_extended = can_id > MAX_STANDARD_ID if is_extended is None else is_extended

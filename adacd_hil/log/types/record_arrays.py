@@ -37,9 +37,9 @@ class Topic(NamedTuple):
 
     @property
     def has_tail(self) -> bool:
-        """Whether a payload ends after the number of bytes of `data` in its `count`.
+        """Whether the topic is of FD frames, whose payloads end after as many bytes of `data` as their `count`.
 
-        Records of it are padded with zeros.
+        Their records are padded with zeros.
         """
         return self.type_name == FD_FRAME.name
 
@@ -183,7 +183,7 @@ def is_sendable(frames: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def receivable_frames(frames: NDArray[Any]) -> NDArray[Any]:
-    """Return the frames that a bus end of ours could receive, (k,) of LONG_FRAME_DTYPE; drop the others."""
+    """Return the frames that a bus end of ours could receive, see `is_plain`, as (k,) of LONG_FRAME_DTYPE."""
     chosen = frames[is_plain(frames)]
     logged = np.zeros(len(chosen), LONG_FRAME_DTYPE)
     for name in LONG_FRAME_DTYPE.names or ():
@@ -307,7 +307,10 @@ class PieceBuilder:
 def _rows_of(
     contents: "Contents", starts: Numbers, sizes: Numbers, topic: Topic
 ) -> tuple[NDArray[np.bool_] | None, NDArray[np.uint8]]:
-    """Return which of a topic's messages have the right length (n,), None: all; and the records of these (k, size)."""
+    """Return which of a topic's messages have the right length (n,), None: all; and the records of these (k, size).
+
+    starts, sizes (n,): of the messages, in the bytes of `contents`.
+    """
     assert topic.dtype is not None
     most = topic.dtype.itemsize
     is_right = sizes == most

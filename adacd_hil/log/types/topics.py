@@ -115,8 +115,8 @@ class OwnTopic:
     def channel(self, parameter_count: int = 0, further_count: int = 0, channel_count: int = 0) -> LogChannel:
         """Return the topic as a channel of a file, with its message type.
 
-        The counts size the block of /scheme: see `records.certified_layout`. Raises LogError if two fields have one
-        name in ROS.
+        The counts size the block of /scheme, see `records.certified_layout`; a topic without such a block needs none.
+        Raises LogError if two fields have one name in ROS.
         """
         if isinstance(self.type, MessageType):
             return LogChannel(self.id, self.name, self.type)

@@ -82,7 +82,10 @@ class CourseMemory:
 
 
 def fill_constants(settings: Settings, k: CourseConstants) -> None:
-    """Fill `k` in place from the settings."""
+    """Fill `k` in place with the settings' reactions, upper thresholds and times, in cycles.
+
+    In the paper's scheme the reaction to each contact is WITHDRAW.
+    """
     wish, is_paper = settings.reaction, settings.scheme == "paper"
     window_s = settings.detector.isolation_window_s
     chosen = (("withdraw",) * JOINTS,) * len(ContactLevel) if is_paper else (wish.contact, wish.collision)
@@ -188,8 +191,8 @@ def _reconsider(
 ) -> None:
     """Choose the reaction anew if the contact has a higher level or another link, unless a withdrawal was given up.
 
-    Stop an arm that goes on along its path if the supervisor has latched the contact without a collision. Check whether
-    a withdrawal in force must be given up, see `_judge`.
+    Stop an arm that goes on along its path if is_latched, the supervisor has latched the contact, without a collision.
+    Check whether a withdrawal in force must be given up, see `_judge`. is_valid: there is a model to float with.
     """
     level = max(level, m.level)
     is_other = level != m.level or m.link != m.cause_link
@@ -204,7 +207,10 @@ def _reconsider(
 
 @compiled
 def _choose(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: bool) -> None:
-    """Begin the reaction of the settings to the contact's level and link, unless it is in force already."""
+    """Begin the reaction of the settings to the contact's level and link, unless it is in force already.
+
+    is_valid: there is a model to float with; else STOP takes the place of FLOAT.
+    """
     reaction = k.reactions[m.level - 1, m.cause_link - 1]
     if reaction != m.reaction:
         _react(m, _possible(reaction, is_valid), tau_ext_hat, True)
@@ -234,7 +240,7 @@ def _judge(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: b
     """Count a cycle of a withdrawal; change to the `two_sided` reaction if the torque has turned against it.
 
     It has if for TURNED_CYCLES in a row, after the first `blind_cycles`, the torque against the withdrawal was over the
-    upper thresholds in that direction.
+    upper thresholds in that direction. is_valid: there is a model to float with.
     """
     m.cycles += 1
     if m.cycles <= k.blind_cycles:

@@ -41,9 +41,9 @@ def predict(W_f: Vector, theta: Vector, tau_f_hat: Vector) -> None:
 
 @compiled
 def estimate_external(tau_f: Vector, tau_f_hat: Vector, dc_gain: float, tau_ext_hat: Vector) -> None:
-    """Fill tau_ext_hat (2,), Nm, with -(tau_f - tau_f_hat) / dc_gain, eq.
+    """Fill tau_ext_hat (2,), Nm, with -(tau_f - tau_f_hat) / dc_gain: equation 13 of the paper with our sign.
 
-    (13) with our sign; dc_gain: b / a of the filter.
+    tau_f, tau_f_hat (2,): filtered torque, measured and predicted. dc_gain: b / a of the filter.
     """
     for i in range(tau_f.shape[0]):
         tau_ext_hat[i] = -(tau_f[i] - tau_f_hat[i]) / dc_gain
@@ -53,7 +53,7 @@ def estimate_external(tau_f: Vector, tau_f_hat: Vector, dc_gain: float, tau_ext_
 def follow_standstill(dq: Vector, standstill_rad_s: float, decay: float, standstill: Vector) -> None:
     """Update `standstill` (2,) in place: each joint's share of standstill in the filter's memory, 0 to 1.
 
-    A joint slower than standstill_rad_s stands still. decay: the filter's factor for one period.
+    A joint slower than standstill_rad_s stands still. decay: share of the old value that stays after one period.
     """
     for i in range(dq.shape[0]):
         target = 1.0 if abs(dq[i]) < standstill_rad_s else 0.0
@@ -95,7 +95,8 @@ def forget(wide: Wide) -> None:
 def undo_filter(tau_ext_hat: Vector, decay: float, history: Vector, tau_ext_wide_hat: Vector) -> None:
     """Put tau_ext_hat (2,) first in `history`; fill tau_ext_wide_hat (2,), the mean torque with the filter undone.
 
-    decay: E, the filter's factor for one period.
+    The mean is over the last WIDE_SAMPLES samples. decay: E = exp(-a T), the share of its old output that the filter
+    keeps over one period.
     """
     for i in range(tau_ext_hat.shape[0]):
         for k in range(history.shape[0] - 1, 0, -1):
@@ -117,7 +118,7 @@ def follow_contact(
     integral: Vector,
     peak: Vector,
 ) -> None:
-    """Update the integral (2,) Nm s and the peak (2,) Nm of each joint's contact in place.
+    """Update each joint's contact: the integral (2,) of tau_ext_hat, Nm s, and the peak (2,) of tau_ext_wide_hat, Nm.
 
     They begin with 0 again while a joint's torque is below ONSET_FRACTION of its threshold. is_reporting: a report is
     still due, so they go on below it, too.

@@ -57,10 +57,10 @@ BLOCK_S = 0.064
 
 
 def constants_of(settings: Settings) -> MarginConstants:
-    """Return the margin's constants; `excursions_Hz` and `shown` have a value per channel (2 C - 1,).
+    """Return the constants by which thresholds get a floor and the smallest push is estimated.
 
-    excursions_Hz: independent excursions per second. shown: response to a step of 1 after WITHIN_S. block_cycles,
-    mean_cycles: length of a block of the tail, and of a mean of the smallest push.
+    excursions_Hz (2 C - 1,): independent excursions per second, by channel. shown (2 C - 1,): response to a step of 1
+    after WITHIN_S. block_cycles, mean_cycles: length of a block of the tail, and of a mean of the smallest push.
     """
     a = np.array(settings.certified.cutoffs_rad_s)
     return MarginConstants(

@@ -88,10 +88,10 @@ _SMOOTHED_FALL_RAD_S = 600.0
 
 
 def noise_constants(certified: CertifiedSettings, period_s: float) -> NoiseConstants:
-    """Return the constants of noise: variances by channel (2 C - 1,), and a sample's weights in running means.
+    """Return the constants by which noise enters the thresholds: variances by channel (2 C - 1,), weights of a sample.
 
-    torque_variance: (k_tau sigma_tau)², Nm²; torque_gain: the same for a noise of 1 Nm; velocity_variance: nu²,
-    rad²/s⁴.
+    The weights (`_share`, `_loss`) are those of one sample in running means. torque_variance: (k_tau sigma_tau)², Nm²;
+    torque_gain: the same for a noise of 1 Nm; velocity_variance: nu², rad²/s⁴.
     """
     a, s = np.array(certified.cutoffs_rad_s), certified.smoothing_rad_s
     width = np.concatenate([a * s / (a + s), a[1:]])
@@ -209,7 +209,7 @@ def keep_velocity_noise(k: Constants, m: Memory) -> None:
 
 @compiled
 def raise_strain(m: Memory, largest: float) -> None:
-    """Double the strain of each joint that is over a threshold in any channel, up to `largest`; lower none.
+    """Double `strain`, a factor on thresholds, of each joint over one in any channel, up to `largest`; lower none.
 
     A contact while learning may be the model's failure. One contact may be a hand; repeated ones come from an error
     that no parameter explains, such as backlash. Then the arm is armed with higher thresholds rather than never.
@@ -224,7 +224,7 @@ def raise_strain(m: Memory, largest: float) -> None:
 
 @compiled
 def decay_strain(k: Constants, m: Memory) -> None:
-    """Update `strain` and `peak_share` (n,) by one sample without contact.
+    """Update `strain`, a factor on the thresholds, and `peak_share` (n,) by one sample without contact.
 
     The strain decays towards 1 while the residual has stayed below RELAXED of its threshold over about STRAIN_S.
     `peak_share` rises to the sample's largest residual over its threshold.
@@ -242,11 +242,12 @@ def decay_strain(k: Constants, m: Memory) -> None:
 
 @compiled
 def follow_unit(k: Constants, m: Memory, fit: int, share: float, is_monitored: bool) -> None:
-    """Update the unit (n,) of the belief's variances by one sample without contact; share: weight of the sample.
+    """Update `unit` (n,), a factor on the belief's variances, by one sample without contact.
 
-    fit: index of the filter whose residual counts. In a faster one the velocity's noise would count as the model's
-    error. is_monitored: the unit is the smaller one of those of positive and of negative residuals. Else it is that of
-    all residuals, with which both signs begin. A joint with an infinite variance, as one at rest, keeps its unit.
+    share: the sample's weight. fit: index of the filter whose residual counts. In a faster one the velocity's noise
+    would count as the model's error. is_monitored: the unit is the smaller one of those of positive and of negative
+    residuals. Else it is that of all residuals, with which both signs begin. A joint with an infinite variance, as one
+    at rest, keeps its unit.
     """
     own = m.sensitivity
     for i in range(own.unit.shape[0]):
@@ -422,7 +423,10 @@ def begin(m: Memory) -> None:
 
 @compiled
 def begin_fit(m: Memory) -> None:
-    """Set the unit to 1 as a fit begins: residuals count as the settings' of a good model until they are measured."""
+    """Set `unit`, the factor on the belief's variances, to 1 as a fit begins.
+
+    Residuals count as the settings' of a good model until they are measured.
+    """
     m.sensitivity.unit[:] = 1.0
 
 

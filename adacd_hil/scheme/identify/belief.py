@@ -68,7 +68,7 @@ def freeze(k: Constants, m: Memory) -> None:
 
 @compiled
 def certify(k: Constants, m: Memory) -> None:
-    """Store the model in use as the certified one, set `promotions` to 0, and hold the lags."""
+    """Store the model in use as the certified one, set `promotions` to 0, and stop learning the lags."""
     m.models.promotions = 0.0
     _certify(m)
     hold_lags(k, m)
@@ -205,9 +205,10 @@ def learn(k: Constants, m: Memory) -> bool:
 
 @compiled
 def hold_lags(k: Constants, m: Memory) -> None:
-    """Stop learning the lags: clear their covariances with other parameters in P_belief, keep their variances.
+    """Stop learning the lags of the velocity behind the torque.
 
-    From now on `learn` subtracts the lags' torque from samples that enter the ring.
+    Clear their covariances with other parameters in P_belief, keep their variances. From now on `learn` subtracts the
+    lags' torque from samples that enter the ring.
     """
     m.models.are_lags_held = 1.0
     P = m.models.P_belief

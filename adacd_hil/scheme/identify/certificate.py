@@ -57,8 +57,9 @@ class Certificate(NamedTuple):
 def last_of(settings: Settings) -> tuple[Vector, Vector, Vector]:
     """Return value, variance and slack (Q,) of the last certificate per quantity of `evidence`.
 
-    The variance is inf for the torque offsets, and for all quantities without a last certificate. A viscous friction is
-    computed from two frictions. Their deviations count as independent, which overestimates its own.
+    slack: size up to which a difference is ignored. The variance is inf for the torque offsets, and for all quantities
+    without a last certificate. A viscous friction is computed from two frictions. Their deviations count as
+    independent, which overestimates its own.
     """
     history = settings.history
     counts = (FRICTIONS, INERTIAS, JOINTS, JOINTS)
@@ -147,7 +148,7 @@ def describe_more(m: Memory, date_utc: str) -> list[str]:
 def certificate_of(k: Constants, m: Memory, text: str) -> Certificate:
     """Return a certificate of the model in use: its parameters, frictions, inertias and offsets, with deviations.
 
-    text: of the event that tells of it.
+    text: of the event that reports the certificate.
     """
     base, first, theta, P = int(k.first_offset), FRICTIONS, m.models.theta, m.models.P
     rows = k.evidence.columns[:OFFSETS]

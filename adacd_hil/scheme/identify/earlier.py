@@ -52,7 +52,7 @@ the arm bends. A mass shows in a1 and a3."""
 
 @compiled
 def forget(m: Memory) -> None:
-    """Drop the kept beliefs; clear the count of refused fits and `has_lapsed`.
+    """Drop the beliefs kept from before a touch; clear the count of refused fits and `has_lapsed`.
 
     Called when a certificate stands, or the user confirms that the arm is free of contact.
     """
@@ -63,7 +63,7 @@ def forget(m: Memory) -> None:
 
 @compiled
 def _drop(m: Memory) -> None:
-    """Empty the sources of all kept beliefs."""
+    """Empty the sources of evidence of all beliefs kept from before a touch."""
     m.earlier.kept_count = 0.0
     for s in range(KEPT, m.evidence.value.shape[0]):
         evidence.empty_source(m, s)

@@ -27,9 +27,10 @@ from adacd_hil.records import Vector
 def update(
     W_f: Vector, tau_f: Vector, R: float, is_least_squares: bool, theta_hat: Vector, P: Vector, v: Vector, K: Vector
 ) -> None:
-    """Correct theta_hat (p,), and P (p, p) if least squares, in place by the rows of one sample.
+    """Correct theta_hat (p,) in place by the rows of one sample, W_f and tau_f.
 
-    R: variance of a row. v, K (p,): overwritten as scratch.
+    R: variance of a row. is_least_squares: correct P (p, p), too; False: the gradient law, with constant P. v, K (p,):
+    overwritten as scratch.
     """
     for i in range(W_f.shape[0]):
         correct(W_f[i], tau_f[i], R, is_least_squares, theta_hat, P, v, K)
@@ -39,10 +40,10 @@ def update(
 def correct(
     w: Vector, tau: float, R: float, is_least_squares: bool, theta_hat: Vector, P: Vector, v: Vector, K: Vector
 ) -> tuple[float, float]:
-    """Correct theta_hat (p,), and P (p, p) if least squares, in place by one row w (p,) of variance R.
+    """Correct theta_hat (p,) in place by one row w (p,) of variance R; return its residual epsilon before, and s.
 
-    Return the residual epsilon of theta_hat before the correction, and its variance s. v, K (p,): overwritten as
-    scratch.
+    s: variance of epsilon. is_least_squares: correct P (p, p), too; False: the gradient law, with constant P. v, K
+    (p,): overwritten as scratch.
     """
     count = theta_hat.shape[0]
     epsilon = -linalg.misfit(w, theta_hat, tau)

@@ -105,7 +105,10 @@ def set_age(m: Memory, first: int, last: int, age_s: float) -> None:
 
 @compiled
 def set_row(m: Memory, s: int, q: int, value: float, variance: float, floor: float, slack: float) -> None:
-    """Fill a row: the value of quantity q by source s, its variance, floor and slack."""
+    """Fill a row: the value of quantity q by source s, and its variance, inf if the source has no value.
+
+    floor: least difference from the fit that counts; slack: added to the limit. Both in the quantity's unit.
+    """
     own = m.evidence
     own.value[s, q] = value
     own.variance[s, q] = variance
@@ -187,9 +190,9 @@ def excess(m: Memory, s: int, q: int) -> float:
 
 @compiled
 def largest_excess(m: Memory, first: int, last: int, q: int) -> int:
-    """Return the source among first ..
+    """Return the source whose last `excess` of quantity `q` is largest in size, the first of equals.
 
-    last - 1 whose last `excess` of quantity `q` is largest in size, the first of equals.
+    first, last: the sources compared are those from first to last - 1.
     """
     worst = first
     for s in range(first, last):

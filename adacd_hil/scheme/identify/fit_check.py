@@ -67,7 +67,7 @@ SMALLEST_UNIT = 0.1
 
 
 def step_samples_of(settings: Settings) -> int:
-    """Return the number of learnt samples from one step to the next."""
+    """Return the number of learnt samples between two steps, at which the fit's present belief is stored."""
     return max(round(STEP_S / (settings.bus.period_s * settings.certified.learn_every)), 1)
 
 
@@ -132,9 +132,10 @@ def _keep_sample(m: Memory, W_f: Vector, tau_f: Vector) -> None:
 
 @compiled
 def unit_of(square: float, rows: float) -> float:
-    """Return u for the worst moments of residuals: HARD times their mean square, within SMALLEST_UNIT and LARGEST_UNIT.
+    """Return u, a factor on a belief's variances, by its fit's residuals: HARD times their mean square, within bounds.
 
-    square: sum of the residuals' squares over their variances. rows: number of residuals.
+    square: sum of the residuals' squares over their variances. rows: number of residuals. The bounds: SMALLEST_UNIT and
+    LARGEST_UNIT.
     """
     return min(max(HARD * square / max(rows, 1.0), SMALLEST_UNIT), LARGEST_UNIT)
 
@@ -159,7 +160,7 @@ def late_square(m: Memory) -> float:
 def _better_square(m: Memory, s: int) -> float:
     """Return the mean square of the residuals over their variances, up to a step or after it, the smaller.
 
-    s: its slot.
+    s: index at which the step is stored.
     """
     own = m.fit_check
     early = own.steps_square[s] / max(own.steps_rows[s], 1.0)
@@ -240,7 +241,7 @@ def last_unsteady_step(m: Memory) -> int:
 def changed_share(m: Memory, s: int) -> float:
     """Return the squared `distance` of a step from the whole fit over its limit; over 1: the fit has changed since.
 
-    s: slot of the step.
+    s: index at which the step is stored.
     """
     return float(distance(m, s) / (STEADY * max(_better_square(m, s), SMALLEST_SQUARE)))
 
@@ -249,7 +250,8 @@ def changed_share(m: Memory, s: int) -> float:
 def later_share(k: Constants, m: Memory, s: int) -> float:
     """Return the largest torque on the kept samples between the fit and the model after a step, over its limit.
 
-    s: slot of the step. Over 1: the samples after it contradict the fit. inf if they determine no model.
+    s: index at which the step is stored. Over 1: the samples after it contradict the fit. inf if they determine no
+    model.
     """
     own = m.fit_check
     if not find_later(m, s):
@@ -281,8 +283,8 @@ def better_rms(m: Memory) -> float:
 def distance(m: Memory, s: int) -> float:
     """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of step s and the fit; inf if P_0 - P has no factor.
 
-    s: slot of the step, of belief theta_0, P_0. Leave the Cholesky factor of P_0 - P in `factor`, scaled by the square
-    roots of P_0's diagonal, and in `apart` the vector whose square is the result.
+    s: index at which the step is stored, with belief theta_0, P_0. Leave the Cholesky factor of P_0 - P in `factor`,
+    scaled by the square roots of P_0's diagonal, and in `apart` the vector whose square is the result.
     """
     own = m.fit_check
     P_0, P, L, x = own.steps_P[s], m.models.P_belief, own.factor, own.apart
@@ -301,7 +303,8 @@ def distance(m: Memory, s: int) -> float:
 def find_later(m: Memory, s: int) -> bool:
     """Fill `later` (p,): parameters of the samples after step s less those of the fit.
 
-    Return False, and keep `later`, if the `distance` is inf. s: slot of the step. Overwrites `factor` and `apart`.
+    Return False, and keep `later`, if the `distance` is inf. s: index at which the step is stored. Overwrites `factor`
+    and `apart`.
     """
     own = m.fit_check
     if not distance(m, s) < np.inf:

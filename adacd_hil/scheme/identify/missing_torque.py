@@ -82,7 +82,7 @@ def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
     """Advance the filtered columns X (n, PLACE_TERMS) over one period, by the filter `LEARNT` and the pole behind it.
 
     is_seen: False after a gap, when that filter keeps its values. rates (3,): its coefficients for one period, see
-    `torque_filter.FirstOrderHold`; smoothing: of the pole.
+    `torque_filter.FirstOrderHold`; smoothing: share of the pole's old output that stays after one period.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]
     X, X_old, X_f, X_learnt = m.regressor.X, m.missing_torque.X_old, m.missing_torque.X_f, m.missing_torque.X_learnt
@@ -96,7 +96,10 @@ def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
 
 @compiled
 def keep_columns(m: Memory, slot: int) -> None:
-    """Put the filtered columns of this sample into a slot of the ring, where they wait with the sample's regressor."""
+    """Put the filtered columns of this sample into the ring, where they wait with the sample's regressor.
+
+    slot: index in the ring.
+    """
     m.missing_torque.ring_X[slot] = m.missing_torque.X_learnt
 
 
@@ -125,9 +128,9 @@ def _clear_sums(m: Memory) -> None:
 
 @compiled
 def add(k: Constants, m: Memory, slot: int, joint: int) -> None:
-    """Add a joint's row, which the belief learns now from a slot of the ring, to the sums.
+    """Add to the sums a joint's row that the belief learns now from the ring; skip it if the joint was slow or at rest.
 
-    Skip the row if the joint was slow or at rest. joint: from 0.
+    slot: index in the ring. joint: from 0.
     """
     own = m.missing_torque
     if m.ring.still[slot, joint] > STILL:

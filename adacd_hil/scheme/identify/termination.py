@@ -40,7 +40,7 @@ def is_quiet(tau_ext_hat: Vector, beta_Nm: float) -> bool:
 
 @compiled
 def begin_fit(m: Memory) -> None:
-    """Clear the evidence of the fit before in the certified scheme: motion, excitation, condition."""
+    """Clear the evidence that the fit is complete, as a new one begins: motion, excitation, condition."""
     begin(m.motion)
     m.fit.excitation = 0.0
     m.fit.condition = np.inf
@@ -182,6 +182,6 @@ _MOTIONS = {
 
 
 def _motion_for(name: str) -> str:
-    """Return the text of a motion by which the parameter `name` is learnt."""
+    """Return the text of a motion by which the parameter `name` is learnt, such as "accelerate joint 2 harder"."""
     found = (text for key, text in _MOTIONS.items() if name.startswith(key))
     return next(found, "move joint {} slowly, and with dwells").format(name[-1])

@@ -101,7 +101,10 @@ def begin_test(constants: Structured, memory: Structured) -> None:
 
 @compiled
 def begin_refinement(constants: Structured, memory: Structured) -> None:
-    """Store the model in use as certified, begin to test candidates, and drop kept beliefs and missing torque."""
+    """Store the model in use as certified, and begin to test candidates for a better one.
+
+    Drop the beliefs kept from before a touch, and the evidence of a torque that the model lacks.
+    """
     k, m = constants[0], memory[0]
     belief.certify(k, m)
     refinement.begin(m)
@@ -148,7 +151,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
 
 @compiled
 def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
-    """Advance the bank to this sample, missing samples interpolated, and fill the torques of the block.
+    """Advance all filters to this sample, missing samples interpolated, and fill the torques of the block.
 
     steps: periods since the fresh sample before. Return False after a gap, when the filters resume from the sample; a
     moving arm then doesn't learn for `settle_cycles`.
@@ -193,7 +196,7 @@ def _take_sample(
     is_seen: bool,
     tau_ext_wide_hat: Vector,
 ) -> None:
-    """Advance the bank by one period to a sample, and compare it with the model in use.
+    """Advance all filters by one period to a sample, and compare it with the model in use.
 
     is_seen: False after a gap: the filters resume from the sample. Fill tau_ext_wide_hat (2,), and the residuals,
     channels, standstill, velocity noise and friction at rest of `m`.

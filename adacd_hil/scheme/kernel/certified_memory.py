@@ -35,9 +35,10 @@ LEAST_PLACES = 32
 
 
 def parameter_names(settings: Settings) -> tuple[str, ...]:
-    """Return the names of all parameters of the certified scheme, in order.
+    """Return the names of all parameters of the certified scheme (p,), in the order of its theta.
 
-    The dynamic ones, then offsets, lags, further friction.
+    The dynamic ones, then offsets, lags, further friction; then, where the settings have them, cross-talk and the
+    torque that depends on the position.
     """
     return settings.estimator.parameter_names + settings.further_names
 
@@ -112,7 +113,10 @@ def _payload_rest_std_of(settings: Settings, count: int) -> Vector:
 
 
 def constants_of(settings: Settings) -> Structured:
-    """Return the constants (1,) of the certified scheme's compiled step."""
+    """Return the settings of the certified scheme's compiled step, converted to cycles, coefficients and vectors.
+
+    As a structured array (1,) with the fields of `Constants`.
+    """
     certified, names = settings.certified, parameter_names(settings)
     period_s = settings.bus.period_s
     cutoff = np.array(certified.cutoffs_rad_s)
@@ -237,7 +241,7 @@ def new_memory(settings: Settings) -> Structured:
 
 
 def new_block(settings: Settings) -> Structured:
-    """Return a block before the first sample: zeros, and infinite thresholds."""
+    """Return the values that a cycle fills and logs (1,), before the first sample: zeros, infinite thresholds."""
     base = len(settings.estimator.parameter_names)
     further = len(parameter_names(settings)) - base
     block = zeros_of(CertifiedBlock, block_sizes(base, further, settings.channel_count))
@@ -247,6 +251,6 @@ def new_block(settings: Settings) -> Structured:
 
 
 def numbers_of(settings: Settings) -> Numbers:
-    """Return new arrays of the kernel for one run, as they are before the first sample."""
+    """Return new constants, memory and block of the kernel for one run, as they are before the first sample."""
     block = new_block(settings)
     return Numbers(constants_of(settings), new_memory(settings), block, block.view(np.float64))

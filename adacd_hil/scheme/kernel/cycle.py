@@ -100,7 +100,7 @@ _PAPER_MODE[[SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED]] = pap
 
 
 def new_course(settings: Settings) -> tuple[Structured, Structured]:
-    """Return constants and memory (1,) of the supervisor and of the contact's course, before the first cycle."""
+    """Return constants and memory (1,) of supervisor, contact reports and reactions, before the first cycle."""
     constants, memory = zeros_of(RunConstants, _SIZES), zeros_of(RunMemory, _SIZES)
     k: RunConstants = constants[0]
     m: RunMemory = memory[0]
@@ -180,7 +180,7 @@ def end_certified(
     course_memory: Structured,
     rows: Vector,
 ) -> int:
-    """Advance the contact's course and fill the decision at the end of a cycle of the certified scheme.
+    """End a cycle of the certified scheme: follow the contact's reports and reaction, and fill the decision.
 
     Return bits of further tasks for Python, REPORT to PUSHED. place: index of the cycle.
     """
@@ -253,7 +253,7 @@ def end_paper(
     course_constants: Structured,
     course_memory: Structured,
 ) -> int:
-    """Advance the contact's course and fill the decision at the end of a cycle of the paper's scheme.
+    """End a cycle of the paper's scheme: follow the contact's reports and reaction, and fill the decision.
 
     Return REPORT if a report is due, else 0. place: index of the cycle.
     """
@@ -291,7 +291,11 @@ def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, deci
 def follow_contact(
     k: RunConstants, m: RunMemory, sample: Sample, decision: Decision, tau_ext_hat: Vector, tau_ext: Vector
 ) -> int:
-    """Advance the contact's course by one cycle, and fill the decision; return REPORT if a report is due, else 0."""
+    """Follow a contact's reports and reaction by one cycle, and fill the decision; return REPORT if a report is due.
+
+    Else return 0. tau_ext_hat (2,): for the reaction; tau_ext (2,): gives the direction of a joint when it crosses its
+    threshold.
+    """
     is_due = course.follow(
         k.contact,
         m.contact,

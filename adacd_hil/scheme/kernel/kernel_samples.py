@@ -84,10 +84,10 @@ def limits_of(settings: Settings) -> Limits:
 
 @compiled
 def observe(limits: Limits, nominal_s: float, block: Structured, steps: int, too_fast: int) -> int:
-    """Return the findings of q, dq, tau_J as bits of an observation, with UNSEEN set.
+    """Return the findings of the block's q, dq, tau_J as bits: finite or not, within limits or not, at rest, unloaded.
 
-    Replace a period_s of 0 in the block by `steps` nominal periods. steps: periods since the fresh sample before it.
-    too_fast: the bit of a joint beyond its velocity limit.
+    UNSEEN is always set. Replace a period_s of 0 in the block by `steps` nominal periods. steps: periods since the
+    fresh sample before it. too_fast: the bit of a joint beyond its velocity limit.
     """
     out: SchemeBlock = block[0]
     if out.period_s == 0.0:

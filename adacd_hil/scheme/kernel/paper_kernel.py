@@ -112,7 +112,10 @@ class PaperConstants:
 
 
 def constants_of(settings: Settings) -> Structured:
-    """Return the constants (1,) of the paper's compiled step."""
+    """Return the settings of the paper's compiled step, converted to cycles, coefficients and vectors.
+
+    As a structured array (1,) with the fields of `PaperConstants`.
+    """
     count = len(settings.estimator.parameter_names)
     period_s = settings.bus.period_s
     hold = torque_filter.first_order_hold(settings.filter.a_rad_s, settings.filter.b_rad_s, period_s)
@@ -153,14 +156,14 @@ def new_memory(parameter_count: int) -> Structured:
 
 
 def new_block(parameter_count: int) -> Structured:
-    """Return a block before the first sample: zeros, and infinite thresholds."""
+    """Return the values that a cycle fills and logs (1,), before the first sample: zeros, infinite thresholds."""
     block = zeros_of(SchemeBlock, block_sizes(parameter_count))
     block["threshold"] = np.inf
     return block
 
 
 def numbers_of(settings: Settings) -> Numbers:
-    """Return new arrays of the kernel for one run, as they are before the first sample."""
+    """Return new constants, memory and block of the kernel for one run, as they are before the first sample."""
     count = len(settings.estimator.parameter_names)
     block = new_block(count)
     return Numbers(constants_of(settings), new_memory(count), block, block.view(np.float64))
@@ -257,7 +260,7 @@ def _advance(
     hold: torque_filter.FirstOrderHold,
     tau_f: Vector,
 ) -> None:
-    """Advance the filters by one period to a sample."""
+    """Advance the filters of torque and regressor by one period to a sample; fill tau_f (2,), and W_f of `m`."""
     a, b = c.a_rad_s, c.b_rad_s
     regressor.fill_momentum(q, dq, m.Y_p)
     regressor.fill_remainder(q, dq, c.level_rad, m.Y_h)
@@ -267,7 +270,10 @@ def _advance(
 
 @compiled
 def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: SchemeBlock) -> None:
-    """Fill the torques predicted by the estimate and by the CAD model, and the external torques by these."""
+    """Fill the torques predicted by the estimate and by the CAD model, and the external torques by these.
+
+    Update each joint's share of standstill first; decay: the share of its old value that stays.
+    """
     external_torque.follow_standstill(dq, c.standstill_rad_s, decay, m.standstill)
     external_torque.predict(m.W_f, out.theta_hat, out.tau_f_hat)
     external_torque.predict(m.W_f, c.theta_cad, out.tau_f_cad)

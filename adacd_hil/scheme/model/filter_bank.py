@@ -165,7 +165,10 @@ def fill_cross_talk(tau_f: Vector, first_column: int, W_f: Vector) -> None:
 
 @compiled
 def smooth_learnt(smoothing: float, W_f: Vector, tau_f: Vector, W_learnt: Vector, tau_learnt: Vector) -> None:
-    """Advance the learnt signals, W_learnt (n, p) and tau_learnt (n,), over one period behind the filter `LEARNT`."""
+    """Advance the learnt signals, W_learnt (n, p) and tau_learnt (n,), over one period behind the filter `LEARNT`.
+
+    smoothing: share of the old value that stays; 0 passes W_f and tau_f of that filter unchanged.
+    """
     for i in range(tau_learnt.shape[0]):
         tau_learnt[i] = tau_f[LEARNT, i] + smoothing * (tau_learnt[i] - tau_f[LEARNT, i])
         for j in range(W_learnt.shape[1]):
@@ -184,10 +187,10 @@ def estimate_external(tau_f: Vector, W_f: Vector, theta: Vector, tau_ext_hat: Ve
 def smooth(smoothing: float, r: Vector, y: Vector) -> None:
     """Advance the channels y (2 C - 1, n) by one period: r (C, n) through a second low-pass, then copies of r[1:].
 
-    smoothing: that low-pass's factor for one period. The drive's velocity noise rises with frequency up to the
-    bandwidth of its tracking loop. A first-order filter passes it on through the momentum undiminished; a second pole
-    takes it away, for a few milliseconds of a small step's detection. A large step is detected in the bare residual
-    first.
+    smoothing: share of the old value that stays after one period; 0 passes r unchanged. The drive's velocity noise
+    rises with frequency up to the bandwidth of its tracking loop. A first-order filter passes it on through the
+    momentum undiminished; a second pole takes it away, for a few milliseconds of a small step's detection. A large step
+    is detected in the bare residual first.
     """
     count = r.shape[0]
     for c in range(count):

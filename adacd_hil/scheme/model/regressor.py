@@ -112,9 +112,9 @@ SLOW_RAD_S = 0.02
 
 @compiled
 def fill(k: Constants, m: Memory, q: Vector, dq: Vector, tau_J: Vector, period_s: float) -> None:
-    """Fill the regressor's memory for a sample: Y_p, Y_h (n, p) with all terms, X, and M (n, n) of the model in use.
+    """Fill the regressor of a sample in `m`: Y_p, Y_h (n, p) with all terms, and X, the columns of torque by position.
 
-    Advance the bristles by period_s.
+    Fill M (n, n), the mass matrix of the model in use. Advance the friction's bristles by period_s.
     """
     own = m.regressor
     base, first_coulomb, count = int(k.first_offset), int(k.first_coulomb), q.shape[0]

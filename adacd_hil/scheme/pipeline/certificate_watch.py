@@ -192,7 +192,10 @@ class CertificateWatch:
         return CommonCause("; ".join(self._describe(int(self._m.certificate.withheld_by))), is_payload=False)
 
     def _describe(self, cause: int) -> list[str]:
-        """Return the lines of a contradiction. cause: its number in `certificate`."""
+        """Return the lines of a contradiction: the quantities that contradict each other, with their bounds.
+
+        cause: its number in `certificate`.
+        """
         k, m = self._k, self._m
         match cause:
             case certificate.READING | certificate.ANCHOR:

@@ -169,7 +169,8 @@ class CertifiedPipeline(Pipeline):
         """Store the beginning or end of a contact in MONITOR; stop the arm if contacts have a common cause.
 
         Return the state after that. A common cause takes the certificate back, unless the reaction lets the arm go on.
-        Without a common cause report a contact that followed soon on another.
+        Without a common cause report a contact that followed soon on another. is_touched: a joint is over its threshold
+        in this cycle.
         """
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
             is_contradicted = self._course.supervisor.cause == SchemeEvent.CONTRADICTED

@@ -161,7 +161,7 @@ class SupervisorMemory:
 
 
 def fill_constants(settings: Settings, k: SupervisorConstants) -> None:
-    """Fill the supervisor's constants from the settings."""
+    """Fill `k` in place with the limits and waiting times of the settings, in cycles or periods."""
     period_s, safety = settings.bus.period_s, settings.safety
     k.has_gravity = settings.estimator.gravity
     k.max_age_cycles = settings.bus.max_age_cycles
@@ -354,7 +354,10 @@ def _touch(m: SupervisorMemory, arm: Sample, observation: int) -> int:
 def _progress(
     k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_reporting: bool, goes_on: bool
 ) -> int:
-    """Return the event other than fault and contact that ends the state in this cycle, or NONE."""
+    """Return the event other than fault and contact that ends the state in this cycle, or NONE.
+
+    observation: bits of the findings. is_reporting, goes_on: as of `supervise`.
+    """
     state = m.state
     event: int = SchemeEvent.NONE
     is_still = m.still_cycles >= k.rest_cycles
@@ -381,8 +384,8 @@ def _progress(
 def _released(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int, is_still: bool) -> int:
     """Return the event by which the user's request ends STOPPED in this cycle, or NONE.
 
-    No request does while the host is late. A changed payload and RELEARN need an arm at rest, an acknowledgement joints
-    below their thresholds.
+    No request does while the host is late. A changed payload and RELEARN need an arm at rest (is_still), an
+    acknowledgement joints below their thresholds.
     """
     event: int = SchemeEvent.NONE
     is_late = arm.is_late != 0
@@ -414,7 +417,7 @@ def _verdict(state: int, observation: int) -> int:
 
 @compiled
 def _begun(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> int:
-    """Return the event that ends a phase before the drives are enabled in this cycle, or 0."""
+    """Return the event that ends INIT, COMMISSION or ENABLE in this cycle, or NONE."""
     state = m.state
     event: int = SchemeEvent.NONE
     if state == SchemeState.INIT and arm.is_complete != 0:
@@ -432,8 +435,8 @@ def _begun(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
 def _settled(k: SupervisorConstants, m: SupervisorMemory, is_still: bool, goes_on: bool) -> int:
     """Return the event that ends REACT in this cycle, or NONE.
 
-    AT_REST if the contact is latched and the arm at rest. CLEARED if it isn't latched, `clear_cycles` in a row were
-    without contact, and the arm is at rest or its reaction lets it go on.
+    AT_REST if the contact is latched and the arm at rest (is_still). CLEARED if it isn't latched, `clear_cycles` in a
+    row were without contact, and the arm is at rest or its reaction lets it go on (goes_on).
     """
     event: int = SchemeEvent.NONE
     if m.is_latched != 0:
@@ -470,7 +473,11 @@ def _overdue(k: SupervisorConstants, m: SupervisorMemory) -> int:
 
 @compiled
 def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> int:
-    """Return the first fault in this cycle's data, limits, drives or timing, or NONE."""
+    """Return the first fault in this cycle, or NONE.
+
+    In this order: the arm's own, a value that isn't a number, a late host, old data, no new sample for too long,
+    position or speed over a limit, drives that aren't enabled.
+    """
     state = m.state
     fault: int = FaultReason.NONE
     is_thrown = state == SchemeState.REACT and m.phase_periods <= k.rebound_cycles

@@ -127,7 +127,7 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, int]] = MappingProx
 
 
 def _numbered() -> NDArray[np.int64]:
-    """Return the table as numbers (states, events): the next state, STAYS or TO_ORIGIN."""
+    """Return `TRANSITIONS` as numbers (states, events): the next state, STAYS or TO_ORIGIN."""
     table = np.full((len(SchemeState), len(SchemeEvent)), STAYS)
     for state, row in TRANSITIONS.items():
         for event, following in row.items():
