@@ -32,7 +32,7 @@ SHORTEST_APPROACH_S = 0.6
 PARK_SETTLE_S = 0.3
 """How long a parked arm settles before its drives are disabled: three periods of joint 2's swing with 1 kg, 0.1 s."""
 AT_CORNER_RAD = 1e-3
-"""Distance below which the arm counts as in the corner: a fifth of a degree, ten times the encoder noise."""
+"""Distance below which the arm counts as in the corner: ten times the encoder noise."""
 THROWN_S = 0.15
 """Time after a contact in which a blow may push the arm off its path: 5 times a blow against a chest."""
 THROWN_rad_s = 0.2

@@ -175,7 +175,7 @@ class _Player:
         self._cycles |= zip(times, ticks.cycle[batch.contact_places].tolist(), strict=True)
         logged = [event for event in part.events if ticks.t_ns[0] <= event.t_ns <= ticks.t_ns[-1]]
         replayed = [event for event in events if event.name in part.said]
-        self.comparison.compare_events(logged, replayed, int(ticks.cycle[0]))
+        self.comparison.compare_events(logged, replayed, ticks)
 
     def _begin(self) -> None:
         """Begin an attempt: a new pipeline in INIT, and a new attempt of the script."""

@@ -200,16 +200,18 @@ class SchemeComparison:
         is_real = isinstance(logged, float) and math.isfinite(logged) and math.isfinite(replayed)
         return is_real and abs(logged - replayed) <= self._tolerance * max(1.0, abs(logged))
 
-    def compare_events(self, logged: Sequence[LoggedEvent], replayed: Sequence[Event], cycle: int) -> None:
+    def compare_events(self, logged: Sequence[LoggedEvent], replayed: Sequence[Event], ticks: Ticks) -> None:
         """Compare the scheme's own events of a stretch, logged and replayed, pair by pair in the order of time.
 
-        Count and keep the mismatches; an event without a counterpart is one. cycle: the stretch's first.
+        Count and keep the mismatches; an event without a counterpart is one. ticks: of the stretch. A mismatch has the
+        cycle of the logged event; without one the stretch's first, as a replayed event has no time.
         """
         for theirs, ours in itertools.zip_longest(logged, replayed):
             if theirs is not None and theirs.event == ours:
                 continue
             name = ours.name if theirs is None else theirs.event.name
-            t_ns = 0 if theirs is None else theirs.t_ns
+            row = 0 if theirs is None else int(np.searchsorted(ticks.t_ns, theirs.t_ns, "right")) - 1
+            cycle, t_ns = int(ticks.cycle[row]), int(ticks.t_ns[row])
             logged_text, replayed_text = _event_text(theirs and theirs.event), _event_text(ours)
             self.add_mismatch(Mismatch(EVENTS.name, name, "", cycle, t_ns, logged_text, replayed_text))
 
