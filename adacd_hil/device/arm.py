@@ -98,8 +98,8 @@ class Arm:
     def synchronise(self, cycle: int, t_ns: int, periods: int) -> None:
         """Begin a cycle: send SYNC, unless another host sends it, then the pipelined commands of `send_command`.
 
-        Before, count a miss of each device whose frame the ending cycle lacks. `cycle`, `t_ns`: of this SYNC.
-        `periods`: since the SYNC before. Raises BusError.
+        First, count a miss of each device whose frame the ending cycle lacks. `cycle`, `t_ns`: number and time of this
+        SYNC. `periods`: since the previous SYNC. Raises BusError if the bus refuses a frame.
         """
         if self._cycle >= 0:
             if not self.has_all_frames:
@@ -320,6 +320,7 @@ class Arm:
     def _device_fault(self, is_enabled: bool) -> FaultReason:
         """Return the arm's first fault, NONE without one, and store whether the drives have been enabled.
 
+        is_enabled: both drives are enabled now.
         In order: DRIVE if the drives are no longer enabled; a sensor's or drive's own fault; DRIVE or SENSOR for a kept
         EMCY; FOREIGN_FRAMES for another sender.
         """
@@ -338,7 +339,8 @@ class Arm:
     def send_command(self, command: ArmCommand) -> None:
         """Send the commands of this cycle, to act at the next SYNC; if pipelined, keep them until then.
 
-        Commands that were kept for longer than the age limit of a value are sent without torque. Raises BusError.
+        Commands that were kept for longer than `bus.max_age_cycles` are sent without torque. Raises BusError if the bus
+        refuses a frame.
         """
         values = command.tau_c.tolist(), command.enable, command.quick_stop
         if self._is_pipelined:
@@ -347,7 +349,11 @@ class Arm:
             self._bus.send_all(self._encode(*values))
 
     def _encode(self, tau_c: list[float], enable: bool, quick_stop: bool) -> tuple[tuple[int, bytes], ...]:
-        """Return (identifier, data) of both drives' commands for `tau_c`, Nm; each call advances the alive counters."""
+        """Return (identifier, data) of both drives' commands; each call advances the alive counters.
+
+        tau_c: of each joint, Nm. enable: go one state nearer to Operation enabled, else disable voltage. quick_stop:
+        has precedence over enable.
+        """
         (drive1, drive2), (ratio1, ratio2), (tau1, tau2) = self.drives, self._permille_per_Nm, tau_c
         return (
             (drive1.command_id, drive1.command(round(tau1 * ratio1), enable, quick_stop)),
@@ -355,7 +361,7 @@ class Arm:
         )
 
     def frame_checks(self) -> FrameChecks:
-        """Return each device's counts so far: of end-to-end statuses, missing frames too, and frames not plausible."""
+        """Return each device's counts so far: frames by end-to-end status, missing and implausible frames."""
         return FrameChecks(
             self._cycle,
             tuple(tuple(device.end_to_end.counts) for device in self.devices),

@@ -24,7 +24,7 @@ from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 
 
 class Recurrence:
-    """Recurs every so many cycles, from the first cycle on; if its cycle is skipped, in the next cycle."""
+    """When an action is due: every so many cycles, from the first on; if its cycle is skipped, in the next one."""
 
     def __init__(self, interval_s: float, period_s: float) -> None:
         self._cycles = max(1, round(interval_s / period_s))
@@ -76,7 +76,7 @@ class RateLimitedEvents(EventSource):
         self.events.append(event._replace(message=f"{event.message} (and {more} before)") if more else event)
 
     def is_due(self, kind: Hashable, t_ns: int) -> bool:
-        """Return whether an event of a kind would be reported at once."""
+        """Return whether `report` would report an event of a kind now: none was reported within the last second."""
         said_ns = self._said_ns.get(kind)
         return said_ns is None or t_ns - said_ns >= REPEAT_NS
 
@@ -92,7 +92,7 @@ class ArmWatch:
     """
 
     def __init__(self, settings: Settings, watch: Callable[[int], list[str]]) -> None:
-        """`watch` returns the heartbeat failures at a time in ns, one line each."""
+        """`watch`: returns the failures of the devices' heartbeats at a time in ns, one line each."""
         self.lost: list[str] = []
         self.deadline = DeadlineWatch(settings)
         self._watch = watch
@@ -135,7 +135,10 @@ class HeartbeatWatch:
     """Follows the heartbeats of some nodes, while they should be operational."""
 
     def __init__(self, nodes: Iterable[tuple[str, int]], period_ms: int, report: Callable[[Event], None]) -> None:
-        """`nodes`: name and node id. `report` gets an event when a node falls out and when it is back."""
+        """`nodes`: name and node id. `period_ms`: of their heartbeats.
+
+        `report` gets an event when a node falls silent or leaves OPERATIONAL, and when it is back.
+        """
         self._nodes = {HEARTBEAT_ID + node_id: _WatchedNode(name, node_id) for name, node_id in nodes}
         self._patience_ns = round(PATIENCE_PERIODS * period_ms * 1_000_000)
         self._report = report
