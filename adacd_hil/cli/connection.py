@@ -29,7 +29,7 @@ from adacd_hil.wire.open_bus import open_bus
 
 
 def make_clock(name: str) -> Clock:
-    """Return the clock of a run: modelled time for `lockstep`, else the system's monotonic clock."""
+    """Return the clock of a run: a new one of modelled time for `lockstep`, else the system's monotonic clock."""
     return VirtualClock() if name == "lockstep" else MonotonicClock()
 
 
@@ -46,7 +46,10 @@ def check_clock(name: str, interface: str, channel: str) -> None:
 
 
 def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
-    """Raise CommandError if the channel may be hardware: there a person must acknowledge, not a scenario's user."""
+    """Raise CommandError if the channel may be hardware: there a person must acknowledge, not a scenario's user.
+
+    scenario: its name, for the error.
+    """
     if may_be_hardware(interface, channel):
         raise CommandError(
             f"--scenario {in_line(scenario)} plays the user of an emulated arm; {interface} {channel} may be hardware: "
@@ -199,7 +202,7 @@ class Connection:
 
     @contextmanager
     def bus(self, clock: Clock, is_fd: bool) -> Iterator[Bus]:
-        """Open the bus without a filter, yield it, and close it after the block.
+        """Open the bus, yield it, and close it after the block. It receives all identifiers; is_fd: CAN FD frames, too.
 
         Raises BusMissingError if it can't be opened. A BusError in the block becomes a CommandError with the exit
         status BUS_MISSING: no drive has been enabled.

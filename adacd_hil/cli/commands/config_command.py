@@ -124,7 +124,7 @@ def docs(keys: tuple[str, ...], as_json: bool) -> ExitCode:
 
 
 def _list_groups(as_json: bool) -> None:
-    """Print the groups of settings: name, number of keys, meaning."""
+    """Print the groups of settings: name, number of keys, meaning; `as_json`: as JSON, else as a table."""
     from adacd_hil.settings.setting_keys import keys_of, sections
 
     groups: list[dict[str, Any]] = [
