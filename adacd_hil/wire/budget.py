@@ -50,7 +50,7 @@ class Stream(NamedTuple):
     interval_ns: int
 
     def arrivals(self, window_ns: int) -> int:
-        """Return the most frames that can be queued within a window: ceil(window / T)."""
+        """Return the most frames that can be queued within a window: ceil(window_ns / interval_ns)."""
         return -(-window_ns // self.interval_ns)
 
 
@@ -148,7 +148,10 @@ class Trigger(Enum):
 
 @dataclass(frozen=True)
 class FrameBudget:
-    """Identifier, bits, durations, deadline and response times of a message; deadline None: it has none."""
+    """Identifier, bits, durations, deadline and response times of a message; deadline None: it has none.
+
+    length: bytes of data. unstuffed, worst: bits without stuff bits, and with the most; duration_ns: of the latter.
+    """
 
     name: str
     can_id: int
@@ -215,12 +218,12 @@ class Budget:
 
     @property
     def unstuffed_bits(self) -> int:
-        """Bits of a cycle's frames without stuff bits, at both rates."""
+        """Number of bits of a cycle's frames without stuff bits, those at both bit rates added up."""
         return sum(entry.unstuffed.total for entry in self.cyclic)
 
     @property
     def worst_bits(self) -> int:
-        """Bits of a cycle's frames with the most stuff bits, at both rates."""
+        """Number of bits of a cycle's frames with the most stuff bits, those at both bit rates added up."""
         return sum(entry.worst.total for entry in self.cyclic)
 
     @property

@@ -117,7 +117,8 @@ def _in_order(message: Message) -> list[Signal]:
 def _lay_out(message: Message) -> tuple[SignalCodec, ...]:
     """Return the signals, placed in containers on byte borders that cover the frame without gaps.
 
-    Raises CodecError for a layout that the module's text excludes, with the signal's name.
+    Raises CodecError, with the signal's name, for any other than little-endian integers of 8, 16, 32 or 64 bits on byte
+    borders and bit fields within one byte, and for overlaps and gaps.
     """
     end_bit = 0
     containers = 0
@@ -195,8 +196,8 @@ def load_codec(path: Path | None = None) -> Codec:
 def parse_codec(text: bytes, path: Path) -> Codec:
     """Return the codec of the text of a DBC; `path`: its file, existing or not.
 
-    Raises CodecError, with `path` first, as `parse_database`; for a WireVersion that is missing or no number, for two
-    messages with the same name or identifier, and for a message of a length, layout or protection that no contract has.
+    Raises CodecError, with `path` first, for a text that isn't a DBC, a WireVersion that is missing or no number, two
+    messages with the same name or identifier, and a message of a length, layout or protection that no contract has.
     """
     database = parse_database(text, path)
     try:

@@ -128,7 +128,7 @@ class E2eProfile:
 
     @property
     def signals(self) -> tuple[tuple[str, int], ...]:
-        """Names of the header's signals with their numbers of bits, in order."""
+        """Names of the header's signals with their numbers of bits, from the frame's bit 0 on."""
         return ("e2e_crc", self.crc_bits), ("e2e_counter", self.counter_bits), ("e2e_status", self.status_bits)
 
     @property
@@ -212,7 +212,7 @@ class E2eReceiver:
         return list(zip(E2eStatus, self.counts, strict=True))
 
     def restart_sequence(self) -> None:
-        """Forget the sequence of the counter; these frames have none. The counts stay."""
+        """Do nothing: these frames have no counter; `ProtectedReceiver` forgets the sequence of its counter here."""
 
     def _judge(self, frame: bytes) -> E2eStatus:  # noqa: ARG002
         return E2eStatus.OK

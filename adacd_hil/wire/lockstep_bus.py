@@ -209,7 +209,7 @@ class LockstepBus(Bus):
     def _transmit_next(self, limit_ns: int) -> bool:
         """Transmit the next waiting frame of host or devices that starts before `limit_ns`; return False without one.
 
-        Before, the devices are asked for frames up to its start if they haven't lived that long yet.
+        If the devices' time is not yet at its start, they are first asked for frames up to then.
         """
         queue = self._queue
         if not self._offered:
@@ -323,7 +323,7 @@ class LockstepBus(Bus):
             frame = self._receive()
 
     def _receive(self, timeout_s: float | None = None) -> Frame | None:
-        """Return the next frame of the bus behind; None after `timeout_s` without a frame (default: the patience)."""
+        """Return the next frame of the bus behind; None after `timeout_s` (default: `patience_s`) without a frame."""
         if self._ahead:
             return self._ahead.popleft()
         return self._bus.receive(self._patience_s if timeout_s is None else timeout_s)
@@ -363,14 +363,17 @@ class LockstepBus(Bus):
         self._offered.append((frame.can_id, self._count, t_ns, frame.data))
 
     def _is_cyclic(self, t_ns: int) -> bool:
-        """Return whether the last SYNC is so recent at a time, `_CYCLIC_PERIODS`, that the devices live by SYNC."""
+        """Return whether a time is within `_CYCLIC_PERIODS` of the last SYNC.
+
+        Then the devices' time advances by SYNC; later by ADVANCE.
+        """
         return t_ns - self.sync_ns < _CYCLIC_PERIODS * self._period_ns
 
     def _let_pass(self, limit_ns: int) -> bool:
         """Ask the devices to let time pass up to `limit_ns`; return False if no frame can come before.
 
-        Devices that send no marks are waited for by the wall clock. Return False at once within `_CYCLIC_PERIODS` of a
-        SYNC, in which the devices live by SYNC.
+        Devices that send no marks are waited for by the wall clock. Return False at once while `_is_cyclic`: then time
+        passes for the devices by SYNC alone.
         """
         now_ns = self._clock.now_ns()
         if self._is_cyclic(now_ns):
