@@ -85,7 +85,7 @@ class AnswerClock:
     def _is_newer(self, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
         """Return whether a second frame after one SYNC, without counter, answers it, so that the first one was late.
 
-        offset_ns, position_error: as of `find`. By the time after SYNC, and the position if that is given.
+        By its time after SYNC, offset_ns, and, if given, the position: position_error, as of `find`.
         """
         if not self._is_usual(offset_ns):
             return False
@@ -129,7 +129,8 @@ class AnswerClock:
     def set_answered(self, ordinal: int, newest: int, offset_ns: int, is_counted: bool) -> None:
         """Set `ordinal` as the last answered SYNC; learn the device's usual time to an answer from one that is in time.
 
-        newest, offset_ns: as of `find`. is_counted: whether the frame has a counter.
+        newest: ordinal of the last SYNC before the answer, which came offset_ns after it. is_counted: whether the frame
+        has a counter.
         """
         before, self.answered = self.answered, ordinal
         if before is not None and ordinal > before:

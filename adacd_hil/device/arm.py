@@ -132,7 +132,7 @@ class Arm:
                 device.miss()
 
     def _remember_gaps(self) -> None:
-        """Shift each device's `gaps`; store in bit 0 whether the ending cycle had no usable frame of it."""
+        """Shift each device's bits in `gaps` by one; set bit 0 if the ending cycle had no usable frame of it."""
         for place, gaps in enumerate(self.gaps):
             self.gaps[place] = (gaps << 1 | ~self.received >> place & 1) & REMEMBERED_GAPS
         self._has_gaps = any(self.gaps)
@@ -199,7 +199,8 @@ class Arm:
     def _find(self, place: int, newest: int, offset_ns: int, step: int | None, data: bytes) -> int | None:
         """Return the ordinal of the SYNC that a frame answers; None if all SYNCs up to `newest` are answered already.
 
-        `newest`, `offset_ns`, `step`: as of `AnswerClock.find`.
+        `place`: index of its device. `newest`: ordinal of the last SYNC before the frame, which came `offset_ns` after
+        it. `step`: advance of its alive counter, None without one.
         """
         if place >= JOINTS:
             return self._clocks[place].find(newest, offset_ns, step)

@@ -99,9 +99,10 @@ class ArmWatch:
         self._looks = Recurrence(_LOOKS * settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Return the arm's state with fault HEARTBEAT if a device's heartbeat fails; else as `DeadlineWatch.judge`.
+        """Return the arm's state with fault HEARTBEAT if a device's heartbeat fails, then as of `DeadlineWatch.judge`.
 
-        A fault that is set already stays. `lost` is updated every `_LOOKS` of a heartbeat period.
+        A fault that is set already stays. `lost` is updated every `_LOOKS` of a heartbeat period. Call it once per
+        cycle.
         """
         if self._looks.take_turn(arm.cycle):
             self.lost = self._watch(arm.t_ns)
@@ -173,7 +174,7 @@ class HeartbeatWatch:
     def judge_nodes(self, t_ns: int) -> list[str]:
         """Return a line per node that fails now; empty if all are well or the watch is stopped.
 
-        Report an event for each node whose failure is new, another than before, or over.
+        Report an event for each node whose failure is new, another than at the last call, or over.
         """
         if not self._is_watching:
             return []
@@ -187,7 +188,7 @@ class HeartbeatWatch:
         return lines
 
     def _judge(self, node: _WatchedNode, t_ns: int, since_ns: int) -> str:
-        """Return a node's failure now in one line, or ""; report a failure that is new, another than before, or over.
+        """Return a node's failure now in one line, or ""; report one that is new, another than the last, or over.
 
         since_ns: time of the first judgement after `start`.
         """
@@ -240,9 +241,10 @@ class DeadlineWatch:
         self._verdict = ""
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Count a cycle's misses; return its state, changed if the host has missed `realtime.misses` periods or more.
+        """Count the periods skipped before a cycle; return its state, changed if there were too many recently.
 
-        Then `is_late` is set if `realtime.on_misses` is hold; else the fault is DEADLINE, unless there is another.
+        Too many: `realtime.misses` within `realtime.misses_window_s`. Then `is_late` is set if `realtime.on_misses` is
+        hold; else the fault is DEADLINE, unless there is another. Call it once per cycle.
         """
         misses = self._misses
         if arm.periods > 1:

@@ -265,7 +265,7 @@ def name_error(code: int) -> str:
 
 
 def describe_emergency(code: int, manufacturer: bytes, has_watchdog: bool) -> str:
-    """Return an EMCY message in words, in one line. `manufacturer`: its bytes 3 to 7.
+    """Return an EMCY message in words, in one line. `code`: its error code; `manufacturer`: its bytes 3 to 7.
 
     `has_watchdog`: these bytes are the watchdog's number and the device's time.
     """

@@ -68,7 +68,11 @@ class Slave:
             return int(self._entry(index, sub).raw)
 
     def write_object(self, index: int, sub: int, value: int) -> None:
-        """Write a number to an object over SDO, and store it in `known`. Raises DeviceError or BusError as `read`."""
+        """Write a number to an object over SDO, and store it in `known`.
+
+        Raises DeviceError if the EDS doesn't list it, or the device refuses or doesn't answer; BusError if the bus
+        fails.
+        """
         what = f"writing {self.name_object(index, sub)} = {_number(value)}"
         with as_device_error(self.name, self.node_id, what, self.answer_s):
             self._entry(index, sub).raw = value
@@ -91,8 +95,8 @@ class Slave:
     def compare(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False) -> str:
         """Read an object; return its difference from `expected` in words, "" if equal. Store `expected` in `known`.
 
-        `quantity`, `unit`: of the value in that text; `is_hex`: its numbers are hexadecimal. Raises DeviceError or
-        BusError as `read`.
+        `quantity`, `unit`: of the value in that text; `is_hex`: its numbers are hexadecimal. Raises DeviceError if the
+        object can't be read, BusError if the bus fails.
         """
         found = self.read(index, sub)
         self.known[index, sub] = expected
@@ -104,7 +108,8 @@ class Slave:
     def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", remedy: str = "") -> None:
         """Compare an object as `compare`; raise DeviceError, with the remedy, if it differs from `expected`.
 
-        Raises DeviceError or BusError as `read`, too, if it can't be read.
+        `quantity`, `unit`: of the value, for the error. Raises DeviceError also if the object can't be read, BusError
+        if the bus fails.
         """
         if text := self.compare(index, sub, expected, quantity, unit):
             self.fail(text, remedy)
@@ -140,7 +145,10 @@ _MODE_READS = 20
 
 
 def command_deadline_ms(settings: Settings) -> int:
-    """Return the deadline of commands in ms, rounded up, for drives that count time instead of SYNCs."""
+    """Return the longest time without a new command until a drive faults, ms, rounded up.
+
+    It is `bus.command_patience_cycles` periods, for drives that count time instead of SYNCs.
+    """
     return max(1, math.ceil(settings.bus.command_patience_cycles * settings.bus.period_us / 1000))
 
 
@@ -414,7 +422,8 @@ class ParameterWatch(RateLimitedEvents):
     def step(self, cycle: int, t_ns: int) -> None:
         """Send the request for the next object if it is due and none is open; warn of one that got no answer in time.
 
-        Call it once per cycle. It sends none if `devices.reread_ms` is 0. Raises BusError if the bus refuses a frame.
+        Call it once per cycle. A request also waits for the `patience.pause_ms` of its device. None is sent if
+        `devices.reread_ms` is 0. Raises BusError if the bus refuses a frame.
         """
         asked = self._asked
         if asked is not None and cycle - self._asked_cycle > round(asked.slave.answer_s / self._period_s):

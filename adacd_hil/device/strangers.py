@@ -38,7 +38,10 @@ _READING = (2, 3, 5)
 
 
 def host_frames(settings: Settings, codec: Codec, devices: Iterable[PlacedDevice]) -> dict[int, str]:
-    """Return the frames that only this host may send: by identifier, words for another sender, as `sends SYNC`."""
+    """Return, by identifier, the frames that only this host may send.
+
+    The values are words for the action of another sender, such as `sends SYNC`.
+    """
     doing = {
         codec.message(HOST_HEARTBEAT).can_id: "sends this host's heartbeat",
         NMT_ID: "sends NMT commands",
@@ -124,7 +127,10 @@ class Strangers(RateLimitedEvents):
         self.report(frame.t_ns, (frame.can_id, "once"), Event("warning", "bus", text))
 
     def _complain(self, frame: Frame, doing: str, cycle: int) -> None:
-        """Report an action of another sender, `doing`, as an error, and store it for `describe_senders`."""
+        """Report an action of another sender, `doing`, as an error.
+
+        For HOLD_S from `cycle` on, `have_acted` is then True and `describe_senders` has the action.
+        """
         text = f"somebody else {doing} (0x{frame.can_id:03X})"
         self._until_cycle = cycle + self._hold_cycles
         self._complaints[text] = cycle
