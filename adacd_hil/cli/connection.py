@@ -112,7 +112,7 @@ def check_shared(name: str, settings: Settings) -> None:
 def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> Bus:
     """Return the bus wrapped for lockstep: only modelled time passes on it.
 
-    Raises CodecError if the contract has no message Sync.
+    Raises CodecError if the contract has no message Sync, or lacks one of the devices' cyclic frames.
     """
     # Imported here: it belongs to lockstep and isn't needed in real time.
     from adacd_hil.wire.lockstep_bus import make_lockstep_bus
@@ -194,7 +194,7 @@ class Connection:
         """Open the bus for a run and return it; in real time it receives only the identifiers of `received_ids`.
 
         A VirtualClock means lockstep: the bus then models the time. Raises BusMissingError if it can't be opened, in
-        lockstep CodecError if the contract has no message Sync.
+        lockstep CodecError if the contract has no message Sync, or lacks one of the devices' cyclic frames.
         """
         can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings, devices)
         bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)
@@ -242,7 +242,8 @@ def never_stopped() -> Iterator[None]:
 def on_interrupt(interrupt: Callable[[], None], *further: signal.Signals) -> Iterator[None]:
     """Call a function on SIGINT, SIGTERM and SIGHUP while the block runs; then restore the handlers.
 
-    further: signals that call it, too. SIGHUP stays ignored if it was. Outside the main thread, change nothing.
+    A signal also shortens the waits for a blocked output. further: signals that call the function, too. SIGHUP stays
+    ignored if it was. Outside the main thread, change nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

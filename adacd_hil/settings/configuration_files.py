@@ -75,8 +75,8 @@ def resolved_table(layers: Sequence[ConfigurationLayer]) -> dict[str, Any]:
 def configuration_layers(name_or_file: str, profile: str | None = None) -> list[ConfigurationLayer]:
     """Return the layers of a configuration and of all that it extends, the base first.
 
-    The profile's layers precede those of the files, whose keys override them. Raises ConfigError for a file that can't
-    be read, wrong `extends`, and an unknown profile.
+    `profile` picks the `[profiles.X]` tables; None: `arm.profile` does. Their layers precede those of the files, whose
+    keys override them. Raises ConfigError for a file that can't be read, wrong `extends`, and an unknown profile.
     """
     files = _load_chain(name_or_file)
     table = resolved_table(files)
@@ -107,7 +107,7 @@ def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
 
 
 def _find_beside(table: dict[str, Any], folder: Path) -> None:
-    """Change `table`: put `folder` before the names in `devices` of files, with a suffix, that exist in it."""
+    """Change `table`: put `folder` before each name in its `devices` that has a suffix and exists in the folder."""
 
     def found(name: Any) -> Any:
         is_beside = isinstance(name, str) and Path(name).suffix and exists(folder / name)

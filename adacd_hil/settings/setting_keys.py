@@ -113,7 +113,7 @@ def explain_unknown(key: str) -> str:
 
 
 def _bounds(metadata: Any) -> str:
-    """Return `KnownKey.bounds` of a setting, from its field's metadata."""
+    """Return the choices of a setting, else its bounds and unit as text, by its field's metadata; "" without any."""
     if metadata["choices"]:
         return ", ".join(metadata["choices"])
     low, high, unit = metadata["low"], metadata["high"], metadata["unit"]

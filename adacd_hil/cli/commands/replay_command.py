@@ -113,7 +113,7 @@ def replay(
 def _next(given: Path, own: "Replay", has_changes: bool) -> tuple[str, ...]:
     """Return the commands to suggest after a replay; () if no cycle was replayed.
 
-    given: the log. has_changes: other settings were replayed, too.
+    given: the log. own: its replay with its own settings. has_changes: other settings were replayed, too.
     """
     if not own.cycles:
         return ()
