@@ -56,7 +56,7 @@ def _imports(text: str) -> Iterator[str]:
 
 
 def all_sources(root: Path) -> dict[str, bytes]:
-    """Return the source of every module of both packages below `root`, as bytes, by dotted name."""
+    """Return the source of every module of `adacd_hil` and `firmware_sim` below `root`, as bytes, by dotted name."""
     texts = {}
     for package in _PACKAGES:
         for path in sorted((root / package).rglob("*.py")):
@@ -66,9 +66,9 @@ def all_sources(root: Path) -> dict[str, bytes]:
 
 
 def compiled_sources(root: Path) -> dict[str, bytes]:
-    """Return the source of each module below `root` that compiles functions, and of all that it imports, by name.
+    """Return, by dotted name, the source of each module below `root` that compiles functions, and of all its imports.
 
-    Imports are followed through. Names are dotted; modules of other packages are left out.
+    Imports of imports are followed, too; modules of packages other than our two are left out.
     """
     texts = all_sources(root)
     waiting = [name for name, text in texts.items() if name == __name__ or _USE.search(text)]

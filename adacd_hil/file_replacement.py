@@ -79,7 +79,8 @@ def replace_file(path: Path, content: bytes | str) -> None:
 def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Path, ...]:
     """Write whole files, by name, into a folder, which is made if missing; return their paths.
 
-    Each is replaced as by `replace_file`, one after the other. Raises OSError; files written before it stay.
+    Each is replaced as by `replace_file`, one after the other. Raises OSError if the folder can't be made or a file not
+    be replaced; files written before it stay.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():

@@ -151,7 +151,8 @@ def request_realtime(request: RealtimeRequest | None = None) -> RealtimeGrant:
 def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
     """Pin the process to the processor of `wish`; return it and the refusals.
 
-    None if any is wished, or the pinning is refused. cpus: processors that the process may use, for the remedy.
+    None if any is wished, or the pinning is refused. wish: "any", "isolated" or a number, as of `RealtimeRequest`.
+    cpus: processors that the process may use, for the remedy.
     """
     if wish == ANY_CPU:
         return None, []
@@ -172,7 +173,7 @@ def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
 def _schedule(libc: ctypes.CDLL, request: RealtimeRequest) -> tuple[str, list[Refusal]]:
     """Set the requested scheduler; return the name of the one in force and the refusals.
 
-    Without SCHED_DEADLINE, SCHED_FIFO is requested; without that, the present one stays.
+    If SCHED_DEADLINE is refused, SCHED_FIFO is requested; if that is refused, the present one stays.
     """
     missing = []
     if request.scheduler == "other":

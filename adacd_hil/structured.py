@@ -49,7 +49,10 @@ def described(kind: type[Any], sizes: Mapping[str, int]) -> Record:
 
 
 def zeros_of(kind: type[Any], sizes: Mapping[str, int]) -> Structured:
-    """Return one record (1,) of a class, all zeros. sizes: of dimensions, by name. Raises as `described`."""
+    """Return one record (1,) of a class, all zeros. sizes: by the names of dimensions in the class.
+
+    Raises ValueError for a field whose name is numpy's own, KeyError for a dimension without a size.
+    """
     return np.zeros(1, described(kind, sizes))
 
 

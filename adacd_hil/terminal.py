@@ -335,7 +335,10 @@ def is_interrupted(error: BaseException | None) -> bool:
 
 
 def _ask_again(lost: "sys.UnraisableHookArgs") -> None:
-    """Interrupt again, a moment later, if a Ctrl-C was lost where exceptions are dropped: in loading compiled code."""
+    """Interrupt again, a moment later, if a Ctrl-C was lost where exceptions are dropped: in loading compiled code.
+
+    It is the hook for lost exceptions; others are printed, as by default.
+    """
     if not issubclass(lost.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(lost)
         return
