@@ -7,7 +7,10 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> str:
-        """Look `__version__` up at its first use: the lookup takes longer than all of `start.py`."""
+        """Return `__version__`, looked up at its first use: the lookup takes longer than all of `start.py`.
+
+        "0+unknown" if the package isn't installed. Raises AttributeError for any other name.
+        """
         if name != "__version__":
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from importlib.metadata import PackageNotFoundError, version

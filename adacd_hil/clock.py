@@ -22,7 +22,7 @@ class _Timespec(ctypes.Structure):
 
 
 class Clock(Protocol):
-    """A clock that gives `t_ns`."""
+    """A clock whose times in ns are the `t_ns` of a run."""
 
     def now_ns(self) -> int:
         """Return the present time in ns."""
@@ -46,7 +46,8 @@ class MonotonicClock:
     def sleep_until_ns(self, t_ns: int) -> None:
         """Sleep until `t_ns` in one system call; the kernel may wake the process later, never earlier.
 
-        A signal's handler runs when the signal comes, and the sleep goes on after it. Raises OSError.
+        A signal's handler runs when the signal comes, and the sleep goes on after it. Raises OSError if the system call
+        fails for another reason.
         """
         due = self._due
         due.seconds, due.nanoseconds = divmod(max(t_ns, 0), _NS_PER_S)
@@ -77,7 +78,7 @@ def wall_ns() -> int:
 
 
 def wall_offset_ns() -> int:
-    """Return the wall clock minus CLOCK_MONOTONIC, ns; the reading with the shortest interruption out of three."""
+    """Return the wall clock minus CLOCK_MONOTONIC, ns: measured three times, the one with the shortest interruption."""
     offsets = []
     for _ in range(3):
         before_ns = time.monotonic_ns()

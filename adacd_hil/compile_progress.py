@@ -20,7 +20,10 @@ _listeners: list[Listener] = []
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """Call `listener`, besides earlier ones, while the block lasts; any thread that compiles calls it."""
+    """Have `listener` called about progress of compiling while the block lasts, besides those of blocks around it.
+
+    The thread that compiles calls it, whichever that is.
+    """
     _listeners.append(listener)
     try:
         yield

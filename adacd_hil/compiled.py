@@ -46,14 +46,17 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def _imports(text: str) -> Iterator[str]:
-    """Yield the modules of the two packages that a source imports, and the imported names, which may be modules."""
+    """Yield the dotted modules of both packages that a source imports from, and each with an imported name added.
+
+    The latter may be modules, too.
+    """
     for module, names in _IMPORT.findall(text):
         yield module
         yield from (f"{module}.{name}" for name in _NAME.findall(names))
 
 
 def all_sources(root: Path) -> dict[str, bytes]:
-    """Return the source of every module of both packages below `root`, as bytes, by dotted name."""
+    """Return the source of every module of `adacd_hil` and `firmware_sim` below `root`, as bytes, by dotted name."""
     texts = {}
     for package in _PACKAGES:
         for path in sorted((root / package).rglob("*.py")):
@@ -63,9 +66,9 @@ def all_sources(root: Path) -> dict[str, bytes]:
 
 
 def compiled_sources(root: Path) -> dict[str, bytes]:
-    """Return the source of each module below `root` that compiles functions, and of all that it imports, by name.
+    """Return, by dotted name, the source of each module below `root` that compiles functions, and of all its imports.
 
-    Imports are followed through. Names are dotted; modules of other packages are left out.
+    Imports of imports are followed, too; modules of packages other than our two are left out.
     """
     texts = all_sources(root)
     waiting = [name for name, text in texts.items() if name == __name__ or _USE.search(text)]
@@ -125,7 +128,7 @@ def cache_folder(digest: str) -> Path:
 
 
 def _make(folder: Path) -> os.stat_result:
-    """Make a folder unless its name is taken; return the status of that name. Raises OSError."""
+    """Make a folder unless its name is taken; return the status of that name. Raises OSError if it can't be made."""
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
     return folder.lstat()
@@ -196,7 +199,7 @@ _claims = _Claims()
 
 
 def _name_of_layout(record: numba.types.Record) -> tuple[str, tuple[str]]:
-    """Return the name of a record in the symbols of compiled code.
+    """Return the name of a record type in the symbols of compiled code: "Record" and a digest of its layout.
 
     numba names it by a count of its process (numba's issue 7654). Two processes then save code of two layouts below one
     symbol, and a third one that loads both runs the code of the first with the memory of the second.
@@ -224,7 +227,7 @@ class _Locator(_CacheLocator):
         return str(_FOLDER / self._module)
 
     def get_source_stamp(self) -> str:
-        """Return the digest of the sources, as `source_digest`."""
+        """Return the digest of all sources that compiled code may depend on, see `source_digest`."""
         return _DIGEST
 
     def get_disambiguator(self) -> str:
@@ -245,7 +248,7 @@ class _CacheFile(IndexDataCacheFile):
         self._shipped = IndexDataCacheFile(str(shipped), base, stamp)  # type: ignore[no-untyped-call]
 
     def load(self, key: Any) -> Any:
-        """Return the code for a key; None: there is none."""
+        """Return the compiled code for numba's key: argument types, processor, function; None: there is none."""
         found = super().load(key)  # type: ignore[no-untyped-call]
         return self._shipped.load(key) if found is None else found  # type: ignore[no-untyped-call]
 
@@ -298,7 +301,7 @@ class _SharedCache(FunctionCache):
             _claims.release(self._claim(sig))
 
     def version(self) -> int | None:
-        """Return the version of the code on the disk, see `_CacheFile.version`."""
+        """Return a number that changes whenever code of this function is saved on the disk; None: there is none."""
         return self._cache_file.version()
 
     def _claim(self, sig: Any) -> str:
@@ -334,7 +337,7 @@ class _Compilation(event.Listener):
         self._on_first: Callable[[], None] | None = None
 
     def new_count(self, functions: Sequence[Any]) -> CompileCount:
-        """Start and return a count of these functions and all that they call."""
+        """Start and return a count of compiled functions, out of these and all that they call."""
         self._count = CompileCount(functions_below(functions), lambda function: function._cache.version())
         return self._count
 

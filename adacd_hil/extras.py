@@ -7,9 +7,10 @@ _SOURCE_TREE = Path(__file__).resolve().parent.parent
 
 
 def install_command(extra: str) -> str:
-    """Return the command that installs an extra into this interpreter's environment, from the source tree if any.
+    """Return the pip command that installs this package with an extra into this interpreter's environment.
 
-    This package is in no registry: without a source tree the command names the package, and the user gives its file.
+    It installs the source tree, editable, if this code runs from one. Otherwise it names the package, which is in no
+    registry: the user gives its file.
     """
     is_source = (_SOURCE_TREE / "pyproject.toml").is_file()
     source = "adacd-hil" if not is_source else "." if Path.cwd() == _SOURCE_TREE else str(_SOURCE_TREE)

@@ -42,7 +42,10 @@ def open_input(path: Path) -> BufferedReader:
 
 
 def read_input(path: Path, most_bytes: int = MOST_TEXT_BYTES) -> bytes:
-    """Return the whole content of a regular file. Raises OSError as `open_input`, and for more than `most_bytes`."""
+    """Return the whole content of a regular file.
+
+    Raises OSError that names it if it can't be read, is no regular file, or has more than `most_bytes`.
+    """
     with open_input(path) as file:
         data = file.read(most_bytes + 1)
     if data is None:  # as of /proc/kmsg, which is a regular file
@@ -67,7 +70,7 @@ class InUseError(Exception):
 def create_file(path: Path) -> int:
     """Create a file and return its descriptor, locked for as long as that, or a copy of it, is open.
 
-    Raises FileExistsError for whatever is there, a dangling link included; OSError.
+    Raises FileExistsError if anything has that name, be it a dangling link; OSError if it can't be created.
     """
     descriptor = os.open(path, NEW, 0o666)
     with contextlib.suppress(OSError):  # a file system without locks: `check_unused` can't see the writer then
@@ -112,7 +115,8 @@ def _owner(descriptor: int) -> str:
 def write_new_file(path: Path, content: bytes) -> None:
     """Write a new file; do nothing if it exists with the same content.
 
-    Raises FileExistsError for anything else of that name, and OSError; a file that can't be written whole is removed.
+    Raises FileExistsError for anything else of that name, OSError if it can't be written; an incomplete file is
+    removed.
     """
     try:
         descriptor = os.open(path, NEW, 0o666)

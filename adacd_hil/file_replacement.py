@@ -24,17 +24,17 @@ class Replacement:
     def __init__(self, path: Path, is_log: bool = False) -> None:
         """Create the new file. `commit` replaces a link itself, not the link's target.
 
-        is_log: a log may be replaced. Raises OSError, also if a FIFO, a device, a folder or (unless is_log) a log is
-        there.
+        is_log: a log may be replaced. Raises OSError if the new file can't be created, or a FIFO, a device, a folder or
+        (unless is_log) a log is at `path`.
         """
         _check_replaceable(path, is_log)
         self.path = path
         self.beside = _create_beside(path)
 
     def commit(self, is_durable: bool = False) -> None:
-        """Rename the new file to `path`; is_durable: after its contents are on the disk.
+        """Rename the new file to `path`; is_durable: only once its contents are on the disk.
 
-        Raises OSError; then the new file is removed, and `path` is as before.
+        Raises OSError if that fails; then the new file is removed, and `path` is unchanged.
         """
         try:
             if is_durable:
@@ -55,7 +55,8 @@ class Replacement:
 def replacing(path: Path, is_durable: bool = False) -> Iterator[Path]:
     """Yield the path of a new file that takes the place of `path` when the block ends without error.
 
-    It is removed if the block ends with one. Raises OSError as `Replacement`. is_durable: as of `commit`.
+    It is removed if the block ends with one. is_durable: its contents are on the disk before it replaces `path`. Raises
+    OSError if it can't be created or renamed, or a folder, FIFO, device or log is at `path`.
     """
     replacement = Replacement(path)
     try:
@@ -67,7 +68,10 @@ def replacing(path: Path, is_durable: bool = False) -> Iterator[Path]:
 
 
 def replace_file(path: Path, content: bytes | str) -> None:
-    """Write a whole file in one step, text as UTF-8; replace an old one. Raises OSError as `Replacement`."""
+    """Write a whole file in one step, text as UTF-8; replace an old one.
+
+    Raises OSError if it can't be written, or a folder, FIFO, device or log has its name.
+    """
     with replacing(path) as beside:
         beside.write_bytes(content.encode() if isinstance(content, str) else content)
 
@@ -75,7 +79,8 @@ def replace_file(path: Path, content: bytes | str) -> None:
 def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Path, ...]:
     """Write whole files, by name, into a folder, which is made if missing; return their paths.
 
-    Each is replaced as by `replace_file`, one after the other. Raises OSError; files written before it stay.
+    Each is replaced as by `replace_file`, one after the other. Raises OSError if the folder can't be made or a file not
+    be replaced; files written before it stay.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, content in contents.items():
@@ -111,7 +116,7 @@ def _check_replaceable(path: Path, is_log: bool) -> None:
 
 
 def _create_beside(path: Path) -> Path:
-    """Create an empty hidden file beside `path`, and return its path. Raises OSError."""
+    """Create an empty hidden file beside `path`, and return its path. Raises OSError if it can't be created."""
     for number in itertools.count():
         beside = path.with_name(f".{path.name}.{os.getpid()}-{number}.part")
         with contextlib.suppress(FileExistsError):  # left by a process of this id that was killed
@@ -131,7 +136,7 @@ def dangling_link(path: Path) -> Path | None:
 
 @contextmanager
 def removing_empty_folders(path: Path) -> Iterator[None]:
-    """When the block ends, remove a folder and its parents as far as they are empty and didn't exist before."""
+    """When the block ends, remove a folder and its parents as far as they are empty and didn't exist before it."""
     made = [folder for folder in (path, *path.parents) if not folder.exists()]
     try:
         yield

@@ -32,7 +32,10 @@ class WrittenPath(GivenPath):
     """A path to write to: refused if a folder of it would have to be made at a link without a target."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return a path as `GivenPath` does; refuse a dangling link."""
+        """Return a path as `GivenPath` does; refuse a link without a target among the folders above it.
+
+        A path that may be a folder is refused, too, if it is such a link itself; a file would replace the link.
+        """
         path = Path(super().convert(value, param, ctx))
         link = dangling_link(path if self.dir_okay else path.parent)  # a file would replace the link
         if link is not None:

@@ -11,7 +11,7 @@ from adacd_hil.records import Vector
 
 @compiled
 def dot(a: Vector, b: Vector) -> float:
-    """Return a b."""
+    """Return the scalar product of a and b."""
     total = 0.0
     for j in range(b.shape[0]):
         total += a[j] * b[j]
@@ -20,7 +20,7 @@ def dot(a: Vector, b: Vector) -> float:
 
 @compiled
 def misfit(w: Vector, theta: Vector, tau: float) -> float:
-    """Return w theta - tau: predicted less measured torque of one row."""
+    """Return w theta - tau: torque predicted by parameters theta and regressor row w, less measured torque tau."""
     total = -tau
     for j in range(theta.shape[0]):
         total += w[j] * theta[j]
@@ -41,7 +41,10 @@ def quadratic(A: Vector, x: Vector) -> float:
 
 @compiled
 def add_row(v: Vector, r: float, R: float, L: Vector, b: Vector) -> None:
-    """Add v v'/R to the lower half of L and v r/R to b: one row of variance R to the sums of a least-squares fit."""
+    """Add a measurement r, of variance R and regressor row v, to the normal equations of a least-squares fit.
+
+    Add v v'/R to the lower half of the matrix L, v r/R to the right side b.
+    """
     for j in range(v.shape[0]):
         if v[j] != 0.0:
             b[j] += v[j] * r / R
@@ -71,7 +74,7 @@ def factor(A: Vector, least: float) -> bool:
 
 @compiled
 def solve_lower(L: Vector, x: Vector) -> None:
-    """Replace x by L^-1 x."""
+    """Replace x by L^-1 x, L lower triangular."""
     for j in range(x.shape[0]):
         for n in range(j):
             x[j] -= L[j, n] * x[n]
@@ -80,7 +83,7 @@ def solve_lower(L: Vector, x: Vector) -> None:
 
 @compiled
 def solve_upper(L: Vector, x: Vector) -> None:
-    """Replace x by L'^-1 x."""
+    """Replace x by L'^-1 x, L lower triangular."""
     for j in range(x.shape[0] - 1, -1, -1):
         for n in range(j + 1, x.shape[0]):
             x[j] -= L[n, j] * x[n]

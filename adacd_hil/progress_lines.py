@@ -43,7 +43,7 @@ class Progress:
         self._lines.put((line, False))
 
     def passing(self, line: str) -> None:
-        """Queue a line that a terminal overwrites with the next one."""
+        """Queue a line that the next one overwrites on a terminal; elsewhere it is printed like any other."""
         self._is_counting = False
         self._lines.put((line, self._has_cursor))
 

@@ -76,7 +76,7 @@ class Layout:
 
     @cached_property
     def slices(self) -> dict[str, slice]:
-        """The slice of each field in the block, by name, in order."""
+        """The slice of each field's values in the block, by the field's name, in the block's order."""
         places: dict[str, slice] = {}
         start = 0
         for field in self.fields:
@@ -133,9 +133,9 @@ class CertifiedBlock(SchemeBlock):
 
 
 def block_sizes(parameter_count: int, further_count: int = 0, channel_count: int = 0) -> dict[str, int]:
-    """Return the sizes by the names that the annotations of `SchemeBlock` and `CertifiedBlock` give them.
+    """Return the number of values of each kind of field by the size's name in the annotations of the blocks' classes.
 
-    channel_count: of the detector bank, per joint.
+    further_count: parameters after the `parameter_count` dynamic ones. channel_count: of the detector bank, per joint.
     """
     return {
         "n": JOINTS,
@@ -147,7 +147,7 @@ def block_sizes(parameter_count: int, further_count: int = 0, channel_count: int
 
 
 def _layout(block: type, sizes: dict[str, int]) -> Layout:
-    """Return the layout of a class of block, from its annotations: size, unit, meaning. sizes: by name."""
+    """Return the layout of a class of block, from its annotations: size, unit, meaning. sizes: of `block_sizes`."""
     hints = get_type_hints(block, include_extras=True)
     return Layout(
         tuple(
@@ -163,7 +163,10 @@ def scheme_layout(parameter_count: int) -> Layout:
 
 
 def certified_layout(parameter_count: int, further_count: int, channel_count: int) -> Layout:
-    """Return the layout of `CertifiedBlock`; channel_count: of the detector bank, per joint."""
+    """Return the layout of `CertifiedBlock` for so many dynamic parameters, and further ones (offsets, lags, ...).
+
+    channel_count: channels of the detector bank, per joint.
+    """
     return _layout(CertifiedBlock, block_sizes(parameter_count, further_count, channel_count))
 
 
@@ -424,7 +427,7 @@ class Event(NamedTuple):
 
     @property
     def operator_text(self) -> str:
-        """Text shown to the operator."""
+        """Text shown to the operator: the message."""
         return self.message
 
 
@@ -442,7 +445,7 @@ class BriefedEvent(Event):
 
     @property
     def operator_text(self) -> str:
-        """Text shown to the operator."""
+        """Text shown to the operator: the shorter one, `brief`."""
         return self.brief
 
 

@@ -46,7 +46,7 @@ _kept_objects: list[bytes] = []
 
 
 class Refusal(NamedTuple):
-    """A request that the system refused: name and reason, and the remedy."""
+    """A request that the system refused. reason: the request's name and why; remedy: how to have it granted."""
 
     reason: str
     remedy: str
@@ -87,7 +87,10 @@ class RealtimeGrant:
 
     @contextmanager
     def unpinned(self) -> Iterator[None]:
-        """Run on any of `cpus` while the block lasts; a child that is started in it doesn't inherit the pinning."""
+        """Let a pinned process run on any of `cpus` while the block lasts, then pin it again; an unpinned one stays so.
+
+        A child that is started in the block doesn't inherit the pinning.
+        """
         if self.cpu is not None:
             os.sched_setaffinity(0, self.cpus)
         try:
@@ -122,10 +125,10 @@ class _SchedulingAttributes(ctypes.Structure):
 
 
 def request_realtime(request: RealtimeRequest | None = None) -> RealtimeGrant:
-    """Request real-time scheduling, a processor, locked memory and shallow idle states; call it after compiling.
+    """Request real-time scheduling, a processor, locked memory and shallow idle states (None: the default request).
 
-    Return the grant, which lists the refusals; none is raised. Children inherit neither scheduler nor locked memory;
-    see `RealtimeGrant.unpinned` for the processor.
+    Call it after compiling. Return the grant, which lists the refusals; none is raised. Children inherit neither
+    scheduler nor locked memory; see `RealtimeGrant.unpinned` for the processor.
     """
     request = request or RealtimeRequest()
     libc = ctypes.CDLL(None, use_errno=True)
@@ -148,7 +151,8 @@ def request_realtime(request: RealtimeRequest | None = None) -> RealtimeGrant:
 def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
     """Pin the process to the processor of `wish`; return it and the refusals.
 
-    None if any is wished, or the pinning is refused. cpus: processors that the process may use, for the remedy.
+    None if any is wished, or the pinning is refused. wish: "any", "isolated" or a number, as of `RealtimeRequest`.
+    cpus: processors that the process may use, for the remedy.
     """
     if wish == ANY_CPU:
         return None, []
@@ -169,7 +173,7 @@ def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
 def _schedule(libc: ctypes.CDLL, request: RealtimeRequest) -> tuple[str, list[Refusal]]:
     """Set the requested scheduler; return the name of the one in force and the refusals.
 
-    Without SCHED_DEADLINE, SCHED_FIFO is requested; without that, the present one stays.
+    If SCHED_DEADLINE is refused, SCHED_FIFO is requested; if that is refused, the present one stays.
     """
     missing = []
     if request.scheduler == "other":
@@ -239,7 +243,10 @@ def _keep_awake() -> tuple[bool, list[Refusal]]:
 
 
 def isolated_cpus(folder: Path = _SYSTEM_CPUS) -> tuple[int, ...]:
-    """Return the processors that the kernel keeps free of ordinary work, from a list such as "2-3,7"; () if unknown."""
+    """Return the processors that the kernel keeps free of ordinary work; () if none or unknown.
+
+    folder: of sysfs, whose file `isolated` lists them, such as "2-3,7".
+    """
     try:
         text = (folder / "isolated").read_text().strip()
     except OSError:
@@ -260,7 +267,10 @@ def freeze_garbage() -> None:
 
 @contextmanager
 def frozen_garbage() -> Iterator[None]:
-    """Collect garbage once; disable the collection while the block lasts, and enable it afterwards in any case."""
+    """Collect garbage once; disable the collection while the block lasts, and enable it afterwards.
+
+    Enable it even if it was disabled before the block.
+    """
     freeze_garbage()
     try:
         yield

@@ -49,7 +49,10 @@ def described(kind: type[Any], sizes: Mapping[str, int]) -> Record:
 
 
 def zeros_of(kind: type[Any], sizes: Mapping[str, int]) -> Structured:
-    """Return one record (1,) of zeros, see `described`."""
+    """Return one record (1,) of a class, all zeros. sizes: by the names of dimensions in the class.
+
+    Raises ValueError for a field whose name is numpy's own, KeyError for a dimension without a size.
+    """
     return np.zeros(1, described(kind, sizes))
 
 
@@ -109,7 +112,10 @@ def _fill(record: Any, values: Any) -> None:
 
 @cache
 def _described(fields: tuple[_Field, ...]) -> Record:
-    """Return the description of a record, the same object for equal fields. Raises ValueError for a name of numpy's."""
+    """Return the description of a record of fields (name, type, shape), the same object for equal fields.
+
+    Raises ValueError for a field whose name is numpy's own attribute of a record.
+    """
     if taken := [name for name, _, _ in fields if hasattr(np.record, name)]:
         raise ValueError(f"field {', '.join(taken)}: numpy's own attribute of a record")
     return np.dtype((np.record, list(fields)))

@@ -67,9 +67,10 @@ def _least_room(column: int, lines: Sequence[Sequence[str]]) -> int:
 
 
 def _parts(least: Sequence[int], width: int, names: int) -> list[list[int]]:
-    """Return the columns of each part of the table: the first `names`, then as many others as fit, one at least.
+    """Return the columns of each part of a wide table: the first `names`, then as many others as fit, one at least.
 
-    If there is no room for another column, only the first one is repeated.
+    least: smallest width of each column; width: of the terminal. If the first `names` leave no room for another column,
+    only the first one is repeated.
     """
     if _sum([*least[:names], max(least[names:], default=0)]) > width:
         names = 1
@@ -82,7 +83,10 @@ def _parts(least: Sequence[int], width: int, names: int) -> list[list[int]]:
 
 
 def _shrunk(natural: list[int], least: list[int], width: int) -> list[int]:
-    """Return the widths of a part's columns, the widest narrowed until the part fits, if necessary below `least`."""
+    """Return the widths of a part's columns: `natural`, the widest narrowed by turns until the part fits into `width`.
+
+    No width falls below its `least`, unless the part can't fit otherwise.
+    """
     widths = [min(one, width) for one in natural]
     while _sum(widths) > width:
         able = [place for place, one in enumerate(widths) if one > least[place]] or range(len(widths))

@@ -103,9 +103,9 @@ def wrap_words(text: str, width: int, indent: str, is_breaking: bool = False) ->
 
 
 def keep_units(text: str, gap: str, most: int | None = None) -> str:
-    """Return a text with `gap`, in place of a space, between each number and its unit of _UNITS.
+    """Return a text with `gap` in place of the space between each number and its unit, if _UNITS has that.
 
-    most: longest number and unit together, letters, that are treated so; None: no limit.
+    most: a number and unit of more letters in all keep their space; None: no limit.
     """
     return _QUANTITY.sub(
         lambda found: found[0] if most and len(found[0]) > most else f"{found[1]}{gap}{found[2]}", text
@@ -132,7 +132,7 @@ def for_people(text: str, stream: "TextIO | Terminal") -> str:
 
 
 def painted(text: str, stream: "TextIO | Terminal") -> str:
-    """Return an escaped text; if the stream has colours, marks that begin a line, such as `error:`, are coloured."""
+    """Return an escaped text with marks that begin a line, such as `error:`, coloured if the stream has colours."""
     if not has_colour(stream):
         return text
     return _MARK.sub(lambda found: f"{found[1]}\x1b[{_MARKS[found[2]]}m{found[2]}\x1b[0m", text)
@@ -180,9 +180,10 @@ class Terminal(io.TextIOBase):
         return True
 
     def write(self, text: str) -> int:
-        """Write a text with control characters escaped; return its length. Raises OSError as `write_raw`.
+        """Write a text with control characters escaped; return its length.
 
-        If the stream isn't needed, `for_people` lays the text out.
+        Unless the stream is needed, `for_people` folds and colours the text. Raises OSError if a needed stream can't be
+        written, unless its reader has gone.
         """
         if not isinstance(text, str):
             raise TypeError(f"{self.name} takes text, not {type(text).__name__}")
@@ -223,9 +224,9 @@ class Terminal(io.TextIOBase):
         return True
 
     def _put(self, view: memoryview) -> None:
-        """Write all bytes, and wait while the output blocks: forever, or after `hurry` half a second. Raises OSError.
+        """Write all bytes, and wait while the output blocks: forever, or after `hurry` half a second.
 
-        After giving up, `_is_gone` is True.
+        After giving up, `_is_gone` is True. Raises OSError if a write fails, as on a full disk or a closed pipe.
         """
         poll = select.poll()
         poll.register(self._descriptor, select.POLLOUT)
@@ -265,7 +266,10 @@ def write_screen(text: str, stream: TextIO | None = None) -> None:
 
 
 def write_result(text: str) -> None:
-    """Write a result and a line end to standard output, laid out by `for_people`. Raises OSError as `write_raw`."""
+    """Write a result and a line end to standard output, laid out by `for_people`.
+
+    Raises OSError if it can't be written, as on a full disk; not if its reader has gone.
+    """
     write_screen(for_people(f"{text}\n", sys.stdout))
 
 
@@ -287,7 +291,11 @@ def has_colour(stream: "TextIO | Terminal") -> bool:
 
 
 def write_line(stream: TextIO, text: str, is_over: bool, has_end: bool) -> None:
-    """Write a line; `is_over`: over the cursor's line. Without `has_end` the cursor stays in the line, which is cut."""
+    """Write a line of text. `is_over`: first erase the line in which the cursor is.
+
+    `has_end`: lay the text out and end the line; otherwise cut the text to the terminal's width, and leave the cursor
+    behind it.
+    """
     shown = (
         f"{for_people(text, stream)}{_LINE_END}"
         if has_end
@@ -327,7 +335,10 @@ def is_interrupted(error: BaseException | None) -> bool:
 
 
 def _ask_again(lost: "sys.UnraisableHookArgs") -> None:
-    """Interrupt again, a moment later, if a Ctrl-C was lost where exceptions are dropped: in loading compiled code."""
+    """Interrupt again, a moment later, if a Ctrl-C was lost where exceptions are dropped: in loading compiled code.
+
+    It is the hook for lost exceptions; others are printed, as by default.
+    """
     if not issubclass(lost.exc_type, KeyboardInterrupt):
         sys.__unraisablehook__(lost)
         return

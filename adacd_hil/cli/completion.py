@@ -65,7 +65,7 @@ def complete_interface(_ctx: Context, _param: Parameter, incomplete: str) -> lis
 def complete_channel(ctx: Context, _param: Parameter, incomplete: str) -> list[CompletionItem]:
     """Return this machine's CAN interfaces that begin with `incomplete`.
 
-    [] if --interface is given and not socketcan.
+    [] if --interface is given and isn't `socketcan`.
     """
     if ctx.params.get("interface") not in (None, "socketcan"):
         return []
@@ -95,7 +95,7 @@ def _starting(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
 
 
 def _toml_files(incomplete: str) -> list[CompletionItem]:
-    """Return the TOML files and folders whose paths begin with `incomplete`."""
+    """Return the TOML files and folders whose paths begin with `incomplete`; hidden ones only if that isn't empty."""
     folder, slash, _ = incomplete.rpartition("/")
     found = []
     try:

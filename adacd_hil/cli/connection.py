@@ -29,7 +29,7 @@ from adacd_hil.wire.open_bus import open_bus
 
 
 def make_clock(name: str) -> Clock:
-    """Return the clock of a run: modelled time for `lockstep`, else the system's monotonic clock."""
+    """Return the clock of a run: a new one of modelled time for `lockstep`, else the system's monotonic clock."""
     return VirtualClock() if name == "lockstep" else MonotonicClock()
 
 
@@ -46,7 +46,10 @@ def check_clock(name: str, interface: str, channel: str) -> None:
 
 
 def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
-    """Raise CommandError if the channel may be hardware: there a person must acknowledge, not a scenario's user."""
+    """Raise CommandError if the channel may be hardware: there a person must acknowledge, not a scenario's user.
+
+    scenario: its name, for the error.
+    """
     if may_be_hardware(interface, channel):
         raise CommandError(
             f"--scenario {in_line(scenario)} plays the user of an emulated arm; {interface} {channel} may be hardware: "
@@ -109,7 +112,7 @@ def check_shared(name: str, settings: Settings) -> None:
 def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> Bus:
     """Return the bus wrapped for lockstep: only modelled time passes on it.
 
-    Raises CodecError if the contract has no message Sync.
+    Raises CodecError if the contract has no message Sync, or lacks one of the devices' cyclic frames.
     """
     # Imported here: it belongs to lockstep and isn't needed in real time.
     from adacd_hil.wire.lockstep_bus import make_lockstep_bus
@@ -191,7 +194,7 @@ class Connection:
         """Open the bus for a run and return it; in real time it receives only the identifiers of `received_ids`.
 
         A VirtualClock means lockstep: the bus then models the time. Raises BusMissingError if it can't be opened, in
-        lockstep CodecError if the contract has no message Sync.
+        lockstep CodecError if the contract has no message Sync, or lacks one of the devices' cyclic frames.
         """
         can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings, devices)
         bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)
@@ -199,7 +202,7 @@ class Connection:
 
     @contextmanager
     def bus(self, clock: Clock, is_fd: bool) -> Iterator[Bus]:
-        """Open the bus without a filter, yield it, and close it after the block.
+        """Open the bus, yield it, and close it after the block. It receives all identifiers; is_fd: CAN FD frames, too.
 
         Raises BusMissingError if it can't be opened. A BusError in the block becomes a CommandError with the exit
         status BUS_MISSING: no drive has been enabled.
@@ -239,7 +242,8 @@ def never_stopped() -> Iterator[None]:
 def on_interrupt(interrupt: Callable[[], None], *further: signal.Signals) -> Iterator[None]:
     """Call a function on SIGINT, SIGTERM and SIGHUP while the block runs; then restore the handlers.
 
-    further: signals that call it, too. SIGHUP stays ignored if it was. Outside the main thread, change nothing.
+    A signal also shortens the waits for a blocked output. further: signals that call the function, too. SIGHUP stays
+    ignored if it was. Outside the main thread, change nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

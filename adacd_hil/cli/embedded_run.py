@@ -46,8 +46,8 @@ _TOUCHED_LINK = TRUTH_LAYOUT.slices["contact_link"].start
 class Cast(NamedTuple):
     """Host and emulated arm of a run, resolved.
 
-    contract: of the emulator if it plays an arm of one's own, else None. assumed: values that it had to assume, as
-    texts.
+    contract: the emulator's, if it plays an arm of one's own; None: it plays the host's contract. assumed: a line
+    for each assumption about such an arm, for the user.
     """
 
     settings: Settings
@@ -62,8 +62,9 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
     If the configuration describes an arm of one's own, the emulator plays that arm, unless a profile is given.
     Otherwise the profile is the given one, else the scenario's, else the configuration's. truth: name or file of the
     emulated arm's true values. seed: None: the scenario's. A configuration without a script gets the demo's user, since
-    somebody must acknowledge. A built-in arm gets its motors' holding torque from its data sheet; an arm of one's own
-    keeps the value of its file. Raises ConfigError or CodecError if configuration, scenario or contract can't be used.
+    somebody must acknowledge; in a scenario other than SCENARIO the user only asks to finish at its end. A built-in arm
+    gets its motors' holding torque from its data sheet; an arm of one's own keeps the value of its file. Raises
+    ConfigError or CodecError if configuration, scenario or contract can't be used.
     """
     contract: EmulatedContract | None = None
     assumed: list[str] = []
@@ -99,8 +100,10 @@ def run_embedded(
 ) -> tuple[SessionSummary, Path]:
     """Run host and emulated arm in this process, with both logs in `out`; return the summary and the path of the truth.
 
-    Raises ConfigError, CodecError or LogError for invalid settings or logs, OSError if a file can't be written,
-    CommandError for a configuration of several arms. After an error the truth's log is discarded.
+    clock_name: `lockstep` or `realtime`. progress: takes lines about the run. live: serves the host's log to viewers;
+    None: not served. on_started: called when the devices become Operational for the first time. Raises ConfigError,
+    CodecError or LogError for invalid settings or logs, OSError if a file can't be written, CommandError for a
+    configuration of several arms. After an error the truth's log is discarded.
     """
     settings, scenario = cast.settings, cast.scenario
     check_shared("lockstep", settings)  # an arm in this process is alone on its bus

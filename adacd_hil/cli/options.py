@@ -95,7 +95,7 @@ _BUS_OPTIONS = (  # last first: click lists them the other way round
 
 
 def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
-    """Return the options --channel and --interface."""
+    """Return decorators that add --channel and --interface to a command; is_required: it can't be called without."""
     return (
         click.option(
             "-c",
@@ -115,7 +115,10 @@ def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
 
 
 def on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
-    """Return a command with the options of a bus, as `explained`; it receives a `Connection` as its first argument."""
+    """Return a command with the options of a bus; it receives a `Connection` as its first argument.
+
+    It ends the process with its exit status, as `explained`.
+    """
     return _connected(command, is_required=True)
 
 
@@ -131,7 +134,8 @@ def on_bus_or_url(help_text: str) -> Callable[[Callable[..., ExitCode]], Callabl
 def _connected(command: Callable[..., ExitCode], is_required: bool) -> Callable[..., None]:
     """Return a command, as `explained`, with the options of a bus; it receives a `Connection`, or the URL, first.
 
-    It raises CommandError without interface and channel, unless there is a URL.
+    is_required: click refuses a call without --interface or --channel; otherwise it ends with a CommandError, unless
+    there is a URL.
     """
 
     @functools.wraps(command)
@@ -202,7 +206,10 @@ def require_extra(asked_for: str, *modules: str) -> None:
 
 
 def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
-    """Return a command with the options of the live view, which receives `live`: a LiveView, or None without --live."""
+    """Return a command with the options of the live view; it receives `live`: a LiveView, or None without --live.
+
+    The LiveView serves the log of a run to viewers such as Foxglove.
+    """
 
     @functools.wraps(command)
     def run(
@@ -225,8 +232,9 @@ def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
 
 
 def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int) -> "LiveView":
-    """Return the live view of an installed package.
+    """Return the live view that an installed package makes, to listen on host and port.
 
+    origins, names, most_viewers: as of --live-origin, --live-name and --live-viewers.
     Raises CommandError if no or more than one package serves one, an origin is wrong, or the port can't be listened on.
     """
     require_extra("--live", "websockets")

@@ -115,7 +115,7 @@ def _expected() -> tuple[tuple[type[BaseException], ExitCode], ...]:
 def explained(command: Callable[..., ExitCode]) -> Callable[..., None]:
     """Return a command wrapped: it ends the process with its exit status; of an expected error it prints one line.
 
-    Other errors pass through, see `complain`.
+    Expected are the errors of `_expected`, and Ctrl-C. Other errors pass through.
     """
 
     @functools.wraps(command)
@@ -164,7 +164,7 @@ def complain(error: BaseException) -> ExitCode:
 def one_by_one(given: Iterable[Given], work: Callable[[Given], Done]) -> tuple[list[Done], list[Exception]]:
     """Return the results of `work` on each of the given ones, and the expected errors of those that it failed on.
 
-    A failure doesn't stop the others. Raises any error that is not expected, see `complain`.
+    A failure doesn't stop the work on the others. Expected are the errors of `_expected`; any other error is raised.
     """
     done: list[Done] = []
     refused: list[Exception] = []
@@ -179,9 +179,9 @@ def one_by_one(given: Iterable[Given], work: Callable[[Given], Done]) -> tuple[l
 
 
 def complain_of(refused: Iterable[Exception]) -> ExitCode:
-    """Print each error of `one_by_one` in a line, equal ones once.
+    """Print each expected error in a line, those of equal text once.
 
-    Return the exit status of the first, OK without any.
+    Return the exit status of the first error, OK without any.
     """
     codes = [complain(error) for error in {str(error): error for error in refused}.values()]
     return codes[0] if codes else ExitCode.OK
@@ -227,9 +227,10 @@ def suggest(*next_commands: str) -> None:
 
 
 def _as_typed(line: str) -> str:
-    """Return a line with a command folded to the terminal's width, with backslashes that a shell accepts.
+    """Return a line with a command folded to the width of the terminal on standard error, with backslashes for a shell.
 
-    A command with quotes is not folded; a comment behind it gets a line of its own.
+    `line` itself if it fits or there is no terminal. A command with quotes is not folded; a comment behind a command
+    that doesn't fit gets a line of its own.
     """
     columns = terminal_columns(sys.stderr)
     command, mark, comment = line.partition("   # ")

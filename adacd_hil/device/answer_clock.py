@@ -83,7 +83,10 @@ class AnswerClock:
         return newest if self._follows_lost_ones(newest - answered, offset_ns, position_error) else answered + 1
 
     def _is_newer(self, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
-        """Return whether a second frame after one SYNC, without counter, answers it, so that the first one was late."""
+        """Return whether a second frame after one SYNC, without counter, answers it, so that the first one was late.
+
+        By its time after SYNC, offset_ns, and, if given, the position: position_error, as of `find`.
+        """
         if not self._is_usual(offset_ns):
             return False
         return position_error is None or position_error(1) <= position_error(-1) + CLEAR_RAD
@@ -115,18 +118,19 @@ class AnswerClock:
         return is_missing
 
     def keep(self, ordinal: int, values: tuple[float, ...]) -> None:
-        """Keep the values that the device sampled on one SYNC, in place of those of KEPT SYNCs before."""
+        """Store the values that the device sampled on the SYNC `ordinal`, in place of those of KEPT SYNCs earlier."""
         self._kept[ordinal % KEPT] = ordinal, values
 
     def values_of(self, ordinal: int) -> tuple[float, ...] | None:
-        """Return the values of one SYNC; None if they did not come or are no longer kept."""
+        """Return the values sampled on the SYNC `ordinal`; None if they did not come or are no longer stored."""
         answered, values = self._kept[ordinal % KEPT]
         return values if answered == ordinal else None
 
     def set_answered(self, ordinal: int, newest: int, offset_ns: int, is_counted: bool) -> None:
         """Set `ordinal` as the last answered SYNC; learn the device's usual time to an answer from one that is in time.
 
-        newest, offset_ns: as of `find`. is_counted: whether the frame has a counter.
+        newest: ordinal of the last SYNC before the answer, which came offset_ns after it. is_counted: whether the frame
+        has a counter.
         """
         before, self.answered = self.answered, ordinal
         if before is not None and ordinal > before:
@@ -151,7 +155,8 @@ class AnswerClock:
 def newest_sample(clocks: Sequence[AnswerClock], last: int, after: int) -> tuple[int, list[tuple[float, ...]]] | None:
     """Return the ordinal of the newest SYNC that all devices have answered, and each device's values; None without one.
 
-    Only the SYNCs with ordinals after `after` and up to `last` are considered, of these the last KEPT.
+    clocks: of the devices. Only SYNCs with ordinals after `after` and up to `last` are considered, of these the last
+    KEPT.
     """
     for ordinal in range(last, max(after, last - KEPT), -1):
         values = [found for clock in clocks if (found := clock.values_of(ordinal)) is not None]

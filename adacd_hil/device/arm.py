@@ -98,8 +98,8 @@ class Arm:
     def synchronise(self, cycle: int, t_ns: int, periods: int) -> None:
         """Begin a cycle: send SYNC, unless another host sends it, then the pipelined commands of `send_command`.
 
-        Before, count a miss of each device whose frame the ending cycle lacks. `cycle`, `t_ns`: of this SYNC.
-        `periods`: since the SYNC before. Raises BusError.
+        First, count a miss of each device whose frame the ending cycle lacks. `cycle`, `t_ns`: number and time of this
+        SYNC. `periods`: since the previous SYNC. Raises BusError if the bus refuses a frame.
         """
         if self._cycle >= 0:
             if not self.has_all_frames:
@@ -132,7 +132,7 @@ class Arm:
                 device.miss()
 
     def _remember_gaps(self) -> None:
-        """Shift each device's `gaps`; store in bit 0 whether the ending cycle had no usable frame of it."""
+        """Shift each device's bits in `gaps` by one; set bit 0 if the ending cycle had no usable frame of it."""
         for place, gaps in enumerate(self.gaps):
             self.gaps[place] = (gaps << 1 | ~self.received >> place & 1) & REMEMBERED_GAPS
         self._has_gaps = any(self.gaps)
@@ -199,7 +199,8 @@ class Arm:
     def _find(self, place: int, newest: int, offset_ns: int, step: int | None, data: bytes) -> int | None:
         """Return the ordinal of the SYNC that a frame answers; None if all SYNCs up to `newest` are answered already.
 
-        `newest`, `offset_ns`, `step`: as of `AnswerClock.find`.
+        `place`: index of its device. `newest`: ordinal of the last SYNC before the frame, which came `offset_ns` after
+        it. `step`: advance of its alive counter, None without one.
         """
         if place >= JOINTS:
             return self._clocks[place].find(newest, offset_ns, step)
@@ -320,6 +321,7 @@ class Arm:
     def _device_fault(self, is_enabled: bool) -> FaultReason:
         """Return the arm's first fault, NONE without one, and store whether the drives have been enabled.
 
+        is_enabled: both drives are enabled now.
         In order: DRIVE if the drives are no longer enabled; a sensor's or drive's own fault; DRIVE or SENSOR for a kept
         EMCY; FOREIGN_FRAMES for another sender.
         """
@@ -338,7 +340,8 @@ class Arm:
     def send_command(self, command: ArmCommand) -> None:
         """Send the commands of this cycle, to act at the next SYNC; if pipelined, keep them until then.
 
-        Commands that were kept for longer than the age limit of a value are sent without torque. Raises BusError.
+        Commands that were kept for longer than `bus.max_age_cycles` are sent without torque. Raises BusError if the bus
+        refuses a frame.
         """
         values = command.tau_c.tolist(), command.enable, command.quick_stop
         if self._is_pipelined:
@@ -347,7 +350,11 @@ class Arm:
             self._bus.send_all(self._encode(*values))
 
     def _encode(self, tau_c: list[float], enable: bool, quick_stop: bool) -> tuple[tuple[int, bytes], ...]:
-        """Return (identifier, data) of both drives' commands for `tau_c`, Nm; each call advances the alive counters."""
+        """Return (identifier, data) of both drives' commands; each call advances the alive counters.
+
+        tau_c: of each joint, Nm. enable: go one state nearer to Operation enabled, else disable voltage. quick_stop:
+        has precedence over enable.
+        """
         (drive1, drive2), (ratio1, ratio2), (tau1, tau2) = self.drives, self._permille_per_Nm, tau_c
         return (
             (drive1.command_id, drive1.command(round(tau1 * ratio1), enable, quick_stop)),
@@ -355,7 +362,7 @@ class Arm:
         )
 
     def frame_checks(self) -> FrameChecks:
-        """Return each device's counts so far: of end-to-end statuses, missing frames too, and frames not plausible."""
+        """Return each device's counts so far: frames by end-to-end status, missing and implausible frames."""
         return FrameChecks(
             self._cycle,
             tuple(tuple(device.end_to_end.counts) for device in self.devices),

@@ -24,7 +24,7 @@ from adacd_hil.wire.contract_frames import HEARTBEAT_ID
 
 
 class Recurrence:
-    """Recurs every so many cycles, from the first cycle on; if its cycle is skipped, in the next cycle."""
+    """When an action is due: every so many cycles, from the first on; if its cycle is skipped, in the next one."""
 
     def __init__(self, interval_s: float, period_s: float) -> None:
         self._cycles = max(1, round(interval_s / period_s))
@@ -76,7 +76,7 @@ class RateLimitedEvents(EventSource):
         self.events.append(event._replace(message=f"{event.message} (and {more} before)") if more else event)
 
     def is_due(self, kind: Hashable, t_ns: int) -> bool:
-        """Return whether an event of a kind would be reported at once."""
+        """Return whether `report` would report an event of a kind now: none was reported within the last second."""
         said_ns = self._said_ns.get(kind)
         return said_ns is None or t_ns - said_ns >= REPEAT_NS
 
@@ -92,16 +92,17 @@ class ArmWatch:
     """
 
     def __init__(self, settings: Settings, watch: Callable[[int], list[str]]) -> None:
-        """`watch` returns the heartbeat failures at a time in ns, one line each."""
+        """`watch`: returns the failures of the devices' heartbeats at a time in ns, one line each."""
         self.lost: list[str] = []
         self.deadline = DeadlineWatch(settings)
         self._watch = watch
         self._looks = Recurrence(_LOOKS * settings.bus.heartbeat_ms * 1e-3, settings.bus.period_s)
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Return the arm's state with fault HEARTBEAT if a device's heartbeat fails; else as `DeadlineWatch.judge`.
+        """Return the arm's state with fault HEARTBEAT if a device's heartbeat fails, then as of `DeadlineWatch.judge`.
 
-        A fault that is set already stays. `lost` is updated every `_LOOKS` of a heartbeat period.
+        A fault that is set already stays. `lost` is updated every `_LOOKS` of a heartbeat period. Call it once per
+        cycle.
         """
         if self._looks.take_turn(arm.cycle):
             self.lost = self._watch(arm.t_ns)
@@ -135,7 +136,10 @@ class HeartbeatWatch:
     """Follows the heartbeats of some nodes, while they should be operational."""
 
     def __init__(self, nodes: Iterable[tuple[str, int]], period_ms: int, report: Callable[[Event], None]) -> None:
-        """`nodes`: name and node id. `report` gets an event when a node falls out and when it is back."""
+        """`nodes`: name and node id. `period_ms`: of their heartbeats.
+
+        `report` gets an event when a node falls silent or leaves OPERATIONAL, and when it is back.
+        """
         self._nodes = {HEARTBEAT_ID + node_id: _WatchedNode(name, node_id) for name, node_id in nodes}
         self._patience_ns = round(PATIENCE_PERIODS * period_ms * 1_000_000)
         self._report = report
@@ -170,7 +174,7 @@ class HeartbeatWatch:
     def judge_nodes(self, t_ns: int) -> list[str]:
         """Return a line per node that fails now; empty if all are well or the watch is stopped.
 
-        Report an event for each node whose failure is new, another than before, or over.
+        Report an event for each node whose failure is new, another than at the last call, or over.
         """
         if not self._is_watching:
             return []
@@ -184,7 +188,7 @@ class HeartbeatWatch:
         return lines
 
     def _judge(self, node: _WatchedNode, t_ns: int, since_ns: int) -> str:
-        """Return a node's failure now in one line, or ""; report a failure that is new, another than before, or over.
+        """Return a node's failure now in one line, or ""; report one that is new, another than the last, or over.
 
         since_ns: time of the first judgement after `start`.
         """
@@ -237,9 +241,10 @@ class DeadlineWatch:
         self._verdict = ""
 
     def judge(self, arm: ArmState) -> ArmState:
-        """Count a cycle's misses; return its state, changed if the host has missed `realtime.misses` periods or more.
+        """Count the periods skipped before a cycle; return its state, changed if there were too many recently.
 
-        Then `is_late` is set if `realtime.on_misses` is hold; else the fault is DEADLINE, unless there is another.
+        Too many: `realtime.misses` within `realtime.misses_window_s`. Then `is_late` is set if `realtime.on_misses` is
+        hold; else the fault is DEADLINE, unless there is another. Call it once per cycle.
         """
         misses = self._misses
         if arm.periods > 1:

@@ -153,13 +153,13 @@ class CanopenBus:
         return node
 
     def command(self, nmt_command: int, node_id: int = 0) -> None:
-        """Send an NMT command to one node, or to all. Raises BusError."""
+        """Send an NMT command to one node; node_id 0: to all. Raises BusError if the bus refuses it."""
         self._bus.send(NMT_ID, bytes((nmt_command, node_id)))
 
     def _send(self, can_id: int, data: bytes) -> None:
         """Send a frame for canopen; after an SDO request, read the bus until its answer is in or overdue.
 
-        Before a request, wait for the node's pause. Raises BusError.
+        Before a request, wait for the node's pause. Raises BusError if the bus fails.
         """
         is_request = can_id & 0x780 == SDO_REQUEST_ID and data[0] != SDO_ABORT
         answer_s, pause_s = self._patience.get(can_id & 0x7F, (ANSWER_TIMEOUT_S, 0.0))
@@ -173,7 +173,7 @@ class CanopenBus:
         """Read the bus until a frame is the answer; return whether it came. Each frame goes to canopen and `bystander`.
 
         False after a silence of `timeout_s`, `timeout_s` after the first of other frames, or after 10,000 of them.
-        Raises BusError.
+        Raises BusError if the bus fails.
         """
         remaining_s = timeout_s
         first_ns: int | None = None
@@ -208,7 +208,8 @@ class CanopenBus:
 def as_device_error(name: str, node_id: int, what: str, answer_s: float = ANSWER_TIMEOUT_S) -> Iterator[None]:
     """Turn exceptions of canopen into a DeviceError of one line, an abort into RefusedError.
 
-    BusError and DeviceError pass. The request, `what`, is in words. `answer_s`: the wait that a missing answer names.
+    BusError and DeviceError pass. `name`, `node_id`: of the device, `what`: the request in words, for the line.
+    `answer_s`: the wait that the error of a missing answer names.
     """
     try:
         yield
@@ -223,9 +224,9 @@ def as_device_error(name: str, node_id: int, what: str, answer_s: float = ANSWER
 
 
 def read_object(node: Any, index: int, subindex: int = 0) -> bytes | None:
-    """Return an object's bytes as the node sends them; None if the node answers that it has no such object.
+    """Read an object over SDO; return its bytes as the node sends them, None if it answers that it has no such object.
 
-    Raises DeviceError if the node refuses or doesn't answer, and BusError.
+    `node`: canopen's. Raises DeviceError if the node refuses or doesn't answer, BusError if the bus fails.
     """
     with as_device_error("node", node.id, f"object 0x{index:04X}:{subindex}"):
         try:
@@ -264,7 +265,7 @@ def name_error(code: int) -> str:
 
 
 def describe_emergency(code: int, manufacturer: bytes, has_watchdog: bool) -> str:
-    """Return an EMCY message in words, in one line. `manufacturer`: its bytes 3 to 7.
+    """Return an EMCY message in words, in one line. `code`: its error code; `manufacturer`: its bytes 3 to 7.
 
     `has_watchdog`: these bytes are the watchdog's number and the device's time.
     """

@@ -108,7 +108,8 @@ def load_contract(settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
 def compose(settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
     """Return the codec of a contract that is composed from the profiles of these devices.
 
-    Raises ConfigError for profiles that give no contract, such as two frames with one identifier, and CodecError.
+    Raises ConfigError for profiles that give no contract, such as two frames with one identifier; CodecError for a
+    layout that the codec doesn't accept, such as a signal of 24 bits.
     """
     text = _write_dbc(settings, _messages(settings, devices))
     return parse_codec(text.encode(), Path(COMPOSED_NAME))
@@ -180,9 +181,9 @@ def _scales(message: MessageCodec) -> str:
 
 
 def _messages(settings: Settings, devices: Sequence[PlacedDevice]) -> list[_DbcMessage]:
-    """Return the messages of an arm, sorted by identifier.
+    """Return the messages of an arm, sorted by identifier: NMT, SYNC, heartbeats, EMCY, SDO and the profiles' PDOs.
 
-    Raises ConfigError as `_pdo_message`, and for two messages with the same identifier.
+    Raises ConfigError for a PDO that doesn't fit its EDS, bounds or frame, and for two messages with one identifier.
     """
     names = tuple(device.name.upper() for device in devices)
     heartbeat_ms = settings.bus.heartbeat_ms
@@ -230,10 +231,10 @@ def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], pe
 
 
 def _mapped(device: PlacedDevice, pdo: PdoSettings, name: ObjectName) -> EdsVariable:
-    """Return an object of a PDO.
+    """Return an object of a PDO by its name.
 
-    Raises ConfigError as `PlacedDevice.variable`, and if by the EDS no PDO may carry it, or the device receives it but
-    it is read-only.
+    Raises ConfigError if it isn't in the EDS or no integer of the type of STANDARD_TYPES, if by the EDS no PDO may
+    carry it, or if the device receives it but it is read-only.
     """
     variable = device.variable(name)
     refused = "fits no PDO: PDOMapping=0" if not variable.is_mappable else ""
@@ -356,7 +357,10 @@ BA_DEF_DEF_ "GenMsgDelayTime" 0;
 
 
 def _write_dbc(settings: Settings, messages: list[_DbcMessage]) -> str:
-    """Return the text of a DBC. Raises ConfigError for frames of CAN FD without a data bit rate in the settings."""
+    """Return the text of a DBC with these messages, and the bit rates and period of the settings.
+
+    Raises ConfigError for frames of CAN FD without a data bit rate in the settings.
+    """
     senders = sorted({message.sender for message in messages} - {"HOST"})
     is_fd = any(message.length > CLASSIC_BYTES for message in messages)
     if is_fd and not settings.devices.data_bitrate:

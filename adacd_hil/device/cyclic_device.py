@@ -144,5 +144,5 @@ class CyclicDevice(ABC):
         """Store the status of a checked status frame as the one in use."""
 
     def miss(self) -> None:
-        """Note a cycle in which no cyclic frame came."""
+        """Count a cycle in which no cyclic frame came, in `end_to_end`."""
         self.end_to_end.miss()

@@ -53,7 +53,7 @@ def load_profile(name_or_file: str, kind: str) -> DeviceProfile:
 
 
 def _read_profile(path: Path, depth: int = 0) -> tuple[dict[str, Any], list[Path]]:
-    """Return the table of a profile, merged with those that it extends, and the folders of all, its own first.
+    """Return the table of a profile merged over those that it extends, and the folders of all these, its own first.
 
     `depth`: number of profiles that extend this one. Raises ConfigError for a file that can't be read, and for
     `extends` that is no name or goes deeper than _MOST_EXTENDED.
@@ -88,7 +88,7 @@ def _message(pdo: object) -> object:
 def place_devices(settings: Settings) -> list[PlacedDevice]:
     """Return all devices with their profiles: Drive1, Drive2, Sensor1, Sensor2, in this order.
 
-    Raises ConfigError as `load_profile`, and for an EDS that can't be parsed.
+    Raises ConfigError for a profile or EDS that can't be read or used, or a profile of the wrong kind.
     """
     names = {"drive": settings.devices.drive, "sensor": settings.devices.sensor}
     return _placed(settings, lambda kind, joint: load_profile(names[kind][joint], kind))

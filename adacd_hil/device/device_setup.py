@@ -34,7 +34,7 @@ class Slave:
     """A device of the arm on the bus, as its master sees it."""
 
     def __init__(self, device: PlacedDevice, node: Any, wait: Callable[[float], object] = lambda _: None) -> None:
-        """`node`: canopen's object of it. `wait`: lets so many seconds pass on the bus."""
+        """`node`: canopen's object of it. `wait`: reads the bus for so many seconds."""
         self.wait = wait
         self.device = device
         self.name = device.name
@@ -61,13 +61,18 @@ class Slave:
     def read(self, index: int, sub: int = 0) -> int:
         """Read an object over SDO and return its number.
 
-        Raises DeviceError if the EDS doesn't list it, or the device refuses or doesn't answer; and BusError.
+        Raises DeviceError if the EDS doesn't list it, or the device refuses or doesn't answer; BusError if the bus
+        fails.
         """
         with as_device_error(self.name, self.node_id, f"reading {self.name_object(index, sub)}", self.answer_s):
             return int(self._entry(index, sub).raw)
 
     def write_object(self, index: int, sub: int, value: int) -> None:
-        """Write a number to an object over SDO, and note it in `known`. Raises as `read`."""
+        """Write a number to an object over SDO, and store it in `known`.
+
+        Raises DeviceError if the EDS doesn't list it, or the device refuses or doesn't answer; BusError if the bus
+        fails.
+        """
         what = f"writing {self.name_object(index, sub)} = {_number(value)}"
         with as_device_error(self.name, self.node_id, what, self.answer_s):
             self._entry(index, sub).raw = value
@@ -76,7 +81,8 @@ class Slave:
     def write_checked(self, index: int, sub: int, value: int, unit: str = "") -> None:
         """Write a number to an object as `write_object`, and read it back. `unit`: for the error's text.
 
-        Raises DeviceError if the two differ, or as `read`.
+        Raises DeviceError if the two differ, the EDS doesn't list it, or the device refuses or doesn't answer; BusError
+        if the bus fails.
         """
         self.write_object(index, sub, value)
         found = self.read(index, sub)
@@ -87,9 +93,10 @@ class Slave:
             )
 
     def compare(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", is_hex: bool = False) -> str:
-        """Read an object; return its difference from `expected` in words, "" if equal. Note `expected` in `known`.
+        """Read an object; return its difference from `expected` in words, "" if equal. Store `expected` in `known`.
 
-        `quantity`, `unit`, `is_hex`: name, unit and form of the value in that text. Raises as `read`.
+        `quantity`, `unit`: of the value in that text; `is_hex`: its numbers are hexadecimal. Raises DeviceError if the
+        object can't be read, BusError if the bus fails.
         """
         found = self.read(index, sub)
         self.known[index, sub] = expected
@@ -101,7 +108,8 @@ class Slave:
     def expect(self, index: int, sub: int, expected: int, quantity: str, unit: str = "", remedy: str = "") -> None:
         """Compare an object as `compare`; raise DeviceError, with the remedy, if it differs from `expected`.
 
-        Raises as `read`, too.
+        `quantity`, `unit`: of the value, for the error. Raises DeviceError also if the object can't be read, BusError
+        if the bus fails.
         """
         if text := self.compare(index, sub, expected, quantity, unit):
             self.fail(text, remedy)
@@ -112,7 +120,7 @@ class Slave:
         return str(ObjectName(index, sub)) + ("" if variable is None else f" {variable.name}")
 
     def fail(self, text: str, remedy: str = "") -> NoReturn:
-        """Raise DeviceError with the device's name. `remedy`: how the user can correct it."""
+        """Raise DeviceError with the device's name, node id and `text`. `remedy`: how the user can correct it."""
         raise DeviceError(f"{self.name} (node {self.node_id}): {text}", remedy)
 
     def _entry(self, index: int, sub: int) -> Any:
@@ -137,7 +145,10 @@ _MODE_READS = 20
 
 
 def command_deadline_ms(settings: Settings) -> int:
-    """Return the deadline of commands in ms, rounded up, for drives that count time instead of SYNCs."""
+    """Return the longest time without a new command until a drive faults, ms, rounded up.
+
+    It is `bus.command_patience_cycles` periods, for drives that count time instead of SYNCs.
+    """
     return max(1, math.ceil(settings.bus.command_patience_cycles * settings.bus.period_us / 1000))
 
 
@@ -150,7 +161,7 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequenc
     """Check the drive, write limits, option codes and mode; return values that could not be checked, a line each.
 
     `drives`: of all joints. Raises DeviceError for a drive without cyclic synchronous torque, another rated torque,
-    gear or unit than configured, or a value that it doesn't take; and BusError.
+    gear or unit than configured, or a value that it doesn't take; BusError if the bus fails.
     """
     joint, profile = slave.device.joint, slave.device.settings
     if slave.has(0x6502):
@@ -278,7 +289,8 @@ def _enter_mode(slave: Slave, codec: Codec) -> None:
     """Request cyclic synchronous torque, if 0x6060 can be written; end a halt under which the drive refuses it.
 
     0x6061 may show the mode later, once the drive is enabled: the cycle compares it. But if no frame carries it, 0x6061
-    must show it within `patience.mode_s`. Raises DeviceError if it doesn't, or as `Slave.read`; and BusError.
+    must show it within `patience.mode_s`. Raises DeviceError if it doesn't, or the drive refuses or doesn't answer;
+    BusError if the bus fails.
     """
     if not slave.can_write(0x6060):
         return
@@ -348,7 +360,7 @@ def check_sensor(slave: Slave, codec: Codec) -> str:
 
 
 def _channel(slave: Slave) -> int:
-    """Return the channel of a sensor: the sub-index of the torque that its profile maps, 1 if that is 0 or missing."""
+    """Return the channel of a sensor: the sub-index of the torque object in its profile, 1 if that is 0 or missing."""
     pdo = slave.device.pdo("Torque")
     signals = () if pdo is None else pdo.signals
     return next((signal.name.sub for signal in signals if signal.signal == "torque"), 0) or 1
@@ -394,7 +406,10 @@ class ParameterWatch(RateLimitedEvents):
         """The first object whose value differs from the set-up, in one line; empty without a difference."""
 
     def follow(self, slaves: Iterable[Slave]) -> None:
-        """Make the objects that the set-up of these devices has written or compared those that `step` reads."""
+        """Have `step` read the objects that the set-up of these devices has written or compared.
+
+        In turn, the first of each device, then the second of each, and so on.
+        """
         found = [[_KnownObject(slave, place, value) for place, value in slave.known.items()] for slave in slaves]
         # By turns, so that no device waits for all objects of another.
         longest = max(map(len, found), default=0)
@@ -407,7 +422,8 @@ class ParameterWatch(RateLimitedEvents):
     def step(self, cycle: int, t_ns: int) -> None:
         """Send the request for the next object if it is due and none is open; warn of one that got no answer in time.
 
-        Sends none if `devices.reread_ms` is 0. Raises BusError.
+        Call it once per cycle. A request also waits for the `patience.pause_ms` of its device. None is sent if
+        `devices.reread_ms` is 0. Raises BusError if the bus refuses a frame.
         """
         asked = self._asked
         if asked is not None and cycle - self._asked_cycle > round(asked.slave.answer_s / self._period_s):
@@ -465,8 +481,8 @@ def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
     """Write the PDOs of a device that differ from its profile, or all if the profile's `mapping` is `rewritten`.
 
     PDOs that the profile doesn't name are switched off. `command_deadline_ms`: event timer of the command PDO if the
-    profile's `command_watchdog` is `0x1400:5`. Raises DeviceError if a PDO still differs, or as `Slave.read`; and
-    BusError.
+    profile's `command_watchdog` is `0x1400:5`. Raises DeviceError if a PDO still differs, or the device refuses or
+    doesn't answer; BusError if the bus fails.
     """
     profile = slave.device.settings
     timers = {pdo.message: _event_timer(slave, pdo, command_deadline_ms) for pdo in profile.pdo}
@@ -548,7 +564,8 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
 def pdo_differences(slave: Slave, command_deadline_ms: int) -> list[str]:
     """Read the PDOs of a device; return the first difference of each from its profile, a line each; empty without any.
 
-    `command_deadline_ms`: as of `set_up_pdos`. Raises as `Slave.read`.
+    `command_deadline_ms`: as of `set_up_pdos`. Raises DeviceError if the device refuses or doesn't answer, BusError if
+    the bus fails.
     """
     found = [
         (pdo, _difference(slave, pdo, _event_timer(slave, pdo, command_deadline_ms)))
@@ -560,7 +577,7 @@ def pdo_differences(slave: Slave, command_deadline_ms: int) -> list[str]:
 def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
     """Read a PDO; return its first difference from the profile in words, "" without one.
 
-    Note the expected values in `known`.
+    Store the expected values in the device's `known`.
     """
     index = pdo.communication_index
     identifier = slave.read(index, _COB_ID)

@@ -138,6 +138,7 @@ class Drive(CyclicDevice):
     ) -> None:
         """`quick_stop_option`: 0x605A, None when unknown. `max_torque_permille`: for commands that carry 0x6072.
 
+        `position_jump_rad`: largest step of an unprotected position beyond velocity x time that is plausible.
         Raises CodecError when the contract lacks a message or signal, or a command has one that the host can't fill.
         """
         name = f"Drive{joint}"
@@ -176,7 +177,8 @@ class Drive(CyclicDevice):
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:
         """Return DATA_AGE if the drives are enabled (`is_enabled`) and the status is older than `status_age_limit`.
 
-        Else DRIVE as of `has_excess`, else NONE. The drive's own FAULT state and `error_code` don't count here.
+        Else DRIVE if a bounded value is outside its bounds, or a status with such values missing or too old; else NONE.
+        The drive's own FAULT state and `error_code` don't count here.
         """
         if is_enabled and cycle - self.status_cycle > self.status_age_limit:
             return FaultReason.DATA_AGE
@@ -217,7 +219,10 @@ class Drive(CyclicDevice):
         return abs(values[self._main_at] - self._received - travel)
 
     def _take_status(self, values: Sequence[float], at: _StatusPlaces, cycle: int) -> None:
-        """Take the signals of the status that a frame carries, at their places; keep the values of all others."""
+        """Store the signals of the status that a frame of `cycle` carries; those that it lacks keep their values.
+
+        at: their places among `values`.
+        """
         self.status_cycle = cycle
         if at.statusword >= 0:
             self.statusword = int(values[at.statusword])

@@ -57,7 +57,10 @@ class DriveUnits(NamedTuple):
 
 
 def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
-    """Return the units of a drive by its objects. `number` reads them. `gear_ratio`: used if 0x6091 is missing or 0."""
+    """Return the units of a drive's position and velocity by its objects; `number` returns an object's value or None.
+
+    `gear_ratio`: motor revolutions per revolution of the joint, used if 0x6091 is missing or 0.
+    """
     encoder, motor_revs = number(0x608F, 1), number(0x608F, 2)
     gear_in, gear_out = number(0x6091, 1), number(0x6091, 2)
     feed, shaft_revs = number(0x6092, 1), number(0x6092, 2)

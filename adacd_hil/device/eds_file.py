@@ -31,7 +31,10 @@ _EDS_NUMBER = re.compile(r"(?i:\s*(?:\$NODEID\s*\+?)?\s*[-+]?\s*(?:0x[0-9a-f]+|[
 
 
 def read_eds(path: Path, node_id: int | None) -> Any:
-    """Return the object dictionary of an EDS file, as `parse_eds`. Raises ConfigError, also if it can't be read."""
+    """Return canopen's object dictionary of an EDS file; `$NODEID` in it becomes `node_id`, see `parse_eds`.
+
+    Raises ConfigError if it can't be read or parsed.
+    """
     return parse_eds(eds_bytes(path), path, node_id)
 
 
@@ -47,7 +50,8 @@ def parse_eds(data: bytes, path: Path, node_id: int | None) -> Any:
     """Return canopen's object dictionary of an EDS; `$NODEID` in it becomes `node_id`; None: the node id of a DCF.
 
     Values that canopen can't read as a number are dropped. The same data give the same object: don't change it. `path`:
-    names the EDS in errors. Raises ConfigError for an EDS that can't be parsed, or as `_check_eds`.
+    names the EDS in errors. Raises ConfigError for an EDS that can't be parsed, has control characters, or gives a
+    standard integer object a value that is no number.
     """
     try:
         return _parse(data, node_id)
@@ -59,7 +63,7 @@ def parse_eds(data: bytes, path: Path, node_id: int | None) -> Any:
 
 @functools.lru_cache(maxsize=32)
 def _parse(data: bytes, node_id: int | None) -> Any:
-    """Check an EDS, and return canopen's object dictionary of it; the same one for the same arguments."""
+    """Check an EDS with `_check_eds`; return canopen's object dictionary of it, the same one for the same arguments."""
     text = data.decode("utf-8", "replace").removeprefix("\ufeff")
     _check_eds(text)
     stream = io.StringIO(readable_eds(text))

@@ -79,7 +79,7 @@ class Master(EventSource):
         self._canopen.bystander = self._heartbeats.accept
 
     def _on_emergency(self, name: str, error: Any) -> None:
-        """Add an event for an EMCY, and keep it as the device's last error; an error reset deletes that instead."""
+        """Add an event for an EMCY of device `name`, and store it as its last error; an error reset deletes that."""
         slave = next(slave for slave in self.slaves if slave.name == name)
         text = describe_emergency(error.code, bytes(error.data), slave.device.can("watchdog_in_emcy"))
         if error.code >> 8:
@@ -111,8 +111,8 @@ class Master(EventSource):
     def reset(self) -> None:
         """Reset the communication of the arm's nodes and wait until each has booted.
 
-        Drop frames from before, forget kept errors, and stop watching heartbeats. Raises DeviceError if a node doesn't
-        boot within `devices.boot_timeout_s`; and BusError.
+        Drop frames received earlier, forget the devices' EMCYs, and stop watching heartbeats. Raises DeviceError if a
+        node doesn't boot within `devices.boot_timeout_s`, BusError if the bus fails.
         """
         for _ in range(_MOST_OLD_FRAMES):  # from before the reset; a full queue has no room for new frames
             if self._bus.receive(0.0) is None:
@@ -133,14 +133,17 @@ class Master(EventSource):
             raise DeviceError(f"no boot-up from {missing} on {self._bus.channel} within {timeout_s:g} s", _UNPOWERED)
 
     def identify(self) -> list[Identity]:
-        """Return each device's identity. Raises DeviceError if one differs from EDS, profile or DBC; and BusError."""
+        """Read and return each device's identity.
+
+        Raises DeviceError if one differs from EDS, profile or DBC, or can't be read; BusError if the bus fails.
+        """
         return [self._identify(slave) for slave in self.slaves]
 
     def _identify(self, slave: Slave) -> Identity:
         """Return a device's identity, 0 for entries that the EDS lacks.
 
         Raises DeviceError for another node id than the DBC's, another device than the EDS's, another serial number than
-        the profile's, and another contract in 0x2000, as far as the profile has these; and BusError.
+        the profile's, and another contract in 0x2000, as far as the profile has these; BusError if the bus fails.
         """
         profile = slave.device.settings
         by_contract = self._codec.node_id(f"{slave.name}Heartbeat")
@@ -205,7 +208,7 @@ class Master(EventSource):
         """Set up all devices over SDO: SYNC, heartbeats, EMCY, PDOs, drives and sensors, the profiles' `setup`.
 
         Afterwards `parameters` watches the written values. Remarks become events. Raises DeviceError if a device
-        refuses a value or differs from its profile or the configuration; and BusError.
+        refuses a value or differs from its profile or the configuration; BusError if the bus fails.
         """
         for slave in self.slaves:
             self._set_up_sync(slave)
@@ -226,7 +229,8 @@ class Master(EventSource):
     def _set_up_sync(self, slave: Slave) -> None:
         """Write SYNC's period, and the overflow of its counter if the device counts.
 
-        Raises DeviceError if the device has another identifier of SYNC or doesn't take the values; and BusError.
+        Raises DeviceError if the device has another identifier of SYNC or doesn't take the values; BusError if the bus
+        fails.
         """
         if slave.has(0x1005):
             identifier = slave.read(0x1005) & MAX_STANDARD_ID
@@ -277,7 +281,7 @@ class Master(EventSource):
     def start(self) -> None:
         """Watch heartbeats, and send NMT start: to all nodes at once if `devices.start` is all, else sensors first.
 
-        Raises BusError.
+        Raises BusError if the bus refuses a frame.
         """
         self._heartbeats.start()
         if self._settings.devices.start == "all":
@@ -288,15 +292,18 @@ class Master(EventSource):
             self._canopen.command(START, slave.node_id)
 
     def stop(self) -> None:
-        """Put all nodes back to pre-operational, and stop watching their heartbeats. Raises BusError.
+        """Send the NMT command to enter pre-operational to all nodes, and stop watching their heartbeats.
 
-        Drives drop out if they are still enabled.
+        Drives that are still enabled then leave Operation enabled. Raises BusError if the bus refuses a frame.
         """
         self._heartbeats.stop()
         self._command(ENTER_PRE_OPERATIONAL)
 
     def leave_operational(self, node_id: int) -> None:
-        """Send one node the NMT command to enter pre-operational; do not wait for its reply. Raises BusError."""
+        """Send one node the NMT command to enter pre-operational; do not wait for its reply.
+
+        Raises BusError if the bus refuses the frame.
+        """
         self._canopen.command(ENTER_PRE_OPERATIONAL, node_id)
 
     def _command(self, nmt_command: int) -> None:
@@ -313,5 +320,5 @@ class Master(EventSource):
         return self._heartbeats.judge_nodes(t_ns)
 
     def send_heartbeat(self) -> None:
-        """Send the host's heartbeat, 0x700 + its node id. Raises BusError."""
+        """Send the host's heartbeat, 0x700 + its node id. Raises BusError if the bus refuses it."""
         self._bus.send(self._heartbeat_id, bytes((OPERATIONAL,)))

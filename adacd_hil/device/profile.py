@@ -116,7 +116,7 @@ class SignalSettings:
 
     @property
     def is_bounded(self) -> bool:
-        """Whether the arm stops at some values."""
+        """Whether a least or greatest value, beyond which the arm stops, is set."""
         return self.low is not None or self.high is not None
 
     @property
@@ -312,7 +312,10 @@ class ProfileSettings:
                 raise ValueError(f"pdo {pdo.message}: transmission = {pdo.transmission} must be 1, on every SYNC")
 
     def _check_bounds(self, pdo: PdoSettings) -> None:
-        """Raise ValueError for bounds in a command or in a status without event timer, and for a wrong `of`."""
+        """Raise ValueError for bounds in a command or in a status without event timer, and for a wrong `of`.
+
+        `of` must name another signal of the frame, of the same unit.
+        """
         signals = {signal.signal: signal for signal in pdo.signals}
         for name, signal in signals.items():
             place = f"pdo {pdo.message}: signal {name!r}"
@@ -431,7 +434,7 @@ class PlacedDevice:
         return variable is not None and variable.is_writable
 
     def can(self, feature: str) -> bool:
-        """Return whether the profile names a feature."""
+        """Return whether the profile lists a feature of FEATURES; the EDS isn't asked."""
         return feature in self.settings.features
 
     def pdo(self, message: str) -> PdoSettings | None:
@@ -439,11 +442,11 @@ class PlacedDevice:
         return next((pdo for pdo in self.settings.pdo if pdo.message == message), None)
 
     def can_id(self, pdo: PdoSettings) -> int:
-        """Return the identifier of a PDO."""
+        """Return the CAN identifier of a PDO of this device: its `cob_id` plus the node id."""
         return pdo.cob_id + self.node_id
 
     def variable(self, name: ObjectName) -> EdsVariable:
-        """Return an object of the EDS.
+        """Return an object of the EDS that is an integer.
 
         Raises ConfigError when it isn't listed, is a float or no number, or hasn't the type of STANDARD_TYPES.
         """
@@ -466,12 +469,15 @@ class PlacedDevice:
         return found
 
     def mapping(self, pdo: PdoSettings) -> list[int]:
-        """Return the mapping entries of a PDO, CiA 301 figure 70: index, sub-index, bits. Raises as `variable`."""
+        """Return the mapping entries of a PDO, CiA 301 figure 70: each index, sub-index and bits in one number.
+
+        Raises ConfigError for an object that `variable` refuses.
+        """
         names = [signal.name for signal in self.header(pdo)] + [signal.name for signal in pdo.signals]
         return [name.index << 16 | name.sub << 8 | self.variable(name).bits for name in names]
 
     def header(self, pdo: PdoSettings) -> list[SignalSettings]:
-        """Return the header objects of a PDO; [] for an unprotected one."""
+        """Return the objects of the end-to-end header of a PDO, each as a signal; [] for an unprotected one."""
         if not pdo.data_ids:
             return []
         return [SignalSettings(object=text, signal="e2e") for text in self.settings.header]

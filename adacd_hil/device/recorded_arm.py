@@ -55,7 +55,7 @@ class RecordedArm:
     """Turns the logged frames of one run into the states that its arm reported, attempt after attempt."""
 
     def __init__(self, settings: Settings, codec: Codec, devices: Sequence[PlacedDevice]) -> None:
-        """Make the first arm. Raises CodecError as `Arm`."""
+        """Make the first arm. Raises CodecError when the contract lacks a frame or signal of the devices."""
         self._settings, self._codec = settings, codec
         self._is_following = settings.bus.follows
         self._devices = devices
@@ -70,7 +70,7 @@ class RecordedArm:
         self._is_running = False
 
     def read(self, ticks: Ticks, frames: NDArray[Any]) -> ArmBatch:
-        """Return the states of some cycles, given all frames that were logged with them, before or between them.
+        """Return the states of the cycles in `ticks`, given all frames that were logged with, before or between them.
 
         `frames`: FRAME_DTYPE or LONG_FRAME_DTYPE of the log's reader. Consecutive calls take up a run piece by piece;
         frames that were logged after the last cycle of a piece may come with this call or with the next.
@@ -134,7 +134,10 @@ class RecordedArm:
         self._is_running = True
 
     def _accept(self, frame: Frame, is_late: bool = False) -> None:
-        """Give a received frame to the arm, else to the heartbeat watch; drop it before the host's NMT start."""
+        """Give a received frame to the arm, else to the heartbeat watch; drop it before the host's NMT start.
+
+        is_late: it arrived before the cycle's SYNC, so it answers an earlier one.
+        """
         if self._is_running and not self._arm.accept(frame, is_late):
             self._heartbeats.accept(frame)
 

@@ -38,7 +38,10 @@ _READING = (2, 3, 5)
 
 
 def host_frames(settings: Settings, codec: Codec, devices: Iterable[PlacedDevice]) -> dict[int, str]:
-    """Return, by identifier of each frame that only this host may send, words for another sender's action."""
+    """Return, by identifier, the frames that only this host may send.
+
+    The values are words for the action of another sender, such as `sends SYNC`.
+    """
     doing = {
         codec.message(HOST_HEARTBEAT).can_id: "sends this host's heartbeat",
         NMT_ID: "sends NMT commands",
@@ -57,7 +60,7 @@ def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec, dev
     """Listen for HOSTS_LISTEN_S; raise DeviceError if another host runs the arm, which a reset would take from it.
 
     Not for lockstep, where time passes only by this host's own frames. Requests that only read objects, and NMT
-    commands to nodes of other arms, are ignored. Raises BusError, too.
+    commands to nodes of other arms, are ignored. Raises BusError if the bus fails.
     """
     strangers = Strangers(settings, codec, devices)
     end_ns = clock.now_ns() + round(HOSTS_LISTEN_S * 1e9)
@@ -112,7 +115,8 @@ class Strangers(RateLimitedEvents):
     def report_second_frame(self, frame: Frame, name: str, cycle: int) -> None:
         """Report a second, different frame of a device on one SYNC: as a warning if it is a single one.
 
-        CONTRADICTIONS of them within CONTRADICTION_WINDOW_S are an error, and count as another sender's action.
+        CONTRADICTIONS of them within CONTRADICTION_WINDOW_S are an error, and count as another sender's action. name:
+        of the device.
         """
         seen = self._contradictions.setdefault(name, deque(maxlen=CONTRADICTIONS))
         seen.append(cycle)
@@ -123,7 +127,10 @@ class Strangers(RateLimitedEvents):
         self.report(frame.t_ns, (frame.can_id, "once"), Event("warning", "bus", text))
 
     def _complain(self, frame: Frame, doing: str, cycle: int) -> None:
-        """Report an action of another sender as an error, and keep it for `have_acted` and `describe_senders`."""
+        """Report an action of another sender, `doing`, as an error.
+
+        For HOLD_S from `cycle` on, `have_acted` is then True and `describe_senders` has the action.
+        """
         text = f"somebody else {doing} (0x{frame.can_id:03X})"
         self._until_cycle = cycle + self._hold_cycles
         self._complaints[text] = cycle

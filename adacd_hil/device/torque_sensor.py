@@ -39,7 +39,7 @@ class TorqueSensor(CyclicDevice):
         torque_rate_Nm_s: float = math.inf,
         torque_range_Nm: float = 0.0,
     ) -> None:
-        """`torque_rate_Nm_s`: the largest change of torque between unprotected frames.
+        """`torque_rate_Nm_s`: the largest plausible rate of torque between unprotected frames. `period_s`: of SYNC.
 
         `torque_range_Nm`: torque in either direction from which a sensor counts as overloaded and not valid, if its
         torque frame carries no status; 0: none.
@@ -69,7 +69,11 @@ class TorqueSensor(CyclicDevice):
         self._heard_bits = 0  # of the last status frame
 
     def fault(self, cycle: int, is_enabled: bool) -> FaultReason:  # noqa: ARG002 (as of all devices)
-        """Return SENSOR if the status has NOT_VALID, or as of `has_excess`; else NONE, also for an overload."""
+        """Return SENSOR if the status has NOT_VALID, or a bounded value is outside its bounds; else NONE.
+
+        SENSOR also if a status with bounded values is missing or too old; NONE for an overload alone. `is_enabled` has
+        no effect here.
+        """
         if self.status not in USABLE or self.has_excess(cycle):
             return FaultReason.SENSOR
         return FaultReason.NONE

@@ -23,11 +23,11 @@ class ValueBound(NamedTuple):
     high: float
 
     def value_in(self, values: Sequence[float]) -> float:
-        """Return the bounded value of a decoded frame, or its difference to the other one."""
+        """Return the bounded quantity of a decoded frame: one value, or its difference to the value at `place_of`."""
         return values[self.place] - (0.0 if self.place_of is None else values[self.place_of])
 
     def is_within(self, values: Sequence[float]) -> bool:
-        """Return whether the value of a decoded frame is within its bounds; NaN isn't."""
+        """Return whether the bounded quantity of a decoded frame is within its bounds, inclusive; NaN isn't."""
         return self.low <= self.value_in(values) <= self.high
 
     def describe(self, values: Sequence[float]) -> str:

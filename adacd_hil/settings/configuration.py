@@ -69,17 +69,26 @@ class Settings:
 
     @property
     def blind_cycles(self) -> int:
-        """Cycles in a row without a fresh sample that fault the run: not fewer than a value may be old."""
+        """Cycles in a row without a fresh sample that fault the run.
+
+        The larger of `data.blind_cycles` and `bus.max_age_cycles`.
+        """
         return max(self.data.blind_cycles, self.bus.max_age_cycles)
 
     @property
     def commission_cycles(self) -> int:
-        """Good cycles in a row before the drives are enabled: those of `safety.commission_s`, at least one."""
+        """Cycles in a row, with complete data, that must pass the checks at rest before the drives are enabled.
+
+        Those of `safety.commission_s`, at least one.
+        """
         return max(1, round(self.safety.commission_s / self.bus.period_s))
 
     @property
     def further_names(self) -> tuple[str, ...]:
-        """Names of the certified scheme's further parameters, after the dynamic ones; () for the paper's scheme."""
+        """Names of the certified scheme's parameters after the dynamic ones, such as `offset1`; () for the paper's.
+
+        Offsets, lags, friction terms, cross-talk and torques by position, as far as the settings ask for them.
+        """
         if self.scheme == "paper":
             return ()
         by_place = POSITION_TERMS if self.arm.position_torque_Nm > 0.0 else ()
@@ -99,9 +108,9 @@ class Settings:
 
     @property
     def channel_count(self) -> int:
-        """Number of residuals per joint with a threshold; 0 for the paper's scheme.
+        """Number of channels per joint, residuals with a threshold each, in the certified scheme's bank; else 0.
 
-        Each filter has a smoothed one, each but the slowest also an unsmoothed one.
+        Each filter has a smoothed channel, each but the slowest also an unsmoothed one.
         """
         return max(2 * self.filter_count - 1, 0)
 

@@ -16,7 +16,7 @@ _LONGEST_CHAIN = 8
 
 
 def with_todays_keys(table: dict[str, Any]) -> dict[str, Any]:
-    """Return a log's configuration, some of its old keys changed to today's; `parse` refuses the other removed keys.
+    """Return a log's configuration table with some old keys changed to today's; `parse` refuses other removed keys.
 
     `safety.commission_cycles` becomes `safety.commission_s`. Withdrawn keys of `detector` are dropped. If
     `certified.cross_talk_std` is missing, the version that wrote the log had no such term, so that it becomes 0.
@@ -61,7 +61,8 @@ def load_settings(name_or_file: str = "paper", profile: str | None = None) -> Se
     """Return the settings of a configuration: a built-in name, or a TOML file merged over the one it `extends`.
 
     A file without `extends` extends `paper`. `profile` picks the `[profiles.X]` table; None: `arm.profile` picks it.
-    Raises ConfigError as `configuration_layers` and `parse`.
+    Raises ConfigError for a file that can't be read, wrong `extends`, an unknown profile, and settings that `parse`
+    refuses.
     """
     return parse(Settings, resolved_table(configuration_layers(name_or_file, profile)))
 
@@ -74,8 +75,8 @@ def resolved_table(layers: Sequence[ConfigurationLayer]) -> dict[str, Any]:
 def configuration_layers(name_or_file: str, profile: str | None = None) -> list[ConfigurationLayer]:
     """Return the layers of a configuration and of all that it extends, the base first.
 
-    The profile's layers precede those of the files, whose keys override them. Raises ConfigError for a file that can't
-    be read, wrong `extends`, and an unknown profile.
+    `profile` picks the `[profiles.X]` tables; None: `arm.profile` does. Their layers precede those of the files, whose
+    keys override them. Raises ConfigError for a file that can't be read, wrong `extends`, and an unknown profile.
     """
     files = _load_chain(name_or_file)
     table = resolved_table(files)
@@ -98,7 +99,7 @@ def configuration_layers(name_or_file: str, profile: str | None = None) -> list[
 
 
 def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
-    """Return a table within a table, empty if absent. Raises ConfigError if the value is not a table."""
+    """Return the table below `key` of a table, empty if absent. Raises ConfigError, with `name`, for another value."""
     value = table.get(key, {})
     if not isinstance(value, dict):
         raise ConfigError(f"{name} = {value!r} must be a table")
@@ -106,7 +107,7 @@ def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
 
 
 def _find_beside(table: dict[str, Any], folder: Path) -> None:
-    """Change `table`: put `folder` before the names in `devices` of files, with a suffix, that exist in it."""
+    """Change `table`: put `folder` before each name in its `devices` that has a suffix and exists in the folder."""
 
     def found(name: Any) -> Any:
         is_beside = isinstance(name, str) and Path(name).suffix and exists(folder / name)

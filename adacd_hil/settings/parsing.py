@@ -73,8 +73,8 @@ def _hints_of(section: type[Any]) -> dict[str, Any]:
 def _read_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
     """Return a value of a TOML table converted to its type `hint`.
 
-    Raises ConfigError for another type or length, and for values outside their bounds or choices; of a list of tables
-    with all problems.
+    key: dotted, for errors. metadata: of the setting's field: unit, bounds, choices. Raises ConfigError for another
+    type or length, and for values outside their bounds or choices; of a list of tables with all problems.
     """
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         hint = next(option for option in typing.get_args(hint) if option is not type(None))
@@ -99,7 +99,10 @@ def _read_value(hint: Any, value: Any, key: str, metadata: Any) -> Any:
 
 
 def _unknown(key: str, known: Iterable[str], where: str) -> str:
-    """Return the error of an unknown key: with its successor or remedy, else the nearest known key, else all."""
+    """Return the error of an unknown key: with its successor or remedy, else the nearest of `known`, else all of them.
+
+    known: the section's keys. where: the section's dotted name and a dot, "" at the top.
+    """
     known = list(known)
     if gone := describe_gone(f"{where}{key}"):
         return gone
@@ -120,7 +123,7 @@ def _is_required(field: "dataclasses.Field[Any]") -> bool:
 
 
 def _parse_scalar(hint: Any, value: Any, key: str, metadata: Any) -> Any:
-    """Return a value that is no list or table, in its type.
+    """Return a value that is no list or table, an integer as float where `hint` is that.
 
     Raises ConfigError for another type, and for a value outside its bounds or choices.
     """
@@ -138,7 +141,10 @@ def _parse_scalar(hint: Any, value: Any, key: str, metadata: Any) -> Any:
 
 
 def _element_hints(hint: Any, value: Any, key: str) -> tuple[Any, ...]:
-    """Return the type of each element of a list. Raises ConfigError for another value or length."""
+    """Return the type of each element of a list, by the tuple type `hint`.
+
+    Raises ConfigError if the value is no list, or hasn't the length that `hint` asks for.
+    """
     if not isinstance(value, list | tuple):
         raise ConfigError(f"`{key}` = {value!r} must be a list")
     hints = typing.get_args(hint)
@@ -179,7 +185,7 @@ _OTHER_UNITS = {
 
 
 def _other_unit(value: float, metadata: Any) -> str:
-    """Return a hint if a value out of bounds would be within them in another unit, else ""."""
+    """Return a hint if a number outside a setting's bounds would be within them, given in another unit; else ""."""
     for unit, worth in _OTHER_UNITS.get(metadata["unit"], ()):
         if value and metadata["low"] <= value * worth <= metadata["high"]:
             return f"; {value:g} {unit} are {value * worth:g} {metadata['unit']}"

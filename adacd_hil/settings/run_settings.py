@@ -366,5 +366,5 @@ class HistorySettings:
 
     @property
     def is_known(self) -> bool:
-        """Whether a last certificate is known."""
+        """Whether a last certificate is given: its date isn't empty."""
         return bool(self.date_utc)

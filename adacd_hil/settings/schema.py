@@ -33,9 +33,10 @@ def setting(
     is_hex: bool = False,
     meaning: str,
 ) -> Any:
-    """Return the field of one setting, required if it has no default. Bounds are inclusive and hold in tuples, too.
+    """Return the dataclass field of one setting, required if it has no default; a section's class as default is called.
 
-    is_hex: an integer that everybody writes in hexadecimal, such as an index; messages do, too.
+    low, high: bounds, inclusive, also of each number of a tuple. choices: permitted texts; (): any. meaning: for the
+    user. is_hex: an integer that everybody writes in hexadecimal, such as an index; messages do, too.
     """
     metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "is_hex": is_hex, "meaning": meaning}
     if isinstance(default, type):

@@ -49,7 +49,7 @@ def sections() -> Iterator[tuple[str, type[Any], str]]:
 
 
 def keys_of(section: type[Any], prefix: str) -> Iterator[KnownKey]:
-    """Yield the settings of a table and of the rows of its lists, `prefix` before each key; no tables within it."""
+    """Yield the settings of a section and of the rows of its lists, `prefix` before each key; no sections within it."""
     hints = typing.get_type_hints(section)
     for field in dataclasses.fields(section):
         kind = hints[field.name]
@@ -113,7 +113,7 @@ def explain_unknown(key: str) -> str:
 
 
 def _bounds(metadata: Any) -> str:
-    """Return `KnownKey.bounds` of a setting, from its field's metadata."""
+    """Return the choices of a setting, else its bounds and unit as text, by its field's metadata; "" without any."""
     if metadata["choices"]:
         return ", ".join(metadata["choices"])
     low, high, unit = metadata["low"], metadata["high"], metadata["unit"]
@@ -127,10 +127,10 @@ _FACTS: Final = ("profile", "sign", "torque_offset_Nm", "torque_offset_std_Nm", 
 
 
 def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
-    """Return the settings with some keys changed, each `section.key` to a TOML value.
+    """Return the settings with some keys changed. changes: by dotted key, a TOML value as text.
 
-    Raises ConfigError for an unknown key, as `explain_unknown`; a text that is no TOML value; a value that `parse`
-    refuses.
+    A word needs no quotes; a single value stands for a list of it, unless the list may be absent. Raises ConfigError
+    for an unknown key, a text that is no TOML value, and a value that `parse` refuses.
     """
     table = tomllib.loads(to_toml(settings))
     known = known_keys()
@@ -166,7 +166,8 @@ def _read_value(key: str, text: str) -> Any:
 def _spread(value: Any, kind: Any, present: Any) -> Any:
     """Return a single value repeated to a list if the setting is a list that can't be absent; else return the value.
 
-    The list is as long as the present one, or as the type says if there is none.
+    kind: the setting's type. The list is as long as `present`, the setting's value so far, or, if that is no list, as
+    `kind` says.
     """
     if typing.get_origin(kind) is tuple and not isinstance(value, list):
         elements = [element for element in typing.get_args(kind) if element is not Ellipsis]
@@ -209,7 +210,7 @@ def parse_changes(given: Sequence[str]) -> dict[str, str]:
 def parse_variations(given: Sequence[str]) -> list[dict[str, str]]:
     """Return every combination of values of `key=a,b,c` texts, each as text by key; [{}] without any text.
 
-    Raises ConfigError as `parse_changes`, and for a key in two texts.
+    Raises ConfigError for a text without `=` or without a key, and for a key in two texts.
     """
     varied = parse_changes(given)
     if len(varied) < len(given):

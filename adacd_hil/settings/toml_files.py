@@ -103,9 +103,9 @@ def toml_names(folder: Traversable) -> list[str]:
 
 
 def find_toml(kind: str, name_or_file: str, folder: Traversable) -> Path:
-    """Return the file of a built-in name, or the given path; a path with a suffix may be missing.
+    """Return the file of a built-in name in `folder`, or the given path; a path with a suffix may be missing.
 
-    Raises ConfigError for any other name, with the nearest built-in one.
+    Raises ConfigError for any other name, with the nearest built-in one. kind: of the file, for the error.
     """
     names = toml_names(folder)
     if name_or_file in names:

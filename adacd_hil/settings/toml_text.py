@@ -22,7 +22,7 @@ def to_short_toml(settings: Any) -> str:
 
 
 def is_default(field: "dataclasses.Field[Any]", value: Any) -> bool:
-    """Return whether a setting has its default value."""
+    """Return whether a setting's value equals its default; False for a setting without one."""
     if field.default_factory is not dataclasses.MISSING:
         return bool(value == field.default_factory())
     return field.default is not dataclasses.MISSING and bool(value == field.default)

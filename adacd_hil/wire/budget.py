@@ -44,18 +44,18 @@ HORIZON_NS = 1_000_000_000
 
 
 class Stream(NamedTuple):
-    """Frames of one message: time on the bus, smallest interval between two."""
+    """Frames of one message: duration of one on the bus, smallest interval between the queueing of two."""
 
     duration_ns: int
     interval_ns: int
 
     def arrivals(self, window_ns: int) -> int:
-        """Return the most frames that can be queued within a window: ceil(window / T)."""
+        """Return the most frames that can be queued within a window: ceil(window_ns / interval_ns)."""
         return -(-window_ns // self.interval_ns)
 
 
 class ResponseTime(NamedTuple):
-    """A response time; if unbounded, a time that it reaches at least."""
+    """Time from a message's queueing to its frame's end, ns; `is_bounded` False: a time that it reaches at least."""
 
     time_ns: int
     is_bounded: bool = True
@@ -64,11 +64,11 @@ class ResponseTime(NamedTuple):
 def response_time(
     stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns: int, deadline_ns: int | None = None
 ) -> ResponseTime:
-    """Return the worst-case response time of a message.
+    """Return the longest time from the queueing of a message to the end of its frame.
 
     higher: messages of higher priority; blocking_ns: the longest frame of lower priority; bit_ns: one bit at the
-    nominal rate. If the bus is overloaded, or busy for longer than the horizon, the result is unbounded: see
-    `_exceeded`, with `deadline_ns` (default: the horizon) as the limit.
+    nominal rate. If the bus is overloaded, or busy for longer than HORIZON_NS, the result is unbounded: a time over
+    `deadline_ns` (default: HORIZON_NS) that the response time reaches, see `_exceeded`.
     """
     if is_overloaded((*higher, stream)):
         return _exceeded(stream, higher, blocking_ns, bit_ns, HORIZON_NS if deadline_ns is None else deadline_ns)
@@ -102,7 +102,11 @@ def is_overloaded(streams: Sequence[Stream]) -> bool:
 def _waiting(
     stream: Stream, higher: Sequence[Stream], blocking_ns: int, bit_ns: int, instance: int, waiting_ns: int
 ) -> int:
-    """Return the next iteration of eq. (9): the time of all frames sent before `instance`, while it waits."""
+    """Return a better estimate than `waiting_ns` of the time that a message's frame `instance`, from 0, waits: eq. (9).
+
+    The longest frame of lower priority, the message's earlier frames, and the frames of higher priority that are queued
+    within `waiting_ns`. Once the estimate no longer grows, it is the time.
+    """
     before_ns = sum(s.arrivals(waiting_ns + bit_ns) * s.duration_ns for s in higher)
     return blocking_ns + instance * stream.duration_ns + before_ns
 
@@ -144,7 +148,10 @@ class Trigger(Enum):
 
 @dataclass(frozen=True)
 class FrameBudget:
-    """Identifier, bits, durations, deadline and response times of a message; deadline None: it has none."""
+    """Identifier, bits, durations, deadline and response times of a message; deadline None: it has none.
+
+    length: bytes of data. unstuffed, worst: bits without stuff bits, and with the most; duration_ns: of the latter.
+    """
 
     name: str
     can_id: int
@@ -178,9 +185,9 @@ class FrameBudget:
         return is_emcy_id and self.trigger is Trigger.EVENT
 
     def late_ns(self, traffic: LoadCase = LoadCase.OPERATION) -> int:
-        """Return the time by which the frame's response misses its deadline, ns; at least that if it is unbounded.
+        """Return the time by which the frame misses its deadline in a load case, ns; 0 if in time or without deadline.
 
-        0 if it is in time or has no deadline.
+        If the response time is unbounded, the frame misses it by at least the result, which is above 0.
         """
         response = self.responses[traffic]
         if self.deadline_ns is None:
@@ -201,7 +208,7 @@ class Budget:
     frames: tuple[FrameBudget, ...]
 
     def _sum_ns(self, *triggers: Trigger) -> int:
-        """Return the duration of one frame each of all messages with these triggers."""
+        """Return the sum of the durations of one frame each of all messages with these triggers."""
         return sum(entry.duration_ns for entry in self.frames if entry.trigger in triggers)
 
     @property
@@ -211,12 +218,12 @@ class Budget:
 
     @property
     def unstuffed_bits(self) -> int:
-        """Bits of a cycle's frames without stuff bits, at both rates."""
+        """Number of bits of a cycle's frames without stuff bits, those at both bit rates added up."""
         return sum(entry.unstuffed.total for entry in self.cyclic)
 
     @property
     def worst_bits(self) -> int:
-        """Bits of a cycle's frames with the most stuff bits, at both rates."""
+        """Number of bits of a cycle's frames with the most stuff bits, those at both bit rates added up."""
         return sum(entry.worst.total for entry in self.cyclic)
 
     @property
@@ -262,12 +269,12 @@ class Budget:
 
     @property
     def late(self) -> tuple[FrameBudget, ...]:
-        """Frames that may miss their deadline in operation."""
+        """Frames that may miss their deadline in operation, which is without requests and EMCY."""
         return tuple(entry for entry in self.frames if entry.late_ns() > 0)
 
     @property
     def is_fit(self) -> bool:
-        """Whether every frame meets its deadline in operation."""
+        """Whether every frame meets its deadline in operation, which is without requests and EMCY."""
         return not self.late
 
     @property
@@ -331,9 +338,10 @@ def _describe_late(entry: FrameBudget, traffic: LoadCase) -> str:
 
 
 def describe_excess(codec: Codec, settings: Settings) -> str:
-    """Return how the frames of a contract miss their deadlines in the configured period; "" if they meet them.
+    """Return in a line how frames of a contract miss their deadlines in the configured period; "" if all meet them.
 
-    "" also for a DBC without attribute Trigger, which can't be judged. Raises CodecError as `compute_budget`.
+    "" also for a DBC without attribute Trigger, which can't be judged. Raises CodecError if the DBC has no bit rates or
+    an unknown Trigger, or if so many arms can't share its node ids.
     """
     if b'"Trigger"' not in codec.text:
         return ""
@@ -351,7 +359,7 @@ def compute_budget(
     """Return the loads and response times of a contract's frames; arms: number of such arms on the bus.
 
     Period in µs and rates in bit/s default to the DBC's own. A missed deadline raises no error. Raises CodecError if
-    the DBC lacks these, or its attribute Trigger.
+    the DBC lacks these or the attribute Trigger, has an unknown Trigger, or if so many arms can't share its node ids.
     """
     name, dbc = codec.path.name, codec.database.dbc
     if dbc is None or "Trigger" not in dbc.attribute_definitions:
@@ -369,7 +377,7 @@ def compute_budget(
 
 
 def _given(codec: Codec, attribute: str, chosen: int | None) -> int:
-    """Return `chosen`, by default the value of a DBC's attribute. Raises CodecError unless it is above 0."""
+    """Return `chosen`, or if it is None the value of a DBC's attribute. Raises CodecError unless that is above 0."""
     value = int(read_attribute(codec.database, attribute)) if chosen is None else chosen
     if value <= 0:
         raise CodecError(f"DBC {codec.path.name} has no {attribute}, and none is given")
@@ -377,9 +385,10 @@ def _given(codec: Codec, attribute: str, chosen: int | None) -> int:
 
 
 def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, data_bitrate: int) -> FrameBudget:
-    """Return the budget of a message, still without response times. Raises CodecError for an unknown Trigger.
+    """Return the budget of a message, still without response times.
 
-    Deadline: the period for cyclic frames, the cycle time, if any, for event frames, none for requests.
+    Deadline: the period for cyclic frames, the cycle time, if any, for event frames, none for requests. contract: name
+    of the DBC, for the error. Raises CodecError for an unknown Trigger.
     """
     choices = list(message.dbc.attribute_definitions["Trigger"].choices or ()) if message.dbc else []
     value = read_attribute(message, "Trigger")
@@ -417,10 +426,10 @@ def _function(can_id: int, is_extended: bool) -> int:
 
 
 def _share_bus(frames: list[FrameBudget], contract: str, arms: int) -> list[FrameBudget]:
-    """Return the frames of several arms of one contract on a bus, for any order of the arms.
+    """Return the frames of `arms` arms of one contract on a bus, frames without a node id only once.
 
-    The devices' node ids follow each other from 1, the hosts' go down from the contract's. Raises CodecError for a
-    29-bit identifier and for a node id beyond 126.
+    The devices' node ids follow each other from 1, arm by arm; the hosts' go down from the contract's. contract: name
+    of the DBC, for errors. Raises CodecError for a 29-bit identifier and for a node id beyond 126.
     """
     if arms == 1:
         return frames

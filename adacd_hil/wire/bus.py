@@ -82,7 +82,10 @@ class Bus(Protocol):
         """Queue a frame for transmission. Raises BusError, such as TransmitQueueError and InterfaceDownError."""
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Queue several frames in this order, together if possible. Raises as `send`."""
+        """Queue several frames in this order, together if possible.
+
+        Raises BusError, such as TransmitQueueError and InterfaceDownError.
+        """
         for can_id, data in frames:
             self.send(can_id, data)
 
@@ -95,7 +98,7 @@ class Bus(Protocol):
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:  # noqa: ARG002 (here at most one)
         """Return the next frame and the received ones behind it, up to `most` in all; [] after `timeout_s`.
 
-        An error frame is returned alone. Raises as `receive`.
+        An error frame is returned alone. Raises BusError, such as BusOffError and InterfaceDownError.
         """
         frame = self.receive(timeout_s)
         return [] if frame is None else [frame]
@@ -139,14 +142,17 @@ class Tap(Bus):
         return self._bus.queue_bytes()
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Record and send a frame; it stays recorded if sending it fails. Raises BusError."""
+        """Record and send a frame; it stays recorded if the wrapped bus can't send it, which raises BusError."""
         # Recorded before sending: on the embedded bus the answers come while `send` runs.
         t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
         self._passed.append((True, Frame(can_id, data, t_ns)))
         self._bus.send(can_id, data)
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Record and send several frames with one stamp; they stay recorded if sending fails. Raises BusError."""
+        """Record and send several frames with one stamp.
+
+        Raises BusError if the wrapped bus can't send them; they stay recorded.
+        """
         t_ns = self._clock.now_ns() if self.held_ns is None else self.held_ns
         self._passed += [(True, Frame(can_id, data, t_ns)) for can_id, data in frames]
         self._bus.send_all(frames)
@@ -154,7 +160,7 @@ class Tap(Bus):
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, or None after `timeout_s`, and record it unless it was put back by `unread`.
 
-        Raises BusError; the error frame of a BusOffError is recorded, too.
+        Raises BusError of the wrapped bus; the error frame of a BusOffError is recorded, too.
         """
         if self._unread is not None:
             unread, self._unread = self._unread, None
@@ -169,9 +175,10 @@ class Tap(Bus):
         return frame
 
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return and record the next frames, up to `most`; [] after `timeout_s`; a frame that was put back alone.
+        """Return and record the next frames, up to `most`; [] after `timeout_s`.
 
-        Raises as `receive`.
+        A frame that was put back by `unread` is returned alone, and not recorded again. Raises BusError of the wrapped
+        bus; the error frame of a BusOffError is recorded, too.
         """
         if self._unread is not None or most == 1:
             frame = self.receive(timeout_s)
@@ -194,7 +201,10 @@ class Tap(Bus):
         return passed
 
     def recover(self) -> None:
-        """Drop all queued frames of the wrapped bus and the one put back; recorded ones stay. Raises BusError."""
+        """Drop all queued frames of the wrapped bus and the one put back; recorded ones stay.
+
+        Raises BusError when the wrapped bus can't recover yet.
+        """
         self._unread = None
         self._bus.recover()
 

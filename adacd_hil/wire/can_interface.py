@@ -56,7 +56,7 @@ class CanInterface:
 
     @property
     def is_virtual(self) -> bool:
-        """Whether the interface certainly has no controller, which could hold frames of its own."""
+        """Whether the interface certainly has no controller, which could hold frames: it is vcan or vxcan."""
         return is_virtual("socketcan", self.name)
 
     def _number(self, file: str, base: int) -> int:
@@ -225,7 +225,7 @@ class InterfaceState:
 
     @property
     def is_virtual(self) -> bool:
-        """Whether the interface has no wire."""
+        """Whether the interface has no wire: its kind is vcan or vxcan."""
         return self.kind in ("vcan", "vxcan")
 
 
@@ -298,7 +298,7 @@ def _kind_of(folder: Path) -> str:
 def carried_frames(name: str) -> int | None:
     """Return the number of frames that an interface has carried, both ways; None if the kernel doesn't report it.
 
-    A virtual interface counts its sent frames as received, too.
+    Of a virtual interface only the received ones are counted: they include those that it has sent.
     """
     folder = _INTERFACES / name / "statistics"
     try:

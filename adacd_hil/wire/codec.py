@@ -35,9 +35,10 @@ class MessageCodec(MessageTable):
         data_ids: bytes,
         senders: tuple[str, ...],
     ) -> None:
-        """Take a message's table, and the protection of its frames.
+        """Take a message's signals, and the end-to-end protection of its frames.
 
-        data_ids: a byte for each counter, or a number, its low byte first. senders: names of the nodes that send it.
+        data_ids: of the CRC, a byte for each counter, or a number, its low byte first; by the protection. senders:
+        names of the nodes that send the message.
         """
         super().__init__(name, can_id, length, signals)
         self.protection, self.data_ids, self.senders = protection, data_ids, senders
@@ -112,7 +113,10 @@ class MessageCodec(MessageTable):
         return length == self.length
 
     def decode_named(self, data: bytes) -> tuple[tuple[str, float, str], ...]:
-        """Return (name, value, unit) of each signal behind the end-to-end header. Raises as `decode`."""
+        """Return (name, value, unit) of each signal behind the end-to-end header.
+
+        Raises CodecError for a wrong length.
+        """
         return tuple(
             (signal.name, value, signal.unit)
             for signal, value in zip(self.values, self.decode_values(data), strict=True)
@@ -131,7 +135,10 @@ class MessageCodec(MessageTable):
 
 
 def _quantise(signal: SignalCodec, value: float) -> int:
-    """Return the raw integer of a physical value. Raises CodecError when it doesn't fit, as NaN and infinity."""
+    """Return a physical value as the signal's raw integer, rounded.
+
+    Raises CodecError for a value outside the signal's range, NaN and infinity included.
+    """
     exact = (value - signal.offset) / signal.scale
     if not (math.isfinite(exact) and signal.raw_low <= round(exact) <= signal.raw_high):
         low, high = (bound * signal.scale + signal.offset for bound in (signal.raw_low, signal.raw_high))
@@ -167,7 +174,10 @@ class Codec:
             raise CodecError(f"message {name} is missing in the DBC") from None
 
     def node_id(self, message_name: str) -> int:
-        """Return the node id of a CANopen message: the low seven bits of its identifier. Raises as `message`."""
+        """Return the node id of a CANopen message by name: the low seven bits of its identifier.
+
+        Raises CodecError when the DBC lacks the message.
+        """
         return self.message(message_name).can_id & 0x7F
 
 

@@ -86,7 +86,10 @@ def _data_id_list(name: str, text: str, count: int) -> bytes:
 
 
 def _data_id(name: str, code: str, value: float | str | None, size: int) -> bytes:
-    """Return a data id as `size` bytes, the low one first. Raises CodecError if it is missing or doesn't fit."""
+    """Return a data id, `value`, as `size` bytes, the low one first. Raises CodecError if it is None or doesn't fit.
+
+    name, code: of message and profile, for the error.
+    """
     if value is None:
         raise CodecError(f"{name}: E2EProfile {code} without E2EDataId")
     most = (1 << 8 * size) - 1
@@ -114,7 +117,8 @@ def _in_order(message: Message) -> list[Signal]:
 def _lay_out(message: Message) -> tuple[SignalCodec, ...]:
     """Return the signals, placed in containers on byte borders that cover the frame without gaps.
 
-    Raises CodecError for a layout that the module's text excludes, with the signal's name.
+    Raises CodecError, with the signal's name, for any other than little-endian integers of 8, 16, 32 or 64 bits on byte
+    borders and bit fields within one byte, and for overlaps and gaps.
     """
     end_bit = 0
     containers = 0
@@ -182,15 +186,18 @@ def read_dbc(path: Path | None = None) -> tuple[bytes, Path]:
 
 
 def load_codec(path: Path | None = None) -> Codec:
-    """Return the codec of a DBC (default: the package's). Raises CodecError as `read_dbc` and `parse_codec`."""
+    """Return the codec of a DBC (default: the package's).
+
+    Raises CodecError if it can't be read, or can't serve as a contract, see `parse_codec`.
+    """
     return parse_codec(*read_dbc(path))
 
 
 def parse_codec(text: bytes, path: Path) -> Codec:
     """Return the codec of the text of a DBC; `path`: its file, existing or not.
 
-    Raises CodecError, with `path` first, as `parse_database`; for a WireVersion that is missing or no number, for two
-    messages with the same name or identifier, and for a message of a length, layout or protection that no contract has.
+    Raises CodecError, with `path` first, for a text that isn't a DBC, a WireVersion that is missing or no number, two
+    messages with the same name or identifier, and a message of a length, layout or protection that no contract has.
     """
     database = parse_database(text, path)
     try:
@@ -208,10 +215,10 @@ def parse_codec(text: bytes, path: Path) -> Codec:
 
 
 def parse_database(text: bytes, path: Path) -> Database:
-    """Return the messages of any DBC that cantools accepts, in UTF-8 or a Windows code page.
+    """Return cantools' database of any DBC that cantools accepts, in UTF-8 or a Windows code page.
 
-    Raises CodecError if cantools can't read it, and for a signal of more bits than the longest frame has. `path`: as in
-    `parse_codec`. Equal texts share one object: don't change it.
+    Equal texts share one object: don't change it. Raises CodecError, with `path`, if cantools can't read the text, and
+    for a signal of more bits than the longest frame has.
     """
     for found in _SIGNAL_PLACE.finditer(text):  # cantools allocates a character for each bit
         if len(found["bits"]) > len(_MOST_BITS) or int(found["bits"]) > int(_MOST_BITS):
@@ -228,7 +235,7 @@ def parse_database(text: bytes, path: Path) -> Database:
 
 @functools.lru_cache(maxsize=16)
 def _load_database(text: str) -> object:
-    """Let cantools parse a DBC. Cached, for it takes 40 ms and each log has one: don't change it."""
+    """Return a DBC as parsed by cantools; cached, since that takes 40 ms and each log has one: don't change it."""
     return cantools.database.load_string(text, "dbc")
 
 

@@ -59,7 +59,7 @@ class DbcDecoder:
     """All messages of one DBC. Of several messages with one name the last counts, as for cantools."""
 
     def __init__(self, text: bytes, path: Path) -> None:
-        """Parse the text; `path`: its file, existing or not. Raises CodecError as `parse_database`."""
+        """Parse the text; `path`: its file, existing or not. Raises CodecError if cantools can't read it."""
         self.path = path
         self.database = parse_database(text, path)
         self.messages = {message.name: MessageDecoder(message, self.is_contract) for message in self.database.messages}
@@ -73,5 +73,5 @@ class DbcDecoder:
 
 
 def load_decoder(path: Path | None = None) -> DbcDecoder:
-    """Return the decoder of a DBC (default: the package's). Raises CodecError as `read_dbc` and `parse_database`."""
+    """Return the decoder of a DBC file (default: the package's). Raises CodecError if it can't be read or parsed."""
     return DbcDecoder(*read_dbc(path))

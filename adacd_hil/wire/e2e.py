@@ -105,7 +105,7 @@ class E2eProfile:
     """A profile: everything that its frames, devices and contracts need to know; a new one is a row of `PROFILES`.
 
     crc_bits, counter_bits, status_bits: the header's signals in this order, from bit 0 on. The CRC has whole bytes, the
-    counter the low bits of the next byte, 8 at most. objects: of a device's dictionary that carry the header.
+    counter the low bits of the next byte, 8 at most. objects: number of a device's objects that carry the header.
     data_id_bytes: of one message; is_id_list: a list by counter, in the DBC attribute `E2EDataIdList`, else a number,
     in `E2EDataId`. crc: returns the CRC of a frame, its counter, and the data ids. is_growing: the largest tolerated
     step is max_delta, and one more for each cycle since the last frame in sequence, the present cycle included.
@@ -128,7 +128,7 @@ class E2eProfile:
 
     @property
     def signals(self) -> tuple[tuple[str, int], ...]:
-        """Names of the header's signals with their numbers of bits, in order."""
+        """Names of the header's signals with their numbers of bits, from the frame's bit 0 on."""
         return ("e2e_crc", self.crc_bits), ("e2e_counter", self.counter_bits), ("e2e_status", self.status_bits)
 
     @property
@@ -157,7 +157,7 @@ class E2eSender:
     """Adds counter and CRC to the frames of one message; without a profile it leaves them unchanged."""
 
     def __init__(self, profile: E2eProfile | None = None, data_ids: bytes = b"") -> None:
-        """`data_ids`: of the message, as the profile takes them."""
+        """Begin with counter 0. `data_ids`: of the message, as the profile's CRC takes them."""
         self._profile, self._data_ids = profile, data_ids
         self._counter = 0
 
@@ -212,7 +212,7 @@ class E2eReceiver:
         return list(zip(E2eStatus, self.counts, strict=True))
 
     def restart_sequence(self) -> None:
-        """Forget the sequence of the counter; these frames have none. The counts stay."""
+        """Do nothing: these frames have no counter; `ProtectedReceiver` forgets the sequence of its counter here."""
 
     def _judge(self, frame: bytes) -> E2eStatus:  # noqa: ARG002
         return E2eStatus.OK
@@ -230,7 +230,7 @@ class ProtectedReceiver(E2eReceiver):
     """
 
     def __init__(self, profile: E2eProfile, data_ids: bytes, length: int, tolerance: Tolerance | None = None) -> None:
-        """`data_ids`: as the profile takes them; `length`: bytes of a frame; `tolerance`: by default the profile's."""
+        """`data_ids`: as the profile's CRC takes them; `length`: bytes of a frame; `tolerance`: None: the profile's."""
         super().__init__()
         self._profile, self._data_ids, self._length = profile, data_ids, length
         self._tolerance = tolerance or profile.tolerance
@@ -266,7 +266,7 @@ class ProtectedReceiver(E2eReceiver):
         return int.from_bytes(frame[: self._place], "little") == crc
 
     def _note_silence(self) -> None:
-        """Count a cycle without a frame, and widen the tolerated step if the profile's grows."""
+        """Count a cycle without a frame; in a profile with `is_growing`, tolerate a step of the counter larger by 1."""
         self._missing += 1
         self._max_delta += self._profile.is_growing
 
@@ -304,7 +304,10 @@ class ProtectedReceiver(E2eReceiver):
         return E2eStatus.WRONG_SEQUENCE
 
     def _accept(self, delta: int) -> E2eStatus:
-        """Return the status of a frame in sequence: OK, OK_SOME_LOST, or SYNC after a silence or a wrong sequence."""
+        """Return the status of a frame whose counter advanced by `delta`, a tolerated step, and update the sequence.
+
+        SYNC after a silence or a wrong sequence; else OK for a step of 1, OK_SOME_LOST for a larger one.
+        """
         missing, self._missing = self._missing, 0
         if missing > self._tolerance.max_missing:
             self._to_sync = self._tolerance.sync_frames

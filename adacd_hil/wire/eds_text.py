@@ -16,7 +16,7 @@ _USED_DUMMY = re.compile(r"\s*Dummy(\d{4})\s*=\s*(0x0*)?1\s*(;.*)?", re.IGNORECA
 def readable_eds(text: str) -> str:
     """Return the text without `[Comments]` and unreadable numbers of `[DeviceInfo]`.
 
-    `[DummyUsage]`, if present, lists each of the dummies 1 to 7.
+    `[DummyUsage]`, if present, is written anew with exactly the dummies 1 to 7, each used or not as in the text.
     """
     return "\n".join(_readable(text.splitlines()))
 

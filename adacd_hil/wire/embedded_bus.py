@@ -26,7 +26,7 @@ class EmbeddedBus(Bus):
         self._device = device
 
     def deliver(self, can_id: int, data: bytes, is_error: bool = False) -> None:
-        """Send a frame from the device to the host, or report an error as the host's controller would."""
+        """Send a frame from the device to the host; is_error: an error frame, as the host's controller reports it."""
         self._received.append(Frame(can_id, data, self._clock.now_ns(), is_error))
 
     def send(self, can_id: int, data: bytes) -> None:

@@ -113,7 +113,10 @@ def decode_error(frame: Frame) -> tuple[TroubleKind, str]:
 
 
 def _of_controller(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
-    """Return (kind, text) of each error of controller, driver or transceiver in an error frame; [] without any."""
+    """Return (kind, text) of each error of controller, driver or transceiver in an error frame; [] without any.
+
+    classes: the frame's identifier, whose bits are error classes. data: its eight bytes.
+    """
     found = [
         (kind, kind.value)
         for bit, kind in (
@@ -133,7 +136,10 @@ def _of_controller(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
 
 
 def _of_bus(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
-    """Return (kind, text) of each bus error in an error frame: acknowledgement, protocol, arbitration."""
+    """Return (kind, text) of each bus error in an error frame: acknowledgement, protocol, arbitration; [] without any.
+
+    classes, data: as of `_of_controller`.
+    """
     found = []
     is_slot_empty = bool(classes & _PROTOCOL) and data[3] == _ACKNOWLEDGE_SLOT
     if classes & _ACKNOWLEDGE or is_slot_empty:

@@ -93,7 +93,8 @@ class FrameReceiver:
     def __init__(self, opened: socket.socket, clock: Clock) -> None:
         """Enable stamps and drop counts of the socket.
 
-        With a clock other than MonotonicClock, frames carry that clock's time at `take_frames`. Raises OSError.
+        With a clock other than MonotonicClock, frames carry that clock's time at `take_frames` instead of the kernel's
+        stamp. Raises OSError if the kernel refuses one of these options.
         """
         opened.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         opened.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
@@ -117,9 +118,9 @@ class FrameReceiver:
         self._last_ns = 0
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until `take_frames` has a frame; return False if there is none after `timeout_s`. Raises OSError.
+        """Wait until `take_frames` has a frame; return False if there is none after `timeout_s`.
 
-        A signal restarts the whole wait.
+        A signal restarts the whole wait. Raises OSError if the socket can't be waited for.
         """
         if self._held:
             return True
@@ -133,9 +134,10 @@ class FrameReceiver:
         return bool(found)
 
     def take_frames(self) -> list[Frame]:
-        """Return up to 64 received frames without waiting. Raises OSError, BlockingIOError if there is no frame.
+        """Return up to 64 received frames without waiting; those behind a drop come with the next call.
 
-        The frames behind a drop come with the next call, as `frames_lost` is then another number.
+        `frames_lost` then counts the drops before them. Raises BlockingIOError if there is no frame, OSError if the
+        socket fails, as when the interface is down.
         """
         if self._held:
             return self._take_held()
@@ -158,12 +160,12 @@ class FrameReceiver:
         return Frame(can_id & CAN_ID_MASK, data[:length], t_ns, bool(can_id & CAN_ERR_FLAG))
 
     def _lost_before(self, index: int) -> int:
-        """Return the drop count before a frame of the batch; the last known one if the frame carries no count."""
+        """Return how many frames were dropped before a frame of the batch: its count, else the last known one."""
         *_, kind, lost = _RECEIVED.unpack_from(self._memory, index * _SLOT_BYTES)
         return lost if kind == _SO_RXQ_OVFL else self.frames_lost
 
     def _take_held(self) -> list[Frame]:
-        """Return the held frames up to the next drop."""
+        """Return the frames held from an earlier batch, up to the next drop, and set `frames_lost`."""
         self.frames_lost = max(self.frames_lost, self._held[0][0])
         frames = [frame for lost, frame in self._held if lost <= self.frames_lost]
         self._held = self._held[len(frames) :]
@@ -207,7 +209,10 @@ class FrameSender:
 
 
 def _lay_out(memory: int, slot_bytes: int, length: int) -> tuple[Any, Any]:
-    """Return the messages of a batch and their vectors, each of `length` bytes at the beginning of its slot."""
+    """Return the mmsghdr structs of a batch and their iovecs, each for `length` bytes at the beginning of its slot.
+
+    memory: address of the first slot.
+    """
     vectors = (_Vector * _FRAMES)()
     messages = (_MessageHead * _FRAMES)()
     for index in range(_FRAMES):

@@ -33,17 +33,23 @@ class FrameBits(NamedTuple):
         return self.nominal + self.data
 
     def duration_ns(self, bitrate: int, data_bitrate: int = 0) -> int:
-        """Return the time on the bus at rates in bit/s, rounded up to whole ns per rate."""
+        """Return the time on the bus at rates in bit/s, rounded up to whole ns per rate.
+
+        data_bitrate: only for frames with bits at the data bit rate.
+        """
         data_ns = -(-self.data * 1_000_000_000 // data_bitrate) if self.data else 0
         return -(-self.nominal * 1_000_000_000 // bitrate) + data_ns
 
     def duration_s(self, bitrate: int, data_bitrate: int = 0) -> float:
-        """Return the time on the bus in s, at rates in bit/s."""
+        """Return the time on the bus in s, at rates in bit/s; data_bitrate: only for bits at that rate."""
         return self.nominal / bitrate + (self.data / data_bitrate if self.data else 0.0)
 
 
 def unstuffed_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the bits of a CAN FD frame, without dynamic stuff bits. Raises ValueError if no such frame exists."""
+    """Return the number of bits of a CAN FD frame of `length` data bytes, without dynamic stuff bits.
+
+    is_extended: its identifier has 29 bits. Raises ValueError for a length that no frame has.
+    """
     if length not in FRAME_LENGTHS:
         above = next((known for known in FRAME_LENGTHS if known > length), FRAME_LENGTHS[-1])
         raise ValueError(f"a CAN FD frame can't have {length} bytes; next possible: {above}")
@@ -53,9 +59,9 @@ def unstuffed_fd_bits(length: int, is_extended: bool = False) -> FrameBits:
 
 
 def unstuffed_frame(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the bits of a frame, classic up to 8 bytes, without content-dependent stuff bits.
+    """Return the number of bits of a frame, classic up to 8 data bytes, without content-dependent stuff bits.
 
-    Raises ValueError for a length that no frame has.
+    is_extended: its identifier has 29 bits. Raises ValueError for a length that no frame has.
     """
     if length > CLASSIC_BYTES:
         return unstuffed_fd_bits(length, is_extended)
@@ -63,10 +69,11 @@ def unstuffed_frame(length: int, is_extended: bool = False) -> FrameBits:
 
 
 def worst_case_frame(length: int, is_extended: bool = False) -> FrameBits:
-    """Return the most bits of a frame, classic up to 8 bytes. Raises ValueError for a length that no frame has.
+    """Return the number of bits of a frame with the most stuff bits; classic up to 8 data bytes.
 
-    Classic frames have stuff bits up to the CRC's end, CAN FD up to the data's end. There, as many of them as possible
-    are counted before the rate switch, where they take longest.
+    is_extended: its identifier has 29 bits. Classic frames have stuff bits up to the CRC's end, CAN FD up to the data's
+    end. There, as many of them as possible are counted before the rate switch, where they take longest. Raises
+    ValueError for a length that no frame has.
     """
     plain = unstuffed_frame(length, is_extended)
     if length <= CLASSIC_BYTES:
@@ -78,10 +85,10 @@ def worst_case_frame(length: int, is_extended: bool = False) -> FrameBits:
 
 
 def _stuffable_bits(length: int, is_extended: bool) -> int:
-    """Return the bits of a classic frame from start of frame to CRC."""
+    """Return the number of bits of a classic frame up to the CRC's end; is_extended: its identifier has 29 bits."""
     return (54 if is_extended else 34) + 8 * length
 
 
 def fd_head_bits(is_extended: bool) -> int:
-    """Return the bits from start of frame to BRS."""
+    """Return the number of bits of a CAN FD frame up to BRS, BRS included; is_extended: its identifier has 29 bits."""
     return 36 if is_extended else 17

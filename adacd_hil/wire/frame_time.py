@@ -45,7 +45,7 @@ def _stuffing(bits: int) -> NDArray[np.int64]:
 
 
 def _crc_15() -> NDArray[np.int64]:
-    """Return the table of a classic frame's CRC by byte."""
+    """Return the table for a classic frame's CRC: by its upper 8 bits XOR the next byte, the XOR of the shifted CRC."""
     table = np.arange(256, dtype=np.int64) << 7
     for _ in range(8):
         table = np.where(table & 0x4000, (table << 1) ^ _CRC_POLYNOMIAL, table << 1) & 0x7FFF
@@ -59,7 +59,7 @@ _CRC_15: Final = _crc_15()
 
 @compiled
 def _stuffed(head: int, head_bits: int, data: int, length: int) -> int:
-    """Return the bits of a classic frame to the end of its CRC, stuff bits included.
+    """Return the number of bits of a classic frame to the end of its CRC, stuff bits included.
 
     head: its first `head_bits` bits, up to the data. data: its `length` bytes as one integer, the first one highest.
     """
@@ -85,7 +85,10 @@ def _stuffed(head: int, head_bits: int, data: int, length: int) -> int:
 
 @compiled
 def _classic_bits(can_id: int, data: int, length: int) -> int:
-    """Return the bits of a classic frame, intermission included. data, length: as of `_stuffed`."""
+    """Return the number of bits of a classic frame, stuff bits and intermission included.
+
+    data: its `length` bytes as one integer, the first one highest.
+    """
     if can_id <= MAX_STANDARD_ID:
         return _stuffed(can_id << 7 | length, _HEAD_BITS, data, length) + TAIL_BITS
     head = ((can_id >> 18) << 2 | 3) << 25 | (can_id & 0x3FFFF) << 7 | length
@@ -94,7 +97,7 @@ def _classic_bits(can_id: int, data: int, length: int) -> int:
 
 @compiled
 def _fd_stuff_bits(head: int, head_bits: int, body: NDArray[np.uint8], code: int) -> tuple[int, int]:
-    """Return the dynamic stuff bits of an FD frame up to BRS, and from there to the end of the data.
+    """Return the numbers of dynamic stuff bits of an FD frame: up to BRS, and from there to the end of the data.
 
     head: its first `head_bits` bits, up to BRS. body: its data. code: data length code.
     """
@@ -128,10 +131,10 @@ def _fd_stuff_bits(head: int, head_bits: int, body: NDArray[np.uint8], code: int
 
 
 def exact_frame(can_id: int, data: bytes) -> FrameBits:
-    """Return the bits of a frame of an error active sender, classic up to 8 bytes; identifiers beyond 0x7FF: 29 bits.
+    """Return the exact number of bits of a frame by its content, classic up to 8 bytes; sent by an error active node.
 
-    If the data of CAN FD end with five equal bits, the fixed stuff bit that begins the CRC field replaces the dynamic
-    one. Raises ValueError if no such frame exists.
+    Identifiers beyond 0x7FF have 29 bits. If the data of CAN FD end with five equal bits, the fixed stuff bit that
+    begins the CRC field replaces the dynamic one. Raises ValueError for a length that no frame has.
     """
     length, is_extended = len(data), can_id > MAX_STANDARD_ID
     if length <= CLASSIC_BYTES:
@@ -149,7 +152,7 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
     """Return a function for the exact duration of frames at rates in bit/s, in ns, rounded up per rate.
 
     That function raises ValueError for a length that no frame has. Frames of more than 8 bytes are CAN FD with rate
-    switch.
+    switch, and need `data_bitrate`.
     """
     classic_bits = _classic_bits
     whole_ns = 1_000_000_000 // bitrate if 1_000_000_000 % bitrate == 0 else 0
@@ -167,7 +170,7 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
 def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
     """Return a function for the longest duration of frames of a length, in ns, whatever their content; rates in bit/s.
 
-    That function raises ValueError for a length that no frame has.
+    That function raises ValueError for a length that no frame has. Frames of more than 8 bytes need `data_bitrate`.
     """
     by_length: dict[tuple[int, bool], int] = {}
 

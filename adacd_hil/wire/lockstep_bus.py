@@ -65,9 +65,9 @@ class LockstepBus(Bus):
     ) -> None:
         """Take over a bus, the one behind. frame_time: duration of a frame, ns. period_ns: between SYNCs.
 
-        answers: identifiers that devices send on every SYNC. patience_s: by the wall clock, longest wait for devices
-        that send no marks. queue_length: frames that wait at most while no node acknowledges. is_fifo: the host's
-        frames leave in the order in which they were handed over.
+        sync_id: identifier of SYNC. answers: identifiers that devices send on every SYNC. patience_s: by the wall
+        clock, longest wait for devices that send no marks. queue_length: frames that wait at most while no node
+        acknowledges. is_fifo: the host's frames leave in the order in which they were handed over.
         """
         self.channel = bus.channel
         self._bus = bus
@@ -110,8 +110,8 @@ class LockstepBus(Bus):
     def send(self, can_id: int, data: bytes) -> None:
         """Queue a frame at the clock's present time.
 
-        Raises TransmitQueueError when the queue is full and no node acknowledges; SilenceError and BusError as
-        `receive`.
+        Frames that start before now are transmitted first if the queue is full. Raises TransmitQueueError if it stays
+        full as no node acknowledges, SilenceError if no device answers a SYNC, BusError if the bus behind fails.
         """
         now_ns = self._clock.now_ns()
         if not self._is_attached:
@@ -128,7 +128,10 @@ class LockstepBus(Bus):
         self._queue.append((can_id, self._count, now_ns, data))
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Queue some frames at the clock's present time, one by one if not all fit into the queue. Raises as `send`."""
+        """Queue some frames at the clock's present time, one by one if not all fit into the queue.
+
+        Raises TransmitQueueError, SilenceError or BusError as `send`.
+        """
         if not self._is_attached or len(self._queue) + len(frames) > self._queue_length:
             super().send_all(frames)
             return
@@ -142,7 +145,7 @@ class LockstepBus(Bus):
     def receive(self, timeout_s: float) -> Frame | None:
         """Return the next frame, with the clock at its end; or None with the clock after `timeout_s`.
 
-        Raises SilenceError when no device answers a SYNC, BusError.
+        Raises SilenceError if no device answers a SYNC, BusError if the bus behind fails.
         """
         if not self._is_attached:
             self._attach()
@@ -162,7 +165,8 @@ class LockstepBus(Bus):
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
         """Return the next frame; while the last one taken is an answer to SYNC, also the one behind it, up to `most`.
 
-        The clock is then at the end of the last frame. [] after `timeout_s`. Raises as `receive`.
+        The clock is then at the end of the last frame. [] after `timeout_s`. Raises SilenceError if no device answers a
+        SYNC, BusError if the bus behind fails.
         """
         limit_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         frame = self.receive(timeout_s)
@@ -182,7 +186,10 @@ class LockstepBus(Bus):
         return frames
 
     def recover(self) -> None:
-        """Drop queued and received frames. Raises BusError when the bus behind it can't recover yet."""
+        """Drop the waiting frames of host and devices, and the received ones, here and in the bus behind.
+
+        Raises BusError when the bus behind can't recover yet.
+        """
         self._bus.recover()
         self._ahead.clear()
         self._queue.clear()
@@ -202,7 +209,7 @@ class LockstepBus(Bus):
     def _transmit_next(self, limit_ns: int) -> bool:
         """Transmit the next waiting frame of host or devices that starts before `limit_ns`; return False without one.
 
-        Before, the devices are asked for frames up to its start if they haven't lived that long yet.
+        If the devices' time is not yet at its start, they are first asked for frames up to then.
         """
         queue = self._queue
         if not self._offered:
@@ -231,9 +238,10 @@ class LockstepBus(Bus):
         return True
 
     def _transmit_own(self, limit_ns: int) -> bool:
-        """Let a frame of the host's, without a competing frame, win the bus, if it starts before `limit_ns`.
+        """Transmit the host's next frame while no device's frame waits, if it starts before `limit_ns`.
 
-        Return False if none starts before; True also if the devices had to be asked first.
+        Return False if none starts before, or no node acknowledges; True also if the devices had to be asked for frames
+        first and nothing was sent yet.
         """
         queue = self._queue
         t_ns = queue[0][2]  # the earliest: the queue is in the order in which frames were handed over
@@ -255,7 +263,7 @@ class LockstepBus(Bus):
     def _forward(self, can_id: int, data: bytes) -> None:
         """Give a frame that the host has transmitted to the devices; after SYNC take their answers.
 
-        Raises SilenceError as `_take_answers`, and BusError.
+        Raises SilenceError if answers to a SYNC are expected and no frame comes, BusError if the bus behind fails.
         """
         self._bus.send(can_id, data)
         if can_id == self._sync_id:
@@ -315,7 +323,7 @@ class LockstepBus(Bus):
             frame = self._receive()
 
     def _receive(self, timeout_s: float | None = None) -> Frame | None:
-        """Return the next frame of the bus behind; None after `timeout_s` without a frame (default: the patience)."""
+        """Return the next frame of the bus behind; None after `timeout_s` (default: `patience_s`) without a frame."""
         if self._ahead:
             return self._ahead.popleft()
         return self._bus.receive(self._patience_s if timeout_s is None else timeout_s)
@@ -355,13 +363,17 @@ class LockstepBus(Bus):
         self._offered.append((frame.can_id, self._count, t_ns, frame.data))
 
     def _is_cyclic(self, t_ns: int) -> bool:
-        """Return whether the last SYNC is so recent at a time, `_CYCLIC_PERIODS`, that the devices live by SYNC."""
+        """Return whether a time is within `_CYCLIC_PERIODS` of the last SYNC.
+
+        Then the devices' time advances by SYNC; later by ADVANCE.
+        """
         return t_ns - self.sync_ns < _CYCLIC_PERIODS * self._period_ns
 
     def _let_pass(self, limit_ns: int) -> bool:
         """Ask the devices to let time pass up to `limit_ns`; return False if no frame can come before.
 
-        Devices without marks are waited for by the wall clock. Soon after a SYNC, return False at once.
+        Devices that send no marks are waited for by the wall clock. Return False at once while `_is_cyclic`: then time
+        passes for the devices by SYNC alone.
         """
         now_ns = self._clock.now_ns()
         if self._is_cyclic(now_ns):
@@ -430,7 +442,7 @@ class LockstepBus(Bus):
 def make_lockstep_bus(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> LockstepBus:
     """Return a modelled bus of a contract, with the stuffing and queue of `settings.lockstep`, at the rates of its DBC.
 
-    A DBC without rates means 1 and 5 Mbit/s. Raises CodecError for one without SYNC or a cyclic frame.
+    A DBC without rates means 1 and 5 Mbit/s. Raises CodecError for one without the message Sync or one of ANSWERS.
     """
     bitrate, data_bitrate = read_bitrates(codec)
     make = worst_time if settings.lockstep.stuffing == "worst" else exact_time

@@ -63,7 +63,7 @@ class MessageTable:
 
     @cached_property
     def containers(self) -> struct.Struct:
-        """The struct of the integers that make up a frame."""
+        """The struct that packs and unpacks a frame as the integers that make it up, its signals' containers."""
         return container_struct(self.signals)
 
     def decode(self, data: bytes) -> tuple[float, ...]:
@@ -81,11 +81,11 @@ class MessageTable:
 
 
 def plain_tables(messages: Iterable[MessageTable]) -> tuple[MessageTable, ...]:
-    """Return the tables of messages without their codecs, so that another process can receive them."""
+    """Return plain tables, with copies of name, identifier, length and signals, that can be sent to another process."""
     return tuple(MessageTable(one.name, one.can_id, one.length, one.signals) for one in messages)
 
 
 def container_struct(signals: Iterable[SignalCodec]) -> struct.Struct:
-    """Return the struct of the containers that hold signals."""
+    """Return the little-endian struct of the integers, in the order of their containers, that hold these signals."""
     formats = {signal.container: _FORMATS[signal.size, signal.is_signed and not signal.mask] for signal in signals}
     return struct.Struct("<" + "".join(formats.values()))

@@ -23,7 +23,7 @@ _STATEMENT = re.compile(
 
 
 def move_contract(codec: Codec, node_offset: int, host_node: int | None = None) -> Codec:
-    """Return the contract with all devices' node ids moved and the host at `host_node` (default: unchanged).
+    """Return the contract with `node_offset` added to the devices' node ids, and the host at `host_node` if given.
 
     Its path is the file's name alone, since it has no file yet. Without a change the same object is returned. Raises
     CodecError without the host's heartbeat, for a device's 29-bit identifier, and for a device's node id outside 1 to
@@ -48,7 +48,7 @@ def move_contract(codec: Codec, node_offset: int, host_node: int | None = None) 
 
 
 def move_id(can_id: int, node_offset: int, host_node: int, name: str) -> int:
-    """Return a device's identifier with its node id moved; one without a node id stays.
+    """Return a device's CAN identifier with `node_offset` added to its node id; one without a node id stays.
 
     Raises CodecError, which begins with `name`, for a 29-bit identifier, a node id outside 1 to 126, and the host's.
     """

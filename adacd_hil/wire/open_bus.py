@@ -17,7 +17,7 @@ def open_bus(
     is_fd: bool = False,
     is_shared: bool = False,
 ) -> Bus:
-    """Open one end of a real or virtual bus. Raises BusMissingError.
+    """Open one end of a real or virtual bus. Raises BusMissingError if the interface is absent, down or unusable.
 
     `can_ids`: identifiers to receive, None: all; SocketCAN filters them in the kernel, other interfaces receive all.
     `bitrate` in bit/s is for interfaces that python-can configures; a SocketCAN interface has its own from `ip link`.

@@ -44,7 +44,7 @@ class PythonCanBus(Bus):
     def __init__(
         self, interface: str, channel: str, clock: Clock, bitrate: int | None = None, is_fd: bool = False
     ) -> None:
-        """Open it, at `bitrate` bit/s if the interface sets one.
+        """Open it, at `bitrate` bit/s if the interface sets one. is_fd: for CAN FD frames, too.
 
         Raises BusMissingError for an interface that is unknown, echoes own frames or doesn't open.
         """
@@ -66,7 +66,7 @@ class PythonCanBus(Bus):
         self._bus = self._open()
 
     def _open(self) -> can.BusABC:
-        """Return the opened interface. Raises BusMissingError with a remedy."""
+        """Return the opened interface. Raises BusMissingError, with a remedy, if it doesn't open."""
         try:
             return can.Bus(self.channel, interface=self._interface, receive_own_messages=False, **self._options)
         except Exception as error:
@@ -74,7 +74,10 @@ class PythonCanBus(Bus):
             raise BusMissingError(f"{where}: {_in_words(error)}{_remedy(self._interface, error)}") from None
 
     def send(self, can_id: int, data: bytes) -> None:
-        """Send a frame, beyond `CLASSIC_BYTES` as CAN FD with rate switch. Raises BusError, also without `is_fd`."""
+        """Send a frame, beyond `CLASSIC_BYTES` as CAN FD with rate switch.
+
+        Raises BusError if the interface fails, and for such a length on a bus that was opened without `is_fd`.
+        """
         is_long = len(data) > CLASSIC_BYTES
         if is_long and not self._is_fd:
             raise BusError(f"sending on {self.channel}: {len(data)} data bytes need CAN FD")
@@ -92,9 +95,10 @@ class PythonCanBus(Bus):
             raise BusError(f"sending on {self.channel}: {_in_words(error)}") from None
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, with the clock's present time, or None after `timeout_s`. Raises BusError.
+        """Return the next frame, with the clock's present time, or None after `timeout_s`.
 
-        Remote frames, and 29-bit identifiers that fit into 11 bits, are dropped.
+        Remote frames, and 29-bit identifiers that fit into 11 bits, are dropped. Raises BusError if the interface
+        fails.
         """
         deadline_ns = self._waiting.now_ns() + int(timeout_s * 1e9)
         while True:
@@ -125,7 +129,7 @@ class PythonCanBus(Bus):
 
 
 def _in_words(error: Exception) -> str:
-    """Return an error of an interface in words, in one line."""
+    """Return the text of an error of an interface in one line, clearer for missing settings or a missing library."""
     text = " ".join(str(error).split())
     if missing := _MISSING.search(text):
         return f"it also needs {missing[1]}, which python-can takes from ~/.canrc"

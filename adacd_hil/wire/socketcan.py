@@ -68,9 +68,10 @@ class SocketCanBus(Bus):
         is_fd: bool = False,
         is_shared: bool = False,
     ) -> None:
-        """Open `channel`, receiving only `can_ids` if given; `is_shared`: see `recover`. Raises BusMissingError.
+        """Open `channel`, receiving only `can_ids` if given. `is_fd`: for CAN FD, too. `is_shared`: see `recover`.
 
         Without `can_ids` the receive buffer is a listener's, or as large as the system allows an unprivileged user.
+        Raises BusMissingError if the interface is absent, down, or carries no CAN FD although `is_fd`.
         """
         self._is_shared = is_shared
         self.channel = channel
@@ -115,8 +116,8 @@ class SocketCanBus(Bus):
     def send(self, can_id: int, data: bytes) -> None:
         """Queue a frame for transmission; identifiers beyond 0x7FF are 29-bit ones.
 
-        If the queue is full, wait for room, up to _SEND_PATIENCE_S. Raises TransmitQueueError then, InterfaceDownError,
-        and BusError, also for data that the bus can't carry.
+        If the queue is full, wait for room, up to _SEND_PATIENCE_S. Raises TransmitQueueError if it stays full,
+        InterfaceDownError, or BusError for other failures and for data that the bus can't carry.
         """
         packed = self._pack(can_id, data)
         try:
@@ -127,7 +128,10 @@ class SocketCanBus(Bus):
             self._send_patiently(packed)
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Queue several frames in this order, in one system call if there is room for all. Raises as `send`."""
+        """Queue several frames in this order, in one system call if there is room for all.
+
+        Wait for room as `send`. Raises TransmitQueueError, InterfaceDownError or BusError as `send`.
+        """
         packed = [self._pack(can_id, data) for can_id, data in frames]
         sent = 0 if self._socket.fileno() < 0 else self._sender.send(packed)
         for can_id, data in frames[sent:]:  # no room for all, or an error, which `send` raises
@@ -151,7 +155,8 @@ class SocketCanBus(Bus):
     def _send_patiently(self, packed: bytes) -> None:
         """Send a frame as soon as there is room for it, trying every 0.1 ms.
 
-        Raises TransmitQueueError after _SEND_PATIENCE_S, and as `_fail` for another error.
+        Raises TransmitQueueError after _SEND_PATIENCE_S, InterfaceDownError or BusError for an error other than a full
+        queue.
         """
         patience = self._patience
         deadline_ns = patience.now_ns() + int(_SEND_PATIENCE_S * 1e9)
@@ -170,9 +175,10 @@ class SocketCanBus(Bus):
         )
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, or None after `timeout_s`. Raises BusOffError, InterfaceDownError, BusError.
+        """Return the next frame, or None after `timeout_s`. An error frame is returned like others.
 
-        An error frame is returned like others, except for one of bus-off, which the BusOffError has.
+        Raises BusOffError, with the frame, for an error frame of bus-off; InterfaceDownError if the interface is down
+        or absent; BusError for other failures.
         """
         received = self._received
         if not received:
@@ -194,7 +200,7 @@ class SocketCanBus(Bus):
     def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
         """Return the frames of one batch, up to `most`; [] after `timeout_s`. An error frame is returned alone.
 
-        Raises as `receive`.
+        Raises BusOffError, InterfaceDownError or BusError as `receive`.
         """
         received = self._received
         if not received or received[0].is_error:
@@ -205,7 +211,10 @@ class SocketCanBus(Bus):
         return take_first(received, most)
 
     def _take(self, timeout_s: float) -> None:
-        """Fetch received frames into `_received`; wait for the first up to `timeout_s`. Raises as `_fail`."""
+        """Fetch received frames into `_received`; wait for the first up to `timeout_s`.
+
+        Raises InterfaceDownError if the interface is down or absent, BusError for other failures.
+        """
         try:
             if timeout_s <= 0.0 or self._receiver.wait(timeout_s):
                 self._received.extend(self._receiver.take_frames())
@@ -236,7 +245,10 @@ class SocketCanBus(Bus):
         return self._lost_before + self._receiver.frames_lost
 
     def queue_bytes(self) -> QueueBytes:
-        """Read the fill of both queues in a system call. Sent frames count until the interface has sent them."""
+        """Return the fill of both queues, by a system call; update `frames_lost`. Zeros if the socket is closed.
+
+        Sent frames count until the interface has sent them.
+        """
         if self._socket.fileno() < 0:
             return NOTHING_QUEUED
         info = _MEMINFO.unpack(self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size))

@@ -45,12 +45,12 @@ class MarkKind(IntEnum):
 
 
 def pack_mark(kind: MarkKind, t_ns: int = 0) -> bytes:
-    """Return the data of a mark; the time wraps at 2.3 years."""
+    """Return the data of a mark's frame: its kind, and a time in ns, which wraps at 2.3 years."""
     return _PACKING.pack((t_ns << 8 | kind) & 0xFFFFFFFFFFFFFFFF)
 
 
 def unpack_mark(data: bytes) -> tuple[MarkKind, int] | None:
-    """Return the kind of a mark and its time in ns; None for another length or kind."""
+    """Return the kind of a mark and its time in ns, from its frame's data; None for another length or kind."""
     if len(data) != _PACKING.size:
         return None
     (packed,) = _PACKING.unpack(data)
@@ -61,5 +61,5 @@ def unpack_mark(data: bytes) -> tuple[MarkKind, int] | None:
 
 
 def answers_to_sync(codec: Codec) -> frozenset[int]:
-    """Return the identifiers of the frames that the devices send on every SYNC. Raises CodecError without them."""
+    """Return the identifiers of ANSWERS, the frames sent on every SYNC. Raises CodecError if the DBC lacks one."""
     return frozenset(codec.message(name).can_id for name in ANSWERS)

@@ -54,7 +54,7 @@ def show_settings(
 
 
 def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tuple[str, ...]) -> list[dict[str, str]]:
-    """Return a row per setting: key, effective value and default as of `in_words`, and origin.
+    """Return a row per setting, all as text by name: key, effective value, default, and origin of the value.
 
     given: changes as KEY=VALUE, which override the configuration. keys: keys or groups of the settings to return; ():
     all. Raises ConfigError for an invalid configuration or change, CommandError for an unknown key or group.
@@ -124,7 +124,7 @@ def docs(keys: tuple[str, ...], as_json: bool) -> ExitCode:
 
 
 def _list_groups(as_json: bool) -> None:
-    """Print the groups of settings: name, number of keys, meaning."""
+    """Print the groups of settings: name, number of keys, meaning; `as_json`: as JSON, else as a table."""
     from adacd_hil.settings.setting_keys import keys_of, sections
 
     groups: list[dict[str, Any]] = [

@@ -113,7 +113,7 @@ def replay(
 def _next(given: Path, own: "Replay", has_changes: bool) -> tuple[str, ...]:
     """Return the commands to suggest after a replay; () if no cycle was replayed.
 
-    given: the log. has_changes: other settings were replayed, too.
+    given: the log. own: its replay with its own settings. has_changes: other settings were replayed, too.
     """
     if not own.cycles:
         return ()
@@ -141,8 +141,9 @@ def _replay_one(
 ) -> _Result:
     """Replay one log or recording with its own settings, and with each variant that the options ask for.
 
-    configured: --config, --profile and --dbc. Raises CommandError, ConfigError, CodecError or LogError for a wrong
-    option, or a file that can't be read.
+    Return its path, the replays (own settings first), and the variants' names. configured: --config, --profile and
+    --dbc; the others as of the options. Raises CommandError, ConfigError, CodecError or LogError for a wrong option, or
+    a file that can't be read.
     """
     from adacd_hil.control.operator import ScriptedOperator
     from adacd_hil.replay.replay import replay_source
@@ -182,7 +183,8 @@ def _open(
 ) -> "tuple[ReplaySource, bool]":
     """Return a log or a recording, and whether it is a recording without a log.
 
-    Raises CommandError for a recording without a log and without --config; errors of reading it.
+    configured: --config, --profile and --dbc. against: log of the run that a recording is of. Raises CommandError for
+    a recording without a log and without --config; LogError, ConfigError or CodecError if one can't be read or used.
     """
     from adacd_hil.device.contract import load_contract
     from adacd_hil.device.device_files import place_devices
@@ -234,7 +236,8 @@ def _verdict(own: "Replay") -> str:
 def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, stretch: "TimeWindow") -> str:
     """Return a log's replays as text: the comparison with the log, then all replays side by side.
 
-    Without variants the second part is left out, unless no cycle was compared.
+    names: of the variants; without any the second part is left out, unless no cycle was compared. shown: most
+    mismatches that are listed. stretch: of the log, that was compared.
     """
     from adacd_hil.replay.replayed_outcome import NOTE, side_by_side
 

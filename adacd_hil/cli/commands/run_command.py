@@ -60,7 +60,8 @@ def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
 def drop_old_frames(bus: Bus, interface: str) -> None:
     """Recover a SocketCAN bus if frames of an earlier process wait to be sent, so that they are dropped.
 
-    Raises BusError if it can't be recovered. On a shared bus that carries frames, they leave by themselves.
+    Do nothing on other interfaces. On a shared bus that carries frames, they leave by themselves. Raises BusError if
+    the bus can't be recovered.
     """
     if interface == "socketcan" and CanInterface(bus.channel).waiting_frames():
         bus.recover()
@@ -80,7 +81,8 @@ def run_on_bus(
 
     out: folder of the log; None: a new one by date. tare_path, history_path: files with the offsets of a tare, and with
     the arm's certificates; this run's are added. scenario: name of an emulated arm's scenario, whose user makes the
-    requests. without_anchor: the user accepts that no anchor bounds the torque offsets.
+    requests. without_anchor: the user accepts that no anchor bounds the torque offsets. live: serves the log to
+    viewers.
     Raises CommandError for options that don't fit the bus, or if the user declines; ConfigError or CodecError for
     settings or files that can't be used, BusMissingError for the bus, LogError or OSError for the folder and log.
     """
