@@ -53,8 +53,9 @@ class Bench:
     ) -> None:
         """Build and compile everything; the devices send no frame before `boot`.
 
-        send: called with (identifier, data). on_answer: called after each SYNC that devices answer, when all frames are
-        sent. seed: outweighs the scenario's. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
+        send: called with (identifier, data). clock_mode: SYNC moves the time ("sync"), or `advance_to` and the frames'
+        times do ("wall"). on_answer: called after each SYNC that devices answer, when all frames are sent. seed:
+        outweighs the scenario's. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
         TRUTH_LAYOUT), the block being valid until the next call. contract: which EDS files the devices have; default:
         those that go with the codec's DBC. on_event: called with t_ns, level, name and text when a fault begins or
         ends. arm: None: a body of the scenario's.
@@ -144,7 +145,7 @@ class Bench:
         self.time.advance_to(t_ns)
 
     def outlive_host(self) -> None:
-        """In clock mode `sync`, advance the time without a host until the arm is at rest, by 5 s at most."""
+        """In clock mode `sync`, advance the time without a host until the arm rests, at most LONGEST_ORPHANAGE_NS."""
         self.time.outlive_host()
 
     def release(self) -> None:

@@ -51,7 +51,7 @@ class TransmitPdo(PdoRecord):
             self._sender = self.message.sender()
 
     def bind(self) -> None:
-        """Set `send` and the events by the present transmission type and mapping; call it after each change of them."""
+        """Set `send` and `is_compared` by the present transmission type and mapping; call it after they changed."""
         self._reads = tuple(self._pdos.dictionary.reader(*key) for key in self.layout.keys)
         is_asynchronous = self.type == 0 or self.type in EVENT_DRIVEN
         self.is_compared = is_asynchronous and not self._pdos.events.intersection(self.layout.keys)

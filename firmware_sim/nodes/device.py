@@ -316,7 +316,7 @@ class EmulatedDevice(ObjectDictionary):
     def _check_overflow(self, overflow: int) -> None:
         """Abort an SDO write of an invalid SYNC overflow, 0x1019, or a change while 0x1006 is not 0: CiA 301, 7.5.2.22.
 
-        Invalid are 1 and more than 240.
+        Invalid are 1 and more than SYNC_OVERFLOW.
         """
         if overflow == 1 or overflow > SYNC_OVERFLOW:
             refuse(Abort.VALUE_RANGE)
@@ -345,7 +345,10 @@ class EmulatedDevice(ObjectDictionary):
             self._application.enter_operational(t_ns)
 
     def _reset(self, is_node_reset: bool) -> None:
-        """Restore the EDS's values of all objects, or of the communication profile only, and reset the application."""
+        """Restore the EDS's values of all objects, or of the communication profile only, and reset the application.
+
+        is_node_reset: all objects; then tripped watchdogs and SYNC counts are forgotten, too.
+        """
         self.restore(0xFFFF if is_node_reset else 0x1FFF)
         self.pdos.restart_sequences()
         if is_node_reset:
@@ -426,10 +429,10 @@ class SyncListeners:
         return self._takers.get(len(data), self._nobody)
 
     def report_sync(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, lost: int, t_ns: int) -> None:
-        """Report the kind of a SYNC to the devices that hear it, with the number of SYNCs lost before it.
+        """Report the kind of a SYNC to the devices that hear it, each with the number of SYNCs that it missed before.
 
         heard: how often each device hears it; the second time counts as repeated. takers: 1 for each device that takes
-        its length, else 0. lost: SYNCs that the counter skipped.
+        its length, else 0: to that one it is of wrong length. lost: SYNCs that the counter skipped, missed by all.
         """
         for place, device in enumerate(self._devices):
             self._unheard[place] += lost
