@@ -385,7 +385,10 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> dict[str, Any]
 
 
 def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
-    """Return label, number and unit of each figure on the first screen. Unknown figures are left out."""
+    """Return label, number as text, and unit of each figure on the first screen; unknown figures are left out.
+
+    They are adaptation times, contacts found, false alarms, links named rightly, and the median delay.
+    """
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]
     times_s = [number_text(value, 2) for value in metrics.adaptation_s.values()]
