@@ -201,7 +201,7 @@ class LogComparison:
 
     @property
     def is_same_where_whole(self) -> bool:
-        """Whether cycles were compared, no field differs, and only a damaged log lacks cycles of the other."""
+        """Whether cycles were compared, no field differs, and a log that lacks cycles of the other log is damaged."""
         damages = self.second.problem, self.first.problem
         lacks = any(count and not damage for count, damage in zip(self.only, damages, strict=True))
         return self.cycles > 0 and not self.fields and not lacks

@@ -177,7 +177,7 @@ def _figured(headed: RunSummary, info: LogInfo) -> RunSummary:
 
 
 def judged(summary: RunSummary) -> RunSummary:
-    """Return the summary with the judge's figures: reads the whole log, and the emulator's truth if there is one.
+    """Return the summary with figures evaluated now: reads the whole log, and the truth beside it, if there is one.
 
     Summaries of another status than NOT_JUDGED are returned unchanged; a log that can't be judged gets BROKEN.
     """
@@ -310,7 +310,7 @@ def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
 
 
 def _told_certificate(info: LogInfo) -> CertificateState:
-    """Return the state of the last certificate by the log's events."""
+    """Return the state of the last certificate by the log's events; NO_CERTIFICATE without one."""
     found = CertificateState(NO_CERTIFICATE, None)
     start_ns: int | None = None
     for t_ns, event in info.milestones:
