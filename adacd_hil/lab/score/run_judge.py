@@ -21,7 +21,7 @@ from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge
 
 
 def find_detections(run: Run) -> tuple[Detection, ...]:
-    """Return the alarms of a run in order, each with its first and last report by cycle; None where there is none."""
+    """Return the alarms of a run, the earliest first, each with the first and last report of its cycle, or None."""
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
     detections = []
@@ -144,7 +144,7 @@ def row_at(run: Run, time_s: float) -> int:
 
 
 def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
-    """Return the filters that detect at a time, with their thresholds: the paper's one filter, or the bank's."""
+    """Return the filters that detect at `time_s`, s since motion start, with thresholds: the paper's, or the bank."""
     if run.certified is None:
         return (FilterChannel(run.a_rad_s, None, threshold_in(run, row_at(run, time_s))),)
     thresholds = run.certified.threshold[row_at(run, time_s)]
