@@ -234,8 +234,8 @@ class OfflineDetection:
 def identify(model: ArmModel, record: Record, before: ModelEstimate, settings: OfflineSettings) -> ModelEstimate:
     """Return the estimate `before`, corrected by a record of free motion; `before` stays as it is.
 
-    With noise of velocities, the record is fitted twice, see the module. Raises ValueError if record or `noise_Nm` and
-    model differ in their number of joints.
+    With noise of velocities, the record is fitted twice: the first result gives the mass matrix that passes that noise
+    on. Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
     """
     theta_M = before.theta
     for has_velocity_noise in (False, True) if settings.velocity_noise_rad_s else (True,):
@@ -288,7 +288,10 @@ def parameter_deviation(
 
 
 def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredTorque:
-    """Return measured torque and residual of a record behind the filter of the fit. Raises ValueError as `identify`."""
+    """Return measured torque and residual of a record behind the filter of the fit.
+
+    Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
+    """
     trace = _trace(model, record, estimate, settings, estimate.theta)
     return FilteredTorque(trace.tau_f, -trace.tau_ext_hat, trace.unit)
 
@@ -296,7 +299,7 @@ def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings:
 def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tuple[Vector, Vector]:
     """Return every `fit_every`-th sample behind the filter of the fit: regressor (m, n, p) and torque (m, n).
 
-    Raises ValueError as `identify`.
+    Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
     """
     count = len(record.q) // settings.fit_every
     shape = (count, model.joints, len(model.parameter_names))
@@ -346,8 +349,8 @@ def detect(
 ) -> OfflineDetection:
     """Return external torque, thresholds and contacts of a record, behind the filter of detection.
 
-    lack_Nm (n,): the model's lack, of `certify`, which widens the thresholds; None: zero. Raises ValueError as
-    `identify`.
+    lack_Nm (n,): the `lack_Nm` of the model's certificate, which widens the thresholds; None: zero. Raises ValueError
+    if record or `noise_Nm` and model differ in their number of joints.
     """
     trace = _trace(model, record, estimate, settings)
     threshold = _threshold(trace, settings, np.zeros(model.joints) if lack_Nm is None else lack_Nm)
@@ -391,7 +394,10 @@ class _Trace(NamedTuple):
 
 
 def _threshold(trace: _Trace, settings: OfflineSettings, lack_Nm: Vector) -> Vector:
-    """Return the threshold of each sample and joint (k, n), Nm. lack_Nm (n,): of the model."""
+    """Return the threshold of each sample and joint (k, n), Nm: `deviations` times the deviation, plus held friction.
+
+    lack_Nm (n,): of the model's certificate, added to the deviation by squares.
+    """
     return settings.deviations * np.sqrt(trace.deviation**2 + lack_Nm**2) + trace.friction
 
 
