@@ -77,8 +77,8 @@ def tune(
 
     stretch: of each log; the replays begin with the log, and only their results in the stretch count.
 
-    Raises TooLittleMotionError if the half to choose on has no free motion with the settings to start from; else as
-    `read_logs`.
+    Raises TooLittleMotionError if the half to choose on has no free motion with the settings to start from;
+    LogError, ConfigError or CodecError if a log, its settings or its contract can't be used.
     """
     progress(f"reading {number_of(len(paths), 'log')}")
     logs = read_logs(paths, config, stretch, progress)
@@ -271,7 +271,7 @@ def _provenance(tuning: Tuning, best: Candidate) -> list[str]:
 
 
 def _plain(path: Path) -> str:
-    """Return a path as text, with "?" in place of letters that would end a comment."""
+    """Return a path as text, with "?" in place of letters that aren't printable, which might end a comment."""
     return "".join(letter if letter.isprintable() else "?" for letter in str(path))
 
 
