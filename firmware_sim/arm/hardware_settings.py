@@ -256,7 +256,7 @@ class MechanicsSettings:
     def substeps(self, arm: EmulatedArm, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
         """Return the integration steps per 100 µs tick that the fastest rates need, 1 to LARGEST_SUBSTEPS.
 
-        payloads: as of `eigenvalues`. touch_rad_s: fastest rate of bodies, hands and walls.
+        payloads: all that the arm carries in turn. touch_rad_s: fastest rate of bodies, hands and walls.
         """
         oscillation, largest = self.eigenvalues(arm, payloads)
         oscillation = max(oscillation, touch_rad_s)

@@ -201,7 +201,8 @@ def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float
 def _recede_rate(thing: np.void, own: np.void) -> float:
     """Return a body's velocity along its free direction, m/s; 0 if it would move into the wall behind it.
 
-    The stored velocity stays until `_settle_body` resets it. thing, own: as of `_meet`.
+    The stored velocity stays until `_settle_body` resets it. thing, own: the body's row of the touch table, and its
+    part of the touch state.
     """
     if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
         return 0.0
@@ -212,7 +213,8 @@ def _recede_rate(thing: np.void, own: np.void) -> float:
 def _body_force(thing: np.void, own: np.void, pose: Pose, dq1: float, dq2: float) -> tuple[float, float, float, float]:
     """Return a body's force on the arm, N, as x and y, its point on the link and the penetration, both in m.
 
-    Without penetration (0 or negative) the force is 0. thing, own: as of `_meet`.
+    Without penetration (0 or negative) the force is 0. thing, own: the body's row of the touch table, and its part of
+    the touch state.
     """
     depth_m, point_m, normal_x, normal_y, _ = _meet(thing, own, pose)
     if depth_m <= 0.0:
@@ -357,7 +359,7 @@ def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
     """Stop a body that has reached the wall behind it, and return whether the arm touches the body.
 
     While it doesn't touch: update the side of a body off the link's end, and the free direction of a body that has not
-    moved. thing, own: as of `_meet`.
+    moved. thing, own: the body's row of the touch table, and its part of the touch state.
     """
     if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
         own["shift_rate_m_s"] = 0.0

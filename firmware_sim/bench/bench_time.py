@@ -188,8 +188,8 @@ class BenchTime:
     def reach(self, t_ns: int) -> None:
         """Advance the bench's time to `t_ns` without letting timers act; an earlier time changes nothing.
 
-        By SYNC the arm waits, except while its host is dead: then the drives' braking goes by time. By wall the arm
-        moves.
+        In clock mode `wall` the arm moves. In `sync` it waits, except while a drive brakes as it has lost its host, or
+        in `outlive_host`.
         """
         dt_ns = max(0, t_ns - self.now_ns)
         if self._is_wall or self._is_orphaned or any(drive.is_left_alone for drive in self._nodes.drives):
@@ -299,7 +299,7 @@ class BenchTime:
     def _advance_without_sync(self, dt_ns: int) -> None:
         """Advance arm and time by `dt_ns` without a SYNC.
 
-        Add a row of truth per period until the arm rests, by the wall from period number `_FIRST_OVERDUE`
+        Add a row of truth per period until the arm rests, in clock mode `wall` from period number `_FIRST_OVERDUE`
         after the last SYNC on.
         """
         end_ns, period_ns = self.now_ns + dt_ns, self._nodes.period_ns

@@ -141,7 +141,7 @@ def touch_table(scenario: Scenario) -> Structured:
 
 
 def initial_touch_state(things: Structured) -> Vector:
-    """Return the touch state at power-on, zeros (TOUCH_HEADER + n THING_PLACES,): no thing is in place yet."""
+    """Return the touch state at power-on, zeros (TOUCH_HEADER + n THING_PLACES,): no body, hand or wall yet."""
     return np.zeros(TOUCH_HEADER + things.size * THING_PLACES)
 
 

@@ -215,7 +215,7 @@ def lay_out(dictionary: ObjectDictionary, values: Sequence[int], is_received: bo
     """Return the layout of a frame with the mapped objects (`values`: entries as in `check_entry`), in their order.
 
     Raises `Refusal` for an invalid entry, more than `longest` bytes, or a header that is incomplete or doesn't lead.
-    Frames of more than CLASSIC_BYTES are padded to one of CAN FD's lengths. is_received: as of `check_entry`.
+    Frames of more than CLASSIC_BYTES are padded to one of CAN FD's lengths. is_received: of an RPDO.
     """
     formats = [check_entry(dictionary, value, is_received) for value in values]
     size = sum(value & 0xFF for value in values) // 8

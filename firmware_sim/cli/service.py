@@ -122,7 +122,7 @@ class Service:
     def _patience_s(self) -> float:
         """Return how long to wait for a frame, s.
 
-        By SYNC it is `_IDLE_NS`; by wall clock the time to the bench's next timer, `_LONGEST_WAIT_NS` at most.
+        In clock mode `sync` it is `_IDLE_NS`, in `wall` the time to the bench's next timer, `_LONGEST_WAIT_NS` at most.
         """
         if not self._is_wall:
             return _IDLE_NS * 1e-9
@@ -130,7 +130,7 @@ class Service:
         return max(0, min(due_ns, _LONGEST_WAIT_NS)) * 1e-9
 
     def _pass_time(self, now_ns: int, is_idle: bool) -> None:
-        """Pass the time to the bench: by wall clock if no frame came (`is_idle`), by SYNC if none came for `_IDLE_NS`.
+        """Pass time to the bench: by wall clock if no frame came (`is_idle`), by SYNC if no SYNC came for `_IDLE_NS`.
 
         A host in lockstep sends the time itself. After a silence of `_SILENCE_NS` the bench outlives the host, and
         lockstep ends.

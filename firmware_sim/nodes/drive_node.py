@@ -335,8 +335,8 @@ class DriveNode(Application):
     def restart_node(self, is_node_reset: bool) -> None:
         """Forget the controlword that waits.
 
-        At a node reset also forget fault, target torque and controlword, and run the state machine up to Switch on
-        disabled.
+        At a node reset (`is_node_reset`) also forget fault, target torque and controlword, and run the state
+        machine up to Switch on disabled.
         """
         self._received_word = None
         if not is_node_reset:

@@ -287,7 +287,7 @@ class Scenario:
 
     @property
     def arm(self) -> EmulatedArm:
-        """The arm of one's own, or that of the profile."""
+        """`own_arm`, or, without it, the arm of the profile."""
         return ARMS[self.profile] if self.own_arm is None else self.own_arm
 
     @property
