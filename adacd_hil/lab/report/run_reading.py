@@ -301,7 +301,7 @@ class RunReading:
     def _edges(self, scheme: Series) -> Rows:
         """Return the first and last row of a piece, and rows around changes of the state or of the paper's arming.
 
-        Rows beyond the piece may be among them.
+        Rows beyond the piece may be among them. Stores state and arming of the last row for the next piece.
         """
         state = scheme.records["state"].astype(np.int64)
         is_armed = np.zeros(len(state), np.bool_)
@@ -373,9 +373,9 @@ class RunReading:
         self._settled -= self._rows.thin(first, end, lambda rows: self._curves(shell, rows), around_ns, _NOISE_CYCLES)
 
     def _thin_times(self) -> None:
-        """Of a long run, drop those rows of /cycle added since the last call in which no curve has a bucket's extreme.
+        """Of a long run, drop rows of /cycle in which no time, queue or overrun is smallest or largest in its bucket.
 
-        The curves are those of `_time_curves`.
+        They are those read since this function last dropped any.
         """
         self._waiting = 0
         if self._times.cycles > self._full_cycles:
