@@ -67,7 +67,7 @@ class RunSummary:
     log has the date, "folder" where its name has, else "file". status: of STATUSES; verdict: the reason in a sentence.
     expected: contacts that there were while detection was armed, None on a real arm; found: the detected ones of those,
     or all detections if the run isn't judged. margin: smallest threshold over residual. duration_s: from the log's
-    first message to its last.
+    first message to its last. friction_Nm (at FRICTION_AT_RAD_S), offset_Nm: of the first certificate without payload.
     """
 
     name: str
