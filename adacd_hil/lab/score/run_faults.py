@@ -140,7 +140,7 @@ class CyclicDataGatherer:
             self._worst = max(self._worst, float(shares[is_long].max()))
 
     def data(self, run: Run) -> CyclicData:
-        """Return the shares of incomplete and aged data so far.
+        """Return the shares of incomplete and aged data so far, those of each device, and a line for each excess.
 
         run: has the cycles in which the state changes, and the checks' counts. Call it after the last piece.
         """

@@ -119,7 +119,7 @@ class FilterChannel:
     def respond(self, tau_ext: Vector, cycle: Cycles, period_s: float) -> Vector:
         """Return the channel's output, Nm (n, 2), for a true torque (n, 2), from rest at the first sample.
 
-        See `filtered`.
+        Each sample is held until the next one. cycle (n,): numbers of their cycles.
         """
         response = filtered(tau_ext, cycle, period_s, self.cutoff_rad_s)
         if self.smoothing_rad_s is None:
@@ -165,7 +165,7 @@ def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[De
 def is_payload_alarm(run: Run, row: int) -> bool:
     """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet.
 
-    False without the truth or without gravity; the row before must be in PAYLOAD.
+    False without the truth, without gravity, or if the row before isn't in PAYLOAD.
     """
     truth, armed = run.truth, np.flatnonzero(is_armed_in(run.state[:row]))
     if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:
