@@ -120,7 +120,7 @@ class ArmModel:
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the p parameters."""
+        """Names of the p parameters in the order of theta: base, F_v, F_c, offset and rotor inertia of each joint."""
         kinds = ("F_v", "F_c", "offset", *(("rotor",) if self.has_rotors else ()))
         per_joint = (f"{kind}{i + 1}" for kind in kinds for i in range(self.joints))
         return (*self.base.names, *per_joint)
@@ -359,9 +359,10 @@ def detect(
 
 
 def find_contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[tuple[int, int, tuple[int, ...]], ...]:
-    """Return the contacts in samples of external torque and threshold (k, n), as in `OfflineDetection`.
+    """Return the contacts in samples of external torque and threshold (k, n): sample, link from 0, signs (n,) each.
 
-    window: samples from a detection until the link is isolated. A contact ends when every joint has stayed within
+    The signs are those of tau_ext_hat where a joint crosses its threshold, 0 if it doesn't within the window. window:
+    samples from a detection until the link is isolated. A contact ends when every joint has stayed within
     `ONSET_FRACTION` of its threshold for a whole window, so a push that sways around the threshold is one. NaN is over
     the threshold.
     """
