@@ -211,8 +211,8 @@ def calibrate_detector(peaks: Vector, rate_per_h: float) -> tuple[Vector, TailCa
     """Return a detector's thresholds (channels, n) for a rate of alarms on any channel and joint, and the calibration.
 
     peaks (B, channels, n): block maxima, NaN where not free. The calibration is of all channels and joints together, of
-    the largest ratio of statistic to threshold; its `threshold` is about 1. Raises TooLittleMotionError as `calibrate`,
-    also for a single channel and joint.
+    the largest ratio of statistic to threshold; its `threshold` is about 1. Raises TooLittleMotionError for too
+    little motion, equal values, or too few separate alarms, of a channel and joint or of all together.
     """
     share = rate_per_h / (peaks.shape[1] * peaks.shape[2])
     thresholds = np.array(

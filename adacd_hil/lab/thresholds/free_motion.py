@@ -115,8 +115,9 @@ def read_motion(
 ) -> LoggedMotion:
     """Return the motion in a log, or in a stretch of it, with its contact-free samples marked; reads the log twice.
 
-    progress: called with a line on the cycles read. watch: called with each piece of /scheme. Raises LogError if
-    the log can't be read, has no /scheme or no measured period, or no sample is free of contact.
+    A sample is free if it and all within APART_S are armed, without a joint over its threshold, a gap or NaN. progress:
+    called with a line on the cycles read. watch: called with each piece of /scheme. Raises LogError if the log can't be
+    read, has no /scheme or no measured period, or no sample is free of contact.
     """
     bounds_ns = None
     where = ""

@@ -85,7 +85,10 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
 
 @dataclass(frozen=True)
 class Statistics:
-    """The detectors' statistics on contact-free motion, and N samples of it, or all, with the stream of them."""
+    """The detectors' statistics on contact-free motion, and all or N samples of it with their stream: z and held_Nm.
+
+    held_Nm: torque that friction may hold. lag_s: by which dq is older than tau_J; lag_of_joint_s: the same by joint.
+    """
 
     settings: detectors.DetectorBankSettings
     weights: Vector  # (n, ages, L), of the likelihood channels
@@ -212,8 +215,8 @@ def calibrate_all(
 ) -> tuple[dict[str, tuple[Vector, TailCalibration]], tuple[str, ...]]:
     """Return each detector's thresholds and calibration for a rate of false alarms, and the names of those that failed.
 
-    They are by name, and as of `calibrate_detector`. A detector fails if its tail can't be fitted. Raises
-    TooLittleMotionError if all fail.
+    By name: thresholds (channels, n), and the calibration of all channels and joints together. A detector fails if its
+    tail can't be fitted. Raises TooLittleMotionError if all fail.
     """
     found: dict[str, tuple[Vector, TailCalibration]] = {}
     missing: list[str] = []
