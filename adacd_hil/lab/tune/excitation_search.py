@@ -57,9 +57,9 @@ class NoExcitationError(ValueError):
 class Figures:
     """Figures of a motion.
 
-    Excitation_Nm2s, inertia_Nm2s: smallest eigenvalues of the information on all parameters, Nm² s. The second is of
-    the inertia alone, in the shortest fit of a payload. condition: largest over smallest eigenvalue. The others are
-    largest |q| and so on, of joint 1 and 2.
+    Smallest eigenvalues, Nm² s: excitation_Nm2s, of the information on all parameters in the shortest fit;
+    inertia_Nm2s, of that on the inertia alone in the shortest fit of a payload. condition: largest over smallest
+    eigenvalue of the former. The others are largest |q| and so on, of joint 1 and 2.
     """
 
     excitation_Nm2s: float
@@ -223,7 +223,7 @@ class Search:
     def _climb(self, start: Vector, iterations: int) -> ExcitationSettings:
         """Return the motion at the end of a climb, in which exceeded limits cost more and more; it may exceed some.
 
-        start: as `free` of `_complete`.
+        start: flat coefficients of the harmonics from the second on. iterations: most per penalty.
         """
         found = start
         for penalty in _PENALTIES:
@@ -300,7 +300,8 @@ class Search:
         """Return the cost of a motion, the lower the better it identifies, plus a penalty for exceeded limits.
 
         The cost is `Figures.cost`, made smooth in the coefficients. The penalty is `penalty` times the mean square of
-        the excess, as share of the limit, summed over the limits. free: as of `_complete`.
+        the excess, as share of the limit, summed over the limits. free: flat coefficients of the harmonics from
+        the second on.
         """
         motion = self.motion_of(*self._complete(free))
         W = self._regressors(motion)

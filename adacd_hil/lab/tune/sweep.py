@@ -142,7 +142,8 @@ def plan_scenarios(
 ) -> Plan:
     """Return the plan of a sweep that runs the emulated arm with each scenario, seed and variant of the settings.
 
-    The arguments are as of `plan_logs`.
+    variants: values as TOML, by key; none: the settings as they are. config: name or file, "" for the one of emulated
+    runs. profile: "" for the default arm. version: of the code.
     """
     subjects = (Subject(scenario=scenario, seed=seed) for scenario in scenarios for seed in seeds)
     return Plan(tuple(dict.fromkeys(subjects)), _tuples(variants), config, profile, version)
@@ -304,7 +305,10 @@ class SweepStore:
         return path
 
     def notes(self, table: Path) -> list[str]:
-        """Return a line "SUBJECT: NOTES" for each row of a joined table whose replay has notes, each text once."""
+        """Return a line "SUBJECT: NOTES" for each row of a joined table whose replay has notes, each text once.
+
+        Raises LogError if the table can't be read.
+        """
         rows = self._read(table).to_pylist()
         noted = (f"{row['log'] or row['scenario']}: {row['notes']}" for row in rows if row.get("notes"))
         return list(dict.fromkeys(noted))

@@ -194,7 +194,7 @@ def problems_of(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate
 
 
 def best_of(judged: Sequence[Candidate]) -> Candidate | None:
-    """Return the fit candidate with the smallest median delay in the half to choose on; None if none is fit.
+    """Return the candidate with the smallest median delay in the half to choose on, without problems; None without one.
 
     judged: at least one, that of the logs' filter and gain first. If the rate is extrapolated more than FARTHEST-fold,
     only this one is considered.
@@ -369,7 +369,7 @@ def draw_roc(tuning: Tuning) -> Drawing:
 
 
 def draw_delays(tuning: Tuning) -> Drawing:
-    """Draw the share of all contacts that is found within a time, at the chosen thresholds. Needs the truth."""
+    """Draw the share of contacts found against the time since onset, at the chosen thresholds. Needs the truth."""
     title = "Delay at the chosen thresholds"
     with _axes(title) as (figure, axes):
         for choice, look in _curves(tuning):

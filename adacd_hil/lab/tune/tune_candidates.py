@@ -139,7 +139,10 @@ def _show_to(shown: "Sequence[ShownLog]") -> Watch:
 
 
 def name_of(changes: Mapping[str, str]) -> str:
-    """Return the name of a candidate by its changed settings, "KEY=VALUE, …"; "as it is" without a change."""
+    """Return the name of a candidate by its changed settings, "KEY=VALUE, …"; "as it is" without a change.
+
+    `filter.b_rad_s` is left out.
+    """
     return ", ".join(f"{key}={value}" for key, value in changes.items() if key != "filter.b_rad_s") or "as it is"
 
 
@@ -222,7 +225,8 @@ class ShownLog:
     def _statistic_of(self, block: Vector) -> Vector:
         """Return the statistic that chosen thresholds are compared with (k, 1, channels), from k cycles of /scheme.
 
-        Certified scheme: largest ratio to the thresholds in force. Paper's scheme: residual less its allowance, Nm.
+        Certified scheme: largest ratio to the thresholds in force. Paper's scheme: residual, Nm, less
+        the part of the threshold beyond the configured one.
         """
         if self._is_certified:
             bank, threshold = (block[:, self._slices[name]] for name in ("tau_ext_bank", "threshold_bank"))

@@ -123,7 +123,7 @@ class Found(NamedTuple):
         return share_bounds(len(self.delays_ms), self.contacts or 0)
 
     def by_key(self) -> dict[str, Any]:
-        """Return the effect of the thresholds by the keys of tune.json."""
+        """Return hours, false alarms and their bound, and contacts found, if known, by the keys of tune.json."""
         plain: dict[str, Any] = {
             "hours": self.hours,
             "false_alarms": self.alarms,
@@ -248,7 +248,7 @@ _TENTHS = 10
 class Window(NamedTuple):
     """The rows [first, last] of a log in which a true contact explains an alarm, see `score.judge`.
 
-    number: the contact's.
+    number: the contact's. is_chosen_on: the contact is in the half that thresholds are chosen on.
     """
 
     number: int
@@ -260,7 +260,7 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class TunedLog:
-    """A log of N cycles, or N of them. digest: SHA-256 of the file. settings: those to start from.
+    """A log of N cycles, or the N of them in `stretch`. digest: SHA-256 of the file. settings: those to start from.
 
     t_ns (N,): times. windows: of the true contacts that begin in those, None if unknown. is_chosen_on (B,): whether a
     block of `BLOCK_S` is in the half that thresholds are chosen on.
@@ -486,7 +486,10 @@ def free_hours(log: TunedLog) -> float:
 
 
 def tuning_by_key(found: Tuning) -> dict[str, Any]:
-    """Return the result by the keys of tune.json; values are tuples, arrays and paths, too."""
+    """Return the result by the keys of tune.json: logs, suggestion, candidates, detectors, notes.
+
+    Values are tuples, arrays and paths, too.
+    """
 
     def candidate(each: Candidate) -> dict[str, Any]:
         return {
