@@ -110,7 +110,7 @@ class EmulatedArm:
         return alpha, beta, gamma
 
     def theta(self, payload_kg: float = 0.0) -> Vector:
-        """Return the arm's parameters (7,) in the order of `records.PARAMETER_NAMES`, with a point mass at the tip."""
+        """Return the arm's parameters (7,) in the order of `records.PARAMETER_NAMES`, with `payload_kg` at the tip."""
         alpha, beta, gamma = self.inertia(payload_kg)
         return np.array([alpha + gamma, beta, gamma, *self.viscous_Nm_s, *self.coulomb_Nm])
 
@@ -190,7 +190,7 @@ class Wiring:
     zero_counts: Joints = (0, 0)
 
     def read(self, measured: Measurement) -> Measurement:
-        """Return a measurement whose pairs are by joint as the devices at places 1 and 2 give it, in counts.
+        """Return a measurement by joint as pairs by device, (Drive1, Drive2) and (Sensor1, Sensor2), in counts.
 
         Each device takes the value of its joint, with its sign; a drive adds its zero before the sign.
         """

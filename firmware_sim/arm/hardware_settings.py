@@ -190,7 +190,7 @@ class MechanicsSettings:
         return self.stop_low_deg, self.stop_high_deg
 
     def numbers(self, arm: EmulatedArm) -> np.void:
-        """Return the mechanics of an arm as one record of dtype MECHANICS_NUMBERS, for compiled functions."""
+        """Return friction, gear, gravity and brakes of an arm as one record of dtype MECHANICS_NUMBERS."""
         numbers = pack_fields(self, MECHANICS_NUMBERS)
         surplus = [max(0.0, self.static_Nm[joint] - arm.coulomb_Nm[joint]) for joint in range(2)]
         numbers["surplus_Nm"] = surplus
@@ -254,9 +254,9 @@ class MechanicsSettings:
         return oscillation, largest
 
     def substeps(self, arm: EmulatedArm, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
-        """Return the integration steps per 100 µs tick that the fastest rates need, at most LARGEST_SUBSTEPS.
+        """Return the integration steps per 100 µs tick that the fastest rates need, 1 to LARGEST_SUBSTEPS.
 
-        touch_rad_s: fastest rate of bodies, hands and walls.
+        payloads: all that the arm carries in turn. touch_rad_s: fastest rate of bodies, hands and walls.
         """
         oscillation, largest = self.eigenvalues(arm, payloads)
         oscillation = max(oscillation, touch_rad_s)

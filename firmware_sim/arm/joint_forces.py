@@ -107,7 +107,10 @@ def bristle_rate(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, leve
 
 @compiled
 def advance_bristle(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, level_Nm: float, step_s: float) -> float:
-    """Return the bristle deflection z after a step of constant velocity, rad: exact, stable at any stiffness."""
+    """Return the bristle deflection z after a step of constant velocity, rad: exact, stable at any stiffness.
+
+    level_Nm: g(v).
+    """
     if velocity_rad_s == 0.0:
         return z_rad
     settled_rad = math.copysign(level_Nm / sigma0_Nm_rad, velocity_rad_s)
@@ -232,10 +235,10 @@ def collect_forces(
     elapsed_s: float,
     forces: np.void,
 ) -> None:
-    """Fill all other fields of `forces`, and `touch_rates` where there are things, for the state `now`.
+    """Fill all fields of `forces` but the two drifts, and `touch_rates` if bodies, hands or walls exist.
 
-    Call `set_drift` first: the friction levels use its factors. time_s: scenario time. elapsed_s: time since the
-    contact's onset.
+    Call `set_drift` first: the friction levels use its factors. now: integrated state, an element of ROW. time_s:
+    scenario time. elapsed_s: time since the contact's onset.
     """
     state, arm, mechanics = around.state, around.arm, around.mechanics
     q1, q2, dq1, dq2 = now["q"][0], now["q"][1], now["dq"][0], now["dq"][1]
@@ -291,7 +294,8 @@ def is_free(joint: int, state: np.void, mechanics: np.void) -> bool:
 def decide(now: np.void, around: Surroundings, forces: np.void) -> Slips:
     """Return the slips of both links, then of both motors, by the present forces: 1 or -1, or 0 if it sticks.
 
-    The sign is the direction of the slip. A link or motor that never sticks has 1.
+    The sign is the direction of the slip. A link or motor that never sticks has 1. now: element of ROW;
+    forces: of FORCES.
     """
     state, mechanics = around.state, around.mechanics
     slip1, slip2 = decide_slips(
@@ -324,7 +328,7 @@ def accelerate_links(
 ) -> tuple[float, float, float, float]:
     """Return ddq of joints 1 and 2, rad/s², and their dry friction, Nm, positive along +dq, for these slips.
 
-    The friction of a sticking link is the torque that holds it.
+    The friction of a sticking link is the torque that holds it. now: element of ROW; forces: of FORCES, for `now`.
     """
     link_Nm = forces["link_Nm"]
     return accelerate(
@@ -336,9 +340,9 @@ def accelerate_links(
 def find_friction(
     now: np.void, around: Surroundings, forces: np.void
 ) -> tuple[float, float, float, float, float, float]:
-    """Return ddq, rad/s², and two frictions, Nm along +dq, of joints 1 and 2 each, from the present forces.
+    """Return ddq, rad/s², then friction on the link side of the sensor, then on its motor side, Nm along +dq.
 
-    The first friction is on the link side of the sensor. The second is on the motor side, 0 for an elastic joint.
+    Each is for joints 1 and 2. On the motor side it is 0 for an elastic joint. now: element of ROW; forces: of FORCES.
     """
     mechanics = around.mechanics
     ddq1, ddq2, dry1, dry2 = accelerate_links(now, around, decide(now, around, forces), forces)

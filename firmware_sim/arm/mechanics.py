@@ -102,7 +102,7 @@ def _collect(row: int, around: Surroundings, time_s: float, elapsed_s: float, wo
 
 @compiled
 def _fill_rates(row: int, rates: int, around: Surroundings, slips: Slips, work: _StepWork) -> None:
-    """Fill the row `rates` with the derivative of the state in `row`.
+    """Fill row number `rates` of the work space with the derivative of the state in row number `row`.
 
     Needs the forces of the same state in the work space. Leaves the rates of bristles and motor torques out.
     """
@@ -128,7 +128,7 @@ def _fill_rates(row: int, rates: int, around: Surroundings, slips: Slips, work: 
 
 @compiled
 def _set_stage(rates: int, length_s: float, mechanics: np.void, work: _StepWork) -> None:
-    """Fill the row `_STAGE` with the start plus `length_s` times the rates in the row `rates`.
+    """Fill the row `_STAGE` with the start row plus `length_s` times the rates in row number `rates`.
 
     The bristles of LuGre friction advance by the mean velocity over `length_s`.
     """
@@ -261,7 +261,7 @@ def _step(
     step_s: float,
     work: _StepWork,
 ) -> None:
-    """Advance the start row by a substep, cutting it where a slip changes.
+    """Advance the start row by `step_s`, in parts that end where a link or motor stops or breaks away.
 
     Needs the forces of the start row in the work space, and leaves those of the new start there.
     """
@@ -298,7 +298,7 @@ def _step(
 
 @compiled
 def _load(around: Surroundings, touch_state: Vector, work: _StepWork) -> None:
-    """Fill the start row of the work space from both states.
+    """Fill the start row of the work space from the mechanical state and the touch state.
 
     Set the friction factors of temperature in the work space's forces, and `rotor_kg_m2` in the mechanical state.
     """
@@ -421,6 +421,7 @@ def observe(
     """Return the present true values, Nm: external torque, friction along +dq, gravity torque, two joints each.
 
     The friction is on the link side of the sensor. Position, velocity and touch state stay; `space` is overwritten.
+    Arguments are as of `integrate_mechanics`.
     """
     around = Surroundings(state, arm, mechanics, contact, things)
     rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]

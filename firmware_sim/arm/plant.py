@@ -90,7 +90,7 @@ def fit_payload(
 ) -> None:
     """Set the payload in `state`: a body with its centre of mass at (along, beside) from the tip, along link 2.
 
-    Updates inertia, and velocities of a moving arm.
+    Updates inertia, and velocities of a moving arm. inertia_kg_m2: about the payload's centre of mass.
 
     An added mass was at rest: it shares the momentum of the moving arm, M q̇ stays. A mass that is taken off leaves with
     its speed: q̇ stays. At rest both change only the inertia.
@@ -142,9 +142,9 @@ def accelerate(
 ) -> tuple[float, float, float, float]:
     """Return ddq1, ddq2 in rad/s² and the Coulomb friction of both joints in Nm, positive along +dq.
 
-    torque: of motor, touches, joint stops and gravity, Nm. slip: 1 or -1, the direction in which a joint slips, or 0:
-    it sticks. A sticking joint has no acceleration; its friction is the holding torque, even where that is more than
-    F_c.
+    state: has the inertia. arm: has the fields `viscous_Nm_s` and `coulomb_Nm`. torque: of motor, touches, joint stops
+    and gravity, Nm. slip: 1 or -1, the direction in which a joint slips, or 0: it sticks. A sticking joint has no
+    acceleration; its friction is the holding torque, even where that is more than F_c.
     """
     sine = state["beta"] * math.sin(q2)
     if state["sigma"] != 0.0:
@@ -177,9 +177,10 @@ def decide_slips(
 ) -> tuple[int, int]:
     """Return the slip of each joint: the sign of its velocity, or at standstill of its breakaway; 0 if it sticks.
 
-    torque: all but friction, Nm. At standstill exactly one choice fits friction's law, because the inertia is positive
-    definite: joints that stick need no more than F_c, joints that slip accelerate the way they slip. Within rounding of
-    the limit no choice may fit; then the function returns the choice that fits best.
+    state, arm: as of `accelerate`. torque: all but friction, Nm. At standstill exactly one choice fits friction's
+    law, because the inertia is positive definite: joints that stick need no more than F_c, joints that slip accelerate
+    the way they slip. Within rounding of the limit no choice may fit; then the function returns the choice that fits
+    best.
     """
     if dq1 != 0.0 and dq2 != 0.0:
         return (1 if dq1 > 0.0 else -1), (1 if dq2 > 0.0 else -1)

@@ -174,7 +174,8 @@ def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float
     """Return how a body meets its link: penetration and point along the link, m; normal x, y; distance across, m.
 
     The penetration is negative while they are apart. The normal points from the link to the body; the last is the
-    signed distance of the body's centre from the link's line.
+    signed distance of the body's centre from the link's line. thing, own: the body's row of the touch table, and its
+    part of the touch state.
     """
     along_x, along_y, link2_x, link2_y = pose
     length_m = thing["length1_m"]
@@ -200,7 +201,8 @@ def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float
 def _recede_rate(thing: np.void, own: np.void) -> float:
     """Return a body's velocity along its free direction, m/s; 0 if it would move into the wall behind it.
 
-    The stored velocity stays until `_settle_body` resets it.
+    The stored velocity stays until `_settle_body` resets it. thing, own: the body's row of the touch table, and its
+    part of the touch state.
     """
     if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
         return 0.0
@@ -211,7 +213,8 @@ def _recede_rate(thing: np.void, own: np.void) -> float:
 def _body_force(thing: np.void, own: np.void, pose: Pose, dq1: float, dq2: float) -> tuple[float, float, float, float]:
     """Return a body's force on the arm, N, as x and y, its point on the link and the penetration, both in m.
 
-    Without penetration (0 or negative) the force is 0.
+    Without penetration (0 or negative) the force is 0. thing, own: the body's row of the touch table, and its part of
+    the touch state.
     """
     depth_m, point_m, normal_x, normal_y, _ = _meet(thing, own, pose)
     if depth_m <= 0.0:
@@ -227,7 +230,8 @@ def _body_force(thing: np.void, own: np.void, pose: Pose, dq1: float, dq2: float
 def _hand_force(thing: np.void, own: np.void, time_s: float, pose: Pose, dq1: float, dq2: float) -> tuple[float, float]:
     """Return a hand's force on the arm, N, as x and y, limited to `force_limit_N`.
 
-    time_s: scenario time, which says how far the hand has moved.
+    own: the hand's part of the touch state: where it grasped, and its way. time_s: scenario time, which gives how far
+    the hand has moved.
     """
     x, y, dx, dy = _moved_point(thing["link"], thing["point_m"], thing["length1_m"], pose, dq1, dq2)
     way_m = thing["speed_m_s"] * (time_s - thing["onset_s"])
@@ -251,9 +255,10 @@ def _hand_force(thing: np.void, own: np.void, time_s: float, pose: Pose, dq1: fl
 def _wall_force(
     thing: np.void, own: np.void, link: float, pose: Pose, dq1: float, dq2: float
 ) -> tuple[float, float, float, float]:
-    """Return a wall's force on the end of a link, N (x, y), the end's distance from its joint and the penetration, m.
+    """Return a wall's force on the end of a link, N, as x and y, the link's length and the penetration, both in m.
 
-    In front of the wall the force is 0 and the penetration negative.
+    In front of the wall the force is 0 and the penetration negative. own: the wall's part of the touch state, with its
+    normal toward the free side.
     """
     point_m = thing["length2_m"] if link == 2.0 else thing["length1_m"]
     x, y, dx, dy = _moved_point(link, point_m, thing["length1_m"], pose, dq1, dq2)
@@ -277,10 +282,10 @@ def touch(
     state: Vector,
     rates_out: Vector,
 ) -> tuple[float, float]:
-    """Return the external torque of all bodies, hands and walls, Nm, and fill the rates of their state.
+    """Return the external torque of all bodies, hands and walls, Nm, and fill the rates of the touch state `state`.
 
-    time_s: scenario time. Writes only rates_out, and leaves even that unchanged for an empty table: an integrator may
-    call it at any stage of a step.
+    things: their table. time_s: scenario time. Writes only rates_out, and leaves even that unchanged for an empty
+    table: an integrator may call it at any stage of a step.
     """
     torque1, torque2 = 0.0, 0.0
     if things.shape[0] == 0:
@@ -315,7 +320,11 @@ def touch(
 
 @compiled
 def _appear(thing: np.void, own: np.void, hand: np.void, pose: Pose) -> None:
-    """Set a thing as present unless the arm is in its place; store where a hand grasps, and the way that it guides."""
+    """Set a body, hand or wall as present, a body or wall only if the arm isn't in its place.
+
+    Store where a hand grasps and the way that it guides, a body's side and given free direction, or a wall's normal,
+    in its part of the touch state. own, hand: two views of that part.
+    """
     if thing["kind"] == HAND:
         hand["start_x_m"], hand["start_y_m"], _, _ = _moved_point(
             thing["link"], thing["point_m"], thing["length1_m"], pose, 0.0, 0.0
@@ -350,7 +359,7 @@ def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
     """Stop a body that has reached the wall behind it, and return whether the arm touches the body.
 
     While it doesn't touch: update the side of a body off the link's end, and the free direction of a body that has not
-    moved.
+    moved. thing, own: the body's row of the touch table, and its part of the touch state.
     """
     if own["shift_m"] >= thing["room_m"] and own["shift_rate_m_s"] > 0.0:
         own["shift_rate_m_s"] = 0.0
@@ -367,7 +376,7 @@ def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
 
 @compiled
 def change_touch(things: Structured, time_s: float, q1: float, q2: float, state: Vector, is_prescribed: bool) -> None:
-    """Apply the changes between ticks to `state`: things come and go, a body stops at its wall.
+    """Apply the changes between ticks to the touch state: bodies, hands, walls come and go, a body stops at its wall.
 
     The energy is set to 0 while nothing touches the arm. Call it at the start of each tick and before `describe_touch`;
     a second call at the same instant changes nothing. is_prescribed: whether a scripted contact acts. The free
@@ -400,7 +409,7 @@ def change_touch(things: Structured, time_s: float, q1: float, q2: float, state:
 
 @compiled
 def _note(out: np.void, force_x: float, force_y: float, link: float, index: float) -> None:
-    """Store force, link and index in `out` if the force is the strongest so far."""
+    """Store size of force, N, link and index of a contact in `out`, of TOUCH_TRUTH, if no stronger one is stored."""
     size = math.sqrt(force_x * force_x + force_y * force_y)
     if out["index"] < 0.0 or size > out["force_N"]:
         out["force_N"], out["link"], out["index"] = size, link, index
@@ -423,8 +432,9 @@ def describe_touch(
 ) -> tuple[float, float]:
     """Fill `out`, a record of TOUCH_TRUTH, and return the external torque of all contacts on both joints, Nm.
 
-    Link and index of `out` are those of the strongest force. contact, contact_index, elapsed_s: the scripted contact
-    that acts, its index and the time since its onset; an empty array without one.
+    Contacts are the scripted one, bodies, hands and walls; link and index of `out` are those of the strongest force.
+    contact, contact_index, elapsed_s: the scripted contact that acts, its index and the time since its onset; an empty
+    array without one.
     """
     out["force_N"], out["link"], out["index"] = 0.0, 0.0, -1.0
     torque1, torque2 = 0.0, 0.0

@@ -53,7 +53,8 @@ class Bench:
     ) -> None:
         """Build and compile everything; the devices send no frame before `boot`.
 
-        send: called with (identifier, data). on_answer: called after each SYNC that devices answer, when all frames are
+        send: called with (identifier, data). clock_mode: the arm's time goes by SYNC ("sync"), or by the clock of
+        `advance_to` and frames ("wall"). on_answer: called after each SYNC that devices answer, when all frames are
         sent. seed: outweighs the scenario's. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
         TRUTH_LAYOUT), the block being valid until the next call. contract: which EDS files the devices have; default:
         those that go with the codec's DBC. on_event: called with t_ns, level, name and text when a fault begins or
@@ -108,7 +109,7 @@ class Bench:
 
     @property
     def now_ns(self) -> int:
-        """The bench's time, ns: by SYNC, the time of `boot` plus the periods since then; by wall, the clock's."""
+        """The bench's time, ns: by mode `sync` that of `boot` plus the periods since then, by `wall` the clock's."""
         return self.time.now_ns
 
     @property
@@ -144,7 +145,7 @@ class Bench:
         self.time.advance_to(t_ns)
 
     def outlive_host(self) -> None:
-        """In clock mode `sync`, advance the time without a host until the arm is at rest, by 5 s at most."""
+        """In clock mode `sync`, advance the time without a host until the arm rests, at most LONGEST_ORPHANAGE_NS."""
         self.time.outlive_host()
 
     def release(self) -> None:
@@ -262,7 +263,10 @@ class Bench:
         self.time.poll(self.time.now_ns)
 
     def _answer(self, data: bytes, t_ns: int, late_ns: int) -> None:
-        """Let the devices sample and answer a SYNC, then log its truth. late_ns: by SYNC, how late it reaches them."""
+        """Let the devices sample and answer a SYNC, then log its truth.
+
+        late_ns: in clock mode `sync`, how late it reaches them.
+        """
         sync_ns = self.time.now_ns
         self.time.delay_sample(late_ns)
         takers = self._nodes.listeners.takers(data)

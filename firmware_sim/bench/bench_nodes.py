@@ -192,6 +192,6 @@ def _scaled(read: Callable[[], int], ratio: float, low: int, high: int) -> Calla
 
 
 def _check_period(period_us: int) -> None:
-    """Abort the SDO write (VALUE_RANGE) of a SYNC period, µs, that is not 0 to 100 ms in whole 100 µs ticks."""
+    """Abort the SDO write (VALUE_RANGE) of a SYNC period, µs, unless it is 0 to `_LONGEST_PERIOD_US` in whole ticks."""
     if not 0 <= period_us <= _LONGEST_PERIOD_US or period_us * 1000 % TICK_NS:
         refuse(Abort.VALUE_RANGE)

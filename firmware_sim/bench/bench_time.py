@@ -43,7 +43,11 @@ class TruthFeed:
     """Gives the rows of truth of one bench their cycle numbers and time stamps, and passes them to `on_truth`."""
 
     def __init__(self, fill: Callable[[Vector], None], on_truth: OnTruth | None) -> None:
-        """`fill`: fills a block with the present truth."""
+        """`fill`: fills a block with the present truth.
+
+        `on_truth`: called with (cycle, t_ns, block) for each row; None: rows are only counted. The next row overwrites
+        the block.
+        """
         self.on_truth = on_truth
         self.cycle = -1
         """Of the last row, -1 before the first."""
@@ -62,7 +66,7 @@ class TruthFeed:
     def add_later_row(self, periods: int, period_ns: int) -> None:
         """Call `on_truth` with the present truth as that of `periods` periods after the last SYNC's row.
 
-        Without `on_truth` it only counts.
+        Without `on_truth` only `cycle` changes.
         """
         self.cycle = self._sync_cycle + periods
         if self.on_truth is not None:
@@ -82,7 +86,7 @@ class TruthLog(Recorder):
         metadata: Mapping[str, str] | None = None,
         scenario: Scenario | None = None,
     ) -> None:
-        """Create the file. `blocking`: wait for the writer rather than lose a cycle.
+        """Create the file. `blocking`: wait for the writer rather than lose a cycle. epoch_ns: added to all times.
 
         scenario: attached, and its faults are named in the metadata.
 
@@ -128,7 +132,7 @@ class BenchTime:
     def __init__(
         self, is_wall: bool, nodes: BenchNodes, arm: MovableArm, injector: Injector, outbox: Outbox, rows: TruthFeed
     ) -> None:
-        """Begin before power-on. `is_wall`: by the given clock, else by SYNC."""
+        """Begin before power-on. `is_wall`: time goes by the clock of the caller, who gives the times, else by SYNC."""
         self.now_ns = 0
         """By SYNC: time of power-on plus the periods since then. By wall: the clock's time."""
         self.due_ns = NEVER_NS
@@ -184,8 +188,8 @@ class BenchTime:
     def reach(self, t_ns: int) -> None:
         """Advance the bench's time to `t_ns` without letting timers act; an earlier time changes nothing.
 
-        By SYNC the arm waits, except while its host is dead: then the drives' braking goes by time. By wall the arm
-        moves.
+        In clock mode `wall` the arm moves. In `sync` it waits, except while a drive brakes as it has lost its host, or
+        in `outlive_host`.
         """
         dt_ns = max(0, t_ns - self.now_ns)
         if self._is_wall or self._is_orphaned or any(drive.is_left_alone for drive in self._nodes.drives):
@@ -268,7 +272,7 @@ class BenchTime:
         self._granted = self._outbox.sent
 
     def outlive_host(self) -> None:
-        """In clock mode `sync`, advance the time without a host until the arm is at rest, by 5 s at most.
+        """In clock mode `sync`, advance the time without a host until the arm is at rest, at most LONGEST_ORPHANAGE_NS.
 
         The drives then miss SYNC as in clock mode `wall`. Later calls do nothing until the next SYNC.
         """
@@ -295,7 +299,8 @@ class BenchTime:
     def _advance_without_sync(self, dt_ns: int) -> None:
         """Advance arm and time by `dt_ns` without a SYNC.
 
-        Add a row of truth per period until the arm rests, by the wall from the fourth period after the last SYNC on.
+        Add a row of truth per period until the arm rests, in clock mode `wall` from period number `_FIRST_OVERDUE`
+        after the last SYNC on.
         """
         end_ns, period_ns = self.now_ns + dt_ns, self._nodes.period_ns
         first = _FIRST_OVERDUE if self._is_wall else 1

@@ -160,13 +160,16 @@ class FaultPlan:
         return edges
 
     def actions(self) -> list[NodeAction]:
-        """Return the actions on nodes that are due now, in order, and remove them from the plan."""
+        """Return and remove the actions on nodes that are due now, in the order in which they were queued."""
         taken, self._actions = self._actions, []
         self._find_quiet()
         return taken
 
     def transmit(self, node: int, can_id: int, data: bytes) -> list[tuple[int, int, bytes]]:
-        """Return the frames that faults make of a node's frame: delay in ns, identifier, data; [] if it is not sent."""
+        """Return the frames that faults make of a node's frame: delay in ns, identifier, data; [] if it is not sent.
+
+        node: index in NODES.
+        """
         if node in self._silent:
             return []
         rows = self._sending.get((node, can_id)) or self._sending.get((node, ANY_FRAME))
@@ -177,7 +180,8 @@ class FaultPlan:
     def receive(self, node: int, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
         """Return the frames that faults make of a host's frame to a node: delay in ns and data; [] if it is lost.
 
-        For a frame to all devices call it with `EVERYBODY` first, then with each of the returned frames for each node.
+        node: index in NODES. For a frame to all devices call it with `EVERYBODY` first, then with each of the returned
+        frames for each node.
         """
         rows = self._receiving.get((node, can_id))
         return self._change(rows, can_id, data) if rows else [(0, data)]
@@ -185,7 +189,8 @@ class FaultPlan:
     def distort(self, position: Pair, velocity: Pair, torque: Pair) -> tuple[Pair, Pair, Pair]:
         """Return the measured values with the active faults applied, unchanged without any; call once per SYNC.
 
-        Pairs are the devices' in order, in counts of POSITION_LSB_RAD, VELOCITY_LSB_RAD_S and `torque_count_Nm`.
+        Pairs are by device (Drive1, Drive2; Sensor1, Sensor2), in counts of POSITION_LSB_RAD, VELOCITY_LSB_RAD_S and
+        `torque_count_Nm`.
         """
         if not self._distorting:
             return position, velocity, torque

@@ -104,7 +104,7 @@ class FaultRow:
 
 
 def distort_value(row: FaultRow, node: int, counts: int, lsb: float) -> int:
-    """Return a measured value in counts as the fault changes it; unchanged if the fault doesn't hit it.
+    """Return a measured value in counts as a fault of kind stick, jump or saturate changes it, or as it is if not hit.
 
     A torque that jumps or saturates stays within TORQUE_COUNTS. node: index in NODES; a stuck value is kept for each.
     lsb: one count in the unit of the signal.

@@ -78,7 +78,7 @@ class Outbox:
         heapq.heappush(self._held, Held(due_ns, self._order, act))
 
     def release(self, now_ns: int) -> None:
-        """Send the held frames and call the held functions that are due by `now_ns`, in order."""
+        """Send the held frames and call the held functions that are due by `now_ns`, the earliest first."""
         while self._held and self._held[0].due_ns <= now_ns:
             heapq.heappop(self._held).act()
 
@@ -122,7 +122,7 @@ class Departure:
         self._frames.append((can_id, data))
 
     def send_waiting(self) -> None:
-        """Send the stored frames. Raises BusError; then the unsent ones are lost, as by a controller's reset."""
+        """Send the stored frames. Raises BusError if the bus refuses one; the unsent ones are lost, as by a reset."""
         if self._frames:
             frames, self._frames = self._frames, []
             self._bus.send_all(frames)
@@ -142,7 +142,10 @@ class Injector:
     def __init__(
         self, scenario: Scenario, seed: int, period_ns: int, codec: Codec, outbox: Outbox, on_event: OnEvent | None
     ) -> None:
-        """Begin before power-on. Raises ConfigError for a fault on a frame that the contract hasn't."""
+        """Begin before power-on. Raises ConfigError for a fault on a frame that the contract hasn't.
+
+        period_ns: SYNC's. on_event: called with t_ns, level, name and text when a fault begins or ends; None: it isn't.
+        """
         first, second = (count_Nm(scenario.sensors, joint) for joint in scenario.wiring.sensor_joint)
         self.plan = FaultPlan(scenario.faults, seed, period_ns, codec, (first, second))
         self._rows = scenario.faults

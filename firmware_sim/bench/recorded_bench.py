@@ -71,7 +71,7 @@ class RecordedCycles:
     def take(self, cycle: int) -> tuple[Answer, ...]:
         """Return the answers to a cycle of this attempt, () if the recording lacks them.
 
-        Earlier cycles are skipped for good. Raises LogError.
+        Earlier cycles are skipped for good. Raises LogError if the recording can't be read on.
         """
         wanted = (self.attempt, cycle)
         while self._next is not None and (self._next.attempt, self._next.cycle) < wanted:
@@ -177,7 +177,10 @@ class RecordedBody:
         drive_mode: Sequence[int],
         tick_count: int | None = None,  # noqa: ARG002 (the body's signature)
     ) -> None:
-        """Set `motor_torque_Nm` to the set-points of drives in torque mode, else to 0; don't move the recorded arm."""
+        """Set `motor_torque_Nm` to the set-points of drives in torque mode, else to 0; don't move the recorded arm.
+
+        tick_count has no effect.
+        """
         first_Nm, second_Nm = torque_setpoint_Nm
         self.motor_torque_Nm = first_Nm * (drive_mode[0] == _TORQUE), second_Nm * (drive_mode[1] == _TORQUE)
 
@@ -207,7 +210,10 @@ class RecordedBench(Bench):
         contract: EmulatedContract | None = None,
         on_answer: Callable[[], None] = lambda: None,
     ) -> None:
-        """Build everything as `Bench` does. `scenario`: without faults. `cycles`: None: SYNC gets no cyclic answer."""
+        """Build everything as `Bench` does. `scenario`: without faults. `cycles`: None: SYNC gets no cyclic answer.
+
+        The other arguments are as of `Bench`.
+        """
         self._cycles = cycles
         self._answers_now: tuple[Answer, ...] = ()
         self._codec = codec

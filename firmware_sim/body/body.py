@@ -81,7 +81,7 @@ def _largest_mobility(arm: EmulatedArm, link: int, points_m: Vector) -> float:
 
 
 def _row(kind: int, arm: EmulatedArm, thing: BodySettings | HandSettings | WallSettings) -> np.void:
-    """Return a row of THING with kind, times and link lengths filled in; the other fields are NaN."""
+    """Return a row of THING for a body, hand or wall with kind, times and link lengths; the other fields are NaN."""
     row: np.void = np.full(THING.itemsize // 8, np.nan).view(THING)[0]
     row["kind"] = kind
     row["onset_s"] = ticks(thing.at_s) * TICK_S
@@ -141,7 +141,7 @@ def touch_table(scenario: Scenario) -> Structured:
 
 
 def initial_touch_state(things: Structured) -> Vector:
-    """Return the touch state at power-on, zeros (TOUCH_HEADER + n THING_PLACES,): no thing is in place yet."""
+    """Return the touch state at power-on, zeros (TOUCH_HEADER + n THING_PLACES,): no body, hand or wall yet."""
     return np.zeros(TOUCH_HEADER + things.size * THING_PLACES)
 
 
@@ -325,7 +325,7 @@ class Body:
     """The largest that are compiled with the first body."""
 
     def _compile(self) -> None:
-        """Run every compiled function once, on a copy of the state."""
+        """Call every compiled function once, on a copy of the state, so that none is compiled during a run."""
         state = self._state_vector.copy()
         advance_body(
             state, self._number_vector, self._contacts, self._things, self._touch_state.copy(),
@@ -387,7 +387,7 @@ class Body:
     def advance(
         self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int], tick_count: int = PERIOD_TICKS
     ) -> None:
-        """Advance the arm by ticks of 100 µs with constant set-points (2,), Nm, and `DriveMode`s (2,), by joint."""
+        """Advance the arm by `tick_count` ticks of 100 µs with constant set-points (2,), Nm, and `DriveMode`s (2,)."""
         while tick_count > 0:
             count = tick_count
             if self._encoder_noise.is_on:

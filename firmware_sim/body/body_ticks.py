@@ -89,7 +89,7 @@ def find_contact(course: np.void, contacts: Structured) -> Structured:
     """Return the row of the scripted contact that acts at this tick (1,), or an empty array.
 
     Sets `course["contact"]` to the index of that contact or of the next one. Contacts that have ended are skipped for
-    good.
+    good. course: that part of the body's state.
     """
     tick = course["tick"] - course["start_tick"]
     index = int(course["contact"])
@@ -156,7 +156,7 @@ def _torque_target(arm: np.void, joint: int, mode: int, setpoint_Nm: float, velo
 
 @compiled
 def _read_encoder(course: np.void, numbers: np.void, joint: int, angle_rad: float, noise_counts: float) -> None:
-    """Store the angle that the encoder measures at a tick's end.
+    """Store the angle that the encoder measures at a tick's end, where its shaft is at `angle_rad`.
 
     Update the drive's position and velocity estimates by it.
     """
@@ -212,8 +212,9 @@ def advance_body(
 ) -> None:
     """Advance the body's state, touch state included, by `tick_count` ticks of 100 µs, in place.
 
-    State and numbers: laid out by BODY_STATE and BODY_NUMBERS. mode1, mode2: `DriveMode`. substeps: integration
-    steps per tick. work: from `work_space`.
+    State and numbers: laid out by BODY_STATE and BODY_NUMBERS. contacts, things, payloads: tables of CONTACT, THING and
+    PAYLOAD_CHANGE. encoder_noise: table of `EncoderNoise`. mode1, mode2: `DriveMode`. substeps: integration steps per
+    tick. work: from `work_space`, overwritten.
     """
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     now, course, motors = state["arm"], state["course"], state["motor"]
@@ -277,8 +278,8 @@ def fill_truth(
 ) -> None:
     """Fill a block laid out by TRUTH_LAYOUT with the true values of this instant.
 
-    First applies the payload and touch changes that are due. touch_truth, overwritten: room for TOUCH_TRUTH. work: from
-    `work_space`, overwritten.
+    First applies the payload and touch changes that are due. Tables are as of `advance_body`.
+    touch_truth: room for TOUCH_TRUTH, overwritten. work: from `work_space`, overwritten.
     """
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     now, course, arm = state["arm"], state["course"], numbers["arm"]

@@ -150,7 +150,10 @@ def command_torque(
 
 @compiled
 def heat_motor(numbers: np.void, state: np.void, joint: int, tau_Nm: float) -> None:
-    """Advance a motor's I²t and temperature by a tick at whose end it gives `tau_Nm`; call only with `has_limits`."""
+    """Advance a motor's I²t and temperatures by a tick at whose end it gives `tau_Nm`, and set the flags for both.
+
+    Call it only if `has_limits` is set in the numbers. Flags: `is_spent` and `is_overheated`.
+    """
     current_Nm = tau_Nm / numbers["gain"][joint]
     square = current_Nm * current_Nm
     winding_away_K = numbers["winding_rise_K_Nm2"][joint] * square - state["winding_K"][joint]

@@ -79,7 +79,10 @@ class ErrorReporter:
     def __init__(
         self, dictionary: ObjectDictionary, send: Send, register: Callable[[], int], is_allowed: Callable[[], bool]
     ) -> None:
-        """`register`: present 0x1001. `is_allowed`: whether the NMT state lets EMCY be sent."""
+        """Serve the device's error objects: 0x1001, 0x1003, 0x1014, 0x1015 and 0x2210.
+
+        `register`: present 0x1001. `is_allowed`: whether the NMT state lets EMCY be sent.
+        """
         self._send = send
         self._register = register
         self._is_allowed = is_allowed
@@ -225,7 +228,10 @@ class HeartbeatConsumer:
         on_return: Callable[[int], None],
         now_ns: Callable[[], int],
     ) -> None:
-        """`on_silence`, `on_return`: called with t_ns when the heartbeat stays away, and when it is there again."""
+        """Watch 0x1016:1, which sets node and timeout.
+
+        `on_silence`, `on_return`: called with t_ns when the heartbeat stays away, and when it is there again.
+        """
         self.is_lost = False
         """Whether the heartbeat is monitored and missing."""
         self._on_silence, self._on_return, self._now_ns = on_silence, on_return, now_ns
@@ -373,18 +379,19 @@ class SyncCounts:
 
     @property
     def is_in_order(self) -> bool:
-        """Whether no odd SYNC of the right length has come since the last `CLEAN_SYNCS` right ones in a row."""
+        """Whether no SYNC was repeated, early or out of sequence since the last `CLEAN_SYNCS` right ones in a row."""
         return self.odd == 0
 
     @property
     def is_time_base(self) -> bool:
-        """Whether SYNC can serve as time base: `odd` is at most TOLERATED."""
+        """Whether SYNC can serve as time base: at most TOLERATED were repeated, early or out of sequence, see `odd`."""
         return self.odd <= TOLERATED
 
     def count_sync(self, kind: SyncKind, lost: int) -> None:
         """Count a SYNC by its kind, and `lost` SYNCs before it.
 
-        `CLEAN_SYNCS` right ones in a row set `odd` to 0; the counts of 0x2211 stay.
+        One that is repeated, early or out of sequence adds to `odd`; `CLEAN_SYNCS` right ones in a row set `odd` to 0.
+        The counts of 0x2211 stay.
         """
         self._counts[_LOST_SUB] += lost
         if kind is not SyncKind.RIGHT:

@@ -82,7 +82,7 @@ def refuse(code: Abort) -> NoReturn:
 
 
 def one_of(*allowed: int) -> Callable[[int], None]:
-    """Return a check that refuses every value except those listed (VALUE_RANGE)."""
+    """Return a check of a written value: it refuses, by VALUE_RANGE, every value except `allowed`."""
 
     def check(value: int) -> None:
         if value not in allowed:
@@ -360,7 +360,7 @@ class ObjectDictionary:
         return (-(1 << bits - 1), (1 << bits - 1) - 1) if is_signed else (0, (1 << bits) - 1)
 
     def describe_misfit(self, index: int, subindex: int, value: int) -> str:
-        """Return in a line why an object can't have this value: it is missing, no integer, or too small.
+        """Return in a line why an object can't have this value: it is missing, no integer, or of a type too small.
 
         Empty if it can.
         """
@@ -381,8 +381,8 @@ class ObjectDictionary:
     ) -> None:
         """Register functions for writes of an object: `check` may `refuse` the value, then `apply` gets it.
 
-        `apply` also gets the default when a reset restores it. Several functions of an object are called in order. An
-        object that the device lacks is never written, and nothing is registered.
+        `apply` also gets the default when a reset restores it. Several functions of an object are called in the
+        order of their registration. An object that the device lacks is never written, and nothing is registered.
         """
         if not self.has(index, subindex):
             return

@@ -51,7 +51,10 @@ class TransmitPdo(PdoRecord):
             self._sender = self.message.sender()
 
     def bind(self) -> None:
-        """Set `send` and the events by the present transmission type and mapping; call it after each change of them."""
+        """Set `send` and `is_compared` by the present type and mapping, and restart the count of SYNCs to a frame.
+
+        Call it after a change of type or mapping.
+        """
         self._reads = tuple(self._pdos.dictionary.reader(*key) for key in self.layout.keys)
         is_asynchronous = self.type == 0 or self.type in EVENT_DRIVEN
         self.is_compared = is_asynchronous and not self._pdos.events.intersection(self.layout.keys)
@@ -217,7 +220,10 @@ class Pdos:
         messages: Mapping[int, MessageCodec],
         longest: int,
     ) -> None:
-        """`messages`: the contract's, by identifier. `longest`: the longest frame, bytes."""
+        """Make a PDO for each of COUNT communication records each way that the dictionary has.
+
+        `messages`: the contract's, by identifier. `longest`: the longest frame, bytes.
+        """
         self.dictionary = dictionary
         self.send = send
         self.longest = longest

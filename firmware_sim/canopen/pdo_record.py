@@ -192,8 +192,8 @@ NOTHING = PdoLayout((), struct.Struct("<"), 0, 0)
 def check_entry(dictionary: ObjectDictionary, value: int, is_received: bool) -> str:
     """Return the `struct` format of a mapping entry; raise `Refusal` if it can't be mapped in this direction.
 
-    An entry is index << 16 | sub-index << 8 | bits. Causes: the object is missing, not mappable, not readable or
-    writable as needed, or of another size.
+    An entry is index << 16 | sub-index << 8 | bits. is_received: it is of an RPDO, so the object must be writable; else
+    readable. Causes: the object is missing, not mappable, without that access, or of another size.
     """
     index, subindex, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
     dummy_bits = dictionary.dummy_bits(index)
@@ -215,7 +215,7 @@ def lay_out(dictionary: ObjectDictionary, values: Sequence[int], is_received: bo
     """Return the layout of a frame with the mapped objects (`values`: entries as in `check_entry`), in their order.
 
     Raises `Refusal` for an invalid entry, more than `longest` bytes, or a header that is incomplete or doesn't lead.
-    Frames of more than 8 bytes are padded to one of CAN FD's lengths.
+    Frames of more than CLASSIC_BYTES are padded to one of CAN FD's lengths. is_received: of an RPDO.
     """
     formats = [check_entry(dictionary, value, is_received) for value in values]
     size = sum(value & 0xFF for value in values) // 8

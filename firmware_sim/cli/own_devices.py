@@ -107,7 +107,8 @@ def rehearse(
 ) -> Rehearsal:
     """Return the arm of a configuration with a scenario, to be played; all names: built in, or files.
 
-    Raises ConfigError for a configuration, scenario or truth that can't be used, CodecError for its DBC.
+    truth: None: the arm is as configured. profile (of the arm), seed: in place of the files'. Raises ConfigError for a
+    configuration, scenario or truth that can't be used, CodecError for its DBC.
     """
     layers = configuration_layers(config, profile)
     settings = parse(Settings, resolved_table(layers))
@@ -123,8 +124,9 @@ def rehearse_settings(
 ) -> Rehearsal:
     """Return the arm of a configuration with a scenario, to be played; `layers`: those that gave the settings.
 
-    If there is no truth and no layer describes an own arm, it is the profile's arm with our own devices. Raises
-    ConfigError, CodecError.
+    If there is no truth and no layer describes an own arm, it is the arm of the profile with the package's devices.
+    truth_name: None: no truth. seed: in place of the scenario's. Raises ConfigError for devices, a scenario or a truth
+    that can't be used, CodecError for their DBC.
     """
     devices = place_devices(settings)
     codec = load_contract(settings, devices)
@@ -209,7 +211,7 @@ def _can_be_set(device: PlacedDevice, index: int, sub: int) -> bool:
 
 
 def describe_devices(codec: Codec, devices: list[PlacedDevice], settings: Settings) -> EmulatedContract:
-    """Return the contract of a DBC whose devices have the EDS and values of their profiles.
+    """Return the contract of a DBC whose devices have the EDS and values of their device profiles.
 
     Raises ConfigError for an EDS that can't be played.
     """
@@ -218,7 +220,7 @@ def describe_devices(codec: Codec, devices: list[PlacedDevice], settings: Settin
 
 
 def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
-    """Return values of encoder, gear and feed constant by (index, sub-index) that give the profile's increments.
+    """Return values of encoder, gear and feed constant by (index, sub-index) that give the device profile's increments.
 
     The objects are 0x608F, 0x6091 and 0x6092; a gear in the EDS is kept.
     """
@@ -266,7 +268,7 @@ def _check_objects(device: PlacedDevice) -> None:
 
 
 def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
-    """Return a device's description: its EDS, and the values at power-on that the profile adds or replaces.
+    """Return a device's description: its EDS, and the values at power-on that its device profile adds or replaces.
 
     Raises ConfigError for an EDS with a wrong type or an unsigned signal.
     """

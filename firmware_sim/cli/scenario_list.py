@@ -24,7 +24,7 @@ class ScenarioFinding:
 
     @property
     def lines(self) -> list[str]:
-        """Lines for a terminal, each with the file's name: the problems, or one line that says good."""
+        """Lines for a terminal, each with the file's name: the problems, or one line "good" with `checked`."""
         return [f"{self.file}: {problem}" for problem in self.problems] or [f"{self.file}: good: {self.checked}"]
 
 

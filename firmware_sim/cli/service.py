@@ -65,7 +65,10 @@ class Service:
         self._gone_ns = NEVER_NS  # when the host was found to have gone
 
     def boot(self) -> None:
-        """Drop frames that wait on the bus, power the bench on, and send the boot-up messages. Raises BusError."""
+        """Drop frames that wait on the bus, power the bench on, and send the boot-up messages.
+
+        Raises BusError if the bus can't receive or send.
+        """
         while self._bus.receive(0.0) is not None and not self._stop.is_made:
             pass
         self._time_ns = self._heard_ns = self._clock.now_ns()
@@ -119,7 +122,7 @@ class Service:
     def _patience_s(self) -> float:
         """Return how long to wait for a frame, s.
 
-        By SYNC it is `_IDLE_NS`; by wall clock the time to the bench's next timer, `_LONGEST_WAIT_NS` at most.
+        In clock mode `sync` it is `_IDLE_NS`, in `wall` the time to the bench's next timer, `_LONGEST_WAIT_NS` at most.
         """
         if not self._is_wall:
             return _IDLE_NS * 1e-9
@@ -127,7 +130,7 @@ class Service:
         return max(0, min(due_ns, _LONGEST_WAIT_NS)) * 1e-9
 
     def _pass_time(self, now_ns: int, is_idle: bool) -> None:
-        """Pass the time to the bench: by wall clock if no frame came, by SYNC if no SYNC has come for `_IDLE_NS`.
+        """Pass time to the bench: by wall clock if no frame came (`is_idle`), by SYNC if no SYNC came for `_IDLE_NS`.
 
         A host in lockstep sends the time itself. After a silence of `_SILENCE_NS` the bench outlives the host, and
         lockstep ends.

@@ -50,35 +50,35 @@ class Application:
 
     @property
     def is_at_work(self) -> bool:
-        """Whether the device is at work, so that its objects must not change."""
+        """Whether the device is at work, so that its objects must not change; False unless overridden."""
         return False
 
     def act(self, t_ns: int) -> None:
-        """Act on the values of an RPDO that doesn't wait for SYNC, after they have been written."""
+        """Do nothing; subclasses act on the values of an RPDO that doesn't wait for SYNC, which have been written."""
 
     def mind_length(self, is_right: bool, t_ns: int) -> None:
-        """React to an RPDO frame of wrong length, or, with `is_right`, to the first of right length after it."""
+        """Do nothing; subclasses react to an RPDO frame of wrong length, or (`is_right`) the first right one after."""
 
     def leave_operational(self, t_ns: int) -> None:
-        """React to leaving Operational; EMCY messages can still be sent."""
+        """Do nothing; subclasses react to leaving Operational. EMCY messages can still be sent."""
 
     def enter_operational(self, t_ns: int) -> None:
-        """React to entering Operational; PDOs are exchanged already."""
+        """Do nothing; subclasses react to entering Operational. PDOs are exchanged already."""
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """React to the loss of the master's heartbeat; called before the device leaves Operational."""
+        """Do nothing; subclasses react to the loss of the master's heartbeat, before the device leaves Operational."""
 
     def find_heartbeat(self, t_ns: int) -> None:
-        """React to the return of the master's heartbeat."""
+        """Do nothing; subclasses react to the return of the master's heartbeat."""
 
     def distrust_sync(self, t_ns: int) -> None:
-        """React to more than TOLERATED odd SYNCs: SYNC can't serve as a time base."""
+        """Do nothing; subclasses react to more than TOLERATED SYNCs that were repeated, early or out of sequence."""
 
     def note_error(self) -> None:
-        """React to a possible change of the error register, 0x1001."""
+        """Do nothing; subclasses react to a possible change of the error register, 0x1001."""
 
     def restart_node(self, is_node_reset: bool) -> None:
-        """Reset the application's state; `is_node_reset`: False at a reset of the communication only."""
+        """Do nothing; subclasses reset their state. `is_node_reset`: False at a reset of the communication only."""
 
 
 class EmulatedDevice(ObjectDictionary):
@@ -257,7 +257,8 @@ class EmulatedDevice(ObjectDictionary):
     def note_sync(self, kind: SyncKind, lost: int, t_ns: int) -> None:
         """Count a SYNC and the `lost` ones before it; trip or clear the watchdogs of SYNC.
 
-        Outside Operational do nothing. Too many odd SYNCs are reported to the application by `distrust_sync`.
+        Outside Operational do nothing. If too many were repeated, early or out of sequence, call the
+        application's `distrust_sync`.
         """
         if not (self.is_operational and self.is_on_bus):
             return
@@ -316,7 +317,7 @@ class EmulatedDevice(ObjectDictionary):
     def _check_overflow(self, overflow: int) -> None:
         """Abort an SDO write of an invalid SYNC overflow, 0x1019, or a change while 0x1006 is not 0: CiA 301, 7.5.2.22.
 
-        Invalid are 1 and more than 240.
+        Invalid are 1 and more than SYNC_OVERFLOW.
         """
         if overflow == 1 or overflow > SYNC_OVERFLOW:
             refuse(Abort.VALUE_RANGE)
@@ -345,7 +346,10 @@ class EmulatedDevice(ObjectDictionary):
             self._application.enter_operational(t_ns)
 
     def _reset(self, is_node_reset: bool) -> None:
-        """Restore the EDS's values of all objects, or of the communication profile only, and reset the application."""
+        """Restore the EDS's values of all objects, or of the communication profile only, and reset the application.
+
+        is_node_reset: all objects; then tripped watchdogs and SYNC counts are forgotten, too.
+        """
         self.restore(0xFFFF if is_node_reset else 0x1FFF)
         self.pdos.restart_sequences()
         if is_node_reset:
@@ -361,7 +365,7 @@ class NodeClock:
     """A device's own clock: that of the bench, until it is set to run fast or slow.
 
     Everything that a device times goes by it: heartbeats, event timers, inhibit times, watchdogs, the time in an EMCY.
-    Both times are integer ns. A clock that stops drifting keeps its lead.
+    Its times and the bench's are integer ns. A clock that stops drifting keeps its lead.
     """
 
     def __init__(self) -> None:
@@ -426,10 +430,10 @@ class SyncListeners:
         return self._takers.get(len(data), self._nobody)
 
     def report_sync(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, lost: int, t_ns: int) -> None:
-        """Report the kind of a SYNC to the devices that hear it, with the number of SYNCs lost before it.
+        """Report the kind of a SYNC to the devices that hear it, each with the number of SYNCs that it missed before.
 
         heard: how often each device hears it; the second time counts as repeated. takers: 1 for each device that takes
-        its length, else 0. lost: SYNCs that the counter skipped.
+        its length, else 0: to that one it is of wrong length. lost: SYNCs that the counter skipped, missed by all.
         """
         for place, device in enumerate(self._devices):
             self._unheard[place] += lost
@@ -445,7 +449,7 @@ class SyncListeners:
     def ignore(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, t_ns: int) -> None:
         """Report the kind of a SYNC that no device answers, without lost ones before it.
 
-        `heard`, `takers` as in `report_sync`.
+        heard: how often each device hears it. takers: 1 for each device that takes its length, else 0.
         """
         for place, device in enumerate(self._devices):
             for _ in range(heard[place]):

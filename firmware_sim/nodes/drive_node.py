@@ -161,7 +161,7 @@ class DriveNode(Application):
 
     @property
     def is_ready(self) -> bool:
-        """Whether a master may command torque: the drive is in Operation enabled and shows that mode."""
+        """Whether a master may command torque: Operation enabled; a drive with habits also shows mode 10."""
         return self.is_enabled and (not self._has_habits or self._shown_mode == CYCLIC_SYNCHRONOUS_TORQUE)
 
     @property
@@ -335,8 +335,8 @@ class DriveNode(Application):
     def restart_node(self, is_node_reset: bool) -> None:
         """Forget the controlword that waits.
 
-        At a node reset also forget fault, target torque and controlword, and run the state machine up to Switch on
-        disabled.
+        At a node reset (`is_node_reset`) also forget fault, target torque and controlword, and run the state
+        machine up to Switch on disabled.
         """
         self._received_word = None
         if not is_node_reset:
@@ -407,9 +407,9 @@ class DriveNode(Application):
         self._apply(event, t_ns)
 
     def _ramp_down(self, event: DriveEvent, t_ns: int) -> None:
-        """Make the transition of an event, shutdown or disable operation.
+        """Make the transition of an event, shutdown or disable operation, or begin to brake if its option code says so.
 
-        The event's option code says whether the drive brakes first.
+        After braking, `_watch_standstill` makes the transition.
         """
         stop = RAMPS[self.device.value_or(0, _RAMPED[event])]
         if stop is DISABLE:
@@ -437,7 +437,7 @@ class DriveNode(Application):
             self._stop_by(FAULT_REACTIONS[self.device.value_or(2, 0x605E)], DriveEvent.FAULT_REACTION_DONE, t_ns)
 
     def _stop_by(self, stop: Stop, done: DriveEvent, t_ns: int) -> None:
-        """Begin to brake, or apply the event `done` at once if the option code has no braking."""
+        """Begin to brake as `stop` says, or apply the event `done` at once if that is DISABLE: no braking."""
         if stop is DISABLE:
             self._apply(done, t_ns)
         else:
@@ -474,7 +474,7 @@ class DriveNode(Application):
     def _latch(self, code: int, cause: Watchdog | None, t_ns: int, is_found_by_time: bool = False) -> None:
         """Latch a fault, begin the fault reaction, and send the EMCY; do nothing while a fault is latched.
 
-        cause: None: no watchdog.
+        code: 0x603F. cause: None: no watchdog. is_found_by_time: a timeout, not a SYNC, showed the cause.
         """
         if self.state in (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT):
             return
@@ -569,7 +569,7 @@ class DriveNode(Application):
             self._apply(DriveEvent.QUICK_STOP_DONE, t_ns)
 
     def _drive_motor(self) -> None:
-        """Set torque demand and set-point: 0 unless the drive follows its target in Operation enabled with mode 10."""
+        """Set torque demand and set-point: 0 outside Operation enabled, in another mode than 10, in a ramp down."""
         self._demand = self._limits.demand() if self._follows_target else 0
         self.torque_Nm = self._demand * self._rated_mNm * 1e-6
 
@@ -579,7 +579,7 @@ class DriveNode(Application):
         return max(-0x8000, min(0x7FFF, permille))
 
     def _keep_habits(self, t_ns: int) -> None:
-        """Update the mode on 0x6061 and carry out a delayed Enable operation, by the times of the drive's habits."""
+        """Update the mode shown on 0x6061, and carry out a delayed Enable operation, when `HabitSettings` says so."""
         if self._enabling_ns is not None and t_ns - self._enabling_ns >= self._habits.enable_s * 1e9:
             self._enabling_ns = None
             self._apply(DriveEvent.ENABLE_OPERATION, t_ns)

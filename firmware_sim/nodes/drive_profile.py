@@ -178,7 +178,7 @@ class Standstill:
         self._since_ns = self._moving_ns = 0
 
     def begin_braking(self, t_ns: int) -> None:
-        """Restart both times at `t_ns`."""
+        """Begin at `t_ns` to measure how long the motor stands still, and how long it brakes."""
         self._since_ns = self._moving_ns = t_ns
 
     def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:

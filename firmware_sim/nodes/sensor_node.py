@@ -135,7 +135,7 @@ class SensorNode(Application):
         return self.device.is_operational
 
     def restart_node(self, is_node_reset: bool) -> None:
-        """At a node reset, forget zero, torque and a running autozero, and mark the value as invalid.
+        """With `is_node_reset`, forget zero, torque and a running autozero, and mark the value as invalid.
 
         At a reset of the communication do nothing.
         """

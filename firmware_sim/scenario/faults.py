@@ -178,12 +178,12 @@ class FaultSettings:
 
     @property
     def chance(self) -> float:
-        """Probability that a frame or value is hit."""
+        """Probability that a frame or value is hit; 1 without `probability`."""
         return 1.0 if self.probability is None else self.probability
 
     @property
     def object_key(self) -> tuple[int, int]:
-        """Index and sub-index of the object whose value the fault replaces."""
+        """Index and sub-index of the object whose value the fault replaces; (0, 0) for other kinds of fault."""
         return self.index or 0, self.sub or 0
 
     @property
@@ -296,8 +296,8 @@ Message = TypeVar("Message")
 def own_messages(messages: Mapping[int, Message], right_id: int, node_id: int) -> Mapping[int, Message]:
     """Return the messages, by identifier, as a device with a wrong node id expects them.
 
-    Its own frames are at the identifiers that follow from the wrong id, but keep their data ids; others with that id
-    are left out.
+    Its own frames are at the identifiers that follow from the wrong id, but keep their data ids; other messages
+    at the wrong id are left out.
     """
     if node_id == right_id:
         return messages

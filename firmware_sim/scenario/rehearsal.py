@@ -187,7 +187,7 @@ def _times(values: Pair, factors: Pair) -> Pair:
 
 
 def _by_place(truth: ArmTruth, what: str, by_joint: Pair) -> Pair:
-    """Return values by joint in the order of the devices; exchanged if the truth exchanges `what`.
+    """Return values by joint in the order of the devices: exchanged if the truth exchanges `what`, or the joints.
 
     what: "drives" or "sensors".
     """

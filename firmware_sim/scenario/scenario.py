@@ -280,14 +280,14 @@ class Scenario:
     def expected_of(self, scheme: str) -> ExpectSettings | None:
         """Return the expected outcome with a healthy host of a scheme, `paper` or `certified`.
 
-        None if the file has none.
+        `certified`: `expect_certified` if the file has that. Otherwise `expect`, None if the file lacks it.
         """
         own = self.expect_certified if scheme == "certified" else None
         return own or self.expect
 
     @property
     def arm(self) -> EmulatedArm:
-        """The arm of one's own, or that of the profile."""
+        """`own_arm`, or, without it, the arm of the profile."""
         return ARMS[self.profile] if self.own_arm is None else self.own_arm
 
     @property
@@ -313,7 +313,7 @@ def builtin_scenarios() -> list[str]:
 
 
 def load_scenario(name_or_file: str, profile: str | None = None, seed: int | None = None) -> Scenario:
-    """Return a scenario: a built-in name or a TOML file. `profile`, `seed`: in place of the file's.
+    """Return a scenario: a built-in name or a TOML file. `profile` (of the arm), `seed`: in place of the file's.
 
     Raises ConfigError if the file is missing, can't be read or has errors.
     """
@@ -353,7 +353,7 @@ def _read(kind: str, name_or_file: str) -> dict[str, Any]:
 
 
 def named_profile(name_or_file: str) -> str | None:
-    """Return the profile in a scenario's file, unchecked; None if it names none.
+    """Return the name of the arm's profile in a scenario's file, unchecked; None if it names none.
 
     Raises ConfigError if the file can't be read.
     """

@@ -115,7 +115,7 @@ def render_page(
 
 
 def render(template: str, **values: Any) -> str:
-    """Return the text of a template filled with values. Raises an error of Jinja2 if one is missing."""
+    """Return the text of a template filled with values. Raises an error of Jinja2 if either is missing."""
     return _environment().get_template(template).render(values) + "\n"
 
 

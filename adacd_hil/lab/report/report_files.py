@@ -51,11 +51,11 @@ class Report:
 
     @property
     def is_complete(self) -> bool:
-        """Whether log and truth are whole, no record was dropped before, and all alarms could be judged."""
+        """Whether log and truth are whole, no packet was dropped on the way to them, and all alarms could be judged."""
         return self.source.is_complete
 
     def as_text(self) -> str:
-        """Return the result of the run, the next steps and the path of the report, as text for a terminal."""
+        """Return the result of the run, contacts that went wrong, next steps and the report's path, for a terminal."""
         first, *further = headlines(self.metrics)
         lines = [in_line(f"{'Good' if self.metrics.is_clean else 'NOT GOOD'}: {first}")]
         lines += [in_line(self.source.notice)] if self.source.notice else []
@@ -142,7 +142,7 @@ def report_tables(run: Run, metrics: Metrics) -> dict[str, str]:
 
 
 def _cells(value: Any, is_pair: bool) -> Sequence[Any]:
-    """Return a value as a list of cells: one, or, for a pair, one per joint. Both are None if the pair is None."""
+    """Return a value as cells: one, or, with `is_pair`, one per joint, both None for the value None."""
     if not is_pair:
         return (value,)
     return (None, None) if value is None else tuple(value)

@@ -62,7 +62,7 @@ def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def push_table(evidence: CertifiedEvidence | None) -> Table | None:
-    """Return the table of the smallest push found in time and the threshold in force, by joint.
+    """Return the table of the smallest push found within PUSH_WITHIN and the threshold in force, by joint.
 
     None if the run has no certified evidence of it.
     """

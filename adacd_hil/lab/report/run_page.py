@@ -192,7 +192,8 @@ def contacts_table(metrics: Metrics) -> Table | None:
 def contact_cards(metrics: Metrics, run: Run) -> list[dict[str, Any]]:
     """Return the cards of the first CARDS contacts: report with uncertainty, truth, and drawing of the arm.
 
-    stretch_s: from and to which time, s since motion start, the traces of a card show.
+    Keys: number, link, at_s, is_wrong, kind: words; entries: (name, text); arm: drawing or None; stretch_s: from and to
+    which time, s since motion start, the traces of a card show.
     """
     contacts = metrics.contacts[:CARDS]
     strongest_N = max((abs(contact.force_N) for contact in contacts if contact.force_N is not None), default=0.0)
@@ -385,7 +386,10 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> dict[str, Any]
 
 
 def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
-    """Return label, number and unit of each figure on the first screen. Unknown figures are left out."""
+    """Return label, number as text, and unit of each figure on the first screen; unknown figures are left out.
+
+    They are adaptation times, contacts found, false alarms, links named rightly, and the median delay.
+    """
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]
     times_s = [number_text(value, 2) for value in metrics.adaptation_s.values()]

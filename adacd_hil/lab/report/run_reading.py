@@ -105,8 +105,8 @@ def read_run(
     """Return the run in a log, or in a stretch of it, with the emulator's truth if there is one.
 
     The truth of another run is left out, and named as a problem of the source. Raises LogError if a file can't be read,
-    or if the stretch has no cycle; ConfigError for the log's configuration. full_cycles: the run of a log with more
-    cycles has only some of them.
+    or if the stretch has no cycle; ConfigError for the log's configuration. progress: called with a line on the cycles
+    read. full_cycles: the run of a log with more cycles has only some of them.
     """
     problem = "" if truth_path is None else foreign_truth(log_path, truth_path)
     truth = None if truth_path is None or problem else read_truth(truth_path)
@@ -193,7 +193,7 @@ def _read(
 def _with_ending(
     run: Run, gathered: RunGatherer, stream: LogStream, truth: TruthTable | None, truth_problem: str
 ) -> ReadRun:
-    """Return a run with the ending and counts of its log.
+    """Return a run with `broken_off`, if the log ended unplanned, and the counts of the log's summary.
 
     The source has the problems of log and truth, and unjudged alarms.
     """
@@ -255,9 +255,10 @@ class RunReading:
         self._last_cycle = -1
 
     def add_piece(self, series: Mapping[str, Series], events: list[LoggedEvent]) -> None:
-        """Add the next piece of the log.
+        """Add the next piece of the log: its records by topic, and its events.
 
-        Sums up and thins cycles once enough of them are older than the settling time.
+        Once `_WAITING` cycles aren't in `sums`, add those older than the settling time; of a long run drop those of
+        them that aren't drawn.
         """
         self._reports += [report for _, report in contacts_of(series[CONTACT.name])]
         self._events += events
@@ -300,7 +301,7 @@ class RunReading:
     def _edges(self, scheme: Series) -> Rows:
         """Return the first and last row of a piece, and rows around changes of the state or of the paper's arming.
 
-        Rows beyond the piece may be among them.
+        Rows beyond the piece may be among them. Stores state and arming of the last row for the next piece.
         """
         state = scheme.records["state"].astype(np.int64)
         is_armed = np.zeros(len(state), np.bool_)
@@ -360,7 +361,7 @@ class RunReading:
         return replace(run, truth=host_truth(self._truth, self._attempts.begins, self._last_cycle, time_s))
 
     def _settle(self, end: int) -> None:
-        """Sum up the rows before `end`. Of a long run, drop then those of them that are not drawn."""
+        """Add the kept rows before `end` to `sums`, each once. Of a long run, drop then those that are not drawn."""
         outline = self.outline()
         shell = replace(self._shell, truth=None, motion_start_ns=outline.motion_start_ns)
         self.sums.untouched.add_untouched(self._rows.run(shell, slice(self._settled, end)), outline)
@@ -372,7 +373,10 @@ class RunReading:
         self._settled -= self._rows.thin(first, end, lambda rows: self._curves(shell, rows), around_ns, _NOISE_CYCLES)
 
     def _thin_times(self) -> None:
-        """Of a long run, drop the waiting rows of /cycle in which no time is smallest or largest in its bucket."""
+        """Of a long run, drop rows of /cycle in which no time, queue or overrun is smallest or largest in its bucket.
+
+        They are those read since this function last dropped any.
+        """
         self._waiting = 0
         if self._times.cycles > self._full_cycles:
             self._times.thin(self._thinned, self._times.count, self._time_curves)
@@ -534,7 +538,7 @@ class KeptRows:
         """Drop the rows from `first` to before `end` in which no curve is smallest or largest in its bucket.
 
         Buckets double once there are more than `most_buckets`; then rows before `first` are thinned, too. curves:
-        returns curves of some rows. Rows within `around_ns`, first and last ns each, are never dropped; in every
+        returns the curves (k,) of k rows. Rows within `around_ns`, first and last ns each, are never dropped; in every
         `_NOISE_BUCKETS`-th bucket the first `noise_cycles` are left, too. Return the number of dropped rows.
         """
         while self.cycles > self._most_buckets * self.bucket:

@@ -248,7 +248,7 @@ def _ticks(scale: _Scale) -> Iterator[tuple[float, str]]:
 
 
 def traces_of(run: Run, metrics: Metrics) -> Traces | None:
-    """Return the curves of a run, packed for the page's script, with states, contacts and bad notices.
+    """Return the curves of a run, packed for the page's script, with states, contacts, faults, errors and false alarms.
 
     None with fewer than two cycles.
     """

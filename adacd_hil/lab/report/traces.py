@@ -142,7 +142,7 @@ def _true_torque(run: Run) -> Vector:
 
 
 def _in_view(threshold: Vector, residual: Vector) -> Vector:
-    """Return a threshold (n,) with NaN where it exceeds both the largest residual and three times its own minimum."""
+    """Return a threshold (n,) with NaN where it exceeds both the largest residual and `_NEAR` times its own minimum."""
     largest = float(np.max(np.abs(residual[np.isfinite(residual)]), initial=0.0))
     finite = threshold[np.isfinite(threshold)]
     ceiling = max(largest, _NEAR * float(finite.min())) if finite.size else 0.0
@@ -254,7 +254,7 @@ _LARGEST_CODE: Final = 2**30
 
 
 def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = None) -> float:
-    """Return the step to which a series (n,) is rounded: half the rms of its white noise, but at least `finest`.
+    """Return the step to which a series (n,) is rounded: rms of white noise over STEPS_PER_SIGMA, at least `finest`.
 
     is_next (n,): samples that follow the one before without a gap; None: all do.
     """
@@ -266,7 +266,7 @@ def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = N
 
 
 def pack(values: Vector, step: float) -> tuple[str, dict[str, Any]]:
-    """Return a series (n,) as base64 text, rounded to `step`, or coarser if its range has more than 2^30 steps.
+    """Return a series (n,) as base64 text, rounded to `step`, or coarser if its range has over `_LARGEST_CODE` steps.
 
     Return with it a table for the page's script: low and step in the series' unit; order: how often it was differenced;
     planes: bytes per number.

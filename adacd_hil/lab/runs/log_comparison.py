@@ -108,7 +108,7 @@ class RunReader:
 
     @property
     def contacts(self) -> list[Contact]:
-        """The contacts by the time of their detection, s since motion start, each once with its last report."""
+        """Each contact once, by time: (its detection, s since motion start; its last report)."""
         return sorted(self._contacts, key=lambda contact: contact[0])
 
     @property
@@ -201,13 +201,13 @@ class LogComparison:
 
     @property
     def is_same_where_whole(self) -> bool:
-        """Whether cycles were compared, no field differs, and only a damaged log lacks cycles of the other."""
+        """Whether cycles were compared, no field differs, and a log that lacks cycles of the other log is damaged."""
         damages = self.second.problem, self.first.problem
         lacks = any(count and not damage for count, damage in zip(self.only, damages, strict=True))
         return self.cycles > 0 and not self.fields and not lacks
 
     def by_key(self) -> dict[str, Any]:
-        """Return the comparison by the keys of `compare --json`."""
+        """Return the comparison by the keys of `compare --json`: both runs, differences, contacts in pairs, notes."""
         runs = [
             {
                 "log": run.path,
@@ -292,7 +292,7 @@ def _fields(records: NDArray[Any]) -> list[str]:
 def compare_logs(
     first: Path, second: Path, progress: Progress = lambda _: None, stretch: TimeWindow = WHOLE
 ) -> LogComparison:
-    """Compare two logs.
+    """Compare two logs: settings, metadata, the fields of /scheme cycle by cycle, and contacts.
 
     stretch: of the first log; the second is read over the same time after its own motion start. progress: called with a
     line on the cycles compared. Raises LogError if a log can't be read or has no cycle in the stretch, ConfigError for

@@ -67,7 +67,7 @@ class RunSummary:
     log has the date, "folder" where its name has, else "file". status: of STATUSES; verdict: the reason in a sentence.
     expected: contacts that there were while detection was armed, None on a real arm; found: the detected ones of those,
     or all detections if the run isn't judged. margin: smallest threshold over residual. duration_s: from the log's
-    first message to its last.
+    first message to its last. friction_Nm (at FRICTION_AT_RAD_S), offset_Nm: of the first certificate without payload.
     """
 
     name: str
@@ -177,7 +177,7 @@ def _figured(headed: RunSummary, info: LogInfo) -> RunSummary:
 
 
 def judged(summary: RunSummary) -> RunSummary:
-    """Return the summary with the judge's figures: reads the whole log, and the emulator's truth if there is one.
+    """Return the summary with figures evaluated now: reads the whole log, and the truth beside it, if there is one.
 
     Summaries of another status than NOT_JUDGED are returned unchanged; a log that can't be judged gets BROKEN.
     """
@@ -310,7 +310,7 @@ def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
 
 
 def _told_certificate(info: LogInfo) -> CertificateState:
-    """Return the state of the last certificate by the log's events."""
+    """Return the state of the last certificate by the log's events; NO_CERTIFICATE without one."""
     found = CertificateState(NO_CERTIFICATE, None)
     start_ns: int | None = None
     for t_ns, event in info.milestones:

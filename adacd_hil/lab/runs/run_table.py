@@ -73,7 +73,7 @@ class RunFilter:
     until: datetime | None = None
 
     def takes(self, run: RunSummary) -> bool:
-        """Return whether a run meets all conditions."""
+        """Return whether a run meets all conditions: on its arm, status, scenario and beginning."""
         if self.arms and not any(is_arm(run, arm) for arm in self.arms):
             return False
         if self.statuses and run.status not in self.statuses:

@@ -85,7 +85,10 @@ class Trend:
         return self.thresholds, self.friction, self.offsets
 
     def by_key(self) -> dict[str, Any]:
-        """Return values, deviations and changes by quantity, by the keys of `trend --json`; NaN where not known."""
+        """Return the trend by the keys of `trend --json`: runs, margins, sentences, and values and changes by quantity.
+
+        Numbers that are not known are NaN.
+        """
         names = [run.name for run in self.runs]
         return {
             "arm": self.arm,

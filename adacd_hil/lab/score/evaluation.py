@@ -378,7 +378,7 @@ class TimingGatherer:
         self._histograms[quantity.name] = self._histograms.get(quantity.name, 0) + log_counts(values_us)
 
     def evidence(self) -> TimingEvidence:
-        """Return the statistics of all cycles added so far."""
+        """Return the statistics of all cycles added so far: times, reactions, ages of data, queues, counts."""
         reactions = self._reactions
         return TimingEvidence(
             period_us=self._period_us,

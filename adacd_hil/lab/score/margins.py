@@ -63,7 +63,7 @@ class BesideGatherer:
         self._largest: dict[str, Vector | None] = {}
 
     def add_stream(self, piece: Run, outline: Run, sections: Sequence[Section], free: Mask) -> None:
-        """Add the paper's scheme's results in the next cycles (n,) of a run.
+        """Add the paper's scheme's results in the next cycles (n,) of a run; call it in the order of time.
 
         piece: these cycles. outline: the run, with all that has happened so far. free (n,): whether a cycle is free of
         contact.
@@ -97,9 +97,9 @@ class BesideGatherer:
                 self._largest[section.label] = larger(self._largest.get(section.label), values)
 
     def _contacts(self, run: Run, sections: Sequence[Section], since_s: float = -np.inf) -> Sequence[TrueContact]:
-        """Return the true contacts that end at `since_s` or later, placed in time for the paper's scheme.
+        """Return the true contacts that end at `since_s` or later, for judging the paper's scheme.
 
-        Each has the times in which it explains that scheme's alarms.
+        Each has the times in which it explains that scheme's alarms. since_s: s since motion start.
         """
         assert run.beside is not None
         time_s = run.time_s()
@@ -110,7 +110,7 @@ class BesideGatherer:
         return placed_in(run, contacts, state, threshold, self._a_rad_s)
 
     def beside(self, run: Run, sections: Sequence[Section]) -> Beside:
-        """Return the results of the cycles added; run: the outline of all of them."""
+        """Return the results of the paper's scheme in the cycles added; run: the whole run."""
         score = self._judge.score(self._contacts(run, sections))
         has_truth = run.truth is not None
         false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
@@ -165,7 +165,7 @@ def last_row(run: Run, section: Section) -> int:
 
 
 def _tests(run: Run, section: Section) -> list[float]:
-    """Return the length of each stay in CERTIFY within a section, s, in order; [] without one."""
+    """Return the length of each stay in CERTIFY within a section, s, in the order of time; [] without one."""
     time_s = run.time_s()
     rows = rows_of(time_s, section, float(time_s[-1]))
     inside = np.concatenate(([False], run.state[rows] == SchemeState.CERTIFY, [False]))
@@ -273,9 +273,11 @@ class UntouchedGatherer:
             self._beside.add_stream(piece, outline, sections, free)
 
     def _free(self, piece: Run, outline: Run) -> Mask:
-        """Return for each cycle (n,) of a piece whether it is free of contact.
+        """Return for each cycle (n,) of a piece whether it is free of contact and, with a truth, covered by it.
 
-        Call it once per piece, in order: it stores the piece's last cycle in REACT.
+        Not free are contacts, or without the truth the settling time around detections, REACT, the settling time after
+        each, and all from the request to finish on.
+        Call it once per piece, in the order of time: it stores the piece's last cycle in REACT.
         """
         settling_ns = round(SETTLING_TIME_CONSTANTS / outline.a_rad_s * 1e9)
         t_ns, truth, finish = piece.t_ns, outline.truth, outline.finish_cycle
@@ -321,7 +323,7 @@ class UntouchedGatherer:
             self.push.add_residuals(piece.certified.tau_ext[rows][armed], threshold[armed])
 
     def _close(self, label: str) -> None:
-        """Sum up the margins of a section that is complete, and drop its values."""
+        """Store the margins of the section `label`, which is complete, and drop the sums that they come from."""
         if label in self._margins:
             self._done[label] = self._margins.pop(label).margins()
 
@@ -347,7 +349,7 @@ class UntouchedGatherer:
         return {each.label: self._done[each.label] for each in sections if each.label in self._done}
 
     def beside(self, run: Run, sections: Sequence[Section]) -> Beside | None:
-        """Return the results of the paper's scheme beside; None if it didn't run. run: the outline of all cycles."""
+        """Return the results of the paper's scheme beside; None if it didn't run. run: the whole run."""
         return None if self._beside is None else self._beside.beside(run, sections)
 
 

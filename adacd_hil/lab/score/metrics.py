@@ -66,7 +66,7 @@ class TimingEvidence:
     counts: Mapping[str, Count | None]
 
     def by_key(self) -> dict[str, Any]:
-        """Return the evidence by the keys of report.json; a histogram is None where the log lacks the time."""
+        """Return the evidence by the keys of report.json, as "times_us"; a histogram is None where it is lacking."""
         return {
             "is_modelled": self.is_modelled,
             "period_us": self.period_us,
@@ -178,8 +178,8 @@ class CertifiedEvidence:
 
     margins: by section. promotions: refined models that took over in the run. is_anchored: whether every certificate in
     the log names the anchors of all its offsets; True without a certificate. revoked: why certificates were withdrawn,
-    in order. smallest_push: None if the scheme was never armed. certificates: those that were not withdrawn, as the log
-    has them at its end; () for a log without its end, or of an earlier version.
+    the earliest first. smallest_push: None if the scheme was never armed. certificates: those that were not withdrawn,
+    as the log has them at its end; () for a log without its end, or of an earlier version.
     """
 
     tests: dict[str, int]
@@ -248,8 +248,9 @@ class PaperRow(NamedTuple):
 class ReportSource(NamedTuple):
     """The log that a run was read from.
 
-    is_complete: log and truth are whole, no record was dropped before, and all alarms could be judged. log_problem: the
-    parts that the log lacks, one line. truth_problem: why the truth could not judge some or all of the run.
+    is_complete: log and truth are whole, no packet was dropped on the way to them, and all alarms could be judged.
+    log_problem: the parts that the log lacks, one line. truth_problem: why the truth could not judge some or all of the
+    run.
     """
 
     log_name: str
@@ -259,12 +260,12 @@ class ReportSource(NamedTuple):
 
     @property
     def problem(self) -> str:
-        """Both problems in one line; "" without any."""
+        """Problems of log and truth in one line; "" without any."""
         return "; ".join(filter(None, (self.log_problem, self.truth_problem)))
 
     @property
     def notice(self) -> str:
-        """One line for a reader on both problems; "" without any."""
+        """One line for a reader on the problems of log and truth; "" without any."""
         log = f"The log is not whole: {self.log_problem}" if self.log_problem else ""
         truth = f"Not all could be judged: {self.truth_problem}" if self.truth_problem else ""
         return "; ".join(filter(None, (log, truth)))
@@ -319,7 +320,7 @@ class ReportedContact:
 
     @property
     def at_s(self) -> float:
-        """Its onset, or its detection if the onset is unknown, s since motion start."""
+        """Onset of the contact, or its detection if the onset is unknown, s since motion start."""
         at_s = self.onset_s if self.onset_s is not None else self.detected_s
         assert at_s is not None
         return at_s

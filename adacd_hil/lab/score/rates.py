@@ -24,7 +24,7 @@ def share_bounds(found: int, count: int) -> tuple[float, float]:
 def rate_bound_per_h(alarms: int, hours: float) -> float:
     """Return the one-sided upper 95 % bound of a rate, 1/h, after `alarms` in `hours`; inf without time.
 
-    Without an alarm it is 3 / hours.
+    Without an alarm it is about 3 / hours.
     """
     return float(gammaincinv(alarms + 1, CONFIDENCE)) / hours if hours > 0.0 else math.inf
 

@@ -39,7 +39,10 @@ def state_words(name: str | None) -> str:
 
 
 def number_text(value: float | None, digits: int, unit: str = "") -> str:
-    """Return a number as text with `digits` decimals and a true minus sign; a dash for None, NaN and infinity."""
+    """Return a number as text with `digits` decimals and a true minus sign; a dash for None, NaN and infinity.
+
+    unit: appended to a number; "" for none.
+    """
     if value is None or not math.isfinite(value):
         return NONE
     text = f"{value:z.{digits}f}".replace("-", "−")
@@ -74,7 +77,7 @@ def scaled(value: float | None, factor: float) -> float | None:
 def uncertain_text(value: float | None, sigma: float | None, digits: int, unit: str) -> str:
     """Return a value with its standard deviation, "1.00 ± 0.10 Nm"; a dash if either is None.
 
-    digits: decimals of both; up to three more for a standard deviation that would read as 0.
+    digits: decimals of both; up to `_MORE_DIGITS` more for a standard deviation that would read as 0.
     """
     if value is None or sigma is None:
         return NONE

@@ -138,7 +138,7 @@ class AttemptBegins:
         self._was_beginning: bool | None = None  # None before the first cycle
 
     def add_cycles(self, cycle: NDArray[Any], state: NDArray[np.uint8]) -> None:
-        """Look for beginnings in the next cycles (k,), k > 0, and add them to `begins`."""
+        """Look for beginnings of attempts in the next cycles (k,), k > 0, and add their cycles to `begins`."""
         is_beginning = np.isin(state, _BEGINNING)
         if self._was_beginning is None and not is_beginning[0]:
             self._begins.append(0)
@@ -342,7 +342,7 @@ def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def split_sections(run: Run) -> tuple[Section, ...]:
-    """Return the lettered sections of a run, in order; () for a run without cycles.
+    """Return the lettered sections of a run, in the order of time; () for a run without cycles.
 
     Cycles before the first ADAPT belong to no section.
     """

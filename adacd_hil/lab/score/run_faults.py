@@ -32,7 +32,10 @@ _MOST_LETTERS = 300
 
 
 def find_faults(run: Run) -> tuple[Fault, ...]:
-    """Return the faults of a run, in order; () without one. The run must have the cycles in which the state changes."""
+    """Return the faults of a run, the earliest first; () without one.
+
+    The run must have the cycles in which the state changes.
+    """
     is_fault = run.state == SchemeState.FAULT
     before = np.concatenate(([False], is_fault[:-1]))
     time_s = run.time_s()
@@ -126,7 +129,10 @@ class CyclicDataGatherer:
         self._present = cycles[:, firsts[-1] :]
 
     def _judge_windows(self, is_incomplete: Cycles, firsts: Cycles) -> None:
-        """Store the worst share of those windows that are long enough; firsts: where in the cycles each begins."""
+        """Store the worst share so far of incomplete cycles in a window; firsts: index at which each window begins.
+
+        Windows of less than SHORTEST_DATA_WINDOW of a whole one don't count.
+        """
         sizes = np.diff(firsts, append=is_incomplete.size)
         is_long = sizes >= SHORTEST_DATA_WINDOW * self._window
         if is_long.any():
@@ -134,7 +140,7 @@ class CyclicDataGatherer:
             self._worst = max(self._worst, float(shares[is_long].max()))
 
     def data(self, run: Run) -> CyclicData:
-        """Return the shares of incomplete and aged data so far.
+        """Return the shares of incomplete and aged data so far, those of each device, and a line for each excess.
 
         run: has the cycles in which the state changes, and the checks' counts. Call it after the last piece.
         """

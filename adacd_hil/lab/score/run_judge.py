@@ -21,7 +21,7 @@ from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge
 
 
 def find_detections(run: Run) -> tuple[Detection, ...]:
-    """Return the alarms of a run in order, each with its first and last report by cycle; None where there is none."""
+    """Return the alarms of a run, the earliest first, each with the first and last report of its cycle, or None."""
     alarms = {report.cycle: report for report in reversed(run.reports) if not report.is_final}
     finals = {report.cycle: report for report in run.reports if report.is_final}
     detections = []
@@ -119,7 +119,7 @@ class FilterChannel:
     def respond(self, tau_ext: Vector, cycle: Cycles, period_s: float) -> Vector:
         """Return the channel's output, Nm (n, 2), for a true torque (n, 2), from rest at the first sample.
 
-        See `filtered`.
+        Each sample is held until the next one. cycle (n,): numbers of their cycles.
         """
         response = filtered(tau_ext, cycle, period_s, self.cutoff_rad_s)
         if self.smoothing_rad_s is None:
@@ -144,7 +144,7 @@ def row_at(run: Run, time_s: float) -> int:
 
 
 def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
-    """Return the filters that detect at a time, with their thresholds: the paper's one filter, or the bank's."""
+    """Return the filters that detect at `time_s`, s since motion start, with thresholds: the paper's, or the bank."""
     if run.certified is None:
         return (FilterChannel(run.a_rad_s, None, threshold_in(run, row_at(run, time_s))),)
     thresholds = run.certified.threshold[row_at(run, time_s)]
@@ -165,7 +165,7 @@ def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[De
 def is_payload_alarm(run: Run, row: int) -> bool:
     """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet.
 
-    False without the truth or without gravity; the row before must be in PAYLOAD.
+    False without the truth, without gravity, or if the row before isn't in PAYLOAD.
     """
     truth, armed = run.truth, np.flatnonzero(is_armed_in(run.state[:row]))
     if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:

@@ -155,7 +155,10 @@ def _beside_text(times_s: list[float | None]) -> str:
 
 
 def _summary(times_s: list[float | None], failed: str) -> str:
-    """Return a phrase on many adaptations: the shortest and the longest time, and how many of them `failed` (words)."""
+    """Return a phrase on many adaptations: the shortest and the longest time, and how many have None: no end.
+
+    failed: words for the latter, such as "not identified".
+    """
     took_s = [time_s for time_s in times_s if time_s is not None]
     text = f"{min(took_s):.2f} to {max(took_s):.2f} s, {len(took_s)} times"
     return text if len(took_s) == len(times_s) else f"{text}, and {failed} {len(times_s) - len(took_s)} times"
@@ -175,7 +178,8 @@ def identified_text(
 ) -> str:
     """Return a phrase with the times until the model was `done`, "identified" or "certified".
 
-    anew: labels from `begun_anew`. More than LISTED adaptations are summed up.
+    adaptation_s: s by label, None: not done. payload_kg: true ones by label, None: unknown; their change is named
+    before a later time. anew: labels from `begun_anew`. More than LISTED adaptations are summed up.
     """
     if not adaptation_s:
         return "the arm never moved to adapt"

@@ -139,7 +139,8 @@ def fill_regressor(
 ) -> None:
     """Write W (n, p) of tau = W theta, friction left out, in the columns of the inertial parameters.
 
-    q, dq, ddq (n,). place, cells that stay, scratch: as of `fill`.
+    q, dq, ddq (n,). place (10 n,): the column of each parameter of theta_full, or NOT_USED. Cells of links before the
+    joint, and other columns, stay as they are, so begin with zeros. Overwrites `scratch`.
     """
     v, a, u, w, row = scratch.v, scratch.a, scratch.u, scratch.w, scratch.row
     _place_links(chain, q, scratch.E, scratch.r)

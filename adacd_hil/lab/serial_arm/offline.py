@@ -120,7 +120,7 @@ class ArmModel:
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the p parameters."""
+        """Names of the p parameters in the order of theta: base, F_v, F_c, offset and rotor inertia of each joint."""
         kinds = ("F_v", "F_c", "offset", *(("rotor",) if self.has_rotors else ()))
         per_joint = (f"{kind}{i + 1}" for kind in kinds for i in range(self.joints))
         return (*self.base.names, *per_joint)
@@ -234,8 +234,8 @@ class OfflineDetection:
 def identify(model: ArmModel, record: Record, before: ModelEstimate, settings: OfflineSettings) -> ModelEstimate:
     """Return the estimate `before`, corrected by a record of free motion; `before` stays as it is.
 
-    With noise of velocities, the record is fitted twice, see the module. Raises ValueError if record or `noise_Nm` and
-    model differ in their number of joints.
+    With noise of velocities, the record is fitted twice: the first result gives the mass matrix that passes that noise
+    on. Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
     """
     theta_M = before.theta
     for has_velocity_noise in (False, True) if settings.velocity_noise_rad_s else (True,):
@@ -288,7 +288,10 @@ def parameter_deviation(
 
 
 def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredTorque:
-    """Return measured torque and residual of a record behind the filter of the fit. Raises ValueError as `identify`."""
+    """Return measured torque and residual of a record behind the filter of the fit.
+
+    Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
+    """
     trace = _trace(model, record, estimate, settings, estimate.theta)
     return FilteredTorque(trace.tau_f, -trace.tau_ext_hat, trace.unit)
 
@@ -296,7 +299,7 @@ def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings:
 def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tuple[Vector, Vector]:
     """Return every `fit_every`-th sample behind the filter of the fit: regressor (m, n, p) and torque (m, n).
 
-    Raises ValueError as `identify`.
+    Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
     """
     count = len(record.q) // settings.fit_every
     shape = (count, model.joints, len(model.parameter_names))
@@ -346,8 +349,8 @@ def detect(
 ) -> OfflineDetection:
     """Return external torque, thresholds and contacts of a record, behind the filter of detection.
 
-    lack_Nm (n,): the model's lack, of `certify`, which widens the thresholds; None: zero. Raises ValueError as
-    `identify`.
+    lack_Nm (n,): the `lack_Nm` of the model's certificate, which widens the thresholds; None: zero. Raises ValueError
+    if record or `noise_Nm` and model differ in their number of joints.
     """
     trace = _trace(model, record, estimate, settings)
     threshold = _threshold(trace, settings, np.zeros(model.joints) if lack_Nm is None else lack_Nm)
@@ -356,9 +359,10 @@ def detect(
 
 
 def find_contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[tuple[int, int, tuple[int, ...]], ...]:
-    """Return the contacts in samples of external torque and threshold (k, n), as in `OfflineDetection`.
+    """Return the contacts in samples of external torque and threshold (k, n): sample, link from 0, signs (n,) each.
 
-    window: samples from a detection until the link is isolated. A contact ends when every joint has stayed within
+    The signs are those of tau_ext_hat where a joint crosses its threshold, 0 if it doesn't within the window. window:
+    samples from a detection until the link is isolated. A contact ends when every joint has stayed within
     `ONSET_FRACTION` of its threshold for a whole window, so a push that sways around the threshold is one. NaN is over
     the threshold.
     """
@@ -391,7 +395,10 @@ class _Trace(NamedTuple):
 
 
 def _threshold(trace: _Trace, settings: OfflineSettings, lack_Nm: Vector) -> Vector:
-    """Return the threshold of each sample and joint (k, n), Nm. lack_Nm (n,): of the model."""
+    """Return the threshold of each sample and joint (k, n), Nm: `deviations` times the deviation, plus held friction.
+
+    lack_Nm (n,): of the model's certificate, added to the deviation by squares.
+    """
     return settings.deviations * np.sqrt(trace.deviation**2 + lack_Nm**2) + trace.friction
 
 

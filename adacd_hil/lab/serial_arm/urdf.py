@@ -277,7 +277,7 @@ def _read_inertial(link: Element, name: str) -> Vector:
 
 
 def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bool) -> _Joint:
-    """Read one joint; of a fixed or locked one only its place. links: names of all links.
+    """Return one joint; of a fixed or, by `is_locked`, locked one only its place. links: names of all links.
 
     Raises UrdfError for an unknown type or child link, a mimic that isn't locked, or a value that is no number or
     impossible.
@@ -328,7 +328,7 @@ def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bo
 def _read_origin(element: Element, where: str) -> FramePose:
     """Return <origin> as a pose, the identity if it is missing.
 
-    Raises UrdfError; where: the element's name in errors.
+    Raises UrdfError for two of them, or a value that is no finite number. where: the element's name in errors.
     """
     origin = _only(element, "origin", where)
     if origin is None:
@@ -374,7 +374,7 @@ def _only(element: Element, tag: str, where: str) -> Element | None:
 def _number(element: Element, key: str, where: str, default: float | None = None) -> float:
     """Return an attribute as a finite number, `default` if it is missing.
 
-    Raises UrdfError if it is no such number, above 1e18, or missing without a default. where: name in errors.
+    Raises UrdfError if it is no such number, above LARGEST, or missing without a default. where: name in errors.
     """
     text = element.get(key)
     if text is None:
@@ -387,7 +387,8 @@ def _number(element: Element, key: str, where: str, default: float | None = None
 def _numbers(element: Element, key: str, where: str, default: float | None = None) -> Vector:
     """Return an attribute as three finite numbers (3,); three times `default` if it is missing.
 
-    Errors as of `_number`.
+    Raises UrdfError if it isn't three such numbers, one is above LARGEST, or it is missing without a default. where:
+    name in errors.
     """
     text = element.get(key)
     if text is None:
@@ -400,7 +401,7 @@ def _numbers(element: Element, key: str, where: str, default: float | None = Non
 
 
 def _parse(word: str, where: str) -> float:
-    """Return a word as a finite number of at most 1e18. Raises UrdfError; where: name in errors."""
+    """Return a word as a finite number, at most LARGEST. Raises UrdfError if it isn't one; where: name in errors."""
     try:
         value = float(word)
     except ValueError:

@@ -76,7 +76,7 @@ class Comparison:
         return tuple(sorted(scores, key=lambda name: sum(scores[name]) / len(scores[name])))
 
     def by_key(self) -> dict[str, Any]:
-        """Return the table by the keys of comparison.json."""
+        """Return the comparison by the keys of detectors.json: rate, hours, steps, ranking, missing detectors, rows."""
         return {
             "rate_per_h": self.rate_per_h,
             "hours": self.hours,
@@ -111,7 +111,7 @@ class Comparison:
 def step_shape(samples: int, onset_s: float, period_s: float) -> Vector:
     """Return a unit step of external torque as it appears in the stream z (samples,), `onset_s` after sample 0.
 
-    Each sample of the stream is the mean over the interval that ends with it.
+    Each sample of the stream is the mean over the interval that ends with it; the step lags by LOOP_LAG_S.
     """
     t = np.arange(-1, samples) * period_s - onset_s
     x = np.maximum(2.0 * t / LOOP_LAG_S, 0.0)
@@ -172,8 +172,9 @@ def _ratios(
 ) -> Vector:
     """Return each detector's largest ratio of statistic to threshold since the onset (detectors, onsets, after, n).
 
-    found: as from `calibrate_all`. starts: first sample of each stretch of `before` samples without and `after` samples
-    with a step of `torque_Nm`; phases_s: time from sample `before` of the stretch to the onset.
+    found: thresholds (channels, n) and calibration by detector. starts: first sample of each part of
+    `before` samples without and `after` samples with a step of `torque_Nm`; phases_s: time from sample `before` of the
+    part to the onset.
     """
     period_s = statistics.motion.period_s
     largest = np.zeros((len(found), len(starts), after, JOINTS))

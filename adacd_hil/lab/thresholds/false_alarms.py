@@ -177,8 +177,8 @@ class TailCalibration:
 def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
     """Return the threshold for a rate of false alarms, with upper bounds, from block maxima (B,), NaN if not free.
 
-    The bounds hold with `CONFIDENCE`. A rate above the tail's is counted, one below is predicted by the tail. Raises
-    TooLittleMotionError as `fit_tail`.
+    The bounds hold with `CONFIDENCE`. A rate below the tail's is predicted by the tail, another is counted. Raises
+    TooLittleMotionError for too little motion, equal values, or too few separate alarms.
     """
     tail = fit_tail(peaks)
     if rate_per_h >= tail.rate_per_h:
@@ -211,7 +211,8 @@ def calibrate_detector(peaks: Vector, rate_per_h: float) -> tuple[Vector, TailCa
     """Return a detector's thresholds (channels, n) for a rate of alarms on any channel and joint, and the calibration.
 
     peaks (B, channels, n): block maxima, NaN where not free. The calibration is of all channels and joints together, of
-    the largest ratio of statistic to threshold; its `threshold` is about 1. Raises TooLittleMotionError as `fit_tail`.
+    the largest ratio of statistic to threshold; its `threshold` is about 1. Raises TooLittleMotionError for too
+    little motion, equal values, or too few separate alarms, of a channel and joint or of all together.
     """
     share = rate_per_h / (peaks.shape[1] * peaks.shape[2])
     thresholds = np.array(
@@ -223,7 +224,7 @@ def calibrate_detector(peaks: Vector, rate_per_h: float) -> tuple[Vector, TailCa
 
 
 def gains(poles_rad_s: Sequence[float], period_s: float, lag_s: float) -> tuple[float, float]:
-    """Return a low-pass filter's gains for white noise: of the torque, Nm per Nm, and of the momentum.
+    """Return the rms of the filtered stream over that of white noise: of the torque, Nm per Nm, and of the momentum.
 
     The second is in Nm per kg m² rad/s. poles_rad_s: of the filter of the stream, () for none. The stream takes the
     mean of two torques minus lag times their slope.

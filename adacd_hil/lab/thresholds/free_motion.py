@@ -77,7 +77,7 @@ class LoggedMotion:
     level_rad: float = 0.0
 
     def pieces(self) -> Iterator[Motion]:
-        """Yield the samples, read from the log piece by piece, in order. Raises LogError if the log can't be read."""
+        """Yield the samples piece by piece, in the order of time. Raises LogError if the log can't be read."""
         place, before = 0, None
         for scheme in schemes(self.path, self.bounds_ns):
             end = place + len(scheme)
@@ -115,8 +115,9 @@ def read_motion(
 ) -> LoggedMotion:
     """Return the motion in a log, or in a stretch of it, with its contact-free samples marked; reads the log twice.
 
-    watch: called with each piece of its /scheme. Raises LogError if the log can't be read, has no /scheme or no
-    measured period, or no sample is free of contact.
+    A sample is free if it and all within APART_S are armed, without a joint over its threshold, a gap or NaN. progress:
+    called with a line on the cycles read. watch: called with each piece of /scheme. Raises LogError if the log can't be
+    read, has no /scheme or no measured period, or no sample is free of contact.
     """
     bounds_ns = None
     where = ""
@@ -199,10 +200,10 @@ def check_together(logs: Sequence[LoggedMotion]) -> None:
 
 
 def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
-    """Return all motion of the logs, one after the other; if it has over a million samples, only windows of it.
+    """Return all motion of the logs, one after the other; of more than MOST_SAMPLES samples only windows.
 
-    The windows have free motion and are spread evenly. Raises LogError if a log can't be read, or the logs don't go
-    together.
+    The windows have free motion and are spread evenly. Raises LogError if a log can't be read, or the logs differ in
+    period or number of parameters.
     """
     check_together(logs)
     chosen = _windows(logs)

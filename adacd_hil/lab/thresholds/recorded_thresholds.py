@@ -59,9 +59,9 @@ _CHECKED_ALARMS: Final = 20.0  # alarms in the held-out half that are enough to 
 
 
 def find_lag(motion: Motion) -> tuple[float, Vector]:
-    """Return by how much the velocity is older than the torque, s, 0 to 5 ms: of both joints together, of each (n,).
+    """Return by how much the velocity is older than the torque, s, for both joints together and for each (n,).
 
-    If the torque never changes, all are `VELOCITY_LAG_S`.
+    It is within 0 and `_LONGEST_LAG_S`. If the torque never changes, all are `VELOCITY_LAG_S`.
     """
     z, _ = detectors.make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
     moving = motion.is_free & (np.abs(motion.dq) > 0.02).all(axis=1)
@@ -85,7 +85,10 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
 
 @dataclass(frozen=True)
 class Statistics:
-    """The detectors' statistics on contact-free motion, and N samples of it, or all, with the stream of them."""
+    """The detectors' statistics on contact-free motion, and all or N samples of it with their stream: z and held_Nm.
+
+    held_Nm: torque that friction may hold. lag_s: by which dq is older than tau_J; lag_of_joint_s: the same by joint.
+    """
 
     settings: detectors.DetectorBankSettings
     weights: Vector  # (n, ages, L), of the likelihood channels
@@ -108,8 +111,8 @@ def run_detectors(
 ) -> Statistics:
     """Run every detector over the motion of logs; return their statistics, and the lag and weights that they used.
 
-    Raises LogError if a log can't be read or the logs don't go together, TooLittleMotionError if motion is too short
-    for the likelihood weights.
+    progress: called with a line on the cycles read. Raises LogError if a log can't be read or the logs differ in period
+    or number of parameters, TooLittleMotionError if motion is too short for the likelihood weights.
     """
     motion = sample_of(logs)
     lag_s, lag_of_joint_s = find_lag(motion)
@@ -212,8 +215,8 @@ def calibrate_all(
 ) -> tuple[dict[str, tuple[Vector, TailCalibration]], tuple[str, ...]]:
     """Return each detector's thresholds and calibration for a rate of false alarms, and the names of those that failed.
 
-    They are by name, and as of `calibrate_detector`. A detector fails if its tail can't be fitted. Raises
-    TooLittleMotionError if all fail.
+    By name: thresholds (channels, n), and the calibration of all channels and joints together. A detector fails if its
+    tail can't be fitted. Raises TooLittleMotionError if all fail.
     """
     found: dict[str, tuple[Vector, TailCalibration]] = {}
     missing: list[str] = []
@@ -349,8 +352,9 @@ def thresholds_of_logs(
 ) -> tuple[Thresholds, Statistics]:
     """Return all detectors' thresholds from the contact-free motion of logs, and the statistics that they come from.
 
-    stretch: part of each log. rate_per_h: wanted false alarms of each detector. Raises LogError for a log that can't be
-    used or is of another arm than the first, TooLittleMotionError if all together are too short.
+    stretch: part of each log. rate_per_h: wanted false alarms of each detector. progress: called with a line on the
+    cycles read. Raises LogError for a log that can't be used or is of another arm than the first, TooLittleMotionError
+    if all together are too short.
     """
     logs = []
     for path in paths:

@@ -57,9 +57,9 @@ class NoExcitationError(ValueError):
 class Figures:
     """Figures of a motion.
 
-    Excitation_Nm2s, inertia_Nm2s: smallest eigenvalues of the information on all parameters, Nm² s. The second is of
-    the inertia alone, in the shortest fit of a payload. condition: largest over smallest eigenvalue. The others are
-    largest |q| and so on, of joint 1 and 2.
+    Smallest eigenvalues, Nm² s: excitation_Nm2s, of the information on all parameters in the shortest fit;
+    inertia_Nm2s, of that on the inertia alone in the shortest fit of a payload. condition: largest over smallest
+    eigenvalue of the former. The others are largest |q| and so on, of joint 1 and 2.
     """
 
     excitation_Nm2s: float
@@ -73,7 +73,10 @@ class Figures:
 
     @property
     def cost(self) -> float:
-        """The cost of the module's formula, which the search minimises; may be negative."""
+        """Cost of the motion, the lower the better it identifies: by `excitation_Nm2s`, `inertia_Nm2s` and `condition`.
+
+        The search minimises it; it may be negative.
+        """
         return _cost_of(self.excitation_Nm2s, self.condition, self.inertia_Nm2s)
 
 
@@ -189,8 +192,8 @@ class Search:
         """Return the best motion found, never a worse one than the configuration's, if that keeps the limits.
 
         goes_on: called with the number of climbs so far, returns whether there is to be another; the first is always
-        made. progress: called with a line for each better motion. iterations: most of one climb and penalty. The climbs
-        are those of `seed`, in order, however many. Raises NoExcitationError if no motion keeps the limits.
+        made. progress: called with a line for each better motion. iterations: most of one climb and penalty. A `seed`
+        always gives the same sequence of climbs. Raises NoExcitationError if no motion keeps the limits.
         """
         random = np.random.default_rng(seed)
         shape = (2, JOINTS, len(self._order) - 1)
@@ -220,7 +223,7 @@ class Search:
     def _climb(self, start: Vector, iterations: int) -> ExcitationSettings:
         """Return the motion at the end of a climb, in which exceeded limits cost more and more; it may exceed some.
 
-        start: as `free` of `_complete`.
+        start: flat coefficients of the harmonics from the second on. iterations: most per penalty.
         """
         found = start
         for penalty in _PENALTIES:
@@ -286,14 +289,19 @@ class Search:
         return float(fit[0]), float(fit[-1]), float(inertia[0])
 
     def _eigenvalues(self, W_f: Vector, scale: Vector) -> Vector:
-        """Return the eigenvalues of the information of filtered regressors (N, 2, c), ascending. scale (c,): D."""
+        """Return the eigenvalues of the information of filtered regressors (N, 2, c), ascending.
+
+        scale (c,): factor on each column, the error of its parameter that must not stay hidden.
+        """
         rows = (W_f * scale).reshape(-1, len(scale))
         return np.asarray(np.linalg.eigvalsh(self._step_s * rows.T @ rows), dtype=np.float64)
 
     def _cost(self, free: Vector, penalty: float) -> float:
-        """Return the cost of a motion, smooth in its coefficients; it grows with the excess over the limits.
+        """Return the cost of a motion, the lower the better it identifies, plus a penalty for exceeded limits.
 
-        That is `penalty` times the mean square of the excess, as share of the limit. free: as of `_complete`.
+        The cost is `Figures.cost`, made smooth in the coefficients. The penalty is `penalty` times the mean square of
+        the excess, as share of the limit, summed over the limits. free: flat coefficients of the harmonics from
+        the second on.
         """
         motion = self.motion_of(*self._complete(free))
         W = self._regressors(motion)

@@ -60,7 +60,7 @@ class Subject(NamedTuple):
 class SweepRow(NamedTuple):
     """One row of the sweep: a run or replay of the subject with changed settings.
 
-    key: of all that the result depends on.
+    key: digest of all that the result depends on.
     """
 
     key: str
@@ -142,7 +142,8 @@ def plan_scenarios(
 ) -> Plan:
     """Return the plan of a sweep that runs the emulated arm with each scenario, seed and variant of the settings.
 
-    The arguments are as of `plan_logs`.
+    variants: values as TOML, by key; none: the settings as they are. config: name or file, "" for the one of emulated
+    runs. profile: "" for the default arm. version: of the code.
     """
     subjects = (Subject(scenario=scenario, seed=seed) for scenario in scenarios for seed in seeds)
     return Plan(tuple(dict.fromkeys(subjects)), _tuples(variants), config, profile, version)
@@ -182,7 +183,7 @@ def failed(subject: Subject, row: SweepRow, error: str) -> Values:
 
 
 def replay_task(task: Task) -> list[Values]:
-    """Replay a task's log with the settings of each row; return a row of results or of an error for each, in order.
+    """Replay a task's log with the settings of each row; return a row of results or an error for each, in their order.
 
     Errors of `REFUSALS` become rows; others are raised.
     """
@@ -288,8 +289,8 @@ class SweepStore:
     def join(self, keys: Iterable[str], about: Mapping[str, str]) -> Path:
         """Write the table of the rows with these keys, in this order, and plan.json with `about`; return its path.
 
-        Of several results of a row, the last good one counts, else the last. Keys without a result are left out.
-        Replaces the table before; the parts stay. Raises LogError if a part can't be read, or the table not be written.
+        Of several results of a row, the last with status "ok" counts, else the last. Keys without one are left out.
+        Replaces an earlier table; the parts stay. Raises LogError if a part can't be read, or the table not be written.
         """
         rows: dict[str, Values] = {}
         for path in self._paths():
@@ -304,7 +305,10 @@ class SweepStore:
         return path
 
     def notes(self, table: Path) -> list[str]:
-        """Return a line "SUBJECT: NOTES" for each row of a joined table whose replay has notes, each text once."""
+        """Return a line "SUBJECT: NOTES" for each row of a joined table whose replay has notes, each text once.
+
+        Raises LogError if the table can't be read.
+        """
         rows = self._read(table).to_pylist()
         noted = (f"{row['log'] or row['scenario']}: {row['notes']}" for row in rows if row.get("notes"))
         return list(dict.fromkeys(noted))
@@ -335,7 +339,7 @@ def _table(rows: list[Values]) -> Any:
 
 
 def _write(parquet: Any, path: Path, table: Any) -> None:
-    """Write a table to `path`, whole or not at all. Raises LogError."""
+    """Write a table to `path`, whole or not at all. Raises LogError if it can't be written."""
     try:
         with replacing(path) as beside:
             parquet.write_table(table, beside, compression="zstd")
@@ -371,8 +375,8 @@ def run_sweep(
 ) -> SweepOutcome:
     """Compute the rows of a plan that the store lacks or that failed, and write them to it every few seconds.
 
-    work: called by the workers with each task. If an error or Ctrl-C ends it, rows computed so far are written. Raises
-    LogError if the cluster is lost, or a part can't be read or written.
+    work: called by the workers with each task, of at most `rows_per_task` rows. If an error or Ctrl-C ends it, rows
+    computed so far are written. Raises LogError if the cluster is lost, or a part can't be read or written.
     """
     clock = MonotonicClock()
     begin_ns = written_ns = clock.now_ns()

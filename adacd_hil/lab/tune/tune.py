@@ -77,8 +77,8 @@ def tune(
 
     stretch: of each log; the replays begin with the log, and only their results in the stretch count.
 
-    Raises TooLittleMotionError if the half to choose on has no free motion with the settings to start from; else as
-    `read_logs`.
+    Raises TooLittleMotionError if the half to choose on has no free motion with the settings to start from;
+    LogError, ConfigError or CodecError if a log, its settings or its contract can't be used.
     """
     progress(f"reading {number_of(len(paths), 'log')}")
     logs = read_logs(paths, config, stretch, progress)
@@ -194,7 +194,7 @@ def problems_of(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate
 
 
 def best_of(judged: Sequence[Candidate]) -> Candidate | None:
-    """Return the fit candidate with the smallest median delay in the half to choose on; None if none is fit.
+    """Return the candidate with the smallest median delay in the half to choose on, without problems; None without one.
 
     judged: at least one, that of the logs' filter and gain first. If the rate is extrapolated more than FARTHEST-fold,
     only this one is considered.
@@ -271,7 +271,7 @@ def _provenance(tuning: Tuning, best: Candidate) -> list[str]:
 
 
 def _plain(path: Path) -> str:
-    """Return a path as text, with "?" in place of letters that would end a comment."""
+    """Return a path as text, with "?" in place of letters that aren't printable, which might end a comment."""
     return "".join(letter if letter.isprintable() else "?" for letter in str(path))
 
 
@@ -369,7 +369,7 @@ def draw_roc(tuning: Tuning) -> Drawing:
 
 
 def draw_delays(tuning: Tuning) -> Drawing:
-    """Draw the share of all contacts that is found within a time, at the chosen thresholds. Needs the truth."""
+    """Draw the share of contacts found against the time since onset, at the chosen thresholds. Needs the truth."""
     title = "Delay at the chosen thresholds"
     with _axes(title) as (figure, axes):
         for choice, look in _curves(tuning):

@@ -134,12 +134,15 @@ def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progr
 
 
 def _show_to(shown: "Sequence[ShownLog]") -> Watch:
-    """Return a watcher for `replay_many` that gives each replayed stretch to the `ShownLog` of its variant."""
+    """Return a watcher for `replay_many` that passes each batch of replayed cycles to the `ShownLog` of its variant."""
     return lambda place, ticks, batch: shown[place].take_stretch(ticks, batch)
 
 
 def name_of(changes: Mapping[str, str]) -> str:
-    """Return the name of a candidate by its changed settings, "KEY=VALUE, …"; "as it is" without a change."""
+    """Return the name of a candidate by its changed settings, "KEY=VALUE, …"; "as it is" without a change.
+
+    `filter.b_rad_s` is left out.
+    """
     return ", ".join(f"{key}={value}" for key, value in changes.items() if key != "filter.b_rad_s") or "as it is"
 
 
@@ -157,7 +160,7 @@ def _monitoring(settings: Settings) -> Settings:
 class ShownLog:
     """The statistics of one candidate on one log of N cycles.
 
-    Call `take_stretch` for the replay in order, then `trials`.
+    Call `take_stretch` for each batch of replayed cycles, in the order of time, then `trials`.
     """
 
     def __init__(self, log: TunedLog, settings: Settings) -> None:
@@ -172,7 +175,9 @@ class ShownLog:
         self._trials: dict[int, Trial] = {}
 
     def take_stretch(self, ticks: Ticks, batch: SchemeBatch) -> None:
-        """Add a replayed stretch to the peaks and to the contacts in it. Stretches come in the order of time.
+        """Add a batch of replayed cycles to the largest statistics per block, and to those of the contacts in it.
+
+        Call it in the order of time. ticks, batch: times and results of the same cycles.
 
         Cycles that the log lacks are skipped.
         """
@@ -196,7 +201,7 @@ class ShownLog:
             self._close(window)
 
     def _take_window(self, window: Window, rows: Places, statistic: Vector, is_armed: NDArray[np.bool_]) -> None:
-        """Add a stretch's cycles that lie in a contact. rows, statistic, is_armed: of the stretch, one per cycle.
+        """Add the cycles of a batch that lie in a contact. rows, statistic, is_armed: of the batch, one per cycle.
 
         A contact at whose onset the candidate isn't armed is skipped.
         """
@@ -220,7 +225,8 @@ class ShownLog:
     def _statistic_of(self, block: Vector) -> Vector:
         """Return the statistic that chosen thresholds are compared with (k, 1, channels), from k cycles of /scheme.
 
-        Certified scheme: largest ratio to the thresholds in force. Paper's scheme: residual less its allowance, Nm.
+        Certified scheme: largest ratio to the thresholds in force. Paper's scheme: residual, Nm, less
+        the part of the threshold beyond the configured one.
         """
         if self._is_certified:
             bank, threshold = (block[:, self._slices[name]] for name in ("tau_ext_bank", "threshold_bank"))
@@ -241,7 +247,7 @@ class ShownLog:
     def trials(self) -> list[Trial]:
         """Return the statistics during each contact for which the logged scheme was armed, in the order of the log.
 
-        Call it after the last stretch: it ends contacts that are still open.
+        Call it after the last batch: it ends contacts that are still open.
         """
         for window in list(self._open):
             self._close(window)
@@ -251,7 +257,8 @@ class ShownLog:
 def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: None) -> list[Observed]:
     """Run all detectors over logs; return the statistics of each, in the order of `DetectorBankSettings.detectors`.
 
-    Raises LogError if a log can't be read or the logs don't go together, TooLittleMotionError if motion is too short.
+    progress: called with a line on the cycles read. Raises LogError if a log can't be read or the logs differ in period
+    or number of parameters, TooLittleMotionError if motion is too short.
     """
     settings = detectors.DetectorBankSettings()
     statistics = run_detectors([log.motion for log in logs], settings, progress)

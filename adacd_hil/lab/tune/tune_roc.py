@@ -69,7 +69,7 @@ class Trial(NamedTuple):
 def rising(trial: Trial) -> Trial:
     """Return a trial without the samples in which no statistic is larger than in all samples before.
 
-    `delay_ms` is the same of both.
+    `delay_ms` gives the same for both.
     """
     if not len(trial.since_s):
         return trial
@@ -83,7 +83,7 @@ def rising(trial: Trial) -> Trial:
 class Observed:
     """A detector's statistics.
 
-    peaks (B, channels, n): largest per block of 0.1 s, NaN in blocks that aren't free of contact. is_chosen_on (B,):
+    peaks (B, channels, n): largest per block of `BLOCK_S`, NaN where it isn't free of contact. is_chosen_on (B,):
     whether a block is in the half that thresholds are chosen on. trials: the contacts for which the logged scheme was
     armed; None if no log records the true contacts.
     """
@@ -94,7 +94,10 @@ class Observed:
     trials: tuple[Trial, ...] | None
 
     def half(self, is_chosen_on: bool) -> Vector:
-        """Return the peaks (B, channels, n) of the half that thresholds are chosen on, or of the other; else NaN."""
+        """Return the peaks (B, channels, n) of the half to choose on if `is_chosen_on`, else of the half to check on.
+
+        Blocks of the other half are NaN.
+        """
         return np.where((self.is_chosen_on == is_chosen_on)[:, None, None], self.peaks, np.nan)
 
 
@@ -120,7 +123,7 @@ class Found(NamedTuple):
         return share_bounds(len(self.delays_ms), self.contacts or 0)
 
     def by_key(self) -> dict[str, Any]:
-        """Return the effect of the thresholds by the keys of tune.json."""
+        """Return hours, false alarms and their bound, and contacts found, if known, by the keys of tune.json."""
         plain: dict[str, Any] = {
             "hours": self.hours,
             "false_alarms": self.alarms,
@@ -154,7 +157,7 @@ class Choice:
 
     @property
     def extrapolation(self) -> float:
-        """One alarm in the time that thresholds are chosen on, over the wanted rate; infinite without a tail.
+        """Rate of one alarm in the time that thresholds are chosen on, over the wanted rate; infinite without a tail.
 
         Up to 1 nothing is extrapolated.
         """
@@ -245,7 +248,7 @@ _TENTHS = 10
 class Window(NamedTuple):
     """The rows [first, last] of a log in which a true contact explains an alarm, see `score.judge`.
 
-    number: the contact's.
+    number: the contact's. is_chosen_on: the contact is in the half that thresholds are chosen on.
     """
 
     number: int
@@ -257,10 +260,10 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class TunedLog:
-    """A log of N cycles, or N of them. digest: SHA-256 of the file. settings: those to start from.
+    """A log of N cycles, or the N of them in `stretch`. digest: SHA-256 of the file. settings: those to start from.
 
     t_ns (N,): times. windows: of the true contacts that begin in those, None if unknown. is_chosen_on (B,): whether a
-    block of 0.1 s is in the half that thresholds are chosen on.
+    block of `BLOCK_S` is in the half that thresholds are chosen on.
     """
 
     path: Path
@@ -286,9 +289,9 @@ def read_logs(
 ) -> list[TunedLog]:
     """Read logs, or a stretch of each, with contact-free motion and true contacts, for tuning.
 
-    config: name or file of the settings to start from, in place of the logs' own. Raises LogError if a log can't be
-    read, has no free motion, or has other settings than the first; ConfigError or CodecError if settings or contract
-    can't be used.
+    config: name or file of the settings to start from, in place of the logs' own. progress: called with a line on the
+    cycles read. Raises LogError if a log can't be read, has no free motion, or has other settings than the first;
+    ConfigError or CodecError if settings or contract can't be used.
     """
     logs = [_read(path, place, len(paths), config, stretch, progress) for place, path in enumerate(paths)]
     first = logs[0]
@@ -311,7 +314,8 @@ def _tunable(settings: Settings) -> Settings:
 def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeWindow, progress: Progress) -> TunedLog:
     """Read a log for tuning. place, count: its index among the logs and their number, by which its half is chosen.
 
-    The other arguments, and errors, are as of `read_logs`.
+    The other arguments are as of `read_logs`. Raises LogError, ConfigError or CodecError if the log, its settings or
+    its contract can't be used.
     """
     own = LogSource(path).settings
     parts = _Index()
@@ -482,7 +486,10 @@ def free_hours(log: TunedLog) -> float:
 
 
 def tuning_by_key(found: Tuning) -> dict[str, Any]:
-    """Return the result by the keys of tune.json; values are tuples, arrays and paths, too."""
+    """Return the result by the keys of tune.json: logs, suggestion, candidates, detectors, notes.
+
+    Values are tuples, arrays and paths, too.
+    """
 
     def candidate(each: Candidate) -> dict[str, Any]:
         return {

@@ -42,9 +42,9 @@ NO_FILES: TlsFiles = dict.fromkeys(("tls_ca_file", "tls_client_cert", "tls_clien
 def connect(scheduler: str, count: int, tls: TlsFiles = NO_FILES, preload: tuple[str, ...] = ()) -> Iterator["Workers"]:
     """Yield the workers of a Dask scheduler at an address, or, if that is "", `count` processes of this machine.
 
-    Processes are ended, and the connection closed, at the block's end. preload: modules that the processes import
-    before their first task. Raises ConfigError if the certificates can't be used, LogError if dask is missing or the
-    scheduler doesn't answer.
+    Processes are ended, and the connection closed, at the block's end. tls: certificate files for the scheduler, by
+    Dask's names; None: Dask's own. preload: modules that the processes import before their first task. Raises
+    ConfigError if the certificates can't be used, LogError if dask is missing or the scheduler doesn't answer.
     """
     if not scheduler:
         pool = ProcessWorkers(count, preload)
