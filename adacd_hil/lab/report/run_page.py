@@ -32,6 +32,7 @@ from adacd_hil.lab.report.report_tables import (
     sections_table,
     timing_tables,
 )
+from adacd_hil.lab.report.run_reading import AROUND_S
 from adacd_hil.lab.report.timeline import (
     certificates_of,
     notices_of,
@@ -221,7 +222,7 @@ def _card(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, A
         "number": contact.number,
         "link": contact.link if contact.link_detected is None else contact.link_detected,
         "at_s": contact.at_s,
-        "stretch_s": (contact.at_s - 0.15, contact.at_s + 0.6),
+        "stretch_s": (contact.at_s - AROUND_S[0], contact.at_s + AROUND_S[1]),
         "is_wrong": went_wrong(contact),
         "kind": _kind(contact),
         "entries": [(term, text) for term, text in entries if text != NONE],

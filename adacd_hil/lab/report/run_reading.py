@@ -74,7 +74,8 @@ FULL_CYCLES: Final = 150_000
 ADAPTATION_S: Final = 10.0
 RUN_TOPICS: Final = (SCHEME.name, CYCLE.name, FRAME_CHECKS.name, CONTACT.name, EVENTS.name)
 """Topics that a report reads."""
-_AROUND_S: Final = (0.15, 0.6)
+AROUND_S: Final = (0.15, 0.6)
+"""Time before and after a contact that is kept, and shown with it."""
 _NOISE_BUCKETS: Final = 150
 _NOISE_CYCLES: Final = 500
 _WAITING: Final = 50_000
@@ -412,7 +413,7 @@ def _around(run: Run) -> list[Bounds]:
     onsets_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
     found_s = [(detection.t_ns - run.zero_ns) * 1e-9 for detection in find_detections(run)]
     around = [
-        (at_s - _AROUND_S[0], at_s + _AROUND_S[1]) for at_s in (*onsets_s[:TRACED_CONTACTS], *found_s[:TRACED_CONTACTS])
+        (at_s - AROUND_S[0], at_s + AROUND_S[1]) for at_s in (*onsets_s[:TRACED_CONTACTS], *found_s[:TRACED_CONTACTS])
     ]
     adaptations = [section for section in split_sections(run) if section.kind == "adaptation"]
     around += [(each.start_s, min(each.end_s, each.start_s + ADAPTATION_S)) for each in adaptations[:ADAPTATIONS]]
