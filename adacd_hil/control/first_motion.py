@@ -170,7 +170,7 @@ class FirstMotion(EventSource):
     def check_lengths(self, certificates: tuple[Certificate, ...]) -> None:
         """Compare the first certificate of the run, if any, with the configured lengths; add an event if they differ.
 
-        An info if torques can't check a length. Set `is_certified`, also without a certificate.
+        It is the event of `geometry_event`. Set `is_certified` to True, also without a certificate.
         """
         self.is_certified = True
         event = geometry_event(self._settings, certificates[0]) if certificates else None

@@ -53,9 +53,10 @@ def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap]:
 
 
 def _head(file: IO[bytes], position: int, size: int) -> tuple[int, int] | None:
-    """Return opcode and length of the record at `position` of a file of `size` bytes.
+    """Return opcode of the record at `position` of a file of `size` bytes, and length of its contents, bytes.
 
-    None if no record is there whose contents fit its kind and length.
+    None if its contents don't fit its kind and length, or end behind the file. A record of an unknown kind counts if a
+    known one follows.
     """
     head = read_bytes(file, position, HEAD.size)
     if len(head) < HEAD.size:

@@ -151,7 +151,7 @@ def put_fitted(m: Memory, q: int, value: float, variance: float) -> None:
 
 @compiled
 def of_belief(k: Constants, q: int, theta: Vector, P: Vector, unit: float) -> tuple[float, float]:
-    """Return a belief's value of quantity `q`, c theta, and its variance. unit: see `split`."""
+    """Return a belief's value of quantity `q`, c theta, and its variance, c P c with the samples' part times `unit`."""
     column = k.evidence.columns[q]
     return linalg.dot(column, theta), split(linalg.quadratic(P, column), k.evidence.columns_prior[q], unit)
 

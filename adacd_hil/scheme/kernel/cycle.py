@@ -147,7 +147,8 @@ def certified_cycle(
 
     With a bit of BEFORE_CONTACT the cycle is not over: Python runs the tasks, then `end_certified`. place: index of the
     cycle in samples, decisions and blocks; `decisions` and `blocks` are filled there. values: the numbers of `block`
-    (size,), same memory. rows: those of `contact_report.put_row`.
+    (size,), same memory. paper_*: the paper's scheme, which runs beside. course_*: supervisor and contact. rows: see
+    `contact_report.put_row`.
     """
     sample, decision, run = samples[place], decisions[place], course_memory[0]
     period_s = interval_s(run, sample)
