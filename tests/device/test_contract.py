@@ -102,6 +102,7 @@ def test_a_misspelt_contract_is_told_the_nearest() -> None:
             ("(1e-06,0)", "(1e-05,0)"),
             "Sensor1Torque: scales torque .* by the device profile, torque .* by contract",
         ),
+        ({}, ("(1e-06,0)", "(1e999,0)"), "torque inf by contract"),  # 0 counts would be NaN
         ({"drive_node": [1, 7]}, ("", ""), "Drive2.*: identifier 0x.* by the device profile"),
         ({}, ("SG_ torque_actual", "SG_ torque"), "Drive1Status: signals statusword, mode_display, torque_actual"),
         ({}, ("f5ddf3da", "f5ddf3db"), "data ids or places of signals differ"),
