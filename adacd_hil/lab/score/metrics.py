@@ -249,13 +249,16 @@ class ReportSource(NamedTuple):
     """The log that a run was read from.
 
     is_complete: log and truth are whole, no record was dropped before, and all alarms could be judged. log_problem: the
-    parts that the log lacks, one line. truth_problem: why the truth could not judge some or all of the run.
+    parts that the log lacks, one line. truth_problem: why the truth could not judge some or all of the run. config,
+    scenario: names or files that the run was started with; "" if unknown.
     """
 
     log_name: str
     log_problem: str = ""
     is_complete: bool = True
     truth_problem: str = ""
+    config: str = ""
+    scenario: str = ""
 
     @property
     def problem(self) -> str:
