@@ -214,6 +214,8 @@ def test_a_gear_that_contradicts_the_drive_is_refused_before_anything_moves(gear
         (tmp_path / path.name).write_bytes(path.read_bytes())
     profile = tmp_path / "my-arm-drive.toml"
     profile.write_text(profile.read_text().replace("gear_ratio = 30", "gear_ratio = 36"))
+    checked = called("config", "check", str(tmp_path / "my-arm.toml"))
+    assert "Drive1: `scale.gear_ratio` = 36, 0x6091 = 30 by the EDS: correct it, or" in checked.stdout
     cast = resolve(str(tmp_path / "my-arm.toml"), "idle", None, None)
     summary, _ = run_embedded(cast, "lockstep", tmp_path / "run")
     assert "0x6076 = 380000 µNm, 316667 µNm expected of a motor behind a gear of 36" in summary.error

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import shlex
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -39,6 +40,19 @@ def rehearse(folder: Path, name: str, *words: str, scenario: str = "short.toml")
     with contextlib.chdir(folder):
         ran = called(*command)
     return ran.exit_code, ran.stderr
+
+
+@pytest.mark.slow
+def test_a_demo_that_faults_is_played_again_by_the_command_that_it_prints(tmp_path: Path) -> None:
+    lab = tmp_path / "my lab"
+    lab.mkdir()
+    (lab / "arm.toml").write_text(OWN_ARM)
+    (lab / "silent.toml").write_text('lasts_s = 0.5\n[[faults]]\nkind = "silence"\nnode = "sensor1"\nat_s = 0.2\n')
+    files = ["--config", "my lab/arm.toml", "--scenario", "my lab/silent.toml"]
+    with contextlib.chdir(tmp_path):
+        played = called("demo", *files, "--out", "my lab/run")
+    printed = [shlex.split(line) for line in played.stdout.splitlines() if line.startswith("    adacd-hil ")]
+    assert (played.exit_code, printed[0]) == (4, ["adacd-hil", "demo", *files])
 
 
 @pytest.mark.slow

@@ -144,20 +144,19 @@ def _difference(devices: Sequence[DeviceRecord], identities: Sequence[Identity],
 
 
 def read_history(path: Path) -> History:
-    """Return the history of a file.
-
-    Raises ConfigError if it is missing, invalid, or its digests are wrong; OSError if it can't be read.
-    """
+    """Return the history of a file. Raises ConfigError if it is missing, can't be read, is invalid or was changed."""
     if not path.exists():
         raise ConfigError(f"history {path} does not exist; `adacd-hil run --history` makes one")
-    return _parse(path, read_input(path))
+    return _read(path)[1]
 
 
-def _parse(path: Path, text: bytes) -> History:
+def _read(path: Path) -> tuple[bytes, History]:
+    """Return the text of a file, and the history in it. Raises ConfigError as `read_history`."""
     try:
-        return parse(History, parse_toml(text))
-    except ConfigError as error:
-        raise ConfigError(f"history {path}: {error}") from None
+        text = read_input(path)
+        return text, parse(History, parse_toml(text))
+    except (OSError, ConfigError) as error:
+        raise ConfigError(f"history {path}: {getattr(error, 'strerror', error)}") from error
 
 
 @dataclass(frozen=True)
@@ -224,12 +223,12 @@ class UsedHistory:
         """Append certificates of a run to the history file, in one step; return a summary.
 
         Read the file again first, so that certificates of another run are kept; make one if there is none. identities:
-        of the devices found. Raises ConfigError for an invalid file or one of another arm, OSError if it can't be read
-        or written.
+        of the devices found. Raises ConfigError as `read_history`, and for a file of another arm; OSError if it can't
+        be written.
         """
         devices, records = tuple(DeviceRecord(*identity) for identity in identities), []
         if self.path.exists():
-            now = _parse(self.path, read_input(self.path))
+            now = _read(self.path)[1]
             if difference := _difference(now.devices, identities, self.path):
                 raise ConfigError(difference)
             devices, records = now.devices, list(now.certificates)
@@ -256,15 +255,14 @@ class Origin(NamedTuple):
 def use_history(path: Path, now_ns: int) -> UsedHistory:
     """Read the arm's history for a run; a missing file is a first run. now_ns: wall clock.
 
-    Raises ConfigError for an invalid file, a link to a missing one, and a certificate over `_FUTURE_NS` in the future;
-    OSError if the file can't be read.
+    Raises ConfigError as `read_history` for a file that is there, for a link to a missing one, and for a certificate
+    over `_FUTURE_NS` in the future.
     """
     if (link := dangling_link(path)) is not None:  # the history was moved: the arm is known, not on its first run
         raise ConfigError(f"history {path}: link {link} leads to {link.readlink()}, which is not there")
     if not path.exists():
         return UsedHistory(path, b"", None)
-    text = read_input(path)
-    history = _parse(path, text)
+    text, history = _read(path)
     ahead_ns = date_ns(history.last.date_utc) - now_ns
     if ahead_ns > _FUTURE_NS:
         raise ConfigError(f"history {path}: its last certificate is {ahead_ns / 3.6e12:.1f} h ahead of this clock")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hand_made_run import record, record_truth, touched_run
+from hand_made_run import A, M, make_run, record, record_truth, touched_run
 
 from adacd_hil.lab.report.report_files import write_report
 from adacd_hil.lab.report.run_reading import read_run
@@ -109,6 +109,12 @@ def test_a_report_without_the_truth_of_another_run_says_so(tmp_path):
     assert report.metrics.false_alarms is None
     assert not report.is_complete
     assert "truth.mcap is of another run: its scenario is idle, the log's paper" in report.as_text()
+
+
+@pytest.mark.slow
+def test_a_command_for_the_terminal_names_the_log_with_its_folder(tmp_path):
+    log, _ = recorded(tmp_path, make_run((A, 1000), (M, 1000)))
+    assert write_report(log, None, tmp_path / "out").next_steps[-1].command == f"adacd-hil replay {log}"
 
 
 def test_a_truth_that_goes_on_with_the_next_host_covers_this_one_to_its_end():

@@ -77,12 +77,13 @@ def test_certificates_that_cant_be_used_are_one_line_and_status_2(
     complaints = [line for line in refused.stderr.splitlines() if not line.startswith("1 row: ")]
     assert (refused.exit_code, len(complaints)) == (2, 1), refused.stderr
     assert reason in complaints[0]
+    assert not (tmp_path / "out").exists()
 
 
 def test_an_open_scheduler_is_called_open(tmp_path, log, monkeypatch):
     monkeypatch.setattr("adacd_hil.lab.tune.workers.TIMEOUT_S", 0.1)
     words = ["sweep", str(log), "--scheduler", "tcp://127.0.0.1:1", "--out", str(tmp_path / "out")]
     refused = called(*words)
-    assert refused.exit_code == 1
+    assert (refused.exit_code, (tmp_path / "out").exists()) == (1, False)
     assert "tcp://127.0.0.1:1 is open" in refused.stderr
     assert refused.stderr.splitlines()[-1].startswith("adacd-hil: no Dask scheduler at tcp://127.0.0.1:1: ")

@@ -540,3 +540,4 @@ def test_init_ends_with_the_commands_up_to_the_first_run_of_which_tare_is_one(tm
     arm = ["-i", "socketcan", "-c", "can0", "--config", str(out)]
     assert typed[2][2:] == [*arm, "--out", str(out.with_name("tare.toml"))]
     assert typed[3][2:] == [*arm, "--tare", str(out.with_name("tare.toml"))]
+    assert f"`adacd-hil config check {shlex.quote(str(out))}`" in out.read_text()

@@ -16,6 +16,7 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.wire.budget import compute_budget
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 
 DRIVE_PROFILE = Path(adacd_hil.__file__).parent / "device_profiles" / "adacd-drive.toml"
@@ -47,6 +48,7 @@ def test_profiles_compose_to_the_dbc_bit_for_bit(name: str) -> None:
     composed = compose(settings, place_devices(settings))
     assert layout(composed.text.decode()) == layout(by_hand.text.decode())
     assert composed.layout_digest == by_hand.layout_digest
+    assert compute_budget(composed).frames == compute_budget(by_hand).frames
 
 
 def test_cantools_reads_a_composed_contract_without_a_warning() -> None:
@@ -100,6 +102,7 @@ def test_a_misspelt_contract_is_told_the_nearest() -> None:
             ("(1e-06,0)", "(1e-05,0)"),
             "Sensor1Torque: scales torque .* by the device profile, torque .* by contract",
         ),
+        ({}, ("(1e-06,0)", "(1e999,0)"), "torque inf by contract"),  # 0 counts would be NaN
         ({"drive_node": [1, 7]}, ("", ""), "Drive2.*: identifier 0x.* by the device profile"),
         ({}, ("SG_ torque_actual", "SG_ torque"), "Drive1Status: signals statusword, mode_display, torque_actual"),
         ({}, ("f5ddf3da", "f5ddf3db"), "data ids or places of signals differ"),

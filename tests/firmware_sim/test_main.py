@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -36,14 +37,16 @@ SOCKETCAN = ("run", "-i", "socketcan", "-c", "no_such_can0")
         ((*SOCKETCAN, "--node-offset", "4", "--host-node", "5"), 2, "Drive1Emcy: node id 5 is the host's"),
         ((*SOCKETCAN, "--scenario", "papper"), 2, "did you mean 'paper'"),
         ((*SOCKETCAN, "--scenario", "missing.toml"), 2, "missing.toml"),
-        ((*SOCKETCAN, "--out", "/dev/null"), 2, "/dev/null"),
+        ((*SOCKETCAN, "--out", "fifo"), 2, "fifo"),
         ((*SOCKETCAN, "--out", __file__), 2, "test_main.py"),
         (SOCKETCAN, 5, "no_such_can0"),
         (("run", "-i", "sockedcan", "-c", "can0"), 5, "did you mean 'socketcan'"),
         (("run", "-i", "udp_multicast", "-c", "239.0.0.1"), 5, "echoes"),
     ],
 )
-def test_bad_input_ends_with_one_line_and_its_exit_code(capsys, arguments, code, words):
+def test_bad_input_ends_with_one_line_and_its_exit_code(monkeypatch, tmp_path, capsys, arguments, code, words):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("fifo")
     assert run_main(*arguments) == code
     printed = capsys.readouterr()
     assert printed.out == ""

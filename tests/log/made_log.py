@@ -1,8 +1,10 @@
 """Small recordings made by hand, and surgery on the records of a log that leaves everything else as it must be."""
 
 import io
+import resource
 import struct
 import zlib
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import can
@@ -24,6 +26,17 @@ MILLISECOND = 1_000_000
 ATTACHMENTS = {"config.toml": b"x = 1\n", "arm.dbc": b"VERSION"}
 RUN = {"epoch_ns": "0", "parameter_count": "7", "name": "Prüfung"}
 SUMMARY = {"messages": "20", "frames": "0", "dropped": "0", "ending": "closed"}
+
+
+@contextmanager
+def disk_full_at(size):
+    """Let this process write no file beyond a size, until the block ends, however it ends."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 class MemorySink(io.BytesIO):

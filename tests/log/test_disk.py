@@ -3,11 +3,11 @@
 import dataclasses
 import os
 import re
-import resource
 import threading
 
 import pytest
 from live_rig import ThreadedWriter, setup_of
+from made_log import disk_full_at
 from recorded_run import make_run
 
 from adacd_hil.log.log_files import find_parts
@@ -115,42 +115,30 @@ def test_a_slow_disk_costs_packets_and_bounded_memory(tmp_path):
     assert log.scheme.block[-100:].tobytes() == run.blocks[-100:].tobytes()
 
 
-class Disk:
-    """What this process may write to files: while the disk is full, nothing."""
-
-    def __init__(self):
-        self._limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-
-    def fill(self):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (0, self._limits[1]))
-
-    def free(self):
-        resource.setrlimit(resource.RLIMIT_FSIZE, self._limits)
-
-
-@pytest.fixture
-def disk():
-    disk = Disk()
-    yield disk
-    disk.free()
-
-
 def create(path):
     return os.open(path, os.O_WRONLY | os.O_CREAT)
 
 
-def test_a_full_disk_is_tried_again_with_another_part(tmp_path, disk):
-    run = make_run(1200)
+@pytest.fixture
+def writer(tmp_path):
+    """It ends though the test fails: sockets that it left open would fail the next one."""
     path = tmp_path / "run.mcap"
     writer = Writer(path, create(path))
+    yield writer
+    if writer.ring.capacity:
+        writer.end()
+
+
+def test_a_full_disk_is_tried_again_with_another_part(tmp_path, writer):
+    run = make_run(1200)
+    path = writer.sink.path
     writer.feed(run.cycles[:300])
     writer.wait_until_taken()
-    disk.fill()
-    writer.feed(run.cycles[300:900])
-    writer.wait_until_taken()
-    full = f"log {path} can't be written: File too large; packets are dropped until there is room"
-    assert writer.told == [full]
-    disk.free()
+    with disk_full_at(0):
+        writer.feed(run.cycles[300:900])
+        writer.wait_until_taken()
+        full = f"log {path} can't be written: File too large; packets are dropped until there is room"
+        assert writer.told == [full]
     failed = writer.clock.now
     writer.wait(lambda: writer.clock.now > failed + 2 * RETRY_PERIOD_NS)
     writer.feed(run.cycles[900:])
@@ -169,14 +157,12 @@ def test_a_full_disk_is_tried_again_with_another_part(tmp_path, disk):
     assert_accounts_for(log, run.cycles, int(word["lost"]))
 
 
-def test_a_part_without_data_is_begun_again_when_there_is_room(tmp_path, disk):
+def test_a_part_without_data_is_begun_again_when_there_is_room(writer):
     run = make_run(400)
-    path = tmp_path / "run.mcap"
-    writer = Writer(path, create(path))
-    disk.fill()
-    writer.feed(run.cycles[:200])
-    writer.wait_until_taken()
-    disk.free()
+    path = writer.sink.path
+    with disk_full_at(0):
+        writer.feed(run.cycles[:200])
+        writer.wait_until_taken()
     failed = writer.clock.now
     writer.wait(lambda: writer.clock.now > failed + 2 * RETRY_PERIOD_NS)
     writer.feed(run.cycles[200:])
@@ -188,19 +174,18 @@ def test_a_part_without_data_is_begun_again_when_there_is_room(tmp_path, disk):
 
 
 @pytest.mark.parametrize("has_chunk", [False, True])
-def test_a_disk_that_stays_full_leaves_no_part_without_data(has_chunk, tmp_path, disk):
+def test_a_disk_that_stays_full_leaves_no_part_without_data(has_chunk, tmp_path, writer):
     run = make_run(400)
-    path = tmp_path / "run.mcap"
-    writer = Writer(path, create(path))
+    path = writer.sink.path
     if has_chunk:
         writer.feed(run.cycles[:200])
         writer.wait_until_taken()
-    disk.fill()
-    writer.feed(run.cycles[200:])
-    writer.wait_until_taken()
-    failed = writer.clock.now
-    writer.wait(lambda: writer.clock.now > failed + 4 * RETRY_PERIOD_NS)
-    word = writer.end()
+    with disk_full_at(0):
+        writer.feed(run.cycles[200:])
+        writer.wait_until_taken()
+        failed = writer.clock.now
+        writer.wait(lambda: writer.clock.now > failed + 4 * RETRY_PERIOD_NS)
+        word = writer.end()
     assert word["lost"] == str(packets_of(run.cycles[200:]))
     assert [file.name for file in tmp_path.iterdir()] == ["run.mcap"]
     assert path.stat().st_size == 0 if not has_chunk else len(read_log(path).scheme) == 200
@@ -225,10 +210,9 @@ def test_what_was_dropped_is_counted_in_one_part_only(tmp_path):
     assert log.summary["dropped"] == "5"
 
 
-def test_a_packet_that_makes_no_sense_is_dropped_alone(tmp_path):
+def test_a_packet_that_makes_no_sense_is_dropped_alone(writer):
     run = make_run(10)
-    path = tmp_path / "run.mcap"
-    writer = Writer(path, create(path))
+    path = writer.sink.path
     writer.feed(run.cycles[:5])
     for packet in (
         pack_cycle(1, 0, [], [(True, Frame(1, bytes(65), 0))]),

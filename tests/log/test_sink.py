@@ -1,7 +1,8 @@
 """The file behind a thread: order, position and failure."""
 
 import os
-import resource
+
+from made_log import disk_full_at
 
 from adacd_hil.log.recording.log_file import Sink
 
@@ -29,14 +30,10 @@ def test_a_file_that_can_not_be_closed_is_reported(tmp_path):
 def test_a_failure_ends_the_file_at_the_last_whole_write_though_there_is_room_again(tmp_path):
     path = tmp_path / "file"
     sink = Sink(os.open(path, os.O_WRONLY | os.O_CREAT))
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (150, hard))
-    try:
+    with disk_full_at(150):
         sink.write(b"a" * 100)
         sink.write(b"b" * 100)
         sink.settle()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     sink.write(b"c")
     sink.close_file()
     assert sink.error == "File too large after 100 bytes"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from adacd_hil.control.history_file import read_history
 from adacd_hil.control.tare_file import read_tare
 from adacd_hil.device.device_files import load_profile
 from adacd_hil.lab.offline.recording_map import read_map
@@ -139,6 +140,7 @@ def test_a_fifo_or_a_device_is_no_configuration_and_no_scenario(load, tmp_path):
         ("scenario", lambda path: load_scenario(str(path))),
         ("map", read_map),
         ("tare", read_tare),
+        ("history", read_history),
         ("device profile", lambda path: load_profile(str(path), "drive")),
     ],
 )

@@ -138,6 +138,11 @@ REFUSED = {
         "controlword : 23|16@0+",
         r"Drive1Command.controlword: only plain little",
     ),
+    "a float, which could be NaN": (
+        "VAL_ 641",
+        "SIG_VALTYPE_ 387 torque : 1;\nVAL_ 641",
+        r"Sensor1Torque.torque: only plain little-endian integers can be cyclic",
+    ),
     "31 bits": ("SG_ velocity : 32|32@1-", "SG_ velocity : 32|31@1-", r"Drive1Feedback.velocity: bits 32\+31 overlap"),
     "a gap": (' SG_ error_register : 8|8@1+ (1,0) [0|255] "" HOST\n', "", r"Sensor1Status: signals cover 8 of 16 bits"),
     "no header": (

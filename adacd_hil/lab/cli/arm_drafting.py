@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil import __version__
-from adacd_hil.cli.output import CommandError, ExitCode, tell
+from adacd_hil.cli.output import CommandError, ExitCode, quoted, tell
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.control.configuration_check import ConfigurationFindings, examine_configuration
 from adacd_hil.dates import format_date
@@ -187,7 +187,7 @@ class Drafting:
         title += f" from {self.bus['interface']} {self.bus['channel']}." if self.bus else " without hardware."
         for period_us in _PERIODS_US if facts.period_us in _PERIODS_US else (facts.period_us,):
             entries, warnings = draft_arm(facts._replace(period_us=period_us))
-            text = draft_as_toml(entries, title, self.writing.out.name)
+            text = draft_as_toml(entries, title, quoted(self.writing.out))
             if not self.writing.examine(text).is_late:
                 break
         summary: dict[str, Any] = {

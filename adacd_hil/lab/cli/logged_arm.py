@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from adacd_hil import __version__
-from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode, quoted
 from adacd_hil.clock import wall_ns
 from adacd_hil.dates import format_date
 from adacd_hil.device.contract import find_contract
@@ -63,7 +63,7 @@ def draft_from_log(
             entries.append(Entry(f"devices.{kind}", tuple(devices.beside(name, kind) for name in names), "given"))
     title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]} from the log {path.name}."
     summary = {"from": str(path), "assumed": list(settings.assumed), "warnings": warnings}
-    written = draft_as_toml(entries, title, files.out.name, base)
+    written = draft_as_toml(entries, title, quoted(files.out), base)
     files.examine(written)
     return written, summary
 

@@ -88,7 +88,6 @@ def sweep(
         raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
     plan = _plan(logs, scenarios, seeds, vary, config, profile or "")
     work = replay_task if logs else simulate_task
-    store = SweepStore(out)
     tls = dict(zip(NO_FILES, (tls_ca_file, tls_cert, tls_key), strict=True))
     with Progress() as progress:
         progress(
@@ -101,6 +100,7 @@ def sweep(
             )
         count = workers or len(os.sched_getaffinity(0))
         with connect(scheduler, min(count, plan.size), tls, (work.__module__, "adacd_hil.replay.replay")) as pool:
+            store = SweepStore(out)
             outcome = run_sweep(plan, work, store, pool, progress)
         about = {"version": plan.version, "config": config, "varied": ", ".join(plan.varied)}
         table = store.join(plan.row_keys(), about)

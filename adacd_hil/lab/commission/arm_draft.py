@@ -698,7 +698,7 @@ extends = "{base}"
 def draft_as_toml(entries: Sequence[Entry], title: str, name: str, base: str = "certified") -> str:
     """Return a draft as the text of a commented TOML file; guesses are listed in `assumed`.
 
-    title: its first comment. name: of the file, for the commands in its comments. base: configuration that it extends.
+    title: its first comment. name: of the file, quoted for a shell. base: configuration that it extends.
     """
     lines = [_HEAD.format(title=one_line(title), name=one_line(name), base=base).rstrip()]
     if assumed := assumed_keys(entries):

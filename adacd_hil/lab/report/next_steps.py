@@ -1,7 +1,7 @@
 """Next steps for the reader of a report: a sentence each, with the command for it, the gravest first.
 
-Commands are for the folder of the log: they name it by its file name alone, so that the same log gives the same page
-wherever it lies. Texts of a log are quoted for the shell.
+Commands of a page are for the folder of the log: they name it by its file name alone, so that the same log gives the
+same page wherever it lies. Names are quoted for the shell.
 """
 
 import shlex
@@ -30,8 +30,8 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
         source.log_problem
     )
     if run.cycle.size == 0:
-        return [*steps, _checked(run, "The arm was not moved. Mend the cause above.")], []
-    steps += _repairs(metrics, run, log)
+        return [*steps, _checked(run, source, "The arm was not moved. Mend the cause above.")], []
+    steps += _repairs(metrics, run, source)
     key = "filter.a_rad_s=20" if metrics.evidence is None else "certified.noise_sigmas=8"
     more = [
         NextStep("Check that the log replays to the same decisions.", f"adacd-hil replay {log}"),
@@ -45,11 +45,12 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
     return steps[:STEPS], steps[STEPS:] + more
 
 
-def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
+def _repairs(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]:
     """Return a next step for each kind of failure that the run shows; [] if there is none."""
+    log = _quoted(source.log_name)
     has_stopped = bool(metrics.fault) or (not metrics.adaptation_s and run.stretch is None)
-    stopped = _checked(run, "Mend the cause above.")
-    late = _checked(run, "Frames came late or were lost, more than allowed.")
+    stopped = _checked(run, source, "Mend the cause above.")
+    late = _checked(run, source, "Frames came late or were lost, more than allowed.")
     rows = (
         (has_stopped, stopped),
         (not has_stopped and bool(metrics.data.excesses), late),
@@ -60,7 +61,7 @@ def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
         (
             not has_stopped and None in metrics.adaptation_s.values(),
             NextStep("The model was not learned; the notices may say why. Try another motion.",
-                     f"adacd-hil excitation --config {_configuration(run)}"),
+                     f"adacd-hil excitation --config {_configuration(run, source)}"),
         ),
         (
             (any(metrics.adaptation_s.values()) and bool(metrics.false_alarms)) or is_margin_below_1(metrics.evidence),
@@ -77,32 +78,36 @@ def _repairs(metrics: Metrics, run: Run, log: str) -> list[NextStep]:
     return [step for is_so, step in rows if is_so]
 
 
-def _checked(run: Run, text: str) -> NextStep:
+def _checked(run: Run, source: ReportSource, text: str) -> NextStep:
     """Return a next step: `text`, and the `doctor` command for host, bus and arm.
 
     For an emulated arm the command is `demo`, to play the run again.
     """
     interface, channel = run.metadata.get("interface", ""), run.metadata.get("channel", "")
     if interface in ("", EMBEDDED):
-        played = f" --scenario {_scenario(run)}" if run.metadata.get("scenario") else ""
-        return NextStep(f"{text} Play it again.", f"adacd-hil demo --config {_configuration(run)}{played}")
+        played = f" --scenario {_scenario(run, source)}" if run.metadata.get("scenario") else ""
+        return NextStep(f"{text} Play it again.", f"adacd-hil demo --config {_configuration(run, source)}{played}")
     bus = f"-i {_quoted(interface)} -c {_quoted(channel or 'can0')}"
     return NextStep(
-        f"{text} Check host, bus and arm before the next run.", f"adacd-hil doctor {bus} --config {_configuration(run)}"
+        f"{text} Check host, bus and arm before the next run.",
+        f"adacd-hil doctor {bus} --config {_configuration(run, source)}",
     )
 
 
-def _configuration(run: Run) -> str:
-    """Return a run's configuration for a command, quoted for the shell: a built-in name, or `<arm's name>.toml`."""
+def _configuration(run: Run, source: ReportSource) -> str:
+    """Return a run's configuration for a command, quoted for the shell.
+
+    Where the source lacks it, a built-in name, or `<arm's name>.toml`.
+    """
     name = run.metadata.get("config", "")
-    return _quoted(name) if name in builtin_names() else _quoted(f"{name or 'my-arm'}.toml")
+    return _quoted(source.config or (name if name in builtin_names() else f"{name or 'my-arm'}.toml"))
 
 
-def _scenario(run: Run) -> str:
-    """Return a run's scenario for `demo`, quoted for the shell: a built-in name, or `<its name>.toml`."""
+def _scenario(run: Run, source: ReportSource) -> str:
+    """Return a run's scenario for `demo`, quoted for the shell; where the source lacks it, as of `_configuration`."""
     name = run.metadata["scenario"]
     is_builtin = name in toml_names(resources.files("firmware_sim") / "scenarios")
-    return _quoted(name if is_builtin else f"{name}.toml")
+    return _quoted(source.scenario or (name if is_builtin else f"{name}.toml"))
 
 
 def _quoted(text: str) -> str:

@@ -40,7 +40,7 @@ HTML_NAME: Final = "report.html"
 class Report:
     """A report that has been written, with its run's metrics.
 
-    content: of report.json.
+    content: of report.json. next_steps: for the terminal.
     """
 
     metrics: Metrics
@@ -94,14 +94,19 @@ def write_report(
     *,
     stretch: TimeWindow = WHOLE,
     progress: Progress = lambda _: None,
+    config: str = "",
+    scenario: str = "",
 ) -> Report:
     """Read a log, or a stretch of it, with the emulator's truth if there is one; write and return its report.
 
     Raises LogError if a log can't be read or the report can't be written, ConfigError for the log's configuration.
-    progress: called with a line on the cycles read.
+    progress: called with a line on the cycles read. config, scenario: as of `ReportSource`, for the next steps
+    that are returned, which name the log by `log_path`.
     """
     run, gathered, source = read_run(log_path, truth_path, stretch, progress)
-    return write_run_report(run, out_dir, source, gathered)
+    report = write_run_report(run, out_dir, source, gathered)
+    here = source._replace(log_name=str(log_path), config=config, scenario=scenario)
+    return dataclasses.replace(report, next_steps=tuple(next_steps(report.metrics, run, here)[0]))
 
 
 def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: RunGatherer | None = None) -> Report:

@@ -200,9 +200,10 @@ def last_step_before_contradiction(k: Constants, m: Memory) -> int:
 
 @compiled
 def first_unexplained(m: Memory) -> int:
-    """Return the index, from 0, of about the first learnt sample that the fit's belief doesn't explain; -1 without one.
+    """Return the index, from 0, of the first kept sample that the fit's belief doesn't explain, less FIRST_EVERY - 1.
 
-    Unexplained: a residual over `limit_Nm`. Only kept samples are examined. -1 for a payload's fit, too.
+    -1 without one, and for a payload's fit. Unexplained: a residual over `limit_Nm`. Up to `samples_every` - 1 learnt
+    samples before it are not kept, so not examined.
     """
     kept, first = int(m.fit_check.samples_kept), -1
     if m.models.is_payload != 0.0 or kept < 2:
