@@ -1,4 +1,4 @@
-"""Bounds that commands state in their help and the lab judges by; this module imports nothing, so that help is fast."""
+"""Bounds and words that commands state in their help and the lab judges by; it imports nothing, so help is fast."""
 
 from typing import Final
 
@@ -8,3 +8,5 @@ MOST_RATE_PER_H: Final = 1e4
 SUFFICIENT_SHARE: Final = 0.90
 GOOD_SHARE: Final = 0.95
 """Of a communication test's cycles with complete fresh data: less is not sufficient, or poor."""
+STATUSES: Final = ("good", "not good", "not judged", "broken", "running")
+"""Of runs."""

@@ -8,6 +8,8 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_truth
 from adacd_hil.cli.options import (
+    HOST,
+    PORT,
     clock_option,
     config_option,
     json_option,
@@ -305,7 +307,7 @@ def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode
 
 
 @click.command(epilog=EPILOG)
-@on_bus_or_url("Watch the live view of a run instead, such as ws://127.0.0.1:8765.")
+@on_bus_or_url(f"Watch the live view of a run instead, such as ws://{HOST}:{PORT}.")
 @click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
 @click.option("--once", is_flag=True, help="Listen for 1 s, print one table, end.")
 @click.option("--seconds", type=click.FloatRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
