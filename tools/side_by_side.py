@@ -26,6 +26,7 @@ import yardstick
 from numpy.typing import NDArray
 
 import adacd_hil
+from adacd_hil.cli.output import ExitCode
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.types.topics import CYCLE
@@ -44,8 +45,8 @@ WINDOW_TRIES = 4
 QUIET_PERCENT = 10.0
 START_LIMIT_S = 120.0
 END_LIMIT_S = 30.0
-ENDED_WELL = (0, 3, 130)
-"""3: the log lacks what the machine had no time to write; 130: SIGINT, as asked."""
+ENDED_WELL = (ExitCode.OK, ExitCode.PARTIAL, ExitCode.INTERRUPTED)
+"""PARTIAL: the log lacks what the machine had no time to write; INTERRUPTED: by SIGINT, as asked."""
 TITLES = {
     "lateness": "lateness of wake-up",
     "stamp": "SYNC out to last frame's stamp",
