@@ -102,7 +102,7 @@ class Distribution:
         return dict(zip(PERCENTILE_NAMES, map(self._at, ranks), strict=True))
 
     def low_percentiles(self) -> dict[str, float]:
-        """Return the mirrored PERCENTILES by LOW_PERCENTILE_NAMES, for values that must not be small; {} without any."""
+        """Return the mirrored PERCENTILES by LOW_PERCENTILE_NAMES, for values that mustn't be small; {} without any."""
         if self._bins is None:
             return low_percentiles(self._values())
         ranks = [self.count - 1 - int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from adacd_hil.clock import Clock
+from adacd_hil.device.arm_watch import STATES
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.device_setup import Slave
 from adacd_hil.lab.commission.traffic import Talk, Traffic, listen
@@ -37,7 +38,7 @@ _UPLOAD_DEVICE_TYPE = bytes.fromhex("4000100000000000")
 _IDENTITY = ("vendor", "product", "revision", "serial")
 _CONTRACT = ("wire_version", "layout_digest")
 
-NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
+NMT_STATES = {number: name.lower() for number, name in STATES.items()}
 _PROFILES = {401: "I/O", 402: "drive", 404: "measuring device", 405: "PLC", 406: "encoder", 408: "hydraulic drive"}
 
 # Predefined connection set, CiA 301 table 38: function code to the service that a node sends with it.
