@@ -55,8 +55,9 @@ class EmulatorExit(IntEnum):
 
 
 EPILOG = (
-    "Exit status: 0 ended by SIGINT, SIGTERM, SIGHUP or --once; 1 failure (the bus or the truth log failed); "
-    "2 wrong usage or configuration; 5 bus missing."
+    f"Exit status: {EmulatorExit.OK} ended by SIGINT, SIGTERM, SIGHUP or --once; {EmulatorExit.FAILURE} failure (the "
+    f"bus or the truth log failed); {EmulatorExit.USAGE} wrong usage or configuration; {EmulatorExit.BUS_MISSING} bus "
+    "missing."
 )
 
 _CODES: tuple[tuple[type[Exception], EmulatorExit], ...] = (
@@ -207,8 +208,9 @@ def run(
 
 @cli.command(
     "play",
-    epilog="Exit status: 0 ended by SIGINT, SIGTERM, SIGHUP or --once; 1 failure (the bus failed, the recording is "
-    "damaged or of another contract); 2 wrong usage; 5 bus missing.",
+    epilog=f"Exit status: {EmulatorExit.OK} ended by SIGINT, SIGTERM, SIGHUP or --once; {EmulatorExit.FAILURE} failure "
+    f"(the bus failed, the recording is damaged or of another contract); {EmulatorExit.USAGE} wrong usage; "
+    f"{EmulatorExit.BUS_MISSING} bus missing.",
 )
 @click.argument("log", type=GivenPath(dir_okay=False))
 @on_bus
@@ -299,7 +301,9 @@ def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int 
     return EmulatorExit.OK
 
 
-@cli.command("check", epilog="Exit status: 0 every file can be played; 2 one can't.")
+@cli.command(
+    "check", epilog=f"Exit status: {EmulatorExit.OK} every file can be played; {EmulatorExit.USAGE} one can't."
+)
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @click.option(
     "--contract", type=click.Choice(list(CONTRACTS)), default="arm", show_default=True, help="Whose frames faults hit."

@@ -13,6 +13,7 @@ from adacd_hil.cli.output import (
     answer,
     complain_of,
     counted,
+    explain_statuses,
     explained,
     format_table,
     one_by_one,
@@ -29,10 +30,13 @@ if TYPE_CHECKING:
     from adacd_hil.replay.replayed_outcome import Replay
     from adacd_hil.settings.configuration import Settings
 
-_EPILOG = (
-    "Exit status: 0 identical, or other settings were replayed; 1 something differs, or a log can't be read; 2 wrong "
-    "usage or configuration; 3 all compared cycles are identical, but part of the log can't be compared; 6 a live "
-    "detector of the log can't run here; 130 interrupted."
+_EPILOG = explain_statuses(
+    OK="identical, or other settings were replayed",
+    FAILURE="something differs, or a log can't be read",
+    USAGE="wrong usage or configuration",
+    PARTIAL="all compared cycles are identical, but part of the log can't be compared",
+    DETECTOR_MISSING="a live detector of the log can't run here",
+    INTERRUPTED="interrupted",
 )
 _MOST_COLUMNS = 6
 """Most variants that are printed as columns beside the log's own; more are printed as rows."""

@@ -21,7 +21,16 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, answer, complain_of, explained, print_and_write, writable_folder
+from adacd_hil.cli.output import (
+    EPILOG,
+    ExitCode,
+    answer,
+    complain_of,
+    explain_statuses,
+    explained,
+    print_and_write,
+    writable_folder,
+)
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.lab.cli.compare_command import compare
 from adacd_hil.lab.cli.history_command import history
@@ -212,7 +221,9 @@ def excitation(
     return ExitCode.OK
 
 
-@click.command(epilog="Exit status: 0 the contract fits; 1 it doesn't; 2 wrong usage, configuration or DBC.")
+@click.command(
+    epilog=explain_statuses(OK="the contract fits", FAILURE="it doesn't", USAGE="wrong usage, configuration or DBC")
+)
 @click.option(
     "--dbc", metavar="NAME|FILE", help="The contract: the package's, or a file; default: the configuration's devices'."
 )

@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import RUNS, CommandError, ExitCode, answer, counted, explained, format_table
+from adacd_hil.cli.output import (
+    RUNS,
+    CommandError,
+    ExitCode,
+    answer,
+    counted,
+    explain_statuses,
+    explained,
+    format_table,
+)
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.lab.stated_bounds import STATUSES
 from adacd_hil.log.log_files import LOG_NAME, LogError
@@ -23,9 +32,12 @@ if TYPE_CHECKING:
     from adacd_hil.lab.runs.run_table import RunFilter
     from adacd_hil.lab.runs.run_trend import Trend
 
-_EPILOG = (
-    "Exit status: 0 done; 1 no run there, or a file can't be written; 2 wrong usage; 3 the log of a run is broken, the "
-    "others are listed; 130 interrupted."
+_EPILOG = explain_statuses(
+    OK="done",
+    FAILURE="no run there, or a file can't be written",
+    USAGE="wrong usage",
+    PARTIAL="the log of a run is broken, the others are listed",
+    INTERRUPTED="interrupted",
 )
 _DATE_FORMS = "2026-11-25, 2026-11-25T14:22 or 2026-11-25T14:22:33"
 

@@ -11,7 +11,7 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained
+from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.printable import in_line
@@ -25,9 +25,14 @@ _SIMULATED_CONFIG = "certified"
 
 
 @click.command(
-    epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` has the reason, or a log is "
-    "damaged, see `notes`, or the disk is full; 1 the cluster is lost, or the folder can't be written; 2 wrong usage "
-    "or configuration; 130 interrupted: the same command continues."
+    epilog=explain_statuses(
+        OK="every row has a result",
+        PARTIAL="some rows failed, the column `error` has the reason, or a log is damaged, see `notes`, or the disk is "
+        "full",
+        FAILURE="the cluster is lost, or the folder can't be written",
+        USAGE="wrong usage or configuration",
+        INTERRUPTED="interrupted: the same command continues",
+    )
 )
 @click.argument("logs", nargs=-1, type=GivenPath(), shell_complete=complete_run)
 @click.option(
