@@ -55,6 +55,8 @@ CONFIG_DIGEST_KEY = "host_config_sha256"
 """Metadata of the emulator's log where the host is in the same process: of its configuration."""
 MOST_VIEWERS = 8
 """Viewers of a run's live view at a time, unless --live-viewers says otherwise."""
+SHOWN = 20
+"""Mismatches, gaps and notes that are listed, of mismatches unless --shown says otherwise; all are counted."""
 _DIGITS, _MOST_DIGITS = 3, 5
 
 

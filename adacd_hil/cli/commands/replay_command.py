@@ -20,6 +20,7 @@ from adacd_hil.cli.output import (
     quoted,
 )
 from adacd_hil.given_path import GivenPath
+from adacd_hil.log.log_files import SHOWN
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
@@ -62,7 +63,7 @@ _MOST_COLUMNS = 6
     type=click.FloatRange(0.0, 1.0),
     help="Relative tolerance of real values; default: 0 on the same machine.",
 )
-@click.option("--shown", type=click.IntRange(min=0), default=20, show_default=True, help="Mismatches to print.")
+@click.option("--shown", type=click.IntRange(min=0), default=SHOWN, show_default=True, help="Mismatches to print.")
 @json_option
 @explained
 @stretch_options

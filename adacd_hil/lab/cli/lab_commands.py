@@ -41,7 +41,7 @@ from adacd_hil.lab.cli.play_command import play
 from adacd_hil.lab.cli.runs_command import runs, trend
 from adacd_hil.lab.cli.sweep_command import sweep
 from adacd_hil.lab.cli.tune_command import rate_option, tune
-from adacd_hil.lab.stated_bounds import GOOD_SHARE, SUFFICIENT_SHARE
+from adacd_hil.lab.stated_bounds import GOOD_SHARE, LISTEN_S, PLAIN_S, SUFFICIENT_SHARE
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.settings.toml_text import to_toml
 
@@ -262,7 +262,7 @@ def budget(
 @click.command(epilog=EPILOG)
 @on_bus
 @click.option(
-    "--seconds", type=click.FloatRange(0.1, 600.0), default=1.5, show_default=True, help="How long to listen."
+    "--seconds", type=click.FloatRange(0.1, 600.0), default=LISTEN_S, show_default=True, help="How long to listen."
 )
 @json_option
 def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
@@ -320,7 +320,7 @@ def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode
 @click.command(epilog=EPILOG)
 @on_bus_or_url(f"Watch the live view of a run instead, such as ws://{HOST}:{PORT}.")
 @click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
-@click.option("--once", is_flag=True, help="Listen for 1 s, print one table, end.")
+@click.option("--once", is_flag=True, help=f"Listen for {PLAIN_S:g} s, print one table, end.")
 @click.option("--seconds", type=click.FloatRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
 @json_option
 def monitor(
@@ -331,7 +331,7 @@ def monitor(
     With --url: watch a run that was started with --live: state, residuals against their thresholds, parameters,
     contacts, events. Redraws a terminal in place until Ctrl-C, which ends it with exit status 0.
     """
-    from adacd_hil.lab.cli.monitor_command import PLAIN_S, watch
+    from adacd_hil.lab.cli.monitor_command import watch
 
     listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
     if not isinstance(place, str):

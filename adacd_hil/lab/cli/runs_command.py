@@ -21,7 +21,7 @@ from adacd_hil.cli.output import (
     format_table,
 )
 from adacd_hil.given_path import GivenPath, WrittenPath
-from adacd_hil.lab.stated_bounds import STATUSES
+from adacd_hil.lab.stated_bounds import MEANT_SHARE, STATUSES, THRESHOLD_SHARE
 from adacd_hil.log.log_files import LOG_NAME, LogError
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
@@ -156,9 +156,9 @@ def runs(
 @click.option(
     "--share",
     type=click.FloatRange(0.0, 10.0, min_open=True),
-    default=0.4,
+    default=THRESHOLD_SHARE,
     show_default=True,
-    help="A threshold that differs by more than this share has changed; a quarter of it where settings have.",
+    help=f"A threshold that differs by more than this share has changed; {MEANT_SHARE:g} of it where settings have.",
 )
 @click.option(
     "--out", type=WrittenPath(dir_okay=False), metavar="FILE.html", help="Write a page with its curves and tables."

@@ -13,7 +13,7 @@ from adacd_hil.cli.completion import complete_run, complete_scenario, complete_s
 from adacd_hil.cli.options import json_option, profile_option
 from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
-from adacd_hil.log.log_files import LOG_NAME
+from adacd_hil.log.log_files import LOG_NAME, SHOWN
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 
@@ -87,7 +87,6 @@ def sweep(
     """
     from adacd_hil.lab.tune.sweep import SweepStore, replay_task, run_sweep
     from adacd_hil.lab.tune.workers import NO_FILES, TLS, connect
-    from adacd_hil.log.logged_run import SHOWN
 
     if bool(logs) == bool(scenarios):
         raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
