@@ -458,7 +458,7 @@ def _devices(facts: ArmFacts) -> Iterator[Entry]:
         yield Entry("devices.bitrate", facts.bitrate, "of the bus")
     if facts.data_bitrate is not None:
         yield Entry("devices.data_bitrate", facts.data_bitrate, "of CAN FD's data phase")
-    if facts.period_us != 1000:
+    if facts.period_us != _MODEL.bus.period_us:
         yield Entry("bus.period_us", facts.period_us, "in which the frames fit; `adacd-hil budget` shows how")
 
 
