@@ -23,12 +23,12 @@ from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.printable import in_line, one_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.settings.arm_settings import BusSettings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import open_terminals, terminal_columns, write_result
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import Codec, CodecError
-from adacd_hil.wire.contract_frames import HOST_NODE
 from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.moved_contract import move_contract
 from firmware_sim.arm.arms import ARMS
@@ -88,7 +88,7 @@ _OPTIONS = (  # last first: click lists them the other way round
     click.option(
         "--host-node",
         type=click.IntRange(1, 127),
-        default=HOST_NODE,
+        default=BusSettings().host_node,
         show_default=True,
         help="Node id of the arm's host: bus.host_node of its configuration.",
     ),
