@@ -21,8 +21,8 @@ _SCHED_DEADLINE = 6
 _SCHED_FLAG_RESET_ON_FORK = 1
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
 _DEADLINE_SHARE = 0.8
-"""Part of each period that SCHED_DEADLINE reserves: feedback is awaited for 0.7 of it and sleeps need no reserve. The
-kernel refuses a share that leaves less than 5 % of all processors to others."""
+"""Part of each period that SCHED_DEADLINE reserves: feedback is awaited for FEEDBACK_SHARE of it and sleeps need
+no reserve. The kernel refuses a share that leaves less than 5 % of all processors to others."""
 
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT_AND_FUTURE = 3

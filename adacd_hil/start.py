@@ -12,6 +12,9 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
+INTERRUPTED = 130
+"""Exit status of the host's program after Ctrl-C; here, as its other ones take long to import."""
+
 
 def start_program(load: Callable[[], Callable[[], NoReturn]], interrupted: int, line: str = "") -> NoReturn:
     """Call `load`, which imports the command line, then call the function that it returns.

@@ -23,8 +23,10 @@ from foreign_arms import record, urdf_text
 
 from adacd_hil.api import load
 from adacd_hil.cli.embedded_run import resolve, run_embedded
+from adacd_hil.cli.output import ExitCode
 from adacd_hil.lab.detectors.detectors import DetectorBankSettings, unregister
 from adacd_hil.lab.logs.python_can_files import McapReader
+from firmware_sim.cli.emulator_main import EmulatorExit
 
 PAGE_NAMES = [str(path.relative_to(ROOT)) for path in PAGES]
 COMMAND = re.compile(r"(\$ )?(\.venv/bin/)?(adacd-hil|firmware-sim|make|tools/\S+|python|pip|can_\w+) \S")
@@ -274,3 +276,10 @@ def test_a_python_example_runs(page, documents, folder, capsys):
     elif page == "detectors.md":
         assert "magnitude" in DetectorBankSettings().detectors
         unregister("magnitude")
+
+
+def test_the_page_of_commands_lists_the_exit_statuses_of_both_programs() -> None:
+    section = (ROOT / "docs" / "commands.md").read_text().partition("## Exit statuses")[2].partition("## ")[0]
+    listed, emulator = section.split("`firmware-sim`")
+    assert [int(status) for status in re.findall(r"^- (\d+):", listed, re.MULTILINE)] == list(ExitCode)
+    assert [int(status) for status in re.findall(r"\d+", emulator)] == list(EmulatorExit)

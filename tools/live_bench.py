@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from side_by_side import patient_config
 
 from adacd_hil.cli.embedded_run import Cast, resolve, run_embedded
+from adacd_hil.cli.options import HOST
 from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.log.reader import Series, read_log
 from adacd_hil.log.types.topics import CYCLE, SCHEME
@@ -70,7 +71,7 @@ def run(blocks: int, block_s: float, folder: Path) -> dict[str, Any]:
             url = line.removeprefix("live view: ").split(",")[0]
             viewers.append(subprocess.Popen([*words, url], stdout=subprocess.PIPE))
 
-    summary, _ = run_embedded(cast, "realtime", folder, on_progress, LiveView("127.0.0.1", 0))
+    summary, _ = run_embedded(cast, "realtime", folder, on_progress, LiveView(HOST, 0))
     viewed, _ = viewers[0].communicate(timeout=60.0) if viewers else (b"", b"")
     if summary.error or summary.result is None or not viewers or viewers[0].returncode:
         ended = "" if summary.result is None else f" after {summary.result.cycles} cycles, {summary.result.fault.name}"

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from adacd_hil.cli.options import HOST, PORT
 from adacd_hil.lab.live.client import LiveMessage, live_client
 from adacd_hil.lab.live.feed import EVERY_MESSAGE, rate_of
 from adacd_hil.log.log_files import LogError
@@ -80,7 +81,7 @@ def as_text(topics: dict[str, dict[str, Any]]) -> str:
 def main() -> None:
     """Watch and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("url", nargs="?", default="ws://127.0.0.1:8765")
+    parser.add_argument("url", nargs="?", default=f"ws://{HOST}:{PORT}")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()

@@ -24,6 +24,7 @@ from mcap.records import Attachment
 
 from adacd_hil.lab.logs.salvaged_log import SalvagedLog
 from adacd_hil.log.log_files import (
+    CLOSED,
     CONTINUED,
     ENDING_KEY,
     FIELDS_KEY,
@@ -231,7 +232,7 @@ class Writer:
 
     def close(self) -> None:
         """End the log."""
-        self._end("closed")
+        self._end(CLOSED)
 
 
 def write(log: LongLog, path: Path, seconds: float, loop_s: tuple[float, float] | None, is_truth: bool) -> None:

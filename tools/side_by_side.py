@@ -26,9 +26,11 @@ import yardstick
 from numpy.typing import NDArray
 
 import adacd_hil
+from adacd_hil.cli.output import ExitCode
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import RunLog, read_log
 from adacd_hil.log.types.topics import CYCLE
+from adacd_hil.score.distribution import PERCENTILE_NAMES, PERCENTILES
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -44,8 +46,8 @@ WINDOW_TRIES = 4
 QUIET_PERCENT = 10.0
 START_LIMIT_S = 120.0
 END_LIMIT_S = 30.0
-ENDED_WELL = (0, 3, 130)
-"""3: the log lacks what the machine had no time to write; 130: SIGINT, as asked."""
+ENDED_WELL = (ExitCode.OK, ExitCode.PARTIAL, ExitCode.INTERRUPTED)
+"""PARTIAL: the log lacks what the machine had no time to write; INTERRUPTED: by SIGINT, as asked."""
 TITLES = {
     "lateness": "lateness of wake-up",
     "stamp": "SYNC out to last frame's stamp",
@@ -56,7 +58,6 @@ TITLES = {
 """The times of a cycle. The stamp is the kernel's, of the reception of the last frame. When that was read, the host
 doesn't say: it reads no clock then.
 """
-SHARES = (50.0, 99.0, 99.9, 100.0)
 PATIENT = """
 extends = "{base}"
 
@@ -456,13 +457,13 @@ def show_each(title: str, result: dict[str, Any], lines_of: Callable[[str, dict[
 
 
 def time_percentiles_us(times_ns: NDArray[np.int64]) -> list[float]:
-    """Return p50, p99, p99.9 and the maximum, µs; empty without a value."""
-    return [float(value) * 1e-3 for value in np.percentile(times_ns, SHARES)] if len(times_ns) else []
+    """Return PERCENTILES, µs; empty without a value."""
+    return [float(value) * 1e-3 for value in np.percentile(times_ns, PERCENTILES)] if len(times_ns) else []
 
 
 def head(title: str) -> str:
     """Lay out the line above rows of percentiles."""
-    return f"{title:54} {'p50':>8} {'p99':>8} {'p99.9':>8} {'max':>8}"
+    return f"{title:54} {' '.join(f'{name:>8}' for name in PERCENTILE_NAMES)}"
 
 
 def row(name: str, values: Sequence[float]) -> str:

@@ -27,18 +27,17 @@ import numpy as np
 from cantools.autosar import end_to_end
 from mcap.writer import CompressionType, Writer
 
+from adacd_hil.device.arm import FEEDBACK_SHARE
+from adacd_hil.scheme.detect.external_torque import WIDE_SAMPLES
+from adacd_hil.scheme.identify.excitation import EXCITATION_EVERY
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 from adacd_hil.wire.dbc_contract import contract_folder
+from adacd_hil.wire.time_marks import ANSWERS
 
-ANSWERS = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
 PRIORITY = 80
 ADAPTATION_S = 5.2
-HEARTBEAT_S = 0.1
-FEEDBACK_SHARE = 0.7
-SYNC_OVERFLOW = 240
-WIDE_SAMPLES = 5
-EXCITATION_EVERY = 64
 DISABLED = {"e2e_crc": 0, "e2e_status": 0, "controlword": 0, "target_torque": 0}
 SECOND_NS = 1_000_000_000
 FRAME = struct.Struct("<4xIIIxI???B8s")
@@ -282,7 +281,7 @@ class Loop:
         self.wall_ns = time.time_ns() - time.monotonic_ns()
         start_ns = -(-time.monotonic_ns() // period_ns) * period_ns
         end_ns = start_ns + int(seconds * 1e9)
-        heartbeat_cycles = max(1, round(HEARTBEAT_S * 1e9 / period_ns))
+        heartbeat_cycles = max(1, round(self.settings.bus.heartbeat_ms * 1e6 / period_ns))
         cycle, done = -1, 0
         print("running", file=sys.stderr, flush=True)
         busy_ns = time.process_time_ns()

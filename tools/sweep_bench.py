@@ -16,6 +16,8 @@ from pathlib import Path
 
 from pyarrow import parquet
 
+from adacd_hil.lab.tune.sweep import TABLE_NAME
+
 BIN = Path(sys.executable).parent
 
 
@@ -59,7 +61,7 @@ def worker_of(pid: int) -> int:
 
 def rows(out: Path) -> list[dict[str, object]]:
     """Read the table."""
-    return parquet.read_table(out / "sweep.parquet").to_pylist()
+    return parquet.read_table(out / TABLE_NAME).to_pylist()
 
 
 def main() -> None:

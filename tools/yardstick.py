@@ -4,17 +4,15 @@ import shutil
 import subprocess
 from pathlib import Path
 
+from adacd_hil.settings.arm_settings import BusSettings
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.time_marks import ANSWERS
 
 SOURCE = Path(__file__).resolve().parent / "yardstick.c"
 FLAGS = ("-std=gnu11", "-O2", "-Wall", "-Wextra", "-Werror")
 COLUMNS = ("due", "lateness", "feedback", "compute", "command", "answer")
 """Of a sample in the file of option -o; int64, ns."""
-ANSWERS = ("Drive1Feedback", "Drive2Feedback", "Sensor1Torque", "Sensor2Torque")
 COMMANDS = ("Drive1Command", "Drive2Command")
-COUNTERS = 16, 256
-"""Values of the alive counter, classic and CAN FD: so many frames differ when the command doesn't."""
-HEARTBEAT_S = 0.1
 RESET_COMMUNICATION, START, PRE_OPERATIONAL = 0x82, 0x01, 0x80
 OPERATIONAL = 5
 
@@ -36,9 +34,8 @@ def command_frames(codec: Codec, name: str) -> list[bytes]:
     """List the frames of one command in the order of their counter: disabled drive, no torque, end-to-end header."""
     message = codec.message(name)
     sender = message.sender()
-    count = COUNTERS[message.length > 8]
     body = [0] * len(message.values)  # controlword 0 is Disable voltage
-    return [bytes(sender.protect(message.encode_raw(*body))) for _ in range(count)]
+    return [bytes(sender.protect(message.encode_raw(*body))) for _ in range(max(1, message.receiver().counter_range))]
 
 
 def arguments(codec: Codec, channel: str, period_us: int, seconds: float, warm_up_s: float, samples: Path) -> list[str]:
@@ -47,7 +44,7 @@ def arguments(codec: Codec, channel: str, period_us: int, seconds: float, warm_u
     others = [message.can_id for message in codec.messages.values() if message.can_id not in answers]
     nmt = codec.message("Nmt").can_id
     heartbeat = codec.message("HostHeartbeat").can_id
-    every = max(1, round(HEARTBEAT_S * 1e6 / period_us))
+    every = max(1, round(BusSettings().heartbeat_ms * 1e3 / period_us))
     written = ["-i", channel, "-p", str(period_us), "-d", f"{seconds:g}", "-w", f"{warm_up_s:g}", "-o", str(samples)]
     written += ["-s", f"{codec.message('Sync').can_id:03X}"]
     for can_id in answers:

@@ -19,6 +19,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from adacd_hil import start
 from adacd_hil.clock import wall_ns
 from adacd_hil.error_texts import error_text, is_disk_full
 from adacd_hil.file_replacement import Replacement, removing_empty_folders, replace_file
@@ -48,13 +49,23 @@ class ExitCode(IntEnum):
     SAFETY_STOP = 4
     BUS_MISSING = 5
     DETECTOR_MISSING = 6
-    INTERRUPTED = 130
+    INTERRUPTED = start.INTERRUPTED
 
 
-EPILOG = (
-    "Exit status: 0 done; 1 failure (a tare: refused); 2 wrong usage or configuration; 3 partial result (the log lost "
-    "something, or a disk is full); 4 safety stop (the run faulted or the arm fell silent); 5 bus or devices missing; "
-    "6 a live detector can't run here; 130 interrupted."
+def explain_statuses(**meanings: str) -> str:
+    """Return the sentence of a help text with exit statuses; meanings: of each, by its name in ExitCode."""
+    return f"Exit status: {'; '.join(f'{ExitCode[name]} {meaning}' for name, meaning in meanings.items())}."
+
+
+EPILOG = explain_statuses(
+    OK="done",
+    FAILURE="failure (a tare: refused)",
+    USAGE="wrong usage or configuration",
+    PARTIAL="partial result (the log lost something, or a disk is full)",
+    SAFETY_STOP="safety stop (the run faulted or the arm fell silent)",
+    BUS_MISSING="bus or devices missing",
+    DETECTOR_MISSING="a live detector can't run here",
+    INTERRUPTED="interrupted",
 )
 
 

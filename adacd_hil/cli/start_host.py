@@ -3,10 +3,7 @@
 from collections.abc import Callable
 from typing import NoReturn
 
-from adacd_hil.start import start_program
-
-INTERRUPTED = 130
-"""Equals `adacd_hil.cli.output.ExitCode.INTERRUPTED`, whose module takes long to import."""
+from adacd_hil.start import INTERRUPTED, start_program
 
 
 def start_host() -> NoReturn:

@@ -46,7 +46,7 @@ _JUDGED_EVERY: Final = 4
 _ROUNDS: Final = 3
 """Equal verdicts in a row that are needed."""
 _SUSPECT_BLOCKS: Final = 6
-_CORRELATED: Final = 4.0
+CORRELATED: Final = 4.0
 """Number of blocks that count as one: the errors of the equation last longer than a block."""
 DEVIATIONS: Final = 5.0
 _LOG_ODDS: Final = 7.0
@@ -294,7 +294,7 @@ class DeviceReadings:
         possible = [place for place, is_arm in zip(allowed, self._may_be_arms(allowed), strict=True) if is_arm]
         possible.sort(key=lambda place: float(self._shares[place]))
         least = min(self._shares[place] for place in range(len(self._readings)) if self._is_distinct(place))
-        odds = math.exp(min(2.0 * _LOG_ODDS * _CORRELATED / self._freedom, 50.0))
+        odds = math.exp(min(2.0 * _LOG_ODDS * CORRELATED / self._freedom, 50.0))
         left = [place for place in possible if self._shares[place] <= max(1.0 / _BETTER, odds) * least]
         texts: dict[tuple[str, int], Reading] = {}
         for place in left:
@@ -431,7 +431,7 @@ class DeviceReadings:
         scaled = normals / (size[:, :, np.newaxis] * size[:, np.newaxis, :])
         inverse = np.diagonal(np.linalg.inv(scaled + RIDGE * np.eye(scaled.shape[1])), axis1=1, axis2=2)
         spread = self._normals[list(places), -1, -1]
-        left = np.maximum(self._shares[list(places)] * spread, 1e-12) / self._freedom * _CORRELATED
+        left = np.maximum(self._shares[list(places)] * spread, 1e-12) / self._freedom * CORRELATED
         slack = DEVIATIONS * np.sqrt(left[:, np.newaxis] * np.maximum(inverse, 0.0)) / size
         return [may_be_arm(self._solutions[place], slack[row]) for row, place in enumerate(places)]
 

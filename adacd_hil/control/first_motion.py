@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from adacd_hil.control.device_readings import DEVIATIONS, RIDGE, DeviceReadings, Reading, TorqueRatio
+from adacd_hil.control.device_readings import CORRELATED, DEVIATIONS, RIDGE, DeviceReadings, Reading, TorqueRatio
 from adacd_hil.control.geometry_check import EVENT as GEOMETRY
 from adacd_hil.control.geometry_check import geometry_event
 from adacd_hil.device.arm import Arm
@@ -40,8 +40,6 @@ _LONGEST_S: Final = 60.0
 """After so long with power, an unknown joint is reported and no longer judged."""
 _MOVING_RAD_S: Final = 0.05
 """At a lower speed, friction before the sensor may hold any torque."""
-_CORRELATED: Final = 4.0
-"""Number of blocks that count as one: the errors of the regression last longer than a block."""
 _SURE: Final = 0.06
 """Largest standard deviation of k at which a joint can be judged wrong."""
 _KNOWN: Final = 0.02
@@ -426,7 +424,7 @@ def ratio_of(normal: NDArray[np.float64], blocks: int) -> TorqueRatio:
     size = np.sqrt(np.maximum(np.diag(A), 1e-12))
     inverse = np.linalg.inv(A / np.outer(size, size) + RIDGE * np.eye(_COLUMNS))
     x = inverse @ (b / size)
-    left = max(square - float(x @ (b / size)), 0.0) / max(blocks - _COLUMNS, 1) * _CORRELATED
+    left = max(square - float(x @ (b / size)), 0.0) / max(blocks - _COLUMNS, 1) * CORRELATED
     std = (np.sqrt(left * np.diag(inverse)) + RIDGE * np.abs(inverse) @ np.abs(x)) / size
     own, other = x[:2] / size[:2]
     return TorqueRatio(float(own), float(other), float(std[_OWN]), float(std[_OTHER]))

@@ -115,7 +115,7 @@ PATIENCE_PERIODS = 2.5
 """Periods without a heartbeat until a node counts as silent, on the host and in 0x1016 of the devices: one heartbeat
 may be lost and the next one be late by half a period, without waiting for a third."""
 OPERATIONAL = 5
-_STATES = {0: "boot-up", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
+STATES = {0: "boot-up", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE-OPERATIONAL"}
 
 
 @dataclass
@@ -206,7 +206,7 @@ class HeartbeatWatch:
             and (node.has_run or t_ns - since_ns > self._patience_ns)
         ):
             complaint = f"state {state}"
-            text = f"is {_STATES.get(state, f'in NMT state {state}')}, OPERATIONAL expected"
+            text = f"is {STATES.get(state, f'in NMT state {state}')}, OPERATIONAL expected"
         else:
             if node.complaint:
                 self._report(Event("info", node.name, "heartbeat: OPERATIONAL again"))

@@ -139,7 +139,7 @@ def _number(value: int) -> str:
     return f"0x{value:08X}" if value > 0xFFFFFF else str(value)
 
 
-_CST_SUPPORTED = 1 << 9  # of 0x6502
+CST_SUPPORTED = 1 << 9  # of 0x6502
 _MODE_READS = 20
 """A drive may take a few of its own cycles to show a new mode; an SDO takes 0.3 ms at 1 Mbit/s at the least."""
 
@@ -166,7 +166,7 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequenc
     joint, profile = slave.device.joint, slave.device.settings
     if slave.has(0x6502):
         modes = slave.read(0x6502)
-        if not modes & _CST_SUPPORTED:
+        if not modes & CST_SUPPORTED:
             slave.fail(
                 f"supported modes 0x6502 = 0x{modes:08X}, bit 9 (cyclic synchronous torque) expected",
                 "this drive can't be commanded by torque; a newer firmware may",

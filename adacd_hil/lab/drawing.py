@@ -4,6 +4,7 @@ Drawn with matplotlib's object interface on a white ground.
 """
 
 import io
+import re
 from collections.abc import Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -26,19 +27,9 @@ from adacd_hil.plain_values import json_text
 from adacd_hil.records import Vector
 from adacd_hil.score.emulator_truth import extreme_rows
 
-COLOURS: Final = {
-    "ink": "#1a2027",
-    "muted": "#5a6672",
-    "rule": "#c9d0d7",
-    "grid": "#e6eaee",
-    "identified": "#0067b1",
-    "cad": "#d9780a",
-    "beside": "#a8327e",
-    "joint1": "#00856a",
-    "joint2": "#8a4fa3",
-    "alarm": "#c4342d",
-    "bar": "#7d8a97",
-}
+_ON_WHITE: Final = (resources.files("adacd_hil.lab.report") / "assets/report.css").read_text("utf-8").partition("}")[0]
+COLOURS: Final[dict[str, str]] = dict(re.findall(r"--(\w+): (#\w+)", _ON_WHITE))
+"""Those of the pages, by their names."""
 _DOTS_PER_INCH: Final = 150
 _ENVELOPE_BINS: Final = 1000
 """Two points each: as fine as the widest screen on which the report is read."""

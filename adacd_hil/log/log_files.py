@@ -35,8 +35,8 @@ PART_KEY = "part"
 """Of the metadata `run`: number of the part, from 0."""
 ENDING_KEY = "ending"
 """Of the summary: why the part ended."""
-CONTINUED = "continued"
-"""The ending of a part that another follows."""
+CLOSED, CONTINUED = "closed", "continued"
+"""The endings of a log that was ended as asked, and of a part that another follows."""
 ROS_PROFILE = "ros2"
 """Of the header: every channel is CDR with a schema of ROS 2, so rosbags and rosbag2 take the file."""
 QOS_KEY = "offered_qos_profiles"
@@ -55,6 +55,8 @@ CONFIG_DIGEST_KEY = "host_config_sha256"
 """Metadata of the emulator's log where the host is in the same process: of its configuration."""
 MOST_VIEWERS = 8
 """Viewers of a run's live view at a time, unless --live-viewers says otherwise."""
+SHOWN = 20
+"""Mismatches, gaps and notes that are listed, of mismatches unless --shown says otherwise; all are counted."""
 _DIGITS, _MOST_DIGITS = 3, 5
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from adacd_hil.log.log_files import CONTINUED, LOG_NAME, LogError, find_parts, part_path
+from adacd_hil.log.log_files import CLOSED, CONTINUED, LOG_NAME, LogError, find_parts, part_path
 
 RECOVERED = "recovered"
 """The ending of a recovered log."""
@@ -13,7 +13,7 @@ MERGED = "merged"
 """The ending of several logs in one, as earlier versions made it."""
 COPY_ENDINGS = (RECOVERED, CUT, MERGED)
 """The endings of logs that are made of others."""
-PLANNED_ENDINGS = ("closed", "continued", *COPY_ENDINGS)
+PLANNED_ENDINGS = (CLOSED, CONTINUED, *COPY_ENDINGS)
 LOST_KEY = "lost"
 """Of the summary of a recovered log: its losses in words; missing without any."""
 DROPPED_KEY = "dropped"
@@ -44,7 +44,7 @@ def parts_of(path: Path) -> dict[int, Path]:
 def missing_parts(path: Path, parts: Collection[int], ending: str = "") -> list[Path]:
     """Return the paths of missing parts of the log `path`, [] if it is whole.
 
-    Those before its last part; also the next one if `ending` is "continued". parts: the numbers of those that exist.
+    Those before its last part; also the next one if `ending` is CONTINUED. parts: the numbers of those that exist.
     ending: of the last one, from its summary.
     """
     last = max(parts)

@@ -188,7 +188,3 @@ class Mismatch(NamedTuple):
         """Return the mismatch as one line, with the time in s since `zero_ns`."""
         time_s = (self.t_ns - zero_ns) * 1e-9
         return f"cycle {self.cycle}, {time_s:.6f} s: {self.name} = {self.logged} logged, {self.replayed} here"
-
-
-SHOWN: Final = 20
-"""Mismatches that are kept; all are counted."""

@@ -17,8 +17,8 @@ from adacd_hil.device.device_files import logged_devices, place_devices
 from adacd_hil.device.network import RESET_COMMUNICATION
 from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LogError
-from adacd_hil.log.logged_run import SHOWN, settings_of
+from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, SHOWN, LogError
+from adacd_hil.log.logged_run import settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS, joined_frames
 from adacd_hil.log.types.topics import ARM, CONTACT, CYCLE, EVENTS, SCHEME

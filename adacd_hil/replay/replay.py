@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
-from adacd_hil.log.log_files import LogError
-from adacd_hil.log.logged_run import SHOWN, Milestones, Mismatch, Progress, is_armed_in
+from adacd_hil.log.log_files import SHOWN, LogError
+from adacd_hil.log.logged_run import Milestones, Mismatch, Progress, is_armed_in
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import ArmBatch, ContactReport, Event, Request, SchemeOutput, SchemeState

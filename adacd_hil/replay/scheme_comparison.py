@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.log_files import LogError, arithmetic
-from adacd_hil.log.logged_run import SHOWN, Mismatch
+from adacd_hil.log.log_files import SHOWN, LogError, arithmetic
+from adacd_hil.log.logged_run import Mismatch
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.types.topics import ARM, CONTACT, EVENTS, SCHEME
 from adacd_hil.records import JOINTS, ArmBatch, ContactReport, Event, Layout, Request, SchemeState, Vector

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 PERCENTILES = (50.0, 99.0, 99.9, 100.0)
-PERCENTILE_NAMES = ("p50", "p99", "p99.9", "max")
-LOW_PERCENTILE_NAMES = ("p50", "p1", "p0.1", "min")
+PERCENTILE_NAMES = (*(f"p{share:g}" for share in PERCENTILES[:-1]), "max")
+LOW_PERCENTILE_NAMES = (*(f"p{100.0 - share:g}" for share in PERCENTILES[:-1]), "min")
 
 Values = NDArray[np.int64] | NDArray[np.float64]
 
 
 def percentiles(values: Values) -> dict[str, float]:
-    """Return p50, p99, p99.9 and max by these names, each a value that occurred (no interpolation); {} without any."""
+    """Return PERCENTILES by PERCENTILE_NAMES, each a value that occurred (no interpolation); {} without any."""
     if values.size == 0:
         return {}
     found = np.percentile(values, PERCENTILES, method="higher")
@@ -27,7 +27,7 @@ def percentiles(values: Values) -> dict[str, float]:
 
 
 def low_percentiles(values: Values) -> dict[str, float]:
-    """Return p50, p1, p0.1 and min by these names, each a value that occurred; {} without any.
+    """Return the mirrored PERCENTILES by LOW_PERCENTILE_NAMES, each a value that occurred; {} without any.
 
     For values that must not be small.
     """
@@ -95,14 +95,14 @@ class Distribution:
         self._bins[_SIDE + low : _SIDE + low + counts.size] += counts
 
     def percentiles(self) -> dict[str, float]:
-        """Return p50, p99, p99.9 and max by these names; {} without a value."""
+        """Return PERCENTILES by PERCENTILE_NAMES; {} without a value."""
         if self._bins is None:
             return percentiles(self._values())
         ranks = [int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
         return dict(zip(PERCENTILE_NAMES, map(self._at, ranks), strict=True))
 
     def low_percentiles(self) -> dict[str, float]:
-        """Return p50, p1, p0.1 and min by these names, for values that must not be small; {} without a value."""
+        """Return the mirrored PERCENTILES by LOW_PERCENTILE_NAMES, for values that mustn't be small; {} without any."""
         if self._bins is None:
             return low_percentiles(self._values())
         ranks = [self.count - 1 - int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]

@@ -20,7 +20,7 @@ PUSH_WITHIN = f"{1e3 * detect_margin.WITHIN_S:g} ms"
 
 @dataclass(frozen=True)
 class SmallestPush:
-    """Percentiles p50, p99, p99.9 and max, by name, of each joint's smallest push found and of its threshold, Nm.
+    """Percentiles, by PERCENTILE_NAMES, of each joint's smallest push found and of its threshold, Nm.
 
     hours: time in MONITOR without a touch. tail_rate_per_h: false alarms to be expected if all channels' residuals have
     the tail of a Gaussian.

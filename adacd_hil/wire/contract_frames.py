@@ -1,7 +1,5 @@
 """CANopen's identifiers in a contract: base identifiers, node ids, the host's heartbeat. Source: CiA 301."""
 
-HOST_NODE = 127
-"""Node id of the host by default."""
 NODE_MASK = 0x7F
 HOST_HEARTBEAT = "HostHeartbeat"
 NMT_ID, SYNC_ID, EMERGENCY_ID, HEARTBEAT_ID = 0x000, 0x080, 0x080, 0x700

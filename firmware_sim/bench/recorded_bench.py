@@ -15,9 +15,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from adacd_hil.log.frames.frame_log import open_frames
-from adacd_hil.records import Vector
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.time_marks import answers_to_sync
+from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
+from adacd_hil.wire.time_marks import ANSWERS, answers_to_sync
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S, DriveMode, Measurement
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.canopen.object_dictionary import EmulatedContract
@@ -26,7 +27,6 @@ from firmware_sim.scenario.scenario import Scenario
 
 RESETS: Final = (129, 130)
 """NMT commands that begin an attempt: reset node, reset communication."""
-_SYNC_COUNTERS = 240
 Answer = tuple[int, bytes]
 """Identifier and data."""
 
@@ -105,7 +105,7 @@ class RecordedCycles:
                 if is_reset:
                     attempt, cycle, is_reset = attempt + 1, 0, False
                 else:
-                    cycle += (now - counter) % _SYNC_COUNTERS if now and counter else 1
+                    cycle += (now - counter) % SYNC_OVERFLOW if now and counter else 1
                 counter = now
         if attempt >= 0:
             yield RecordedCycle(attempt, cycle, tuple(answers))
@@ -125,9 +125,8 @@ class RecordedCycles:
                 yield can_id, data[:length].tobytes()
 
 
-_FEEDBACKS = ("Drive1Feedback", "Drive2Feedback")
+_FEEDBACKS, _TORQUES = ANSWERS[:JOINTS], ANSWERS[JOINTS:]
 _TORQUE = DriveMode.TORQUE
-_TORQUES = ("Sensor1Torque", "Sensor2Torque")
 
 
 class RecordedBody:

@@ -23,12 +23,12 @@ from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.printable import in_line, one_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import freeze_garbage, request_realtime
+from adacd_hil.settings.arm_settings import BusSettings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import open_terminals, terminal_columns, write_result
 from adacd_hil.wire.bus import BusError, BusMissingError
 from adacd_hil.wire.codec import Codec, CodecError
-from adacd_hil.wire.contract_frames import HOST_NODE
 from adacd_hil.wire.dbc_contract import load_codec
 from adacd_hil.wire.moved_contract import move_contract
 from firmware_sim.arm.arms import ARMS
@@ -55,8 +55,9 @@ class EmulatorExit(IntEnum):
 
 
 EPILOG = (
-    "Exit status: 0 ended by SIGINT, SIGTERM, SIGHUP or --once; 1 failure (the bus or the truth log failed); "
-    "2 wrong usage or configuration; 5 bus missing."
+    f"Exit status: {EmulatorExit.OK} ended by SIGINT, SIGTERM, SIGHUP or --once; {EmulatorExit.FAILURE} failure (the "
+    f"bus or the truth log failed); {EmulatorExit.USAGE} wrong usage or configuration; {EmulatorExit.BUS_MISSING} bus "
+    "missing."
 )
 
 _CODES: tuple[tuple[type[Exception], EmulatorExit], ...] = (
@@ -87,7 +88,7 @@ _OPTIONS = (  # last first: click lists them the other way round
     click.option(
         "--host-node",
         type=click.IntRange(1, 127),
-        default=HOST_NODE,
+        default=BusSettings().host_node,
         show_default=True,
         help="Node id of the arm's host: bus.host_node of its configuration.",
     ),
@@ -207,8 +208,9 @@ def run(
 
 @cli.command(
     "play",
-    epilog="Exit status: 0 ended by SIGINT, SIGTERM, SIGHUP or --once; 1 failure (the bus failed, the recording is "
-    "damaged or of another contract); 2 wrong usage; 5 bus missing.",
+    epilog=f"Exit status: {EmulatorExit.OK} ended by SIGINT, SIGTERM, SIGHUP or --once; {EmulatorExit.FAILURE} failure "
+    f"(the bus failed, the recording is damaged or of another contract); {EmulatorExit.USAGE} wrong usage; "
+    f"{EmulatorExit.BUS_MISSING} bus missing.",
 )
 @click.argument("log", type=GivenPath(dir_okay=False))
 @on_bus
@@ -299,7 +301,9 @@ def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int 
     return EmulatorExit.OK
 
 
-@cli.command("check", epilog="Exit status: 0 every file can be played; 2 one can't.")
+@cli.command(
+    "check", epilog=f"Exit status: {EmulatorExit.OK} every file can be played; {EmulatorExit.USAGE} one can't."
+)
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @click.option(
     "--contract", type=click.Choice(list(CONTRACTS)), default="arm", show_default=True, help="Whose frames faults hit."

@@ -32,6 +32,7 @@ from firmware_sim.canopen.object_dictionary import (
     MadeUp,
     contract_of,
 )
+from firmware_sim.nodes.drive_node import CYCLIC_SYNCHRONOUS_TORQUE
 from firmware_sim.scenario.rehearsal import DeviceCounts, compose_scenario, told_arm
 from firmware_sim.scenario.scenario import (
     ArmTruth,
@@ -42,8 +43,6 @@ from firmware_sim.scenario.scenario import (
     resolve_scenario,
 )
 
-_CYCLIC_SYNCHRONOUS_TORQUE = 1 << 9  # of 0x6502
-_CYCLIC_SYNCHRONOUS_TORQUE_MODE = 10  # of 0x6060
 _DEVICE_TYPES = {"drive": 0x00020192, "sensor": 0x00020194}
 _NEWTON_METRE = 0x00560100
 _RECORDS = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
@@ -83,7 +82,7 @@ def _made_up(kind: str, settings: Settings) -> dict[int, MadeUp]:
     }
     if kind == "drive":
         made |= {
-            0x6060: MadeUp("mode of operation", _SIGNED8, _CYCLIC_SYNCHRONOUS_TORQUE_MODE),
+            0x6060: MadeUp("mode of operation", _SIGNED8, CYCLIC_SYNCHRONOUS_TORQUE),
             0x6061: MadeUp("its display", _SIGNED8, 0),
             0x6076: MadeUp("rated torque", _UNSIGNED32, 0),
         }
@@ -297,7 +296,7 @@ def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
         fallbacks |= counts
         # Writable objects have been set up for this arm, whatever the factory's values; a guess is played as it is.
         defaults |= {place: value for place, value in counts.items() if _can_be_set(device, *place)}
-        fallbacks[0x6502, 0] = _CYCLIC_SYNCHRONOUS_TORQUE
+        fallbacks[0x6502, 0] = 1 << CYCLIC_SYNCHRONOUS_TORQUE - 1
     else:
         fallbacks |= {(0x6131, sub): _NEWTON_METRE for sub in range(1, 255)}
         fallbacks |= {(0x6132, sub): max(round(-math.log10(scale.torque_Nm)), 0) for sub in range(1, 255)}

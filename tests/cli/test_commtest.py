@@ -50,7 +50,7 @@ def test_a_silent_device_and_a_missing_priority_are_warned_of():
     ]
     lines = as_text(described).splitlines()
     assert lines[4].startswith("Sensor2: fresh in 0.00 % of the periods; ")
-    assert "SYNC → feedback, µs (SYNC sent to last cyclic frame decoded): no value" in lines
+    assert "SYNC → feedback, µs (SYNC sent to last frame decoded): no value" in lines
     assert lines[-1].startswith("not sufficient: 0.00 %")
 
 

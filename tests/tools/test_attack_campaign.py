@@ -5,7 +5,6 @@ from typing import Any
 
 import attack_vcan
 import attacked_run
-import attacks
 import numpy as np
 import pytest
 from attacked_run import Finding
@@ -17,6 +16,7 @@ from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.records import Event
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from adacd_hil.wire.e2e import E2eStatus
+from firmware_sim.arm.sensing import POSITION_LSB_RAD
 
 FORGER = Forger((contract_folder() / "arm.dbc").read_bytes())
 COMMAND = bytes.fromhex("00050f006400")  # counter 5, Enable operation, 100 per mille
@@ -36,7 +36,7 @@ def test_a_forged_frame_has_the_crc_of_its_data_id_and_passes_the_receivers_chec
 BOTH = ((0x201, COMMAND), (0x202, COMMAND))
 FEEDBACK = (1000).to_bytes(4, "little") + (7).to_bytes(4, "little")
 SYNC = (0x080, b"\xf0")
-OFFSET, DRIFT = (1000 + round(rad / attacks.POSITION_LSB_RAD) for rad in (0.018, 0.1))
+OFFSET, DRIFT = (1000 + round(rad / POSITION_LSB_RAD) for rad in (0.018, 0.1))
 TAILS = {0x080: slice(0, 1), 0x181: slice(0, 4), 0x183: slice(2, 6), 0x184: slice(2, 6)}
 """Where the value is that an attack forges; in a command it is the torque, 4 to 5."""
 

@@ -28,7 +28,7 @@ from adacd_hil.records import SchemeState
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
-from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
+from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings, SafetySettings
 from adacd_hil.wire.bus import Bus, Frame
 from firmware_sim.bench.bench import Bench
 from firmware_sim.scenario.scenario import Scenario
@@ -37,9 +37,9 @@ ATTACK_S = 4.29
 """When an attack begins, since the drives were enabled: both joints move, joint 1 at its fastest, 100 deg/s."""
 AFTER_S = 1.5
 """How long the arm is watched after the host has gone; the attack goes on until its own end."""
-REST_RAD_S = 0.05
+REST_RAD_S = SafetySettings().rest_velocity_rad_s
 REST_HOLD_S = 0.1
-"""At rest is an arm that is this slow for so long: slow as `safety.rest_velocity_rad_s` has it by default."""
+"""At rest is an arm that is this slow for so long: the speed is the setting's default."""
 STOPS = (SchemeState.FAULT, SchemeState.REACT)
 REST_BOUND_S = 0.12
 """At rest so soon after it was noticed: from 100 deg/s, the fastest the arm moves, at 900 deg/s² it takes 0.11 s."""

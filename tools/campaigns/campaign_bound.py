@@ -24,9 +24,11 @@ from lab import PERIOD_S, LabArm, Push, Recording, random_moves, record
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from firmware_sim.arm.hardware_settings import VELOCITY_LOOP_HZ
+
 FAST_RAD_S = 800.0
-LAG_S = 1.6e-3
-"""Of the drive's velocity, 2 / (2π 200 Hz)."""
+LAG_S = 1.0 / (np.pi * VELOCITY_LOOP_HZ)
+"""Of the drive's velocity."""
 ORDER = 24
 WINDOW_S = 0.25
 RESPONSE_SAMPLES = 20

@@ -9,10 +9,10 @@ from campaign_bound import Bound
 from campaign_trials import STEPS_NM, Row
 
 from adacd_hil.cli.output import format_table
+from adacd_hil.scheme.detect.margin import WITHIN_S
 
 Rows = dict[str, list[Row]]
 Bounds = dict[tuple[str, bool], Bound]
-WITHIN_S = 0.1
 KNOWN_S = 0.5
 """A touch that begins earlier in an adaptation meets a model that nothing is known of yet."""
 NAN = float("nan")
@@ -104,7 +104,7 @@ def figures_of(bounds: Bounds) -> list[Figure]:
             noise_Nm = max(bounds[key].smallest_Nm(joint, WITHIN_S) for key in bounds if key[1] == is_loaded)
             figures.append(
                 Figure(
-                    f"smallest step within 100 ms, joint {joint + 1}, {load}, Nm",
+                    f"smallest step within {1e3 * WITHIN_S:g} ms, joint {joint + 1}, {load}, Nm",
                     0.08 if is_loaded else 0.05,
                     lambda rows, j=joint, load=is_loaded: _smallest(rows, load, j),  # type: ignore[misc]
                     noise_Nm,

@@ -25,7 +25,7 @@ from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.settings.arm_settings import ArmSettings
 from adacd_hil.structured import Structured
 from firmware_sim.arm.plant import external_torque
-from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S
+from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S, DriveMode
 from firmware_sim.arm.touch_settings import TICK_S, ContactSettings, ticks
 from firmware_sim.body.body import Body
 from firmware_sim.body.body_ticks import BODY_NUMBERS, BODY_STATE, advance_body, find_contact, sample_body
@@ -37,7 +37,7 @@ __all__ = [
 ]  # fmt: skip
 
 TICKS = ticks(PERIOD_S)
-_POWERED = 1  # DriveMode.TORQUE
+_POWERED = int(DriveMode.TORQUE)
 _UNLIMITED_NM = 1e9
 _PUSH_COLUMNS = 5
 

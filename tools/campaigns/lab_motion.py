@@ -17,7 +17,7 @@ from adacd_hil.settings.run_settings import TrajectorySettings
 
 PERIOD_S = 1e-3
 REACH_RAD = np.radians([60.0, 110.0])
-"""Random motions stay within these of zero; the arms' limits are 75 and 120 degrees."""
+"""Random motions stay within these of zero, inside `arm.position_limit_deg`."""
 SPEED_RAD_S = np.radians([100.0, 100.0])
 BRAKE_S = 0.4
 """In which a motion that is broken off comes to rest."""

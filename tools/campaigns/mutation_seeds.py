@@ -10,6 +10,7 @@ import numpy as np
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.control.device_record import DeviceRecord
 from adacd_hil.control.history_file import HISTORY_FORMAT, CertificateRecord, History, devices_digest
+from adacd_hil.control.tare_file import TARE_FORMAT
 from adacd_hil.lab.logs.cut import TimeWindow, cut
 from adacd_hil.lab.logs.python_can_files import to_messages
 from adacd_hil.log.frames.frame_log import read_frames
@@ -50,7 +51,7 @@ start_deg = [-30.0, -60.0]
 contacts = [{ at_s = 1.0, link = 2, point_m = 0.2, force_N = 10.0, duration_s = 0.1 }]
 faults = [{ kind = "lose", node = "sensor1", frame = "torque", at_s = 0.5, duration_s = 0.2, probability = 0.5 }]
 """
-TARE = """format = 1
+TARE = f"""format = {TARE_FORMAT}
 offset_Nm = [0.01, -0.02]
 standard_error_Nm = [0.001, 0.001]
 spread_Nm = [0.0, 0.0]
@@ -182,7 +183,7 @@ def _history() -> History:
     digest, records = devices_digest(devices), []
     for month in (1, 2):
         record = CertificateRecord(
-            date_utc=f"2026-0{month}-01T12:00:00Z", log="run.mcap", profile="P", version="0.1.0", parameters=(0.1,) * 7,
+            date_utc=f"2026-0{month}-01T12:00:00Z", log=LOG_NAME, profile="P", version="0.1.0", parameters=(0.1,) * 7,
             friction_Nm=(0.1,) * 6, friction_std_Nm=(0.01,) * 6, inertia_kgm2=(0.2, 0.05, 0.02),
             inertia_std_kgm2=(0.001,) * 3, offset_Nm=(0.01, -0.02), offset_std_Nm=(0.003, 0.002), is_payload=False,
             text="torque offsets anchored",

@@ -16,6 +16,7 @@ from witnessed_run import Played
 
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import ContactLevel, Request, SchemeState
+from adacd_hil.settings.arm_settings import MOST_BLIND_CYCLES
 
 JOINTS = (0, 1)
 SENSOR_NOT_VALID = 1
@@ -34,10 +35,10 @@ VALUE_KINDS = ("stick", "jump", "saturate", "sensor_error")
 class Bounds:
     """How much is allowed. Cycles are SYNCs."""
 
-    rest_s: float = 0.19
-    """Before the drives are asked to enable: 200 cycles of 1 ms at rest, less what the start may hide."""
-    rest_rad_s: float = 0.06
-    """Speed at rest as measured: `safety.rest_velocity_rad_s` and a count."""
+    hidden_s: float = 0.01
+    """What the start may hide of `safety.commission_s` before the drives are asked to enable."""
+    hidden_rad_s: float = 0.01
+    """What a count may add to `safety.rest_velocity_rad_s`."""
     permille: float = 1.01
     """Rounding of torque on the wire, one count."""
     status_cycles: int = 2
@@ -52,9 +53,9 @@ class Bounds:
     """From the last of them to zero torque."""
     old_cycles: int = 2
     """Feedback of this age is older than a cycle: torque must not grow on it."""
-    blind_cycles: int = 6
-    """Cycles in a row in which the armed model had no fresh sample: 5 are allowed, and the one that says so. Where a
-    setting lets a value be older than that, so many more."""
+    blind_cycles: int = MOST_BLIND_CYCLES + 1
+    """Cycles in a row in which the armed model had no fresh sample: so many are allowed, and the one that says so.
+    Where a setting lets a value be older than that, so many more."""
     deaf_cycles: int = 2
     """Cycles without feedback after which a drive has gone: where all have, nobody acknowledges what stops them."""
     contact_share: float = 3.0
@@ -261,8 +262,9 @@ def enabling_needs_rest(case: Case) -> Iterator[Violation]:
 
     Rest is judged by all right feedback frames of that time; where some fault may change their values, by the truth.
     """
-    bounds = case.bounds
-    least = round(bounds.rest_s / case.period_s)
+    bounds, safety = case.bounds, case.played.settings.safety
+    rest_s, rest_rad_s = safety.commission_s - bounds.hidden_s, safety.rest_velocity_rad_s + bounds.hidden_rad_s
+    least = round(rest_s / case.period_s)
     for joint, commands in enumerate(case.commands):
         for attempt in np.unique(commands.attempt):
             wants = np.flatnonzero((commands.attempt == attempt) & (commands.controlword == ENABLE_OPERATION))
@@ -281,8 +283,8 @@ def enabling_needs_rest(case: Case) -> Iterator[Violation]:
             if case.is_velocity_made_up(joint, first_row, last_row):
                 speed = case.truth["dq"][first_row : last_row + 1, joint]
             fastest = float(np.abs(speed).max(initial=0.0))
-            if fastest > bounds.rest_rad_s:
-                text = f"joint {joint + 1} moved at {fastest:.3f} rad/s within {bounds.rest_s:g} s before"
+            if fastest > rest_rad_s:
+                text = f"joint {joint + 1} moved at {fastest:.3f} rad/s within {rest_s:g} s before"
                 yield Violation("enabled-in-motion", case.t_s(int(commands.sight.t_ns[first])), text)
 
 

@@ -44,6 +44,7 @@ from timing_disk import DISK_CASES, STOPPED_S, run_disk, show_disk
 from timing_hogs import finish_hogs, run_hogs, show_hogs
 from timing_hour import CONTACT_S, finish_hour, run_hour, show_hour
 
+from adacd_hil.cli.output import RUNS
 from adacd_hil.wire.dbc_contract import contract_folder
 
 PROGRAM = "timing_campaign"
@@ -152,7 +153,7 @@ def parse_arguments(argv: Sequence[str]) -> argparse.Namespace:
     if chosen.command in ("hour", "hogs") and not chosen.every > CONTACT_S:
         parser.error(f"--every = {chosen.every:g} s must be above the {CONTACT_S:g} s that a contact takes")
     if chosen.out is None:
-        chosen.out = Path("runs") / f"timing-{chosen.command}"
+        chosen.out = RUNS / f"timing-{chosen.command}"
     if re.search(r"^\s*period_us\b", chosen.settings, re.MULTILINE):
         parser.error("--settings can't change period_us: what is measured depends on it")
     return chosen

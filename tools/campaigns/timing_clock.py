@@ -20,6 +20,7 @@ from side_by_side import (
     time_percentiles_us,
 )
 
+from adacd_hil.cli.output import ExitCode
 from adacd_hil.log.log_files import LOG_NAME
 from adacd_hil.log.reader import read_log
 
@@ -86,7 +87,7 @@ def run_step(step_s: float, chosen: argparse.Namespace, folder: Path) -> dict[st
 def violations_of(status: int, said: dict[str, Any], problem: str, times_ns: Any) -> list[str]:
     """Say what a set clock has changed."""
     found = []
-    if status not in (0, 130):
+    if status not in (ExitCode.OK, ExitCode.INTERRUPTED):
         found.append(f"exit status {status}")
     if said.get("fault") not in ("NONE", None):
         found.append(f"fault {said['fault']}")

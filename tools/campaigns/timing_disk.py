@@ -32,9 +32,9 @@ from witness import Seen, read_witness, times_after, witness
 from adacd_hil.log.log_files import LOG_NAME, LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.topics import CYCLE
+from firmware_sim.arm.sensing import POSITION_LSB_RAD
 
 SYNC_ID, FEEDBACK_ID, LAST_COMMAND_ID, STATUS_ID = 0x080, 0x181, 0x202, 0x281
-POSITION_RAD = 2.0 * np.pi / 2**20
 DISK_CASES = ("undisturbed", "slow", "full", "killed", "stopped")
 SLOW_BYTES_S = 64 * 1024
 STOPPED_S = 10.0
@@ -102,7 +102,7 @@ def describe_span(
     """Say by the frames on the bus how the cycle went, and how far joint 1 moved, in a span of wall clock."""
     span = seen.between(begin_ns, end_ns)
     sync_ns = span.of(SYNC_ID).wall_ns
-    position = span.of(FEEDBACK_ID).data.astype(np.uint32).astype(np.int32) * POSITION_RAD
+    position = span.of(FEEDBACK_ID).data.astype(np.uint32).astype(np.int32) * POSITION_LSB_RAD
     return {
         "cycles": len(sync_ns),
         "overruns": round((end_ns - begin_ns) / (period_us * 1e3)) - len(sync_ns),

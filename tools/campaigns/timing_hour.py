@@ -25,7 +25,7 @@ from side_by_side import (
 )
 from witness import Seen, read_witness, witness
 
-from adacd_hil.log.log_files import LOG_NAME
+from adacd_hil.log.log_files import LOG_NAME, find_parts
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.topics import CYCLE, EVENTS
 
@@ -37,7 +37,6 @@ FIRST_CONTACT_S = 10.0
 CONTACTS = ((1, 0.25, 90.0, 20.0), (1, 0.25, -90.0, 20.0), (2, 0.20, 90.0, 15.0), (2, 0.20, -90.0, 15.0))
 """Link, point in m, direction in degrees, force in N: those of the paper's experiment."""
 CONTACT_S = 0.25
-LOG_PARTS = "run*.mcap"
 REACTION = "MONITOR -> REACT"
 
 
@@ -92,7 +91,7 @@ def run_hour(chosen: argparse.Namespace) -> dict[str, Any]:
 def read_parts(folder: Path) -> list[dict[str, Any]]:
     """Open every part of a log by itself, with a reader that isn't ours: its messages, or what is wrong with it."""
     parts: list[dict[str, Any]] = []
-    for path in sorted(folder.glob(LOG_PARTS), key=lambda path: path.stat().st_mtime_ns):
+    for path in find_parts(folder / LOG_NAME).values():
         described: dict[str, Any] = {"name": path.name, "bytes": path.stat().st_size, "messages": 0, "problem": ""}
         try:
             with path.open("rb") as file:

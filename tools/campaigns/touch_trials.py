@@ -14,6 +14,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests" / "scheme"))
 
+from campaign_figures import KNOWN_S
 from excited_arm import NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop
 from lab_motion import paper_motion
 from mujoco_arm import MujocoArm
@@ -45,8 +46,6 @@ pulls against it."""
 RULES = ("one model of the whole fit", "each sample explained", "borne out by what came later", "no more than before")
 LIKE_A_JOINT = ("drag", "viscous", "inertia", "payload", "help")
 """Whose torque is a change of the arm's parameters."""
-KNOWN_S = 0.5
-"""Before this nothing is known of the arm that a hand like a joint could contradict."""
 WIDE = 3.0
 """A wide arm has each parameter of profile M times or over at most this."""
 HELPS_FROM_RAD_S = 0.02

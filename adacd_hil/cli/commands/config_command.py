@@ -8,7 +8,7 @@ import click
 
 from adacd_hil.cli.completion import complete_configuration, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, set_option
-from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained, format_table
+from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained, format_table
 from adacd_hil.given_path import CommandGroup
 from adacd_hil.printable import in_line
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from adacd_hil.settings.configuration import Settings
     from adacd_hil.settings.setting_keys import KnownKey
 
-EPILOG = "Exit status: 0 done, warnings included; 2 wrong usage, or a configuration that can't be used."
+EPILOG = explain_statuses(OK="done, warnings included", USAGE="wrong usage, or a configuration that can't be used")
 
 
 @click.group("config", cls=CommandGroup)

@@ -13,12 +13,14 @@ from adacd_hil.cli.output import (
     answer,
     complain_of,
     counted,
+    explain_statuses,
     explained,
     format_table,
     one_by_one,
     quoted,
 )
 from adacd_hil.given_path import GivenPath
+from adacd_hil.log.log_files import SHOWN
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
@@ -29,10 +31,13 @@ if TYPE_CHECKING:
     from adacd_hil.replay.replayed_outcome import Replay
     from adacd_hil.settings.configuration import Settings
 
-_EPILOG = (
-    "Exit status: 0 identical, or other settings were replayed; 1 something differs, or a log can't be read; 2 wrong "
-    "usage or configuration; 3 all compared cycles are identical, but part of the log can't be compared; 6 a live "
-    "detector of the log can't run here; 130 interrupted."
+_EPILOG = explain_statuses(
+    OK="identical, or other settings were replayed",
+    FAILURE="something differs, or a log can't be read",
+    USAGE="wrong usage or configuration",
+    PARTIAL="all compared cycles are identical, but part of the log can't be compared",
+    DETECTOR_MISSING="a live detector of the log can't run here",
+    INTERRUPTED="interrupted",
 )
 _MOST_COLUMNS = 6
 """Most variants that are printed as columns beside the log's own; more are printed as rows."""
@@ -58,7 +63,7 @@ _MOST_COLUMNS = 6
     type=click.FloatRange(0.0, 1.0),
     help="Relative tolerance of real values; default: 0 on the same machine.",
 )
-@click.option("--shown", type=click.IntRange(min=0), default=20, show_default=True, help="Mismatches to print.")
+@click.option("--shown", type=click.IntRange(min=0), default=SHOWN, show_default=True, help="Mismatches to print.")
 @json_option
 @explained
 @stretch_options

@@ -48,7 +48,8 @@ from adacd_hil.lab.commission.survey import survey
 from adacd_hil.lab.serial_arm.urdf import UrdfError
 from adacd_hil.log.recording.run_folder import is_there
 from adacd_hil.printable import in_line
-from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
+from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings, DevicesSettings
+from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import bounds_of, parse
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import known_keys
@@ -213,23 +214,27 @@ class Drafting:
         ratings = [device.ratings for device in drives]
         rated = self._rated(ratings, profiles, geometry)
         torque = self._limit("torque_limit_Nm", "--torque-limit-nm", _torque_proposals(rated, ratings, geometry))
+        usual, usual_devices = ArmSettings(), DevicesSettings()
         scaled = list(zip(ratings, scales, strict=False))
         by_drives = [rating.position_limit_deg(scale) for rating, scale in scaled]
-        proposal = _limit_proposal(geometry.position_limit_deg, by_drives, "0x607D of the drives", (75.0, 120.0))
+        proposal = _limit_proposal(
+            geometry.position_limit_deg, by_drives, "0x607D of the drives", usual.position_limit_deg
+        )
         position = self._limit("position_limit_deg", "--position-limit-deg", proposal)
         by_drives = [rating.velocity_limit_deg_s(scale) for rating, scale in scaled]
         source = "0x6080 of the drives, by their gears"
-        proposal = _limit_proposal(geometry.velocity_limit_deg_s, by_drives, source, (250.0, 300.0))
+        proposal = _limit_proposal(geometry.velocity_limit_deg_s, by_drives, source, usual.velocity_limit_deg_s)
         velocity = self._limit("velocity_limit_deg_s", "--velocity-limit-deg-s", proposal)
         nodes = [
             Fact(tuple(device.node.node_id for device in found), "found on the bus")
             if found
             else Fact(given or default, "given" if given else "")
             for found, given, default in (
-                (drives, options.drive_node, (1, 2)),
-                (sensors, options.sensor_node, (3, 4)),
+                (drives, options.drive_node, usual_devices.drive_node),
+                (sensors, options.sensor_node, usual_devices.sensor_node),
             )
         ]
+        half = load_settings("fd_500us")
         is_half = all(name.endswith("-500us") for name in (*drive.value, *sensor.value))
         return ArmFacts(
             geometry,
@@ -244,8 +249,8 @@ class Drafting:
             sensor,
             nodes[0],
             nodes[1],
-            500 if is_half else _PERIODS_US[0],
-            8_000_000 if is_half else None,
+            half.bus.period_us if is_half else _PERIODS_US[0],
+            half.devices.data_bitrate if is_half else None,
             self.bitrate,
         )
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.options import json_option, stretch_options
-from adacd_hil.cli.output import ExitCode, answer, complain_of, explained, format_table, one_by_one
+from adacd_hil.cli.output import ExitCode, answer, complain_of, explain_statuses, explained, format_table, one_by_one
 from adacd_hil.given_path import GivenPath
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.printable import in_line
@@ -17,9 +17,11 @@ if TYPE_CHECKING:
     from adacd_hil.lab.runs.log_comparison import Contact, LogComparison
     from adacd_hil.log.time_window import TimeWindow
 
-_EPILOG = (
-    "Exit status: 0 all decided the same in every cycle; 1 they differ, or a log can't be read; 2 wrong usage; 3 the "
-    "same as far as the logs are whole."
+_EPILOG = explain_statuses(
+    OK="all decided the same in every cycle",
+    FAILURE="they differ, or a log can't be read",
+    USAGE="wrong usage",
+    PARTIAL="the same as far as the logs are whole",
 )
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import CommandError, ExitCode, answer, explained, format_table, quoted, show
+from adacd_hil.cli.output import CommandError, ExitCode, answer, explain_statuses, explained, format_table, quoted, show
 from adacd_hil.file_access import write_new_file
 from adacd_hil.file_replacement import replace_file
 from adacd_hil.given_path import GivenPath, WrittenPath
@@ -27,8 +27,12 @@ _RECORDING = GivenPath()
 
 
 @click.command(
-    epilog="Exit status: 0 done; 1 a recording can't be read; 2 wrong usage or map; 3 the model doesn't explain the "
-    "test; the verdict gives the reason."
+    epilog=explain_statuses(
+        OK="done",
+        FAILURE="a recording can't be read",
+        USAGE="wrong usage or map",
+        PARTIAL="the model doesn't explain the test; the verdict gives the reason",
+    )
 )
 @click.argument("recordings", nargs=-1, required=True, type=_RECORDING)
 @click.option("--map", "map_path", type=WrittenPath(dir_okay=False), help="TOML: meaning of the columns, and the arm.")

@@ -8,6 +8,8 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_truth
 from adacd_hil.cli.options import (
+    HOST,
+    PORT,
     clock_option,
     config_option,
     json_option,
@@ -19,7 +21,16 @@ from adacd_hil.cli.options import (
     run_folder_option,
     stretch_options,
 )
-from adacd_hil.cli.output import EPILOG, ExitCode, answer, complain_of, explained, print_and_write, writable_folder
+from adacd_hil.cli.output import (
+    EPILOG,
+    ExitCode,
+    answer,
+    complain_of,
+    explain_statuses,
+    explained,
+    print_and_write,
+    writable_folder,
+)
 from adacd_hil.given_path import GivenPath, WrittenPath
 from adacd_hil.lab.cli.compare_command import compare
 from adacd_hil.lab.cli.history_command import history
@@ -30,7 +41,7 @@ from adacd_hil.lab.cli.play_command import play
 from adacd_hil.lab.cli.runs_command import runs, trend
 from adacd_hil.lab.cli.sweep_command import sweep
 from adacd_hil.lab.cli.tune_command import rate_option, tune
-from adacd_hil.lab.stated_bounds import GOOD_SHARE, SUFFICIENT_SHARE
+from adacd_hil.lab.stated_bounds import GOOD_SHARE, LISTEN_S, PLAIN_S, SUFFICIENT_SHARE
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.settings.toml_text import to_toml
 
@@ -210,7 +221,9 @@ def excitation(
     return ExitCode.OK
 
 
-@click.command(epilog="Exit status: 0 the contract fits; 1 it doesn't; 2 wrong usage, configuration or DBC.")
+@click.command(
+    epilog=explain_statuses(OK="the contract fits", FAILURE="it doesn't", USAGE="wrong usage, configuration or DBC")
+)
 @click.option(
     "--dbc", metavar="NAME|FILE", help="The contract: the package's, or a file; default: the configuration's devices'."
 )
@@ -249,7 +262,7 @@ def budget(
 @click.command(epilog=EPILOG)
 @on_bus
 @click.option(
-    "--seconds", type=click.FloatRange(0.1, 600.0), default=1.5, show_default=True, help="How long to listen."
+    "--seconds", type=click.FloatRange(0.1, 600.0), default=LISTEN_S, show_default=True, help="How long to listen."
 )
 @json_option
 def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
@@ -305,9 +318,9 @@ def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode
 
 
 @click.command(epilog=EPILOG)
-@on_bus_or_url("Watch the live view of a run instead, such as ws://127.0.0.1:8765.")
+@on_bus_or_url(f"Watch the live view of a run instead, such as ws://{HOST}:{PORT}.")
 @click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
-@click.option("--once", is_flag=True, help="Listen for 1 s, print one table, end.")
+@click.option("--once", is_flag=True, help=f"Listen for {PLAIN_S:g} s, print one table, end.")
 @click.option("--seconds", type=click.FloatRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
 @json_option
 def monitor(
@@ -318,7 +331,7 @@ def monitor(
     With --url: watch a run that was started with --live: state, residuals against their thresholds, parameters,
     contacts, events. Redraws a terminal in place until Ctrl-C, which ends it with exit status 0.
     """
-    from adacd_hil.lab.cli.monitor_command import PLAIN_S, watch
+    from adacd_hil.lab.cli.monitor_command import watch
 
     listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
     if not isinstance(place, str):

@@ -13,6 +13,7 @@ from adacd_hil.cli.output import (
     ExitCode,
     answer,
     complain_of,
+    explain_statuses,
     explained,
     format_table,
     one_by_one,
@@ -37,7 +38,11 @@ def log() -> None:
     """Look at logs, check, recover, cut and export them. A log is named by its first part."""
 
 
-@log.command(epilog="Exit status: 0 done; 1 a log can't be read; 2 wrong usage; 3 a log is cut or lacks a part.")
+@log.command(
+    epilog=explain_statuses(
+        OK="done", FAILURE="a log can't be read", USAGE="wrong usage", PARTIAL="a log is cut or lacks a part"
+    )
+)
 @click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
 @json_option
 @explained
@@ -58,7 +63,11 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
     return code or (ExitCode.PARTIAL if any(entry.problems for entry in found) else ExitCode.OK)
 
 
-@log.command(epilog="Exit status: 0 clean; 1 an error, or a log can't be read; 2 wrong usage; 3 warnings only.")
+@log.command(
+    epilog=explain_statuses(
+        OK="clean", FAILURE="an error, or a log can't be read", USAGE="wrong usage", PARTIAL="warnings only"
+    )
+)
 @click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
 @json_option
 @explained
@@ -79,7 +88,9 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
 
 
 @log.command(
-    epilog="Exit status: 0 without loss; 1 no data to save, or the log can't be read; 2 wrong usage; 3 with loss."
+    epilog=explain_statuses(
+        OK="without loss", FAILURE="no data to save, or the log can't be read", USAGE="wrong usage", PARTIAL="with loss"
+    )
 )
 @_log_argument
 @_out_option
@@ -98,7 +109,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     return ExitCode.PARTIAL if recovery.losses.is_any else ExitCode.OK
 
 
-@log.command(epilog="Exit status: 0 done; 1 no data there, or the log is damaged; 2 wrong usage.")
+@log.command(epilog=explain_statuses(OK="done", FAILURE="no data there, or the log is damaged", USAGE="wrong usage"))
 @_log_argument
 @click.option("--contact", type=click.IntRange(min=1), help="Cut around this contact, numbered from 1.")
 @click.option(
@@ -269,8 +280,13 @@ dbc_option = click.option(
 
 @log.command(
     "export",
-    epilog="Exit status: 0 done; 1 the recording can't be read or lacks a topic, or a file is in the way; 2 wrong "
-    "usage or contract; 3 the recording is damaged, or a disk is full; 130 interrupted.",
+    epilog=explain_statuses(
+        OK="done",
+        FAILURE="the recording can't be read or lacks a topic, or a file is in the way",
+        USAGE="wrong usage or contract",
+        PARTIAL="the recording is damaged, or a disk is full",
+        INTERRUPTED="interrupted",
+    ),
 )
 @click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
 @click.option("--format", "kind", type=TableFormat(TABLES), required=True, help="Of the output.")

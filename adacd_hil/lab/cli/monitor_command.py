@@ -10,6 +10,7 @@ from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import Clock, MonotonicClock
 from adacd_hil.lab.commission.survey import BusView
 from adacd_hil.lab.commission.traffic import receive_until
+from adacd_hil.lab.stated_bounds import PLAIN_S
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import plain
 from adacd_hil.terminal import fold, moves_cursor, terminal_columns, write_screen
@@ -21,8 +22,6 @@ from adacd_hil.wire.dbc_decoder import DbcDecoder
 
 REDRAW_S = 0.2
 """Interval of redrawing a terminal: the eye can follow 5 Hz."""
-PLAIN_S = 1.0
-"""Interval between tables without a terminal."""
 _LINK_S = 1.0
 _HOME, _CLEAR_LINE, _CLEAR_BELOW = "\x1b[H", "\x1b[K", "\x1b[J"
 

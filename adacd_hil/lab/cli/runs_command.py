@@ -10,8 +10,18 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained, format_table
+from adacd_hil.cli.output import (
+    RUNS,
+    CommandError,
+    ExitCode,
+    answer,
+    counted,
+    explain_statuses,
+    explained,
+    format_table,
+)
 from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.lab.stated_bounds import MEANT_SHARE, STATUSES, THRESHOLD_SHARE
 from adacd_hil.log.log_files import LOG_NAME, LogError
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
@@ -22,10 +32,12 @@ if TYPE_CHECKING:
     from adacd_hil.lab.runs.run_table import RunFilter
     from adacd_hil.lab.runs.run_trend import Trend
 
-_STATUSES = ("good", "not good", "not judged", "broken", "running")
-_EPILOG = (
-    "Exit status: 0 done; 1 no run there, or a file can't be written; 2 wrong usage; 3 the log of a run is broken, the "
-    "others are listed; 130 interrupted."
+_EPILOG = explain_statuses(
+    OK="done",
+    FAILURE="no run there, or a file can't be written",
+    USAGE="wrong usage",
+    PARTIAL="the log of a run is broken, the others are listed",
+    INTERRUPTED="interrupted",
 )
 _DATE_FORMS = "2026-11-25, 2026-11-25T14:22 or 2026-11-25T14:22:33"
 
@@ -90,13 +102,13 @@ def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
     return decorated
 
 
-_folder_argument = click.argument("folder", type=GivenPath(file_okay=False), default=Path("runs"), required=False)
+_folder_argument = click.argument("folder", type=GivenPath(file_okay=False), default=RUNS, required=False)
 
 
 @click.command(epilog=_EPILOG)
 @_folder_argument
 @click.option(
-    "--verdict", "statuses", multiple=True, type=click.Choice(_STATUSES), help="Runs with this verdict; repeatable."
+    "--verdict", "statuses", multiple=True, type=click.Choice(STATUSES), help="Runs with this verdict; repeatable."
 )
 @click.option("--judge", "is_judging", is_flag=True, help="Read the whole log of each run without a report.")
 @click.option("--csv", "csv_path", type=WrittenPath(dir_okay=False), help="Write the table here.")
@@ -144,9 +156,9 @@ def runs(
 @click.option(
     "--share",
     type=click.FloatRange(0.0, 10.0, min_open=True),
-    default=0.4,
+    default=THRESHOLD_SHARE,
     show_default=True,
-    help="A threshold that differs by more than this share has changed; a quarter of it where settings have.",
+    help=f"A threshold that differs by more than this share has changed; {MEANT_SHARE:g} of it where settings have.",
 )
 @click.option(
     "--out", type=WrittenPath(dir_okay=False), metavar="FILE.html", help="Write a page with its curves and tables."

@@ -11,9 +11,9 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explained
+from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained
 from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
-from adacd_hil.log.log_files import LOG_NAME
+from adacd_hil.log.log_files import LOG_NAME, SHOWN
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 
@@ -25,9 +25,14 @@ _SIMULATED_CONFIG = "certified"
 
 
 @click.command(
-    epilog="Exit status: 0 every row has a result; 3 some rows failed, the column `error` has the reason, or a log is "
-    "damaged, see `notes`, or the disk is full; 1 the cluster is lost, or the folder can't be written; 2 wrong usage "
-    "or configuration; 130 interrupted: the same command continues."
+    epilog=explain_statuses(
+        OK="every row has a result",
+        PARTIAL="some rows failed, the column `error` has the reason, or a log is damaged, see `notes`, or the disk is "
+        "full",
+        FAILURE="the cluster is lost, or the folder can't be written",
+        USAGE="wrong usage or configuration",
+        INTERRUPTED="interrupted: the same command continues",
+    )
 )
 @click.argument("logs", nargs=-1, type=GivenPath(), shell_complete=complete_run)
 @click.option(
@@ -82,7 +87,6 @@ def sweep(
     """
     from adacd_hil.lab.tune.sweep import SweepStore, replay_task, run_sweep
     from adacd_hil.lab.tune.workers import NO_FILES, TLS, connect
-    from adacd_hil.log.logged_run import SHOWN
 
     if bool(logs) == bool(scenarios):
         raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)

@@ -9,6 +9,7 @@ from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import json_option, stretch_options
 from adacd_hil.cli.output import (
     ExitCode,
+    explain_statuses,
     explained,
     format_table,
     print_and_write,
@@ -40,8 +41,13 @@ rate_option = click.option(
 
 
 @click.command(
-    epilog="Exit status: 0 found, and the half to check on shows the wanted rate; 3 it can't show it, or no candidate "
-    "is fit; 1 a log can't be read, or has no motion that counts; 2 wrong usage or configuration; 130 interrupted."
+    epilog=explain_statuses(
+        OK="found, and the half to check on shows the wanted rate",
+        PARTIAL="it can't show it, or no candidate is fit",
+        FAILURE="a log can't be read, or has no motion that counts",
+        USAGE="wrong usage or configuration",
+        INTERRUPTED="interrupted",
+    )
 )
 @click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
 @rate_option

@@ -35,6 +35,7 @@ from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, BusError, Tap
 from adacd_hil.wire.can_interface import InterfaceState
 from adacd_hil.wire.codec import Codec
+from adacd_hil.wire.contract_attributes import DEFAULT_BITRATE
 
 LISTEN_S = 0.5
 """Listening time for other masters: five of the usual heartbeats of 100 ms."""
@@ -59,7 +60,7 @@ class ArmExamination:
     clock: Clock
     open_bus: Callable[[], Bus]
     read_link: Callable[[], InterfaceState | None]
-    bitrate: int = 1_000_000
+    bitrate: int = DEFAULT_BITRATE
     data_bitrate: int = 0
     ask: Callable[[str], None] | None = None
     no_move_reason: str = "give --move and move the joints when asked"

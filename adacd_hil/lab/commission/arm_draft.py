@@ -419,8 +419,8 @@ def _arm(facts: ArmFacts) -> Iterator[Entry]:
     yield _stated("arm.torque_limit_Nm", facts.torque_limit_Nm, "the most that is ever commanded")
     rate = tuple(_round(_RATE_PER_NM * torque) for torque in rated.value)
     yield Entry("arm.torque_rate_limit_Nm_s", rate, "in proportion to the rated torque")
-    yield _stated("arm.position_limit_deg", facts.position_limit_deg, "largest |q|; beyond it the run faults")
-    yield _stated("arm.velocity_limit_deg_s", facts.velocity_limit_deg_s, "largest |dq|; beyond it the run faults")
+    for key in ("arm.position_limit_deg", "arm.velocity_limit_deg_s"):
+        yield _stated(key, getattr(facts, key.removeprefix("arm.")), known_keys()[key].meaning)
     comment = "+1 where the device counts as the joint"
     if geometry.sign != (1, 1):
         comment = "joint 2 of the URDF turns against joint 1, and the drives as the URDF"
@@ -459,7 +459,7 @@ def _devices(facts: ArmFacts) -> Iterator[Entry]:
         yield Entry("devices.bitrate", facts.bitrate, "of the bus")
     if facts.data_bitrate is not None:
         yield Entry("devices.data_bitrate", facts.data_bitrate, "of CAN FD's data phase")
-    if facts.period_us != 1000:
+    if facts.period_us != _MODEL.bus.period_us:
         yield Entry("bus.period_us", facts.period_us, "in which the frames fit; `adacd-hil budget` shows how")
 
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from adacd_hil.device.canopen_bus import EdsVariable, find_variable
 from adacd_hil.device.device_files import load_profile, profile_names
-from adacd_hil.device.device_setup import NEWTON_METRE, PREFIX_SHIFT
+from adacd_hil.device.device_setup import CST_SUPPORTED, NEWTON_METRE, PREFIX_SHIFT
 from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, name_velocity_unit, read_drive_units
 from adacd_hil.device.eds_file import read_eds
 from adacd_hil.device.profile import (
@@ -240,7 +240,6 @@ _LEAST_JOINT_NM, _JOINT_NM = 3.0, 10.0
 _LIKELY_GEAR, _MOST_GEAR = 50.0, 160.0
 _RPM_UNITS = {prefix << 24 | 0x00B44700 for prefix in (0, *range(0xF7, 0x100))}
 """0x60A9: rpm, and decimal fractions of it."""
-_CST = 1 << 9  # of 0x6502
 TORQUE_KEYS = {"scale.gear_ratio", "scale.rated_torque_count_Nm"}
 """Factors from 0x6076 to the torque at the joint, except the efficiency, which is within a third of 1."""
 _MOST_OPTION = 8  # of 0x605A
@@ -510,7 +509,7 @@ class _DriveWriter(_ProfileWriter):
                 "0x6071 (target torque) can't be in a frame to the drive: it can't be commanded by torque"
             )
         modes = self.number(0x6502, 0)
-        if modes and not modes & _CST and not self.is_factory(0x6502, 0):
+        if modes and not modes & CST_SUPPORTED and not self.is_factory(0x6502, 0):
             raise self.refuse(f"0x6502 = 0x{modes:X} has no cyclic synchronous torque: it can't be commanded by torque")
         for index, what in (
             (0x6040, "controlword"),

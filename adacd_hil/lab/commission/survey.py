@@ -15,9 +15,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from adacd_hil.clock import Clock
+from adacd_hil.device.arm_watch import STATES
 from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.device_setup import Slave
 from adacd_hil.lab.commission.traffic import Talk, Traffic, listen
+from adacd_hil.lab.stated_bounds import LISTEN_S
 from adacd_hil.wire.bus import Bus, Frame, Tap
 from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import HEARTBEAT_ID
@@ -25,8 +27,6 @@ from adacd_hil.wire.dbc_decoder import DbcDecoder, MessageDecoder
 from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
-LISTEN_S = 1.5
-"""Default time to listen: longer than the usual heartbeat and status periods of up to 1 s."""
 _NODE_IDS = range(1, 128)
 _BETWEEN_REQUESTS_S = 0.002
 """Request and answer are 270 bits at worst, 0.27 ms at 1 Mbit/s: the rest is for the bus's own traffic."""
@@ -37,7 +37,7 @@ _UPLOAD_DEVICE_TYPE = bytes.fromhex("4000100000000000")
 _IDENTITY = ("vendor", "product", "revision", "serial")
 _CONTRACT = ("wire_version", "layout_digest")
 
-NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
+NMT_STATES = {number: name.lower() for number, name in STATES.items()}
 _PROFILES = {401: "I/O", 402: "drive", 404: "measuring device", 405: "PLC", 406: "encoder", 408: "hydraulic drive"}
 
 # Predefined connection set, CiA 301 table 38: function code to the service that a node sends with it.

@@ -8,6 +8,7 @@ from mcap.writer import Writer
 
 from adacd_hil.log.frames.mcap_frames import CHANNEL_KEY, ERROR_STATE_KEY, RATE_SWITCH_KEY, RecordedFrame
 from adacd_hil.log.log_files import (
+    CLOSED,
     ENDING_KEY,
     EPOCH_KEY,
     QOS_KEY,
@@ -93,7 +94,7 @@ class FrameWriter:
     def finish(self) -> None:
         """Write the summary, with which the file ends. Call it once."""
         counts = {"frames": str(self._frames), "messages": str(self._messages), "dropped": "0"}
-        self._writer.add_metadata(SUMMARY_METADATA, {**counts, ENDING_KEY: "closed"})
+        self._writer.add_metadata(SUMMARY_METADATA, {**counts, ENDING_KEY: CLOSED})
         self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.flush()
 

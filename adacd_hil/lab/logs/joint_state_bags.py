@@ -8,10 +8,10 @@ from typing import Any, Final
 from adacd_hil.file_access import open_input
 from adacd_hil.lab.logs.joint_states import TYPE, JointStateMessage, decode_joint_state
 from adacd_hil.log.log_files import LOG_NAME, LogError
+from adacd_hil.log.mcap.record_layout import MAGIC
 from adacd_hil.settings.schema import ConfigError
 
 JOINT_STATES: Final = "/joint_states"
-_MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
 _BAG_MAGIC: Final = b"#ROSBAG V"
 _SQLITE_MAGIC: Final = b"SQLite format 3\0"
 
@@ -29,7 +29,7 @@ def is_bag(path: Path) -> bool:
         return True
     try:
         with open_input(path) as file:
-            return file.peek(16).startswith((_MCAP_MAGIC, _BAG_MAGIC, _SQLITE_MAGIC))
+            return file.peek(16).startswith((MAGIC, _BAG_MAGIC, _SQLITE_MAGIC))
     except OSError:
         return False  # its reader raises the reason
 
@@ -43,7 +43,7 @@ def opened_bag(path: Path) -> Iterator[Bag]:
     try:
         if not path.is_dir():
             with open_input(path) as file:
-                is_mcap, is_ros1 = (file.peek(16).startswith(magic) for magic in (_MCAP_MAGIC, _BAG_MAGIC))
+                is_mcap, is_ros1 = (file.peek(16).startswith(magic) for magic in (MAGIC, _BAG_MAGIC))
             with _opened_mcap(path) if is_mcap else _opened_rosbag(path, is_ros1) as bag:
                 yield bag
         else:

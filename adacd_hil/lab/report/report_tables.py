@@ -69,7 +69,8 @@ def push_table(evidence: CertifiedEvidence | None) -> Table | None:
     push = None if evidence is None else evidence.smallest_push
     if push is None:
         return None
-    names = {"p50": "median", "p99": "99 %", "max": "worst"}
+    median, high, *_, worst = PERCENTILE_NAMES
+    names = {median: "median", high: f"{high[1:]} %", worst: "worst"}
     rows = [
         (what, *(pair_text([joint[name] for joint in joints], 3) for name in names))
         for what, joints in (
@@ -289,11 +290,12 @@ def _counts_table(evidence: TimingEvidence) -> Table:
 
 def _queues_table(evidence: TimingEvidence) -> Table:
     rows: list[Sequence[object]] = []
+    names = PERCENTILE_NAMES[1], PERCENTILE_NAMES[-1]
     for name, words in _QUEUES.items():
         depth = evidence.queues_bytes[name]
-        values = ["", _ABSENT] if depth is None else [number_text(depth.get(key), 0) for key in ("p99", "max")]
+        values = ["", _ABSENT] if depth is None else [number_text(depth.get(key), 0) for key in names]
         rows.append((words, *values))
-    return make_table(("bytes", "p99", "max"), rows)
+    return make_table(("bytes", *names), rows)
 
 
 def _ages_table(evidence: TimingEvidence) -> Table:

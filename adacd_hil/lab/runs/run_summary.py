@@ -25,6 +25,7 @@ from typing import Any, Final, NamedTuple
 from adacd_hil.file_access import InUseError, check_unused, read_input
 from adacd_hil.lab.logs.log_info import LogInfo, read_info
 from adacd_hil.lab.report.report_json import JSON_NAME, SCHEMA
+from adacd_hil.lab.stated_bounds import STATUSES
 from adacd_hil.log.log_files import CONFIG_NAME, EPOCH_KEY, LOG_NAME, TRUTH_NAME, LogError
 from adacd_hil.log.log_parts import PLANNED_ENDINGS, parts_of
 from adacd_hil.log.log_walk import attachment
@@ -35,7 +36,7 @@ from adacd_hil.settings.configuration import Settings
 
 DEEPEST: Final = 4
 """Levels below a folder in which its runs are looked for."""
-GOOD, NOT_GOOD, NOT_JUDGED, BROKEN, RUNNING = STATUSES = ("good", "not good", "not judged", "broken", "running")
+GOOD, NOT_GOOD, NOT_JUDGED, BROKEN, RUNNING = STATUSES
 CERTIFIED, IDENTIFIED, TAKEN_BACK, NO_CERTIFICATE = CERTIFICATES = ("certified", "identified", "taken back", "none")
 """`identified`: by the paper's scheme, which issues no certificates."""
 _MOST_REPORT_BYTES: Final = 64 << 20

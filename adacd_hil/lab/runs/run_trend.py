@@ -2,7 +2,7 @@
 
 A run is compared with the first one since the last change, so that slow drift adds up and is found. A **threshold** has
 changed when it differs by more than a share of it, `THRESHOLD_SHARE` by default: it varies from run to run with the
-identified parameters. If settings of the detection differ from those of the run before, a quarter of that is enough.
+identified parameters. If settings of the detection differ from those of the run before, `MEANT_SHARE` of that does.
 **Friction and torque offsets** have changed when they differ by more than `LAST_SIGMAS` standard
 deviations of both certificates together, the bound by which a run doubts the last certificate. The friction that the
 paper's scheme identifies has no deviation, so its changes are not judged. Margins are only drawn.
@@ -22,13 +22,11 @@ import numpy as np
 from adacd_hil.lab.runs.run_summary import RunSummary
 from adacd_hil.lab.runs.run_table import in_order
 from adacd_hil.lab.score.run_arrays import EMBEDDED
+from adacd_hil.lab.stated_bounds import MEANT_SHARE, THRESHOLD_SHARE
 from adacd_hil.records import FRICTION_AT_RAD_S, JOINTS, Vector
 from adacd_hil.scheme.identify.evidence import LAST_SIGMAS
 from adacd_hil.settings.setting_keys import changed_keys
 
-THRESHOLD_SHARE: Final = 0.4
-"""Eight demos that differed in their seeds only had thresholds up to 27 % apart, 2026-11-25."""
-_MEANT_SHARE: Final = 0.25
 _DETECTION: Final = ("certified.", "detector.", "estimator.", "filter.", "scheme")
 """Settings that thresholds follow from."""
 _TOLD_KEYS: Final = 3
@@ -168,7 +166,7 @@ def _columns(pairs: Sequence[tuple[float, float] | None]) -> Vector:
 def _changes(runs: Sequence[RunSummary], values: Vector, std: Vector, share: float | None) -> tuple[TrendChange, ...]:
     """Return the runs whose value differs too much from the first one since the last change, joint by joint.
 
-    share: of that first value, times `_MEANT_SHARE` if settings of the detection differ from the run before; None:
+    share: of that first value, times `MEANT_SHARE` if settings of the detection differ from the run before; None:
     compare by standard deviations `std`, more than LAST_SIGMAS of both.
     """
     found: list[TrendChange] = []
@@ -183,7 +181,7 @@ def _changes(runs: Sequence[RunSummary], values: Vector, std: Vector, share: flo
             sigmas = abs(value - before) / both if both > 0.0 else math.nan
             bound = 0.0 if share is None else share * abs(before)
             if share is not None and _is_meant(runs[row], runs[row - 1]):
-                bound *= _MEANT_SHARE
+                bound *= MEANT_SHARE
             is_changed = sigmas > LAST_SIGMAS if share is None else abs(value - before) > bound
             if is_changed:
                 found.append(

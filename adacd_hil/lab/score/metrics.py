@@ -371,7 +371,7 @@ class Metrics:
 
     @property
     def false_alarm_bound_per_h(self) -> float | None:
-        """Upper 95 % bound, one-sided, of the certified scheme's rate of false alarms in MONITOR, 1/h, by their number.
+        """Upper bound, one-sided, of the certified scheme's rate of false alarms in MONITOR, 1/h, by their number.
 
         None without the truth, for the paper's scheme, or if the scheme was never armed.
         """

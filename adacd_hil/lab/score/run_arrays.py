@@ -25,6 +25,7 @@ from adacd_hil.log.logged_run import (
 )
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.log.types.topics import CYCLE
 from adacd_hil.records import ContactReport, CycleRecord, SchemeState, Vector
 from adacd_hil.score.emulator_truth import TruthTable
 from adacd_hil.settings.configuration import Settings
@@ -39,29 +40,21 @@ class Quantity(NamedTuple):
     name: str
     column: str
     title: str
-    meaning: str
     is_reserve: bool = False
 
-
-LATENESS: Final = Quantity("lateness", "lateness_ns", "Lateness", "wake-up after the grid point")
-
-
-COMPUTE: Final = Quantity("compute", "compute_ns", "Compute", "last cyclic frame received to last command handed over")
-
-
-SYNC_TO_COMMAND: Final = Quantity(
-    "sync_to_command", "command_ns", "SYNC → command", "SYNC sent to last command handed over"
-)
+    @property
+    def meaning(self) -> str:
+        """From when to when, as /cycle says."""
+        return next(member.meaning for member in CYCLE.head if member.name == self.column)
 
 
-SLACK: Final = Quantity(
-    "slack", "slack_ns", "Slack", "last command to the next grid point; negative: overrun", is_reserve=True
-)
-
-
+LATENESS: Final = Quantity("lateness", "lateness_ns", "Lateness")
+COMPUTE: Final = Quantity("compute", "compute_ns", "Compute")
+SYNC_TO_COMMAND: Final = Quantity("sync_to_command", "command_ns", "SYNC → command")
+SLACK: Final = Quantity("slack", "slack_ns", "Slack", is_reserve=True)
 QUANTITIES: Final = (
     LATENESS,
-    Quantity("sync_to_feedback", "feedback_ns", "SYNC → feedback", "SYNC sent to last cyclic frame decoded"),
+    Quantity("sync_to_feedback", "feedback_ns", "SYNC → feedback"),
     COMPUTE,
     SYNC_TO_COMMAND,
     SLACK,

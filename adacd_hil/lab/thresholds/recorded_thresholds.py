@@ -180,7 +180,7 @@ class ChannelRow:
 class DetectorRow:
     """Rates of a detector with all of its thresholds together, a row of the thresholds file.
 
-    rate_bound_per_h: upper 95 % bound. bound_ratio: factor on the thresholds with which the bound is the wanted rate.
+    rate_bound_per_h: upper bound. bound_ratio: factor on the thresholds with which the bound is the wanted rate.
     predicted_per_h, measured_per_h: rate predicted from one half of the motion, and counted in the other; None if it is
     too short.
     """

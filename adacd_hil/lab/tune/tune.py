@@ -1,7 +1,7 @@
 """Thresholds, filter and gain found from logs: candidates, how each is judged, which one is suggested, as TOML.
 
 One half of the logs gives each candidate its thresholds for the wanted rate of false alarms: those at which the tail's
-upper 95 % bound is that rate. Then the logs are replayed with the candidate and its thresholds. A candidate is fit if
+upper bound is that rate. Then the logs are replayed with the candidate and its thresholds. A candidate is fit if
 it adapts as often as the logs' own settings do, misses no contact for which those were armed, and has no more false
 alarms than the wanted rate allows. The suggestion is the fit candidate with the smallest median delay.
 If a wanted rate is extrapolated too far, the bounds of the tails differ more by chance than by candidate: then filter

@@ -114,12 +114,12 @@ class Found(NamedTuple):
 
     @property
     def rate_bound_per_h(self) -> float:
-        """Upper 95 % bound of the rate of false alarms, by counting."""
+        """Upper bound of the rate of false alarms, by counting."""
         return rate_bound_per_h(self.alarms, self.hours)
 
     @property
     def share_bounds(self) -> tuple[float, float]:
-        """The 95 % interval, low and high, of the share of contacts that is found."""
+        """The interval, low and high, of the share of contacts that is found."""
         return share_bounds(len(self.delays_ms), self.contacts or 0)
 
     def by_key(self) -> dict[str, Any]:
@@ -178,7 +178,7 @@ class Choice:
 def choose(observed: Observed, rate_per_h: float) -> Choice:
     """Return thresholds chosen on one half of the motion, with the alarms and contacts found that they give on both.
 
-    For these thresholds the tail's upper 95 % bound is `rate_per_h`; without a tail they are the largest values seen.
+    For these thresholds the tail's upper bound is `rate_per_h`; without a tail they are the largest values seen.
     Raises TooLittleMotionError if the half to choose on has no contact-free motion.
     """
     first = observed.half(True)
@@ -473,7 +473,7 @@ class Tuning:
 
     @property
     def is_shown(self) -> bool:
-        """Whether the half to check on shows the wanted rate: the upper 95 % bound there is not above it.
+        """Whether the half to check on shows the wanted rate: the upper bound there is not above it.
 
         False without a suggestion.
         """

@@ -11,6 +11,7 @@ from mcap.opcode import Opcode
 
 from adacd_hil.file_access import InUseError, check_unused, open_input
 from adacd_hil.log.log_files import (
+    CLOSED,
     ENDING_KEY,
     RUN_METADATA,
     SUMMARY_METADATA,
@@ -111,5 +112,5 @@ def _has_no_cycle(file: IO[bytes]) -> bool:
     metadata = {each.name: each.metadata for each in (parse(Opcode.METADATA, body) for body in found)}
     counts = kinds[Opcode.STATISTICS][0].channel_message_counts
     cycles = sum(counts.get(channel.id, 0) for channel in kinds[Opcode.CHANNEL] if channel.topic == CYCLE.name)
-    is_closed = metadata.get(SUMMARY_METADATA, {}).get(ENDING_KEY) == "closed"
+    is_closed = metadata.get(SUMMARY_METADATA, {}).get(ENDING_KEY) == CLOSED
     return bool(metadata.get(RUN_METADATA)) and ((is_closed and not cycles) or not sum(counts.values()))

@@ -17,7 +17,7 @@ import struct
 import sys
 
 from adacd_hil.clock import Clock, MonotonicClock
-from adacd_hil.log.log_files import CONTINUED, ENDING_KEY, PART_KEY, PRODUCT, LogError, part_path
+from adacd_hil.log.log_files import CLOSED, CONTINUED, ENDING_KEY, PART_KEY, PRODUCT, LogError, part_path
 from adacd_hil.log.mcap.chunked_file import FLUSH_PERIOD_NS
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.log_file import McapFile, Sink
@@ -76,7 +76,7 @@ class WriterProcess:
             self._take()
             if word in (processes.END, processes.NOTHING):
                 break
-        self._end(self._finish("closed" if word == processes.END else "control process died"))
+        self._end(self._finish(CLOSED if word == processes.END else "control process died"))
 
     def _end(self, summary: dict[str, str]) -> None:
         """Close the last file and send the summary; end the live view.

@@ -105,7 +105,7 @@ _FAULT_ASKED[Request.FAULT_MISCONFIGURED] = FaultReason.MISCONFIGURED
 _OVERDUE = np.zeros(len(SchemeState), np.int64)
 _OVERDUE[[SchemeState.INIT, SchemeState.COMMISSION]] = FaultReason.COMMISSION_TIMEOUT
 _OVERDUE[SchemeState.ENABLE] = FaultReason.ENABLE_TIMEOUT
-_OVERDUE[[SchemeState.ADAPT, SchemeState.CERTIFY]] = FaultReason.ADAPT_TIMEOUT
+_OVERDUE[IS_LEARNING] = FaultReason.ADAPT_TIMEOUT
 """Fault of a phase that takes too long, by state; NONE for a phase without a time limit."""
 
 
@@ -175,7 +175,7 @@ def fill_constants(settings: Settings, k: SupervisorConstants) -> None:
     limits = k.limit_periods
     limits[[SchemeState.INIT, SchemeState.COMMISSION]] = round(safety.phase_timeout_s / period_s)
     limits[SchemeState.ENABLE] = round((safety.enable_timeout_s or safety.phase_timeout_s) / period_s)
-    limits[[SchemeState.ADAPT, SchemeState.CERTIFY]] = round(settings.termination.timeout_s / period_s)
+    limits[IS_LEARNING] = round(settings.termination.timeout_s / period_s)
 
 
 def begin(m: SupervisorMemory) -> None:
