@@ -27,26 +27,45 @@ _MOST_RAD = 2.0 * math.pi
 
 
 class ConfigurationFindings(NamedTuple):
-    """errors: reasons why the configuration can't be used. warnings: likely mistakes. `settings`: None with errors."""
+    """errors: reasons why the configuration can't be used. mistakes: likely ones. `settings`: None with errors.
+
+    guesses: keys of values that the configuration or a device profile lists as assumed.
+    """
 
     errors: list[str]
-    warnings: list[str]
+    mistakes: list[str]
     settings: Settings | None
+    guesses: tuple[str, ...] = ()
     is_late: bool = False
     """Whether frames miss their deadlines in the period."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """The likely mistakes, and a line on the guesses if there are any."""
+        guesses = ", ".join(f"`{key}`" for key in self.guesses)
+        return [*self.mistakes, *([f"assumed, not known: {guesses}"] if guesses else [])]
 
 
 def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
     """Return errors and likely mistakes of a configuration, by its name or file, instead of raising ConfigError.
 
-    profile: name of one of its `[profiles]` to apply. Checked in turn are the keys, the motion's limits, the device
-    profiles, the contract; if one of these has errors, the later ones and the warnings are left out.
+    profile: name of one of its `[profiles]` to apply. Wrong keys and values are errors; without any, as
+    `examine_settings`.
     """
     try:
         layers = configuration_layers(name_or_file, profile)
         settings = parse(Settings, resolved_table(layers))
     except ConfigError as error:
         return ConfigurationFindings([*error.problems], [], None)
+    return examine_settings(settings, layers)
+
+
+def examine_settings(settings: Settings, layers: Sequence[ConfigurationLayer] = ()) -> ConfigurationFindings:
+    """Return errors and likely mistakes of settings. layers: of their configuration, () if unknown.
+
+    Checked in turn are the motion's limits, the device profiles, the contract; if one of these has errors, the later
+    ones and the likely mistakes are left out.
+    """
     if problems := motion_problems(settings):
         return ConfigurationFindings([*problems, *_radians(settings)], [], None)
     if problems := _device_problems(settings):
@@ -58,11 +77,10 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
         return ConfigurationFindings([str(error)], [], None)
     excess = describe_excess(codec, settings)
     late = [excess] if excess else []
-    guesses = [*settings.assumed, *profile_guesses(settings)]
-    assumed = [f"assumed, not known: {', '.join(f'`{key}`' for key in guesses)}"] if guesses else []
-    found = [*oddities(settings), *_narrow(codec, settings), *_unseen(devices)]
-    warnings = [*found, *assumed, *_layer_warnings(layers), *late]
-    return ConfigurationFindings([], warnings, settings, bool(late))
+    mistakes = [line for look in _LOOKS for line in look(settings)]
+    mistakes += [*_narrow(codec, settings), *_unseen(devices), *_layer_warnings(layers), *late]
+    guesses = *settings.assumed, *profile_guesses(settings)
+    return ConfigurationFindings([], mistakes, settings, guesses, bool(late))
 
 
 def profile_guesses(settings: Settings) -> dict[str, float]:
@@ -78,14 +96,6 @@ def profile_guesses(settings: Settings) -> dict[str, float]:
                 section, _, field = key.partition(".")
                 found[f"{PurePath(name).name}: {key}"] = getattr(getattr(profile, section), field)
     return found
-
-
-def oddities(settings: Settings) -> list[str]:
-    """Return the likely mistakes that the settings alone show, a line each; [] without any.
-
-    They are values above their bounds, degrees that look like radians, and unknown keys in `assumed`.
-    """
-    return [line for look in _LOOKS for line in look(settings)]
 
 
 _MOST_NAMED = 4

@@ -8,7 +8,7 @@ from called import called
 from click.testing import Result
 
 from adacd_hil.lab.commission.host_checks import Status, configuration_checks
-from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.settings.configuration_files import configuration_layers, load_settings
 from adacd_hil.settings.toml_files import builtin_names
 
 USAGE = 2
@@ -120,6 +120,24 @@ def test_a_likely_mistake_is_a_warning_and_a_motion_that_leaves_the_arm_s_limits
     result = config("check", str(path))
     assert result.exit_code == status
     assert line in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "reason"),
+    [
+        ("", Status.OK, ""),
+        ("[arm]\ntorque_limit_Nm = [13.0, 6.0]\n", Status.WARNING, "`arm.torque_limit_Nm[0]` = 13 Nm exceeds"),
+        (LENGTHS, Status.WARNING, "`arm.cad_theta` is that of an emulated arm"),
+        ("[arm]\nvelocity_limit_deg_s = [90, 300]\n", Status.FAILED, "`arm.velocity_limit_deg_s[0]` = 90 deg/s"),
+    ],
+)
+def test_doctor_doubts_a_configuration_as_this_command_does(tmp_path, text, status, reason):
+    path = tmp_path / "mine.toml"
+    path.write_text(f'extends = "certified"\n{text}')
+    layers = configuration_layers(str(path))
+    finding = configuration_checks(load_settings(str(path)), layers)[0].run(load_settings(str(path)))
+    assert finding.status is status
+    assert reason in finding.reason
 
 
 def test_devices_and_contract_are_looked_at(tmp_path):

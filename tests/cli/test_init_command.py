@@ -95,6 +95,20 @@ def test_what_is_known_is_no_guess(out):
     assert set(settings.assumed) == {*(f"arm.{name}" for name in guessed), "controller.Kp", "controller.Kd"}
 
 
+@pytest.mark.parametrize(
+    ("options", "keys"),
+    [
+        (("--position-limit-deg", "1.3", "2.1"), ["arm.position_limit_deg", "trajectory.amplitude_deg"]),
+        (("--rated-torque-nm", "8", "4", "--torque-limit-nm", "9", "3"), ["arm.torque_limit_Nm[0]"]),
+        (("--rated-torque-nm", "8", "4", "--torque-limit-nm", "7", "3"), []),
+    ],
+)
+def test_an_answer_that_config_check_doubts_is_doubted_at_once(out, options, keys):
+    result = init(out, *NO_BUS, *options, "--json")
+    assert result.exit_code == 0
+    assert re.findall(r"^`([^`]+)`", "\n".join(json.loads(result.stdout)["warnings"]), re.MULTILINE) == keys
+
+
 def test_a_file_that_is_there_is_replaced_by_force_alone(out):
     out.parent.mkdir()
     out.write_text("mine")

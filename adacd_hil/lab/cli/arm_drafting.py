@@ -129,7 +129,8 @@ class DraftFiles:
     def examine(self, text: str) -> ConfigurationFindings:
         """Check a configuration's text together with the added files, as `config check`; return the findings.
 
-        Raises CommandError if it has errors. Writes to a temporary folder only.
+        Likely mistakes name the files as they will be. Raises CommandError if it has errors. Writes to a temporary
+        folder only.
         """
         with tempfile.TemporaryDirectory() as folder:
             for path, data in (self.contents | {self.out: text.encode()}).items():
@@ -138,7 +139,7 @@ class DraftFiles:
         if found.errors:
             line = found.errors[0].replace(f"{folder}/", "")
             raise CommandError(f"{self.out} is not written, as it could not be used: {line}", ExitCode.USAGE)
-        return found
+        return found._replace(mistakes=[line.replace(f"{folder}/", "") for line in found.mistakes])
 
     def write_files(self, text: str) -> None:
         """Write the configuration, `text`, to `out`, and the added files; make the folder.
@@ -184,7 +185,8 @@ class Drafting:
         for period_us in _PERIODS_US if facts.period_us in _PERIODS_US else (facts.period_us,):
             entries, warnings = draft_arm(facts._replace(period_us=period_us))
             text = draft_as_toml(entries, title, self.writing.out.name)
-            if not self.writing.examine(text).is_late:
+            found = self.writing.examine(text)
+            if not found.is_late:
                 break
         summary: dict[str, Any] = {
             "bus": self.bus,
@@ -193,7 +195,7 @@ class Drafting:
             "sensor": list(facts.sensor.value),
             "sensor_node": list(facts.sensor_node.value),
             "assumed": [*assumed_keys(entries), *self._profile_guesses(facts)],
-            "warnings": [*self.warnings, *warnings],
+            "warnings": [*self.warnings, *warnings, *found.mistakes],
         }
         return text, summary
 
