@@ -323,7 +323,7 @@ def check_sensor(slave: Slave, codec: Codec) -> str:
     """
     torque = codec.message(f"{slave.name}Torque")
     scale = torque.values[torque.place("torque")].scale
-    channel = _channel(slave)
+    channel = sensor_channel(slave)
     remedy = f"correct `scale.torque_Nm` of devices.sensor[{slave.device.joint}], or unit and digits in the sensor"
     prefix = 0
     if slave.has(0x6131, channel):
@@ -347,7 +347,7 @@ def check_sensor(slave: Slave, codec: Codec) -> str:
     return ""
 
 
-def _channel(slave: Slave) -> int:
+def sensor_channel(slave: Slave) -> int:
     """Return the channel of a sensor: the sub-index of the torque that its profile maps, 1 if that is 0 or missing."""
     pdo = slave.device.pdo("Torque")
     signals = () if pdo is None else pdo.signals

@@ -153,6 +153,26 @@ def test_devices_of_one_s_own_pass(tmp_path, describe):
     if describe is describe_geared_arm:
         text = "Drive1: 0x6076 = 400000 µNm x gear 50, 20 Nm at the joint, 0.1 % of it a count"
         assert text in findings["torque scale"].reason
+    # Their sensors' EDS tells neither unit nor status, and maxon's no increments.
+    blind = {"torque scale", "saturation"} | ({"position scale"} if describe is describe_geared_arm else set())
+    assert blind == {"torque scale", "position scale", "saturation"} & set(statuses(findings, Status.WARNING))
+
+
+@pytest.mark.parametrize(
+    ("index", "device", "name"),
+    [(0x608F, 1, "position scale"), (0x6132, 2, "torque scale"), (0x6076, 0, "torque scale")],
+)
+def test_a_scale_that_no_object_says_is_not_passed(index, device, name, monkeypatch):
+    patient = examination(Rig(is_wall=True))
+    patient.connect()
+    look = {check.name: check.run for check in ARM_CHECKS}[name]
+    assert look(patient).status is Status.OK
+    slave = patient.master.slaves[device]
+    has = slave.has
+    monkeypatch.setattr(slave, "has", lambda at, sub=0: at != index and has(at, sub))
+    finding = look(patient)
+    assert finding.status is Status.WARNING
+    assert [line.split(":")[0] for line in finding.reason.split("; ") if "nothing confirms" in line] == [slave.name]
 
 
 def test_a_value_outside_the_bounds_of_its_profile_fails(tmp_path):
