@@ -118,6 +118,19 @@ def test_a_file_that_is_there_is_replaced_by_force_alone(out):
     written(out)
 
 
+def test_a_draft_that_can_t_be_written_whole_replaces_no_file(out):
+    words = (*NO_BUS, "--eds", str(contract_folder() / "stock_drive.eds"))
+    assert init(out, *words).exit_code == 0
+    out.write_text("mine")
+    profile = out.with_name("my-arm-stock_drive.toml")
+    profile.unlink()
+    profile.mkdir()
+    refused = init(out, *words, "--force")
+    assert refused.exit_code == 1
+    assert f"{profile} can't be written: it is a folder" in refused.stderr
+    assert out.read_text() == "mine"
+
+
 def test_a_urdf_gives_lengths_masses_and_limits(tmp_path, out):
     assert init(out, *NO_BUS, "--urdf", str(urdf(tmp_path))).exit_code == 0
     settings = written(out)

@@ -16,7 +16,7 @@ from adacd_hil.dates import format_date
 from adacd_hil.device.device_files import load_profile, profile_names
 from adacd_hil.device.profile import ProfileSettings, ScaleSettings
 from adacd_hil.file_access import read_input
-from adacd_hil.file_replacement import replace_file
+from adacd_hil.file_replacement import replace_files
 from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.lab.commission.arm_draft import (
     LEVEL_DEG,
@@ -144,15 +144,14 @@ class DraftFiles:
     def write_files(self, text: str) -> None:
         """Write the configuration, `text`, to `out`, and the added files; make the folder.
 
-        An existing file is replaced. Raises CommandError if one can't be written; earlier ones are then written.
+        Existing files are replaced, as by `replace_files`. Raises CommandError if one can't be written.
         """
         self.contents[self.out] = text.encode()
         try:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            for path, data in self.contents.items():
-                replace_file(path, data)
+            replace_files(self.out.parent, {path.name: data for path, data in self.contents.items()})
         except OSError as error:
-            raise CommandError(f"{self.out} can't be written: {error.strerror}") from error
+            failed = next((path for path in self.contents if str(path) == error.filename), self.out)
+            raise CommandError(f"{failed} can't be written: {error.strerror}") from error
 
 
 class Drafting:
