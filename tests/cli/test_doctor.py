@@ -15,7 +15,13 @@ from rig import CODEC, Rig
 
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.lab.cli.doctor_command import as_json, as_text
-from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
+from adacd_hil.lab.commission.arm_checks import (
+    ARM_CHECKS,
+    ArmExamination,
+    check_other_masters,
+    check_pdo_map,
+    check_position_scale,
+)
 from adacd_hil.lab.commission.host_checks import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import apply_settings
@@ -173,6 +179,21 @@ def test_a_scale_that_no_object_says_is_not_passed(index, device, name, monkeypa
     finding = look(patient)
     assert finding.status is Status.WARNING
     assert [line.split(":")[0] for line in finding.reason.split("; ") if "nothing confirms" in line] == [slave.name]
+
+
+@pytest.mark.parametrize(
+    ("polarity", "status"), [(0x00, Status.OK), (0xE0, Status.OK), (0xC0, Status.WARNING), (0x40, Status.WARNING)]
+)
+def test_a_drive_that_reverses_position_and_not_torque_is_not_passed(polarity, status, monkeypatch):
+    patient = examination(Rig(is_wall=True))
+    patient.connect()
+    slave = patient.master.slaves[1]
+    has, read = slave.has, slave.read
+    monkeypatch.setattr(slave, "has", lambda at, sub=0: at == 0x607E or has(at, sub))
+    monkeypatch.setattr(slave, "read", lambda at, sub=0: polarity if at == 0x607E else read(at, sub))
+    finding = check_position_scale(patient)
+    assert finding.status is status
+    assert f"Drive2: polarity 0x607E = 0x{polarity:02X}" in finding.reason
 
 
 def test_a_value_outside_the_bounds_of_its_profile_fails(tmp_path):

@@ -227,11 +227,12 @@ def check_torque_scale(patient: ArmExamination) -> Finding:
 
 
 def check_position_scale(patient: ArmExamination) -> Finding:
-    """Describe each drive's increments per revolution of the joint; warn if no object tells them. Raises DeviceError.
+    """Describe each drive's increments per revolution of the joint; warn if no object tells them, or of its polarity.
 
-    The set-up has compared those that an object tells.
+    The set-up has compared the increments that an object tells. Raises DeviceError.
     """
-    return _together([_increments(slave) for slave in patient.master.slaves[:JOINTS]])
+    drives = patient.master.slaves[:JOINTS]
+    return _together([*map(_increments, drives), *(_polarity(slave) for slave in drives if slave.has(0x607E))])
 
 
 def _together(findings: Sequence[Finding]) -> Finding:
@@ -279,6 +280,23 @@ def _increments(slave: Slave) -> Finding:
     return warning(
         f"{slave.name}: nothing confirms {count}" + f": {units.increments_text}" * bool(units.increments_text),
         "turn each joint by a known angle, and compare it with the position",
+    )
+
+
+_POLARITIES = (0x00, 0xE0)
+"""0x607E of a drive that turns none or all of position (bit 7), velocity (bit 6) and torque (bit 5, not of all makers)
+round."""
+
+
+def _polarity(slave: Slave) -> Finding:
+    """Return the finding on a drive's 0x607E: a warning if it reverses only some quantities. Raises DeviceError."""
+    polarity = slave.read(0x607E)
+    text = f"{slave.name}: polarity 0x607E = 0x{polarity:02X}"
+    if polarity & 0xE0 in _POLARITIES:
+        return ok(text)
+    return warning(
+        f"{text}: position and torque may count against each other, and the arm run away",
+        "set 0x607E to 0 with the maker's tool; `arm.sign` reverses a joint",
     )
 
 
