@@ -200,6 +200,8 @@ def test_words_say_how_an_arm_without_a_urdf_is_mounted(out, options, mounting_d
         (("0.35 0 0", "0 0 0.35"), "the two axes are the same line"),
         (('<mass value="3"/>', '<mass value="0"/>'), 'link "upper": an inertia without a mass'),
         (('xyz="0.13 0 0"/><mass', 'xyz="0 0 0"/><mass'), 'link "lower": mass 1.5 kg without inertia'),
+        (('izz="0.04"', 'izz="400"'), 'link "upper", 0.35 m: an inertia of 400 kg m² with 3 kg'),
+        (('xyz="0.13 0 0"/><mass', 'xyz="130 0 0"/><mass'), 'link "lower", 0.3 m: the centre of its mass is 130 m'),
     ],
 )
 def test_a_urdf_of_another_arm_or_with_a_mass_that_no_link_has_is_refused(change, line):
@@ -207,6 +209,20 @@ def test_a_urdf_of_another_arm_or_with_a_mass_that_no_link_has_is_refused(change
     with pytest.raises(UrdfError) as caught:
         planar_from_urdf(text.replace(*change).encode())
     assert line in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "doubted"),
+    [
+        (('izz="0.04"', 'izz="0.3"'), []),
+        (('izz="0.04"', 'izz="0.4"'), ['link "upper", 0.35 m: an inertia of 0.4 kg m²']),
+        (('xyz="0.13 0 0"/><mass', 'xyz="1.3 0 0"/><mass'), ['link "lower", 0.3 m: the centre of its mass is 1.3 m']),
+    ],
+)
+def test_a_mass_beyond_its_link_is_doubted(change, doubted):
+    text = URDF.format(axis="0 0 1", wrist="fixed").replace(*change)
+    found = planar_from_urdf(text.encode()).doubts
+    assert [doubt[: len(line)] for doubt, line in zip(found, doubted, strict=True)] == doubted
 
 
 def test_crossed_axes_are_refused_and_a_bent_zero_is_doubted():
