@@ -17,6 +17,7 @@ from adacd_hil.settings.setting_keys import explain_unknown, known_keys, value_o
 from adacd_hil.settings.toml_files import builtin_names
 from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.codec import Codec, CodecError
+from adacd_hil.wire.contract_attributes import DEFAULT_BITRATE, read_bitrates
 
 Pair = tuple[float, float]
 
@@ -78,7 +79,8 @@ def examine_settings(settings: Settings, layers: Sequence[ConfigurationLayer] = 
     excess = describe_excess(codec, settings)
     late = [excess] if excess else []
     mistakes = [line for look in _LOOKS for line in look(settings)]
-    mistakes += [*_narrow(codec, settings), *_unseen(devices), *_layer_warnings(layers), *late]
+    mistakes += [*_narrow(codec, settings), *_unseen(devices), *_unused(codec, settings)]
+    mistakes += [*_layer_warnings(layers), *late]
     guesses = *settings.assumed, *profile_guesses(settings)
     return ConfigurationFindings([], mistakes, settings, guesses, bool(late))
 
@@ -223,6 +225,16 @@ def _unseen(devices: Sequence[PlacedDevice]) -> Iterator[str]:
         sent = {signal.signal for pdo in device.settings.pdo for signal in pdo.signals}
         if device.settings.kind == "drive" and "torque_actual" not in sent:
             yield f"no frame of {device.name} carries `torque_actual`: nothing watches for the fault TORQUE"
+
+
+def _unused(codec: Codec, settings: Settings) -> Iterator[str]:
+    """Yield a warning if `devices.bitrate` is set beside a DBC, which has its own bit rate."""
+    bitrate, _ = read_bitrates(codec)
+    if settings.devices.contract and settings.devices.bitrate not in (bitrate, DEFAULT_BITRATE):
+        yield (
+            f"`devices.bitrate` = {settings.devices.bitrate} bit/s is of a composed contract; "
+            f"`devices.contract` = {settings.devices.contract!r} has {bitrate} bit/s"
+        )
 
 
 def _pair(values: Sequence[float]) -> str:

@@ -101,6 +101,7 @@ LENGTHS = "[arm]\nlink_length_m = [0.4, 0.3]"
         (LENGTHS, 0, "`arm.cad_theta` is that of an emulated arm, from paper [profiles.P]"),
         (LENGTHS, 0, "`controller.Kp` is that of an emulated arm"),
         ("[filter]\na_rad_s = 11", 0, "the scheme is the paper's"),
+        ("[devices]\nbitrate = 500000", 0, "`devices.contract` = 'arm' has 1000000 bit/s"),
         ("assumed = ['arm.link_length_m']", 0, "assumed, not known: `arm.link_length_m`"),
         ("assumed = ['arm.link_length']", 0, "`assumed` names no setting: unknown key `arm.link_length`; did you mean"),
         ("[arm]\nposition_limit_deg = [1.31, 2.09]", USAGE, "looks like rad; in degrees that would be 75.1 and 120"),
