@@ -370,6 +370,14 @@ def test_profiles_are_drafted_from_eds_files_beside_the_configuration(out, tmp_p
     assert drafted.layout_digest == stock.layout_digest
 
 
+def test_an_eds_beside_named_profiles_of_its_kind_is_refused(out):
+    words = ("--eds", str(contract_folder() / "stock_drive.eds"), "--drive", "maxon-epos4", "maxon-epos4")
+    refused = init(out, *NO_BUS, *words)
+    assert refused.exit_code == USAGE
+    assert "stock_drive.eds is of a drive, and --drive names" in refused.stderr
+    assert not out.parent.exists()
+
+
 def test_two_eds_of_a_kind_are_of_joint_1_and_2_and_more_or_namesakes_are_refused(out, tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).mkdir()

@@ -475,11 +475,16 @@ class Drafting:
         """Draft profiles of each given EDS, beside the configuration; return their file names by kind and joint (0, 1).
 
         devices: found on the bus; [] without a bus: of two EDS of a kind, the first is of joint 1. Raises CommandError
-        for an EDS that fits no device, or a device that has another EDS already.
+        for an EDS beside named profiles, or that fits no device, or a device that has another EDS already.
         """
         names: dict[tuple[str, int], str] = {}
         files = self._eds_files()
         for place, (eds, kind) in enumerate(files):
+            if getattr(self.options, kind) is not None:
+                raise CommandError(
+                    f"EDS {eds} is of a {kind}, and --{kind} names the {kind}s' profiles: leave out one of them",
+                    ExitCode.USAGE,
+                )
             identity = identity_of(eds)
             same = [device for device in devices if device.kind == kind]
             fitting = [
