@@ -109,6 +109,11 @@ def test_an_answer_that_config_check_doubts_is_doubted_at_once(out, options, key
     assert re.findall(r"^`([^`]+)`", "\n".join(json.loads(result.stdout)["warnings"]), re.MULTILINE) == keys
 
 
+def test_doctor_without_a_bus_is_refused_before_anything_is_written_or_played(out):
+    assert init(out, *NO_BUS, "--rehearse", "--doctor").exit_code == USAGE
+    assert not out.parent.exists()
+
+
 def test_a_file_that_is_there_is_replaced_by_force_alone(out):
     out.parent.mkdir()
     out.write_text("mine")
@@ -142,6 +147,19 @@ def test_a_urdf_gives_lengths_masses_and_limits(tmp_path, out):
     theta = [0.040 + 3.0 * 0.04 + 1.5 * 0.1225 + 0.015 + 1.5 * 0.0169, 0.35 * 1.5 * 0.13, 0.015 + 1.5 * 0.0169]
     assert settings.arm.cad_theta[:3] == pytest.approx(theta, rel=1e-5)
     assert "arm.link_length_m" not in settings.assumed
+
+
+@pytest.mark.parametrize(
+    ("option", "doubted"),
+    [
+        (("--position-limit-deg", "68", "114"), []),
+        (("--position-limit-deg", "70", "114"), ["`arm.position_limit_deg[0]` = 70 is above 68.75, the URDF's"]),
+        (("--velocity-limit-deg-s", "170", "250"), ["`arm.velocity_limit_deg_s[1]` = 250 is above 229.18, the URDF's"]),
+    ],
+)
+def test_a_limit_above_the_urdf_s_is_doubted(tmp_path, out, option, doubted):
+    result = init(out, *NO_BUS, "--urdf", str(urdf(tmp_path)), *option, "--json")
+    assert json.loads(result.stdout)["warnings"] == doubted
 
 
 @pytest.mark.parametrize(

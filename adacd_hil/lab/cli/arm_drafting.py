@@ -772,8 +772,8 @@ class Drafting:
     def _limit(self, key: str, option: str, proposal: Fact) -> Fact:
         """Return the two values of `arm.KEY`, within its bounds, by option or user, with their source.
 
-        proposal: for the user, or taken with `--yes`. Raises ConfigError for a wrong option, CommandError without an
-        answer.
+        proposal: for the user, or taken with `--yes`; an answer above a known one is added to the warnings. Raises
+        ConfigError for a wrong option, CommandError without an answer.
         """
         given = getattr(self.options, option[2:].replace("-", "_"))
         meaning = known_keys()[f"arm.{key}"].meaning
@@ -784,6 +784,9 @@ class Drafting:
             lambda value: _checked(key, _numbers(value, float, option)),
             proposal,
         )
+        for joint, (limit, known) in enumerate(zip(value, proposal.value, strict=True)):
+            if limit > known and proposal.source not in ("", _BY_RATED):
+                self.warnings.append(f"`arm.{key}[{joint}]` = {limit:g} is above {known:g}, {proposal.source}")
         return Fact(value, source)
 
 
@@ -869,6 +872,10 @@ def _read_urdf(path: Path, locked: Sequence[str], pitch_deg: float = 0.0) -> Pla
         raise ConfigError(f"URDF {path}: {error}") from None
 
 
+_BY_RATED = "the rated torque"
+"""Source of a torque limit above which `config check` doubts it, too."""
+
+
 def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Fact:
     """Return as proposed torque limits, Nm, the smallest of 0x6072, the URDF's effort and the rated torque, per joint.
 
@@ -877,7 +884,7 @@ def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: P
     shares = [min(rating.torque_share or 1.0, 1.0) for rating in ratings] or [1.0, 1.0]
     efforts = geometry.effort_Nm or rated.value
     limit = tuple(min(rated.value[joint] * shares[joint], efforts[joint]) for joint in range(2))
-    source = "the rated torque" if limit == tuple(rated.value) else "the least of 0x6072 and the URDF's effort"
+    source = _BY_RATED if limit == tuple(rated.value) else "the least of 0x6072 and the URDF's effort"
     return Fact(limit, source if rated.source else "")
 
 
