@@ -10,7 +10,12 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import load_profile, place_devices
 from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
+from adacd_hil.settings.configuration_files import (
+    ConfigurationLayer,
+    configuration_layers,
+    profiles_of,
+    resolved_table,
+)
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import explain_unknown, known_keys, value_of
@@ -50,15 +55,23 @@ class ConfigurationFindings(NamedTuple):
 def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
     """Return errors and likely mistakes of a configuration, by its name or file, instead of raising ConfigError.
 
-    profile: name of one of its `[profiles]` to apply. Wrong keys and values are errors; without any, as
-    `examine_settings`.
+    profile: name of one of its `[profiles]` to apply; None: the configuration's choice, and the errors of the other
+    profiles of its file are found, too. Wrong keys and values are errors; without any, as `examine_settings`.
     """
     try:
         layers = configuration_layers(name_or_file, profile)
         settings = parse(Settings, resolved_table(layers))
+        others = [] if profile is not None else profiles_of(name_or_file)
     except ConfigError as error:
         return ConfigurationFindings([*error.problems], [], None)
-    return examine_settings(settings, layers)
+    found = examine_settings(settings, layers)
+    errors = [
+        f"--profile {other}: {line}"
+        for other in others
+        if other != settings.arm.profile
+        for line in examine_configuration(name_or_file, other).errors
+    ]
+    return found._replace(errors=[*found.errors, *errors], settings=None) if errors else found
 
 
 def examine_settings(settings: Settings, layers: Sequence[ConfigurationLayer] = ()) -> ConfigurationFindings:

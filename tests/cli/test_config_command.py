@@ -173,6 +173,17 @@ def test_several_files_are_checked_each():
     assert "did you mean 'paper'?" in result.stdout
 
 
+def test_the_profiles_that_are_not_chosen_are_looked_at_too(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("[profiles.bench.arm]\ntypo = 1\n[profiles.S.controller]\nKd = [3, 4]\n")
+    result = config("check", str(path))
+    assert result.exit_code == USAGE
+    found = [line.split(": ") for line in result.stdout.splitlines() if "error: " in line]
+    assert {parts[2] for parts in found} == {"--profile bench"}
+    assert any("arm.typo" in parts[3] for parts in found)
+    assert config("check", str(path), "--profile", "S").exit_code == 0
+
+
 def test_the_groups_a_group_and_a_key_are_explained():
     assert "certified" in config("docs").stdout
     assert "arm.position_limit_deg" in config("docs", "arm").stdout
