@@ -92,8 +92,8 @@ def examine_settings(settings: Settings, layers: Sequence[ConfigurationLayer] = 
     excess = describe_excess(codec, settings)
     late = [excess] if excess else []
     mistakes = [line for look in _LOOKS for line in look(settings)]
-    mistakes += [*_narrow(codec, settings), *_unseen(devices), *_unused(codec, settings)]
-    mistakes += [*_layer_warnings(layers), *late]
+    mistakes += [*_narrow(codec, settings), *_ranges(codec, settings, devices), *_unseen(devices)]
+    mistakes += [*_unused(codec, settings), *_layer_warnings(layers), *late]
     guesses = *settings.assumed, *profile_guesses(settings)
     return ConfigurationFindings([], mistakes, settings, guesses, bool(late))
 
@@ -230,6 +230,22 @@ def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
                 f"{message.name} carries ±{most_Nm:.3g} Nm, `arm.rated_torque_Nm[{joint}]` = {rated_Nm:g} Nm: is "
                 f"`torque_Nm` of {settings.devices.sensor[joint]} right?"
             )
+
+
+def _ranges(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> Iterator[str]:
+    """Yield a warning for each sensor whose stated range is less than the rated torque, or beyond its frame's."""
+    for device in devices:
+        range_Nm = device.settings.plausibility.torque_range_Nm
+        if device.settings.kind != "sensor" or not range_Nm:
+            continue
+        message = codec.message(f"{device.name}Torque")
+        signal = message.values[message.place("torque")]
+        most_Nm, rated_Nm = signal.raw_high * signal.scale, settings.arm.rated_torque_Nm[device.joint]
+        stated = f"`plausibility.torque_range_Nm` of {settings.devices.sensor[device.joint]} = {range_Nm:g} Nm"
+        if range_Nm > most_Nm:
+            yield f"{stated}, {message.name} carries ±{most_Nm:.3g} Nm: a saturated torque isn't noticed"
+        if range_Nm < rated_Nm:
+            yield f"{stated} is below `arm.rated_torque_Nm[{device.joint}]` = {rated_Nm:g} Nm"
 
 
 def _unseen(devices: Sequence[PlacedDevice]) -> Iterator[str]:
