@@ -234,6 +234,11 @@ def moving(cycle: int, can_id: int, data: bytes) -> bytes:
     return bytes(message.encode(message.decode_values(data)[0], 0.2)) if can_id == message.can_id else data
 
 
+def creeping(cycle: int, can_id: int, data: bytes) -> bytes:
+    message = CODEC.message("Drive2Feedback")
+    return bytes(message.encode(message.decode_values(data)[0] + 1e-4 * cycle, 0.0)) if can_id == 0x182 else data
+
+
 def without_heartbeat(cycle: int, can_id: int, data: bytes) -> bytes | None:
     return None if can_id == 0x704 and data != b"\x00" else data
 
@@ -246,7 +251,8 @@ def losing(cycle: int, can_id: int, data: bytes) -> bytes | None:
     ("tamper", "name", "text", "skipped"),
     [
         (saturated, "saturation", "POSITIVE_OVERLOAD", "torque zero"),
-        (moving, "rest", "", "torque zero"),
+        (moving, "rest", "|dq[joint1]| = 0.2 rad/s exceeds", "torque zero"),
+        (creeping, "rest", "q[joint2] went through", "torque zero"),
         (without_heartbeat, "heartbeat", "no heartbeat from Sensor2", ""),
         (losing, "rate", "80.0 % of the periods complete", ""),
     ],

@@ -30,6 +30,7 @@ from adacd_hil.lab.commission.communication_test import (
 )
 from adacd_hil.lab.commission.host_checks import Check, Finding, failed, ok, skipped, warning
 from adacd_hil.lab.commission.survey import NMT_STATES, compare, expected_nodes, survey
+from adacd_hil.lab.commission.tare import ArmMovedError, check_motion
 from adacd_hil.lab.commission.traffic import Traffic, listen
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.settings.configuration import Settings
@@ -443,19 +444,18 @@ def _by_joint(form: str, values: Vector) -> str:
 
 
 def check_rest(patient: ArmExamination) -> Finding:
-    """Fail if a joint was faster than `safety.rest_velocity_rad_s` in the stored cycles.
+    """Fail if a joint moved or crept in the stored cycles, as a tare judges it by `check_motion`.
 
     The check is skipped if no cycle is complete.
     """
-    dq = patient.joint_values("dq")
+    q, dq = patient.joint_values("q"), patient.joint_values("dq")
     if not len(dq):
         return skipped("no complete cycle")
-    fastest = np.abs(dq).max(axis=0)
-    bound = patient.settings.safety.rest_velocity_rad_s
-    text = _by_joint("up to {:.4f} rad/s", fastest)
-    if np.any(fastest > bound):
-        return failed(f"{text}, above {bound:g}", "let the arm come to rest and keep hands off")
-    return ok(text)
+    try:
+        check_motion(q, dq, patient.settings)
+    except ArmMovedError as moved:
+        return failed(str(moved), "let the arm come to rest and keep hands off")
+    return ok(_by_joint("up to {:.4f} rad/s", np.abs(dq).max(axis=0)))
 
 
 def check_torque_zero(patient: ArmExamination) -> Finding:
