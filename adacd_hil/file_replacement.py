@@ -79,12 +79,15 @@ def replace_file(path: Path, content: bytes | str) -> None:
 def replace_files(folder: Path, contents: Mapping[str, bytes | str]) -> tuple[Path, ...]:
     """Write whole files, by name, into a folder, which is made if missing; return their paths.
 
-    Each is replaced as by `replace_file`, one after the other. Raises OSError if the folder can't be made or a file not
-    be replaced; files written before it stay.
+    All are written beside the old ones before the first is replaced, as by `replace_file`, in their order. Raises
+    OSError if the folder can't be made or a file not be written, and none is replaced; after a rename that failed the
+    files before it are.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for name, content in contents.items():
-        replace_file(folder / name, content)
+    with contextlib.ExitStack() as stack:
+        for name, content in reversed([*contents.items()]):  # the stack commits the last one first
+            beside = stack.enter_context(replacing(folder / name))
+            beside.write_bytes(content.encode() if isinstance(content, str) else content)
     return tuple(folder / name for name in contents)
 
 

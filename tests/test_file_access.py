@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from adacd_hil.file_access import InUseError, check_unused, create_file, exists, open_input, read_input, write_new_file
-from adacd_hil.file_replacement import Replacement, removing_empty_folders, replace_file, replacing
+from adacd_hil.file_replacement import Replacement, removing_empty_folders, replace_file, replace_files, replacing
 from adacd_hil.log.mcap.record_layout import MAGIC
 
 
@@ -189,3 +189,17 @@ def test_only_folders_that_were_made_and_are_empty_go(tmp_path: Path) -> None:
         assert [file.name for file in tmp_path.glob("old/new/newer/*")] == kept
         assert (tmp_path / "old" / "new").exists() is used
     assert (tmp_path / "old").exists()
+
+
+def test_of_several_files_none_is_replaced_if_one_can_t_be_written(tmp_path: Path) -> None:
+    contents = {"a.toml": "new", "folder": "new", "z.toml": "new"}
+    (tmp_path / "folder").mkdir()
+    for name in ("a.toml", "z.toml"):
+        (tmp_path / name).write_text("kept")
+    with pytest.raises(IsADirectoryError):
+        replace_files(tmp_path, contents)
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(contents)
+    assert [(tmp_path / name).read_text() for name in ("a.toml", "z.toml")] == ["kept", "kept"]
+    (tmp_path / "folder").rmdir()
+    assert replace_files(tmp_path, contents) == tuple(tmp_path / name for name in contents)
+    assert {(tmp_path / name).read_text() for name in contents} == {"new"}

@@ -195,6 +195,17 @@ def test_a_drive_whose_position_does_not_reach_the_arm_s_limit_is_named(tmp_path
     assert [line.partition(" carries ±118 deg")[0] for line in warnings] == ["Drive2Feedback"]
 
 
+def test_a_sensor_s_range_beyond_its_frame_or_below_the_rated_torque_is_named(tmp_path: Path) -> None:
+    for name, range_Nm in (("wide", 30_000.0), ("small", 5.0)):
+        text = f'extends = "int32-sensor"\n[plausibility]\ntorque_range_Nm = {range_Nm}\n'
+        (tmp_path / f"{name}.toml").write_text(text)
+    mine = 'extends = "stock"\n[devices]\nsensor = ["wide.toml", "small.toml"]\ncontract = ""\n'
+    (tmp_path / "mine.toml").write_text(mine)
+    wide, small = (line for line in examine_configuration(str(tmp_path / "mine.toml")).warnings if "_range_" in line)
+    assert "wide.toml = 30000 Nm, Sensor1Torque carries ±2.15e+04 Nm" in wide
+    assert "small.toml = 5 Nm is below `arm.rated_torque_Nm[1]` = 6 Nm" in small
+
+
 def test_a_drive_whose_torque_is_in_no_frame_is_named(tmp_path: Path) -> None:
     stock = resources.files("adacd_hil").joinpath("device_profiles", "stock-drive.toml").read_text()
     torque = '    { object = "0x6077", signal = "torque_actual", unit = "permille" },\n'

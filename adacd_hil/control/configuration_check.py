@@ -1,22 +1,31 @@
 """Checks of a configuration without a bus: all errors and likely mistakes at once, a line each."""
 
+import functools
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import PurePath
 from typing import NamedTuple
 
 from adacd_hil.control.motions import motion_problems
+from adacd_hil.device.canopen_bus import find_variable
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import load_profile, place_devices
+from adacd_hil.device.drive_units import read_drive_units
 from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.settings.configuration import Settings
-from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
+from adacd_hil.settings.configuration_files import (
+    ConfigurationLayer,
+    configuration_layers,
+    profiles_of,
+    resolved_table,
+)
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import explain_unknown, known_keys, value_of
 from adacd_hil.settings.toml_files import builtin_names
 from adacd_hil.wire.budget import describe_excess
 from adacd_hil.wire.codec import Codec, CodecError
+from adacd_hil.wire.contract_attributes import DEFAULT_BITRATE, read_bitrates
 
 Pair = tuple[float, float]
 
@@ -27,26 +36,53 @@ _MOST_RAD = 2.0 * math.pi
 
 
 class ConfigurationFindings(NamedTuple):
-    """errors: reasons why the configuration can't be used. warnings: likely mistakes. `settings`: None with errors."""
+    """errors: reasons why the configuration can't be used. mistakes: likely ones. `settings`: None with errors.
+
+    guesses: keys of values that the configuration or a device profile lists as assumed.
+    """
 
     errors: list[str]
-    warnings: list[str]
+    mistakes: list[str]
     settings: Settings | None
+    guesses: tuple[str, ...] = ()
     is_late: bool = False
     """Whether frames miss their deadlines in the period."""
+
+    @property
+    def warnings(self) -> list[str]:
+        """The likely mistakes, and a line on the guesses if there are any."""
+        guesses = ", ".join(f"`{key}`" for key in self.guesses)
+        return [*self.mistakes, *([f"assumed, not known: {guesses}"] if guesses else [])]
 
 
 def examine_configuration(name_or_file: str, profile: str | None = None) -> ConfigurationFindings:
     """Return errors and likely mistakes of a configuration, by its name or file, instead of raising ConfigError.
 
-    profile: name of one of its `[profiles]` to apply. Checked in turn are the keys, the motion's limits, the device
-    profiles, the contract; if one of these has errors, the later ones and the warnings are left out.
+    profile: name of one of its `[profiles]` to apply; None: the configuration's choice, and the errors of the other
+    profiles of its file are found, too. Wrong keys and values are errors; without any, as `examine_settings`.
     """
     try:
         layers = configuration_layers(name_or_file, profile)
         settings = parse(Settings, resolved_table(layers))
+        others = [] if profile is not None else profiles_of(name_or_file)
     except ConfigError as error:
         return ConfigurationFindings([*error.problems], [], None)
+    found = examine_settings(settings, layers)
+    errors = [
+        f"--profile {other}: {line}"
+        for other in others
+        if other != settings.arm.profile
+        for line in examine_configuration(name_or_file, other).errors
+    ]
+    return found._replace(errors=[*found.errors, *errors], settings=None) if errors else found
+
+
+def examine_settings(settings: Settings, layers: Sequence[ConfigurationLayer] = ()) -> ConfigurationFindings:
+    """Return errors and likely mistakes of settings. layers: of their configuration, () if unknown.
+
+    Checked in turn are the motion's limits, the device profiles, the contract; if one of these has errors, the later
+    ones and the likely mistakes are left out.
+    """
     if problems := motion_problems(settings):
         return ConfigurationFindings([*problems, *_radians(settings)], [], None)
     if problems := _device_problems(settings):
@@ -58,11 +94,11 @@ def examine_configuration(name_or_file: str, profile: str | None = None) -> Conf
         return ConfigurationFindings([str(error)], [], None)
     excess = describe_excess(codec, settings)
     late = [excess] if excess else []
-    guesses = [*settings.assumed, *profile_guesses(settings)]
-    assumed = [f"assumed, not known: {', '.join(f'`{key}`' for key in guesses)}"] if guesses else []
-    found = [*oddities(settings), *_narrow(codec, settings), *_unseen(devices)]
-    warnings = [*found, *assumed, *_layer_warnings(layers), *late]
-    return ConfigurationFindings([], warnings, settings, bool(late))
+    mistakes = [line for look in _LOOKS for line in look(settings)]
+    mistakes += [*_narrow(codec, settings), *_ranges(codec, settings, devices), *_unseen(devices), *_gears(devices)]
+    mistakes += [*_unused(codec, settings), *_layer_warnings(layers), *late]
+    guesses = *settings.assumed, *profile_guesses(settings)
+    return ConfigurationFindings([], mistakes, settings, guesses, bool(late))
 
 
 def profile_guesses(settings: Settings) -> dict[str, float]:
@@ -78,14 +114,6 @@ def profile_guesses(settings: Settings) -> dict[str, float]:
                 section, _, field = key.partition(".")
                 found[f"{PurePath(name).name}: {key}"] = getattr(getattr(profile, section), field)
     return found
-
-
-def oddities(settings: Settings) -> list[str]:
-    """Return the likely mistakes that the settings alone show, a line each; [] without any.
-
-    They are values above their bounds, degrees that look like radians, and unknown keys in `assumed`.
-    """
-    return [line for look in _LOOKS for line in look(settings)]
 
 
 _MOST_NAMED = 4
@@ -211,12 +239,51 @@ def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
             )
 
 
+def _ranges(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> Iterator[str]:
+    """Yield a warning for each sensor whose stated range is less than the rated torque, or beyond its frame's."""
+    for device in devices:
+        range_Nm = device.settings.plausibility.torque_range_Nm
+        if device.settings.kind != "sensor" or not range_Nm:
+            continue
+        message = codec.message(f"{device.name}Torque")
+        signal = message.values[message.place("torque")]
+        most_Nm, rated_Nm = signal.raw_high * signal.scale, settings.arm.rated_torque_Nm[device.joint]
+        stated = f"`plausibility.torque_range_Nm` of {settings.devices.sensor[device.joint]} = {range_Nm:g} Nm"
+        if range_Nm > most_Nm:
+            yield f"{stated}, {message.name} carries ±{most_Nm:.3g} Nm: a saturated torque isn't noticed"
+        if range_Nm < rated_Nm:
+            yield f"{stated} is below `arm.rated_torque_Nm[{device.joint}]` = {rated_Nm:g} Nm"
+
+
 def _unseen(devices: Sequence[PlacedDevice]) -> Iterator[str]:
     """Yield a warning for each drive whose actual torque is in no frame, so that the fault TORQUE can't be found."""
     for device in devices:
         sent = {signal.signal for pdo in device.settings.pdo for signal in pdo.signals}
         if device.settings.kind == "drive" and "torque_actual" not in sent:
             yield f"no frame of {device.name} carries `torque_actual`: nothing watches for the fault TORQUE"
+
+
+def _gears(devices: Sequence[PlacedDevice]) -> Iterator[str]:
+    """Yield a warning for each drive whose gear by its profile isn't that of 0x6091 by its EDS."""
+    for device in devices:
+        find = functools.partial(find_variable, device.objects)
+        units = read_drive_units(lambda *at, find=find: getattr(find(*at), "default", None))
+        gear = device.settings.scale.gear_ratio
+        if units.is_other_gear(gear):
+            yield (
+                f"{device.name}: `scale.gear_ratio` = {gear:g}, 0x6091 = {units.gear_ratio:g} by the EDS: correct it, "
+                f"or set the gear in the drive"
+            )
+
+
+def _unused(codec: Codec, settings: Settings) -> Iterator[str]:
+    """Yield a warning if `devices.bitrate` is set beside a DBC, which has its own bit rate."""
+    bitrate, _ = read_bitrates(codec)
+    if settings.devices.contract and settings.devices.bitrate not in (bitrate, DEFAULT_BITRATE):
+        yield (
+            f"`devices.bitrate` = {settings.devices.bitrate} bit/s is of a composed contract; "
+            f"`devices.contract` = {settings.devices.contract!r} has {bitrate} bit/s"
+        )
 
 
 def _pair(values: Sequence[float]) -> str:

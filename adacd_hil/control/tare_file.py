@@ -204,14 +204,19 @@ class UsedTare:
 def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
     """Read a tare for a run with these settings, with warnings about its age and a zero set by the sensors themselves.
 
-    now_ns: wall clock. Raises ConfigError if the tare is missing, too old, or measured with another sign, or in gravity
-    with another mounting or zero of the arm.
+    now_ns: wall clock. Raises ConfigError if the tare is missing, too old, or measured with another sign, without
+    gravity where the configuration has it or the other way round, or in gravity with another mounting or zero.
     """
     tare = read_tare(path)
     if tare.sign != settings.arm.sign:
         raise ConfigError(
             f"tare {path} was measured with arm.sign = {list(tare.sign)}, but the configuration has "
             f"{list(settings.arm.sign)}; tare again"
+        )
+    if (tare.gravity_model != "none") != settings.estimator.gravity:
+        raise ConfigError(
+            f"tare {path} was measured with gravity_model = {tare.gravity_model!r}, but the configuration has "
+            f"estimator.gravity = {str(settings.estimator.gravity).lower()}, which makes another offset; tare again"
         )
     for name, tared, present in (
         ("mounting_deg", tare.mounting_deg, settings.mounting_deg),

@@ -268,8 +268,7 @@ def _check_units(slave: Slave, codec: Codec) -> list[str]:
             f"{found.velocity_rad_s:.6g} rad/s at the joint, {velocity:.6g} rad/s expected",
             f"correct `scale.velocity_rad_s` of {place}, or set 0x60A9 in the drive",
         )
-    # 1 in the profile: 0x6076 is the joint's. 1 : 1 in the drive: the factory's value.
-    if found.gear_ratio not in (None, 1.0) and scale.gear_ratio not in (1.0, found.gear_ratio):
+    if found.is_other_gear(scale.gear_ratio):
         slave.fail(
             f"gear ratio 0x6091 = {found.gear_ratio:g}, {scale.gear_ratio:g} expected",
             f"correct `scale.gear_ratio` of {place}, or the gear in the drive",
@@ -335,7 +334,7 @@ def check_sensor(slave: Slave, codec: Codec) -> str:
     """
     torque = codec.message(f"{slave.name}Torque")
     scale = torque.values[torque.place("torque")].scale
-    channel = _channel(slave)
+    channel = sensor_channel(slave)
     remedy = f"correct `scale.torque_Nm` of devices.sensor[{slave.device.joint}], or unit and digits in the sensor"
     prefix = 0
     if slave.has(0x6131, channel):
@@ -359,7 +358,7 @@ def check_sensor(slave: Slave, codec: Codec) -> str:
     return ""
 
 
-def _channel(slave: Slave) -> int:
+def sensor_channel(slave: Slave) -> int:
     """Return the channel of a sensor: the sub-index of the torque object in its profile, 1 if that is 0 or missing."""
     pdo = slave.device.pdo("Torque")
     signals = () if pdo is None else pdo.signals

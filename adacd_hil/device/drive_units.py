@@ -55,6 +55,13 @@ class DriveUnits(NamedTuple):
         """Whether `increments_per_joint_rev` is known and at least LEAST_INCREMENTS: fewer are the factory's 1 : 1."""
         return (self.increments_per_joint_rev or 0.0) >= LEAST_INCREMENTS
 
+    def is_other_gear(self, ratio: float) -> bool:
+        """Return whether 0x6091 contradicts a profile's `scale.gear_ratio`.
+
+        1 in the profile doesn't: 0x6076 is then the joint's. Nor does 1 : 1 in the drive, the factory's value.
+        """
+        return self.gear_ratio not in (None, 1.0) and ratio not in (1.0, self.gear_ratio)
+
 
 def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
     """Return the units of a drive's position and velocity by its objects; `number` returns an object's value or None.

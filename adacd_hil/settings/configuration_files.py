@@ -98,6 +98,14 @@ def configuration_layers(name_or_file: str, profile: str | None = None) -> list[
     return layers
 
 
+def profiles_of(name_or_file: str) -> list[str]:
+    """Return the names of the `[profiles]` that a configuration's own file has, without those that it extends.
+
+    Raises ConfigError as `configuration_layers`.
+    """
+    return [*_table_in(_load_chain(name_or_file)[-1].table, "profiles", "`profiles`")]
+
+
 def _table_in(table: dict[str, Any], key: str, name: str) -> dict[str, Any]:
     """Return the table below `key` of a table, empty if absent. Raises ConfigError, with `name`, for another value."""
     value = table.get(key, {})

@@ -70,15 +70,22 @@ def check(file: str, codec: Codec) -> ScenarioFinding:
     return ScenarioFinding(file, (), _checked(scenario, codec))
 
 
+_TIMED = ("payloads", "contacts", "bodies", "hands", "walls", "faults")
+
+
 def _checked(scenario: Scenario, codec: Codec) -> str:
-    counts = [
-        f"{len(rows)} of [[{key}]]"
-        for key in ("payloads", "contacts", "bodies", "hands", "walls", "faults")
-        if (rows := getattr(scenario, key))
+    counts = [f"{len(rows)} of [[{key}]]" for key in _TIMED if (rows := getattr(scenario, key))]
+    late = [
+        f"`{key}[{index}]` at {row.at_s:g} s"
+        for key in _TIMED
+        for index, row in enumerate(getattr(scenario, key))
+        if not getattr(row, "is_from_power_on", False) and row.at_s >= scenario.lasts_s
     ]
     parts = ["keys, types and bounds", *counts, f"all of it against arm {scenario.profile}"]
     if scenario.faults:
         parts.append(f"frames of faults against contract {codec.path.stem}")
+    if late:
+        parts.append(f"`demo` ends before {', '.join(late)}: lasts_s = {scenario.lasts_s:g} s")
     if scenario.expect is not None:
         parts.append(f"expects {scenario.expect.text}")
     return "; ".join(parts)

@@ -202,3 +202,12 @@ def test_the_command_writes_a_map_that_identifies_the_arm_and_replaces_none(tmp_
     refused = identify("--init", recording, urdf)
     assert (refused.exit_code, described.read_text()) == (2, "# my own\n")
     assert "--map names a file for this one" in refused.stderr
+
+
+def test_a_map_that_could_not_be_used_is_not_written(tmp_path, monkeypatch):
+    (tmp_path / "arm.urdf").write_text(URDF)
+    keys = [DraftedKey("arm", "urdf", "another.urdf", "")]
+    (tmp_path / "r.csv").write_text("t,q\n")
+    monkeypatch.setattr("adacd_hil.lab.offline.map_draft.draft_map", lambda *_: keys)
+    refused = called("identify", "--init", tmp_path / "r.csv", tmp_path / "arm.urdf")
+    assert (refused.exit_code, sorted(file.name for file in tmp_path.iterdir())) == (2, ["arm.urdf", "r.csv"])

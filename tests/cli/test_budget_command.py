@@ -80,7 +80,7 @@ def test_json_has_every_message_with_its_response_times():
 
 def test_the_period_is_the_options_else_the_dbcs_else_the_configurations(tmp_path):
     config = tmp_path / "slow.toml"
-    config.write_text("[bus]\nperiod_us = 2000\n")
+    config.write_text("[bus]\nperiod_us = 2000\n[devices]\nbitrate = 500000\n")
     without = tmp_path / "without.dbc"
     arm = (CONTRACTS / "stock.dbc").read_text()
     without.write_text(arm.replace('BA_ "BusPeriod_us" 1000;', ""))
@@ -94,6 +94,7 @@ def test_the_period_is_the_options_else_the_dbcs_else_the_configurations(tmp_pat
     assert period("--dbc", str(without)) == 2000
     said = budget("--config", str(config)).stdout
     assert "configuration slow has bus.period_us = 2000, the DBC 1000" in said
+    assert "configuration slow has devices.bitrate = 500000, the DBC 1000000" in said
 
 
 STOCK = 'drive = ["stock-drive", "stock-drive"]\nsensor = ["int32-sensor", "int32-sensor"]\ncontract = ""'

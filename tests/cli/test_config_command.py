@@ -8,7 +8,7 @@ from called import called
 from click.testing import Result
 
 from adacd_hil.lab.commission.host_checks import Status, configuration_checks
-from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.settings.configuration_files import configuration_layers, load_settings
 from adacd_hil.settings.toml_files import builtin_names
 
 USAGE = 2
@@ -101,6 +101,7 @@ LENGTHS = "[arm]\nlink_length_m = [0.4, 0.3]"
         (LENGTHS, 0, "`arm.cad_theta` is that of an emulated arm, from paper [profiles.P]"),
         (LENGTHS, 0, "`controller.Kp` is that of an emulated arm"),
         ("[filter]\na_rad_s = 11", 0, "the scheme is the paper's"),
+        ("[devices]\nbitrate = 500000", 0, "`devices.contract` = 'arm' has 1000000 bit/s"),
         ("assumed = ['arm.link_length_m']", 0, "assumed, not known: `arm.link_length_m`"),
         ("assumed = ['arm.link_length']", 0, "`assumed` names no setting: unknown key `arm.link_length`; did you mean"),
         ("[arm]\nposition_limit_deg = [1.31, 2.09]", USAGE, "looks like rad; in degrees that would be 75.1 and 120"),
@@ -120,6 +121,24 @@ def test_a_likely_mistake_is_a_warning_and_a_motion_that_leaves_the_arm_s_limits
     result = config("check", str(path))
     assert result.exit_code == status
     assert line in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "reason"),
+    [
+        ("", Status.OK, ""),
+        ("[arm]\ntorque_limit_Nm = [13.0, 6.0]\n", Status.WARNING, "`arm.torque_limit_Nm[0]` = 13 Nm exceeds"),
+        (LENGTHS, Status.WARNING, "`arm.cad_theta` is that of an emulated arm"),
+        ("[arm]\nvelocity_limit_deg_s = [90, 300]\n", Status.FAILED, "`arm.velocity_limit_deg_s[0]` = 90 deg/s"),
+    ],
+)
+def test_doctor_doubts_a_configuration_as_this_command_does(tmp_path, text, status, reason):
+    path = tmp_path / "mine.toml"
+    path.write_text(f'extends = "certified"\n{text}')
+    layers = configuration_layers(str(path))
+    finding = configuration_checks(load_settings(str(path)), layers)[0].run(load_settings(str(path)))
+    assert finding.status is status
+    assert reason in finding.reason
 
 
 def test_devices_and_contract_are_looked_at(tmp_path):
@@ -152,6 +171,17 @@ def test_several_files_are_checked_each():
     assert result.exit_code == USAGE
     assert result.stdout.splitlines()[0] == "certified: 0 errors, 0 warnings"
     assert "did you mean 'paper'?" in result.stdout
+
+
+def test_the_profiles_that_are_not_chosen_are_looked_at_too(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text("[profiles.bench.arm]\ntypo = 1\n[profiles.S.controller]\nKd = [3, 4]\n")
+    result = config("check", str(path))
+    assert result.exit_code == USAGE
+    found = [line.split(": ") for line in result.stdout.splitlines() if "error: " in line]
+    assert {parts[2] for parts in found} == {"--profile bench"}
+    assert any("arm.typo" in parts[3] for parts in found)
+    assert config("check", str(path), "--profile", "S").exit_code == 0
 
 
 def test_the_groups_a_group_and_a_key_are_explained():

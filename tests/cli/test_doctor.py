@@ -15,7 +15,13 @@ from rig import CODEC, Rig
 
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.lab.cli.doctor_command import as_json, as_text
-from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination, check_other_masters, check_pdo_map
+from adacd_hil.lab.commission.arm_checks import (
+    ARM_CHECKS,
+    ArmExamination,
+    check_other_masters,
+    check_pdo_map,
+    check_position_scale,
+)
 from adacd_hil.lab.commission.host_checks import Check, Finding, Status, diagnose, failed, ok, summarise, warning
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import apply_settings
@@ -153,6 +159,41 @@ def test_devices_of_one_s_own_pass(tmp_path, describe):
     if describe is describe_geared_arm:
         text = "Drive1: 0x6076 = 400000 µNm x gear 50, 20 Nm at the joint, 0.1 % of it a count"
         assert text in findings["torque scale"].reason
+    # Their sensors' EDS tells neither unit nor status, and maxon's no increments.
+    blind = {"torque scale", "saturation"} | ({"position scale"} if describe is describe_geared_arm else set())
+    assert blind == {"torque scale", "position scale", "saturation"} & set(statuses(findings, Status.WARNING))
+
+
+@pytest.mark.parametrize(
+    ("index", "device", "name"),
+    [(0x608F, 1, "position scale"), (0x6132, 2, "torque scale"), (0x6076, 0, "torque scale")],
+)
+def test_a_scale_that_no_object_says_is_not_passed(index, device, name, monkeypatch):
+    patient = examination(Rig(is_wall=True))
+    patient.connect()
+    look = {check.name: check.run for check in ARM_CHECKS}[name]
+    assert look(patient).status is Status.OK
+    slave = patient.master.slaves[device]
+    has = slave.has
+    monkeypatch.setattr(slave, "has", lambda at, sub=0: at != index and has(at, sub))
+    finding = look(patient)
+    assert finding.status is Status.WARNING
+    assert [line.split(":")[0] for line in finding.reason.split("; ") if "nothing confirms" in line] == [slave.name]
+
+
+@pytest.mark.parametrize(
+    ("polarity", "status"), [(0x00, Status.OK), (0xE0, Status.OK), (0xC0, Status.WARNING), (0x40, Status.WARNING)]
+)
+def test_a_drive_that_reverses_position_and_not_torque_is_not_passed(polarity, status, monkeypatch):
+    patient = examination(Rig(is_wall=True))
+    patient.connect()
+    slave = patient.master.slaves[1]
+    has, read = slave.has, slave.read
+    monkeypatch.setattr(slave, "has", lambda at, sub=0: at == 0x607E or has(at, sub))
+    monkeypatch.setattr(slave, "read", lambda at, sub=0: polarity if at == 0x607E else read(at, sub))
+    finding = check_position_scale(patient)
+    assert finding.status is status
+    assert f"Drive2: polarity 0x607E = 0x{polarity:02X}" in finding.reason
 
 
 def test_a_value_outside_the_bounds_of_its_profile_fails(tmp_path):
@@ -193,6 +234,11 @@ def moving(cycle: int, can_id: int, data: bytes) -> bytes:
     return bytes(message.encode(message.decode_values(data)[0], 0.2)) if can_id == message.can_id else data
 
 
+def creeping(cycle: int, can_id: int, data: bytes) -> bytes:
+    message = CODEC.message("Drive2Feedback")
+    return bytes(message.encode(message.decode_values(data)[0] + 1e-4 * cycle, 0.0)) if can_id == 0x182 else data
+
+
 def without_heartbeat(cycle: int, can_id: int, data: bytes) -> bytes | None:
     return None if can_id == 0x704 and data != b"\x00" else data
 
@@ -205,7 +251,8 @@ def losing(cycle: int, can_id: int, data: bytes) -> bytes | None:
     ("tamper", "name", "text", "skipped"),
     [
         (saturated, "saturation", "POSITIVE_OVERLOAD", "torque zero"),
-        (moving, "rest", "", "torque zero"),
+        (moving, "rest", "|dq[joint1]| = 0.2 rad/s exceeds", "torque zero"),
+        (creeping, "rest", "q[joint2] went through", "torque zero"),
         (without_heartbeat, "heartbeat", "no heartbeat from Sensor2", ""),
         (losing, "rate", "80.0 % of the periods complete", ""),
     ],

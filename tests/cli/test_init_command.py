@@ -95,6 +95,25 @@ def test_what_is_known_is_no_guess(out):
     assert set(settings.assumed) == {*(f"arm.{name}" for name in guessed), "controller.Kp", "controller.Kd"}
 
 
+@pytest.mark.parametrize(
+    ("options", "keys"),
+    [
+        (("--position-limit-deg", "1.3", "2.1"), ["arm.position_limit_deg", "trajectory.amplitude_deg"]),
+        (("--rated-torque-nm", "8", "4", "--torque-limit-nm", "9", "3"), ["arm.torque_limit_Nm[0]"]),
+        (("--rated-torque-nm", "8", "4", "--torque-limit-nm", "7", "3"), []),
+    ],
+)
+def test_an_answer_that_config_check_doubts_is_doubted_at_once(out, options, keys):
+    result = init(out, *NO_BUS, *options, "--json")
+    assert result.exit_code == 0
+    assert re.findall(r"^`([^`]+)`", "\n".join(json.loads(result.stdout)["warnings"]), re.MULTILINE) == keys
+
+
+def test_doctor_without_a_bus_is_refused_before_anything_is_written_or_played(out):
+    assert init(out, *NO_BUS, "--rehearse", "--doctor").exit_code == USAGE
+    assert not out.parent.exists()
+
+
 def test_a_file_that_is_there_is_replaced_by_force_alone(out):
     out.parent.mkdir()
     out.write_text("mine")
@@ -102,6 +121,19 @@ def test_a_file_that_is_there_is_replaced_by_force_alone(out):
     assert out.read_text() == "mine"
     assert init(out, *NO_BUS, "--force").exit_code == 0
     written(out)
+
+
+def test_a_draft_that_can_t_be_written_whole_replaces_no_file(out):
+    words = (*NO_BUS, "--eds", str(contract_folder() / "stock_drive.eds"))
+    assert init(out, *words).exit_code == 0
+    out.write_text("mine")
+    profile = out.with_name("my-arm-stock_drive.toml")
+    profile.unlink()
+    profile.mkdir()
+    refused = init(out, *words, "--force")
+    assert refused.exit_code == 1
+    assert f"{profile} can't be written: it is a folder" in refused.stderr
+    assert out.read_text() == "mine"
 
 
 def test_a_urdf_gives_lengths_masses_and_limits(tmp_path, out):
@@ -115,6 +147,19 @@ def test_a_urdf_gives_lengths_masses_and_limits(tmp_path, out):
     theta = [0.040 + 3.0 * 0.04 + 1.5 * 0.1225 + 0.015 + 1.5 * 0.0169, 0.35 * 1.5 * 0.13, 0.015 + 1.5 * 0.0169]
     assert settings.arm.cad_theta[:3] == pytest.approx(theta, rel=1e-5)
     assert "arm.link_length_m" not in settings.assumed
+
+
+@pytest.mark.parametrize(
+    ("option", "doubted"),
+    [
+        (("--position-limit-deg", "68", "114"), []),
+        (("--position-limit-deg", "70", "114"), ["`arm.position_limit_deg[0]` = 70 is above 68.75, the URDF's"]),
+        (("--velocity-limit-deg-s", "170", "250"), ["`arm.velocity_limit_deg_s[1]` = 250 is above 229.18, the URDF's"]),
+    ],
+)
+def test_a_limit_above_the_urdf_s_is_doubted(tmp_path, out, option, doubted):
+    result = init(out, *NO_BUS, "--urdf", str(urdf(tmp_path)), *option, "--json")
+    assert json.loads(result.stdout)["warnings"] == doubted
 
 
 @pytest.mark.parametrize(
@@ -173,6 +218,8 @@ def test_words_say_how_an_arm_without_a_urdf_is_mounted(out, options, mounting_d
         (("0.35 0 0", "0 0 0.35"), "the two axes are the same line"),
         (('<mass value="3"/>', '<mass value="0"/>'), 'link "upper": an inertia without a mass'),
         (('xyz="0.13 0 0"/><mass', 'xyz="0 0 0"/><mass'), 'link "lower": mass 1.5 kg without inertia'),
+        (('izz="0.04"', 'izz="400"'), 'link "upper", 0.35 m: an inertia of 400 kg m² with 3 kg'),
+        (('xyz="0.13 0 0"/><mass', 'xyz="130 0 0"/><mass'), 'link "lower", 0.3 m: the centre of its mass is 130 m'),
     ],
 )
 def test_a_urdf_of_another_arm_or_with_a_mass_that_no_link_has_is_refused(change, line):
@@ -180,6 +227,20 @@ def test_a_urdf_of_another_arm_or_with_a_mass_that_no_link_has_is_refused(change
     with pytest.raises(UrdfError) as caught:
         planar_from_urdf(text.replace(*change).encode())
     assert line in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "doubted"),
+    [
+        (('izz="0.04"', 'izz="0.3"'), []),
+        (('izz="0.04"', 'izz="0.4"'), ['link "upper", 0.35 m: an inertia of 0.4 kg m²']),
+        (('xyz="0.13 0 0"/><mass', 'xyz="1.3 0 0"/><mass'), ['link "lower", 0.3 m: the centre of its mass is 1.3 m']),
+    ],
+)
+def test_a_mass_beyond_its_link_is_doubted(change, doubted):
+    text = URDF.format(axis="0 0 1", wrist="fixed").replace(*change)
+    found = planar_from_urdf(text.encode()).doubts
+    assert [doubt[: len(line)] for doubt, line in zip(found, doubted, strict=True)] == doubted
 
 
 def test_crossed_axes_are_refused_and_a_bent_zero_is_doubted():
@@ -325,6 +386,14 @@ def test_profiles_are_drafted_from_eds_files_beside_the_configuration(out, tmp_p
     monkeypatch.chdir(tmp_path)  # the profiles are found from anywhere
     drafted, stock = (loaded_contract(load_settings(name)) for name in ("lab/my-arm.toml", "stock"))
     assert drafted.layout_digest == stock.layout_digest
+
+
+def test_an_eds_beside_named_profiles_of_its_kind_is_refused(out):
+    words = ("--eds", str(contract_folder() / "stock_drive.eds"), "--drive", "maxon-epos4", "maxon-epos4")
+    refused = init(out, *NO_BUS, *words)
+    assert refused.exit_code == USAGE
+    assert "stock_drive.eds is of a drive, and --drive names" in refused.stderr
+    assert not out.parent.exists()
 
 
 def test_two_eds_of_a_kind_are_of_joint_1_and_2_and_more_or_namesakes_are_refused(out, tmp_path):

@@ -1,6 +1,7 @@
 """`adacd-hil tare`, and `adacd-hil run --tare`: the commands on the embedded bus."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,14 @@ def test_a_tare_is_measured_stored_and_printed(lab):
     assert tuple(printed["offset_Nm"]) == stored.offset_Nm
     np.testing.assert_allclose(stored.offset_Nm, OFFSET, atol=0.005)
     assert stored.samples == 300
+
+
+@pytest.mark.parametrize(("has_noise", "joints"), [(True, []), (False, ["joint1", "joint2"])])
+def test_a_torque_that_never_changes_is_warned_of(lab, has_noise, joints):
+    lab.scenario["noise"] = has_noise
+    result = lab.tare()
+    assert result.exit_code == 0
+    assert re.findall(r"warning: the torque of (\w+) never changed", result.stdout) == joints
 
 
 def test_a_second_tare_keeps_the_first_and_says_what_it_replaces(lab):

@@ -15,7 +15,8 @@ from adacd_hil.records import FaultReason
 from adacd_hil.wire.bus import QueueBytes
 from adacd_hil.wire.dbc_contract import load_codec
 
-COMMAND = load_codec().message("Drive1Command")
+CODEC = load_codec()
+COMMAND = CODEC.message("Drive1Command")
 COMMANDS = (0x201, 0x202)
 
 
@@ -27,7 +28,7 @@ def loop_of(rig: Rig, is_enabling: bool = False) -> ZeroTorqueLoop:
 
 def run(rig: Rig, seconds: float = 0.2, is_enabling: bool = False) -> tuple[CommunicationTest, FaultReason]:
     loop = loop_of(rig, is_enabling)
-    test = CommunicationTest(rig.settings, rig.arm, 1_000_000)
+    test = CommunicationTest(rig.settings, rig.arm, 1_000_000, is_enabling=is_enabling)
     fault = loop.run(seconds, test.observe_cycle)
     return test, fault
 
@@ -54,6 +55,27 @@ def test_enabled_drives_get_no_torque_and_are_disabled_at_the_end():
     last = [frame for frame in rig.sent if frame.can_id in COMMANDS][-2 * DISABLE_CYCLES :]
     assert {int(COMMAND.decode_values(frame.data)[0]) for frame in last} == {0}
     assert not any(drive.is_enabled for drive in rig.bench.drives)
+
+
+@pytest.mark.parametrize("is_willing", [True, False])
+def test_an_enabled_test_is_good_only_of_drives_that_were_enabled(is_willing):
+    rig = Rig(is_wall=True)
+    status = CODEC.message("Drive1Status")
+
+    def refuse(cycle: int, can_id: int, data: bytes) -> bytes:
+        values = list(status.decode_values(data)) if can_id == status.can_id else []
+        if is_willing or not values:
+            return data
+        values[status.place("statusword")] = 0x40
+        return bytes(status.encode(*values))
+
+    rig.tamper = refuse
+    loop = loop_of(rig, is_enabling=True)
+    test = CommunicationTest(rig.settings, rig.arm, 1_000_000, is_enabling=True)
+    assert loop.run(0.4, test.observe_cycle) is FaultReason.NONE
+    assert (test.share, test.enabled > 0) == (1.0, is_willing)
+    assert test.verdict is (Verdict.GOOD if is_willing else Verdict.NOT_SUFFICIENT)
+    assert [line.split(",")[0] for line in loop.device_faults] == ([] if is_willing else ["Drive1: SWITCH_ON_DISABLED"])
 
 
 def test_a_drive_that_drops_out_ends_an_enabled_test_with_quick_stop():

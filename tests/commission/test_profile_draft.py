@@ -165,9 +165,12 @@ def test_a_maker_s_drive_is_recognised_whatever_its_model():
     assert fitting_profiles(node, "drive") == ()
 
 
-@pytest.mark.parametrize(("rpm", "degrees_s"), [(50_000, None), (3000, 360.0), (6, None), (0, None)])
-def test_a_speed_limit_that_no_joint_has_is_the_factory_s(rpm, degrees_s):
-    ratings = DeviceRatings(numbers={(0x6080, 0): rpm})
+@pytest.mark.parametrize(
+    ("rpm", "gear", "degrees_s"),
+    [(50_000, None, None), (3000, None, 360.0), (6, None, None), (0, None, None), (3000, 1, 360.0), (3000, 100, 180.0)],
+)
+def test_a_speed_limit_that_no_joint_has_is_the_factory_s(rpm, gear, degrees_s):
+    ratings = DeviceRatings(numbers={(0x6080, 0): rpm} | ({} if gear is None else {(0x6091, 1): gear, (0x6091, 2): 1}))
     assert ratings.velocity_limit_deg_s(ScaleSettings(gear_ratio=50.0)) == degrees_s
 
 

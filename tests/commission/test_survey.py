@@ -62,8 +62,21 @@ def test_who_is_found_is_compared_with_who_is_expected():
         return compare(found, [dataclasses.replace(node, **changes) for node in expected])
 
     assert compared(product=0x403)[1] == "Drive1 expected; product is not 0x403"
+    assert compared(profile_number=404)[1] == "Drive1 expected; profile number is not 404"
+    assert compared(serial=7)[2] == "Drive2 expected; serial number is not 7"
     assert set(compared(vendor=None, product=None).values()) == {""}  # not known, not compared
     assert compare(found, [node for node in expected if node.node_id != 2])[2] == "unexpected"
+
+
+def test_a_device_of_the_other_joint_is_known_by_its_serial_number():
+    rig = Rig(is_wall=True)
+    for slave, serial, expected in zip(rig.master.slaves, (11, 12, 21, 22), ((12, 11),) * 2 + ((),) * 2, strict=True):
+        rig.bench.devices[slave.node_id - 1].serve(0x1018, 4, lambda serial=serial: serial)
+        profile = slave.device.profile
+        settings = dataclasses.replace(profile.settings, serial=expected)
+        slave.device = dataclasses.replace(slave.device, profile=profile._replace(settings=settings))
+    verdicts = compare(look(rig), expected_nodes(rig.master.slaves))
+    assert [node for node, verdict in verdicts.items() if verdict] == [1, 2]
 
 
 def test_a_node_that_is_only_heard_is_found_and_does_not_answer():

@@ -138,19 +138,22 @@ def test_a_tare_knows_the_zero_less_well_as_it_ages(
         ({}, ""),
         ({"mounting_deg": (90.0, 0.0)}, r"arm.mounting_deg = \[90.0, 0.0\], but the configuration has \[90.0, -90.0\]"),
         ({"zero_deg": (45.0, 0.0)}, r"arm.zero_deg = \[45.0, 0.0\], but the configuration has \[0.0, 0.0\]"),
+        ({"gravity_model": "none"}, r"gravity_model = 'none', but the configuration has estimator.gravity = true"),
     ],
-    ids=["as measured", "of an earlier version", "turned", "another zero"],
+    ids=["as measured", "of an earlier version", "turned", "another zero", "taken for flat"],
 )
 def test_a_tare_of_another_gravity_is_refused(tmp_path: Path, changes: dict[str, object], words: str) -> None:
     estimator = dataclasses.replace(SETTINGS.estimator, gravity=True, P0=(*SETTINGS.estimator.P0, 50.0, 50.0))
     arm = dataclasses.replace(SETTINGS.arm, cad_theta=())
-    upright, path = dataclasses.replace(SETTINGS, estimator=estimator, arm=arm), stored(tmp_path, **changes)
+    upright = dataclasses.replace(SETTINGS, estimator=estimator, arm=arm)
+    path = stored(tmp_path, **{"gravity_model": "estimated"} | changes)
     if words:
         with pytest.raises(ConfigError, match=words):
             use_tare(path, upright, DATE_NS)
     else:
         assert use_tare(path, upright, DATE_NS).tare.offset_Nm == TARE.offset_Nm
-    assert use_tare(path, SETTINGS, DATE_NS).tare.offset_Nm == TARE.offset_Nm
+        with pytest.raises(ConfigError, match=r"the configuration has estimator.gravity = false"):
+            use_tare(path, SETTINGS, DATE_NS)
 
 
 @pytest.mark.parametrize(("age_h", "words"), [(24.0, None), (24.1, "is 24.1 h old"), (-0.2, "0.2 h in the future")])

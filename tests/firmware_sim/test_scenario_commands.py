@@ -58,6 +58,19 @@ def test_check_has_a_line_for_each_problem_of_each_file(capsys, tmp_path):
     assert found == [(str(second), 1), ("idle", 0), ("nowhere.toml", 1)]
 
 
+def test_check_names_what_begins_after_the_run(capsys, tmp_path):
+    path = tmp_path / "mine.toml"
+    touch = "[[contacts]]\nat_s = {}\nlink = 1\npoint_m = 0.3\nangle_deg = 90.0\nforce_N = 20.0\nduration_s = 0.1\n"
+    fault = "[[faults]]\nkind = 'lose'\nframe = 'torque'\nnode = 'sensor1'\nat_s = {}\n"
+    rows = [touch.format(4.0), touch.format(9.0), fault.format(5.0), fault.format(7.0) + "since = 'power_on'\n"]
+    path.write_text("lasts_s = 5.0\n" + "".join(rows))
+    assert run_main("check", str(path)) == 0
+    late = capsys.readouterr().out.partition("`demo` ends before ")[2].partition(":")[0]
+    assert late == "`contacts[1]` at 9 s, `faults[0]` at 5 s"
+    assert run_main("check", "paper") == 0
+    assert "ends before" not in capsys.readouterr().out
+
+
 def test_check_knows_the_contract(capsys, tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text("[[faults]]\nkind = 'freeze_counter'\nframe = 'torque'\nnode = 'sensor1'\nat_s = 1.0\n")

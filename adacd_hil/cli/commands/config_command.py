@@ -1,7 +1,5 @@
 """`adacd-hil config`: effective settings and their origins, errors and likely mistakes, the meaning of a key."""
 
-import functools
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -13,7 +11,6 @@ from adacd_hil.given_path import CommandGroup
 from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
-    from adacd_hil.settings.configuration import Settings
     from adacd_hil.settings.setting_keys import KnownKey
 
 EPILOG = explain_statuses(OK="done, warnings included", USAGE="wrong usage, or a configuration that can't be used")
@@ -95,8 +92,6 @@ def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCod
     from adacd_hil.control.configuration_check import examine_configuration
 
     findings = {name: examine_configuration(name, profile) for name in names}
-    for found in findings.values():
-        found.warnings.extend(_other_gears(found.settings) if found.settings else ())
     described = {name: {"errors": found.errors, "warnings": found.warnings} for name, found in findings.items()}
     lines = []
     for name, found in findings.items():
@@ -105,24 +100,6 @@ def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCod
         lines.append(f"{name}: {counted(len(found.errors), 'error')}, {counted(len(found.warnings), 'warning')}")
     answer(as_json, described, "\n".join(map(in_line, lines)))
     return ExitCode.USAGE if any(found.errors for found in findings.values()) else ExitCode.OK
-
-
-def _other_gears(settings: "Settings") -> Iterator[str]:
-    """Yield a warning for each drive whose gear by the profile isn't that of 0x6091 by the EDS.
-
-    1 in the profile, and 1 : 1 in the EDS, say nothing of the gear.
-    """
-    from adacd_hil.device.canopen_bus import find_variable
-    from adacd_hil.device.device_files import place_devices
-    from adacd_hil.device.drive_units import read_drive_units
-
-    for device in place_devices(settings):
-        find = functools.partial(find_variable, device.objects)
-        by_eds = read_drive_units(lambda *at, find=find: getattr(find(*at), "default", None)).gear_ratio
-        gear = device.settings.scale.gear_ratio
-        if by_eds not in (None, 1.0) and gear not in (1.0, by_eds):
-            text = f"{device.name}: `scale.gear_ratio` = {gear:g}, 0x6091 = {by_eds:g} by the EDS"
-            yield f"{text}: correct it, or set the gear in the drive"
 
 
 @config.command(epilog=EPILOG)

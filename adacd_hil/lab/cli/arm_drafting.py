@@ -16,7 +16,7 @@ from adacd_hil.dates import format_date
 from adacd_hil.device.device_files import load_profile, profile_names
 from adacd_hil.device.profile import ProfileSettings, ScaleSettings
 from adacd_hil.file_access import read_input
-from adacd_hil.file_replacement import replace_file
+from adacd_hil.file_replacement import replace_files
 from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.lab.commission.arm_draft import (
     LEVEL_DEG,
@@ -133,7 +133,8 @@ class DraftFiles:
     def examine(self, text: str) -> ConfigurationFindings:
         """Check a configuration's text together with the added files, as `config check`; return the findings.
 
-        Raises CommandError if it has errors. Writes to a temporary folder only.
+        Likely mistakes name the files as they will be. Raises CommandError if it has errors. Writes to a temporary
+        folder only.
         """
         with tempfile.TemporaryDirectory() as folder:
             for path, data in (self.contents | {self.out: text.encode()}).items():
@@ -142,20 +143,19 @@ class DraftFiles:
         if found.errors:
             line = found.errors[0].replace(f"{folder}/", "")
             raise CommandError(f"{self.out} is not written, as it could not be used: {line}", ExitCode.USAGE)
-        return found
+        return found._replace(mistakes=[line.replace(f"{folder}/", "") for line in found.mistakes])
 
     def write_files(self, text: str) -> None:
         """Write the configuration, `text`, to `out`, and the added files; make the folder.
 
-        An existing file is replaced. Raises CommandError if one can't be written; earlier ones are then written.
+        Existing files are replaced, as by `replace_files`. Raises CommandError if one can't be written.
         """
         self.contents[self.out] = text.encode()
         try:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            for path, data in self.contents.items():
-                replace_file(path, data)
+            replace_files(self.out.parent, {path.name: data for path, data in self.contents.items()})
         except OSError as error:
-            raise CommandError(f"{self.out} can't be written: {error.strerror}") from error
+            failed = next((path for path in self.contents if str(path) == error.filename), self.out)
+            raise CommandError(f"{failed} can't be written: {error.strerror}") from error
 
 
 class Drafting:
@@ -189,7 +189,8 @@ class Drafting:
         for period_us in _PERIODS_US if facts.period_us in _PERIODS_US else (facts.period_us,):
             entries, warnings = draft_arm(facts._replace(period_us=period_us))
             text = draft_as_toml(entries, title, quoted(self.writing.out))
-            if not self.writing.examine(text).is_late:
+            found = self.writing.examine(text)
+            if not found.is_late:
                 break
         summary: dict[str, Any] = {
             "bus": self.bus,
@@ -198,7 +199,7 @@ class Drafting:
             "sensor": list(facts.sensor.value),
             "sensor_node": list(facts.sensor_node.value),
             "assumed": [*assumed_keys(entries), *self._profile_guesses(facts)],
-            "warnings": [*self.warnings, *warnings],
+            "warnings": [*self.warnings, *warnings, *found.mistakes],
         }
         return text, summary
 
@@ -484,11 +485,16 @@ class Drafting:
         """Draft profiles of each given EDS, beside the configuration; return their file names by kind and joint (0, 1).
 
         devices: found on the bus; [] without a bus: of two EDS of a kind, the first is of joint 1. Raises CommandError
-        for an EDS that fits no device, or a device that has another EDS already.
+        for an EDS beside named profiles, or that fits no device, or a device that has another EDS already.
         """
         names: dict[tuple[str, int], str] = {}
         files = self._eds_files()
         for place, (eds, kind) in enumerate(files):
+            if getattr(self.options, kind) is not None:
+                raise CommandError(
+                    f"EDS {eds} is of a {kind}, and --{kind} names the {kind}s' profiles: leave out one of them",
+                    ExitCode.USAGE,
+                )
             identity = identity_of(eds)
             same = [device for device in devices if device.kind == kind]
             fitting = [
@@ -777,8 +783,8 @@ class Drafting:
     def _limit(self, key: str, option: str, proposal: Fact) -> Fact:
         """Return the two values of `arm.KEY`, within its bounds, by option or user, with their source.
 
-        proposal: for the user, or taken with `--yes`. Raises ConfigError for a wrong option, CommandError without an
-        answer.
+        proposal: for the user, or taken with `--yes`; an answer above a known one is added to the warnings. Raises
+        ConfigError for a wrong option, CommandError without an answer.
         """
         given = getattr(self.options, option[2:].replace("-", "_"))
         meaning = known_keys()[f"arm.{key}"].meaning
@@ -789,6 +795,9 @@ class Drafting:
             lambda value: _checked(key, _numbers(value, float, option)),
             proposal,
         )
+        for joint, (limit, known) in enumerate(zip(value, proposal.value, strict=True)):
+            if limit > known and proposal.source not in ("", _BY_RATED):
+                self.warnings.append(f"`arm.{key}[{joint}]` = {limit:g} is above {known:g}, {proposal.source}")
         return Fact(value, source)
 
 
@@ -874,6 +883,10 @@ def _read_urdf(path: Path, locked: Sequence[str], pitch_deg: float = 0.0) -> Pla
         raise ConfigError(f"URDF {path}: {error}") from None
 
 
+_BY_RATED = "the rated torque"
+"""Source of a torque limit above which `config check` doubts it, too."""
+
+
 def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: PlanarArm) -> Fact:
     """Return as proposed torque limits, Nm, the smallest of 0x6072, the URDF's effort and the rated torque, per joint.
 
@@ -882,7 +895,7 @@ def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: P
     shares = [min(rating.torque_share or 1.0, 1.0) for rating in ratings] or [1.0, 1.0]
     efforts = geometry.effort_Nm or rated.value
     limit = tuple(min(rated.value[joint] * shares[joint], efforts[joint]) for joint in range(2))
-    source = "the rated torque" if limit == tuple(rated.value) else "the least of 0x6072 and the URDF's effort"
+    source = _BY_RATED if limit == tuple(rated.value) else "the least of 0x6072 and the URDF's effort"
     return Fact(limit, source if rated.source else "")
 
 

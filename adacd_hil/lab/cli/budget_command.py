@@ -48,6 +48,10 @@ def judge(
         notes.append(
             f"configuration {settings.name} has bus.period_us = {settings.bus.period_us}, the DBC {budget.period_us}"
         )
+    if bitrate is None and settings.devices.bitrate != budget.bitrate:
+        notes.append(
+            f"configuration {settings.name} has devices.bitrate = {settings.devices.bitrate}, the DBC {budget.bitrate}"
+        )
     return codec, budget, notes
 
 

@@ -8,7 +8,6 @@ from adacd_hil.cli.output import CommandError, ExitCode, tell
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.control.pacing import prepare_spin
 from adacd_hil.device.arm import Arm
-from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Master
 from adacd_hil.device.strangers import refuse_company
@@ -83,7 +82,7 @@ def run_commtest(
         try:
             if recorder is not None:
                 recorder.cycle(clock.now_ns(), [], boot_frames)
-            test = CommunicationTest(settings, arm, *read_bitrates(codec))
+            test = CommunicationTest(settings, arm, *read_bitrates(codec), is_enabling)
             tell(f"testing for {seconds:g} s, drives {'enabled, torque zero' if is_enabling else 'not enabled'}")
             fault = _run(loop, master, test, recorder, seconds)
         finally:
@@ -94,7 +93,7 @@ def run_commtest(
     described |= {
         "fault": fault.name,
         "is_interrupted": loop.is_interrupted,
-        "device_faults": describe_faults(arm),
+        "device_faults": loop.device_faults,
     }
     described |= {"events": [f"{event.name}: {event.message}" for event in master.take_events()]}
     if recorder is not None:
@@ -230,13 +229,18 @@ def _evidence(test: CommunicationTest, period_us: float) -> TimingEvidence:
 
 
 def _warnings(test: CommunicationTest, scheduler: str) -> list[str]:
-    """Return the warnings of a test, a line each: no real-time priority, silent devices, skipped periods."""
+    """Return the warnings of a test, a line each.
+
+    They are: no real-time priority, silent devices, drives never enabled, skipped periods.
+    """
     warnings = []
     if not scheduler.startswith(("SCHED_FIFO", "SCHED_DEADLINE")):
         warnings.append(f"without real-time priority ({scheduler}) the times are those of a busy desktop")
     silent = [name for name, device in test.devices().items() if not any(device["ages"])]
     if silent:
         warnings.append(f"never a cyclic frame from {', '.join(silent)}")
+    if test.is_enabling and not test.enabled:
+        warnings.append("the drives were never enabled: the data are those of a disabled arm")
     if test.overruns:
         warnings.append(f"{test.overruns} of {test.periods} periods were skipped: this host was late")
     return warnings

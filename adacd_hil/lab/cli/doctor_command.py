@@ -19,6 +19,7 @@ from adacd_hil.lab.commission.host_checks import (
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import request_realtime
+from adacd_hil.settings.configuration_files import configuration_layers
 from adacd_hil.wire.can_interface import InterfaceState, read_link
 from adacd_hil.wire.contract_attributes import read_bitrates
 from adacd_hil.wire.open_bus import open_bus
@@ -68,7 +69,8 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
             patient.ask = lambda line: progress(f">>> {line}")
         elif is_moving:
             patient.no_move_reason = "stdin is not a terminal"
-        findings = diagnose(configuration_checks(settings), settings, report)
+        layers = configuration_layers(connection.config, connection.profile)
+        findings = diagnose(configuration_checks(settings, layers), settings, report)
         findings += diagnose(HOST_CHECKS, host, report)
         try:
             with on_interrupt(raise_interrupt):

@@ -15,6 +15,7 @@ from adacd_hil.log.log_files import failing_as
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
+from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.settings.toml_text import toml_value
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
     is in the way; ConfigError, LogError if recording and URDF don't give a map.
     """
     from adacd_hil.lab.offline.map_draft import draft_map, map_text
-    from adacd_hil.lab.offline.recording_map import read_map
+    from adacd_hil.lab.offline.recording_map import parse_map
 
     urdfs = [path for path in given if path.suffix.lower() in (".urdf", ".xml")]
     others = [path for path in given if path not in urdfs]
@@ -109,16 +110,17 @@ def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
     recording = others[0]
     target = map_path or recording.parent / "map.toml"
     keys = draft_map(recording, urdfs[0], target)
+    text = map_text(recording, keys)
+    parse_map(parse_toml(text), target)
     try:
-        write_new_file(target, map_text(recording, keys).encode())
+        write_new_file(target, text.encode())
     except FileExistsError:
         line = f"{target} is another map already; --map names a file for this one"
         raise CommandError(line, ExitCode.USAGE) from None
-    read_map(target)
     guesses = [(f"{key.section}.{key.key}", toml_value(key.value), key.reason) for key in keys if key.reason]
     table = format_table(("key", "value", "a guess, because"), guesses)
-    text = f"{target} written" + (f"; look at these:\n{table}" if guesses else ", without guesses")
-    show(text, f"adacd-hil identify {quoted(recording)} --map {quoted(target)}")
+    written = f"{target} written" + (f"; look at these:\n{table}" if guesses else ", without guesses")
+    show(written, f"adacd-hil identify {quoted(recording)} --map {quoted(target)}")
     return ExitCode.OK
 
 

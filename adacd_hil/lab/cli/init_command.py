@@ -85,9 +85,11 @@ def init(
         text, summary = Drafting(options, interview, writing).draft()
     else:
         text, summary = draft_from_log(log, options, interview, writing)
+    bus, code = summary.pop("bus", None), ExitCode.OK
+    if doctor and bus is None:
+        raise CommandError("--doctor needs a bus: run `adacd-hil doctor` where the arm is", ExitCode.USAGE)
     writing.write_files(text)
     summary |= {"file": str(out), "written": [str(path) for path in writing.contents]}
-    bus, code = summary.pop("bus", None), ExitCode.OK
     if not as_json:
         show(as_text(summary))
     if interview.confirm(rehearse, "Rehearse with an emulated arm now?"):
@@ -97,8 +99,6 @@ def init(
         summary["rehearsal"] = report.content
         if not as_json:
             show(report.as_text())
-    if doctor and bus is None:
-        raise CommandError("--doctor needs a bus: run `adacd-hil doctor` where the arm is", ExitCode.USAGE)
     if bus is not None and interview.confirm(doctor, "Check host, bus and arm now (`doctor`)?"):
         from adacd_hil.cli.connection import Connection
         from adacd_hil.lab.cli import doctor_command

@@ -62,10 +62,9 @@ def draft_from_log(
         if names is not None and all(entry.key != f"devices.{kind}" for entry in entries):
             entries.append(Entry(f"devices.{kind}", tuple(devices.beside(name, kind) for name in names), "given"))
     title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]} from the log {path.name}."
-    summary = {"from": str(path), "assumed": list(settings.assumed), "warnings": warnings}
     written = draft_as_toml(entries, title, quoted(files.out), base)
-    files.examine(written)
-    return written, summary
+    warnings += files.examine(written).mistakes
+    return written, {"from": str(path), "assumed": list(settings.assumed), "warnings": warnings}
 
 
 def _differences(settings: Settings, base: str, path: Path, warnings: list[str]) -> list[Entry]:

@@ -21,7 +21,7 @@ from adacd_hil.settings.setting_keys import apply_settings
 
 
 def as_text(tare: Tare, path: Path, backup: Path | None) -> str:
-    """Return a tare as text for people. path: its file.
+    """Return a tare as text for people, with a warning of a torque that never changed. path: its file.
 
     backup: copy of the file that was there before, None without one.
     """
@@ -39,6 +39,12 @@ def as_text(tare: Tare, path: Path, backup: Path | None) -> str:
             ),
             start=1,
         )
+    ]
+    spans_Nm = zip(*(pose.peak_to_peak_Nm for pose in tare.poses), strict=True)
+    lines += [
+        f"warning: the torque of joint{joint} never changed: the sensor is dead, or coarser than its noise"
+        for joint, spans in enumerate(spans_Nm, start=1)
+        if not any(spans)
     ]
     if tare.gravity_model != "none":
         lines.append("gravity ({}): a4 = {:.4f} Nm, a5 = {:.4f} Nm".format(tare.gravity_model, *tare.gravity_Nm))

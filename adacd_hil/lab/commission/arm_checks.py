@@ -16,11 +16,12 @@ from adacd_hil.clock import Clock
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import describe_faults
 from adacd_hil.device.canopen_bus import read_object
-from adacd_hil.device.device_setup import Slave, command_deadline_ms, pdo_differences, torque_unit
+from adacd_hil.device.device_setup import Slave, command_deadline_ms, pdo_differences, sensor_channel, torque_unit
+from adacd_hil.device.drive_units import read_drive_units
 from adacd_hil.device.network import Master
-from adacd_hil.device.profile import PlacedDevice
+from adacd_hil.device.profile import ObjectName, PlacedDevice
 from adacd_hil.device.strangers import host_frames
-from adacd_hil.device.torque_sensor import SensorStatus
+from adacd_hil.device.torque_sensor import SensorStatus, TorqueSensor
 from adacd_hil.lab.commission.communication_test import (
     CommunicationTest,
     Verdict,
@@ -29,6 +30,7 @@ from adacd_hil.lab.commission.communication_test import (
 )
 from adacd_hil.lab.commission.host_checks import Check, Finding, failed, ok, skipped, warning
 from adacd_hil.lab.commission.survey import NMT_STATES, compare, expected_nodes, survey
+from adacd_hil.lab.commission.tare import ArmMovedError, check_motion
 from adacd_hil.lab.commission.traffic import Traffic, listen
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.settings.configuration import Settings
@@ -223,34 +225,94 @@ def check_pdo_map(patient: ArmExamination) -> Finding:
     return ok("read back, equal to the contract")
 
 
-def describe_torque_scale(slave: Slave, rated_Nm: float) -> str:
-    """Return a line on how a motor's rated torque, 0x6076, becomes that of its joint, `rated_Nm`.
+def check_torque_scale(patient: ArmExamination) -> Finding:
+    """Describe each drive's way from 0x6076 to the rated torque of its joint, and the torque of a sensor's count.
 
-    If the slave's EDS lacks 0x6076, the line is on that. Reads the object from the slave. Raises DeviceError if it
-    refuses or doesn't answer.
+    The set-up has compared the values already; warn of an EDS without the objects. Raises DeviceError if a device
+    refuses a read or doesn't answer.
     """
+    slaves = patient.master.slaves
+    pairs = zip(slaves[:JOINTS], patient.settings.arm.rated_torque_Nm, strict=True)
+    return _together([*(_rated_torque(*pair) for pair in pairs), *map(_torque_of_count, slaves[JOINTS:])])
+
+
+def check_position_scale(patient: ArmExamination) -> Finding:
+    """Describe each drive's increments per revolution of the joint; warn if no object tells them, or of its polarity.
+
+    The set-up has compared the increments that an object tells. Raises DeviceError.
+    """
+    drives = patient.master.slaves[:JOINTS]
+    return _together([*map(_increments, drives), *(_polarity(slave) for slave in drives if slave.has(0x607E))])
+
+
+def _together(findings: Sequence[Finding]) -> Finding:
+    """Return findings on several devices, passed or warnings, as one: a warning if one of them is."""
+    text = "; ".join(finding.reason for finding in findings)
+    remedies = dict.fromkeys(finding.remedy for finding in findings if finding.remedy)
+    return warning(text, "; ".join(remedies)) if remedies else ok(text)
+
+
+def _rated_torque(slave: Slave, rated_Nm: float) -> Finding:
+    """Return the finding on a motor's rated torque, 0x6076, and that of its joint, `rated_Nm`. Raises DeviceError."""
     if not slave.has(0x6076):
-        return f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint"
+        return warning(
+            f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint",
+            "compare `arm.rated_torque_Nm` with the data sheets of motor and gear",
+        )
     scale = slave.device.settings.scale
     parts = [f"{slave.read(0x6076)} {torque_unit(scale)}"]
     if scale.gear_ratio != 1.0:
         parts.append(f"gear {scale.gear_ratio:g}")
     if scale.gear_efficiency != 1.0:
         parts.append(f"efficiency {scale.gear_efficiency:g}")
-    return f"{slave.name}: 0x6076 = {' x '.join(parts)}, {rated_Nm:.4g} Nm at the joint, 0.1 % of it a count"
+    return ok(f"{slave.name}: 0x6076 = {' x '.join(parts)}, {rated_Nm:.4g} Nm at the joint, 0.1 % of it a count")
 
 
-def check_torque_scale(patient: ArmExamination) -> Finding:
-    """Describe how each drive's 0x6076 becomes the rated torque of its joint; warn if an EDS lacks 0x6076.
+def _torque_of_count(slave: Slave) -> Finding:
+    """Return the finding on the torque of one count of a sensor; the set-up needs 0x6131 and 0x6132 to compare it."""
+    count, channel = f"{slave.device.settings.scale.torque_Nm:g} Nm a count", sensor_channel(slave)
+    lacking = [str(ObjectName(index, channel)) for index in (0x6131, 0x6132) if not slave.has(index, channel)]
+    if lacking:
+        return warning(
+            f"{slave.name}: its EDS has no {', '.join(lacking)}, so nothing confirms {count}",
+            "compare `scale.torque_Nm` with the sensor's data sheet, or by a known weight",
+        )
+    return ok(f"{slave.name}: {count}")
 
-    The set-up has compared the values already. Raises DeviceError if a drive refuses a read or doesn't answer.
-    """
-    slaves = patient.master.slaves[:JOINTS]
-    pairs = zip(slaves, patient.settings.arm.rated_torque_Nm, strict=True)
-    text = "; ".join(describe_torque_scale(slave, rated_Nm) for slave, rated_Nm in pairs)
-    if any(not slave.has(0x6076) for slave in slaves):
-        return warning(text, "compare `arm.rated_torque_Nm` with the data sheets of motor and gear")
-    return ok(text)
+
+def _increments(slave: Slave) -> Finding:
+    """Return the finding on a drive's increments per revolution of the joint. Raises DeviceError."""
+    scale = slave.device.settings.scale
+    units = read_drive_units(_reader(slave), scale.gear_ratio)
+    count = f"{scale.increments_per_joint_rev:.10g} increments per revolution of the joint"
+    if units.has_increments:
+        return ok(f"{slave.name}: {count}, {units.increments_text}")
+    return warning(
+        f"{slave.name}: nothing confirms {count}" + f": {units.increments_text}" * bool(units.increments_text),
+        "turn each joint by a known angle, and compare it with the position",
+    )
+
+
+_POLARITIES = (0x00, 0xE0)
+"""0x607E of a drive that turns none or all of position (bit 7), velocity (bit 6) and torque (bit 5, not of all makers)
+round."""
+
+
+def _polarity(slave: Slave) -> Finding:
+    """Return the finding on a drive's 0x607E: a warning if it reverses only some quantities. Raises DeviceError."""
+    polarity = slave.read(0x607E)
+    text = f"{slave.name}: polarity 0x607E = 0x{polarity:02X}"
+    if polarity & 0xE0 in _POLARITIES:
+        return ok(text)
+    return warning(
+        f"{text}: position and torque may count against each other, and the arm run away",
+        "set 0x607E to 0 with the maker's tool; `arm.sign` reverses a joint",
+    )
+
+
+def _reader(slave: Slave) -> Callable[[int, int], int | None]:
+    """Return a function that reads an object by index and sub-index; it returns None for one that the EDS lacks."""
+    return lambda index, sub: slave.read(index, sub) if slave.has(index, sub) else None
 
 
 def check_protection(patient: ArmExamination) -> Finding:
@@ -363,14 +425,33 @@ def check_devices(patient: ArmExamination) -> Finding:
 
 
 def check_saturation(patient: ArmExamination) -> Finding:
-    """Fail if a sensor's last status is not zero: saturated, not valid."""
+    """Fail if a sensor's last status is not zero: saturated, not valid; warn of sensors that can't tell.
+
+    They send no status, and their profile has no `plausibility.torque_range_Nm`. The check is skipped without complete
+    cycles.
+    """
+    if not len(patient.joint_values("tau_J")):
+        return skipped("no complete cycle")
     reported = {sensor.name: SensorStatus(sensor.status) for sensor in patient.arm.sensors if sensor.status}
     text = ", ".join(f"{name} {status!r}" for name, status in reported.items())
     if any(status & SensorStatus.NOT_VALID for status in reported.values()):
         return failed(text, "see the sensor's EMCY; check its cable to the strain gauge")
     if reported:
         return failed(text, "take the load off the joint; the arm must hang free")
+    mute = [sensor.name for sensor in patient.arm.sensors if not _tells_range(sensor, patient.devices)]
+    if mute:
+        return warning(
+            f"{', '.join(mute)}: no status, and no range in the profile: a saturated torque isn't noticed",
+            "give `plausibility.torque_range_Nm` of its profile",
+        )
     return ok("within range")
+
+
+def _tells_range(sensor: TorqueSensor, devices: Sequence[PlacedDevice]) -> bool:
+    """Return whether a sensor's frames or its profile show that it is saturated. devices: of the arm."""
+    frames = (pdo for device in devices if device.name == sensor.name for pdo in device.settings.pdo)
+    has_status = any(signal.signal == "status" for pdo in frames for signal in pdo.signals)
+    return has_status or sensor.status_in_header is not None or sensor.torque_range_Nm > 0.0
 
 
 def _by_joint(form: str, values: Vector) -> str:
@@ -378,19 +459,18 @@ def _by_joint(form: str, values: Vector) -> str:
 
 
 def check_rest(patient: ArmExamination) -> Finding:
-    """Fail if a joint was faster than `safety.rest_velocity_rad_s` in the stored cycles.
+    """Fail if a joint moved or crept in the stored cycles, as a tare judges it by `check_motion`.
 
     The check is skipped if no cycle is complete.
     """
-    dq = patient.joint_values("dq")
+    q, dq = patient.joint_values("q"), patient.joint_values("dq")
     if not len(dq):
         return skipped("no complete cycle")
-    fastest = np.abs(dq).max(axis=0)
-    bound = patient.settings.safety.rest_velocity_rad_s
-    text = _by_joint("up to {:.4f} rad/s", fastest)
-    if np.any(fastest > bound):
-        return failed(f"{text}, above {bound:g}", "let the arm come to rest and keep hands off")
-    return ok(text)
+    try:
+        check_motion(q, dq, patient.settings)
+    except ArmMovedError as moved:
+        return failed(str(moved), "let the arm come to rest and keep hands off")
+    return ok(_by_joint("up to {:.4f} rad/s", np.abs(dq).max(axis=0)))
 
 
 def check_torque_zero(patient: ArmExamination) -> Finding:
@@ -554,6 +634,7 @@ ARM_CHECKS: tuple[Check[ArmExamination], ...] = (
     Check("set-up", set_up_nodes, ("boot", "contract")),
     Check("PDO map", check_pdo_map, ("boot", "set-up")),
     Check("torque scale", check_torque_scale, ("boot", "set-up")),
+    Check("position scale", check_position_scale, ("boot", "set-up")),
     Check("protection", check_protection),
     Check("cycle", play_cycles, ("boot", "contract", "set-up", "PDO map")),
     Check("rate", check_rate, ("cycle",)),

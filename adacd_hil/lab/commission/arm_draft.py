@@ -40,6 +40,8 @@ _BENT_DEG = 5.0
 """Angle from which the zero of joint 2 is not that of a stretched arm."""
 _LEAST_MOMENT_KG_M = 1e-6
 """Least mass moment of link 2 about its joint; the direction of a smaller one is undefined."""
+_IMPOSSIBLE = 5.0
+"""Lengths of a link from its joint to its centre of mass that no arm has; so for the radius of gyration."""
 LEVEL_DEG: Pair = (0.0, 0.0)
 """Mounting of an arm with vertical axes, without gravity."""
 
@@ -152,6 +154,7 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float
         if mounting_deg[0] > SLIGHT_TILT_DEG:
             doubts += _gravity_doubts(first[1:4], along, chain.axis[0], moments[0] + second[0] * l1)
         body = _body(arm, (first[0], second[0]), moments, inertia)
+        doubts += _size_doubts(arm.link_names, body, (l1, l2))
     zero_deg, limits = _straightened(arm, sign[1], bent_deg, doubts)
     return PlanarArm(
         (_short(l1), _short(l2)),
@@ -264,6 +267,25 @@ def _body(arm: SerialArm, mass_kg: Pair, moment_kg_m: Pair, inertia: Pair) -> di
     if np.any(arm.damping) or np.any(arm.friction):
         named |= {"viscous_Nm_s": arm.damping, "coulomb_Nm": arm.friction}
     return {name: (_short(float(pair[0])), _short(float(pair[1]))) for name, pair in named.items()}
+
+
+def _size_doubts(names: Sequence[str], body: dict[str, Pair], length_m: Pair) -> Iterator[str]:
+    """Yield a line for each link whose centre of mass, or radius of gyration about it, is beyond the link's length.
+
+    names: of the links. body: of `_body`. length_m: of each link. Raises UrdfError beyond `_IMPOSSIBLE` lengths.
+    """
+    for name, mass, center, inertia, length in zip(
+        names, body["mass_kg"], body["center_m"], body["inertia_kg_m2"], length_m, strict=True
+    ):
+        for what, size_m in (
+            (f"the centre of its mass is {center:g} m from its joint", abs(center)),
+            (f"an inertia of {inertia:g} kg m² with {mass:g} kg", math.sqrt(inertia / mass)),
+        ):
+            line = f'link "{name}", {length:g} m: {what}; are m, kg and kg m² the units of the URDF?'
+            if size_m > _IMPOSSIBLE * length:
+                raise UrdfError(line)
+            if size_m > length:
+                yield line
 
 
 def _reach(arm: SerialArm) -> float:

@@ -22,6 +22,7 @@ from adacd_hil.clock import Clock
 from adacd_hil.control.exchange import Exchange
 from adacd_hil.control.pacing import make_pacer
 from adacd_hil.device.arm import Arm
+from adacd_hil.device.arm_report import describe_disabled, describe_faults
 from adacd_hil.device.drive import DISABLE_CYCLES, Drive
 from adacd_hil.device.network import Master
 from adacd_hil.device.torque_sensor import TorqueSensor
@@ -52,9 +53,12 @@ class ZeroTorqueLoop:
         self._period_ns = settings.bus.period_ns
         self._clock = clock
         self._bus = bus
+        self._arm = arm
         self._is_enabling = is_enabling
         self.is_interrupted = False
         """Whether the end was requested."""
+        self.device_faults: list[str] = []
+        """Lines on the devices at the end of the last `run`, before it disabled the drives; empty without a fault."""
         self._exchange = Exchange(settings, bus, arm, master, self.pacer, clock)
         self._max_age_cycles = settings.bus.max_age_cycles
 
@@ -79,6 +83,8 @@ class ZeroTorqueLoop:
             cycle = self.step(self._is_enabling)
             fault = self._fault(cycle.state)
             observe(cycle)
+        never = self._is_enabling and not self._arm.was_enabled
+        self.device_faults = [*describe_faults(self._arm), *(describe_disabled(self._arm) if never else ())]
         self.disable(quick_stop=fault is not FaultReason.NONE)
         return fault
 
@@ -139,16 +145,19 @@ def judge(share: float) -> Verdict:
 class CommunicationTest:
     """Collects the cycles of a test, by `observe_cycle`, and judges them.
 
-    Bitrate, data_bitrate: bit/s, 0 without CAN FD. complete: number of cycles with complete fresh data. overruns:
-    number of skipped periods.
+    Bitrate, data_bitrate: bit/s, 0 without CAN FD. is_enabling: whether the drives shall be enabled. complete: number
+    of cycles with complete fresh data. overruns: number of skipped periods. enabled: number of cycles with both drives
+    enabled.
     """
 
     settings: Settings
     arm: Arm
     bitrate: int
     data_bitrate: int = 0
+    is_enabling: bool = False
     complete: int = 0
     overruns: int = 0
+    enabled: int = 0
     _t_ns: list[int] = field(default_factory=list)
     _records: list[CycleRecord] = field(default_factory=list)
     _ages: list[tuple[int, ...]] = field(default_factory=list)
@@ -165,6 +174,7 @@ class CommunicationTest:
         if self._ages:  # periods skipped before the first cycle don't count
             self.overruns += state.periods - 1
         self.complete += state.is_complete
+        self.enabled += state.is_enabled
         self._ages.append(ages)
         self._recent.append(cycle)
         record = cycle.record._replace(overruns=self.overruns, log_queue_bytes=log_queue_bytes)
@@ -189,8 +199,8 @@ class CommunicationTest:
 
     @property
     def verdict(self) -> Verdict:
-        """Verdict on `share`."""
-        return judge(self.share)
+        """Verdict on `share`; NOT_SUFFICIENT if drives that shall be enabled never were."""
+        return Verdict.NOT_SUFFICIENT if self.is_enabling and not self.enabled else judge(self.share)
 
     @cached_property
     def columns(self) -> CycleColumns:

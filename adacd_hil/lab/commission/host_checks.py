@@ -12,10 +12,11 @@ from enum import Enum
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
-from adacd_hil.control.configuration_check import oddities, profile_guesses
+from adacd_hil.control.configuration_check import examine_settings, profile_guesses
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeGrant, isolated_cpus
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.configuration_files import ConfigurationLayer
 from adacd_hil.settings.setting_keys import KnownKey, in_words, known_keys, value_of
 from adacd_hil.wire.bus import BusError
 from adacd_hil.wire.can_interface import CANFD_MTU, InterfaceState, can_interfaces
@@ -120,26 +121,27 @@ def summarise(findings: Sequence[Finding]) -> str:
     return ", ".join(f"{count} {status.value}" for status, count in counts.items())
 
 
-def configuration_checks(settings: Settings) -> list[Check[Settings]]:
-    """Return doctor's checks of a configuration: one of its likely mistakes, and one for each guessed value.
+def configuration_checks(settings: Settings, layers: Sequence[ConfigurationLayer] = ()) -> list[Check[Settings]]:
+    """Return doctor's checks of a configuration: one of its errors and likely mistakes, and one for each guessed value.
 
-    Guessed are keys in `assumed` of the configuration, and of its device profiles.
+    Guessed are keys in `assumed` of the configuration, and of its device profiles. layers: as of `examine_settings`.
     """
     known = known_keys()
     guesses = [key for key in settings.assumed if key in known]
     return [
-        Check("settings", check_settings),
+        Check("settings", lambda settings: check_settings(settings, layers)),
         *(Check(f"`{key}`", _asking_for(known[key])) for key in guesses),
         *(Check(f"`{key}`", _asking_for_profile(value)) for key, value in profile_guesses(settings).items()),
     ]
 
 
-def check_settings(settings: Settings) -> Finding:
-    """Warn of likely mistakes in a configuration, as `config check` does; ok without any."""
-    odd = oddities(settings)
-    if odd:
-        return warning("; ".join(odd), "correct the configuration; `adacd-hil config check` looks at it without a bus")
-    return ok(f"configuration {settings.name}")
+def check_settings(settings: Settings, layers: Sequence[ConfigurationLayer] = ()) -> Finding:
+    """Fail for errors of a configuration, warn of likely mistakes; as `config check`. layers: of the configuration."""
+    found = examine_settings(settings, layers)
+    remedy = "correct the configuration; `adacd-hil config check` looks at it without a bus"
+    if found.errors:
+        return failed("; ".join(found.errors), remedy)
+    return warning("; ".join(found.mistakes), remedy) if found.mistakes else ok(f"configuration {settings.name}")
 
 
 def _asking_for(known: KnownKey) -> Callable[[Settings], Finding]:

@@ -95,10 +95,12 @@ class DeviceRatings(NamedTuple):
     def velocity_limit_deg_s(self, scale: ScaleSettings) -> float | None:
         """Return the joint's largest speed, deg/s, by 0x6080, rpm of the motor, and the gear, 0x6091 or `scale`'s.
 
-        None if 0x6080 was not read, or the result is beyond any joint, as a factory's 50000 rpm.
+        `scale`'s counts if 0x6091 was not read, or is 1 : 1, a factory value. None if 0x6080 was not read, or the
+        result is beyond any joint, as a factory's 50000 rpm.
         """
         rpm = self.numbers.get((0x6080, 0))
-        gear = self.numbers.get((0x6091, 1), 0) / (self.numbers.get((0x6091, 2)) or 1) or scale.gear_ratio
+        gear = read_drive_units(lambda *place: self.numbers.get(place)).gear_ratio
+        gear = scale.gear_ratio if gear in (None, 1.0) else gear
         degrees_s = (rpm or 0) * _DEG_S_PER_RPM / gear
         return degrees_s if _LEAST_LIMIT_DEG <= degrees_s <= _MOST_SPEED_DEG_S else None
 

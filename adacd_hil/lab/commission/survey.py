@@ -115,12 +115,17 @@ class Node:
 
 @dataclass(frozen=True)
 class Expected:
-    """A node that the configuration expects. None: any value will do, also a missing one."""
+    """A node that the configuration expects. None: any value will do, also a missing one.
+
+    profile_number: low word of 0x1000.
+    """
 
     name: str
     node_id: int
     vendor: int | None
     product: int | None
+    profile_number: int | None = None
+    serial: int | None = None
     wire_version: int | None = None
     layout_digest: int | None = None
 
@@ -235,20 +240,27 @@ def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
 
 
 def expected_nodes(slaves: Iterable[Slave], codec: Codec | None = None) -> list[Expected]:
-    """Return the nodes that an arm's master expects, with vendor and product of their EDS, None where any will do.
+    """Return the nodes that an arm's master expects, None where any value will do.
 
-    codec: if given, nodes whose profile has the object 0x2000 are expected with its wire version and layout digest.
+    Vendor, product and profile number are their EDS's, serial numbers their profile's. codec: if given, nodes whose
+    profile has the object 0x2000 are expected with its wire version and layout digest.
     """
     expected = []
     for slave in slaves:
         is_checked = slave.device.settings.identity == "eds"
-        vendor, product = (
-            slave.default(0x1018, sub) if is_checked and slave.has(0x1018, sub) else None for sub in (1, 2)
+        vendor, product, device_type = (
+            slave.default(*place) if is_checked and slave.has(*place) else None
+            for place in ((0x1018, 1), (0x1018, 2), (0x1000, 0))
         )
+        profile_number = None if device_type is None else device_type & 0xFFFF
+        serials = slave.device.settings.serial
+        serial = serials[slave.device.joint] if serials else None
         version, digest = None, None
         if codec is not None and slave.device.settings.contract_object:
             version, digest = codec.wire_version, codec.layout_digest
-        expected.append(Expected(slave.name, slave.node_id, vendor, product, version, digest))
+        expected.append(
+            Expected(slave.name, slave.node_id, vendor, product, profile_number, serial, version, digest),
+        )
     return expected
 
 
@@ -273,16 +285,19 @@ def compare(found: Survey, expected: list[Expected]) -> dict[int, str]:
 def _difference(node: Node, wanted: Expected) -> str:
     if not node.answers:
         return f"{wanted.name} expected; does not answer SDO"
-    for what, found, value in (
-        ("vendor", node.vendor, wanted.vendor),
-        ("product", node.product, wanted.product),
+    profile_number = None if node.device_type is None else node.device_type & 0xFFFF
+    for what, found, value, form in (
+        ("profile number", profile_number, wanted.profile_number, "{}"),
+        ("vendor", node.vendor, wanted.vendor, "0x{:X}"),
+        ("product", node.product, wanted.product, "0x{:X}"),
+        ("serial number", node.serial, wanted.serial, "{}"),
     ):
         if value is None:
             continue
         if found is None:
             return f"{wanted.name} expected; tells no {what}"
         if found != value:
-            return f"{wanted.name} expected; {what} is not 0x{value:X}"
+            return f"{wanted.name} expected; {what} is not {form.format(value)}"
     for what, found, value in (
         ("wire version", node.wire_version, wanted.wire_version),
         ("layout digest", node.layout_digest, wanted.layout_digest),

@@ -213,12 +213,16 @@ _SECTIONS = {
 
 
 def read_map(path: Path) -> RecordingMap:
-    """Read a map and the URDF that it names.
+    """Read a map and the URDF that it names. Raises ConfigError if it can't be read, or as `parse_map`."""
+    return parse_map(read_toml(path, "map"), path)
 
-    Raises ConfigError if a file can't be read, a section, key or value is wrong, or a list's length isn't the number of
-    moving joints.
+
+def parse_map(table: dict[str, Any], path: Path) -> RecordingMap:
+    """Return a map by its TOML table, and read the URDF that it names. path: of the map; it need not exist.
+
+    Raises ConfigError if the URDF can't be read, a section, key or value is wrong, or a list's length isn't the number
+    of moving joints.
     """
-    table = read_toml(path, "map")
     unknown = [key for key in table if key not in (*_SECTIONS, "scheme")]
     if unknown:
         raise ConfigError(f"{path}: unknown section `{unknown[0]}`; known: {', '.join((*_SECTIONS, 'scheme'))}")
