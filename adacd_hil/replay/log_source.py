@@ -347,9 +347,6 @@ class LogSource:
         """
         splitter = self._splitter
         notes = [f"the log is not whole: {self._stream.problem}"] if self._stream.problem else []
-        dropped = self._stream.summary.get("dropped", "0")
-        if dropped != "0":
-            notes.append(f"{dropped} packets never reached the log")
         if splitter.headless_cycles:
             notes.append(
                 f"{splitter.headless_cycles} cycles at its beginning can't be replayed: the attempt began before"
