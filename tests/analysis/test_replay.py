@@ -287,6 +287,8 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(log, whole):
     assert judged(first, last) == (1, True, ())
     assert judged(first, (attempt, onset - 1)) == (0, False, (said,))
     assert judged(last, last) == (0, False, (said,))
+    found = replay_source(LogSource(log), [source.settings], ((), (first, (last[0], last[1] - 100))))[0]
+    assert [note.partition(" s of MONITOR")[0] for note in found.notes] == ["the truth doesn't cover 0.08"]
     assert judged(first, (whole.attempts, 0)) == (1, True, ())  # it goes on with the next host
     assert replay_source(LogSource(log), [source.settings], (contacts, span))[0].notes == ()
 

@@ -151,13 +151,19 @@ def merge(logs: tuple[str, ...]) -> ExitCode:  # noqa: ARG001
 
 def info_as_text(info: "LogInfo") -> str:
     """Return the contents of a log as text: main facts, errors and problems, then tables of topics and metadata."""
+    from adacd_hil.log.types.topics import CONTACT, EVENTS
+
     ending = f", {info.ending}" if info.ending else ", without an end" if info.problems else ""
     parts = f"{info.files} parts, " if info.files > 1 else ""
+    topics = {topic.topic for topic in info.topics}
+    said = {
+        CONTACT.name: f"{info.contacts} contacts, {info.collisions} of them collisions",
+        EVENTS.name: f"{len(info.faults)} errors, {info.events['warning']} warnings",
+    }
     lines = [
         f"{info.path}: {parts}{_size(info.size_bytes)}, {info.duration_s:.3f} s, {info.cycles} cycles{ending}",
         f"{info.frames} frames, {info.messages} messages, {info.dropped} packets dropped",
-        f"{info.contacts} contacts, {info.collisions} of them collisions; {len(info.faults)} errors, "
-        f"{info.events['warning']} warnings",
+        "; ".join(line if topic in topics else f"no {topic}" for topic, line in said.items()),
     ]
     lines += [f"  error: {fault}" for fault in info.faults[:_TOLD_FAULTS]]
     if len(info.faults) > _TOLD_FAULTS:

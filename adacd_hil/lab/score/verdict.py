@@ -22,6 +22,7 @@ from adacd_hil.lab.score.metrics import (
 )
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
 from adacd_hil.lab.score.run_arrays import Run, Section
+from adacd_hil.lab.score.run_judge import untold_watch
 from adacd_hil.log.logged_run import is_armed_in
 from adacd_hil.score.judge import Score
 from adacd_hil.score.smallest_push import PUSH_WITHIN
@@ -81,15 +82,13 @@ def _judged_text(run: Run, found: str) -> str:
 
     If it covers nothing of MONITOR, return words on that instead.
     """
-    watched = is_armed_in(run.state)
-    if run.truth is None or run.truth.span is None or not watched.any():
+    untold = untold_watch(run)
+    if not untold.any():
         return found
-    is_told = run.truth.span.covers(run.cycle[watched])
-    if is_told.all():
-        return found
+    is_told = is_armed_in(run.state) & ~untold
     if not is_told.any():
         return "the arm was watched, but the truth of that time is not recorded"
-    first_s, last_s = run.time_s()[watched][is_told][[0, -1]]
+    first_s, last_s = run.time_s()[is_told][[0, -1]]
     return f"{found}, from {first_s:.2f} to {last_s:.2f} s: the truth covers no more"
 
 
