@@ -159,9 +159,9 @@ def _replay_one(
     source, is_alone = _open(given, configured, against)
     own = source.settings
     base = own
-    config, profile, _ = configured
+    config, _, _ = configured
     if config is not None and not is_alone:
-        base = keep_log_settings(own, load_settings(config, profile or own.arm.profile))
+        base = keep_log_settings(own, load_settings(config, own.arm.profile))
     for asked in (parse_changes(changes), *(parse_variations(vary) if vary else ())):
         refuse_log_settings(asked)
     base = apply_settings(base, parse_changes(changes))
@@ -182,7 +182,8 @@ def _open(
 ) -> "tuple[ReplaySource, bool]":
     """Return a log or a recording, and whether it is a recording without a log.
 
-    Raises CommandError for a recording without a log and without --config; errors of reading it.
+    Raises CommandError for a recording without a log and without --config, and for --profile or --dbc where a log has
+    its own; errors of reading it.
     """
     from adacd_hil.device.contract import load_contract
     from adacd_hil.device.device_files import place_devices
@@ -192,11 +193,11 @@ def _open(
     from adacd_hil.wire.dbc_contract import load_codec
 
     path = log_in(given)
-    if against is not None:
-        return RecordingAgainstLog(path, log_in(against)), False
-    if path.suffix.lower() == ".mcap" or not path.exists():
-        return LogSource(path), False
     config, profile, dbc = configured
+    if against is not None or path.suffix.lower() == ".mcap" or not path.exists():
+        if unused := [name for name, value in (("--profile", profile), ("--dbc", dbc)) if value is not None]:
+            raise CommandError(f"{unused[0]} is for a recording without a log: a log has its own", ExitCode.USAGE)
+        return (LogSource(path) if against is None else RecordingAgainstLog(path, log_in(against))), False
     if config is None:
         raise CommandError(f"{path} holds no settings: give --against the log of its run, or --config", ExitCode.USAGE)
     settings = load_settings(config, profile)

@@ -105,8 +105,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     "--around",
     "around_s",
     type=click.FloatRange(min=0.0, min_open=True),
-    default=1.0,
-    show_default=True,
+    show_default="1.0",
     help="s before and after the contact.",
 )
 @click.option("--topic", "topics", multiple=True, help="Take only this topic; can be given more than once.")
@@ -117,7 +116,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
 def cut(
     log: Path,
     contact: int | None,
-    around_s: float,
+    around_s: float | None,
     topics: tuple[str, ...],
     out: Path | None,
     as_json: bool,
@@ -130,7 +129,9 @@ def cut(
     if contact is not None:
         if not stretch.is_whole:
             raise CommandError("--contact excludes --from and --until", ExitCode.USAGE)
-        stretch = find_contact(log, contact, around_s)
+        stretch = find_contact(log, contact, 1.0 if around_s is None else around_s)
+    elif around_s is not None:
+        raise CommandError("--around has no effect without --contact", ExitCode.USAGE)
     out = out or default_out(log)
     messages = cut_log(log, out, stretch, topics, tell)
     answer(as_json, {"out": out, **stretch.named_bounds, "messages": messages}, in_line(f"{out}: {messages} messages"))
