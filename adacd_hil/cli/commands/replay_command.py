@@ -169,10 +169,20 @@ def _replay_one(
     if not variants and base != own:
         variants = {", ".join(filter(None, [config or "", *changes])): base}
     progress(f"replaying {given}" + (f" with {counted(len(variants), 'other setting')}" if variants else ""))
-    truth = contacts_beside(log_in(against or given), progress)
+    remarks: list[str] = []
+    truth = contacts_beside(log_in(against or given), remarks.append)
     settings: list[Settings] = [own, *variants.values()]
     replays = replay_source(
-        source, settings, truth, progress, tolerance, ScriptedOperator, shown, stretch=stretch, by_frames=by_frames
+        source,
+        settings,
+        truth,
+        progress,
+        tolerance,
+        ScriptedOperator,
+        shown,
+        stretch=stretch,
+        by_frames=by_frames,
+        remarks=remarks,
     )
     return given, replays, list(variants)
 
