@@ -197,6 +197,14 @@ def _spread(is_bad: Mask, samples: int) -> Mask:
     return np.asarray(spread.view(np.bool_))
 
 
+def arm_differences(first: Settings | None, second: Settings | None) -> dict[str, tuple[str, str]]:
+    """Return the settings, both values by key, by which two runs are of two arms; {} for one arm, and for None."""
+    if first is None or second is None:
+        return {}
+    differing = changed_keys(first, second)
+    return {key: differing[key] for key in _ARM_KEYS if key in differing}
+
+
 def check_together(logs: Sequence[LoggedMotion]) -> None:
     """Raise LogError unless all logs have the same number of parameters, and periods within 2 % of the first's.
 
@@ -210,11 +218,9 @@ def check_together(logs: Sequence[LoggedMotion]) -> None:
             raise LogError(f"{first.parameters} and {other.parameters} parameters don't go together")
     known = [(log.path, settings) for log in logs if (settings := logged_settings(log.path)) is not None]
     for path, settings in known[1:]:
-        differing = changed_keys(known[0][1], settings)
-        if keys := [key for key in _ARM_KEYS if key in differing]:
+        for key, pair in arm_differences(known[0][1], settings).items():
             raise LogError(
-                f"logs {known[0][0]} and {path} are of two arms: {keys[0]} is {' and '.join(differing[keys[0]])}; use "
-                "them apart"
+                f"logs {known[0][0]} and {path} are of two arms: {key} is {' and '.join(pair)}; use them apart"
             )
 
 
