@@ -323,10 +323,14 @@ class LogSource:
     def parts(self, with_frames: bool) -> Iterator[Part]:
         """Yield the content of the log in parts, in order; each call begins with the first.
 
-        with_frames: read the frames, too; else stretches have none.
+        with_frames: read the frames, too; else stretches have none. Raises LogError if they are wanted and the log has
+        no topic for them.
         """
         self._stream = self._open(with_frames)
         for read in self._stream:
+            if with_frames and not (self.is_recording or any(topic in self._stream.topics for topic in FRAME_TOPICS)):
+                lacks = "no frames" if self.has_arms else f"neither {ARM.name} nor frames"
+                raise LogError(f"log {self._path} has {lacks}: it can't be replayed so")
             piece = self._piece(read)
             events = [logged for logged in self._stream.events(piece) if logged.event.name in self._said]
             yield Part(self._splitter.split(piece), contact_records(piece.series[CONTACT.name]), events, self._said)

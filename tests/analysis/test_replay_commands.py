@@ -55,6 +55,19 @@ def test_a_log_that_cannot_be_read_keeps_no_other_back(log, tmp_path):
     assert [str(tmp_path / "gone.mcap") in line for line in complaints(done)] == [True]
 
 
+@pytest.mark.parametrize(
+    ("topics", "options", "lacks"),
+    [(("/scheme", "/cycle"), (), "neither /arm nor frames"), (("/scheme", "/arm"), ("--frames",), "no frames")],
+)
+def test_a_log_without_frames_is_not_compared_with_what_none_decode_to(log, tmp_path, topics, options, lacks):
+    called(
+        "log", "cut", log, *(word for topic in topics for word in ("--topic", topic)), "--out", tmp_path / "run.mcap"
+    )
+    done = called("replay", tmp_path, *options)
+    assert (done.exit_code, done.stdout) == (FAILURE, "")
+    assert f"has {lacks}" in done.stderr
+
+
 def test_a_cut_log_ends_with_status_3(log, tmp_path):
     content = log.read_bytes()
     (tmp_path / "run.mcap").write_bytes(content[: len(content) // 2])
