@@ -116,6 +116,12 @@ def test_other_settings_stand_beside_the_original(log):
     assert missed == {"detector.threshold_Nm=0.3": 0, "detector.threshold_Nm=50": 1}
     text = called("replay", log, "--set", "detector.threshold_Nm=50").stdout
     assert "missed" in text
+    assert "every figure is the original's" not in text
+    text = called("replay", log, "--vary", "certified.noise_sigmas=1,2").stdout
+    assert [line.split(" with ")[1].partition(":")[0] for line in text.splitlines() if "every figure" in line] == [
+        "certified.noise_sigmas=1",
+        "certified.noise_sigmas=2",
+    ]
     assert "The arm in the log moved as it did" in text
 
 

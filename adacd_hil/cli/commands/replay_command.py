@@ -247,7 +247,7 @@ def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, 
 
     Without variants the second part is left out, unless no cycle was compared.
     """
-    from adacd_hil.replay.replayed_outcome import NOTE, side_by_side
+    from adacd_hil.replay.replayed_outcome import NOTE, as_json, side_by_side
 
     own = replays[0]
     attempts = f" in {own.attempts} attempts" if own.attempts > 1 else ""
@@ -258,6 +258,10 @@ def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, 
     if own.mismatch_count > shown:
         lines.append(f"  … {own.mismatch_count} in all: " + _counts(own))
     lines += [f"  {note}" for note in own.notes]
+    alike = [name for name, found in zip(names, replays[1:], strict=True) if as_json(found) == as_json(own)]
+    lines += [
+        f"  every figure is the original's with {name}: scheme {own.settings.scheme} may not use it" for name in alike
+    ]
     lines = [in_line(line) for line in lines]
     if not names and own.compared:
         return "\n".join(lines)
