@@ -113,7 +113,7 @@ class _Player:
         checks_arms: bool,
     ) -> None:
         self.settings = settings
-        self.cycles = self.monitored = self.untold = 0  # in the stretch; untold: monitored without the truth
+        self.cycles = self.monitored = self.uncovered = 0  # in the stretch; uncovered: monitored without the truth
         self.comparison = comparison
         self.requests = RequestCheck()
         self.gatherer = OutcomeGatherer(settings, truth)
@@ -144,7 +144,7 @@ class _Player:
             self.cycles += len(ticks.cycle)
             monitored = ticks.cycle[is_armed_in(batch.state)]
             self.monitored += len(monitored)
-            self.untold += int(np.count_nonzero(self.gatherer.untold(monitored)))
+            self.uncovered += int(np.count_nonzero(self.gatherer.uncovered(monitored)))
             self._compare(stretch, arms, batch, asked, part, events)
         return batch
 
@@ -428,9 +428,9 @@ def _result(
     behind_gap = sum(alarm.t_ns in gatherer.behind_gap_ns for alarm in unjudged)
     if untold := unjudged_sentence(len(unjudged) - behind_gap):
         notes.append(untold)
-    elif player.untold:
-        untold_s = player.untold * player.settings.bus.period_s
-        notes.append(f"the truth doesn't cover {untold_s:.2f} s of MONITOR: contacts then are not counted")
+    elif player.uncovered:
+        uncovered_s = player.uncovered * player.settings.bus.period_s
+        notes.append(f"the truth doesn't cover {uncovered_s:.2f} s of MONITOR: contacts then are not counted")
     if behind_gap:
         notes.append(f"{number_of(behind_gap, 'detection')} behind missing cycles may stem from them, not judged")
     if comparison is not None:

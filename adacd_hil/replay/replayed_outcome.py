@@ -199,7 +199,7 @@ class OutcomeGatherer:
         """Times of all alarms, ns, the ones behind gaps included."""
         return [alarm.t_ns for _, alarm in self._alarms]
 
-    def untold(self, cycle: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def uncovered(self, cycle: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return for each cycle (n,) of the attempts so far whether the truth lacks it; all False without a truth."""
         if self._truth is None:
             return np.zeros(len(cycle), np.bool_)
@@ -212,7 +212,7 @@ class OutcomeGatherer:
         """
         if self._truth is None:
             return None
-        is_known = (~self.untold(np.array([cycle for cycle, _ in self._alarms], np.int64))).tolist()
+        is_known = (~self.uncovered(np.array([cycle for cycle, _ in self._alarms], np.int64))).tolist()
         alarms = [
             replace(alarm, is_known=known and alarm.t_ns not in self.behind_gap_ns)
             for (_, alarm), known in zip(self._alarms, is_known, strict=True)

@@ -50,7 +50,7 @@ from adacd_hil.lab.score.run_arrays import (
     split_sections,
     truth_rows,
 )
-from adacd_hil.lab.score.run_judge import find_detections, timed_contacts, untold_watch
+from adacd_hil.lab.score.run_judge import find_detections, timed_contacts, uncovered_watch
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, DBC_NAME, ENDING_KEY, TRUTH_NAME, LogError
 from adacd_hil.log.log_parts import CUT, PLANNED_ENDINGS
 from adacd_hil.log.logged_run import Cycles, Mask, Milestones, Progress, host_cycles, settings_of
@@ -201,13 +201,13 @@ def _with_ending(
     if ending and ending not in PLANNED_ENDINGS:
         run = replace(run, broken_off=one_line(ending))
     unjudged = unjudged_sentence(sum(not detection.is_known for detection in find_detections(run)))
-    if not unjudged and untold_watch(run).any():
+    if not unjudged and uncovered_watch(run).any():
         unjudged = f"{TRUTH_NAME} doesn't cover all of MONITOR"
     damage = f"{TRUTH_NAME} is not whole: {truth.problem}" if truth is not None and truth.problem else ""
     of_truth = "; ".join(filter(None, (truth_problem, damage, unjudged)))
     lacking = [topic for topic in (CONTACT.name, EVENTS.name) if run.cycle.size and topic not in stream.topics]
-    untold = f"it has no {' and no '.join(lacking)}, so that not all that happened is known" if lacking else ""
-    log_problem = "; ".join(filter(None, (stream.problem, untold)))
+    lacks = f"it has no {' and no '.join(lacking)}, so that not all that happened is known" if lacking else ""
+    log_problem = "; ".join(filter(None, (stream.problem, lacks)))
     is_complete = not (log_problem or of_truth)
     if ending == CUT:
         bounds_s = ((word, stream.summary.get(f"{word}_s", "inf")) for word in ("from", "until"))

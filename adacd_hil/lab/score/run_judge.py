@@ -38,7 +38,7 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
     return tuple(detections)
 
 
-def untold_watch(run: Run) -> Mask:
+def uncovered_watch(run: Run) -> Mask:
     """Return for each cycle (n,) whether it is in MONITOR and not covered by the truth; all False without a truth."""
     watched = is_armed_in(run.state)
     if run.truth is None or run.truth.span is None:

@@ -22,7 +22,7 @@ from adacd_hil.lab.score.metrics import (
 )
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
 from adacd_hil.lab.score.run_arrays import Run, Section
-from adacd_hil.lab.score.run_judge import untold_watch
+from adacd_hil.lab.score.run_judge import uncovered_watch
 from adacd_hil.log.logged_run import is_armed_in
 from adacd_hil.records import JOINTS
 from adacd_hil.score.judge import Score
@@ -84,10 +84,10 @@ def _judged_text(run: Run, found: str) -> str:
 
     If it covers nothing of MONITOR, return words on that instead.
     """
-    untold = untold_watch(run)
-    if not untold.any():
+    uncovered = uncovered_watch(run)
+    if not uncovered.any():
         return found
-    is_told = is_armed_in(run.state) & ~untold
+    is_told = is_armed_in(run.state) & ~uncovered
     if not is_told.any():
         return "the arm was watched, but the truth of that time is not recorded"
     first_s, last_s = run.time_s()[is_told][[0, -1]]

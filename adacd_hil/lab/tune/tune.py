@@ -82,10 +82,10 @@ def tune(
     """
     progress(f"reading {number_of(len(paths), 'log')}")
     logs = read_logs(paths, config, stretch, progress)
-    untold = [str(log.path) for log in logs if log.windows is None]
-    has_truth = len(untold) < len(logs)
-    notes = [f"the true contacts of {', '.join(untold)} are not known: an alarm of such a run counts as a contact, and "
-             "none as missed or false"] * bool(untold)  # fmt: skip
+    unknown = [str(log.path) for log in logs if log.windows is None]
+    has_truth = len(unknown) < len(logs)
+    notes = [f"the true contacts of {', '.join(unknown)} are not known: an alarm of such a run counts as a contact, and "
+             "none as missed or false"] * bool(unknown)  # fmt: skip
     detectors: list[Choice] = []
     try:
         detectors = [choose(observed, rate_per_h) for observed in observe_detectors(logs, progress)]
