@@ -8,7 +8,6 @@ from pathlib import Path
 from adacd_hil.cli.output import CommandError, ExitCode
 from adacd_hil.log.log_files import PART_KEY
 from adacd_hil.log.log_parts import log_in
-from adacd_hil.log.log_walk import run_metadata
 
 _EVERY = 100
 """Of so many cycles one is compared."""
@@ -33,6 +32,8 @@ def _have_one_motion(first: Path, second: Path) -> bool:
 
     Raises LogError if one can't be read.
     """
+    from adacd_hil.log.log_walk import run_metadata
+
     if filecmp.cmp(first, second, shallow=False):
         return True
     runs = [{key: text for key, text in run_metadata(path).items() if key != PART_KEY} for path in (first, second)]

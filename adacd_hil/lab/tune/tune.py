@@ -84,8 +84,8 @@ def tune(
     logs = read_logs(paths, config, stretch, progress)
     unknown = [str(log.path) for log in logs if log.windows is None]
     has_truth = len(unknown) < len(logs)
-    notes = [f"the true contacts of {', '.join(unknown)} are not known: an alarm of such a run counts as a contact, and "
-             "none as missed or false"] * bool(unknown)  # fmt: skip
+    notes = [f"the true contacts of {', '.join(unknown)} are not known: an alarm of such a run counts as a contact, "
+             "and none as missed or false"] * bool(unknown)  # fmt: skip
     detectors: list[Choice] = []
     try:
         detectors = [choose(observed, rate_per_h) for observed in observe_detectors(logs, progress)]
