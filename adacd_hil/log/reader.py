@@ -130,7 +130,7 @@ class RunLog:
     """
 
     path: Path
-    problem: str  # the missing parts, one line; "" for a whole file
+    problem: str  # what the log lacks, one line; "" for a whole log
     metadata: dict[str, str]  # of the run
     summary: dict[str, str]  # frames, messages, dropped, ending, as far as the parts have their ends
     attachments: dict[str, bytes]
@@ -144,7 +144,7 @@ class RunLog:
     @property
     def is_complete(self) -> bool:
         """Whether the file is whole, no packet was dropped on the way to it, and a recovered log had lost nothing."""
-        return _is_complete(self.problem, self.summary)
+        return not self.problem
 
     @property
     def epoch_ns(self) -> int:
@@ -170,10 +170,6 @@ class RunLog:
     def truth(self) -> Series:
         """The emulator's truth, truth_topic.TRUTH_LAYOUT."""
         return self.topics[TRUTH.name]
-
-
-def _is_complete(problem: str, summary: Mapping[str, str]) -> bool:
-    return not problem and summary.get(DROPPED_KEY, "0") == "0" and LOST_KEY not in summary
 
 
 def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
@@ -367,9 +363,22 @@ class LogStream(LogWalk):
         return Piece(_series_of({}, {}, _own_topics(self.metadata), self.epoch_ns), np.empty(0, FRAME_DTYPE), {})
 
     @property
+    def problem(self) -> str:
+        """Missing and damaged parts, dropped packets, and the losses of a recovered log, in one line.
+
+        As far as it was read; "" for a whole log, and before.
+        """
+        dropped, lost = self.summary.get(DROPPED_KEY, "0"), self.summary.get(LOST_KEY, "")
+        said = (
+            f"{dropped} packets never reached the log" if dropped != "0" else "",
+            lost and f"recovered without {lost}",
+        )
+        return "; ".join(filter(None, (super().problem, *said)))
+
+    @property
     def is_complete(self) -> bool:
         """Whether all that was read so far is whole, no packet was dropped, and a recovered log had lost nothing."""
-        return _is_complete(self.problem, self.summary)
+        return not self.problem
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
         """Return the events of a piece; [] for a log without events."""

@@ -326,10 +326,14 @@ class LogSource:
     def parts(self, with_frames: bool) -> Iterator[Part]:
         """Yield the content of the log piece by piece from front to end; each call begins with the first piece.
 
-        with_frames: read the frames, too; else stretches have none.
+        with_frames: read the frames, too; else stretches have none. Raises LogError if they are wanted and the log has
+        no topic for them.
         """
         self._stream = self._open(with_frames)
         for read in self._stream:
+            if with_frames and not (self.is_recording or any(topic in self._stream.topics for topic in FRAME_TOPICS)):
+                lacks = "no frames" if self.has_arms else f"neither {ARM.name} nor frames"
+                raise LogError(f"log {self._path} has {lacks}: it can't be replayed so")
             piece = self._piece(read)
             events = [logged for logged in self._stream.events(piece) if logged.event.name in self._said]
             yield Part(self._splitter.split(piece), contact_records(piece.series[CONTACT.name]), events, self._said)
@@ -350,9 +354,6 @@ class LogSource:
         """
         splitter = self._splitter
         notes = [f"the log is not whole: {self._stream.problem}"] if self._stream.problem else []
-        dropped = self._stream.summary.get("dropped", "0")
-        if dropped != "0":
-            notes.append(f"{dropped} packets never reached the log")
         if splitter.headless_cycles:
             notes.append(
                 f"{splitter.headless_cycles} cycles at its beginning can't be replayed: the attempt began before"

@@ -69,10 +69,10 @@ def replay(
     script_of: plays the user of a configuration; with it, the requests of a run without typed requests are compared.
     Raises LogError, ConfigError or CodecError if the log, its attachments or a device can't be read.
     """
-    source = LogSource(path)
-    return replay_source(
-        source, [settings or source.settings], contacts_beside(path, progress), progress, tolerance, script_of
-    )[0]
+    source, remarks = LogSource(path), list[str]()
+    truth = contacts_beside(path, remarks.append)
+    own = [settings or source.settings]
+    return replay_source(source, own, truth, progress, tolerance, script_of, remarks=remarks)[0]
 
 
 def replay_many(
@@ -89,9 +89,9 @@ def replay_many(
     ConfigError or CodecError if the log, its attachments or a device can't be read; LogError also if no cycle of the
     stretch can be replayed.
     """
-    return replay_source(
-        LogSource(path), variants, contacts_beside(path, progress), progress, watch=watch, stretch=stretch
-    )
+    source, remarks = LogSource(path), list[str]()
+    truth = contacts_beside(path, remarks.append)
+    return replay_source(source, variants, truth, progress, watch=watch, stretch=stretch, remarks=remarks)
 
 
 _DecodedPart = tuple[Part, list[list[ArmBatch]]]
@@ -114,7 +114,7 @@ class _Player:
         checks_arms: bool,
     ) -> None:
         self.settings = settings
-        self.cycles = self.monitored = 0  # in the stretch
+        self.cycles = self.monitored = self.uncovered = 0  # in the stretch; uncovered: monitored without the truth
         self.comparison = comparison
         self.requests = RequestCheck()
         self.gatherer = OutcomeGatherer(settings, truth)
@@ -143,7 +143,9 @@ class _Player:
             asked = self._asking.requests(ticks, batch)
         if is_told:
             self.cycles += len(ticks.cycle)
-            self.monitored += int(np.count_nonzero(is_armed_in(batch.state)))
+            monitored = ticks.cycle[is_armed_in(batch.state)]
+            self.monitored += len(monitored)
+            self.uncovered += int(np.count_nonzero(self.gatherer.uncovered(monitored)))
             self._compare(stretch, arms, batch, asked, part, events)
         return batch
 
@@ -241,13 +243,14 @@ def replay_source(
     watch: Watch | None = None,
     stretch: TimeWindow = WHOLE,
     by_frames: bool = False,
+    remarks: Sequence[str] = (),
 ) -> list[Replay]:
     """Replay a source, once for each of the settings; shown: mismatches that are kept.
 
-    truth: the true contacts, None if unknown. progress, tolerance, script_of: as for `replay`. stretch: the part that
-    is compared and reported; watch sees all from the beginning of the log on. by_frames: decode the frames and compare
-    each state with the log's. Raises LogError if the source can't be read, or no cycle of the stretch can be replayed;
-    ConfigError if a device can't be loaded.
+    truth: the true contacts, None if unknown; remarks: on it, for the notes of each replay. progress, tolerance,
+    script_of: as for `replay`. stretch: the part that is compared and reported; watch sees all from the beginning of
+    the log on. by_frames: decode the frames and compare each state with the log's. Raises LogError if the source can't
+    be read, or no cycle of the stretch can be replayed; ConfigError if a device can't be loaded.
     """
     bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
@@ -268,7 +271,7 @@ def replay_source(
         milestones.reach(done)
     if not stretch.is_whole and not players[0].cycles:
         raise LogError(f"the log has no cycle {stretch.text} that can be replayed")
-    notes = source.notes()
+    notes = [*source.notes(), *remarks]
     if by_frames and not source.has_arms:
         notes.append("the log has no /arm: what its frames were taken for can't be compared, only the decisions")
     return [_result(player, source, notes, tolerance, bounds_ns[0]) for player in players]
@@ -436,6 +439,9 @@ def _result(
     behind_gap = sum(alarm.t_ns in gatherer.behind_gap_ns for alarm in unjudged)
     if untold := unjudged_sentence(len(unjudged) - behind_gap):
         notes.append(untold)
+    elif player.uncovered:
+        uncovered_s = player.uncovered * player.settings.bus.period_s
+        notes.append(f"the truth doesn't cover {uncovered_s:.2f} s of MONITOR: contacts then are not counted")
     if behind_gap:
         notes.append(f"{number_of(behind_gap, 'detection')} behind missing cycles may stem from them, not judged")
     if comparison is not None:

@@ -200,6 +200,12 @@ class OutcomeGatherer:
         """Times of all alarms, ns, the ones behind gaps included."""
         return [alarm.t_ns for _, alarm in self._alarms]
 
+    def uncovered(self, cycle: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return for each cycle (n,) of the attempts so far whether the truth lacks it; all False without a truth."""
+        if self._truth is None:
+            return np.zeros(len(cycle), np.bool_)
+        return ~host_span(self._truth[1], np.array(self._begins or [0])).covers(cycle)
+
     def score(self) -> Score | None:
         """Return which true contacts were detected and which alarms were false; None if the truth is not known.
 
@@ -207,8 +213,7 @@ class OutcomeGatherer:
         """
         if self._truth is None:
             return None
-        span = host_span(self._truth[1], np.array(self._begins or [0]))
-        is_known = span.covers(np.array([cycle for cycle, _ in self._alarms], np.int64)).tolist()
+        is_known = (~self.uncovered(np.array([cycle for cycle, _ in self._alarms], np.int64))).tolist()
         alarms = [
             replace(alarm, is_known=known and alarm.t_ns not in self.behind_gap_ns)
             for (_, alarm), known in zip(self._alarms, is_known, strict=True)

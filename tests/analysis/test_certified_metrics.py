@@ -86,6 +86,26 @@ def test_the_margin_is_the_smallest_threshold_over_residual():
     assert evaluate(run).evidence.smallest_margin == pytest.approx(2.0)
 
 
+@pytest.mark.parametrize("make", [make_run, make_certified_run])
+@pytest.mark.parametrize(
+    ("residual", "threshold", "is_good"), [(0.0, 0.1, True), (math.nan, 0.1, False), (0.0, math.inf, False)]
+)
+def test_a_run_whose_joint_was_blind_is_not_good(make, residual, threshold, is_good):
+    run = make((A, 600), (M, 1000))
+    by = run.certified
+    for values, changed in zip(
+        (run.tau_ext_hat, run.threshold) if by is None else (by.tau_ext, by.threshold),
+        (residual, threshold),
+        strict=True,
+    ):
+        values[1350:, ..., 1] = changed
+    found = evaluate(run)
+    assert found.is_clean == is_good
+    assert [text.text.partition(" of MONITOR")[0] for text in found.findings if text.is_bad] == (
+        [] if is_good else ["a joint was blind in 25 %"]
+    )
+
+
 def test_a_touch_is_no_small_margin():
     run = make_certified_run()
     touch(run, 2000, 100, (5.0, 0.0))

@@ -87,6 +87,7 @@ def with_truth_of(run: Run, rows: slice) -> Run:
         (slice(None), 1, "", []),
         (slice(3000), 0, "2 detections", [("1.00", "2.95")]),
         (slice(3000, None), 1, "1 detection", [("2.95", "9.30")]),
+        (slice(9100), 1, None, [("1.00", "8.95")]),
     ],
 )
 def test_what_comes_before_or_after_the_truth_is_not_judged(
@@ -96,8 +97,9 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(
     metrics = evaluate(run, gathered)
     assert metrics.false_alarms == false_alarms
     assert re.findall(r"from (\S+) to (\S+) s", metrics.findings[0].text) == judged_s
-    said = f"the truth doesn't cover {unjudged}, not judged" if unjudged else ""
-    assert (source.log_problem, source.truth_problem, source.is_complete) == ("", said, not unjudged)
+    said = f"the truth doesn't cover {unjudged}, not judged" if unjudged else unjudged
+    said = "truth.mcap doesn't cover all of MONITOR" if said is None else said
+    assert (source.log_problem, source.truth_problem, source.is_complete) == ("", said, not said)
 
 
 @pytest.mark.slow

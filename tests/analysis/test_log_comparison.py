@@ -80,6 +80,24 @@ def test_what_differs_is_named_with_its_first_cycle_and_by_how_much(paths):
     assert (found.cycles, found.only) == (25, (15, 0))
 
 
+def test_a_contact_that_one_log_reports_otherwise_or_not_at_all_is_a_difference(tmp_path):
+    def other_link(run) -> None:
+        for cycle in run.cycles:
+            cycle.contact = cycle.contact and cycle.contact._replace(link=3 - cycle.contact.link)
+
+    def no_contact(run) -> None:
+        for cycle in run.cycles:
+            cycle.contact = None
+
+    path = write(tmp_path / "own")
+    for name, change in (("link", other_link), ("report", no_contact)):
+        found = compare_logs(path, write(tmp_path / name, change=change))
+        assert {field.field for field in found.fields} == {f"contact.{name}"}
+        assert (found.only, found.is_same, found.is_same_where_whole) == ((0, 0), False, False)
+    assert compare_logs(path, path).is_same
+    assert not compare_logs(path, write(tmp_path / "short", 25)).fields
+
+
 def test_contacts_are_matched_with_the_nearest_and_the_rest_stands_alone():
     first = [contact(1.0), contact(5.0), contact(9.0)]
     second = [contact(1.0 + 0.9 * MATCH_S), contact(1.1), contact(5.0 + 1.1 * MATCH_S)]

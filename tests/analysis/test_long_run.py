@@ -9,6 +9,7 @@ import pytest
 from called import called
 from hand_made_run import make_certified_run, make_run, react, record, record_truth, touch, with_columns
 
+from adacd_hil.lab.logs.cut import cut
 from adacd_hil.lab.report import run_reading
 from adacd_hil.lab.report.page import left_out_text, shown_contacts
 from adacd_hil.lab.report.report_files import write_run_report
@@ -23,6 +24,7 @@ from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Truth
 from adacd_hil.log.reader import Series, start_of_log
 from adacd_hil.log.time_window import TimeWindow
+from adacd_hil.log.types.topics import CYCLE, SCHEME
 from adacd_hil.records import CycleRecord, FaultReason, SchemeState
 from adacd_hil.score import emulator_truth
 from adacd_hil.score.emulator_truth import TruthTable, read_truth
@@ -199,6 +201,16 @@ def test_a_contact_of_a_stretch_is_what_it_is_in_the_whole_log(certified):
     assert (part.number, replace(part, section=whole.section)) == (2, whole)
     untold = read_run(certified, None, TimeWindow(2.9, 4.9))
     assert [contact.number for contact in evaluate(untold.run).contacts] == [2]
+
+
+def test_a_cut_says_so_and_names_the_topics_that_it_lacks(certified, tmp_path):
+    sources = []
+    for name, topics in (("whole", ()), ("part", (SCHEME.name, CYCLE.name))):
+        cut(certified, tmp_path / f"{name}.mcap", TimeWindow(end_s=2.0), topics)
+        sources.append(read_run(tmp_path / f"{name}.mcap", None).source)
+    assert {source.truth_problem for source in sources} == {"the log is a cut of its run until 2 s"}
+    assert [source.is_complete for source in sources] == [True, False]
+    assert [source.log_problem.partition(",")[0] for source in sources] == ["", "it has no /contact and no /events"]
 
 
 def test_a_long_stretch_comes_to_the_same_as_one_that_is_kept_whole(few_kept, path):

@@ -1,5 +1,6 @@
 """A log is replayed: the same bits come out, and what isn't the same, or isn't there, is named."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from adacd_hil.score.emulator_truth import contacts_beside
 from adacd_hil.score.judge import Score
 from adacd_hil.settings.setting_keys import apply_settings
 from adacd_hil.settings.toml_text import to_toml
+from firmware_sim.bench.bench_time import TruthLog
 
 pytestmark = pytest.mark.slow
 
@@ -287,8 +289,20 @@ def test_what_comes_before_or_after_the_truth_is_not_judged(log, whole):
     assert judged(first, last) == (1, True, ())
     assert judged(first, (attempt, onset - 1)) == (0, False, (said,))
     assert judged(last, last) == (0, False, (said,))
+    found = replay_source(LogSource(log), [source.settings], ((), (first, (last[0], last[1] - 100))))[0]
+    assert [note.partition(" s of MONITOR")[0] for note in found.notes] == ["the truth doesn't cover 0.08"]
     assert judged(first, (whole.attempts, 0)) == (1, True, ())  # it goes on with the next host
     assert replay_source(LogSource(log), [source.settings], (contacts, span))[0].notes == ()
+
+
+def test_a_truth_of_another_run_is_noted_by_each_replay(log, tmp_path):
+    shutil.copy(log, tmp_path / "run.mcap")
+    TruthLog(tmp_path / "truth.mcap", blocking=True, metadata={"scenario": "another"}).close()
+    settings = LogSource(log).settings
+    others = [settings, apply_settings(settings, {"detector.threshold_Nm": "0.3"})]
+    for found in replay_many(tmp_path / "run.mcap", others):
+        assert found.score is None
+        assert [note.partition(":")[0] for note in found.notes] == [f"{tmp_path / 'truth.mcap'} is of another run"]
 
 
 def test_an_alarm_behind_missing_cycles_is_not_called_false(log):

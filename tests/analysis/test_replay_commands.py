@@ -55,6 +55,19 @@ def test_a_log_that_cannot_be_read_keeps_no_other_back(log, tmp_path):
     assert [str(tmp_path / "gone.mcap") in line for line in complaints(done)] == [True]
 
 
+@pytest.mark.parametrize(
+    ("topics", "options", "lacks"),
+    [(("/scheme", "/cycle"), (), "neither /arm nor frames"), (("/scheme", "/arm"), ("--frames",), "no frames")],
+)
+def test_a_log_without_frames_is_not_compared_with_what_none_decode_to(log, tmp_path, topics, options, lacks):
+    called(
+        "log", "cut", log, *(word for topic in topics for word in ("--topic", topic)), "--out", tmp_path / "run.mcap"
+    )
+    done = called("replay", tmp_path, *options)
+    assert (done.exit_code, done.stdout) == (FAILURE, "")
+    assert f"has {lacks}" in done.stderr
+
+
 def test_a_cut_log_ends_with_status_3(log, tmp_path):
     content = log.read_bytes()
     (tmp_path / "run.mcap").write_bytes(content[: len(content) // 2])
@@ -103,6 +116,12 @@ def test_other_settings_stand_beside_the_original(log):
     assert missed == {"detector.threshold_Nm=0.3": 0, "detector.threshold_Nm=50": 1}
     text = called("replay", log, "--set", "detector.threshold_Nm=50").stdout
     assert "missed" in text
+    assert "every figure is the original's" not in text
+    text = called("replay", log, "--vary", "certified.noise_sigmas=1,2").stdout
+    assert [line.split(" with ")[1].partition(":")[0] for line in text.splitlines() if "every figure" in line] == [
+        "certified.noise_sigmas=1",
+        "certified.noise_sigmas=2",
+    ]
     assert "The arm in the log moved as it did" in text
 
 

@@ -188,6 +188,17 @@ def test_what_has_no_deviation_is_not_said_to_have_changed():
     assert trend.sentence == "Thresholds can't be compared: 0 of 2 runs have any."
 
 
+def test_two_arms_of_one_name_have_a_trend_each():
+    one = load_settings("certified")
+    other = replace(one, arm=replace(one.arm, link_length_m=(0.45, 0.35)))
+    tuned = replace(one, certified=replace(one.certified, noise_sigmas=9.0))
+    found = trends(series(settings=[one, other, tuned, None, other], threshold_Nm=[(0.1, 0.1)] * 5))
+    assert {each.arm: [run.name for run in each.runs] for each in found} == {
+        "lab/P": ["r0", "r2", "r3"],
+        "lab/P, arm.link_length_m = [0.45, 0.35]": ["r1", "r4"],
+    }
+
+
 def test_an_emulated_arm_is_another_than_that_on_a_bus():
     runs = series(margin=[1.0, 2.0])
     found = trends([runs[0], replace(runs[1], interface="embedded"), replace(runs[1], status=BROKEN)])

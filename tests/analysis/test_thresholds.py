@@ -15,7 +15,6 @@ from scheme.smooth_motion import torque_of
 
 from adacd_hil.lab.detectors.detectors import DetectorBankSettings, register, unregister
 from adacd_hil.lab.thresholds import free_motion as module
-from adacd_hil.lab.thresholds import recorded_thresholds
 from adacd_hil.lab.thresholds.detector_comparison import (
     STEPS_NM,
     Comparison,
@@ -30,7 +29,6 @@ from adacd_hil.lab.thresholds.recorded_thresholds import (
     compute_thresholds,
     find_lag,
     run_detectors,
-    thresholds_of_logs,
 )
 from adacd_hil.log.log_files import LogError
 from adacd_hil.plain_values import plain_values
@@ -179,9 +177,9 @@ def arm_with(**changes) -> Settings:
 )
 def test_logs_of_two_arms_are_refused(monkeypatch, changes, error, words):
     found = {"a.mcap": Settings(), "b.mcap": arm_with(**changes)}
-    monkeypatch.setattr(recorded_thresholds, "logged_settings", lambda path: found[path.name])
-    with logs_of({name: log_of(2.0) for name in found}) as paths, pytest.raises(error, match=words):
-        thresholds_of_logs(paths, 1.0)
+    monkeypatch.setattr(module, "logged_settings", lambda path: found[path.name])
+    with pytest.raises(error, match=words):
+        compute_thresholds(statistics_of({name: log_of(2.0) for name in found}), 1.0)
 
 
 @pytest.mark.long

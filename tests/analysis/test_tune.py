@@ -481,7 +481,7 @@ def test_without_truth_only_thresholds_are_looked_for(log, tmp_path):
     shutil.copy(log, tmp_path / "run.mcap")
     done = tune(tmp_path)
     assert done.exit_code == 3, done.output
-    assert "contacts and delays are not known" in done.stdout
+    assert f"the true contacts of {tmp_path / 'run.mcap'} are not known" in done.stdout
     assert "filter.a_rad_s" not in done.stdout
 
 
@@ -498,14 +498,18 @@ def test_what_can_not_be_tuned_is_said_in_one_line(log, tmp_path):
     link, copy = tmp_path / "link.mcap", tmp_path / "copy.mcap"
     link.symlink_to(log)
     shutil.copy(log, copy)
+    called("log", "recover", log, "--out", tmp_path / "saved.mcap")
+    called("log", "cut", log, "--until", 1.0, "--out", tmp_path / "early.mcap")
     for words, code, said in (
         ((log, log), 2, "a log is given twice"),
         ((log, link), 2, "a log is given twice"),
         ((log, copy), 2, "a log is given twice"),
+        ((log, tmp_path / "saved.mcap"), 2, "a log is given twice"),
+        ((log, tmp_path / "early.mcap"), 1, "no motion in MONITOR"),
         ((log, "--config", "paper"), 1, "with the settings to start from"),
     ):
         done = tune(*words)
-        assert done.exit_code == code
+        assert done.exit_code == code, (words, done.output)
         assert said in done.stderr.splitlines()[-1]
 
 

@@ -92,6 +92,11 @@ def test_info_shows_a_run_at_a_glance(recorded):
     assert "4 contacts, 4 of them collisions; 1 errors, 2 warnings" in text
 
 
+def test_info_counts_no_errors_where_there_is_no_topic_for_them(recorded, tmp_path):
+    call("cut", recorded, "--topic", "/cycle", "--out", tmp_path / "run.mcap")
+    assert call("info", tmp_path / "run.mcap")[1].splitlines()[2] == "no /contact; no /events"
+
+
 def test_info_of_a_cut_log_shows_what_is_there(recorded, tmp_path):
     whole, cut = json.loads(call("info", recorded, "--json")[1])[0], tmp_path / "run.mcap"
     cut.write_bytes(recorded.read_bytes()[:-30])

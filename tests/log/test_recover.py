@@ -73,6 +73,7 @@ def test_a_cut_log_keeps_every_whole_chunk_and_says_that_the_end_is_lost(whole, 
     assert (recovery.losses.is_any, recovery.losses.is_cut, recovery.losses.messages) == (True, True, None)
     assert metadata["summary"]["lost"] == "the end, an unknown number of messages"
     assert metadata["summary"]["lost_messages"] == "unknown"
+    assert read_log(recovery.out).problem == "recovered without the end, an unknown number of messages"
     assert [finding.rule for finding in check_log(recovery.out).findings] == ["lost"]
 
 
@@ -204,7 +205,7 @@ def test_parts_become_one_log(tmp_path):
     assert metadata["run"] == RUN
     assert metadata["summary"]["dropped"] == "3"
     log = read_log(recovery.out)
-    assert (log.problem, log.parts) == ("", 1)
+    assert (log.problem, log.parts) == ("3 packets never reached the log", 1)
 
 
 def test_parts_that_are_missing_or_of_another_run_cost_themselves(tmp_path):

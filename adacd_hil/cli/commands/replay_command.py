@@ -165,9 +165,9 @@ def _replay_one(
     source, is_alone = _open(given, configured, against)
     own = source.settings
     base = own
-    config, profile, _ = configured
+    config, _, _ = configured
     if config is not None and not is_alone:
-        base = keep_log_settings(own, load_settings(config, profile or own.arm.profile))
+        base = keep_log_settings(own, load_settings(config, own.arm.profile))
     for asked in (parse_changes(changes), *(parse_variations(vary) if vary else ())):
         refuse_log_settings(asked)
     base = apply_settings(base, parse_changes(changes))
@@ -175,10 +175,20 @@ def _replay_one(
     if not variants and base != own:
         variants = {", ".join(filter(None, [config or "", *changes])): base}
     progress(f"replaying {given}" + (f" with {counted(len(variants), 'other setting')}" if variants else ""))
-    truth = contacts_beside(log_in(against or given), progress)
+    remarks: list[str] = []
+    truth = contacts_beside(log_in(against or given), remarks.append)
     settings: list[Settings] = [own, *variants.values()]
     replays = replay_source(
-        source, settings, truth, progress, tolerance, ScriptedOperator, shown, stretch=stretch, by_frames=by_frames
+        source,
+        settings,
+        truth,
+        progress,
+        tolerance,
+        ScriptedOperator,
+        shown,
+        stretch=stretch,
+        by_frames=by_frames,
+        remarks=remarks,
     )
     return given, replays, list(variants)
 
@@ -189,7 +199,8 @@ def _open(
     """Return a log or a recording, and whether it is a recording without a log.
 
     configured: --config, --profile and --dbc. against: log of the run that a recording is of. Raises CommandError for
-    a recording without a log and without --config; LogError, ConfigError or CodecError if one can't be read or used.
+    a recording without a log and without --config, and for --profile or --dbc where a log has its own; LogError,
+    ConfigError or CodecError if one can't be read or used.
     """
     from adacd_hil.device.contract import load_contract
     from adacd_hil.device.device_files import place_devices
@@ -199,11 +210,11 @@ def _open(
     from adacd_hil.wire.dbc_contract import load_codec
 
     path = log_in(given)
-    if against is not None:
-        return RecordingAgainstLog(path, log_in(against)), False
-    if path.suffix.lower() == ".mcap" or not path.exists():
-        return LogSource(path), False
     config, profile, dbc = configured
+    if against is not None or path.suffix.lower() == ".mcap" or not path.exists():
+        if unused := [name for name, value in (("--profile", profile), ("--dbc", dbc)) if value is not None]:
+            raise CommandError(f"{unused[0]} is for a recording without a log: a log has its own", ExitCode.USAGE)
+        return (LogSource(path) if against is None else RecordingAgainstLog(path, log_in(against))), False
     if config is None:
         raise CommandError(f"{path} holds no settings: give --against the log of its run, or --config", ExitCode.USAGE)
     settings = load_settings(config, profile)
@@ -244,7 +255,7 @@ def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, 
     names: of the variants; without any the second part is left out, unless no cycle was compared. shown: most
     mismatches that are listed. stretch: of the log, that was compared.
     """
-    from adacd_hil.replay.replayed_outcome import NOTE, side_by_side
+    from adacd_hil.replay.replayed_outcome import NOTE, as_json, side_by_side
 
     own = replays[0]
     attempts = f" in {own.attempts} attempts" if own.attempts > 1 else ""
@@ -255,6 +266,10 @@ def _as_text(path: Path, replays: "list[Replay]", names: list[str], shown: int, 
     if own.mismatch_count > shown:
         lines.append(f"  … {own.mismatch_count} in all: " + _counts(own))
     lines += [f"  {note}" for note in own.notes]
+    alike = [name for name, found in zip(names, replays[1:], strict=True) if as_json(found) == as_json(own)]
+    lines += [
+        f"  every figure is the original's with {name}: scheme {own.settings.scheme} may not use it" for name in alike
+    ]
     lines = [in_line(line) for line in lines]
     if not names and own.compared:
         return "\n".join(lines)

@@ -116,8 +116,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     "--around",
     "around_s",
     type=click.FloatRange(min=0.0, min_open=True),
-    default=1.0,
-    show_default=True,
+    show_default="1.0",
     help="s before and after the contact.",
 )
 @click.option("--topic", "topics", multiple=True, help="Take only this topic; can be given more than once.")
@@ -128,7 +127,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
 def cut(
     log: Path,
     contact: int | None,
-    around_s: float,
+    around_s: float | None,
     topics: tuple[str, ...],
     out: Path | None,
     as_json: bool,
@@ -141,7 +140,9 @@ def cut(
     if contact is not None:
         if not stretch.is_whole:
             raise CommandError("--contact excludes --from and --until", ExitCode.USAGE)
-        stretch = find_contact(log, contact, around_s)
+        stretch = find_contact(log, contact, 1.0 if around_s is None else around_s)
+    elif around_s is not None:
+        raise CommandError("--around has no effect without --contact", ExitCode.USAGE)
     out = out or default_out(log)
     messages = cut_log(log, out, stretch, topics, tell)
     answer(as_json, {"out": out, **stretch.named_bounds, "messages": messages}, in_line(f"{out}: {messages} messages"))
@@ -162,13 +163,19 @@ def merge(logs: tuple[str, ...]) -> ExitCode:  # noqa: ARG001
 
 def info_as_text(info: "LogInfo") -> str:
     """Return the contents of a log as text: main facts, errors and problems, then tables of topics and metadata."""
+    from adacd_hil.log.types.topics import CONTACT, EVENTS
+
     ending = f", {info.ending}" if info.ending else ", without an end" if info.problems else ""
     parts = f"{info.files} parts, " if info.files > 1 else ""
+    topics = {topic.topic for topic in info.topics}
+    said = {
+        CONTACT.name: f"{info.contacts} contacts, {info.collisions} of them collisions",
+        EVENTS.name: f"{len(info.faults)} errors, {info.events['warning']} warnings",
+    }
     lines = [
         f"{info.path}: {parts}{_size(info.size_bytes)}, {info.duration_s:.3f} s, {info.cycles} cycles{ending}",
         f"{info.frames} frames, {info.messages} messages, {info.dropped} packets dropped",
-        f"{info.contacts} contacts, {info.collisions} of them collisions; {len(info.faults)} errors, "
-        f"{info.events['warning']} warnings",
+        "; ".join(line if topic in topics else f"no {topic}" for topic, line in said.items()),
     ]
     lines += [f"  error: {fault}" for fault in info.faults[:_TOLD_FAULTS]]
     if len(info.faults) > _TOLD_FAULTS:

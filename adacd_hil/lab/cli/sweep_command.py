@@ -43,7 +43,7 @@ _SIMULATED_CONFIG = "certified"
     help="Play this scenario instead; repeatable.",
     shell_complete=complete_scenario,
 )
-@click.option("--seeds", default="1", show_default=True, metavar="N|A:B", help="Seeds of the scenarios, A to B.")
+@click.option("--seeds", show_default="1", metavar="N|A:B", help="Seeds of the scenarios, A to B.")
 @click.option(
     "--vary",
     multiple=True,
@@ -69,7 +69,7 @@ _SIMULATED_CONFIG = "certified"
 def sweep(
     logs: tuple[Path, ...],
     scenarios: tuple[str, ...],
-    seeds: str,
+    seeds: str | None,
     vary: tuple[str, ...],
     config: str,
     profile: str | None,
@@ -90,9 +90,17 @@ def sweep(
 
     if bool(logs) == bool(scenarios):
         raise CommandError("a sweep is of LOGS or of --scenario, one of the two", ExitCode.USAGE)
-    plan = _plan(logs, scenarios, seeds, vary, config, profile or "")
-    work = replay_task if logs else simulate_task
+    options = ("--seeds", seeds, logs), ("--profile", profile, logs), ("--workers", workers, scheduler)
+    for name, value, other in options:
+        if value is not None and other:
+            raise CommandError(
+                f"{name} has no effect with {'LOGS' if other is logs else '--scheduler'}", ExitCode.USAGE
+            )
     tls = dict(zip(NO_FILES, (tls_ca_file, tls_cert, tls_key), strict=True))
+    if any(tls.values()) and not scheduler:
+        raise CommandError("a certificate has no effect without --scheduler", ExitCode.USAGE)
+    plan = _plan(logs, scenarios, seeds or "1", vary, config, profile or "")
+    work = replay_task if logs else simulate_task
     with Progress() as progress:
         progress(
             f"{counted(plan.size, 'row')}: {counted(len(plan.subjects), 'log' if logs else 'run')} × "

@@ -373,15 +373,12 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> dict[str, Any]
     words = origin_words(run)
     if run.stretch is not None:
         words.append(stretch_text(run.stretch))
-    problems = [source.notice] if source.notice else []
-    if not problems and metrics.dropped:
-        problems = [f"{metrics.dropped} packets are not in the log."]
     first, *further = headlines(metrics)
     return {
         "over": " · ".join(["run report", *words]),
         "headline": first,
         "is_good": metrics.is_clean,
-        "problems": problems,
+        "problems": [source.notice] if source.notice else [],
         "findings": further,
     }
 

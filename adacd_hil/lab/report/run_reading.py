@@ -50,9 +50,9 @@ from adacd_hil.lab.score.run_arrays import (
     split_sections,
     truth_rows,
 )
-from adacd_hil.lab.score.run_judge import find_detections, timed_contacts
+from adacd_hil.lab.score.run_judge import find_detections, timed_contacts, uncovered_watch
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, DBC_NAME, ENDING_KEY, TRUTH_NAME, LogError
-from adacd_hil.log.log_parts import PLANNED_ENDINGS
+from adacd_hil.log.log_parts import CUT, PLANNED_ENDINGS
 from adacd_hil.log.logged_run import Cycles, Mask, Milestones, Progress, host_cycles, settings_of
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series, check_states, contacts_of, start_of_log
 from adacd_hil.log.time_window import WHOLE, TimeWindow
@@ -202,10 +202,19 @@ def _with_ending(
     if ending and ending not in PLANNED_ENDINGS:
         run = replace(run, broken_off=one_line(ending))
     unjudged = unjudged_sentence(sum(not detection.is_known for detection in find_detections(run)))
-    cut = f"{TRUTH_NAME} is not whole: {truth.problem}" if truth is not None and truth.problem else ""
-    is_complete = stream.is_complete and not (truth_problem or unjudged) and (truth is None or truth.is_complete)
-    of_truth = "; ".join(filter(None, (truth_problem, cut, unjudged)))
-    source = ReportSource(stream.path.name, stream.problem, is_complete, of_truth)
+    if not unjudged and uncovered_watch(run).any():
+        unjudged = f"{TRUTH_NAME} doesn't cover all of MONITOR"
+    damage = f"{TRUTH_NAME} is not whole: {truth.problem}" if truth is not None and truth.problem else ""
+    of_truth = "; ".join(filter(None, (truth_problem, damage, unjudged)))
+    lacking = [topic for topic in (CONTACT.name, EVENTS.name) if run.cycle.size and topic not in stream.topics]
+    lacks = f"it has no {' and no '.join(lacking)}, so that not all that happened is known" if lacking else ""
+    log_problem = "; ".join(filter(None, (stream.problem, lacks)))
+    is_complete = not (log_problem or of_truth)
+    if ending == CUT:
+        bounds_s = ((word, stream.summary.get(f"{word}_s", "inf")) for word in ("from", "until"))
+        words = ("the log is a cut of its run", *(f"{word} {at_s} s" for word, at_s in bounds_s if "inf" not in at_s))
+        of_truth = "; ".join(filter(None, (of_truth, " ".join(words))))
+    source = ReportSource(stream.path.name, log_problem, is_complete, of_truth)
     if run.stretch is None:
         run = replace(run, frames=_count(stream.summary, "frames"), dropped=_count(stream.summary, "dropped"))
     return ReadRun(run, gathered, source)

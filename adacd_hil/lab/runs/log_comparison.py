@@ -7,7 +7,7 @@ keeps a digest of each run.
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -160,7 +160,8 @@ class FieldDifference(NamedTuple):
     """A field of /scheme that differs between two logs. cycles: in how many it differs.
 
     first_cycle: of the first log; first_s: s since motion start. largest: difference; 0.0 for integers, inf where one
-    value is NaN and the other isn't.
+    value is NaN and the other isn't. A field of /contact is named "contact.<field>", counted once for each contact;
+    its difference is 0.0.
     """
 
     field: str
@@ -196,7 +197,7 @@ class LogComparison:
 
     @property
     def is_same(self) -> bool:
-        """Whether no field differs and no cycle is in one log only."""
+        """Whether no field, of contacts neither, differs and no cycle is in one log only."""
         return not self.fields and self.only == (0, 0)
 
     @property
@@ -316,13 +317,15 @@ def compare_logs(
     notes = [f"{run.path}: {run.problem}" for run in readers if run.problem]
     if differences.missing:
         notes.append(f"not in both, or not of one size: {', '.join(sorted(differences.missing))}")
+    contacts = tuple(match_contacts(one.contacts, two.contacts))
+    found = [*differences.found.values(), *_contact_differences(contacts, only == (0, 0))]
     return LogComparison(
         one,
         two,
         changed_keys(one.settings, two.settings),
         {key: pair for key, pair in metadata.items() if pair[0] != pair[1]},
-        tuple(sorted(differences.found.values(), key=lambda field: (field.first_s, field.field))),
-        tuple(match_contacts(one.contacts, two.contacts)),
+        tuple(sorted(found, key=lambda field: (field.first_s, field.field))),
+        contacts,
         cycles,
         only,
         tuple(notes),
@@ -363,6 +366,30 @@ def _walk_together(
 def _next_rows(stream: Iterator[NDArray[Any]]) -> NDArray[Any] | None:
     """Return the next array of the stream that isn't empty; None at its end."""
     return next((rows for rows in stream if len(rows)), None)
+
+
+def _contact_differences(pairs: Sequence[ContactPair], have_same_cycles: bool) -> Iterator[FieldDifference]:
+    """Yield each field of /contact that differs in the last reports of a contact, and "report" if one log has none.
+
+    Unless the logs have the same cycles, a missing or not yet final report may be lost, and is no difference.
+    """
+    differs: dict[str, list[Contact]] = {}
+    for pair in pairs:
+        first, second = pair
+        if first is None or second is None:
+            names = ["report"] * have_same_cycles
+        elif have_same_cycles or first[1].is_final == second[1].is_final:
+            values = zip(first[1]._replace(cycle=0), second[1]._replace(cycle=0), strict=True)
+            names = [
+                name for name, both in zip(ContactReport._fields, values, strict=True) if len({*map(repr, both)}) > 1
+            ]
+        else:
+            names = []
+        for name in names:
+            differs.setdefault(f"contact.{name}", []).append(next(filter(None, pair)))
+    for name, contacts in differs.items():
+        time_s, report = contacts[0]
+        yield FieldDifference(name, report.cycle, time_s, len(contacts), 0.0)
 
 
 def match_contacts(first: list[Contact], second: list[Contact]) -> list[ContactPair]:

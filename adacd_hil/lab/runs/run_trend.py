@@ -23,6 +23,7 @@ from adacd_hil.lab.runs.run_summary import RunSummary
 from adacd_hil.lab.runs.run_table import in_order
 from adacd_hil.lab.score.run_arrays import EMBEDDED
 from adacd_hil.lab.stated_bounds import MEANT_SHARE, THRESHOLD_SHARE
+from adacd_hil.lab.thresholds.free_motion import arm_differences
 from adacd_hil.records import FRICTION_AT_RAD_S, JOINTS, Vector
 from adacd_hil.scheme.identify.evidence import LAST_SIGMAS
 from adacd_hil.settings.setting_keys import changed_keys
@@ -110,11 +111,17 @@ class Trend:
 def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE) -> list[Trend]:
     """Return the trend of each arm, sorted by name; runs that are not judged are left out of it, but listed.
 
+    Runs of one name whose settings are of two arms are apart; the name of the later arm has the settings that differ.
     threshold_share: share of a threshold from which a difference is a change.
     """
     by_arm: dict[str, list[RunSummary]] = {}
     for run in in_order(runs):
-        by_arm.setdefault(arm_of(run), []).append(run)
+        name = arm_of(run)
+        differing = arm_differences(
+            next((each.settings for each in by_arm.get(name, ()) if each.settings), None), run.settings
+        )
+        name += "".join(f", {key} = {value}" for key, (_, value) in differing.items())
+        by_arm.setdefault(name, []).append(run)
     return [_trend(arm, found, threshold_share) for arm, found in sorted(by_arm.items())]
 
 

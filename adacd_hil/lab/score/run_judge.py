@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from adacd_hil.lab.score.run_arrays import Run
-from adacd_hil.log.logged_run import Cycles, begins_alarm, is_armed_in
+from adacd_hil.log.logged_run import Cycles, Mask, begins_alarm, is_armed_in
 from adacd_hil.records import JOINTS, SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.score.emulator_truth import HostCycles, placed_contact
@@ -36,6 +36,14 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
         is_known = run.truth is None or run.truth.covers(cycle)
         detections.append(Detection(int(run.t_ns[row]), is_armed, is_known, row, first, final or first))
     return tuple(detections)
+
+
+def uncovered_watch(run: Run) -> Mask:
+    """Return for each cycle (n,) whether it is in MONITOR and not covered by the truth; all False without a truth."""
+    watched = is_armed_in(run.state)
+    if run.truth is None or run.truth.span is None:
+        return np.zeros_like(watched)
+    return np.asarray(watched & ~run.truth.span.covers(run.cycle))
 
 
 def timed_contacts(run: Run) -> tuple[TrueContact, ...]:

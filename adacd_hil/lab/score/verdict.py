@@ -22,7 +22,9 @@ from adacd_hil.lab.score.metrics import (
 )
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
 from adacd_hil.lab.score.run_arrays import Run, Section
+from adacd_hil.lab.score.run_judge import uncovered_watch
 from adacd_hil.log.logged_run import is_armed_in
+from adacd_hil.records import JOINTS
 from adacd_hil.score.judge import Score
 from adacd_hil.score.smallest_push import PUSH_WITHIN
 from adacd_hil.score.wording import NONE, found_text, number_of
@@ -64,6 +66,7 @@ def list_findings(
     grave = _fault_texts(faults)
     grave += [f"the run was broken off: {'; '.join(causes)}"] if causes else []
     grave += evidence.revoked if is_revoked(evidence) else ()
+    grave += filter(None, [_blind_text(run)])
     if is_margin_below_1(evidence):
         grave.append(f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}")
     findings = [*(Finding(text, True) for text in grave), Finding(found, has_wrong)]
@@ -81,16 +84,28 @@ def _judged_text(run: Run, found: str) -> str:
 
     If it covers nothing of MONITOR, return words on that instead.
     """
-    watched = is_armed_in(run.state)
-    if run.truth is None or run.truth.span is None or not watched.any():
+    uncovered = uncovered_watch(run)
+    if not uncovered.any():
         return found
-    is_told = run.truth.span.covers(run.cycle[watched])
-    if is_told.all():
-        return found
+    is_told = is_armed_in(run.state) & ~uncovered
     if not is_told.any():
         return "the arm was watched, but the truth of that time is not recorded"
-    first_s, last_s = run.time_s()[watched][is_told][[0, -1]]
+    first_s, last_s = run.time_s()[is_told][[0, -1]]
     return f"{found}, from {first_s:.2f} to {last_s:.2f} s: the truth covers no more"
+
+
+def _blind_text(run: Run) -> str:
+    """Return a text on the cycles of MONITOR in which no residual of some joint can be over its threshold, "" without.
+
+    Such as those with an infinite threshold, or a residual that is no number.
+    """
+    by = run.certified
+    values = (run.tau_ext_hat, run.threshold) if by is None else (by.tau_ext, by.threshold)
+    is_finite = np.isfinite(values[0]) & np.isfinite(values[1])
+    sees = np.any(is_finite.reshape(len(run.state), -1, JOINTS), axis=1)
+    watched = is_armed_in(run.state) & np.concatenate(([False], is_armed_in(run.state[:-1])))
+    share = 1.0 - float(np.all(sees[watched], axis=1).mean()) if watched.any() else 0.0
+    return f"a joint was blind in {percent_text(share)} of MONITOR: no finite residual and threshold" if share else ""
 
 
 _HEADLINE_LETTERS: Final = 160

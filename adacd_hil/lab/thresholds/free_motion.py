@@ -25,6 +25,7 @@ from adacd_hil.log.types.topics import SCHEME
 from adacd_hil.records import PARAMETER_NAMES, Vector
 from adacd_hil.scheme.kernel.kernel_samples import LONGEST_SHARE, SHORTEST_SHARE
 from adacd_hil.settings.configuration import Settings
+from adacd_hil.settings.setting_keys import changed_keys
 
 APART_S: Final = 0.6
 """Distance from contacts and gaps: six time constants of the slowest filter."""
@@ -35,6 +36,14 @@ WINDOW: Final = 10_000
 TOPICS: Final = (SCHEME.name,)
 _PERIODS: Final = 1_000_000
 """Number of intervals whose median is the period."""
+_ARM_KEYS: Final = tuple(
+    f"arm.{name}"
+    for name in (
+        *("profile", "link_length_m", "rated_torque_Nm", "mounting_deg"),
+        *("mass_kg", "center_m", "inertia_kg_m2", "viscous_Nm_s", "coulomb_Nm"),
+    )
+)
+"""Settings that another arm has otherwise; limits, signs and zeros may differ between the runs of one arm."""
 
 Mask = NDArray[np.bool_]
 Watch = Callable[[Series], None]
@@ -189,14 +198,31 @@ def _spread(is_bad: Mask, samples: int) -> Mask:
     return np.asarray(spread.view(np.bool_))
 
 
+def arm_differences(first: Settings | None, second: Settings | None) -> dict[str, tuple[str, str]]:
+    """Return the settings, both values by key, by which two runs are of two arms; {} for one arm, and for None."""
+    if first is None or second is None:
+        return {}
+    differing = changed_keys(first, second)
+    return {key: differing[key] for key in _ARM_KEYS if key in differing}
+
+
 def check_together(logs: Sequence[LoggedMotion]) -> None:
-    """Raise LogError unless all logs have the same number of parameters, and periods within 2 % of the first's."""
+    """Raise LogError unless all logs have the same number of parameters, and periods within 2 % of the first's.
+
+    Also if a log has other values of `_ARM_KEYS` than the first log with settings; one without isn't checked for them.
+    """
     first = logs[0]
     for other in logs[1:]:
         if abs(other.period_s - first.period_s) > 0.02 * first.period_s:
             raise LogError(f"periods of {1e3 * first.period_s:.3f} and {1e3 * other.period_s:.3f} ms don't go together")
         if other.parameters != first.parameters:
             raise LogError(f"{first.parameters} and {other.parameters} parameters don't go together")
+    known = [(log.path, settings) for log in logs if (settings := logged_settings(log.path)) is not None]
+    for path, settings in known[1:]:
+        for key, pair in arm_differences(known[0][1], settings).items():
+            raise LogError(
+                f"logs {known[0][0]} and {path} are of two arms: {key} is {' and '.join(pair)}; use them apart"
+            )
 
 
 def sample_of(logs: Sequence[LoggedMotion]) -> Motion:

@@ -32,7 +32,6 @@ from adacd_hil.lab.thresholds.free_motion import (
     LoggedMotion,
     Mask,
     Motion,
-    logged_settings,
     read_motion,
     sample_of,
     torque_streams,
@@ -42,19 +41,10 @@ from adacd_hil.log.logged_run import Milestones, Progress
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.model.regressor import mass_matrix
-from adacd_hil.settings.setting_keys import changed_keys
 
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0
 """Corner frequency below which the model's errors exceed the noise."""
-_ARM_KEYS: Final = tuple(
-    f"arm.{name}"
-    for name in (
-        *("profile", "link_length_m", "rated_torque_Nm", "mounting_deg"),
-        *("mass_kg", "center_m", "inertia_kg_m2", "viscous_Nm_s", "coulomb_Nm"),
-    )
-)
-"""Settings that another arm has otherwise; limits, signs and zeros may differ between the runs of one arm."""
 _CHECKED_ALARMS: Final = 20.0  # alarms in the held-out half that are enough to compare with the prediction
 
 
@@ -332,21 +322,6 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
     return limits
 
 
-def _check_one_arm(logs: Sequence[LoggedMotion]) -> None:
-    """Raise LogError if a log has other values of `_ARM_KEYS` than the first log with settings.
-
-    A log without settings isn't checked.
-    """
-    known = [(log.path, settings) for log in logs if (settings := logged_settings(log.path)) is not None]
-    for path, settings in known[1:]:
-        differing = changed_keys(known[0][1], settings)
-        if keys := [key for key in _ARM_KEYS if key in differing]:
-            raise LogError(
-                f"logs {known[0][0]} and {path} are of two arms: {keys[0]} is {' and '.join(differing[keys[0]])}; find "
-                "their thresholds apart"
-            )
-
-
 def thresholds_of_logs(
     paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None
 ) -> tuple[Thresholds, Statistics]:
@@ -362,6 +337,5 @@ def thresholds_of_logs(
         if log.parameters < len(PARAMETER_NAMES):
             raise LogError(f"log {path} has {log.parameters} parameters")
         logs.append(log)
-    _check_one_arm(logs)
     statistics = run_detectors(logs, detectors.DetectorBankSettings(), progress)
     return compute_thresholds(statistics, rate_per_h, [str(path) for path in paths]), statistics

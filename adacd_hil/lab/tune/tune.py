@@ -82,9 +82,10 @@ def tune(
     """
     progress(f"reading {number_of(len(paths), 'log')}")
     logs = read_logs(paths, config, stretch, progress)
-    has_truth = any(log.windows is not None for log in logs)
-    notes = [] if has_truth else ["no truth.mcap beside the logs: contacts and delays are not known, and an alarm of a "
-                                  "logged run counts as a contact"]  # fmt: skip
+    unknown = [str(log.path) for log in logs if log.windows is None]
+    has_truth = len(unknown) < len(logs)
+    notes = [f"the true contacts of {', '.join(unknown)} are not known: an alarm of such a run counts as a contact, "
+             "and none as missed or false"] * bool(unknown)  # fmt: skip
     detectors: list[Choice] = []
     try:
         detectors = [choose(observed, rate_per_h) for observed in observe_detectors(logs, progress)]
