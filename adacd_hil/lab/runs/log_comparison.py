@@ -7,7 +7,7 @@ keeps a digest of each run.
 
 import math
 from bisect import bisect_left
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -50,6 +50,8 @@ class RunReader:
         self.states: list[tuple[float, str]] = []
         self.parameters: dict[str, list[float]] = {}
         self._contacts: list[Contact] = []
+        self.contact_fields: set[str] = set()
+        """Fields of /contact in the log, which an earlier version may have written; known after the iteration."""
         self._times = {name: Distribution() for name in _TIMES}
         self._bounds: tuple[int, int] | None = None
 
@@ -87,6 +89,7 @@ class RunReader:
             if len(records):
                 last = records[-1].copy()
             contacts = self._wanted(piece.series[CONTACT.name])
+            self.contact_fields.update(contacts.fields)
             times_s = ((contacts.t_ns - self.zero_ns) * 1e-9).tolist()
             self._contacts = each_once((*self._contacts, *zip(times_s, _reports(contacts), strict=True)))
             cycles = self._wanted(piece.series[CYCLE.name])
@@ -315,10 +318,12 @@ def compare_logs(
     keys = [*one.metadata, *(key for key in two.metadata if key not in one.metadata)]
     metadata = {key: (one.metadata.get(key, ""), two.metadata.get(key, "")) for key in keys}
     notes = [f"{run.path}: {run.problem}" for run in readers if run.problem]
-    if differences.missing:
-        notes.append(f"not in both, or not of one size: {', '.join(sorted(differences.missing))}")
     contacts = tuple(match_contacts(one.contacts, two.contacts))
-    found = [*differences.found.values(), *_contact_differences(contacts, only == (0, 0))]
+    fields = one.contact_fields & two.contact_fields
+    found = [*differences.found.values(), *_contact_differences(contacts, fields, only == (0, 0))]
+    missing = {*differences.missing, *(f"contact.{name}" for name in one.contact_fields ^ two.contact_fields)}
+    if missing:
+        notes.append(f"not in both, or not of one size: {', '.join(sorted(missing))}")
     return LogComparison(
         one,
         two,
@@ -368,10 +373,13 @@ def _next_rows(stream: Iterator[NDArray[Any]]) -> NDArray[Any] | None:
     return next((rows for rows in stream if len(rows)), None)
 
 
-def _contact_differences(pairs: Sequence[ContactPair], have_same_cycles: bool) -> Iterator[FieldDifference]:
-    """Yield each field of /contact that differs in the last reports of a contact, and "report" if one log has none.
+def _contact_differences(
+    pairs: Sequence[ContactPair], fields: Collection[str], have_same_cycles: bool
+) -> Iterator[FieldDifference]:
+    """Yield each of the `fields` of /contact that differs in the last reports of a contact.
 
-    Unless the logs have the same cycles, a missing or not yet final report may be lost, and is no difference.
+    "report" stands for a contact that only one log has. Unless the logs have the same cycles, a missing or not yet
+    final report may be lost, and is no difference.
     """
     differs: dict[str, list[Contact]] = {}
     for pair in pairs:
@@ -379,10 +387,9 @@ def _contact_differences(pairs: Sequence[ContactPair], have_same_cycles: bool) -
         if first is None or second is None:
             names = ["report"] * have_same_cycles
         elif have_same_cycles or first[1].is_final == second[1].is_final:
-            values = zip(first[1]._replace(cycle=0), second[1]._replace(cycle=0), strict=True)
-            names = [
-                name for name, both in zip(ContactReport._fields, values, strict=True) if len({*map(repr, both)}) > 1
-            ]
+            texts = [(repr(getattr(first[1], name)), repr(getattr(second[1], name))) for name in ContactReport._fields]
+            compared = zip(ContactReport._fields, texts, strict=True)
+            names = [name for name, (one, two) in compared if one != two and name in fields and name != "cycle"]
         else:
             names = []
         for name in names:
