@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from adacd_hil.log.time_window import TimeWindow
 
 _TOLD_FAULTS = 5
+_AROUND_S = 1.0
 _log_argument = click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
 _out_option = click.option("--out", type=WrittenPath(dir_okay=False), metavar="FILE")
 
@@ -116,7 +117,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
     "--around",
     "around_s",
     type=click.FloatRange(min=0.0, min_open=True),
-    show_default="1.0",
+    show_default=str(_AROUND_S),
     help="s before and after the contact.",
 )
 @click.option("--topic", "topics", multiple=True, help="Take only this topic; can be given more than once.")
@@ -140,7 +141,7 @@ def cut(
     if contact is not None:
         if not stretch.is_whole:
             raise CommandError("--contact excludes --from and --until", ExitCode.USAGE)
-        stretch = find_contact(log, contact, 1.0 if around_s is None else around_s)
+        stretch = find_contact(log, contact, around_s or _AROUND_S)
     elif around_s is not None:
         raise CommandError("--around has no effect without --contact", ExitCode.USAGE)
     out = out or default_out(log)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from adacd_hil.lab.tune.sweep import Plan, SweepRow, Task, Values
 
 _SIMULATED_CONFIG = "certified"
+_SEEDS = "1"
 """Configuration of simulated runs without --config."""
 
 
@@ -43,7 +44,7 @@ _SIMULATED_CONFIG = "certified"
     help="Play this scenario instead; repeatable.",
     shell_complete=complete_scenario,
 )
-@click.option("--seeds", show_default="1", metavar="N|A:B", help="Seeds of the scenarios, A to B.")
+@click.option("--seeds", show_default=_SEEDS, metavar="N|A:B", help="Seeds of the scenarios, A to B.")
 @click.option(
     "--vary",
     multiple=True,
@@ -99,7 +100,7 @@ def sweep(
     tls = dict(zip(NO_FILES, (tls_ca_file, tls_cert, tls_key), strict=True))
     if any(tls.values()) and not scheduler:
         raise CommandError("a certificate has no effect without --scheduler", ExitCode.USAGE)
-    plan = _plan(logs, scenarios, seeds or "1", vary, config, profile or "")
+    plan = _plan(logs, scenarios, seeds or _SEEDS, vary, config, profile or "")
     work = replay_task if logs else simulate_task
     with Progress() as progress:
         progress(

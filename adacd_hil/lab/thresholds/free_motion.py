@@ -36,6 +36,8 @@ WINDOW: Final = 10_000
 TOPICS: Final = (SCHEME.name,)
 _PERIODS: Final = 1_000_000
 """Number of intervals whose median is the period."""
+_OTHER_PERIOD: Final = 0.02
+"""Share of a period from which two logs are of two periods."""
 _ARM_KEYS: Final = tuple(
     f"arm.{name}"
     for name in (
@@ -207,13 +209,13 @@ def arm_differences(first: Settings | None, second: Settings | None) -> dict[str
 
 
 def check_together(logs: Sequence[LoggedMotion]) -> None:
-    """Raise LogError unless all logs have the same number of parameters, and periods within 2 % of the first's.
+    """Raise LogError unless all logs have the same number of parameters, and periods within `_OTHER_PERIOD`.
 
     Also if a log has other values of `_ARM_KEYS` than the first log with settings; one without isn't checked for them.
     """
     first = logs[0]
     for other in logs[1:]:
-        if abs(other.period_s - first.period_s) > 0.02 * first.period_s:
+        if abs(other.period_s - first.period_s) > _OTHER_PERIOD * first.period_s:
             raise LogError(f"periods of {1e3 * first.period_s:.3f} and {1e3 * other.period_s:.3f} ms don't go together")
         if other.parameters != first.parameters:
             raise LogError(f"{first.parameters} and {other.parameters} parameters don't go together")
