@@ -51,9 +51,9 @@ class TransmitPdo(PdoRecord):
             self._sender = self.message.sender()
 
     def bind(self) -> None:
-        """Set `send` and `is_compared` by the present type and mapping, and restart the count of SYNCs to a frame.
+        """Set `send`, the function that sends a frame, and `is_compared` by the present type and mapping.
 
-        Call it after a change of type or mapping.
+        Restart the count of SYNCs to a frame. Call it after a change of type or mapping.
         """
         self._reads = tuple(self._pdos.dictionary.reader(*key) for key in self.layout.keys)
         is_asynchronous = self.type == 0 or self.type in EVENT_DRIVEN

@@ -101,7 +101,7 @@ def _response(response: ResponseTime) -> str:
 
 
 def as_json(codec: Codec, budget: Budget, notes: Sequence[str]) -> dict[str, Any]:
-    """Return a budget, with the remarks `notes`, as a dictionary for JSON."""
+    """Return the budget of a contract's frames on its bus, with the remarks `notes`, as a dictionary for JSON."""
     return {
         "contract": budget.name,
         "wire_version": codec.wire_version,

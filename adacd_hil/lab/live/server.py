@@ -415,7 +415,7 @@ def listen(setup: LiveView) -> socket.socket:
 
 
 def url_of(setup: LiveView, listening: socket.socket) -> str:
-    """Return the URL for viewers: `setup`'s host, and the port of the open socket `listening`."""
+    """Return the URL for viewers, ws://…: `setup`'s host, and the port of the open socket `listening`."""
     host = f"[{setup.host}]" if ":" in setup.host else setup.host
     return f"ws://{host}:{listening.getsockname()[1]}"
 

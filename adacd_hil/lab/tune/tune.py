@@ -285,7 +285,10 @@ def in_words(found: Found) -> str:
 
 
 def slowest_adaptation(outcome: TuningOutcome) -> str:
-    """Return the longest adaptation, s, as text such as "12.34"; "not finished" or "not looked at" if there is none."""
+    """Return the longest adaptation, s, as text such as "12.34".
+
+    Without any: "not finished" if the replayed motion has one that did not end, else "not looked at".
+    """
     if outcome.adaptation_s:
         return f"{max(outcome.adaptation_s):.2f}"
     return "not finished" if outcome.unfinished else "not looked at"
