@@ -174,6 +174,22 @@ def test_a_log_is_arrays_with_a_row_for_each_cycle(log):
         run["q"][0] = 1.0
 
 
+def test_cycles_that_lack_a_topic_or_go_back_are_told(log, monkeypatch):
+    raw = read_log(log, ("/scheme", "/control", "/cycle", "/contact", "/events"))
+    monkeypatch.setattr("adacd_hil.lab.library.loaded_run.read_log", lambda *_: raw)
+    count, cycles = len(raw.scheme), raw.topics["/cycle"]
+    cycles.records = cycles.records[: count - 100].copy()
+    assert (len(load(log)), load(log).problem) == (
+        count - 100, "100 cycles without a record of each topic left out"
+    )  # fmt: skip
+    cycles.records["publish_time"][50:] -= 20_000_000
+    with pytest.raises(LogError, match=r"/cycle: a cycle at 0\.\d+ s is not after the one before"):
+        load(log)
+    cycles.records["publish_time"][:] = 1 + np.arange(len(cycles.records))
+    with pytest.raises(LogError, match="no cycle has a record of each of /scheme, /control, /cycle"):
+        load(log)
+
+
 def test_what_is_no_log_is_one_line(tmp_path):
     with pytest.raises(LogError, match=r"run\.mcap"):
         load(tmp_path)

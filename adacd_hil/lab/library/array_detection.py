@@ -7,7 +7,6 @@ friction and the torque sensors' offsets are identified.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from numbers import Real
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
@@ -340,9 +339,9 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
         raise ArrayError(str(error)) from None
 
 
-def _check_lag(velocity_lag_s: float, has_dq: bool) -> None:
+def _check_lag(velocity_lag_s: Any, has_dq: bool) -> None:
     """Raise ArrayError if a lag is no number, outside its range, or not 0 without velocities."""
-    if not isinstance(velocity_lag_s, Real):
+    if not isinstance(velocity_lag_s, int | float | np.number):
         raise ArrayError(f"velocity_lag_s = {velocity_lag_s!r} is no time in s")
     if not 0.0 <= velocity_lag_s <= _LONGEST_LAG_S:
         raise ArrayError(f"velocity_lag_s = {velocity_lag_s:g} s is not within 0 to {_LONGEST_LAG_S:g} s")
