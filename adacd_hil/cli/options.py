@@ -22,6 +22,18 @@ from adacd_hil.settings.toml_files import builtin_names
 if TYPE_CHECKING:
     from adacd_hil.control.session import LiveView
 
+
+class FiniteRange(click.FloatRange):
+    """A number within bounds; click's own range lets NaN through, and infinity where a bound is missing."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number. Raises click.BadParameter for no number, one that isn't finite, or is out of bounds."""
+        number: float = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f"{number:g} is not finite", param, ctx)
+        return number
+
+
 config_option = click.option(
     "--config",
     default="certified",
@@ -152,6 +164,8 @@ def _connected(command: Callable[..., ExitCode], is_required: bool) -> Callable[
         from adacd_hil.cli.connection import Connection
 
         if url is not None:
+            if given := [name for name, value in (("--interface", interface), ("--channel", channel)) if value]:
+                raise CommandError(f"--url watches a run, {given[0]} a bus: choose one", ExitCode.USAGE)
             return command(url, **own)
         if interface is None or channel is None:
             raise CommandError("give --interface and --channel, or --url", ExitCode.USAGE)

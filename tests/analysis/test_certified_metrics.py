@@ -88,7 +88,8 @@ def test_the_margin_is_the_smallest_threshold_over_residual():
 
 @pytest.mark.parametrize("make", [make_run, make_certified_run])
 @pytest.mark.parametrize(
-    ("residual", "threshold", "is_good"), [(0.0, 0.1, True), (math.nan, 0.1, False), (0.0, math.inf, False)]
+    ("residual", "threshold", "is_good"),
+    [(0.0, 0.1, True), (math.nan, 0.1, False), (0.0, math.inf, False), (0.0, 5.9, True), (0.0, 6.1, False)],
 )
 def test_a_run_whose_joint_was_blind_is_not_good(make, residual, threshold, is_good):
     run = make((A, 600), (M, 1000))

@@ -159,6 +159,7 @@ def test_rotors_are_parameters_only_of_motors(tmp_path, example):
         ('q = "deg"', 'q = "degree"', "did you mean 'deg'?"),
         ('["j1_mNm", "j2_mNm"]', '["j1_mNm"]', "`columns.tau_J` has 1 values; the arm has 2 moving joints"),
         ("[scheme]", "[schemes]", "unknown section `schemes`"),
+        ("[scheme]", "[scheme]\nperiod_s = 0.01", "`scheme.period_s` is no setting: the recording's own period"),
         ("planar-arm.urdf", "none.urdf", "none.urdf: No such file"),
     ],
 )

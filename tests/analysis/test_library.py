@@ -18,6 +18,7 @@ from adacd_hil.lab.library.loaded_run import load
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import SchemeState
+from adacd_hil.settings.schema import ConfigError
 
 pytestmark = pytest.mark.slow
 
@@ -64,6 +65,38 @@ def test_a_model_of_one_recording_watches_another_and_names_of_others_are_taken(
     assert detect(renamed, arm, model=model).contacts == detect(arrays, arm, fit_s=(100.0, 105.0)).contacts
 
 
+@pytest.mark.parametrize("value", [0.0, 0.3])
+def test_no_contact_in_the_arrays_of_a_dead_logger_is_no_finding(arm, arrays, value):
+    model = fit(arrays, arm, fit_s=(100.0, 105.0))
+    dead = {name: np.full_like(arrays[name], value) for name in ("q", "tau_J")} | {"dq": 0.0 * arrays["dq"]}
+    found = detect({**arrays, **dead}, arm, model=model)
+    assert [fault.partition(" is always ")[0] for fault in found.faults] == [
+        "the torque of joint1 (1)",
+        "the arm does not move",
+    ]
+    assert "not judged: the torque of joint1" in repr(found)
+    assert detect(arrays, arm, model=model).faults == ()
+
+
+@pytest.mark.parametrize("other", [{"has_rotors": True}, {"gravity_m_s2": (0.0, 9.81, 0.0)}])
+def test_a_model_of_another_arm_is_refused(arm, arrays, other):
+    with pytest.raises(ArrayError, match=r"^model is of another arm"):
+        detect(
+            arrays, OfflineArm.from_urdf(urdf_text(1, ("0 0 1",), has_masses=False), **other), model=fit(arrays, arm)
+        )
+
+
+def test_a_lag_without_velocities_is_refused(arm, arrays):
+    with pytest.raises(ArrayError, match=r"^velocity_lag_s = 0.001 s is of dq, which is not given"):
+        detect({name: arrays[name] for name in ("t", "q", "tau_J")}, arm, velocity_lag_s=1e-3)
+
+
+@pytest.mark.parametrize("gravity", [(0.0, 0.0), (0.0, 0.0, np.nan), 9.81])
+def test_a_gravity_that_is_no_vector_is_refused(gravity):
+    with pytest.raises(ConfigError, match=r"^`gravity_m_s2"):
+        OfflineArm.from_urdf(urdf_text(1, ("0 0 1",), has_masses=False), gravity_m_s2=gravity)
+
+
 def test_touches_that_are_known_are_left_out_of_the_fit(arm, arrays):
     touched = (arrays["t"] >= 100.0 + PUSH_S[0]) & (arrays["t"] < 100.0 + PUSH_S[1])
     blind = fit(arrays, arm, fit_s=(106.0, 112.0))
@@ -93,6 +126,12 @@ WRONG = {
     "q is of list, real numbers in rad are expected": lambda a: {**a, "q": [[0.0], [0.0, 1.0]]},
     "t has a median period of 2 s, 1e-05 to 0.1 s are expected": lambda a: {**a, "t": a["t"] * 1000.0},
     "touched has shape (6000,) of float64, (6000,) of bool is expected": lambda a: {**a, "touched": a["t"]},
+    "tau_J is of masked values, real numbers in Nm are expected": lambda a: {
+        **a,
+        "tau_J": np.ma.masked_greater(a["tau_J"], 0.5),
+    },
+    "arrays are of list, a mapping from names is expected, as `run.motion`": lambda a: [a["t"], a["q"]],
+    "unknown array 1; known: t, q, tau_J, dq, touched, t_s, time, qd, tau": lambda a: {**a, 1: a["q"]},
 }
 
 
@@ -103,6 +142,11 @@ OPTIONS = {
     "`deviations` = 0.0 is below 1": {"deviations": 0.0},
     "unknown key `deviation`; did you mean `deviations`?": {"deviation": 5.0},
     "velocity_lag_s = -1 s is not within 0 to 0.05 s": {"velocity_lag_s": -1.0},
+    "velocity_lag_s = '1' is no time in s": {"velocity_lag_s": "1"},
+    "fit_s = (0.0, nan) is no pair of times in s": {"fit_s": (0.0, np.nan)},
+    "fit_s = (5, 0) s ends before it begins": {"fit_s": ("5", "0")},
+    "`period_s` is no setting: the recording's own period is taken": {"period_s": 1.04 * PERIOD_S},
+    "model is of str, a Model is expected, as of `fit`": {"model": "model"},
 }
 
 
@@ -128,6 +172,22 @@ def test_a_log_is_arrays_with_a_row_for_each_cycle(log):
         run["tau_K"]
     with pytest.raises(ValueError, match="read-only"):
         run["q"][0] = 1.0
+
+
+def test_cycles_that_lack_a_topic_or_go_back_are_told(log, monkeypatch):
+    raw = read_log(log, ("/scheme", "/control", "/cycle", "/contact", "/events"))
+    monkeypatch.setattr("adacd_hil.lab.library.loaded_run.read_log", lambda *_: raw)
+    count, cycles = len(raw.scheme), raw.topics["/cycle"]
+    cycles.records = cycles.records[: count - 100].copy()
+    assert (len(load(log)), load(log).problem) == (
+        count - 100, "100 cycles without a record of each topic left out"
+    )  # fmt: skip
+    cycles.records["publish_time"][50:] -= 20_000_000
+    with pytest.raises(LogError, match=r"/cycle: a cycle at 0\.\d+ s is not after the one before"):
+        load(log)
+    cycles.records["publish_time"][:] = 1 + np.arange(len(cycles.records))
+    with pytest.raises(LogError, match="no cycle has a record of each of /scheme, /control, /cycle"):
+        load(log)
 
 
 def test_what_is_no_log_is_one_line(tmp_path):

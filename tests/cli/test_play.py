@@ -91,6 +91,22 @@ def test_frames_are_chosen(log, listener, options, expected, unsendable):
     assert [m.arbitration_id for m in heard(listener)] == expected
 
 
+@pytest.mark.parametrize(
+    ("options", "status", "words"),
+    [
+        (("--start", "100"), 1, "no frame sent: the recording has none"),
+        (("--id", "7ff"), 1, "no frame sent: the recording has none"),
+        (("--start", "0.004", "--end", "0.002"), 2, "--start 0.004 s is not before --end 0.002 s"),
+        (("--end", "inf"), 2, "inf is not finite"),
+        (("--speed", "nan"), 2, "nan is not finite"),
+    ],
+)
+def test_a_choice_that_leaves_no_frame_is_a_failure(log, listener, options, status, words):
+    done = run(log, *options)
+    assert (done.exit_code, heard(listener)) == (status, [])
+    assert words in done.output
+
+
 def test_a_real_bus_gets_what_devices_send_and_commands_when_asked_for(log, listener, monkeypatch):
     monkeypatch.setattr(play_module, "is_virtual", lambda *_: False)
     done = run(log)

@@ -86,6 +86,11 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     (f"{RUN} -b 1M", USAGE, ("'1M' is not a valid integer", "run --help")),
     ("init new.toml -i virtual -c x --yes", BUS_MISSING, ("drives that answer: none", "Check power, wiring and node")),
     ("monitor --url ws://127.0.0.1:1", FAILURE, ("nobody serves one there", "start the run with --live")),
+    ("monitor --url ws://127.0.0.1:1 -i virtual -c x", USAGE, ("--url watches a run, --interface a bus: choose one",)),
+    ("monitor --url ws://127.0.0.1:1 --node 3", USAGE, ("--node has no effect with --url",)),
+    ("monitor -i virtual -c x --seconds nan", USAGE, ("nan is not finite", "monitor --help")),
+    ("excitation --seconds nan", USAGE, ("nan is not finite",)),
+    ("thresholds log.mcap --rate-per-h nan", USAGE, ("nan is not finite",)),
     ("demo --live --live-port {port}", FAILURE, ("can't listen on 127.0.0.1:{port}", "--live-port 0 takes one")),
     # -- the configuration
     ("demo --config papper", USAGE, ("'papper' is neither built in nor a file", "did you mean 'paper'?")),

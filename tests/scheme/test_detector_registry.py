@@ -3,11 +3,12 @@
 import sys
 import tomllib
 
+import numpy as np
 import pytest
 from documents import ROOT
 
 from adacd_hil.lab.detectors import detector_registry
-from adacd_hil.lab.detectors.detectors import DetectorBankSettings
+from adacd_hil.lab.detectors.detectors import DetectorBank, DetectorBankSettings, register, unregister
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings, with_todays_keys
 from adacd_hil.settings.parsing import parse
@@ -81,6 +82,53 @@ def test_a_package_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
     for _ in looked_up_anew():
         with pytest.raises(DetectorError, match=r"mean of 20 of package lab-detectors 1.0 .* ImportError: no libfoo"):
             _ = DetectorBankSettings().registered
+
+
+class Broken:
+    """A detector that breaks the contract in one way."""
+
+    def __init__(self, way):
+        self.way, self.count = way, 0
+
+    def take(self, z, held_Nm):
+        self.count += len(z)
+        if self.way == "in place":
+            held_Nm[:] = 0.0
+        if self.way == "at zero":
+            with np.errstate(invalid="ignore"):
+                return z * z / np.abs(z)
+        if self.way == "one sample":
+            return np.abs(z) if len(z) > 1 else np.zeros(z.shape)
+        if self.way == "late":
+            return np.abs(z) if self.count < 1000 else np.full(z.shape, np.nan)
+        return {"list": z.tolist(), "yes or no": z > 1.0}.get(self.way, np.abs(z))
+
+
+CAUSES = {
+    "in place": "changes the samples",
+    "at zero": "gives nan for sample 0 of joint 1",
+    "one sample": "gives sample 136 another statistic",
+    "list": "gives list, an array of real numbers",
+    "yes or no": "gives bool, an array of real numbers",
+}
+
+
+@pytest.mark.parametrize("way", CAUSES)
+def test_a_detector_that_breaks_the_contract_is_refused(way):
+    with pytest.raises(ValueError, match=f"^detector its name {CAUSES[way]}"):
+        detector_registry.check_contract("its name", lambda _: Broken(way))
+
+
+def test_a_statistic_that_stops_being_a_number_after_the_check_is_no_threshold():
+    settings = DetectorBankSettings()
+    register("its name", lambda _: Broken("late"))
+    try:
+        bank = DetectorBank(settings, np.zeros((2, len(settings.onset_samples), 128)), 1e-3)
+        bank.take_stream(np.ones((900, 2)), np.zeros((900, 2)))
+        with pytest.raises(DetectorError, match=r"^detector its name .* gives nan for sample 0 of joint 1$"):
+            bank.take_stream(np.ones((900, 2)), np.zeros((900, 2)))
+    finally:
+        unregister("its name")
 
 
 OLD = {"detector": {"threshold_Nm": [0.2, 0.2], "live_lag_s": 1.25e-3, "live": [{"name": "cusum"}]}}

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.completion import complete_run, complete_setting
-from adacd_hil.cli.options import json_option, profile_option, set_option, stretch_options
+from adacd_hil.cli.options import FiniteRange, json_option, profile_option, set_option, stretch_options
 from adacd_hil.cli.output import (
     CommandError,
     ExitCode,
@@ -60,7 +60,7 @@ _MOST_COLUMNS = 6
 @click.option("--frames", "by_frames", is_flag=True, help="Decode the frames, and compare the arm's states, too.")
 @click.option(
     "--tolerance",
-    type=click.FloatRange(0.0, 1.0),
+    type=FiniteRange(0.0, 1.0),
     help="Relative tolerance of real values; default: 0 on the same machine.",
 )
 @click.option("--shown", type=click.IntRange(min=0), default=SHOWN, show_default=True, help="Mismatches to print.")

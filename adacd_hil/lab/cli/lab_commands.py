@@ -10,6 +10,7 @@ from adacd_hil.cli.completion import complete_run, complete_scenario, complete_t
 from adacd_hil.cli.options import (
     HOST,
     PORT,
+    FiniteRange,
     clock_option,
     config_option,
     json_option,
@@ -23,6 +24,7 @@ from adacd_hil.cli.options import (
 )
 from adacd_hil.cli.output import (
     EPILOG,
+    CommandError,
     ExitCode,
     answer,
     complain_of,
@@ -193,7 +195,7 @@ def thresholds(
 @profile_option
 @click.option(
     "--seconds",
-    type=click.FloatRange(0.0, 86_400.0),
+    type=FiniteRange(0.0, 86_400.0),
     default=60.0,
     show_default=True,
     help="How long to begin new climbs; the one under way is ended.",
@@ -262,7 +264,7 @@ def budget(
 @click.command(epilog=EPILOG)
 @on_bus
 @click.option(
-    "--seconds", type=click.FloatRange(0.1, 600.0), default=LISTEN_S, show_default=True, help="How long to listen."
+    "--seconds", type=FiniteRange(0.1, 600.0), default=LISTEN_S, show_default=True, help="How long to listen."
 )
 @json_option
 def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
@@ -282,9 +284,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
     f"{GOOD_SHARE:.2f} there is a warning. {EPILOG}"
 )
 @on_bus
-@click.option(
-    "--seconds", type=click.FloatRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test."
-)
+@click.option("--seconds", type=FiniteRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test.")
 @click.option("--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: the arm isn't held.")
 @click.option("--out", type=WrittenPath(file_okay=False), help="Folder for a log; default: none.")
 @json_option
@@ -321,7 +321,7 @@ def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode
 @on_bus_or_url(f"Watch the live view of a run instead, such as ws://{HOST}:{PORT}.")
 @click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
 @click.option("--once", is_flag=True, help=f"Listen for {PLAIN_S:g} s, print one table, end.")
-@click.option("--seconds", type=click.FloatRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
+@click.option("--seconds", type=FiniteRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
 @json_option
 def monitor(
     place: "Connection | str", node_id: int | None, once: bool, seconds: float | None, as_json: bool
@@ -336,6 +336,8 @@ def monitor(
     listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
     if not isinstance(place, str):
         return watch(place, node_id, listened_s, listened_s is None, as_json)
+    if node_id is not None:
+        raise CommandError("--node has no effect with --url", ExitCode.USAGE)
     require_extra("--url", "websockets")
     from adacd_hil.lab.cli.live_monitor import watch_live
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.completion import complete_run
-from adacd_hil.cli.options import json_option, stretch_options
+from adacd_hil.cli.options import FiniteRange, json_option, stretch_options
 from adacd_hil.cli.output import (
     CommandError,
     ExitCode,
@@ -116,7 +116,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
 @click.option(
     "--around",
     "around_s",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=FiniteRange(min=0.0, min_open=True),
     show_default=str(_AROUND_S),
     help="s before and after the contact.",
 )

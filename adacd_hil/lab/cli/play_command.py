@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
-from adacd_hil.cli.options import json_option
+from adacd_hil.cli.options import FiniteRange, json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.given_path import GivenPath
@@ -60,17 +60,17 @@ def hex_id(text: str) -> int:
 @click.option("--fd", "is_fd", is_flag=True, help="Open the bus for CAN FD; default: as the contract is.")
 @click.option(
     "--speed",
-    type=click.FloatRange(0.001, 1000.0),
+    type=FiniteRange(0.001, 1000.0),
     default=1.0,
     show_default=True,
     help="Factor on the speed of the recording.",
 )
-@click.option("--start", "start_s", type=click.FloatRange(0.0), help="Begin so many s after the first frame.")
-@click.option("--end", "end_s", type=click.FloatRange(0.0), help="End so many s after the first frame.")
+@click.option("--start", "start_s", type=FiniteRange(0.0), help="Begin so many s after the first frame.")
+@click.option("--end", "end_s", type=FiniteRange(0.0), help="End so many s after the first frame.")
 @click.option(
     "--loop", "times", type=click.IntRange(0), default=1, show_default=True, help="How often; 0: until interrupted."
 )
-@click.option("--skip", "longest_pause_s", type=click.FloatRange(0.0), help="Cut longer pauses to so many s.")
+@click.option("--skip", "longest_pause_s", type=FiniteRange(0.0), help="Cut longer pauses to so many s.")
 @click.option(
     "--commands", is_flag=True, help="On a real bus, send frames of others than devices, too: they can move a real arm."
 )
@@ -111,6 +111,8 @@ def play(
     from adacd_hil.log.frames.frame_log import open_frames
     from adacd_hil.wire.dbc_contract import parse_codec
 
+    if start_s is not None and end_s is not None and start_s >= end_s:
+        raise CommandError(f"--start {start_s:g} s is not before --end {end_s:g} s", ExitCode.USAGE)
     codec = parse_codec(*find_dbc(log, dbc))
     choice = FrameChoice(
         only,
@@ -188,8 +190,8 @@ def _run(
     """Play a recording onto a bus, `times` times (0: until interrupted), and close the bus.
 
     speed: factor on the recording's. longest_pause_s: to which pauses are cut; None: they stay. Return counts and
-    lateness of the frames for JSON, and the exit status: INTERRUPTED, PARTIAL for a damaged recording, else OK. Raises
-    LogError if the recording can't be read, CommandError if the bus fails.
+    lateness of the frames for JSON, and the exit status: INTERRUPTED, PARTIAL for a damaged recording, FAILURE if no
+    frame was sent, else OK. Raises LogError if the recording can't be read, CommandError if the bus fails.
     """
     from adacd_hil.cli.connection import on_interrupt
     from adacd_hil.lab.logs.playback import play as play_frames
@@ -230,7 +232,9 @@ def _run(
     }
     if interrupted.is_set():
         return described, ExitCode.INTERRUPTED
-    return described, ExitCode.PARTIAL if playback.problem else ExitCode.OK
+    if playback.problem:
+        return described, ExitCode.PARTIAL
+    return described, ExitCode.OK if lateness.frames else ExitCode.FAILURE
 
 
 def _as_text(described: dict[str, Any]) -> str:
@@ -241,6 +245,8 @@ def _as_text(described: dict[str, Any]) -> str:
     lines = [
         f"{described['frames']} frames sent, late by p50 {late['p50']} µs, p99 {late['p99']} µs, max {late['max']} µs; "
         f"{described['late_by_1_ms']} by more than {1e-6 * LATE_NS:g} ms"
+        if described["frames"]
+        else "no frame sent: the recording has none that was asked for and can be sent"
     ]
     if described["withheld"]:
         lines.append(

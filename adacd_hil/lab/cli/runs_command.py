@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.options import json_option
+from adacd_hil.cli.options import FiniteRange, json_option
 from adacd_hil.cli.output import (
     RUNS,
     CommandError,
@@ -155,7 +155,7 @@ def runs(
 @_folder_argument
 @click.option(
     "--share",
-    type=click.FloatRange(0.0, 10.0, min_open=True),
+    type=FiniteRange(0.0, 10.0, min_open=True),
     default=THRESHOLD_SHARE,
     show_default=True,
     help=f"A threshold that differs by more than this share has changed; {MEANT_SHARE:g} of it where settings have.",

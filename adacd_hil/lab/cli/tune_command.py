@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from adacd_hil.cli.completion import complete_run
-from adacd_hil.cli.options import json_option, stretch_options
+from adacd_hil.cli.options import FiniteRange, json_option, stretch_options
 from adacd_hil.cli.output import (
     ExitCode,
     explain_statuses,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 rate_option = click.option(
     "--rate-per-h",
-    type=click.FloatRange(LEAST_RATE_PER_H, MOST_RATE_PER_H),
+    type=FiniteRange(LEAST_RATE_PER_H, MOST_RATE_PER_H),
     default=0.01,
     show_default=True,
     help="Wanted false alarms per hour of a detector.",

@@ -5,11 +5,12 @@ the entry point's name is the detector's, its object a function that begins one,
 loaded when a detector is first looked up; a run never loads one.
 
 **Contract** (`StreamDetector`): `take` returns one finite statistic per sample and joint, which depends on this sample
-and on those before it. `check_contract` plays noise before a detector is taken: whole, and cut in two.
+and on those before it. `check_contract` plays noise before a detector is taken: whole, and cut in three.
 """
 
 import importlib.metadata
 from collections.abc import Callable, Collection, Mapping
+from itertools import pairwise
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
@@ -19,7 +20,9 @@ from adacd_hil.settings.schema import DetectorError
 
 ENTRY_POINTS: Final = "adacd_hil.detectors"
 """Group of the entry points by which a package registers detectors."""
-_CHECK_SAMPLES, _CHECK_CUT = 400, 137
+_CHECK_SAMPLES = 400
+_CHECK_CUTS = (136, 137)
+_CHECK_ZEROS = [0, *range(200, 240)]  # the first sample of each stream is 0
 _LONGEST_TEXT = 200
 
 
@@ -29,9 +32,9 @@ class StreamDetector(Protocol):
     def take(self, z: Vector, held_Nm: Vector) -> Vector:
         """Process N more samples of the stream; return the statistic of each sample and joint (N, n), finite.
 
-        z (N, n): the stream, Nm. held_Nm (N, n): the friction that may hold a standing joint. An alarm is a statistic
-        above its threshold. A statistic may depend on its sample and those before, but not on how the stream is cut
-        into pieces.
+        z (N, n): the stream, Nm. held_Nm (N, n): the friction that may hold a standing joint. Both stay as they are. An
+        alarm is a statistic above its threshold. A statistic may depend on its sample and those before, but not on how
+        the stream is cut into pieces.
         """
 
 
@@ -106,27 +109,52 @@ def remove(name: str) -> None:
 
 
 def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> None:
-    """Run a detector on noise of two joints, whole and cut in two.
+    """Run a detector on two joints' noise, with moments at zero as a standing arm has; whole, and cut in three.
 
-    make: begins it on a stream of period_s. Raises ValueError if a statistic has another shape, isn't finite, or
-    depends on the cut. Errors of the detector are raised as they are.
+    make: begins it on a stream of period_s. Raises ValueError if a statistic is no array of numbers, has another shape,
+    isn't finite, or depends on the cut, or if the samples are changed. Errors of the detector are raised as they are.
     """
     z = np.random.default_rng(0).standard_normal((_CHECK_SAMPLES, JOINTS))
+    z[_CHECK_ZEROS] = 0.0
     held_Nm = np.where(z > 1.0, 0.1, 0.0)
+    given = z.copy(), held_Nm.copy()
     first, parts = make(period_s), make(period_s)
-    whole = first.take(z.copy(), held_Nm.copy())
-    if whole.shape != z.shape:
-        raise ValueError(f"detector {name} gives statistics {whole.shape} for samples {z.shape}")
-    if not np.isfinite(whole).all():
-        sample, joint = np.argwhere(~np.isfinite(whole))[0].tolist()
-        raise ValueError(f"detector {name} gives {whole[sample, joint]} for sample {sample} of joint {joint + 1}")
-    whole = np.array(whole, np.float64)
-    cut = np.concatenate([parts.take(z[rows], held_Nm[rows]) for rows in (slice(_CHECK_CUT), slice(_CHECK_CUT, None))])
+    whole = np.array(checked_statistics(name, first.take(*given), z), np.float64)
+    if not all(map(np.array_equal, given, (z, held_Nm))):
+        raise ValueError(f"detector {name} changes the samples that it is given, which others take after it")
+    rows = [slice(*bounds) for bounds in pairwise((0, *_CHECK_CUTS, None))]
+    cut = np.concatenate([parts.take(z[each], held_Nm[each]) for each in rows])
     if not np.array_equal(whole, cut):
         sample = int(np.argwhere(whole != cut)[0, 0])
-        raise ValueError(
-            f"detector {name} gives sample {sample} another statistic where the stream is cut at {_CHECK_CUT}"
-        )
+        places = " and ".join(map(str, _CHECK_CUTS))
+        raise ValueError(f"detector {name} gives sample {sample} another statistic where the stream is cut at {places}")
+
+
+def checked_statistics(name: str, statistics: Vector, z: Vector) -> Vector:
+    """Return the statistics that a detector gives for samples z (N, n).
+
+    Raises ValueError if they are no array (N, n) of finite numbers.
+    """
+    kind = statistics.dtype if isinstance(statistics, np.ndarray) else type(statistics).__name__
+    if not isinstance(statistics, np.ndarray) or statistics.dtype.kind not in "fiu":
+        raise ValueError(f"detector {name} gives {kind}, an array of real numbers is expected")
+    if statistics.shape != z.shape:
+        raise ValueError(f"detector {name} gives statistics {statistics.shape} for samples {z.shape}")
+    if not np.isfinite(statistics).all():
+        sample, joint = np.argwhere(~np.isfinite(statistics))[0].tolist()
+        raise ValueError(f"detector {name} gives {statistics[sample, joint]} for sample {sample} of joint {joint + 1}")
+    return statistics
+
+
+def statistics_of(name: str, detector: StreamDetector, z: Vector, held_Nm: Vector) -> Vector:
+    """Return a detector's statistics (N, n) of N more samples of its stream, as of `StreamDetector.take`.
+
+    Raises DetectorError, with the detector's name, if it raises an error or its statistics break the contract.
+    """
+    try:
+        return checked_statistics(name, detector.take(z, held_Nm), z)
+    except Exception as error:
+        raise DetectorError(f"detector {name} can't be used: {describe_error(error)}") from error
 
 
 def describe_error(error: BaseException) -> str:

@@ -326,13 +326,14 @@ class DetectorBank:
         self._constants = constants_of(settings, weights, period_s)
         self._memory = new_memory(self._constants)
         self._channels = len(settings.channels)
-        self._registered = [found.make(period_s) for found in settings.registered.values()]
+        self._registered = {name: found.make(period_s) for name, found in settings.registered.items()}
 
     def take_stream(self, z: Vector, held_Nm: Vector, block_samples: int = 1) -> Vector:
         """Process N more samples (N, n); return the largest statistic of each block of them.
 
         The result has the shape (ceil(N / block_samples), channels, n). held_Nm (N, n): the friction that may hold a
         standing joint. One sample per block keeps every statistic. The next call continues the stream with a new block.
+        Raises DetectorError if a registered detector raises an error, or breaks its contract.
         """
         count, joints = z.shape
         own = np.empty((-(-count // block_samples), self._channels - len(self._registered), joints))
@@ -340,7 +341,10 @@ class DetectorBank:
         if not self._registered or not count:
             return np.concatenate((own, np.zeros((own.shape[0], len(self._registered), joints))), axis=1)
         starts = np.arange(0, count, block_samples)
-        further = [np.maximum.reduceat(detector.take(z, held_Nm), starts) for detector in self._registered]
+        further = [
+            np.maximum.reduceat(detector_registry.statistics_of(name, detector, z, held_Nm), starts)
+            for name, detector in self._registered.items()
+        ]
         return np.concatenate((own, np.stack(further, axis=1)), axis=1)
 
 

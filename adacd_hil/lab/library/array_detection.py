@@ -15,16 +15,15 @@ from numpy.typing import ArrayLike
 
 from adacd_hil.file_access import read_input
 from adacd_hil.lab.offline.recorded_columns import LARGEST, SHORTEST_SAMPLES, RecordedColumns
-from adacd_hil.lab.offline.recording_identification import Identified, identify, watch
+from adacd_hil.lab.offline.recording_identification import Identified, examined, identify, watch
 from adacd_hil.lab.offline.recording_import import (
     LONGEST_PERIOD_S,
     SHORTEST_PERIOD_S,
     ForeignRecording,
     recording_of,
 )
-from adacd_hil.lab.offline.recording_map import ArmSection, ColumnsSection, RecordingMap
+from adacd_hil.lab.offline.recording_map import ArmSection, ColumnsSection, RecordingMap, checked_scheme
 from adacd_hil.lab.offline.recording_verdict import Verdict
-from adacd_hil.lab.serial_arm.offline import OfflineSettings
 from adacd_hil.lab.serial_arm.urdf import STANDARD_GRAVITY_M_S2, SerialArm, read_urdf
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.robot_description import robot_description
@@ -69,8 +68,10 @@ class OfflineArm:
 
         gravity_m_s2: in the axes of the root link. locked: joints that do not move, as of a gripper. has_rotors: the
         torques are those of geared motors, which turn their rotors too. Raises UrdfError, a ValueError, if it is no
-        usable URDF; OSError if the file can't be read.
+        usable URDF; ConfigError, a ValueError, for another argument; OSError if the file can't be read.
         """
+        given = {"gravity_m_s2": gravity_m_s2, "locked": locked, "has_rotors": has_rotors}
+        parse(ArmSection, {"urdf": ""} | {key: _plain(value) for key, value in given.items()}, "")
         text = urdf if isinstance(urdf, str) and "<" in urdf else read_input(Path(urdf))
         return cls(read_urdf(text, gravity_m_s2, locked), has_rotors)
 
@@ -95,6 +96,13 @@ class OfflineArm:
     def joint_names(self) -> tuple[str, ...]:
         """Names of the joints (n,), from the base outward."""
         return self.serial.joint_names
+
+
+def _plain(value: Any) -> Any:
+    """Return a setting as TOML would give it: tuples and arrays as lists, numpy's numbers as Python's."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return list(value) if isinstance(value, tuple) else value
 
 
 class ArrayContact(NamedTuple):
@@ -139,7 +147,8 @@ class ArrayDetection:
     """Contacts in arrays, in the order of time, and external torques with their thresholds of m samples.
 
     t_s (m,), s; tau_ext_hat, threshold (m, n), Nm. Their period is fixed; if that of the arrays is, they are the
-    samples of the arrays. Gaps split them, and parts of fewer than `SHORTEST_SAMPLES` are left out.
+    samples of the arrays. Gaps split them, and parts of fewer than `SHORTEST_SAMPLES` are left out. faults: defects of
+    the arrays with which contacts can't be told, such as a dead sensor, a line each; () without one.
     """
 
     model: FittedModel
@@ -147,10 +156,12 @@ class ArrayDetection:
     tau_ext_hat: Vector
     threshold: Vector
     contacts: tuple[ArrayContact, ...]
+    faults: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         seconds = self.t_s.size * self.model.identified.settings.period_s
         found = f"{number_of(len(self.contacts), 'contact')} in {seconds:.1f} s"
+        found += f", not judged: {self.faults[0]}" if self.faults else ""
         return f"<Detection: {found}; model {self.model.verdict.headline}>"
 
 
@@ -223,19 +234,21 @@ def detect(
     """
     recording = _taken(arrays, arm, velocity_lag_s)
     begin_s = recording.columns.begin_s
+    if not isinstance(model, FittedModel | None):
+        raise ArrayError(f"model is of {type(model).__name__}, a Model is expected, as of `fit`")
     if model is None:
         model = _fitted(recording, arm, fit_s, scheme)
     elif fit_s is not None or scheme:
         raise ArrayError(
             f"model is given, and so is {'fit_s' if fit_s is not None else next(iter(scheme))}: choose one"
         )
-    elif model.arm.joints != arm.joints:
-        raise ArrayError(f"model is of {model.arm.joints} joints, the arm has {arm.joints}")
+    _check_arm(model, arm)
     found = model.identified
     period_s = found.settings.period_s
     if not math.isclose(recording.period_s, period_s, rel_tol=0.05):
         raise ArrayError(f"t has a period of {recording.period_s:g} s, the model was fitted at {period_s:g} s")
     watched = watch(found.model, found.settings, found.estimate, found.certificate.lack_Nm, recording)
+    watched = examined(found.described, watched)
     stretches = recording.stretches
     t_s = [begin_s + each.start_s + recording.period_s * np.arange(len(each.record.q)) for each in stretches]
     return ArrayDetection(
@@ -244,19 +257,30 @@ def detect(
         tau_ext_hat=np.concatenate(watched.tau_ext_hat),
         threshold=np.concatenate(watched.threshold),
         contacts=tuple(ArrayContact(begin_s + each.start_s, each.link, each.direction) for each in watched.contacts),
+        faults=watched.faults,
     )
+
+
+def _check_arm(model: FittedModel, arm: OfflineArm) -> None:
+    """Raise ArrayError if a model is of another arm than `arm`."""
+    if model.arm.joints != arm.joints:
+        raise ArrayError(f"model is of {model.arm.joints} joints, the arm has {arm.joints}")
+    if model.arm.has_rotors != arm.has_rotors or not all(map(np.allclose, model.arm.serial.chain, arm.serial.chain)):
+        raise ArrayError("model is of another arm: geometry, gravity or `has_rotors` differ")
 
 
 def _named(arrays: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
     """Return the arrays by the names `t`, `q`, `tau_J`, `dq` and `touched`, whatever synonym was given.
 
-    Raises ArrayError for one that is unknown, missing or given twice.
+    Raises ArrayError for one that is unknown, missing or given twice, and for no mapping.
     """
+    if not isinstance(arrays, Mapping):
+        raise ArrayError(f"arrays are of {type(arrays).__name__}, a mapping from names is expected, as `run.motion`")
     named: dict[str, ArrayLike] = {}
     for given, values in arrays.items():
         name = _ALIASES.get(given, given)
         if name not in (*_REQUIRED, *_OPTIONAL):
-            near = nearest_name(given, _KNOWN)
+            near = nearest_name(str(given), _KNOWN)
             raise ArrayError(
                 f"unknown array {given!r}; " + (f"did you mean {near!r}?" if near else f"known: {', '.join(_KNOWN)}")
             )
@@ -276,6 +300,8 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
     type or value, times don't grow, or the lag is out of its range.
     """
     named = _named(arrays)
+    if not isinstance(arm, OfflineArm):
+        raise ArrayError(f"arm is of {type(arm).__name__}, an Arm is expected, as of Arm.from_urdf")
     t_s = _numbers("t", named["t"])
     if t_s.ndim != 1 or t_s.size < SHORTEST_SAMPLES:
         raise ArrayError(f"t has shape {t_s.shape}, (k,) with k ≥ {SHORTEST_SAMPLES} is expected")
@@ -287,19 +313,21 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
     if not SHORTEST_PERIOD_S <= period_s <= LONGEST_PERIOD_S:
         bounds = f"{SHORTEST_PERIOD_S:g} to {LONGEST_PERIOD_S:g} s are expected"
         raise ArrayError(f"t has a median period of {period_s:g} s, {bounds}")
+    _check_lag(velocity_lag_s, "dq" in named)
     columns = []
     for name in ("q", "tau_J", *(("dq",) if "dq" in named else ())):
         values = _numbers(name, named[name])
         if values.shape != (t_s.size, arm.joints):
             raise ArrayError(f"{name} has shape {values.shape}, ({t_s.size}, {arm.joints}) is expected")
         columns.append(values)
-    if not 0.0 <= velocity_lag_s <= _LONGEST_LAG_S:
-        raise ArrayError(f"velocity_lag_s = {velocity_lag_s:g} s is not within 0 to {_LONGEST_LAG_S:g} s")
-    if "dq" in named and velocity_lag_s:
+    if velocity_lag_s:
         columns[-1] = np.column_stack([np.interp(t_s + velocity_lag_s, t_s, column) for column in columns[-1].T])
     touched = None
     if "touched" in named:
-        touched = np.asarray(named["touched"])
+        try:
+            touched = np.asarray(named["touched"])
+        except ValueError as error:
+            raise ArrayError(f"touched can't be read: {error}") from None
         if touched.shape != t_s.shape or touched.dtype.kind not in "bui":
             raise ArrayError(f"touched has shape {touched.shape} of {touched.dtype}, ({t_s.size},) of bool is expected")
         touched = touched.astype(np.bool_)
@@ -311,18 +339,28 @@ def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: flo
         raise ArrayError(str(error)) from None
 
 
+def _check_lag(velocity_lag_s: Any, has_dq: bool) -> None:
+    """Raise ArrayError if a lag is no number, outside its range, or not 0 without velocities."""
+    if not isinstance(velocity_lag_s, int | float | np.number):
+        raise ArrayError(f"velocity_lag_s = {velocity_lag_s!r} is no time in s")
+    if not 0.0 <= velocity_lag_s <= _LONGEST_LAG_S:
+        raise ArrayError(f"velocity_lag_s = {velocity_lag_s:g} s is not within 0 to {_LONGEST_LAG_S:g} s")
+    if velocity_lag_s and not has_dq:
+        raise ArrayError(f"velocity_lag_s = {velocity_lag_s:g} s is of dq, which is not given: derived, it has no lag")
+
+
 def _numbers(name: str, given: ArrayLike) -> Vector:
     """Return an array as float64 values of at most `LARGEST` in size; times may be larger, but finite.
 
-    name: of the array, for the error. Raises ArrayError for other values, or for no real numbers.
+    name: of the array, for the error. Raises ArrayError for other values, masked ones, or no real numbers.
     """
     try:
         values = np.asarray(given)
-        if values.dtype.kind not in "fiu":
+        if values.dtype.kind not in "fiu" or np.ma.is_masked(given):
             raise TypeError
         values = np.ascontiguousarray(values, np.float64)
     except (TypeError, ValueError):
-        kind = getattr(given, "dtype", type(given).__name__)
+        kind = "masked values" if np.ma.is_masked(given) else getattr(given, "dtype", type(given).__name__)
         raise ArrayError(f"{name} is of {kind}, real numbers in {_UNITS[name]} are expected") from None
     bad = np.argwhere(~(np.abs(values) <= LARGEST)) if name != "t" else np.argwhere(~np.isfinite(values))
     if len(bad):
@@ -343,9 +381,11 @@ def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tup
     try:
         start_s, end_s = (float(bound) - recording.columns.begin_s for bound in fit_s)
     except (TypeError, ValueError):
-        raise ArrayError(f"fit_s = {fit_s!r} is no pair of times in s") from None
+        start_s = end_s = math.nan
+    if math.isnan(start_s) or math.isnan(end_s):
+        raise ArrayError(f"fit_s = {fit_s!r} is no pair of times in s")
     if not start_s < end_s:
-        raise ArrayError(f"fit_s = ({fit_s[0]:g}, {fit_s[1]:g}) s ends before it begins")
+        raise ArrayError(f"fit_s = ({float(fit_s[0]):g}, {float(fit_s[1]):g}) s ends before it begins")
     return start_s, end_s
 
 
@@ -355,9 +395,8 @@ def _described(arm: OfflineArm, has_dq: bool, scheme: Mapping[str, Any]) -> Reco
     Raises ArrayError for an invalid setting of the scheme.
     """
     names = tuple(f"{place}" for place in range(1, arm.joints + 1))
-    plain = {key: list(value) if isinstance(value, tuple | np.ndarray) else value for key, value in scheme.items()}
     try:
-        parse(OfflineSettings, {"noise_Nm": [1.0] * arm.joints} | plain, "")
+        plain = checked_scheme({key: _plain(value) for key, value in scheme.items()}, "")
     except ConfigError as error:
         raise ArrayError(str(error)) from None
     if len(plain.get("noise_Nm", names)) != arm.joints:

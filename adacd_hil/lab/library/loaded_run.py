@@ -168,12 +168,14 @@ def load(run: str | Path) -> LoadedRun:
     """Return the run in a log, all parts of the log as one. run: a folder with run.mcap, or the log's first part.
 
     A cut or damaged log is read as far as it is intact, see `problem`. Raises LogError, in one line, if it can't be
-    read or has no cycle.
+    read, has no cycle, or its times don't grow.
     """
     path = log_in(run)
     log = read_log(path, _READ)
     arrays = _arrays(log)
     t_ns = arrays.pop("t_ns")
+    left_out = max(len(log.topics[topic]) for topic in _TOPICS) - len(t_ns)
+    lack = f"{number_of(left_out, 'cycle')} without a record of each topic left out" if left_out else ""
     is_moving = np.flatnonzero(arrays["state"] == SchemeState.ADAPT)
     zero_ns = int(t_ns[is_moving[0] if is_moving.size else 0])
     arrays = {"t_s": (t_ns - zero_ns) * 1e-9, **arrays}
@@ -187,22 +189,30 @@ def load(run: str | Path) -> LoadedRun:
         contacts=tuple(RunContact((t_ns - zero_ns) * 1e-9, report) for t_ns, report in each_once(log.contacts)),
         metadata=log.metadata,
         attachments=log.attachments,
-        problem=log.problem,
+        problem=log.problem or lack,
     )
 
 
 def _arrays(log: RunLog) -> dict[str, NDArray[Any]]:
     """Return the fields of /scheme, /control and /cycle, and `t_ns`, for the cycles that all three have.
 
-    A topic without any record is left out, with its fields. Raises LogError if /scheme has none.
+    A topic without any record is left out, with its fields. Raises LogError if /scheme has none, no cycle is common, or
+    times don't grow.
     """
     if not len(log.scheme):
         raise LogError(f"log {log.path} has no cycle" + (f": {log.problem}" if log.problem else ""))
-    series = [log.topics[topic] for topic in _TOPICS if len(log.topics[topic])]
+    names = [topic for topic in _TOPICS if len(log.topics[topic])]
+    series = [log.topics[topic] for topic in names]
     stamps = [topic.records["publish_time"].astype(np.int64) for topic in series]
     common = stamps[0]
-    for stamp in stamps[1:]:
+    for name, stamp in zip(names, stamps, strict=True):
+        backward = np.flatnonzero(np.diff(stamp) <= 0) + 1
+        if backward.size:
+            at_s = (stamp[backward[0]] - stamp[0]) * 1e-9
+            raise LogError(f"log {log.path}, {name}: a cycle at {at_s:.3f} s is not after the one before")
         common = np.intersect1d(common, stamp)
+    if not len(common):
+        raise LogError(f"log {log.path}: no cycle has a record of each of {', '.join(names)}")
     arrays: dict[str, NDArray[Any]] = {}
     for topic, stamp in zip(series, stamps, strict=True):
         rows = np.searchsorted(stamp, common)

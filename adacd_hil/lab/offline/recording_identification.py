@@ -193,7 +193,7 @@ def identify(
         verdict=judge_fit(fit),
         test=watch(model, settings, estimate, np.zeros(model.joints), tested),
         watched=tuple(
-            _examined(described, watch(model, settings, estimate, certificate.lack_Nm, recording))
+            examined(described, watch(model, settings, estimate, certificate.lack_Nm, recording))
             for recording in watched
         ),
     )
@@ -203,7 +203,7 @@ _MOST_OVER: Final = 0.5
 """Share of the time over a threshold from which on the model, not a touch, is taken for the cause."""
 
 
-def _examined(described: RecordingMap, watched: Watched) -> Watched:
+def examined(described: RecordingMap, watched: Watched) -> Watched:
     """Return a watched recording with the defects for which its contacts can't be told, in `faults`.
 
     Those are defects of columns that aren't harmless, else a torque over a threshold for over `_MOST_OVER` of the time.

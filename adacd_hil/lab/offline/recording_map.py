@@ -230,14 +230,24 @@ def parse_map(table: dict[str, Any], path: Path) -> RecordingMap:
         sections: dict[str, Any] = {
             name: parse(section, table.get(name, {}), f"{name}.") for name, section in _SECTIONS.items()
         }
-        scheme = dict(table.get("scheme", {}))
-        parse(OfflineSettings, {"noise_Nm": [1.0]} | scheme, "scheme.")
+        scheme = checked_scheme(dict(table.get("scheme", {})), "scheme.")
         urdf = _read_arm(path.parent, sections["arm"])
         found = RecordingMap(**sections, scheme=scheme, urdf=urdf)
         _check_lengths(found)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
     return found
+
+
+def checked_scheme(scheme: dict[str, Any], prefix: str) -> dict[str, Any]:
+    """Return settings of the scheme, as given. prefix: of their keys in errors.
+
+    Raises ConfigError for a key or value that `OfflineSettings` doesn't allow, and for the period: the recording's.
+    """
+    if "period_s" in scheme:
+        raise ConfigError(f"`{prefix}period_s` is no setting: the recording's own period is taken")
+    parse(OfflineSettings, {"noise_Nm": [1.0]} | scheme, prefix)
+    return scheme
 
 
 def _read_arm(folder: Path, arm: ArmSection) -> SerialArm:

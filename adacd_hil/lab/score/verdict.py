@@ -95,17 +95,21 @@ def _judged_text(run: Run, found: str) -> str:
 
 
 def _blind_text(run: Run) -> str:
-    """Return a text on the cycles of MONITOR in which no residual of some joint can be over its threshold, "" without.
+    """Return a text on the cycles of MONITOR in which no touch of some joint can be told, "" without.
 
-    Such as those with an infinite threshold, or a residual that is no number.
+    Such as those with a threshold above the joint's rated torque, or a residual that is no number.
     """
     by = run.certified
     values = (run.tau_ext_hat, run.threshold) if by is None else (by.tau_ext, by.threshold)
-    is_finite = np.isfinite(values[0]) & np.isfinite(values[1])
-    sees = np.any(is_finite.reshape(len(run.state), -1, JOINTS), axis=1)
+    can_alarm = np.isfinite(values[0]) & (values[1] <= np.array(run.settings.arm.rated_torque_Nm))
+    sees = np.any(can_alarm.reshape(len(run.state), -1, JOINTS), axis=1)
     watched = is_armed_in(run.state) & np.concatenate(([False], is_armed_in(run.state[:-1])))
     share = 1.0 - float(np.all(sees[watched], axis=1).mean()) if watched.any() else 0.0
-    return f"a joint was blind in {percent_text(share)} of MONITOR: no finite residual and threshold" if share else ""
+    return (
+        f"a joint was blind in {percent_text(share)} of MONITOR: no residual, or no threshold up to its rated torque"
+        if share
+        else ""
+    )
 
 
 _HEADLINE_LETTERS: Final = 160
