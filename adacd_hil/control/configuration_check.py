@@ -20,6 +20,7 @@ from adacd_hil.settings.configuration_files import (
     resolved_table,
 )
 from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.run_settings import ReactionSettings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import explain_unknown, known_keys, value_of
 from adacd_hil.settings.toml_files import builtin_names
@@ -182,7 +183,15 @@ def _unknown_assumptions(settings: Settings) -> Iterator[str]:
             yield f"`assumed` names no setting: {explain_unknown(key)}"
 
 
-_LOOKS: tuple[Callable[[Settings], Iterator[str]], ...] = (_over, _radians, _unknown_assumptions)
+def _ignored(settings: Settings) -> Iterator[str]:
+    """Yield a warning for each changed reaction that the paper's scheme, which always withdraws, doesn't know."""
+    usual = ReactionSettings()
+    for key in ("contact", "collision") if settings.scheme == "paper" else ():
+        if (wanted := getattr(settings.reaction, key)) != getattr(usual, key):
+            yield f"`reaction.{key}` = {list(wanted)} has no effect: with scheme paper the arm always withdraws"
+
+
+_LOOKS: tuple[Callable[[Settings], Iterator[str]], ...] = (_over, _radians, _unknown_assumptions, _ignored)
 
 
 def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:

@@ -98,6 +98,11 @@ LENGTHS = "[arm]\nlink_length_m = [0.4, 0.3]"
             "`detector.threshold_Nm[1]` = 7 Nm exceeds `arm.rated_torque_Nm[1]` = 6 Nm",
         ),
         ("[reaction]\nvelocity_limit_deg_s = [300, 300]", 0, "`reaction.velocity_limit_deg_s[0]` = 300 deg/s exceeds"),
+        (
+            "[reaction]\ncollision = ['none', 'none']",
+            0,
+            "`reaction.collision` = ['none', 'none'] has no effect: with scheme paper",
+        ),
         (LENGTHS, 0, "`arm.cad_theta` is that of an emulated arm, from paper [profiles.P]"),
         (LENGTHS, 0, "`controller.Kp` is that of an emulated arm"),
         ("[filter]\na_rad_s = 11", 0, "the scheme is the paper's"),
