@@ -64,7 +64,7 @@ EPILOG = explain_statuses(
     PARTIAL="partial result (the log lost something, or a disk is full)",
     SAFETY_STOP="safety stop (the run faulted or the arm fell silent)",
     BUS_MISSING="bus or devices missing",
-    DETECTOR_MISSING="a live detector can't run here",
+    DETECTOR_MISSING="a registered detector can't be used",
     INTERRUPTED="interrupted",
 )
 

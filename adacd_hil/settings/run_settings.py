@@ -83,7 +83,7 @@ class LogSettings:
     """The log: memory for its writer, and the length of its parts."""
 
     buffer_MiB: int = setting(
-        4, unit="MiB", low=1, high=256, meaning="memory between control process and writer; 6 s of cycles at 1 kHz"
+        4, unit="MiB", low=1, high=256, meaning="memory between control process and writer; 3 s of `certified` at 1 kHz"
     )
     part_MiB: int = setting(
         512, unit="MiB", low=0, high=1_000_000, meaning="largest part, before compression; 0: any size"

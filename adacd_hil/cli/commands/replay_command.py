@@ -36,7 +36,6 @@ _EPILOG = explain_statuses(
     FAILURE="something differs, or a log can't be read",
     USAGE="wrong usage or configuration",
     PARTIAL="all compared cycles are identical, but part of the log can't be compared",
-    DETECTOR_MISSING="a live detector of the log can't run here",
     INTERRUPTED="interrupted",
 )
 _MOST_COLUMNS = 6

@@ -25,7 +25,7 @@ likelihood N       log-likelihood of a step that began N samples ago: the stream
 cusum              sum of the excess of the smoothed channel of highest cut-off over a drift; in Nm s
 
 **Further detectors** are registered (`detector_registry`), one channel each. They run wherever those above do: in
-thresholds, in the comparison of `thresholds --report`, in `tune`, and live if they keep the contract for that.
+thresholds, in the comparison of `thresholds --report`, and in `tune`.
 
 A step of tau_ext passes h of a first-order channel after -ln(1 - h / |tau_ext|) / a. Without the drift, the sum is h
 after h / |tau_ext|.

@@ -23,7 +23,7 @@ from adacd_hil.log.mcap.chunked_file import ChunkedFile
 from adacd_hil.log.types.topics import LogChannel
 
 WAITING_BYTES = 32 * 1024 * 1024
-"""Most bytes waiting for the disk: about 45 s of a run at 1 kHz, compressed."""
+"""Most bytes waiting for the disk: about 36 s of `certified` at 1 kHz, compressed."""
 
 
 class Sink:
