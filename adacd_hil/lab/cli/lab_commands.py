@@ -91,8 +91,8 @@ def demo(
 
     The arm is that of the configuration: a file of your own arm is rehearsed; missing values are assumed, and listed.
 
-    The configuration's script plays the user of the paper's experiment. In any other scenario the user acknowledges
-    stops as the configuration says, and asks to finish at the scenario's `lasts_s`.
+    The configuration's script plays the user of the paper's experiment, without one that of `demo`. In any other
+    scenario this user acknowledges stops, and asks to finish at the scenario's `lasts_s`.
     """
     from adacd_hil.lab.cli.demo_command import next_of_report, play
 
