@@ -6,8 +6,11 @@ import signal
 from collections.abc import Iterator
 from types import SimpleNamespace
 
+import hypothesis
 import pytest
 
+hypothesis.settings.register_profile("untimed", deadline=None)  # an example may compile, or wait for a busy machine
+hypothesis.settings.load_profile("untimed")
 STARTS_WRITER = "adacd_hil.log.recording.recorder.start_module"
 os.environ.pop("COLUMNS", None)  # pytest-xdist gives its workers 80; what no terminal shows has none
 os.unsetenv("COLUMNS")  # readline, which pytest loads, sets it behind Python's back

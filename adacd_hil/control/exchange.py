@@ -96,16 +96,15 @@ class Exchange:
         for _ in range(MOST_FRAMES):
             if arm.has_all_frames:
                 return last_ns
-            frames = bus.receive_some(patience_s, 1 if self._is_following else arm.open_answers)
-            if not frames:
+            frame = bus.receive(patience_s)
+            if frame is None:
                 break
-            if self._is_following and frames[0].can_id == arm.sync_id and not frames[0].is_error:
-                bus.unread(frames[0])
+            if self._is_following and frame.can_id == arm.sync_id and not frame.is_error:
+                bus.unread(frame)
                 break
-            last_ns = frames[-1].t_ns
-            for frame in frames:
-                if not arm.accept(frame, frame.t_ns < sync_ns):
-                    self._pass_on(frame)
+            last_ns = frame.t_ns
+            if not arm.accept(frame, last_ns < sync_ns):
+                self._pass_on(frame)
             elapsed_s = (last_ns - sync_ns) * 1e-9
             if not 0.0 <= elapsed_s <= self._patience_s:  # a late frame, or a stamp of a wall clock that was set
                 elapsed_s = (self._clock.now_ns() - sync_ns) * 1e-9

@@ -157,11 +157,6 @@ class Arm:
         self._hear_emergency(frame)
         return self.strangers.judge_host_frame(frame, self._cycle)
 
-    @property
-    def open_answers(self) -> int:
-        """Number of cyclic frames that have not come in this cycle; 1 if all have come."""
-        return max(len(self.devices) - self._seen.bit_count(), 1)
-
     def _answer(self, frame: Frame, place: int, newest: int) -> None:
         """Take a cyclic frame of device `place` as the answer to a SYNC, or refuse it if it answers none.
 

@@ -399,8 +399,8 @@ class ParameterWatch(RateLimitedEvents):
         self._last_cycle: dict[int, int] = {}
         """By node id: least pause between requests, and cycle of the last request."""
         self._period_s = settings.bus.period_s
-        self._due = Recurrence(settings.devices.reread_ms * 1e-3, settings.bus.period_s)
-        self._is_on = settings.devices.reread_ms > 0
+        self._reread_ms = settings.devices.reread_ms
+        self._due = Recurrence(self._reread_ms * 1e-3, self._period_s)
         self.first_difference = ""
         """The first object whose value differs from the set-up, in one line; empty without a difference."""
 
@@ -429,11 +429,12 @@ class ParameterWatch(RateLimitedEvents):
             text = f"{asked.name} is not answered"
             self.report(t_ns, asked.slave.name, Event("warning", "parameters", text))
             self._asked = asked = None
-        if asked is not None or not (self._is_on and self._objects and self._due.take_turn(cycle)):
+        if asked is not None or not (self._reread_ms and self._objects):
             return
         chosen = self._objects[self._next]
         node_id = chosen.slave.node_id
-        if cycle - self._last_cycle.get(node_id, -math.inf) <= self._pause_cycles[node_id]:
+        is_paused = cycle - self._last_cycle.get(node_id, -math.inf) <= self._pause_cycles[node_id]
+        if is_paused or not self._due.take_turn(cycle):
             return
         self._asked = chosen
         self._asked_cycle = self._last_cycle[node_id] = cycle

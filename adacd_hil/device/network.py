@@ -205,12 +205,14 @@ class Master(EventSource):
             )
 
     def configure(self) -> None:
-        """Set up all devices over SDO: SYNC, heartbeats, EMCY, PDOs, drives and sensors, the profiles' `setup`.
+        """Set up all devices over SDO: the profile's `setup`, then SYNC, heartbeats, EMCY, PDOs, drives and sensors.
 
         Afterwards `parameters` watches the written values. Remarks become events. Raises DeviceError if a device
         refuses a value or differs from its profile or the configuration; BusError if the bus fails.
         """
         for slave in self.slaves:
+            for extra in slave.device.settings.setup:  # first: the host checks and writes on top of them
+                slave.write_checked(extra.name.index, extra.name.sub, extra.value)
             self._set_up_sync(slave)
             self._set_up_heartbeats(slave)
             self._set_up_emergencies(slave)
@@ -222,8 +224,6 @@ class Master(EventSource):
                 status = check_sensor(slave, self._codec)
                 if status:
                     self.events.append(Event("info", slave.name, status))
-            for extra in slave.device.settings.setup:
-                slave.write_checked(extra.name.index, extra.name.sub, extra.value)
         self.parameters.follow(self.slaves)
 
     def _set_up_sync(self, slave: Slave) -> None:

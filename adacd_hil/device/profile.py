@@ -76,6 +76,26 @@ _TOGETHER = {
 HOST_SIGNALS = ("controlword", "target_torque", "torque_offset", "max_torque", "mode")
 """Signals that the host can fill in a command frame."""
 
+_COMMANDS = (0x6040, 0x6071, 0x60B2)
+"""Controlword, target torque and torque offset: what is written there enables a drive, or acts as torque."""
+_KEYS_OF_KIND = {
+    "drive": (
+        "scale.increments_per_joint_rev",
+        "scale.velocity_rad_s",
+        "scale.gear_ratio",
+        "scale.gear_efficiency",
+        "scale.rated_torque_count_Nm",
+        "plausibility.position_jump_rad",
+        "patience.enable_s",
+        "patience.mode_s",
+        "command_watchdog",
+        "quick_stop_option",
+        "fault_reaction_option",
+    ),
+    "sensor": ("scale.torque_Nm", "plausibility.torque_rate_Nm_s", "plausibility.torque_range_Nm"),
+}
+"""Keys of a profile that have an effect on devices of one kind only."""
+
 _WORDS, _INTEGERS = (0x603F, 0x6040, 0x6041, 0x6072), (0x6071, 0x6077, 0x60B2)
 STANDARD_TYPES = {
     **dict.fromkeys(_WORDS, (16, False)),
@@ -227,7 +247,8 @@ class WriteSettings:
     value: int = setting(low=-(2**31), high=2**32 - 1, meaning="value")
 
     def __post_init__(self) -> None:
-        parse_object(self.object)
+        if self.name.index in _COMMANDS:
+            raise ValueError(f"object {self.object!r} commands the drive: only the host's cycle may write it")
 
     @property
     def name(self) -> ObjectName:
@@ -264,7 +285,7 @@ class ProfileSettings:
     plausibility: PlausibilitySettings = setting(PlausibilitySettings, meaning="bounds for unprotected frames")
     patience: PatienceSettings = setting(PatienceSettings, meaning="how long the host waits for it")
     assumed: tuple[str, ...] = setting((), meaning="keys of this profile whose values are guesses")
-    setup: tuple[WriteSettings, ...] = setting((), meaning="extra SDO writes, last")
+    setup: tuple[WriteSettings, ...] = setting((), meaning="extra SDO writes, before the host's own")
 
     def __post_init__(self) -> None:
         for text in self.header:
@@ -272,6 +293,7 @@ class ProfileSettings:
         self._check_frames()
         self._check_protection()
         self._check_scale()
+        self._check_kind()
         for pdo in self.pdo:
             self._check_bounds(pdo)
         self._check_assumed()
@@ -369,6 +391,15 @@ class ProfileSettings:
             raise ValueError("scale: a sensor needs torque_Nm")
         if self.serial and len(self.serial) != 2:
             raise ValueError(f"serial has {len(self.serial)} numbers, 2 expected")
+
+    def _check_kind(self) -> None:
+        """Raise ValueError for a key that has an effect on devices of another kind only, and isn't its default."""
+        for kind, keys in _KEYS_OF_KIND.items():
+            for key in keys if kind != self.kind else ():
+                section, _, name = key.rpartition(".")
+                owner = getattr(self, section) if section else self
+                if getattr(owner, name) != getattr(type(owner), name):
+                    raise ValueError(f"`{key}` has no effect: this is a {self.kind}, and the key is a {kind}'s")
 
     def _check_assumed(self) -> None:
         """Raise ValueError for a key in `assumed` that no section in MERGED has."""

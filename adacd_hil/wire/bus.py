@@ -95,14 +95,6 @@ class Bus(Protocol):
         Raises BusError, such as BusOffError and InterfaceDownError.
         """
 
-    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:  # noqa: ARG002 (here at most one)
-        """Return the next frame and the received ones behind it, up to `most` in all; [] after `timeout_s`.
-
-        An error frame is returned alone. Raises BusError, such as BusOffError and InterfaceDownError.
-        """
-        frame = self.receive(timeout_s)
-        return [] if frame is None else [frame]
-
     def recover(self) -> None:
         """Drop all queued frames of both directions, here and in the interface, so that no outdated frame passes.
 
@@ -173,23 +165,6 @@ class Tap(Bus):
         if frame is not None:
             self._passed.append((False, frame))
         return frame
-
-    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return and record the next frames, up to `most`; [] after `timeout_s`.
-
-        A frame that was put back by `unread` is returned alone, and not recorded again. Raises BusError of the wrapped
-        bus; the error frame of a BusOffError is recorded, too.
-        """
-        if self._unread is not None or most == 1:
-            frame = self.receive(timeout_s)
-            return [] if frame is None else [frame]
-        try:
-            frames = self._bus.receive_some(timeout_s, most)
-        except BusOffError as error:
-            self._passed.append((False, error.frame))
-            raise
-        self._passed += [(False, frame) for frame in frames]
-        return frames
 
     def unread(self, frame: Frame) -> None:
         """Put a received frame back, one at most; the next `receive` returns it and doesn't record it again."""

@@ -5,7 +5,6 @@ from collections.abc import Callable
 
 from adacd_hil.clock import Clock
 from adacd_hil.wire.bus import Bus, Frame
-from adacd_hil.wire.frame_queue import take_first
 
 
 class EmbeddedBus(Bus):
@@ -37,10 +36,6 @@ class EmbeddedBus(Bus):
     def receive(self, timeout_s: float) -> Frame | None:  # noqa: ARG002 (the protocol's signature)
         """Return the next frame, or None; doesn't wait."""
         return self._received.popleft() if self._received else None
-
-    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:  # noqa: ARG002 (the protocol's signature)
-        """Return the next frames, up to `most`, an error frame alone; doesn't wait."""
-        return take_first(self._received, most)
 
     def recover(self) -> None:
         """Drop the frames that the host has not read."""

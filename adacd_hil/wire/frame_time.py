@@ -1,7 +1,7 @@
 """Durations of frames on the bus, exact and at worst.
 
-Compiled, a byte at a time by table: a cycle has seven frames. Source: ISO 11898-1, frame formats and frame coding; for
-the counted bits, and CAN FD, see `adacd_hil.wire.frame_bits`.
+Compiled: a cycle has seven frames. Source: ISO 11898-1, frame formats and frame coding; for the counted bits, and
+CAN FD, see `adacd_hil.wire.frame_bits`.
 """
 
 from collections.abc import Callable
@@ -23,38 +23,8 @@ FrameTime = Callable[[int, bytes], int]
 """Returns the duration of a frame on the bus, ns, from identifier and data."""
 
 
+_CRC_BITS: Final = 15
 _STUFF_RUN: Final = 5
-
-
-def _stuffing(bits: int) -> NDArray[np.int64]:
-    """Return a table for so many bits at once, by state and bits: stuff bits added << 3 | next state.
-
-    State: (length of the run of equal bits - 1) << 1 | the last bit. A stuff bit begins a run.
-    """
-    table = np.zeros((2 * (_STUFF_RUN - 1), 1 << bits), np.int64)
-    for start in range(len(table)):
-        for value in range(1 << bits):
-            run, last, added = (start >> 1) + 1, start & 1, 0
-            for place in reversed(range(bits)):
-                bit = value >> place & 1
-                run, last = (run + 1 if bit == last else 1), bit
-                if run == _STUFF_RUN:
-                    run, last, added = 1, 1 - last, added + 1
-            table[start, value] = added << 3 | (run - 1) << 1 | last
-    return table
-
-
-def _crc_15() -> NDArray[np.int64]:
-    """Return the table for a classic frame's CRC: by its upper 8 bits XOR the next byte, the XOR of the shifted CRC."""
-    table = np.arange(256, dtype=np.int64) << 7
-    for _ in range(8):
-        table = np.where(table & 0x4000, (table << 1) ^ _CRC_POLYNOMIAL, table << 1) & 0x7FFF
-    return table
-
-
-_STUFF_1: Final = _stuffing(1)
-_STUFF_8: Final = _stuffing(8)
-_CRC_15: Final = _crc_15()
 
 
 @compiled
@@ -63,24 +33,23 @@ def _stuffed(head: int, head_bits: int, data: int, length: int) -> int:
 
     head: its first `head_bits` bits, up to the data. data: its `length` bytes as one integer, the first one highest.
     """
-    crc = state = added = 0  # after start of frame, one dominant bit
-    left = head_bits - 1
-    while left & 7:
-        left -= 1
-        bit = (head >> left) & 1
-        crc = ((crc << 1) ^ _CRC_POLYNOMIAL) & 0x7FFF if ((crc >> 14) ^ bit) & 1 else (crc << 1) & 0x7FFF
-        step = _STUFF_1[state, bit]
-        state, added = step & 7, added + (step >> 3)
-    for place in range(left // 8 + length):
-        shift = left - 8 * (place + 1)
-        byte = (head >> shift) & 0xFF if shift >= 0 else (data >> (shift + 8 * length)) & 0xFF
-        crc = ((crc << 8) & 0x7FFF) ^ _CRC_15[(crc >> 7) ^ byte]
-        step = _STUFF_8[state, byte]
-        state, added = step & 7, added + (step >> 3)
-    for place in range(14, 7, -1):
-        step = _STUFF_1[state, (crc >> place) & 1]
-        state, added = step & 7, added + (step >> 3)
-    return int(head_bits + 8 * length + 15 + added + (_STUFF_8[state, crc & 0xFF] >> 3))
+    crc = run = added = 0
+    last = -1
+    plain = head_bits + 8 * length
+    for place in range(plain + _CRC_BITS):
+        if place < head_bits:
+            bit = (head >> (head_bits - 1 - place)) & 1
+        elif place < plain:
+            bit = (data >> (plain - 1 - place)) & 1
+        else:
+            bit = (crc >> (plain + _CRC_BITS - 1 - place)) & 1
+        if place < plain:
+            crc = ((crc << 1) ^ (_CRC_POLYNOMIAL if ((crc >> 14) ^ bit) & 1 else 0)) & 0x7FFF
+        run = run + 1 if bit == last else 1
+        last = bit
+        if run == _STUFF_RUN:  # a stuff bit begins a run
+            run, last, added = 1, 1 - last, added + 1
+    return plain + _CRC_BITS + added
 
 
 @compiled
@@ -120,7 +89,7 @@ def _fd_stuff_bits(head: int, head_bits: int, body: NDArray[np.uint8], code: int
             run = 1
             last = bit
         # The fixed stuff bit that begins the CRC field replaces a dynamic one after the last bit of the data.
-        if run == 5 and place < total - 1:
+        if run == _STUFF_RUN and place < total - 1:
             if place < head_bits:
                 before += 1
             else:
@@ -154,17 +123,7 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
     That function raises ValueError for a length that no frame has. Frames of more than 8 bytes are CAN FD with rate
     switch, and need `data_bitrate`.
     """
-    classic_bits = _classic_bits
-    whole_ns = 1_000_000_000 // bitrate if 1_000_000_000 % bitrate == 0 else 0
-
-    def exact(can_id: int, data: bytes, from_bytes: Callable[..., int] = int.from_bytes) -> int:
-        length = len(data)
-        if length > CLASSIC_BYTES:
-            return exact_frame(can_id, data).duration_ns(bitrate, data_bitrate)
-        bits = classic_bits(can_id, from_bytes(data, "big", signed=True), length)
-        return bits * whole_ns if whole_ns else -(-bits * 1_000_000_000 // bitrate)
-
-    return exact
+    return lambda can_id, data: exact_frame(can_id, data).duration_ns(bitrate, data_bitrate)
 
 
 def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:

@@ -82,8 +82,7 @@ class LockstepBus(Bus):
         self._queue: list[Offer] = []  # the host's
         self._offered: list[Offer] = []  # the devices'
         self._received: deque[Frame] = deque()
-        """Frames that the bus has sent, or will send before the host can add another; see `_withdraw`."""
-        self._ahead: deque[Frame] = deque()  # of the bus behind, taken with others
+        """Frames that the bus has sent."""
         self._free_ns = 0
         """When the last frame was through."""
         self.sync_ns = -NEVER_NS
@@ -122,8 +121,6 @@ class LockstepBus(Bus):
                 raise TransmitQueueError(
                     f"transmit queue of {self.channel} is full with {self._queue_length} frames: nobody acknowledges"
                 )
-        if self._received:
-            self._withdraw(now_ns)
         self._count += 1
         self._queue.append((can_id, self._count, now_ns, data))
 
@@ -136,8 +133,6 @@ class LockstepBus(Bus):
             super().send_all(frames)
             return
         now_ns = self._clock.now_ns()
-        if self._received:
-            self._withdraw(now_ns)
         for can_id, data in frames:
             self._count += 1
             self._queue.append((can_id, self._count, now_ns, data))
@@ -162,36 +157,12 @@ class LockstepBus(Bus):
         self._clock.sleep_until_ns(limit_ns)
         return None
 
-    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return the next frame; while the last one taken is an answer to SYNC, also the one behind it, up to `most`.
-
-        The clock is then at the end of the last frame. [] after `timeout_s`. Raises SilenceError if no device answers a
-        SYNC, BusError if the bus behind fails.
-        """
-        limit_ns = self._clock.now_ns() + round(timeout_s * 1e9)
-        frame = self.receive(timeout_s)
-        if frame is None:
-            return []
-        frames, received = [frame], self._received
-        while (
-            received
-            and len(frames) < most
-            and received[0].t_ns <= limit_ns
-            and not (received[0].is_error or frame.is_error)
-            and frame.can_id in self._answers
-        ):
-            frame = received.popleft()
-            frames.append(frame)
-        self._clock.sleep_until_ns(frame.t_ns)
-        return frames
-
     def recover(self) -> None:
         """Drop the waiting frames of host and devices, and the received ones, here and in the bus behind.
 
         Raises BusError when the bus behind can't recover yet.
         """
         self._bus.recover()
-        self._ahead.clear()
         self._queue.clear()
         self._offered.clear()
         self._received.clear()
@@ -212,8 +183,6 @@ class LockstepBus(Bus):
         If the devices' time is not yet at its start, they are first asked for frames up to then.
         """
         queue = self._queue
-        if not self._offered:
-            return bool(queue) and self._transmit_own(limit_ns)
         while True:
             waiting = self._offered
             if queue and self._is_acknowledged:
@@ -237,29 +206,6 @@ class LockstepBus(Bus):
             self._forward(can_id, data)
         return True
 
-    def _transmit_own(self, limit_ns: int) -> bool:
-        """Transmit the host's next frame while no device's frame waits, if it starts before `limit_ns`.
-
-        Return False if none starts before, or no node acknowledges; True also if the devices had to be asked for frames
-        first and nothing was sent yet.
-        """
-        queue = self._queue
-        t_ns = queue[0][2]  # the earliest: the queue is in the order in which frames were handed over
-        start_ns = t_ns if t_ns > self._free_ns else self._free_ns
-        if start_ns >= limit_ns or not self._is_acknowledged:
-            return False
-        if self._is_marked and start_ns > self._granted_ns and not self._is_cyclic(start_ns):
-            self._ask(start_ns)  # the devices may have something that comes first
-            return True  # whatever came: look again
-        winner = queue[0]
-        if len(queue) > 1 and not self._is_fifo:
-            winner = min([offer for offer in queue if offer[2] <= start_ns])
-        can_id, _, _, data = winner
-        self._free_ns = start_ns + self._frame_time(can_id, data)
-        queue.remove(winner)
-        self._forward(can_id, data)
-        return True
-
     def _forward(self, can_id: int, data: bytes) -> None:
         """Give a frame that the host has transmitted to the devices; after SYNC take their answers.
 
@@ -275,32 +221,20 @@ class LockstepBus(Bus):
 
         Raises SilenceError when answers are expected and no frame comes.
         """
-        count = missing = len(self._answers)
-        came = self._bus.receive_some(self._patience_s, count) if count and not self._ahead else []
-        if len(came) == count and {frame.can_id for frame in came} == self._answers:
-            missing = 0
-        else:
-            self._ahead.extend(came)
-            came = []
+        missing = len(self._answers)
+        is_silent = missing > 0
         while missing:
             frame = self._receive()
             if frame is None:
                 break
             if frame.can_id == DEVICE_MARK:
-                for earlier in came:
-                    self._offer(earlier, self.sync_ns)
                 self._take_marked(frame)
                 return
-            came.append(frame)
-            if frame.can_id in self._answers:
-                missing -= 1
-        if missing == count != 0 and not came:
+            is_silent = False
+            self._offer(frame, self.sync_ns)
+            missing -= frame.can_id in self._answers
+        if is_silent:
             raise SilenceError(f"silence on {self.channel} for {self._patience_s:g} s")
-        if len(came) == count and not (self._queue or self._offered):
-            self._line_up(came)
-        else:
-            for frame in came:
-                self._offer(frame, self.sync_ns)
 
     def _take_marked(self, mark: Frame) -> None:
         """Queue the devices' frames up to the mark END, or silence, each from its release on.
@@ -324,35 +258,7 @@ class LockstepBus(Bus):
 
     def _receive(self, timeout_s: float | None = None) -> Frame | None:
         """Return the next frame of the bus behind; None after `timeout_s` (default: `patience_s`) without a frame."""
-        if self._ahead:
-            return self._ahead.popleft()
         return self._bus.receive(self._patience_s if timeout_s is None else timeout_s)
-
-    def _line_up(self, came: list[Frame]) -> None:
-        """Store answers as received one after the other, by identifier, from when the bus is free.
-
-        Call it only if no other frames compete.
-        """
-        came.sort()
-        through_ns = self._free_ns
-        for can_id, data, _, is_error in came:
-            if is_error:
-                self._received.append(Frame(can_id, data, through_ns, True))
-                continue
-            through_ns += self._frame_time(can_id, data)
-            self._received.append(Frame(can_id, data, through_ns))
-        self._free_ns = through_ns
-
-    def _withdraw(self, now_ns: int) -> None:
-        """Queue received answers again whose transmission begins at `now_ns` or later, to compete with a new frame."""
-        while self._received:
-            last = self._received[-1]
-            start_ns = last.t_ns - (0 if last.is_error else self._frame_time(last.can_id, last.data))
-            if start_ns < now_ns or last.is_error:
-                return
-            self._received.pop()
-            self._free_ns = start_ns
-            self._offer(last, self.sync_ns)
 
     def _offer(self, frame: Frame, t_ns: int) -> None:
         """Queue a device's frame to compete for the bus from `t_ns` on; an error frame is received at once."""

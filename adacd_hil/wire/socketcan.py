@@ -32,7 +32,6 @@ from adacd_hil.wire.can_interface import CanInterface
 from adacd_hil.wire.error_frames import ERROR_CLASS_MASK, is_bus_off
 from adacd_hil.wire.frame_batches import CAN_ID_MASK, FrameReceiver, FrameSender
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FD_LENGTHS, MAX_STANDARD_ID
-from adacd_hil.wire.frame_queue import take_first
 
 CAN_RTR_FLAG = 0x40000000
 CAN_EFF_FLAG = 0x80000000
@@ -196,19 +195,6 @@ class SocketCanBus(Bus):
                 frame,
             )
         return frame
-
-    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Return the frames of one batch, up to `most`; [] after `timeout_s`. An error frame is returned alone.
-
-        Raises BusOffError, InterfaceDownError or BusError as `receive`.
-        """
-        received = self._received
-        if not received or received[0].is_error:
-            frame = self.receive(timeout_s)
-            if frame is None or frame.is_error:
-                return [] if frame is None else [frame]
-            received.appendleft(frame)
-        return take_first(received, most)
 
     def _take(self, timeout_s: float) -> None:
         """Fetch received frames into `_received`; wait for the first up to `timeout_s`.

@@ -66,7 +66,7 @@ def steps_of(run: Run, source: ReportSource = SOURCE) -> list[NextStep]:
 
 def test_a_good_run_needs_nothing_and_says_so():
     nothing, *further = steps_of(make_run((A, 1000), (M, 1000)))
-    assert nothing.text == "Nothing: all went well."
+    assert nothing.text == "Nothing to do: all went well."
     replayed = "adacd-hil replay run.mcap"
     assert [step.command for step in further] == [replayed, f"{replayed} --set filter.a_rad_s=20"]
 

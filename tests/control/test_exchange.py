@@ -49,15 +49,15 @@ def test_the_feedback_is_in_when_its_last_frame_came_not_when_it_was_read() -> N
     rig = ExchangeRig()
     clock = rig.bench.clock
     rig.read()
-    receive_some = rig.bench.bus.receive_some
+    receive = rig.bench.bus.receive
 
-    def read_late(timeout_s: float, most: int):  # type: ignore[no-untyped-def]
-        frames = receive_some(timeout_s, most)
-        if frames and frames[-1].can_id == CODEC.message("Sensor2Torque").can_id:
-            clock.sleep_until_ns(frames[-1].t_ns + 30_000)
-        return frames
+    def read_late(timeout_s: float) -> Frame | None:
+        frame = receive(timeout_s)
+        if frame is not None and frame.can_id == CODEC.message("Sensor2Torque").can_id:
+            clock.sleep_until_ns(frame.t_ns + 30_000)
+        return frame
 
-    rig.bench.bus.receive_some = read_late  # type: ignore[method-assign]
+    rig.bench.bus.receive = read_late  # type: ignore[method-assign]
     rig.read()
     assert rig.exchange.feedback_ns == rig.exchange.sync_ns == clock.now_ns() - 30_000
 

@@ -78,6 +78,10 @@ def test_a_users_file_is_a_profile_and_an_eds_beside_it_comes_first(tmp_path: Pa
         ((SENSOR, HEADED), "signal 'e2e_counter' has the name of a part of the header"),
         (("[scale]", "features = ['sync_conter']\n[scale]"), "did you mean 'sync_counter'?"),
         (("[scale]", "serial = [1]\n[scale]"), "serial has 1 numbers, 2 expected"),
+        (("[scale]", "[scale]\ngear_ratio = 2"), "`scale.gear_ratio` has no effect: this is a sensor"),
+        (("[scale]", "quick_stop_option = 2\n[scale]"), "`quick_stop_option` has no effect: this is a sensor"),
+        (("[scale]", 'setup = [{object = "0x6040", value = 6}]\n[scale]'), "object '0x6040' commands the drive"),
+        (("[scale]", 'setup = [{object = "0x60B2", value = 9}]\n[scale]'), "object '0x60B2' commands the drive"),
     ],
 )
 def test_a_profile_that_cant_be_used_is_one_line(tmp_path: Path, change: tuple[str, str], line: str) -> None:
@@ -88,6 +92,13 @@ def test_a_profile_that_cant_be_used_is_one_line(tmp_path: Path, change: tuple[s
 
 
 DRIVE = resources.files("adacd_hil") / "device_profiles" / "stock-drive.toml"
+
+
+def test_a_drive_has_no_key_of_a_sensor() -> None:
+    table = tomllib.loads(DRIVE.read_text())
+    table["plausibility"]["torque_range_Nm"] = 9.0
+    with pytest.raises(ConfigError, match=r"`plausibility.torque_range_Nm` has no effect: this is a drive"):
+        parse(ProfileSettings, table)
 
 
 @pytest.mark.parametrize(

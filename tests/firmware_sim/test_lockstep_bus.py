@@ -100,8 +100,8 @@ class Rig:
     def receive_all(self, timeout_s: float) -> list[tuple[int, int]]:
         received = []
         end_ns = self.clock.now_ns() + round(timeout_s * 1e9)
-        while frames := self.bus.receive_some((end_ns - self.clock.now_ns()) * 1e-9, 4):
-            received += [(frame.can_id, frame.t_ns) for frame in frames]
+        while frame := self.bus.receive((end_ns - self.clock.now_ns()) * 1e-9):
+            received.append((frame.can_id, frame.t_ns))
         return received
 
     def at(self, t_ns: int) -> "Rig":

@@ -62,16 +62,6 @@ def test_a_tap_remembers_the_error_frame_of_a_bus_off() -> None:
     assert tap.take_passed() == [(False, Frame(0x40, bytes(8), 5, is_error=True))]
 
 
-def test_frames_that_are_there_together_are_received_together_but_for_error_frames() -> None:
-    bus = EmbeddedBus(VirtualClock())
-    tap = Tap(bus, VirtualClock())
-    for can_id in (0x181, 0x182, 0x40, 0x183, 0x184, 0x185):
-        bus.deliver(can_id, bytes(8), is_error=can_id == 0x40)
-    batches = [[frame.can_id for frame in tap.receive_some(0.0, 2)] for _ in range(5)]
-    assert batches == [[0x181, 0x182], [0x40], [0x183, 0x184], [0x185], []]
-    assert [frame.can_id for _, frame in tap.take_passed()] == [0x181, 0x182, 0x40, 0x183, 0x184, 0x185]
-
-
 def test_any_other_python_can_interface_carries_fd_frames_and_marks_them_so() -> None:
     left = open_bus("virtual", "fd seam", MonotonicClock(), is_fd=True)
     with can.Bus("fd seam", interface="virtual") as right:

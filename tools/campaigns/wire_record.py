@@ -68,12 +68,6 @@ class WitnessBus(Tap):
             self.passed.append(Passed(frame.t_ns, False, frame.can_id, frame.data))
         return frame
 
-    def receive_some(self, timeout_s: float, most: int) -> list[Frame]:
-        """Receive and remember frames that are there together. Raises BusError."""
-        frames = self._bus.receive_some(timeout_s, most)
-        self.passed += [Passed(frame.t_ns, False, frame.can_id, frame.data) for frame in frames if not frame.is_error]
-        return frames
-
     def _remember(self, can_id: int, data: bytes) -> None:
         t_ns = self._clock.now_ns()
         if t_ns > self.limit_ns:

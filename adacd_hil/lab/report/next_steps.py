@@ -40,7 +40,7 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
     if run.truth is None and metrics.contacts:
         more.insert(0, NextStep("Compare the detections with what you did: the log has no record of the touches."))
     if not steps:
-        steps = [NextStep("Nothing: all went well.")] * (metrics.is_clean and not source.truth_problem) + more[:1]
+        steps = [NextStep("Nothing to do: all went well.")] * (metrics.is_clean and not source.truth_problem) + more[:1]
         more = more[1:]
     return steps[:STEPS], steps[STEPS:] + more
 
