@@ -116,11 +116,16 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
 def opened_text(path: Path) -> Iterator[TextIO]:
     """Open a text file for the block.
 
-    Raises LogError if the file can't be read or has another format, and, from the block, if it is no text in UTF-8.
+    Raises LogError if the file can't be read or its first bytes are those of another format, and, from the block, if it
+    is no text in UTF-8, with or without a byte-order mark.
     """
     try:
-        with _open_text(path) as file:
-            yield file
+        with open_input(path) as file:
+            begin = file.peek(16)
+            for magic, kind in _KINDS_OF_FILE:
+                if begin.startswith(magic):
+                    raise LogError(f"recording {path} is {kind}")
+            yield io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
     except UnicodeDecodeError:
         raise LogError(f"recording {path} is no text in UTF-8") from None
     except OSError as error:
@@ -137,20 +142,6 @@ def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[lis
         yield from rows
     except csv.Error as error:
         raise LogError(f"recording {path}, row {rows.line_num}: {error}") from None
-
-
-def _open_text(path: Path) -> TextIO:
-    """Open a text file in UTF-8, with or without a byte-order mark; the caller closes it.
-
-    Raises LogError, with the remedy, if its first bytes are those of another format; OSError if it can't be opened.
-    """
-    file = open_input(path)
-    begin = file.peek(16)
-    for magic, kind in _KINDS_OF_FILE:
-        if begin.startswith(magic):
-            file.close()
-            raise LogError(f"recording {path} is {kind}")
-    return io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
 
 
 def _columns(path: Path, heads: list[str], cells: int, described: RecordingMap) -> list[_Column]:

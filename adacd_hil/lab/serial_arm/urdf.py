@@ -160,22 +160,17 @@ def _assemble(
     moving: list[_Joint] = []
     placed: list[FramePose] = []
     places: dict[str, tuple[int, FramePose]] = {}
-    here = FramePose(np.eye(3), np.zeros(3))
-    following: str | None = roots[0]
-    while following is not None:
-        index = len(moving) - 1
-        outward = _merge(following, index, children, places)
+    outward = _merge(roots[0], BASE, children, places)
+    while outward:
         if len(outward) > 1:
             raise UrdfError(
                 f"the arm branches: joints {_list([joint.name for joint in outward])} move on the same link; "
                 "lock those that are no part of it"
             )
-        following = None
-        if outward:
-            here = places[outward[0].parent][1]
-            moving.append(outward[0])
-            placed.append(here.then(outward[0].origin))
-            following = outward[0].child
+        joint = outward[0]
+        moving.append(joint)
+        placed.append(places[joint.parent][1].then(joint.origin))
+        outward = _merge(joint.child, len(moving) - 1, children, places)
     lost = [link for link in children if link in carried and link not in places]
     if lost:
         raise UrdfError(f'link "{lost[0]}" hangs on a loop, not on the root')
