@@ -168,9 +168,8 @@ def identify(
         last = recordings[-1]
         if not last.stretches:
             raise LogError(f"{last.path}: no part is free of touches")
-        first, final = last.stretches[0], last.stretches[-1]
-        end_s = final.start_s + len(final.record.q) * last.period_s
-        split_s = first.start_s + FIT_SHARE * (end_s - first.start_s)
+        start_s, end_s = last.span_s
+        split_s = start_s + FIT_SHARE * (end_s - start_s)
         recordings[-1], tested = last.between(-np.inf, split_s), last.between(split_s, np.inf)
     tested = tested.free
     if not tested.stretches or not any(recording.stretches for recording in recordings):
