@@ -60,14 +60,8 @@ def sines(joints: int, seconds: float, period_s: float, seed: int, amplitude_rad
 
 def rigid_torque(arm: SerialArm, motion) -> np.ndarray:
     """Return the torque (k, n) of the URDF's masses along q, dq, ddq (3, k, n)."""
-    place, theta, n = chain.all_columns(arm.chain), arm.theta_full, motion.shape[2]
-    scratch, W = chain.new_scratch(arm.chain), np.zeros((n, place.size))
-    tau = np.empty(motion.shape[1:])
-    for k in range(motion.shape[1]):
-        W[:] = 0.0
-        chain.fill_regressor(arm.chain, place, *motion[:, k], scratch, W)
-        tau[k] = W @ theta
-    return tau
+    theta = arm.theta_full
+    return np.array([chain.regressor(arm.chain, *state) @ theta for state in motion.swapaxes(0, 1).copy()])
 
 
 def record(

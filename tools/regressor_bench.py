@@ -34,11 +34,13 @@ def closed_form(q, dq, Y_p, Y_h):
 
 
 @compiled
-def by_chain(arm, place, first_friction, q, dq, scratch, Y_p, Y_h):
+def by_chain(arm, columns, q, dq, Y_p, Y_h):
     """Fill a chain's columns for each state."""
     for k in range(q.shape[0]):
-        chain.fill(arm, place, q[k], dq[k], scratch, Y_p, Y_h)
-        chain.fill_friction(dq[k], first_friction, Y_h)
+        momentum, remainder = chain.split_regressor(arm, q[k], dq[k])
+        Y_p[:, : columns.size] = momentum[:, columns]
+        Y_h[:, : columns.size] = remainder[:, columns]
+        chain.fill_friction(dq[k], columns.size, Y_h)
 
 
 @compiled
@@ -49,10 +51,10 @@ def filtered(count, hold, cutoff, Y_p, Y_h, input_old, S, W_f):
 
 
 @compiled
-def looked_at(count, W_f, P, noise, WP, deviation):
+def looked_at(count, W_f, P, noise):
     """Work out the uncertainty of the residual `count` times."""
     for _ in range(count):
-        offline.fill_deviation(W_f, P, noise, WP, deviation)
+        offline.residual_deviation(W_f, P, noise)
 
 
 @compiled
@@ -79,10 +81,10 @@ def show_rest(named: str, Y_p: np.ndarray, Y_h: np.ndarray) -> None:
     """Print what follows the regressor: one filter, the uncertainty, one correction."""
     n, p = Y_p.shape
     hold = torque_filter.first_order_hold(CUTOFF_RAD_S, CUTOFF_RAD_S, PERIOD_S)
-    input_old, S, W_f, WP = (np.zeros((n, p)) for _ in range(4))
+    input_old, S, W_f = (np.zeros((n, p)) for _ in range(3))
     P, noise = np.eye(p), np.full(n, 0.02)
     show(f"{named}: one filter of it", lambda: filtered(BLOCK, hold, CUTOFF_RAD_S, Y_p, Y_h, input_old, S, W_f), BLOCK)
-    show(f"{named}: w P w'", lambda: looked_at(BLOCK, W_f, P, noise, WP, np.zeros(n)), BLOCK)
+    show(f"{named}: w P w'", lambda: looked_at(BLOCK, W_f, P, noise), BLOCK)
     theta_hat, v, K = (np.zeros(p) for _ in range(3))
     show(f"{named}: one correction", lambda: corrected(BLOCK, W_f, np.zeros(n), theta_hat, P, v, K), BLOCK)
 
@@ -117,18 +119,16 @@ def print_table() -> None:
 
 def bench_chain(arm: chain.Chain) -> None:
     """Print the rows of one arm."""
-    base, n = chain.find_base(arm), len(arm.axis)
-    first_friction = base.columns.size
-    p = first_friction + 2 * n
+    columns, n = chain.find_base(arm).columns, len(arm.axis)
+    p = columns.size + 2 * n
     q, dq = np.random.default_rng(0).uniform(-1.0, 1.0, (2, BLOCK, n))
-    Y_p, Y_h, scratch = np.zeros((n, p)), np.zeros((n, p)), chain.new_scratch(arm)
+    Y_p, Y_h = np.zeros((n, p)), np.zeros((n, p))
     show(
         f"{n} joints, chain, p = {p}: Y_p, Y_h",
-        lambda: by_chain(arm, base.place, first_friction, q, dq, scratch, Y_p, Y_h),
+        lambda: by_chain(arm, columns, q, dq, Y_p, Y_h),
         BLOCK,
     )
-    one = (arm, base.place, first_friction, q[:1], dq[:1], scratch, Y_p, Y_h)
-    show("  from Python", lambda: by_chain(*one), 1)
+    show("  from Python", lambda: by_chain(arm, columns, q[:1], dq[:1], Y_p, Y_h), 1)
     show_rest(f"  p = {p}", Y_p, Y_h)
 
 

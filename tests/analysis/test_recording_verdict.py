@@ -512,10 +512,11 @@ def test_a_position_that_stays_while_its_velocity_does_not_is_a_dead_encoder(tmp
 
 
 def test_a_threshold_that_is_wide_for_want_of_motion_explains_no_dead_encoder(tmp_path):
+    """Its velocity has one sign in the fit, where friction looks like an offset, and the other in the test."""
     motion = record(urdf_text(2, LEVEL), seconds=9.0, amplitude_rad=np.array([0.7, 0.0]))
-    further = 0.15 * np.sin(5.0 * motion.t)[:, None]
-    turned = replace(motion, q=np.degrees(motion.q) + np.array([0.0, 60.0]), tau=motion.tau + further)
-    verdict = judged(tmp_path, turned, LEVEL, more='[units]\nq = "deg"\n').verdict
+    dq = np.column_stack([motion.dq[:, 0], 1e-6 * np.sign(5.4 - motion.t)])
+    dead = replace(motion, dq=dq, tau=motion.tau + 0.15 * np.sin(5.0 * motion.t)[:, None])
+    verdict = judged(tmp_path, dead, LEVEL, has_dq=True).verdict
     assert all(joint.is_explained for joint in verdict.joints)
     assert min(joint.share for joint in verdict.joints) < 0.8
     assert "a dead encoder" in verdict.reasons[0]

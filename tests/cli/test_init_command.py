@@ -437,7 +437,8 @@ def test_a_given_count_of_torque_is_no_guess(tmp_path, out):
 
 
 def test_what_the_device_says_outweighs_the_eds():
-    draft = draft_profile(contract_folder() / "int32_sensor.eds", DeviceRatings(torque_Nm=1e-4))
+    read = {(0x6131, 1): 0x00560100, (0x6132, 1): 4}  # in Nm, four decimals
+    draft = draft_profile(contract_folder() / "int32_sensor.eds", DeviceRatings(read))
     assert draft.guesses == ()
     assert "torque_Nm = 0.0001\n" in draft.text
 

@@ -3,14 +3,14 @@
 from rig import CODEC, Rig
 
 from adacd_hil.lab.cli.scan_command import as_text, describe
-from adacd_hil.lab.commission.survey import compare, expected_nodes, survey
+from adacd_hil.lab.commission.survey import compare, survey
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.dbc_contract import parse_codec
 
 
 def scanned(rig: Rig, codec: Codec = CODEC) -> dict:
     found = survey(rig.bus, rig.clock, contract_ids={1, 2, 3, 4})
-    return describe(found, compare(found, expected_nodes(rig.master.slaves, codec)), codec)
+    return describe(found, compare(found, rig.master.slaves, codec), codec)
 
 
 def test_the_table_shows_nodes_what_they_send_and_whether_they_fit():
@@ -24,8 +24,11 @@ def test_the_table_shows_nodes_what_they_send_and_whether_they_fit():
     )
     assert lines[1].endswith("operational  0x00   as expected")
     cells = [line.split() for line in lines]
-    (feedback,) = [row for row in cells if "Drive1Feedback" in row]
-    assert (feedback[:4], feedback[5]) == (["1", "0x181", "Drive1Feedback", "8"], "1000.0")
+    heard = {row[2]: (*row[:2], row[3], row[5]) for row in cells if len(row) == 6}
+    assert heard["Drive1Feedback"] == ("1", "0x181", "8", "1000.0")
+    assert heard["Drive1Status"] == ("1", "0x281", "7", "10.0")
+    assert heard["Drive1Heartbeat"] == ("1", "0x701", "1", "10.0")
+    assert any(row[:3] == ["0x080", "Sync", "1"] and row[4] == "1000.0" for row in cells)
     assert ["0x055", "unknown", "1", "1", "-"] in cells
     assert lines[-1] == "nodes: 4 as expected"
 

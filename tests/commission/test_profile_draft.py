@@ -141,10 +141,7 @@ def test_the_reason_of_a_refusal_is_the_object_that_lacks(eds, variant, reason):
         draft(eds, variant)
 
 
-def test_a_node_without_profile_number_can_be_said_to_be_a_drive_and_a_known_maker_s_is_one(eds):
-    path = EdsVariant().with_value("", "1000").write(eds)
-    assert kind_of(path) == ""
-    assert draft_profile(path, kind="drive").settings.kind == "drive"
+def test_a_known_maker_s_drive_without_profile_number_is_one(eds):
     assert kind_of(EdsVariant("maxon_epos4.eds").with_value("", "1000").write(eds)) == "drive"
 
 

@@ -5,7 +5,8 @@ import dataclasses
 import pytest
 from rig import CODEC, Rig
 
-from adacd_hil.lab.commission.survey import Survey, compare, expected_nodes, function_name, message_name, survey
+from adacd_hil.device.device_setup import Slave
+from adacd_hil.lab.commission.survey import Survey, compare, function_name, message_name, survey
 
 
 def look(rig: Rig, duration_s: float = 1.5) -> Survey:
@@ -13,7 +14,13 @@ def look(rig: Rig, duration_s: float = 1.5) -> Survey:
 
 
 def verdicts(rig: Rig, found: Survey) -> dict[int, str]:
-    return compare(found, expected_nodes(rig.master.slaves))
+    return compare(found, rig.master.slaves)
+
+
+def replace_profile(slave: Slave, **changes: object) -> None:
+    profile = slave.device.profile
+    settings = dataclasses.replace(profile.settings, **changes)
+    slave.device = dataclasses.replace(slave.device, profile=profile._replace(settings=settings))
 
 
 def test_every_node_is_found_with_its_identity_and_nothing_but_sdo_uploads_is_sent():
@@ -32,19 +39,6 @@ def test_every_node_is_found_with_its_identity_and_nothing_but_sdo_uploads_is_se
     assert {frame.can_id & 0x7F for frame in rig.sent} == set(range(1, 128))
 
 
-def test_nodes_in_operation_are_seen_with_what_they_produce():
-    rig = Rig(is_wall=True)
-    rig.start()
-    rig.add_host()
-    found = look(rig)
-    assert [node.state_text for node in found.nodes] == ["operational"] * 4
-    produced = {
-        message_name(CODEC, talk.can_id): (talk.length, round(talk.rate_Hz or 0)) for talk in found.nodes[0].produces
-    }
-    assert produced == {"Drive1Feedback": ("8", 1000), "Drive1Status": ("7", 10), "Drive1Heartbeat": ("1", 10)}
-    assert [(talk.can_id, round(talk.rate_Hz or 0)) for talk in found.others] == [(0x080, 1000)]
-
-
 def test_an_operational_node_without_heartbeat_is_told_by_its_pdos():
     rig = Rig(is_wall=True)
     rig.start()
@@ -56,27 +50,31 @@ def test_an_operational_node_without_heartbeat_is_told_by_its_pdos():
 
 def test_who_is_found_is_compared_with_who_is_expected():
     rig = Rig(is_wall=True)
-    found, expected = look(rig), expected_nodes(rig.master.slaves)
+    found, slaves = look(rig), rig.master.slaves
 
     def compared(**changes: object) -> dict[int, str]:
-        return compare(found, [dataclasses.replace(node, **changes) for node in expected])
+        nodes = [dataclasses.replace(node, **changes) for node in found.nodes]
+        return compare(dataclasses.replace(found, nodes=nodes), slaves)
 
-    assert compared(product=0x403)[1] == "Drive1 expected; product is not 0x403"
-    assert compared(profile_number=404)[1] == "Drive1 expected; profile number is not 404"
-    assert compared(serial=7)[2] == "Drive2 expected; serial number is not 7"
-    assert set(compared(vendor=None, product=None).values()) == {""}  # not known, not compared
-    assert compare(found, [node for node in expected if node.node_id != 2])[2] == "unexpected"
+    assert compared(product=0x403)[1] == "Drive1 expected; product is not 0x402"
+    assert compared(vendor=None)[1] == "Drive1 expected; tells no vendor"
+    assert compared(device_type=0x20000 | 404)[1] == "Drive1 expected; profile number is not 402"
+    assert compare(found, slaves[:1] + slaves[2:])[2] == "unexpected"
+    for slave in slaves:
+        replace_profile(slave, identity="any")
+    assert set(compared(vendor=1, product=None, device_type=None).values()) == {""}  # not known, not compared
 
 
 def test_a_device_of_the_other_joint_is_known_by_its_serial_number():
     rig = Rig(is_wall=True)
     for slave, serial, expected in zip(rig.master.slaves, (11, 12, 21, 22), ((12, 11),) * 2 + ((),) * 2, strict=True):
         rig.bench.devices[slave.node_id - 1].serve(0x1018, 4, lambda serial=serial: serial)
-        profile = slave.device.profile
-        settings = dataclasses.replace(profile.settings, serial=expected)
-        slave.device = dataclasses.replace(slave.device, profile=profile._replace(settings=settings))
-    verdicts = compare(look(rig), expected_nodes(rig.master.slaves))
-    assert [node for node, verdict in verdicts.items() if verdict] == [1, 2]
+        replace_profile(slave, serial=expected)
+    differing = {node: verdict for node, verdict in compare(look(rig), rig.master.slaves).items() if verdict}
+    assert differing == {
+        1: "Drive1 expected; serial number is not 12",
+        2: "Drive2 expected; serial number is not 11",
+    }
 
 
 def test_a_node_that_is_only_heard_is_found_and_does_not_answer():

@@ -50,10 +50,4 @@ def random_state(seed, n):
 
 def mass_matrix(arm, q, theta_full):
     """Return M(q) (n, n), kg m²: column j is the momentum at dq_j = 1."""
-    n, scratch, place = q.shape[0], chain.new_scratch(arm), chain.all_columns(arm)
-    Y_p, Y_h = np.zeros((n, place.size)), np.zeros((n, place.size))
-    M = np.zeros((n, n))
-    for j in range(n):
-        chain.fill(arm, place, q, np.eye(n)[j], scratch, Y_p, Y_h)
-        M[:, j] = Y_p @ theta_full
-    return M
+    return np.column_stack([chain.split_regressor(arm, q, unit)[0] @ theta_full for unit in np.eye(q.size)])

@@ -16,17 +16,6 @@ FULL_NAMES = [f"{name}_{link}" for link in (1, 2) for name in chain.LINK_PARAMET
 CLOSED_NAMES = PARAMETER_NAMES + GRAVITY_PARAMETER_NAMES
 
 
-def parts(arm, place, q, dq, columns):
-    """Return Y_p, Y_h (n, columns), friction left out."""
-    Y_p, Y_h = np.zeros((q.size, columns)), np.zeros((q.size, columns))
-    chain.fill(arm, place, q, dq, chain.new_scratch(arm), Y_p, Y_h)
-    return Y_p, Y_h
-
-
-def full_parts(arm, q, dq):
-    return parts(arm, chain.all_columns(arm), q, dq, 10 * q.size)
-
-
 def closed_parts(q, dq, count, level_rad):
     Y_p, Y_h = np.zeros((2, count)), np.zeros((2, count))
     regressor.fill_momentum(q, dq, Y_p)
@@ -62,7 +51,7 @@ def test_the_planar_closed_form_is_a_chain_of_two_however_it_is_mounted(seed, le
     theta = np.array([0.4, 0.07, 0.04])
     body = theta @ np.array(list(INERTIA.values()))
     np.testing.assert_allclose(regressor.mass_matrix(q, theta), mass_matrix(level, q, body), rtol=1e-12)
-    level, upright = full_parts(level, q, dq), full_parts(mounted, q, dq)
+    level, upright = chain.split_regressor(level, q, dq), chain.split_regressor(mounted, q, dq)
     for name, change in INERTIA.items():
         Y_p[:, CLOSED_NAMES.index(name)] = level[0] @ change
         Y_h[:, CLOSED_NAMES.index(name)] = level[1] @ change

@@ -204,6 +204,6 @@ def test_the_filters_leave_the_noise_that_is_reckoned_with():
     record = Record(still, still, 0.1 * rng.standard_normal(still.shape))
     zero = offline.ModelEstimate(np.zeros(len(columns.parameter_names)), np.zeros((len(columns.parameter_names),) * 2))
     left = offline.filtered(columns, record, zero, settings)
-    np.testing.assert_allclose(left.torque.std(axis=0), offline.filtered_noise_Nm(settings), rtol=0.1)
-    np.testing.assert_array_equal(left.torque, left.residual)
+    np.testing.assert_allclose(left.tau_f.std(axis=0), offline.filtered_noise_Nm(settings), rtol=0.1)
+    np.testing.assert_array_equal(left.tau_f, -left.tau_ext_hat)
     assert left.unit[-1] == pytest.approx(1.0)

@@ -70,8 +70,7 @@ def test_pinocchio_agrees_on_momentum_and_remainder(seed):
     M = upper + np.triu(upper, 1).T
     C = pinocchio.computeCoriolisMatrix(model, data, q, dq)
     g = pinocchio.computeGeneralizedGravity(model, data, q)
-    Y_p, Y_h = np.zeros((model.nv, theta_full.size)), np.zeros((model.nv, theta_full.size))
-    chain.fill(arm, chain.all_columns(arm), q, dq, chain.new_scratch(arm), Y_p, Y_h)
+    Y_p, Y_h = chain.split_regressor(arm, q, dq)
     assert_close(mass_matrix(arm, q, theta_full), M)
     assert_close(Y_p @ theta_full, M @ dq)
     assert_close(Y_h @ theta_full, -C.T @ dq + g)

@@ -6,7 +6,7 @@ from adacd_hil.cli.connection import Connection
 from adacd_hil.cli.output import ExitCode, format_table, tell
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.device.network import Master
-from adacd_hil.lab.commission.survey import Node, Survey, compare, expected_nodes, message_name, survey
+from adacd_hil.lab.commission.survey import Node, Survey, compare, message_name, survey
 from adacd_hil.lab.commission.traffic import Talk
 from adacd_hil.printable import in_line
 from adacd_hil.wire.codec import Codec
@@ -22,10 +22,10 @@ def scan_bus(connection: Connection, listen_s: float) -> tuple[dict[str, Any], E
     settings, codec, devices = connection.load()
     clock = MonotonicClock()
     with connection.bus(clock, codec.is_fd) as bus:
-        expected = expected_nodes(Master(settings, codec, devices, bus).slaves, codec)
-        reporting = {node.node_id for node in expected if node.layout_digest is not None}
+        slaves = Master(settings, codec, devices, bus).slaves
+        reporting = {slave.node_id for slave in slaves if slave.device.settings.contract_object}
         found = survey(bus, clock, listen_s, tell, reporting)
-    described = describe(found, compare(found, expected), codec)
+    described = describe(found, compare(found, slaves, codec), codec)
     is_right = not any(row["verdict"] not in ("", "unexpected") for row in described["nodes"])
     return described, ExitCode.OK if is_right else ExitCode.BUS_MISSING
 

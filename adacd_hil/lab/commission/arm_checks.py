@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from adacd_hil.clock import Clock
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.arm_report import describe_faults
-from adacd_hil.device.canopen_bus import read_object
 from adacd_hil.device.device_setup import Slave, command_deadline_ms, pdo_differences, sensor_channel, torque_unit
 from adacd_hil.device.drive_units import read_drive_units
 from adacd_hil.device.network import Master
@@ -29,10 +28,10 @@ from adacd_hil.lab.commission.communication_test import (
     ZeroTorqueLoop,
 )
 from adacd_hil.lab.commission.host_checks import Check, Finding, failed, ok, skipped, warning
-from adacd_hil.lab.commission.survey import NMT_STATES, compare, expected_nodes, survey
+from adacd_hil.lab.commission.survey import NMT_STATES, compare, read_number, survey
 from adacd_hil.lab.commission.tare import ArmMovedError, check_motion
 from adacd_hil.lab.commission.traffic import Traffic, listen
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import JOINTS, ArmState, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, BusError, Tap
 from adacd_hil.wire.can_interface import InterfaceState
@@ -127,8 +126,11 @@ class ArmExamination:
 
         name: "q", "dq" or "tau_J".
         """
-        values = [getattr(cycle.state, name) for cycle in self.cycles if cycle.state.is_complete]
-        return np.array(values, dtype=np.float64).reshape(len(values), JOINTS)
+        return _joint_values([cycle.state for cycle in self.cycles if cycle.state.is_complete], name)
+
+
+def _joint_values(states: Sequence[ArmState], name: str) -> NDArray[np.float64]:
+    return np.array([getattr(state, name) for state in states], dtype=np.float64).reshape(len(states), JOINTS)
 
 
 def open_arm_bus(patient: ArmExamination) -> Finding:
@@ -153,16 +155,15 @@ def check_other_masters(patient: ArmExamination) -> Finding:
 
 def check_nodes(patient: ArmExamination) -> Finding:
     """Fail if an expected node is missing or has another identity; warn of nodes that the configuration lacks."""
-    expected = expected_nodes(patient.master.slaves)
-    found = survey(patient.tap, patient.clock, 0.0)
-    verdicts = compare(found, expected)
+    slaves = patient.master.slaves
+    verdicts = compare(survey(patient.tap, patient.clock, 0.0), slaves)
     wrong = [f"node {node}: {text}" for node, text in verdicts.items() if text not in ("", "unexpected")]
     if wrong:
         return failed("; ".join(wrong), "check power, wiring, node id (0x100B or the maker's tool) and configuration")
     strangers = [str(node) for node, text in verdicts.items() if text]
     if strangers:
         return warning(f"node {', '.join(strangers)} is not in the configuration", "take it off the bus if it can be")
-    return ok(", ".join(f"{node.name} (node {node.node_id})" for node in expected))
+    return ok(", ".join(f"{node.name} (node {node.node_id})" for node in slaves))
 
 
 def boot_nodes(patient: ArmExamination) -> Finding:
@@ -183,14 +184,12 @@ def check_contract(patient: ArmExamination) -> Finding:
     codec = patient.codec
     lacking = []
     for name, node in patient.master.nodes.items():
-        version, digest = read_object(node, 0x2000, 1), read_object(node, 0x2000, 2)
+        version, digest = read_number(node, 0x2000, 1), read_number(node, 0x2000, 2)
         if version is None or digest is None:
             lacking.append(name)
-            continue
-        pair = int.from_bytes(version, "little"), int.from_bytes(digest, "little")
-        if pair != (codec.wire_version, codec.layout_digest):
+        elif (version, digest) != (codec.wire_version, codec.layout_digest):
             return failed(
-                f"{name}: wire version {pair[0]}, layout digest 0x{pair[1]:08X}; the DBC's are "
+                f"{name}: wire version {version}, layout digest 0x{digest:08X}; the DBC's are "
                 f"{codec.wire_version}, 0x{codec.layout_digest:08X}",
                 "give host and devices the same DBC file",
             )
@@ -283,7 +282,7 @@ def _torque_of_count(slave: Slave) -> Finding:
 def _increments(slave: Slave) -> Finding:
     """Return the finding on a drive's increments per revolution of the joint. Raises DeviceError."""
     scale = slave.device.settings.scale
-    units = read_drive_units(_reader(slave), scale.gear_ratio)
+    units = read_drive_units(lambda *place: slave.read(*place) if slave.has(*place) else None, scale.gear_ratio)
     count = f"{scale.increments_per_joint_rev:.10g} increments per revolution of the joint"
     if units.has_increments:
         return ok(f"{slave.name}: {count}, {units.increments_text}")
@@ -308,11 +307,6 @@ def _polarity(slave: Slave) -> Finding:
         f"{text}: position and torque may count against each other, and the arm run away",
         "set 0x607E to 0 with the maker's tool; `arm.sign` reverses a joint",
     )
-
-
-def _reader(slave: Slave) -> Callable[[int, int], int | None]:
-    """Return a function that reads an object by index and sub-index; it returns None for one that the EDS lacks."""
-    return lambda index, sub: slave.read(index, sub) if slave.has(index, sub) else None
 
 
 def check_protection(patient: ArmExamination) -> Finding:
@@ -524,6 +518,14 @@ def check_bus_errors(patient: ArmExamination) -> Finding:
     return ok(f"no error frame{counters}")
 
 
+WORK_FLOOR_J = 1e-3
+"""Least work that shows a sign: 10 degrees against 6 mNm. Noise and zero error make less on a free joint."""
+_DOMINANCE = 2.0
+"""Least ratio of the moved joint's travel to the other joint's."""
+_WANTED_DEG = 10.0
+"""Travel of a joint that ends the motion by hand."""
+
+
 def _check_joint(joint: int) -> Callable[[ArmExamination], Finding]:
     """Return the check of a joint's signs, for which the user moves the joint by hand. joint: from 0.
 
@@ -533,96 +535,69 @@ def _check_joint(joint: int) -> Callable[[ArmExamination], Finding]:
     def check(patient: ArmExamination) -> Finding:
         if patient.ask is None:
             return skipped(patient.no_move_reason)
-        tau_J = patient.joint_values("tau_J")
-        if not len(tau_J):
+        at_rest_Nm = patient.joint_values("tau_J")
+        if not len(at_rest_Nm):
             return skipped("no complete cycle")
-        motion = HandMotion(joint, tau_J.mean(axis=0))
+        states: list[ArmState] = []
+
+        def observe(cycle: ZeroTorqueCycle) -> None:
+            if cycle.state.is_complete:
+                states.append(cycle.state)
+
+        def way() -> Vector:
+            return states[-1].q - states[0].q if states else np.zeros(JOINTS)
+
         patient.ask(
-            f"move joint {joint + 1} by hand toward +q, at least {motion.WANTED_DEG:g} degrees, "
-            f"within {patient.move_s:g} s"
+            f"move joint {joint + 1} by hand toward +q, at least {_WANTED_DEG:g} degrees, within {patient.move_s:g} s"
         )
-        patient.loop.run(patient.move_s, motion.observe_cycle, lambda: motion.is_done)
-        return motion.judge()
+        patient.loop.run(patient.move_s, observe, lambda: _has_moved(way()))
+        steps = np.diff(_joint_values(states, "q"), axis=0)
+        torque_Nm = _joint_values(states, "tau_J")[1:] - at_rest_Nm.mean(axis=0)
+        return _judge_motion(joint, way(), float((torque_Nm * steps)[:, joint].sum()))
 
     return check
 
 
-WORK_FLOOR_J = 1e-3
-"""Least work that shows a sign: 10 degrees against 6 mNm. Noise and zero error make less on a free joint."""
-_DOMINANCE = 2.0
-"""Least ratio of the moved joint's travel to the other joint's."""
+def _has_moved(way: Vector) -> bool:
+    return bool(np.abs(way).max() >= math.radians(_WANTED_DEG))
 
 
-class HandMotion:
-    """Judges the signs of joint `joint` (0, 1) by cycles in which the user moves it toward +q, its drive disabled.
+def _judge_motion(joint: int, way: Vector, work_J: float) -> Finding:
+    """Return the finding on a motion by hand toward +q: whether the right joint moved, with the right signs.
+
+    joint: from 0. way (2,): travel of both joints, rad. work_J: of the joint, as of `_judge_work`. A warning if it
+    moved too little, with the other joint, or with too little torque to tell the sign.
+    """
+    number, moved = joint + 1, int(np.argmax(np.abs(way)))
+    text = "moved {:+.1f} and {:+.1f} deg, work {:+.4f} J".format(*np.degrees(way), work_J)
+    if not _has_moved(way):
+        return warning(f"not moved by {_WANTED_DEG:g} deg in time ({text})", "run doctor --move again")
+    if moved != joint:
+        return failed(
+            f"drive {moved + 1} reports the motion of joint {number} ({text})",
+            "exchange the node ids of the drives, or their cables",
+        )
+    if abs(way[joint]) < _DOMINANCE * abs(way[1 - joint]):
+        return warning(f"both joints moved ({text})", "hold the other joint and run doctor --move again")
+    if way[joint] < 0.0:
+        return failed(f"position decreases toward +q ({text})", f"reverse arm.sign of joint {number}")
+    return _judge_work(work_J, text)
+
+
+def _judge_work(work_J: float, text: str) -> Finding:
+    """Return the finding on the work ∫ tau_J dq of a joint moved by hand, its drive disabled, zero torque subtracted.
 
     The hand drives the arm, and the arm drives the idle motor through the sensor, so the sensed torque opposes the
-    motion: the work ∫ tau_J dq must be negative. `zero_Nm` (2,): torque at rest, which is subtracted.
+    motion: the work must be negative. text: of the motion.
     """
-
-    WANTED_DEG = 10.0
-
-    def __init__(self, joint: int, zero_Nm: Vector) -> None:
-        self._joint = joint
-        self._start: Vector | None = None
-        self._last: Vector | None = None
-        self._way = np.zeros(JOINTS)
-        self._work_J = np.zeros(JOINTS)
-        self._zero_Nm = zero_Nm
-
-    @property
-    def is_done(self) -> bool:
-        """Whether any joint, the right one or not, is `WANTED_DEG` away from its first position."""
-        return bool(np.abs(self._way).max() >= math.radians(self.WANTED_DEG))
-
-    def observe_cycle(self, cycle: ZeroTorqueCycle) -> None:
-        """Add a cycle to the travel and the work of the joints; ignore an incomplete one.
-
-        The first one is the beginning.
-        """
-        state = cycle.state
-        if not state.is_complete:
-            return
-        if self._start is None or self._last is None:
-            self._start = self._last = state.q
-            return
-        self._work_J += (state.tau_J - self._zero_Nm) * (state.q - self._last)
-        self._last = state.q
-        self._way = state.q - self._start
-
-    def judge(self) -> Finding:
-        """Return the finding on the motion so far: whether the right joint moved, with the right signs.
-
-        The signs of position and of torque. A warning if it moved too little, with the other joint, or with too little
-        torque to tell the sign.
-        """
-        joint, number = self._joint, self._joint + 1
-        ways_deg = np.degrees(self._way)
-        moved = int(np.argmax(np.abs(self._way)))
-        text = f"moved {ways_deg[0]:+.1f} and {ways_deg[1]:+.1f} deg, work {self._work_J[joint]:+.4f} J"
-        if not self.is_done:
-            return warning(f"not moved by {self.WANTED_DEG:g} deg in time ({text})", "run doctor --move again")
-        if moved != joint:
-            return failed(
-                f"drive {moved + 1} reports the motion of joint {number} ({text})",
-                "exchange the node ids of the drives, or their cables",
-            )
-        if abs(self._way[joint]) < _DOMINANCE * abs(self._way[1 - joint]):
-            return warning(f"both joints moved ({text})", "hold the other joint and run doctor --move again")
-        if self._way[joint] < 0.0:
-            return failed(f"position decreases toward +q ({text})", f"reverse arm.sign of joint {number}")
-        return self._judge_torque(text)
-
-    def _judge_torque(self, text: str) -> Finding:
-        work_J = self._work_J[self._joint]
-        if work_J > WORK_FLOOR_J:
-            return failed(
-                f"the torque has the motion's sign: it should oppose it ({text})",
-                "reverse the torque sensor's sign (0x6126 or the maker's tool), or exchange the sensors",
-            )
-        if work_J > -WORK_FLOOR_J:
-            return warning(f"right joint and direction; too little torque to tell its sign ({text})", "move it faster")
-        return ok(f"right joint, right signs ({text})")
+    if work_J > WORK_FLOOR_J:
+        return failed(
+            f"the torque has the motion's sign: it should oppose it ({text})",
+            "reverse the torque sensor's sign (0x6126 or the maker's tool), or exchange the sensors",
+        )
+    if work_J > -WORK_FLOOR_J:
+        return warning(f"right joint and direction; too little torque to tell its sign ({text})", "move it faster")
+    return ok(f"right joint, right signs ({text})")
 
 
 ARM_CHECKS: tuple[Check[ArmExamination], ...] = (

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from adacd_hil.lab.serial_arm.chain import PER_LINK, Chain
-from adacd_hil.lab.serial_arm.urdf import BASE, SerialArm, UrdfError, read_urdf
+from adacd_hil.lab.serial_arm.urdf import BASE, SerialArm, UrdfError, read_urdf, symmetric
 from adacd_hil.printable import one_line
 from adacd_hil.records import GRAVITY_M_S2, JOINTS, Vector
 from adacd_hil.settings.arm_settings import SLIGHT_TILT_DEG, ArmSettings
@@ -211,26 +211,17 @@ def _straightened(arm: SerialArm, sign: int, bent_deg: float, doubts: list[str])
     UrdfError for limits without 0.
     """
     limits = _position_limits(arm)
-    if abs(bent_deg) <= _BENT_DEG:
-        return (0.0, 0.0), limits
-    straight = _limit_about_stretched(arm, sign, bent_deg)
-    if straight > 0.0:
-        return (0.0, round(-bent_deg, 2)), np.array((limits[0], straight))
-    doubts.append(
-        f"at the URDF's q2 = 0 the centre of mass of link 2 is {abs(bent_deg):.0f} deg off the line of link 1, and the "
-        "stretched arm, the model's q2 = 0, is not within the limits of joint 2"
-    )
+    if abs(bent_deg) > _BENT_DEG:
+        ends = (math.degrees(sign * float(end[1])) + bent_deg for end in (arm.position_low, arm.position_high))
+        low, high = sorted(ends)
+        straight = round(min(-low, high), 2)
+        if straight > 0.0:
+            return (0.0, round(-bent_deg, 2)), np.array((limits[0], straight))
+        doubts.append(
+            f"at the URDF's q2 = 0 the centre of mass of link 2 is {abs(bent_deg):.0f} deg off the line of link 1, and "
+            "the stretched arm, the model's q2 = 0, is not within the limits of joint 2"
+        )
     return (0.0, 0.0), limits
-
-
-def _limit_about_stretched(arm: SerialArm, sign: int, bent_deg: float) -> float:
-    """Return the largest |q2| that joint 2's limits allow on both sides of the stretched arm, deg.
-
-    It is 0 or less if they exclude the stretched arm. sign: 1, or -1 if joint 2 of the URDF turns against joint 1.
-    bent_deg: the model's q2 at the URDF's zero.
-    """
-    first, second = (math.degrees(sign * float(end[1])) + bent_deg for end in (arm.position_low, arm.position_high))
-    return round(min(-min(first, second), max(first, second)), 2)
 
 
 def _mass_doubts(arm: SerialArm) -> list[str]:
@@ -303,8 +294,7 @@ def _about(link: Vector, axis: Vector) -> float:
 
     link: its parameters (10,), axis (3,): unit vector.
     """
-    xx, xy, yy, xz, yz, zz = link[4:]
-    return float(axis @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ axis)
+    return float(axis @ symmetric(link[4:]) @ axis)
 
 
 def _position_limits(arm: SerialArm) -> Vector:
@@ -340,15 +330,14 @@ def _short(value: float) -> float:
 
 
 _MODEL = load_settings("certified", "P")
-_MODEL_INERTIA = _MODEL.arm.cad_theta[0], _MODEL.arm.cad_theta[2]
+_MODEL_INERTIA = np.array(_MODEL.arm.cad_theta)[[0, 2]]
 """a1 and a3 of P's CAD model, kg m², for which its gains were measured."""
 _MOST_DAMPING_RAD_S = 300.0
 """Kd over that inertia. P's: 142 and 113. An arm with 340 lost its certificate, one with 1180 vibrated to a FAULT."""
-_KP, _KD = _MODEL.controller.Kp, _MODEL.controller.Kd
-_MODEL_TORQUE_NM = _MODEL.arm.rated_torque_Nm
+_MODEL_TORQUE_NM = np.array(_MODEL.arm.rated_torque_Nm)
 _RATE_PER_NM = _MODEL.arm.torque_rate_limit_Nm_s[1] / _MODEL_TORQUE_NM[1]
 """Torque rate limit per rated torque, 1/s."""
-_AMPLITUDE_DEG, _HALF_PERIOD_S = _MODEL.trajectory.amplitude_deg, _MODEL.trajectory.half_period_s
+_AMPLITUDE_DEG, _HALF_PERIOD_S = np.array((_MODEL.trajectory.amplitude_deg, _MODEL.trajectory.half_period_s))
 _MOST_HALF_PERIOD_S = bounds_of(TrajectorySettings, "half_period_s")[1]
 _MOST_SLOWER = _MOST_HALF_PERIOD_S / max(_HALF_PERIOD_S)
 """Largest slowdown of the motion; beyond it the amplitude shrinks, by steps of this factor."""
@@ -439,8 +428,8 @@ def _arm(facts: ArmFacts) -> Iterator[Entry]:
     yield _stated("arm.link_length_m", Fact(geometry.link_length_m, facts.length_source), "axis to axis, axis to tip")
     yield _stated("arm.rated_torque_Nm", rated, "of each drive, 0x6076, at the joint")
     yield _stated("arm.torque_limit_Nm", facts.torque_limit_Nm, "the most that is ever commanded")
-    rate = tuple(_round(_RATE_PER_NM * torque) for torque in rated.value)
-    yield Entry("arm.torque_rate_limit_Nm_s", rate, "in proportion to the rated torque")
+    rate = _RATE_PER_NM * np.array(rated.value)
+    yield Entry("arm.torque_rate_limit_Nm_s", _rounded(rate), "in proportion to the rated torque")
     for key in ("arm.position_limit_deg", "arm.velocity_limit_deg_s"):
         yield _stated(key, getattr(facts, key.removeprefix("arm.")), known_keys()[key].meaning)
     comment = "+1 where the device counts as the joint"
@@ -490,13 +479,12 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
 
     Raises ConfigError for a joint without torque.
     """
-    limit, speed = facts.position_limit_deg.value, facts.velocity_limit_deg_s.value
     hangs_rad = math.radians(facts.geometry.mounting_deg[1])
     is_level = facts.geometry.has_gravity and abs(math.sin(hangs_rad)) > _LEVEL
     wanted, comment = _AMPLITUDE_DEG, f"±, within {_TRAVEL_SHARE:.0%} of the position limit"
     if is_level:
         wanted, comment = _UPRIGHT_DEG, f"{comment}; wide, to tell gravity from the sensors' offsets"
-    amplitude = tuple(_round(min(wanted[i], _TRAVEL_SHARE * limit[i])) for i in range(JOINTS))
+    amplitude = _rounded(np.minimum(wanted, _TRAVEL_SHARE * np.array(facts.position_limit_deg.value)))
     if is_level and amplitude[0] < _LEAST_UPRIGHT_DEG:
         warnings.append(
             f"joint 1 may swing by ±{amplitude[0]:g} deg only, {_LEAST_UPRIGHT_DEG:g} deg tell gravity from the offset "
@@ -506,7 +494,7 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
     if slower > _MOST_SLOWER:
         whole = amplitude
         while slower > _MOST_SLOWER:
-            amplitude = tuple(_round(_SHORTER * value) for value in amplitude)
+            amplitude = _rounded(_SHORTER * np.array(amplitude))
             slower = _slowdown(facts, amplitude, [])
         comment += f"; {amplitude[0] / whole[0]:.2g} of it, for a half period of {_MOST_HALF_PERIOD_S:g} s at most"
         warnings.append(
@@ -514,42 +502,40 @@ def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
             f"{slower * max(_HALF_PERIOD_S):.3g} s: learning it takes minutes; are the limits and the gears right?"
         )
     yield Entry("trajectory.amplitude_deg", amplitude, comment)
-    half_period = tuple(_round(slower * period_s) for period_s in _HALF_PERIOD_S)
     reason = "as of the emulated arm" if slower == 1.0 else f"{slower:.2f} times slower than the emulated arm"
-    yield Entry("trajectory.half_period_s", half_period, reason)
+    yield Entry("trajectory.half_period_s", _rounded(slower * _HALF_PERIOD_S), reason)
     yield Entry("excitation.period_s", _round(slower * _MODEL.excitation.period_s), reason)
-    withdrawal = tuple(_round(min(_PEAK_DEG_S[i], max(_SPEED_SHARE * speed[i], 1.0))) for i in range(JOINTS))
+    speed = _SPEED_SHARE * np.array(facts.velocity_limit_deg_s.value)
+    withdrawal = _rounded(np.minimum(_PEAK_DEG_S, np.maximum(speed, 1.0)))
     if withdrawal != _PEAK_DEG_S:
         yield Entry("reaction.velocity_limit_deg_s", withdrawal, f"{_SPEED_SHARE:.0%} of the velocity limit")
-    inertia = _inertia(facts)
     has_masses = bool(facts.geometry.cad_theta)
-    for name, model in (("Kp", _KP), ("Kd", _KD)):
-        gain = tuple(_round(model[i] * inertia[i] / _MODEL_INERTIA[i]) for i in range(JOINTS))
+    for name in ("Kp", "Kd"):
+        gain = _rounded(np.array(getattr(_MODEL.controller, name)) * _inertia(facts) / _MODEL_INERTIA)
         basis = "the inertia" if has_masses else "the rated torque, as the masses are not known"
         yield Entry(f"controller.{name}", gain, f"the emulated arm's, in proportion to {basis}", not has_masses)
         if name == "Kd" and has_masses:
-            warnings += _fast_damping(gain, facts.geometry.cad_theta)
+            warnings += _fast_damping(np.array(gain), facts.geometry.cad_theta)
     if facts.geometry.has_gravity:
         yield _rest_torque(facts)
     yield from _certified(facts)
 
 
-def _fast_damping(Kd: Sequence[float], cad_theta: Sequence[float]) -> Iterator[str]:
+def _fast_damping(Kd: Vector, cad_theta: Sequence[float]) -> Iterator[str]:
     """Yield a warning for each joint whose Kd over its inertia exceeds `_MOST_DAMPING_RAD_S`, so that it may vibrate.
 
     Kd in Nm s/rad; cad_theta: a1, a2, a3 first. The inertia is that at q2 = 0 while the other joint turns freely, less
     than the element of M.
     """
     a1, a2, a3 = cad_theta[:3]
-    diagonal, coupling = (a1 + 2.0 * a2, a3), a3 + a2
-    for i in range(JOINTS):
-        free = max(diagonal[i] - coupling**2 / diagonal[1 - i], 1e-9)
-        if Kd[i] > _MOST_DAMPING_RAD_S * free:
-            yield (
-                f"`controller.Kd[{i}]` = {Kd[i]:.3g} Nm s/rad on {free:.2g} kg m², joint {i + 1}'s inertia while the "
-                f"other is free: {Kd[i] / free:.3g} rad/s, {_MOST_DAMPING_RAD_S:g} at most; the arm may vibrate, "
-                "rehearse it"
-            )
+    diagonal = np.array((a1 + 2.0 * a2, a3))
+    free = np.maximum(diagonal - (a3 + a2) ** 2 / diagonal[::-1], 1e-9)
+    for i in np.flatnonzero(Kd > _MOST_DAMPING_RAD_S * free):
+        yield (
+            f"`controller.Kd[{i}]` = {Kd[i]:.3g} Nm s/rad on {free[i]:.2g} kg m², joint {i + 1}'s inertia while the "
+            f"other is free: {Kd[i] / free[i]:.3g} rad/s, {_MOST_DAMPING_RAD_S:g} at most; the arm may vibrate, "
+            "rehearse it"
+        )
 
 
 def _rest_torque(facts: ArmFacts) -> Entry:
@@ -573,7 +559,7 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
     They are the defaults, scaled by the arm's rated torque, inertia and gravity.
     """
     base = load_settings("certified")
-    found, inertia, rated = base.certified, _inertia(facts), facts.rated_torque_Nm.value
+    found, inertia = base.certified, _inertia(facts)
     scale = _torque_scale(facts)
     wanted = (2.0 * inertia[0], 0.0, 0.0, 2.0 * sum(facts.geometry.cad_theta[7:]), 0.0, 0.0, 0.0)
     prior = [max(values) for values in zip(found.prior_std, _scaled(found.prior_std, scale), wanted, strict=True)]
@@ -594,7 +580,7 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
         ]
     reason = "prior; inertia and gravity: at least twice the description's"
     entries.append(("certified.prior_std", prior, found.prior_std, reason))
-    ratios = [inertia[i] / _MODEL_INERTIA[i] for i in range(JOINTS)]
+    ratios = inertia / _MODEL_INERTIA
     light, heavy = min(1.0, _ALIKE * min(ratios)), max(1.0, max(ratios) / _HEAVY_INERTIA)
     reason = "evidence of a lag grows with the inertia"
     entries += [
@@ -602,10 +588,10 @@ def _certified(facts: ArmFacts) -> Iterator[Entry]:
         ("certified.condition", (heavy / light) ** 2 * found.condition, found.condition, reason),
     ]
     upper = base.detector.collision_Nm
-    lower = [min(1.0, rated[i] / _MODEL_TORQUE_NM[i]) * upper[i] for i in range(JOINTS)]
+    lower = np.minimum(1.0, np.array(facts.rated_torque_Nm.value) / _MODEL_TORQUE_NM) * upper
     entries.append(("detector.collision_Nm", lower, upper, "in proportion to the rated torque where that is smaller"))
     for key, value, default, comment in entries:
-        rounded = tuple(map(_round, value)) if isinstance(default, tuple) else _round(value)
+        rounded = _rounded(value) if isinstance(default, tuple) else _round(value)
         if rounded != default:
             yield Entry(key, rounded, comment)
 
@@ -615,7 +601,7 @@ def _torque_scale(facts: ArmFacts) -> float:
 
     1 unless both joints' ratios are above `_ALIKE`, or both below 1 / `_ALIKE`.
     """
-    ratios = [facts.rated_torque_Nm.value[i] / _MODEL_TORQUE_NM[i] for i in range(JOINTS)]
+    ratios = np.array(facts.rated_torque_Nm.value) / _MODEL_TORQUE_NM
     if min(ratios) > _ALIKE:
         return float(min(ratios))
     return float(max(ratios)) if max(ratios) < 1.0 / _ALIKE else 1.0
@@ -632,47 +618,44 @@ def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) 
     amplitude: of both joints, deg. Adds a line to `warnings` if gravity leaves too little torque. Raises ConfigError
     for a joint without torque.
     """
-    limit_Nm, speed = facts.torque_limit_Nm.value, facts.velocity_limit_deg_s.value
-    inertia, gravity, slower = _inertia(facts), _gravity(facts, amplitude), 1.0
-    for i in range(JOINTS):
-        if limit_Nm[i] <= 0.0:
-            raise ConfigError(f"`arm.torque_limit_Nm[{i}]` = 0 Nm: joint {i + 1} can't move without torque")
-        share = amplitude[i] / _AMPLITUDE_DEG[i]
-        slower = max(slower, share * _PEAK_DEG_S[i] / (_SPEED_SHARE * speed[i]))
-        slower = max(slower, math.sqrt(_FULL_ACCELERATION * share)) if share > 1.0 else slower
-        left_Nm = limit_Nm[i] - gravity[i]
-        if left_Nm < _LEAST_TORQUE_SHARE * limit_Nm[i]:
-            warnings.append(
-                f"gravity takes {gravity[i]:.1f} Nm of joint {i + 1}'s {limit_Nm[i]:g} Nm: too little is left to move"
-            )
-            left_Nm = _LEAST_TORQUE_SHARE * limit_Nm[i]
-        heavy = inertia[i] / _MODEL_INERTIA[i] * _MODEL_TORQUE_NM[i] / left_Nm * share
-        slower = max(slower, math.sqrt(heavy / _HEAVY))
-    return slower if slower > 1.01 else 1.0
+    limit_Nm, speed = np.array((facts.torque_limit_Nm.value, facts.velocity_limit_deg_s.value))
+    for i in np.flatnonzero(limit_Nm <= 0.0):
+        raise ConfigError(f"`arm.torque_limit_Nm[{i}]` = 0 Nm: joint {i + 1} can't move without torque")
+    gravity, share = _gravity(facts, amplitude), amplitude / _AMPLITUDE_DEG
+    least_Nm, left_Nm = _LEAST_TORQUE_SHARE * limit_Nm, limit_Nm - gravity
+    for i in np.flatnonzero(left_Nm < least_Nm):
+        warnings.append(
+            f"gravity takes {gravity[i]:.1f} Nm of joint {i + 1}'s {limit_Nm[i]:g} Nm: too little is left to move"
+        )
+    heavy = _inertia(facts) / _MODEL_INERTIA * _MODEL_TORQUE_NM / np.maximum(left_Nm, least_Nm) * share
+    slower = max(
+        *share * _PEAK_DEG_S / (_SPEED_SHARE * speed),
+        *np.sqrt(_FULL_ACCELERATION * share[share > 1.0]),
+        *np.sqrt(heavy / _HEAVY),
+    )
+    return float(slower) if slower > 1.01 else 1.0
 
 
-def _inertia(facts: ArmFacts) -> Pair:
+def _inertia(facts: ArmFacts) -> Vector:
     """Return a1 and a3, kg m², by the masses; if these are unknown, in proportion to the rated torque."""
     if theta := facts.geometry.cad_theta:
-        return theta[0], theta[2]
-    rated = facts.rated_torque_Nm.value
-    first, second = (_MODEL_INERTIA[i] * rated[i] / _MODEL_TORQUE_NM[i] for i in range(JOINTS))
-    return first, second
+        return np.array(theta)[[0, 2]]
+    return np.asarray(_MODEL_INERTIA * facts.rated_torque_Nm.value / _MODEL_TORQUE_NM)
 
 
-def _gravity(facts: ArmFacts, within_deg: Sequence[float]) -> Pair:
+def _gravity(facts: ArmFacts, within_deg: Sequence[float]) -> Vector:
     """Return gravity's largest torque on each joint while |q| is within these bounds, Nm.
 
     0 without gravity, and if the masses are unknown.
     """
     geometry = facts.geometry
     if not (geometry.has_gravity and geometry.cad_theta):
-        return 0.0, 0.0
+        return np.zeros(JOINTS)
     a4, a5 = geometry.cad_theta[7:]
     swing_1, swing_2 = (np.radians(np.linspace(-bound, bound, 73)) for bound in within_deg)
     uphill = swing_1[:, np.newaxis] - math.radians(geometry.mounting_deg[1] + 90.0)
     second = a5 * np.cos(uphill + swing_2)
-    return float(np.max(np.abs(a4 * np.cos(uphill) + second))), float(np.max(np.abs(second)))
+    return np.array((np.max(np.abs(a4 * np.cos(uphill) + second)), np.max(np.abs(second))))
 
 
 _ARROWS = "→↗↑↖←↙↓↘"
@@ -709,6 +692,10 @@ def _round(value: float) -> float:
     return float(f"{value:.4g}")
 
 
+def _rounded(values: Iterable[float]) -> tuple[float, ...]:
+    return tuple(map(_round, values))
+
+
 _HEAD = """# {title}
 # `adacd-hil config check {name}` checks this file, `adacd-hil config docs KEY` explains a key; other keys
 # are as in `{base}`. `adacd-hil run` needs offsets of the torque sensors: `adacd-hil tare`.
@@ -731,15 +718,10 @@ def draft_as_toml(entries: Sequence[Entry], title: str, name: str, base: str = "
             *(f'    "{key}",' for key in assumed),
             "]",
         ]
-    order = [known.partition(".")[0] for known in known_keys()]
-    top = [entry for entry in entries if "." not in entry.key]
-    lines += [line for entry in top for line in _lines_of(entry)]
-    sections = sorted({entry.key.partition(".")[0] for entry in entries if "." in entry.key}, key=order.index)
-    for section in sections:
-        lines += ["", f"[{section}]"]
-        for entry in entries:
-            if entry.key.startswith(f"{section}."):
-                lines += _lines_of(entry)
+    order = ["", *(known.partition(".")[0] for known in known_keys())]
+    for section in sorted({entry.key.rpartition(".")[0] for entry in entries}, key=order.index):
+        lines += ["", f"[{section}]"] if section else []
+        lines += [line for entry in entries if entry.key.rpartition(".")[0] == section for line in _lines_of(entry)]
     return "\n".join(lines) + "\n"
 
 

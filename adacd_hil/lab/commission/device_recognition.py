@@ -14,13 +14,13 @@ from adacd_hil.device.canopen_bus import CanopenBus, DeviceError, read_object
 from adacd_hil.device.contract import compose
 from adacd_hil.device.device_files import load_profile, place_devices
 from adacd_hil.lab.commission.profile_draft import (
+    DRIVE,
     KINDS,
     SENSOR,
     DeviceRatings,
     identity_of,
     is_of,
     shipped_profiles,
-    torque_of_count,
 )
 from adacd_hil.lab.commission.survey import BETWEEN_READS_S, Node
 from adacd_hil.records import JOINTS
@@ -74,30 +74,30 @@ def fitting_profiles(node: Node, kind: str) -> tuple[str, ...]:
 
     An EDS without a product number fits all products of its vendor. () if there is none.
     """
-    names = []
-    for name, profile in shipped_profiles(kind):
-        identity = identity_of(profile.eds)
-        if identity[0] is not None and is_of(identity, (node.vendor, node.product)):
-            names.append(name)
-    return tuple(sorted(names, key=len))
+    identities = ((name, identity_of(profile.eds)) for name, profile in shipped_profiles(kind))
+    its = node.vendor, node.product
+    return tuple(sorted((name for name, eds in identities if eds[0] is not None and is_of(eds, its)), key=len))
 
 
 _SIGNED = ((0x607D, 1), (0x607D, 2))
-_OF_DRIVES = (
-    (0x6076, 0),
-    (0x6072, 0),
-    (0x608F, 1),
-    (0x608F, 2),
-    (0x6091, 1),
-    (0x6091, 2),
-    (0x6092, 1),
-    (0x6092, 2),
-    (0x60A8, 0),
-    (0x60A9, 0),
-    *_SIGNED,
-    (0x6080, 0),
-    (0x6502, 0),
-)
+_RATINGS = {
+    DRIVE: (
+        (0x6076, 0),
+        (0x6072, 0),
+        (0x608F, 1),
+        (0x608F, 2),
+        (0x6091, 1),
+        (0x6091, 2),
+        (0x6092, 1),
+        (0x6092, 2),
+        (0x60A8, 0),
+        (0x60A9, 0),
+        *_SIGNED,
+        (0x6080, 0),
+        (0x6502, 0),
+    ),
+    SENSOR: ((0x6131, 1), (0x6132, 1)),
+}
 
 
 def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> int | None:
@@ -113,9 +113,7 @@ def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> i
 
 
 def _read_ratings(remote: Any, kind: str) -> DeviceRatings:
-    if kind == SENSOR:
-        return DeviceRatings(torque_Nm=torque_of_count(_number(remote, 0x6131, 1), _number(remote, 0x6132, 1)))
-    read = {place: _number(remote, *place, is_signed=place in _SIGNED) for place in _OF_DRIVES}
+    read = {place: _number(remote, *place, is_signed=place in _SIGNED) for place in _RATINGS[kind]}
     return DeviceRatings({place: value for place, value in read.items() if value is not None})
 
 

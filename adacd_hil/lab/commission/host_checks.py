@@ -17,7 +17,7 @@ from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.scheduling import ANY_CPU, ISOLATED_CPU, RealtimeGrant, isolated_cpus
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import ConfigurationLayer
-from adacd_hil.settings.setting_keys import KnownKey, in_words, known_keys, value_of
+from adacd_hil.settings.setting_keys import in_words, known_keys, value_of
 from adacd_hil.wire.bus import BusError
 from adacd_hil.wire.can_interface import CANFD_MTU, InterfaceState, can_interfaces
 
@@ -126,44 +126,33 @@ def configuration_checks(settings: Settings, layers: Sequence[ConfigurationLayer
 
     Guessed are keys in `assumed` of the configuration, and of its device profiles. layers: as of `examine_settings`.
     """
-    known = known_keys()
-    guesses = [key for key in settings.assumed if key in known]
+    known, guesses = known_keys(), dict[str, Finding]()
+    for key in settings.assumed:
+        if key in known:
+            value = value_of(settings, key)
+            text = "nothing is given" if value is None else f"{in_words(value)} is a guess"
+            remedy = f"measure it or look it up, write it, and take `{key}` off `assumed`"
+            guesses[key] = warning(f"{text}: {known[key].meaning}", remedy)
+    for key, number in profile_guesses(settings).items():
+        remedy = "look it up or measure it, write it into that profile, and take the key off its `assumed`"
+        guesses[key] = warning(f"{number:.10g} is a guess", remedy)
     return [
         Check("settings", lambda settings: check_settings(settings, layers)),
-        *(Check(f"`{key}`", _asking_for(known[key])) for key in guesses),
-        *(Check(f"`{key}`", _asking_for_profile(value)) for key, value in profile_guesses(settings).items()),
+        *(Check(f"`{key}`", _telling(finding)) for key, finding in guesses.items()),
     ]
 
 
-def check_settings(settings: Settings, layers: Sequence[ConfigurationLayer] = ()) -> Finding:
+def _telling(finding: Finding) -> Callable[[Settings], Finding]:
+    return lambda _: finding
+
+
+def check_settings(settings: Settings, layers: Sequence[ConfigurationLayer]) -> Finding:
     """Fail for errors of a configuration, warn of likely mistakes; as `config check`. layers: of the configuration."""
     found = examine_settings(settings, layers)
     remedy = "correct the configuration; `adacd-hil config check` looks at it without a bus"
     if found.errors:
         return failed("; ".join(found.errors), remedy)
     return warning("; ".join(found.mistakes), remedy) if found.mistakes else ok(f"configuration {settings.name}")
-
-
-def _asking_for(known: KnownKey) -> Callable[[Settings], Finding]:
-    """Return a check that always warns that the value of this key is a guess, with the value and its meaning."""
-
-    def ask(settings: Settings) -> Finding:
-        value = value_of(settings, known.key)
-        text = "nothing is given" if value is None else f"{in_words(value)} is a guess"
-        remedy = f"measure it or look it up, write it, and take `{known.key}` off `assumed`"
-        return warning(f"{text}: {known.meaning}", remedy)
-
-    return ask
-
-
-def _asking_for_profile(value: float) -> Callable[[Settings], Finding]:
-    """Return a check that always warns that this value of a device profile is a guess."""
-
-    def ask(_: Settings) -> Finding:
-        remedy = "look it up or measure it, write it into that profile, and take the key off its `assumed`"
-        return warning(f"{value:.10g} is a guess", remedy)
-
-    return ask
 
 
 QUEUE_FRAMES = 10

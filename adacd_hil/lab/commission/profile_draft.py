@@ -10,7 +10,7 @@ CiA 404.
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -62,13 +62,9 @@ _SIGNAL_OBJECTS = {
 
 
 class DeviceRatings(NamedTuple):
-    """Values read from a device. numbers: by (index, sub-index); an object that wasn't read is missing.
-
-    torque_Nm: one count of a torque sensor; None if unknown, and for a drive.
-    """
+    """Values read from a device. numbers: by (index, sub-index); an object that wasn't read is missing."""
 
     numbers: Mapping[_Place, int] = {}
-    torque_Nm: float | None = None
 
     @property
     def torque_share(self) -> float | None:
@@ -115,9 +111,9 @@ class ProfileDraft(NamedTuple):
     text: str
     settings: ProfileSettings
     guessed: Mapping[str, tuple[float, str]]
-    remarks: tuple[str, ...] = ()
-    rated_torque_Nm: float | None = None
-    is_rated_known: bool = False
+    remarks: tuple[str, ...]
+    rated_torque_Nm: float | None
+    is_rated_known: bool
 
     @property
     def guesses(self) -> tuple[str, ...]:
@@ -134,8 +130,7 @@ def identity_of(eds: Path) -> tuple[int | None, int | None]:
     head = objects.device_information
     found = []
     for sub, number in ((1, head.vendor_number), (2, head.product_number)):
-        variable = find_variable(objects, 0x1018, sub)
-        default = None if variable is None else variable.default
+        default = _default(objects, 0x1018, sub)
         found.append(default if default is not None else number)
     return found[0], found[1]
 
@@ -171,8 +166,13 @@ def describe_kind(eds: Path) -> str:
 
 
 def _profile_number(eds: Path) -> int:
-    variable = find_variable(read_eds(eds, 1), 0x1000, 0)
-    return 0 if variable is None or variable.default is None else variable.default & 0xFFFF
+    return (_default(read_eds(eds, 1), 0x1000, 0) or 0) & 0xFFFF
+
+
+def _default(objects: Any, index: int, sub: int) -> int | None:
+    """Return the default of an object by an EDS; None if the EDS lacks either."""
+    variable = find_variable(objects, index, sub)
+    return None if variable is None else variable.default
 
 
 def draft_profile(
@@ -226,6 +226,7 @@ _TORQUE_OBJECTS = ((0x9130, 1), (0x7130, 1))
 _SENSOR_FEATURES = {"heartbeat_consumer": (0x1016, 1), "sync_counter": (0x1019, 0)}
 _PERMILLE = ("torque_actual", "torque_demand", "target_torque", "torque_offset", "max_torque")
 _STATUS_OBJECTS = ((0x6041, 0), (0x6061, 0), (0x6077, 0), (0x603F, 0))
+_COMMANDED = ((0x6040, 0), (0x6071, 0))
 _EVENT_TYPE, _EVENT_MS = 255, 100
 _INHIBIT_100US = 50
 """Inhibit time of a status frame with the torque, which changes all the time: 5 ms leave two drives 4 % of a bus."""
@@ -267,9 +268,14 @@ class _Record(NamedTuple):
         """Return whether the PDO's default mapping has all these objects, (index, sub-index)."""
         return set(places) <= set(self.entries)
 
-    def can_be(self, transmission: int) -> bool:
-        """Return whether the PDO's transmission type is this one, or can be written."""
-        return self.transmission in (None, transmission)
+    def takes(self, *places: _Place) -> bool:
+        """Return whether all these objects can be mapped, or are in a mapping that is read-only."""
+        return self.room >= len(places) if self.room else self.carries(*places)
+
+    @property
+    def can_sync(self) -> bool:
+        """Whether the PDO goes with every SYNC, transmission type 1, or can be set to that."""
+        return self.transmission in (None, 1)
 
 
 class _ProfileWriter(ABC):
@@ -301,15 +307,11 @@ class _ProfileWriter(ABC):
         return variable is not None and variable.is_writable
 
     def default(self, index: int, sub: int = 0) -> int:
-        variable = self.find((index, sub))
-        return 0 if variable is None or variable.default is None else variable.default
+        return _default(self.objects, index, sub) or 0
 
     def number(self, index: int, sub: int) -> int | None:
         """Return the value read from the device, else the EDS's default; None if there is neither."""
-        if (index, sub) in self.ratings.numbers:
-            return self.ratings.numbers[index, sub]
-        variable = self.find((index, sub))
-        return None if variable is None else variable.default
+        return self.ratings.numbers.get((index, sub), _default(self.objects, index, sub))
 
     def is_factory(self, index: int, sub: int) -> bool:
         """Return whether an object can be written and was not read: its default is a factory setting at best."""
@@ -318,6 +320,12 @@ class _ProfileWriter(ABC):
     def refuse(self, reason: str) -> ConfigError:
         """Return the ConfigError, with the EDS's path, to raise if no profile can be made."""
         return ConfigError(f"EDS {self.eds}: {reason}")
+
+    def first(self, fitting: Iterable[_Record], reason: str) -> _Record:
+        """Return the first of the fitting PDOs. Raises ConfigError with the reason if there is none."""
+        for record in fitting:
+            return record
+        raise self.refuse(reason)
 
     def require(self, index: int, sub: int, what: str) -> None:
         """Raise ConfigError if the EDS lacks an object, or the object can't be mapped to a PDO.
@@ -367,8 +375,7 @@ class _ProfileWriter(ABC):
         by_eds = self.default(index, 1)
         if by_eds & NOT_VALID and not self.can_write(index, 1):
             return None
-        second = find_variable(self._numbered, index, 1)
-        other = 0 if second is None or second.default is None else second.default
+        other = _default(self._numbered, index, 1) or 0
         # An identifier without $NODEID belongs to the node id of the file; a DCF states it.
         node = 1 if other != by_eds else (read_eds(self.eds, None).node_id or 1)
         cob_id = (by_eds & 0x7FF) - node
@@ -536,9 +543,8 @@ class _DriveWriter(_ProfileWriter):
     def options(self, can_write: bool) -> list[str]:
         if can_write:
             return ["# Brake on a ramp, then without torque.", "quick_stop_option = 2", "fault_reaction_option = 2"]
-        variable = self.find((0x605A, 0))
-        option = -1 if variable is None or variable.default is None else variable.default
-        return [f"quick_stop_option = {option}"] if 0 <= option <= _MOST_OPTION else []
+        option = _default(self.objects, 0x605A, 0)
+        return [f"quick_stop_option = {option}"] if option is not None and 0 <= option <= _MOST_OPTION else []
 
     def further(self) -> list[str]:
         if self.facts is None or self.facts.patience == PatienceSettings():
@@ -673,37 +679,25 @@ class _DriveWriter(_ProfileWriter):
 
         If its mapping is fixed, it has no object that the host can't fill. Raises ConfigError if there is no such RPDO.
         """
-        wanted = ((0x6040, 0), (0x6071, 0))
-        for record in self.records(is_received=True):
-            known = {_SIGNAL_OBJECTS[name] for name in HOST_SIGNALS}
-            if record.room >= len(wanted) and self.find((0x6040, 0)):
-                return record
-            if not record.room and record.carries(*wanted) and {index for index, _ in record.entries} <= known:
-                return record
-        raise self.refuse("no RPDO takes 0x6040 (controlword) and 0x6071 (target torque) together")
+        known = {_SIGNAL_OBJECTS[name] for name in HOST_SIGNALS}
+        fitting = (
+            record
+            for record in self.records(is_received=True)
+            if record.takes(*_COMMANDED) and (record.room or {index for index, _ in record.entries} <= known)
+        )
+        return self.first(fitting, "no RPDO takes 0x6040 (controlword) and 0x6071 (target torque) together")
 
     def frames(self) -> list[str]:
         self._check()
-        sample = ((0x6064, 0), (0x606C, 0))
+        sample, statusword = ((0x6064, 0), (0x606C, 0)), (0x6041, 0)
         sent = self.records(is_received=False)
-        feedback = next(
-            (
-                record
-                for record in sent
-                if record.can_be(1) and (record.room >= len(sample) or (not record.room and record.carries(*sample)))
-            ),
-            None,
-        )
-        if feedback is None:
-            raise self.refuse("no TPDO brings 0x6064 (position) and 0x606C (velocity) together on every SYNC")
+        fitting = (record for record in sent if record.can_sync and record.takes(*sample))
+        reason = "no TPDO brings 0x6064 (position) and 0x606C (velocity) together on every SYNC"
+        feedback = self.first(fitting, reason)
         lines = self.pdo("Feedback", feedback, sample)
-        if not (not feedback.room and feedback.carries((0x6041, 0))):
-            status = next(
-                (record for record in sent if record is not feedback and (record.room or record.carries((0x6041, 0)))),
-                None,
-            )
-            if status is None:
-                raise self.refuse("no TPDO is left for 0x6041 (statusword)")
+        if feedback.room or not feedback.carries(statusword):
+            others = (record for record in sent if record is not feedback and record.takes(statusword))
+            status = self.first(others, "no TPDO is left for 0x6041 (statusword)")
             # Without an inhibit time, a torque that changes all the time would fill the bus.
             is_bounded = self.has(_SENT + status.number - 1, 3)
             wanted = [place for place in _STATUS_OBJECTS if is_bounded or place != (0x6077, 0)]
@@ -713,60 +707,55 @@ class _DriveWriter(_ProfileWriter):
                     f"its statusword comes on change only, as 0x{_SENT + status.number - 1:X}:5 (event timer) is not "
                     "there: a lost one is not noticed"
                 )
-        return [*lines, *self.pdo("Command", self._command(), ((0x6040, 0), (0x6071, 0)))]
+        return [*lines, *self.pdo("Command", self._command(), _COMMANDED)]
 
 
 class _SensorWriter(_ProfileWriter):
     kind = SENSOR
 
     def scale(self) -> list[str]:
-        torque_Nm = self.answers.get("torque_Nm", self.ratings.torque_Nm)
-        if torque_Nm is None:
-            torque_Nm = self._by_eds()
+        torque_Nm = self.answers.get("torque_Nm", self._torque_of_count())
         if torque_Nm is not None:
             return [f"torque_Nm = {torque_Nm!r}"]
-        place = next((place for place in _TORQUE_OBJECTS if self.has(*place)), _TORQUE_OBJECTS[0])
-        variable = self.find(place)
+        variable = self.find(self._torque())
         guess_Nm = _GUESSED_TORQUE_NM[0 if variable is None or variable.bits > 16 else 1]
         return [
             self.guess("torque_Nm", guess_Nm, f"{guess_Nm:g}: the worth of a count is in the data sheet"),
             f"torque_Nm = {guess_Nm!r}",
         ]
 
-    def _by_eds(self) -> float | None:
-        """Return the torque of one count, Nm, by unit and digits of the EDS, 0x6131 and 0x6132.
+    def _torque_of_count(self) -> float | None:
+        """Return the torque of one count, Nm, by its unit, 0x6131, and its digits, 0x6132.
 
-        None if they are missing, or are writable and were not read, or the unit is no torque.
+        None if they are missing, or are writable and were not read, the unit is no torque, or the size is beyond any
+        sensor.
         """
         if self.is_factory(0x6131, 1) or self.is_factory(0x6132, 1):
             return None
-        return torque_of_count(self.number(0x6131, 1), self.number(0x6132, 1))
+        unit, digits = self.number(0x6131, 1), self.number(0x6132, 1)
+        if unit is None or digits is None or unit & 0x00FFFFFF != NEWTON_METRE:
+            return None
+        prefix = unit >> PREFIX_SHIFT
+        exponent = (prefix - 256 if prefix > 127 else prefix) - digits
+        return 10.0**exponent if abs(exponent) < 12 else None
+
+    def _torque(self) -> _Place:
+        """Return the object that holds the torque. Raises ConfigError if the EDS has none that fits a frame."""
+        for place in _TORQUE_OBJECTS:
+            if self.has(*place):
+                return place
+        hint = "; its 0x6130:1 is a float, which no frame of a cycle can hold" if self.has(0x6130, 1) else ""
+        raise self.refuse(f"no 0x9130:1 or 0x7130:1 (torque), which a sensor needs{hint}")
 
     def frames(self) -> list[str]:
-        torque = next((place for place in _TORQUE_OBJECTS if self.has(*place)), None)
-        if torque is None:
-            hint = "; its 0x6130:1 is a float, which no frame of a cycle can hold" if self.has(0x6130, 1) else ""
-            raise self.refuse(f"no 0x9130:1 or 0x7130:1 (torque), which a sensor needs{hint}")
+        torque = self._torque()
         self.require(*torque, "torque")
         sent = self.records(is_received=False)
-        record = next((one for one in sent if one.can_be(1) and (one.room or one.carries(torque))), None)
-        if record is None:
-            raise self.refuse(f"no TPDO brings {ObjectName(*torque)} (torque) on every SYNC")
+        fitting = (one for one in sent if one.can_sync and one.takes(torque))
+        record = self.first(fitting, f"no TPDO brings {ObjectName(*torque)} (torque) on every SYNC")
         lines = self.pdo("Torque", record, [torque])
         status = next((one for one in sent if one is not record and one.room), None)
         mapped = [] if status is None else self.fill([(0x6150, 1), (0x1001, 0)], status.room)
         if status is not None and (0x6150, 1) in mapped:
             lines += self.pdo("Status", status, mapped, _EVENT_TYPE)
         return lines
-
-
-def torque_of_count(unit: int | None, digits: int | None) -> float | None:
-    """Return the torque of one count of a sensor, Nm, by its unit, 0x6131, and its digits, 0x6132.
-
-    None if either is unknown, the unit is not newton metre, or the size is beyond any sensor.
-    """
-    if unit is None or digits is None or unit & 0x00FFFFFF != NEWTON_METRE:
-        return None
-    prefix = unit >> PREFIX_SHIFT
-    exponent = (prefix - 256 if prefix > 127 else prefix) - digits
-    return 10.0**exponent if abs(exponent) < 12 else None

@@ -9,7 +9,7 @@ Everything is counted frame by frame; values are decoded by `BusView.describe`.
 """
 
 import struct
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,7 +23,7 @@ from adacd_hil.lab.stated_bounds import LISTEN_S
 from adacd_hil.wire.bus import Bus, Frame, Tap
 from adacd_hil.wire.codec import Codec, MessageCodec
 from adacd_hil.wire.contract_frames import HEARTBEAT_ID
-from adacd_hil.wire.dbc_decoder import DbcDecoder, MessageDecoder
+from adacd_hil.wire.dbc_decoder import DbcDecoder
 from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
@@ -35,7 +35,6 @@ BETWEEN_READS_S = 0.02
 _ANSWER_S = 0.1
 _UPLOAD_DEVICE_TYPE = bytes.fromhex("4000100000000000")
 _IDENTITY = ("vendor", "product", "revision", "serial")
-_CONTRACT = ("wire_version", "layout_digest")
 
 NMT_STATES = {number: name.lower() for number, name in STATES.items()}
 _PROFILES = {401: "I/O", 402: "drive", 404: "measuring device", 405: "PLC", 406: "encoder", 408: "hydraulic drive"}
@@ -111,23 +110,6 @@ class Node:
         if self.nmt_state is None:
             return "? (no heartbeat)"
         return NMT_STATES.get(self.nmt_state, f"unknown ({self.nmt_state})")
-
-
-@dataclass(frozen=True)
-class Expected:
-    """A node that the configuration expects. None: any value will do, also a missing one.
-
-    profile_number: low word of 0x1000.
-    """
-
-    name: str
-    node_id: int
-    vendor: int | None
-    product: int | None
-    profile_number: int | None = None
-    serial: int | None = None
-    wire_version: int | None = None
-    layout_digest: int | None = None
 
 
 @dataclass(frozen=True)
@@ -211,16 +193,20 @@ def _identify(canopen: CanopenBus, node: Node, has_contract: bool) -> None:
     try:
         name = read_object(remote, 0x1008)
         node.name = None if name is None else name.rstrip(b"\0").decode("ascii", "replace").strip()
-        register = read_object(remote, 0x1001)
-        node.error_register = None if register is None else int.from_bytes(register, "little")
+        node.error_register = read_number(remote, 0x1001)
         for subindex, what in enumerate(_IDENTITY, start=1):
-            value = read_object(remote, 0x1018, subindex)
-            setattr(node, what, None if value is None else int.from_bytes(value, "little"))
-        for subindex, what in enumerate(_CONTRACT, start=1):
-            value = read_object(remote, 0x2000, subindex) if has_contract else None
-            setattr(node, what, None if value is None else int.from_bytes(value, "little"))
+            setattr(node, what, read_number(remote, 0x1018, subindex))
+        if has_contract:
+            node.wire_version = read_number(remote, 0x2000, 1)
+            node.layout_digest = read_number(remote, 0x2000, 2)
     except DeviceError:
         node.answers = False  # it fell silent or refuses: values read so far stay
+
+
+def read_number(remote: Any, index: int, sub: int = 0) -> int | None:
+    """Read an object of a node as an unsigned number, None if it is missing. Raises DeviceError as `read_object`."""
+    data = read_object(remote, index, sub)
+    return None if data is None else int.from_bytes(data, "little")
 
 
 def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
@@ -239,37 +225,13 @@ def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
     return others
 
 
-def expected_nodes(slaves: Iterable[Slave], codec: Codec | None = None) -> list[Expected]:
-    """Return the nodes that an arm's master expects, None where any value will do.
+def compare(found: Survey, slaves: Iterable[Slave], codec: Codec | None = None) -> dict[int, str]:
+    """Return, by node id, how each node differs from the arm's slaves, or "" if it fits.
 
-    Vendor, product and profile number are their EDS's, serial numbers their profile's. codec: if given, nodes whose
-    profile has the object 0x2000 are expected with its wire version and layout digest.
+    Texts are such as "unexpected" or "missing: NAME expected". codec: nodes whose profile has the object 0x2000 must
+    have its wire version and layout digest.
     """
-    expected = []
-    for slave in slaves:
-        is_checked = slave.device.settings.identity == "eds"
-        vendor, product, device_type = (
-            slave.default(*place) if is_checked and slave.has(*place) else None
-            for place in ((0x1018, 1), (0x1018, 2), (0x1000, 0))
-        )
-        profile_number = None if device_type is None else device_type & 0xFFFF
-        serials = slave.device.settings.serial
-        serial = serials[slave.device.joint] if serials else None
-        version, digest = None, None
-        if codec is not None and slave.device.settings.contract_object:
-            version, digest = codec.wire_version, codec.layout_digest
-        expected.append(
-            Expected(slave.name, slave.node_id, vendor, product, profile_number, serial, version, digest),
-        )
-    return expected
-
-
-def compare(found: Survey, expected: list[Expected]) -> dict[int, str]:
-    """Return, by node id, how each node, found or expected, differs from the configuration.
-
-    "" if it fits, "unexpected" if the configuration lacks it, else a text such as "missing: NAME expected".
-    """
-    wanted = {node.node_id: node for node in expected}
+    wanted = {slave.node_id: slave for slave in slaves}
     present = {node.node_id: node for node in found.nodes}
     verdicts = {}
     for node_id in sorted({*wanted, *present}):
@@ -278,34 +240,43 @@ def compare(found: Survey, expected: list[Expected]) -> dict[int, str]:
         elif node_id not in wanted:
             verdicts[node_id] = "unexpected"
         else:
-            verdicts[node_id] = _difference(present[node_id], wanted[node_id])
+            verdicts[node_id] = _difference(present[node_id], wanted[node_id], codec)
     return verdicts
 
 
-def _difference(node: Node, wanted: Expected) -> str:
+def _difference(node: Node, slave: Slave, codec: Codec | None) -> str:
+    """Return the first difference of a node from its slave as text, "" without one. codec: as of `compare`.
+
+    Vendor, product and profile number must be the EDS's, the serial number the profile's; those that these lack are not
+    compared.
+    """
     if not node.answers:
-        return f"{wanted.name} expected; does not answer SDO"
-    profile_number = None if node.device_type is None else node.device_type & 0xFFFF
-    for what, found, value, form in (
-        ("profile number", profile_number, wanted.profile_number, "{}"),
-        ("vendor", node.vendor, wanted.vendor, "0x{:X}"),
-        ("product", node.product, wanted.product, "0x{:X}"),
-        ("serial number", node.serial, wanted.serial, "{}"),
+        return f"{slave.name} expected; does not answer SDO"
+    settings = slave.device.settings
+    vendor, product, device_type = (
+        slave.default(*place) if settings.identity == "eds" and slave.has(*place) else None
+        for place in ((0x1018, 1), (0x1018, 2), (0x1000, 0))
+    )
+    serial = settings.serial[slave.device.joint] if settings.serial else None
+    version, digest = None, None
+    if codec is not None and settings.contract_object:
+        version, digest = codec.wire_version, codec.layout_digest
+    for what, told, value, form in (
+        ("profile number", _low_word(node.device_type), _low_word(device_type), "is not {1}"),
+        ("vendor", node.vendor, vendor, "is not 0x{1:X}"),
+        ("product", node.product, product, "is not 0x{1:X}"),
+        ("serial number", node.serial, serial, "is not {1}"),
+        ("wire version", node.wire_version, version, "0x{0:08X}, the contract has 0x{1:08X}"),
+        ("layout digest", node.layout_digest, digest, "0x{0:08X}, the contract has 0x{1:08X}"),
     ):
-        if value is None:
-            continue
-        if found is None:
-            return f"{wanted.name} expected; tells no {what}"
-        if found != value:
-            return f"{wanted.name} expected; {what} is not {form.format(value)}"
-    for what, found, value in (
-        ("wire version", node.wire_version, wanted.wire_version),
-        ("layout digest", node.layout_digest, wanted.layout_digest),
-    ):
-        if value is not None and found != value:
-            told = f"tells no {what}" if found is None else f"{what} 0x{found:08X}, the contract has 0x{value:08X}"
-            return f"{wanted.name} expected; {told}"
+        if value is not None and told != value:
+            difference = f"tells no {what}" if told is None else f"{what} {form.format(told, value)}"
+            return f"{slave.name} expected; {difference}"
     return ""
+
+
+def _low_word(number: int | None) -> int | None:
+    return None if number is None else number & 0xFFFF
 
 
 def message_name(codec: Codec | DbcDecoder, can_id: int) -> str:
@@ -321,45 +292,6 @@ _WINDOW_NS = 1_000_000_000
 """Rates are means over one to two of these."""
 
 
-class _Entry:
-    """Counts and checks of one identifier's frames so far. message: None if the contract lacks it.
-
-    receiver: of its end-to-end check, None if unprotected. valid: data of the last frame that passed its checks, None
-    before.
-    """
-
-    def __init__(self, message: MessageCodec | MessageDecoder | None) -> None:
-        self.message = message
-        self.receiver = message.receiver() if isinstance(message, MessageCodec) and message.is_protected else None
-        self.count = 0
-        self.last_ns = 0
-        self.wrong_lengths = 0
-        self.data = b""
-        self.valid: bytes | None = None
-
-    def accept(self, frame: Frame) -> None:
-        self.count += 1
-        self.last_ns = frame.t_ns
-        self.data = frame.data
-        if self.message is None:
-            return
-        if not self.message.takes(len(frame.data)):
-            self.wrong_lengths += 1
-        elif self.receiver is None or self.receiver.check(frame.data).is_valid:
-            self.valid = frame.data
-
-    @property
-    def lost(self) -> int:
-        return 0 if self.receiver is None else self.receiver.counts[E2eStatus.OK_SOME_LOST]
-
-    @property
-    def errors(self) -> int:
-        if self.receiver is None:
-            return self.wrong_lengths
-        counts = dict(self.receiver.tally())
-        return self.wrong_lengths + sum(count for status, count in counts.items() if not status.is_valid)
-
-
 class BusView:
     """Counts, checks and decodes the frames of a bus for a listener; `describe` returns the results."""
 
@@ -368,39 +300,47 @@ class BusView:
 
         Raises ValueError for a bit rate of 0.
         """
-        self.frames = 0
-        self._codec = codec
         from adacd_hil.lab.commission.load_meter import LoadMeter
 
+        self.frames = 0
+        self._codec = codec
         self._load = LoadMeter(bitrate, data_bitrate, t_ns)
-        self._entries: dict[int, _Entry] = {}
-        self._error_frames = 0
+        self._traffic = Traffic()
         self._marks: deque[tuple[int, dict[int, int]]] = deque([(t_ns, {})], maxlen=2)
         self._strange_frames = 0
+        self._wrong_lengths: Counter[int] = Counter()
+        self._valid: dict[int, bytes] = {}  # of the last frame that passed its checks, by identifier
+        self._receivers = {
+            can_id: message.receiver()
+            for can_id, message in codec.by_id.items()
+            if isinstance(message, MessageCodec) and message.is_protected
+        }
 
     def accept(self, frame: Frame) -> None:
         """Add a frame to the counts, the bus load, and the statistics and checks of its identifier."""
         self.frames += 1
+        self._traffic.count_frame(frame)
         if frame.is_error:
-            self._error_frames += 1
             return
         try:
             self._load.count_frame(frame)
         except ValueError:  # a length that the contract's bus can't carry
             self._strange_frames += 1
-        entry = self._entries.get(frame.can_id)
-        if entry is None:
-            entry = self._entries[frame.can_id] = _Entry(self._codec.by_id.get(frame.can_id))
-        entry.accept(frame)
+        message, receiver = self._codec.by_id.get(frame.can_id), self._receivers.get(frame.can_id)
+        if message is None:
+            return
+        if not message.takes(len(frame.data)):
+            self._wrong_lengths[frame.can_id] += 1
+        elif receiver is None or receiver.check(frame.data).is_valid:
+            self._valid[frame.can_id] = frame.data
 
     def restart_counters(self) -> None:
         """Let the counter of each protected message jump once without being counted as lost frames.
 
         For frames that this computer has lost, not the bus.
         """
-        for entry in self._entries.values():
-            if entry.receiver is not None:
-                entry.receiver.restart_sequence()
+        for receiver in self._receivers.values():
+            receiver.restart_sequence()
 
     def describe(self, t_ns: int, node_id: int | None = None) -> dict[str, Any]:
         """Return counts, nodes and messages as of `t_ns` for JSON, and the bus load since the call before, percent.
@@ -413,56 +353,57 @@ class BusView:
         """
         mark_ns, counts = self._marks[0]
         elapsed_s = (t_ns - mark_ns) * 1e-9
-        wanted = {
-            can_id: self._entries[can_id]
-            for can_id in sorted(self._entries)
-            if node_id is None or (can_id <= MAX_STANDARD_ID and can_id & 0x7F == node_id)
-        }
+        wanted = [
+            talk
+            for talk in self._traffic.sorted()
+            if node_id is None or (talk.can_id <= MAX_STANDARD_ID and talk.can_id & 0x7F == node_id)
+        ]
         described = {
             "frames": self.frames,
-            "error_frames": self._error_frames,
+            "error_frames": self._traffic.error_frames,
             "strange_frames": self._strange_frames,
             "load_percent": round(self._load.take_percent(t_ns), 2),
             "nodes": [
-                self._node(can_id & 0x7F, entry, t_ns)
-                for can_id, entry in wanted.items()
-                if can_id & ~0x7F == HEARTBEAT_ID and can_id != HEARTBEAT_ID
+                self._node(talk, t_ns)
+                for talk in wanted
+                if talk.can_id & ~0x7F == HEARTBEAT_ID and talk.can_id != HEARTBEAT_ID
             ],
             "messages": [
-                self._message(
-                    can_id, entry, t_ns, (entry.count - counts.get(can_id, 0)) / elapsed_s if elapsed_s else 0
-                )
-                for can_id, entry in wanted.items()
+                self._message(talk, t_ns, (talk.count - counts.get(talk.can_id, 0)) / elapsed_s if elapsed_s else 0)
+                for talk in wanted
             ],
         }
         if t_ns - self._marks[-1][0] >= _WINDOW_NS:
-            self._marks.append((t_ns, {can_id: entry.count for can_id, entry in self._entries.items()}))
+            self._marks.append((t_ns, {talk.can_id: talk.count for talk in self._traffic.sorted()}))
         return described
 
-    def _node(self, node_id: int, entry: _Entry, t_ns: int) -> dict[str, Any]:
-        state = entry.data[0] & 0x7F if entry.data else -1
-        name = message_name(self._codec, HEARTBEAT_ID + node_id).removesuffix("Heartbeat")
+    def _node(self, talk: Talk, t_ns: int) -> dict[str, Any]:
+        state = talk.data[0] & 0x7F if talk.data else -1
+        name = message_name(self._codec, talk.can_id).removesuffix("Heartbeat")
         return {
-            "node_id": node_id,
+            "node_id": talk.can_id & 0x7F,
             "name": "" if name.startswith("(") else name,
             "state": NMT_STATES.get(state, "unknown"),
-            "age_s": round((t_ns - entry.last_ns) * 1e-9, 3),
+            "age_s": round((t_ns - talk.last_ns) * 1e-9, 3),
         }
 
-    def _message(self, can_id: int, entry: _Entry, t_ns: int, rate_Hz: float) -> dict[str, Any]:
-        message, valid = entry.message, entry.valid
+    def _message(self, talk: Talk, t_ns: int, rate_Hz: float) -> dict[str, Any]:
+        can_id = talk.can_id
+        message, valid, receiver = self._codec.by_id.get(can_id), self._valid.get(can_id), self._receivers.get(can_id)
         values = () if message is None or valid is None else message.decode_named(valid)
+        checks = {} if receiver is None else dict(receiver.tally())
+        invalid = sum(count for status, count in checks.items() if not status.is_valid)
         return {
             "id": can_id,
             "message": message_name(self._codec, can_id),
             "is_known": message is not None,
-            "is_protected": entry.receiver is not None,
-            "count": entry.count,
+            "is_protected": receiver is not None,
+            "count": talk.count,
             "rate_Hz": round(rate_Hz, 1),
-            "age_s": round((t_ns - entry.last_ns) * 1e-9, 4),
-            "lost": entry.lost,
-            "errors": entry.errors,
-            "data": entry.data.hex(),
+            "age_s": round((t_ns - talk.last_ns) * 1e-9, 4),
+            "lost": checks.get(E2eStatus.OK_SOME_LOST, 0),
+            "errors": self._wrong_lengths[can_id] + invalid,
+            "data": talk.data.hex(),
             "values": {name: value for name, value, _ in values},
             "units": {name: unit for name, _, unit in values},
         }

@@ -147,17 +147,13 @@ class TareSession:
         )
 
     def _measure_poses(self) -> list[Pose]:
-        count = self.settings.tare.poses
-        poses: list[Pose] = []
-        while len(poses) < count:
-            number = len(poses) + 1
-            if poses:
-                pose = self._measure_next_pose(poses[-1], number)
-            else:
-                self.progress(f"pose 1 of {count}: measuring for {self.settings.tare.window_s:g} s, keep off the arm")
-                pose = self._measure()
-            poses.append(pose)
-            self.progress(f"pose {number} of {count}: {_describe_pose(pose)}")
+        tare = self.settings.tare
+        self.progress(f"pose 1 of {tare.poses}: measuring for {tare.window_s:g} s, keep off the arm")
+        poses = [self._measure()]
+        for number in range(2, tare.poses + 1):
+            self.progress(f"pose {number - 1} of {tare.poses}: {_describe_pose(poses[-1])}")
+            poses.append(self._measure_next_pose(poses[-1], number))
+        self.progress(f"pose {tare.poses} of {tare.poses}: {_describe_pose(poses[-1])}")
         return poses
 
     def _measure_next_pose(self, last: Pose, number: int) -> Pose:

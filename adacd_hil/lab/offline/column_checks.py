@@ -76,11 +76,6 @@ class RecordingFinding(NamedTuple):
     is_dead: bool = False
     is_wrong: bool = False
 
-    @property
-    def is_harmless(self) -> bool:
-        """Whether contacts can be detected in spite of the finding: neither is_dead nor is_wrong."""
-        return not (self.is_dead or self.is_wrong)
-
 
 class _Columns(NamedTuple):
     """All samples of some recordings (k, n), one recording after the other.
@@ -105,7 +100,7 @@ def find_faults(
     recordings = [*fitted, tested]
     found = list(column_faults(described, recordings))
     still = np.ptp(samples(recordings, "q"), axis=0) < STILL_RAD
-    for part, records in (("fit", fitted), ("test", [tested])):
+    for part, records in (("fitted", fitted), ("tested", [tested])):
         found += _of_rest(described, part, records, still)
     if all(recording.has_velocities for recording in recordings):
         found += _of_velocities(described, recordings)
@@ -376,14 +371,14 @@ def _of_rest(
 ) -> Iterator[RecordingFinding]:
     """Report joints that rest in the fitted, or the tested, part although they move in the other one.
 
-    part: "fit" or "test", for the text. recordings: of this part. still (n,): joints that rest in both.
+    part: "fitted" or "tested", for the text. recordings: of this part. still (n,): joints that rest in both.
     """
     rests = np.ptp(samples(recordings, "q"), axis=0) < STILL_RAD
     joints = np.flatnonzero(rests & ~still).tolist()
     if joints:
         names = "the arm" if rests.all() else joined_names([described.urdf.joint_names[i] for i in joints], len(rests))
         yield RecordingFinding(
-            f"{names} does not move in the part that is {'fitted' if part == 'fit' else 'tested'}",
+            f"{names} does not move in the part that is {part}",
             "choose what is fitted with --from and --until, and other motion for --test",
             is_dead=bool(rests.all()),
         )

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple, TextIO
 
 from adacd_hil.file_access import open_input
 from adacd_hil.lab.offline.recorded_columns import RecordedColumns, RecordedRows
-from adacd_hil.lab.offline.recording_map import ISO, RecordingMap, unit_of
+from adacd_hil.lab.offline.recording_map import ISO, TIME_S, RecordingMap, unit_of
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.remedies import nearest_name
@@ -70,10 +70,10 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
     read = RecordedRows(path, len(columns), described.time_s, span)
     if not columns[0].name:
         read.notes.append(f"no column of times: a row every {described.sampling.period_s:g} s (sampling.period_s)")
-    reader = _RowReader(path, columns, described, len(head))
-    for number, cells in rows if described.csv.has_header else chain([first], rows):
-        if row := reader.read(number, cells, read):
-            read.append(number, row)
+    if not described.csv.has_header:
+        rows = chain([first], rows)
+    for number, row in _numbers(path, rows, columns, described, len(head), read):
+        read.append(number, row)
         if read.is_past_span:
             break
     names = [column.name for column in columns[1 : len(columns) - bool(described.columns.contact)]]
@@ -116,11 +116,16 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
 def opened_text(path: Path) -> Iterator[TextIO]:
     """Open a text file for the block.
 
-    Raises LogError if the file can't be read or has another format, and, from the block, if it is no text in UTF-8.
+    Raises LogError if the file can't be read or its first bytes are those of another format, and, from the block, if it
+    is no text in UTF-8, with or without a byte-order mark.
     """
     try:
-        with _open_text(path) as file:
-            yield file
+        with open_input(path) as file:
+            begin = file.peek(16)
+            for magic, kind in _KINDS_OF_FILE:
+                if begin.startswith(magic):
+                    raise LogError(f"recording {path} is {kind}")
+            yield io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
     except UnicodeDecodeError:
         raise LogError(f"recording {path} is no text in UTF-8") from None
     except OSError as error:
@@ -137,20 +142,6 @@ def split_rows(path: Path, lines: Iterable[str], delimiter: str) -> Iterator[lis
         yield from rows
     except csv.Error as error:
         raise LogError(f"recording {path}, row {rows.line_num}: {error}") from None
-
-
-def _open_text(path: Path) -> TextIO:
-    """Open a text file in UTF-8, with or without a byte-order mark; the caller closes it.
-
-    Raises LogError, with the remedy, if its first bytes are those of another format; OSError if it can't be opened.
-    """
-    file = open_input(path)
-    begin = file.peek(16)
-    for magic, kind in _KINDS_OF_FILE:
-        if begin.startswith(magic):
-            file.close()
-            raise LogError(f"recording {path} is {kind}")
-    return io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
 
 
 def _columns(path: Path, heads: list[str], cells: int, described: RecordingMap) -> list[_Column]:
@@ -200,84 +191,79 @@ def _place(path: Path, name: str, heads: list[str], cells: int) -> int:
     raise ConfigError(f"recording {path} has no column {name!r}; {known}")
 
 
-class _RowReader:
-    """Reads the wanted cells of each row as numbers, and counts the rows, by which those without a time get one."""
+def _numbers(
+    path: Path,
+    rows: Iterable[tuple[int, list[str]]],
+    columns: list[_Column],
+    described: RecordingMap,
+    width: int,
+    into: RecordedRows,
+) -> Iterator[tuple[int, list[float]]]:
+    """Yield each row's number in the file and its values, the time first; an empty cell is nan.
 
-    def __init__(self, path: Path, columns: list[_Column], described: RecordingMap, cells: int) -> None:
-        self._path, self._columns, self._described, self._cells = path, columns, described, cells
-        self._first = self._rows = 0
-        self._has_time = bool(columns[0].name)
-        self._wanted = columns if self._has_time else columns[1:]
-        self._plain = [(column.place, column.read) for column in self._wanted]
-
-    def read(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
-        """Return the numbers of a row, the time first; an empty cell is nan.
-
-        None for a bad row, and for a row of units. A bad row is counted in `into`, a row of units noted there. number:
-        the row's in the file, from 1. Raises ConfigError if a row of units differs from the map.
-        """
-        self._rows += 1
-        self._first = self._first or number
-        if len(cells) < self._cells:
-            into.drop(_CUT, f"row {number}: it has {len(cells)} cells of {self._cells}")
-            return None
-        row: list[float] | None
+    Rows without a time column get one by their count. Bad rows are counted in `into`, a row of units is noted there.
+    width: number of cells of a row. Raises ConfigError if a row of units differs from the map.
+    """
+    has_time = bool(columns[0].name)
+    wanted = columns if has_time else columns[1:]
+    plain = [(column.place, column.read) for column in wanted]
+    first, count = 0, -1
+    for number, cells in rows:
+        first, count = first or number, count + 1
+        if len(cells) < width:
+            into.drop(_CUT, f"row {number}: it has {len(cells)} cells of {width}")
+            continue
         try:
-            row = [read(cells[place]) for place, read in self._plain]
+            row = [read(cells[place]) for place, read in plain]
         except (ValueError, OverflowError):
-            row = self._read_unusual_row(number, cells, into)
-        if row is None:
-            return None
-        if len(cells) > self._cells and any(map(str.strip, cells[self._cells :])):
-            into.drop(_UNREADABLE, f"row {number}: it has {len(cells)} cells, more than the head's {self._cells}")
-            return None
-        return row if self._has_time else [(self._rows - 1) * self._described.sampling.period_s, *row]
+            row, wrong = _read_unusual_row(cells, wanted)
+            if wrong and number == first and len(wrong) == len(wanted) and _is_of_units(path, wrong):
+                into.notes.append(f"row {number} names units ({', '.join(text for _, text in wrong)})")
+                first, count = number + 1, count - 1
+                continue
+            if wrong:
+                column, text = wrong[0]
+                remedy = _remedy(text, column, described)
+                into.drop(_UNREADABLE, f"row {number}: column {column.name!r} is {text!r}, no number{remedy}")
+                continue
+        if any(map(str.strip, cells[width:])):
+            into.drop(_UNREADABLE, f"row {number}: it has {len(cells)} cells, more than the head's {width}")
+            continue
+        yield number, row if has_time else [count * described.sampling.period_s, *row]
 
-    def _read_unusual_row(self, number: int, cells: list[str], into: RecordedRows) -> list[float] | None:
-        """Return the numbers of a row, nan for empty cells; None if a cell is no number.
 
-        A first row of units is noted in `into`, any other unreadable row counted there. Raises ConfigError for units
-        that differ from the map's.
-        """
-        row, wrong = [], []
-        for column in self._wanted:
-            text = cells[column.place].strip()
-            try:
-                row.append(column.read(text) if text else math.nan)
-            except (ValueError, OverflowError):
-                wrong.append((column, text))
-        if not wrong:
-            return row
-        if number == self._first and len(wrong) == len(self._wanted) and self._is_of_units(wrong):
-            into.notes.append(f"row {number} names units ({', '.join(text for _, text in wrong)})")
-            self._rows -= 1
-            self._first = number + 1
-            return None
-        column, text = wrong[0]
-        into.drop(_UNREADABLE, f"row {number}: column {column.name!r} is {text!r}{self._remedy(text, column)}")
-        return None
+def _read_unusual_row(cells: list[str], wanted: list[_Column]) -> tuple[list[float], list[tuple[_Column, str]]]:
+    """Return the numbers of a row, nan for empty cells, and the columns and texts of cells that are no numbers."""
+    row, wrong = [], []
+    for column in wanted:
+        text = cells[column.place].strip()
+        try:
+            row.append(column.read(text) if text else math.nan)
+        except (ValueError, OverflowError):
+            wrong.append((column, text))
+    return row, wrong
 
-    def _is_of_units(self, wrong: list[tuple[_Column, str]]) -> bool:
-        """Return whether unreadable cells, with their columns, have no digits, as in a row of units.
 
-        Raises ConfigError if one of them is a unit other than the map's.
-        """
-        for column, text in wrong:
-            unit = unit_of(text)
-            if unit and column.unit and unit != column.unit and not (column.unit == ISO):
-                raise ConfigError(
-                    f"recording {self._path}: its row of units says {unit!r} for column {column.name!r}, the map "
-                    f"{column.unit!r} (`units`)"
-                )
-        return not any(map(str.isdigit, "".join(text for _, text in wrong)))
+def _is_of_units(path: Path, wrong: list[tuple[_Column, str]]) -> bool:
+    """Return whether unreadable cells, with their columns, have no digits, as in a row of units.
 
-    def _remedy(self, text: str, column: _Column) -> str:
-        """Return the words ", no number", with the key of the map that would make the cell readable, if any."""
-        if self._described.csv.decimal == "." and text.count(",") == 1 and is_number(text, ","):
-            return ', no number: `csv.decimal` = "," reads it'
-        if column is self._columns[0] and is_iso_time(text):
-            return f', no number: `units.time` = "{ISO}" reads it'
-        return ", no number"
+    Raises ConfigError if one of them is a unit other than the map's.
+    """
+    for column, text in wrong:
+        unit = unit_of(text)
+        if unit and column.unit not in ("", ISO, unit):
+            raise ConfigError(
+                f"recording {path}: its row of units says {unit!r} for column {column.name!r}, the map "
+                f"{column.unit!r} (`units`)"
+            )
+    return not any(map(str.isdigit, "".join(text for _, text in wrong)))
+
+
+def _remedy(text: str, column: _Column, described: RecordingMap) -> str:
+    """Return the key of the map that would make a cell readable, as words that end a sentence, "" if there is none."""
+    if described.csv.decimal == "." and text.count(",") == 1 and is_number(text, ","):
+        return ': `csv.decimal` = "," reads it'
+    return f': `units.time` = "{ISO}" reads it' if column.unit in TIME_S and is_iso_time(text) else ""
 
 
 def read_number(text: str, decimal: str) -> float:

@@ -89,19 +89,19 @@ class _Equations(NamedTuple):
     """Normal equations of fit or test, by joint, from its filtered rows w (p,) and torques.
 
     A (n, p, p): sums of w w'. b (n, n, p): sums of w times each torque column. S (n, n): products of the torques. u
-    (n,), U (1,): products of the filtered constant with the torques, and with itself.
+    (n,), U: products of the filtered constant with the torques, and with itself.
     """
 
     A: Vector
     b: Vector
     S: Vector
     u: Vector
-    U: Vector
+    U: float
 
     @property
     def spread(self) -> Vector:
         """Sum of squares (n,) of each torque column about its best constant."""
-        return np.maximum(np.diag(self.S) - self.u**2 / np.maximum(self.U, 1e-18), 1e-18)
+        return np.maximum(np.diag(self.S) - self.u**2 / max(self.U, 1e-18), 1e-18)
 
 
 def find_readings(
@@ -172,7 +172,7 @@ def _thinned(records: list[Record], settings: OfflineSettings) -> list[Record]:
     step, room = _step(settings), round(_MOST_S / settings.period_s)
     kept = []
     for record in records:
-        rows = slice(0, max(0, min(room, len(record.q))), step)
+        rows = slice(0, max(0, room), step)
         room -= len(record.q)
         if len(record.q[rows]) > 1:
             kept.append(Record(record.q[rows], record.dq[rows], record.tau_J[rows]))
@@ -184,24 +184,19 @@ def _equations(records: list[Record], settings: OfflineSettings, motion: _Motion
 
     None if a record's filtered regressor isn't finite.
     """
-    model = motion.model
-    n, p = model.joints, len(model.parameter_names)
-    found = _Equations(*(np.zeros(shape) for shape in ((n, p, p), (n, n, p), (n, n), (n,), (1,))))
-    offset = model.place_of("offset").start
+    model, rows = motion.model, []
     for record in records:
         tau_J = record.tau_J if motion.R is None else record.tau_J @ motion.R.T
         dq = record.dq @ motion.T.T if motion.is_of_velocities else record.dq
-        W, tau = offline.fit_rows(model, Record(record.q @ motion.T.T, dq, tau_J), settings)
-        if not np.all(np.isfinite(W)):
-            return None
-        constant = W[:, 0, offset]
-        for i in range(n):
-            found.A[i] += W[:, i].T @ W[:, i]
-            found.b[i] += tau.T @ W[:, i]
-        found.S[:] += tau.T @ tau
-        found.u[:] += constant @ tau
-        found.U[:] += constant @ constant
-    return found
+        rows.append(offline.fit_rows(model, Record(record.q @ motion.T.T, dq, tau_J), settings))
+    if not all(np.all(np.isfinite(W)) for W, _ in rows):
+        return None
+    n, p = model.joints, len(model.parameter_names)
+    W = np.concatenate([np.zeros((0, n, p)), *(each for each, _ in rows)])
+    tau = np.concatenate([np.zeros((0, n)), *(each for _, each in rows)])
+    constant, by_joint = W[:, 0, model.place_of("offset").start], W.swapaxes(0, 1)
+    A, b = by_joint.swapaxes(1, 2) @ by_joint, tau.T @ by_joint
+    return _Equations(A, b, tau.T @ tau, constant @ tau, float(constant @ constant))
 
 
 def _judge(
@@ -256,7 +251,7 @@ def _torques(described: RecordingMap, most_turned: int, units: list[tuple[int, f
     """
     n, names = described.joints, described.urdf.joint_names
     straight, ones = tuple(range(n)), np.ones(n)
-    Nm = np.array(described.tau_J_Nm)
+    Nm = np.array(described.factors("tau_J"))
     for choice in itertools.product((1.0, -1.0), repeat=min(n, _MOST_SIGNS)):
         turned = tuple(i for i, sign in enumerate(choice) if sign < 0.0)
         signs = np.concatenate((choice, ones[len(choice) :]))
@@ -299,13 +294,13 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
     both_columns = "`columns.q`, `columns.tau_J`"
     for pair in itertools.combinations(range(n), 2):
         places, both = _exchanged(n, *pair), _both(names, pair)
-        swap, swap_torques = (_moved(units, places) for units in (described.q_rad, described.tau_J_Nm))
+        swap, swap_torques = (_moved(described.factors(key), places) for key in ("q", "tau_J"))
         yield _Motion(f"the positions of {both} are exchanged", "exchange them in `columns.q`", model, swap)
         text = f"{both} are exchanged, positions and torques"
         yield _Motion(text, f"exchange them in {both_columns}", model, swap, swap_torques)
     if n > 3:
         text, remedy = "the columns begin with the outermost joint", f"turn the order round in {both_columns}"
-        turned, turned_torques = (_moved(units, range(n)[::-1]) for units in (described.q_rad, described.tau_J_Nm))
+        turned, turned_torques = (_moved(described.factors(key), range(n)[::-1]) for key in ("q", "tau_J"))
         yield _Motion(text, remedy, model, turned, turned_torques)
     # A column may count from the base, or with the joint before, as behind belts: then torques do the same power.
     for i, (sign, what) in itertools.product(range(1, n), ((-1.0, "sum"), (1.0, "difference"))):

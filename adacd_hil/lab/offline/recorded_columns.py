@@ -122,7 +122,7 @@ class RecordedRows:
             )
         has_dq = len(names) > 2 * described.joints
         self._check_sources(table[:, 2 : 2 + len(names)], names)
-        units = np.array((*described.q_rad, *described.tau_J_Nm, *(described.dq_rad_s if has_dq else ())))
+        units = np.concatenate([described.factors(key) for key in ("q", "tau_J", "dq")[: 3 if has_dq else 2]])
         time_s, given = table[:, 1] * self._unit_s, table[:, 2 : 2 + len(units)]
         with np.errstate(over="ignore"):
             values = given * units

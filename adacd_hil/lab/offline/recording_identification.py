@@ -168,9 +168,8 @@ def identify(
         last = recordings[-1]
         if not last.stretches:
             raise LogError(f"{last.path}: no part is free of touches")
-        first, final = last.stretches[0], last.stretches[-1]
-        end_s = final.start_s + len(final.record.q) * last.period_s
-        split_s = first.start_s + FIT_SHARE * (end_s - first.start_s)
+        start_s, end_s = last.span_s
+        split_s = start_s + FIT_SHARE * (end_s - start_s)
         recordings[-1], tested = last.between(-np.inf, split_s), last.between(split_s, np.inf)
     tested = tested.free
     if not tested.stretches or not any(recording.stretches for recording in recordings):
@@ -206,9 +205,9 @@ _MOST_OVER: Final = 0.5
 def examined(described: RecordingMap, watched: Watched) -> Watched:
     """Return a watched recording with the defects for which its contacts can't be told, in `faults`.
 
-    Those are defects of columns that aren't harmless, else a torque over a threshold for over `_MOST_OVER` of the time.
+    Those are dead or wrong columns, else a torque over a threshold for over `_MOST_OVER` of the time.
     """
-    faults = [fault.text for fault in column_faults(described, [watched.recording]) if not fault.is_harmless]
+    faults = [fault.text for fault in column_faults(described, [watched.recording]) if fault.is_dead or fault.is_wrong]
     pairs = zip(watched.tau_ext_hat, watched.threshold, strict=True)
     is_over = np.concatenate([(np.abs(tau) > threshold).any(axis=1) for tau, threshold in pairs])
     if not faults and is_over.mean() > _MOST_OVER:
@@ -224,12 +223,15 @@ def _joined(parts: list[OfflineCertificate], tested: ForeignRecording) -> Offlin
     """
     weights = np.array([len(record.q) for record in tested.records], np.float64)
     weights /= weights.sum()
+    rms, largest, lack, threshold, margins = (
+        np.array(values) for values in zip(*(vars(part).values() for part in parts), strict=True)
+    )
     return OfflineCertificate(
-        residual_rms_Nm=np.sqrt(sum(w * part.residual_rms_Nm**2 for w, part in zip(weights, parts, strict=True))),
-        residual_max_Nm=np.max([part.residual_max_Nm for part in parts], axis=0),
-        lack_Nm=np.sqrt(sum(w * part.lack_Nm**2 for w, part in zip(weights, parts, strict=True))),
-        threshold_Nm=sum(w * part.threshold_Nm for w, part in zip(weights, parts, strict=True)),
-        margins=np.min([part.margins for part in parts], axis=0),
+        residual_rms_Nm=np.sqrt(weights @ rms**2),
+        residual_max_Nm=largest.max(axis=0),
+        lack_Nm=np.sqrt(weights @ lack**2),
+        threshold_Nm=weights @ threshold,
+        margins=margins.min(axis=0),
     )
 
 

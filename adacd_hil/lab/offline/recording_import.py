@@ -89,6 +89,12 @@ class ForeignRecording:
         return [stretch.record for stretch in self.stretches]
 
     @property
+    def span_s(self) -> tuple[float, float]:
+        """Begin of the first stretch and end of the last one, s since the recording's first row."""
+        last = self.stretches[-1]
+        return self.stretches[0].start_s, last.start_s + len(last.record.q) * self.period_s
+
+    @property
     def own_rows(self) -> Vector:
         """The rows of the file, in SI units (k, c), between the begin of the first stretch and the end of the last one.
 
@@ -96,9 +102,7 @@ class ForeignRecording:
         """
         if not self.stretches:
             return self.columns.values[:0]
-        last = self.stretches[-1]
-        bounds = (self.stretches[0].start_s, last.start_s + len(last.record.q) * self.period_s)
-        first, end = np.searchsorted(self.columns.time_s - self.columns.begin_s, bounds)
+        first, end = np.searchsorted(self.columns.time_s - self.columns.begin_s, self.span_s)
         rows = self.columns.values[first:end]
         return rows[np.isfinite(rows).all(axis=1)]
 
@@ -196,9 +200,9 @@ def recording_of(
         if room < 0:
             raise LogError(f"{path}: more than {MOST_ROWS} samples of {period_s:g} s")
         grid_s = time_s[rows[0]] + period_s * np.arange(count)
-        columns = [np.interp(grid_s, time_s[rows], values[rows, column]) for column in range(values.shape[1])]
-        q, tau_J = np.column_stack(columns[:n]), np.column_stack(columns[n : 2 * n])
-        dq = np.column_stack(columns[2 * n :]) if has_dq else derive(q, period_s, window)
+        sampled = np.column_stack([np.interp(grid_s, time_s[rows], column) for column in values[rows].T])
+        q, tau_J = sampled[:, :n], sampled[:, n : 2 * n]
+        dq = sampled[:, 2 * n :] if has_dq else derive(q, period_s, window)
         is_touched = None
         if touched is not None:
             is_touched = touched[rows][np.searchsorted(time_s[rows], grid_s, side="right") - 1]

@@ -24,6 +24,7 @@ TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, ISO: 1.0}
 _ANGLE = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
 _SPEED = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0}
 _TORQUE = {"Nm": 1.0, "mNm": 1e-3, "A": 1.0, "mA": 1e-3}
+_UNITS = {"q": _ANGLE, "dq": _SPEED, "tau_J": _TORQUE}
 _USUAL_PERIOD_S = (2e-4, 0.1)
 _SPELLINGS = {
     **{unit.casefold(): unit for units in (TIME_S, _ANGLE, _SPEED, _TORQUE) for unit in units},
@@ -166,22 +167,13 @@ class RecordingMap:
         """One unit of the recorded times in s; 1 for dates."""
         return TIME_S[self.units.time]
 
-    @property
-    def q_rad(self) -> tuple[float, ...]:
-        """Factor from each recorded position to rad: unit times scale (n,)."""
-        return tuple(_ANGLE[self.units.q] * factor for factor in self._factors(self.scale.q))
+    def factors(self, key: str) -> tuple[float, ...]:
+        """Factor from each recorded value to rad, rad/s or Nm: unit times scale (n,). key: "q", "dq" or "tau_J"."""
+        unit = _UNITS[key][getattr(self.units, key)]
+        return tuple(unit * factor for factor in self._scale("tau_J" if key == "tau_J" else "q"))
 
-    @property
-    def dq_rad_s(self) -> tuple[float, ...]:
-        """Factor from each recorded velocity to rad/s: unit times the scale of positions (n,)."""
-        return tuple(_SPEED[self.units.dq] * factor for factor in self._factors(self.scale.q))
-
-    @property
-    def tau_J_Nm(self) -> tuple[float, ...]:
-        """Factor from each recorded torque or current to Nm: unit times scale (n,)."""
-        return tuple(_TORQUE[self.units.tau_J] * factor for factor in self._factors(self.scale.tau_J))
-
-    def _factors(self, given: tuple[float, ...]) -> tuple[float, ...]:
+    def _scale(self, key: str) -> tuple[float, ...]:
+        given: tuple[float, ...] = getattr(self.scale, key)
         return given or (1.0,) * self.joints
 
     def scaled(self, key: str, factors: Vector) -> str:
@@ -189,7 +181,7 @@ class RecordingMap:
 
         key: "q" or "tau_J".
         """
-        values = np.array(self._factors(getattr(self.scale, key))) * factors
+        values = np.array(self._scale(key)) * factors
         return f"`scale.{key}` = [{', '.join(f'{value:g}' for value in values)}]"
 
     def settings(self, noise_Nm: tuple[float, ...], period_s: float, velocity_noise_rad_s: float) -> OfflineSettings:

@@ -176,7 +176,7 @@ def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
 def _shares(fit: Fitted) -> tuple[JointShare, ...]:
     """Return each joint's result of the test, in their order: explained share, margin, rms torque, explained or not."""
     parts = [offline.filtered(fit.model, record, fit.estimate, fit.settings) for record in fit.tested.records]
-    torque, residual = (np.concatenate([getattr(part, name) for part in parts]) for name in ("torque", "residual"))
+    torque, residual = (np.concatenate([getattr(part, name) for part in parts]) for name in ("tau_f", "tau_ext_hat"))
     unit = np.concatenate([part.unit for part in parts])
     spread = torque - np.outer(unit, unit @ torque / (unit @ unit))
     squares, left = np.sum(spread**2, axis=0), np.sum(residual**2, axis=0)

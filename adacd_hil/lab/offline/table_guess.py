@@ -198,10 +198,10 @@ def _by_heads(guess: TableGuess, joint_names: Sequence[str]) -> None:
 
     Positions, velocities and torques need one column per joint. Currents are the torques if there are no torques.
     """
-    heads = [_taken_apart(place, text, joint_names) for place, text in enumerate(guess.heads)]
-    heads = [head._replace(unit=guess.units_below[head.place] or head.unit) for head in heads]
     groups: dict[tuple[tuple[str, ...], str], list[_Head]] = {}
-    for head in heads:
+    for place, (text, unit) in enumerate(zip(guess.heads, guess.units_below, strict=True)):
+        head = _taken_apart(place, text, joint_names)
+        head = head._replace(unit=unit or head.unit)
         groups.setdefault((head.words, head.unit), []).append(head)
     n = len(joint_names)
     chosen: dict[str, tuple[tuple[int, int, int], list[_Head]]] = {}

@@ -22,14 +22,12 @@ algebra: Featherstone, Rigid Body Dynamics Algorithms, 2008, chapters 2 and 5. T
 
 **Parameters.** For each link, about the origin of its joint and in the axes of its frame, in the order of
 `LINK_PARAMETERS`: mass, first moment, inertia; together theta_full (10 n,). The torque doesn't show all of them:
-`find_base` picks a smallest set of columns that spans the others and gives the map theta_base = B theta_full. A
-regressor for the filter has the chosen columns first, then F_v and F_c of each joint, then those that the caller adds.
+`find_base` picks a smallest set of columns that spans the others and gives the map theta_base = B theta_full.
 
-`Chain` and `Scratch` are tuples of arrays, not structured arrays: their type does not hold n, so that one compilation
-serves every arm.
+`Chain` is a tuple of arrays, not a structured array: its type does not hold n, so that one compilation serves every
+arm.
 
-Shapes: q, dq, ddq, tau (n,); W, Y_p, Y_h (n, p) with p at least the number of columns chosen. Units: rad, m, s, kg, Nm
-(N for a prismatic joint).
+Shapes: q, dq, ddq, tau (n,); W, Y_p, Y_h (n, 10 n). Units: rad, m, s, kg, Nm (N for a prismatic joint).
 """
 
 from collections.abc import Sequence
@@ -51,9 +49,6 @@ frame."""
 
 PER_LINK = len(LINK_PARAMETERS)
 
-NOT_USED = -1
-"""Value in `place` of a parameter without a column."""
-
 _BASE_STATES_PER_PARAMETER = 4
 _RANK_TOLERANCE = 1e-9  # of the largest: rounding leaves 1e-15 of a dependent column; a real one is over 1e-6
 
@@ -68,58 +63,32 @@ class Chain(NamedTuple):
     gravity_m_s2: Vector  # (3,), in the frame of the base
 
 
-class Scratch(NamedTuple):
-    """Scratch arrays for one evaluation of an arm; each evaluation overwrites them. `new_scratch` makes them."""
-
-    E: Vector  # (n, 3, 3), from the frame of the link before to the link's
-    r: Vector  # (n, 3), the link's origin in the frame of the link before, m
-    v: Vector  # (n, 6), velocity of each link
-    a: Vector  # (n, 6), acceleration of each link, gravity as an upward one
-    u: Vector  # (6,)
-    w: Vector  # (6,)
-    x: Vector  # (6,)
-    row: Vector  # (PER_LINK,)
-
-
-def new_scratch(chain: Chain) -> Scratch:
-    """Return scratch arrays for evaluations of an arm, one after the other; each overwrites them."""
-    n = chain.axis.shape[0]
-    shapes = ((n, 3, 3), (n, 3), (n, 6), (n, 6), (6,), (6,), (6,), (PER_LINK,))
-    return Scratch(*(np.zeros(shape) for shape in shapes))
-
-
-def all_columns(chain: Chain) -> Indices:
-    """Return the `place` (10 n,) of regressors with all of theta_full: parameter i has column i."""
-    return np.arange(PER_LINK * chain.axis.shape[0], dtype=np.int64)
-
-
 @compiled
-def fill(chain: Chain, place: Indices, q: Vector, dq: Vector, scratch: Scratch, Y_p: Vector, Y_h: Vector) -> None:
-    """Write Y_p and Y_h (n, p) of tau = d/dt (Y_p theta) + Y_h theta, in the columns of the inertial parameters.
+def split_regressor(chain: Chain, q: Vector, dq: Vector) -> tuple[Vector, Vector]:
+    """Return Y_p and Y_h (n, 10 n) of tau = d/dt (Y_p theta_full) + Y_h theta_full. q, dq (n,).
 
-    Friction is left out; gravity is in. q, dq (n,). place (10 n,): the column of each parameter of theta_full, or
-    NOT_USED. A joint has no torque of the links before it: these entries, and other columns, stay as they are, so begin
-    with zeros. Overwrites `scratch`.
+    Friction is left out; gravity is in.
     """
-    v, a, u, w, row = scratch.v, scratch.a, scratch.u, scratch.w, scratch.row
-    _place_links(chain, q, scratch.E, scratch.r)
-    _move_links(chain, dq, scratch.E, scratch.r, v)
-    _lift_links(chain, scratch.E, a)
-    for i in range(q.shape[0]):
+    n = q.shape[0]
+    Y_p, Y_h = np.zeros((n, PER_LINK * n)), np.zeros((n, PER_LINK * n))
+    E, r = _place_links(chain, q)
+    rest, still = np.zeros(n), np.zeros((n, 6))
+    v = _move_links(chain, E, r, np.zeros(6), dq, still)
+    a = _move_links(chain, E, r, _upward(chain), rest, still)
+    u, w = np.zeros(6), np.zeros(6)
+    for i in range(n):
         u[:] = 0.0
         _add_along_axis(chain, i, 1.0, u)
         _cross(v[i], u, w)
-        for k in range(i, q.shape[0]):
+        for k in range(i, n):
             if k > i:
-                _carry(scratch.E[k], scratch.r[k], u, u)
-                _carry(scratch.E[k], scratch.r[k], w, w)
-            row[:] = 0.0
-            add_form(u, v[k], 1.0, row)
-            _put(row, place, k, Y_p[i])
-            row[:] = 0.0
-            add_form(w, v[k], -1.0, row)
-            add_form(u, a[k], 1.0, row)
-            _put(row, place, k, Y_h[i])
+                _carry(E[k], r[k], u, u)
+                _carry(E[k], r[k], w, w)
+            link = slice(PER_LINK * k, PER_LINK * (k + 1))
+            add_form(u, v[k], 1.0, Y_p[i, link])
+            add_form(w, v[k], -1.0, Y_h[i, link])
+            add_form(u, a[k], 1.0, Y_h[i, link])
+    return Y_p, Y_h
 
 
 @compiled
@@ -134,29 +103,29 @@ def fill_friction(dq: Vector, first_column: int, Y: Vector) -> None:
 
 
 @compiled
-def fill_regressor(
-    chain: Chain, place: Indices, q: Vector, dq: Vector, ddq: Vector, scratch: Scratch, W: Vector
-) -> None:
-    """Write W (n, p) of tau = W theta, friction left out, in the columns of the inertial parameters.
-
-    q, dq, ddq (n,). place (10 n,): the column of each parameter of theta_full, or NOT_USED. Cells of links before the
-    joint, and other columns, stay as they are, so begin with zeros. Overwrites `scratch`.
-    """
-    v, a, u, w, row = scratch.v, scratch.a, scratch.u, scratch.w, scratch.row
-    _place_links(chain, q, scratch.E, scratch.r)
-    _move_links(chain, dq, scratch.E, scratch.r, v)
-    _accelerate_links(chain, dq, ddq, scratch.E, scratch.r, v, scratch.x, a)
-    for i in range(q.shape[0]):
+def regressor(chain: Chain, q: Vector, dq: Vector, ddq: Vector) -> Vector:
+    """Return W (n, 10 n) of tau = W theta_full, friction left out. q, dq, ddq (n,)."""
+    n = q.shape[0]
+    W = np.zeros((n, PER_LINK * n))
+    E, r = _place_links(chain, q)
+    bias = np.zeros((n, 6))
+    v = _move_links(chain, E, r, np.zeros(6), dq, bias)
+    for i in range(n):
+        _add_along_axis(chain, i, dq[i], bias[i])
+        _cross(v[i], bias[i], bias[i])
+    a = _move_links(chain, E, r, _upward(chain), ddq, bias)
+    u, w = np.zeros(6), np.zeros(6)
+    for i in range(n):
         u[:] = 0.0
         _add_along_axis(chain, i, 1.0, u)
-        for k in range(i, q.shape[0]):
+        for k in range(i, n):
             if k > i:
-                _carry(scratch.E[k], scratch.r[k], u, u)
-            row[:] = 0.0
-            add_form(u, a[k], 1.0, row)
+                _carry(E[k], r[k], u, u)
+            link = slice(PER_LINK * k, PER_LINK * (k + 1))
+            add_form(u, a[k], 1.0, W[i, link])
             _cross(v[k], u, w)
-            add_form(w, v[k], -1.0, row)  # u' (v x* I v) = -(v x u)' I v
-            _put(row, place, k, W[i])
+            add_form(w, v[k], -1.0, W[i, link])  # u' (v x* I v) = -(v x u)' I v
+    return W
 
 
 @compiled
@@ -180,20 +149,12 @@ def add_form(u: Vector, x: Vector, scale: float, row: Vector) -> None:
 
 
 @compiled
-def _put(row: Vector, place: Indices, k: int, target: Vector) -> None:
-    """Write the coefficients (10,) of link k, from 0, into their columns of `target` (p,), if they have one."""
-    for j in range(row.shape[0]):
-        column = place[k * row.shape[0] + j]
-        if column >= 0:
-            target[column] = row[j]
-
-
-@compiled
-def _place_links(chain: Chain, q: Vector, E: Vector, r: Vector) -> None:
-    """Write the pose of each link in the frame of the link before, at joint positions q (n,).
+def _place_links(chain: Chain, q: Vector) -> tuple[Vector, Vector]:
+    """Return the pose of each link in the frame of the link before, at joint positions q (n,).
 
     E (n, 3, 3): rotation from that frame to the link's. r (n, 3): the link's origin in that frame, m.
     """
+    E, r = np.zeros((q.shape[0], 3, 3)), np.zeros((q.shape[0], 3))
     for i in range(q.shape[0]):
         x, y, z = chain.axis[i, 0], chain.axis[i, 1], chain.axis[i, 2]
         angle = 0.0 if chain.is_prismatic[i] != 0.0 else q[i]
@@ -206,53 +167,33 @@ def _place_links(chain: Chain, q: Vector, E: Vector, r: Vector) -> None:
             E[i, 0, row] = (c + x * x * rest) * to_x + (x * y * rest + z * s) * to_y + (x * z * rest - y * s) * to_z
             E[i, 1, row] = (x * y * rest - z * s) * to_x + (c + y * y * rest) * to_y + (y * z * rest + x * s) * to_z
             E[i, 2, row] = (x * z * rest + y * s) * to_x + (y * z * rest - x * s) * to_y + (c + z * z * rest) * to_z
+    return E, r
 
 
 @compiled
-def _move_links(chain: Chain, dq: Vector, E: Vector, r: Vector, v: Vector) -> None:
-    """Write the velocity of each link, angular part first, in its own frame, to v (n, 6). E, r: of `_place_links`."""
-    for i in range(dq.shape[0]):
-        if i == 0:
-            v[0, :] = 0.0
-        else:
-            _carry(E[i], r[i], v[i - 1], v[i])
-        _add_along_axis(chain, i, dq[i], v[i])
+def _upward(chain: Chain) -> Vector:
+    """Return the upward acceleration (6,) of the base that stands for gravity."""
+    upward = np.zeros(6)
+    upward[3:] = -chain.gravity_m_s2
+    return upward
 
 
 @compiled
-def _lift_links(chain: Chain, E: Vector, a: Vector) -> None:
-    """Write to a (n, 6) the upward acceleration that stands for gravity, in each link's frame. E: of `_place_links`."""
-    for i in range(E.shape[0]):
-        for row in range(3):
-            a[i, row] = 0.0
-            a[i, 3 + row] = 0.0
-            for column in range(3):
-                before = -chain.gravity_m_s2[column] if i == 0 else a[i - 1, 3 + column]
-                a[i, 3 + row] += E[i, row, column] * before
+def _move_links(chain: Chain, E: Vector, r: Vector, base: Vector, rate: Vector, bias: Vector) -> Vector:
+    """Return the motion (n, 6) of each link in its own frame, angular part first: velocity or acceleration.
 
-
-@compiled
-def _accelerate_links(
-    chain: Chain, dq: Vector, ddq: Vector, E: Vector, r: Vector, v: Vector, x: Vector, a: Vector
-) -> None:
-    """Write the acceleration of each link, gravity as an upward one, in its own frame, to a (n, 6).
-
-    E, r: of `_place_links`; v: of `_move_links`; x (6,) is scratch.
+    E, r: of `_place_links`. base (6,): motion of the base. rate (n,): of each joint, added along its axis. bias (n, 6):
+    added to each link's motion.
     """
-    for i in range(dq.shape[0]):
-        if i == 0:
-            for j in range(3):
-                x[j] = 0.0
-                x[3 + j] = -chain.gravity_m_s2[j]
-        else:
-            x[:] = a[i - 1]
-        _carry(E[i], r[i], x, a[i])
-        _add_along_axis(chain, i, ddq[i], a[i])
-        x[:] = 0.0
-        _add_along_axis(chain, i, dq[i], x)
-        _cross(v[i], x, x)
+    motion = np.zeros_like(bias)
+    before = base
+    for i in range(rate.shape[0]):
+        _carry(E[i], r[i], before, motion[i])
+        _add_along_axis(chain, i, rate[i], motion[i])
         for j in range(6):
-            a[i, j] += x[j]
+            motion[i, j] += bias[i, j]
+        before = motion[i]
+    return motion
 
 
 @compiled
@@ -288,14 +229,6 @@ def _cross(v: Vector, u: Vector, y: Vector) -> None:
     y[5] = v[0] * u4 - v[1] * u3 + v[3] * u1 - v[4] * u0
 
 
-def regressor(chain: Chain, q: Vector, dq: Vector, ddq: Vector) -> Vector:
-    """Return W (n, 10 n) of tau = W theta_full, friction left out. q, dq, ddq (n,)."""
-    place = all_columns(chain)
-    W = np.zeros((q.shape[0], place.size))
-    fill_regressor(chain, place, q, dq, ddq, new_scratch(chain), W)
-    return W
-
-
 def point_mass(mass_kg: float, at_m: Sequence[float] | Vector) -> Vector:
     """Return the parameters (10,) that a point mass at `at_m` (3,), in the link's frame, adds to those of its link."""
     x, y, z = at_m
@@ -311,7 +244,6 @@ class BaseParameters:
     """
 
     columns: Indices  # (n_base,), the chosen columns of theta_full, ascending
-    place: Indices  # (10 n,), the column of each parameter of theta_full in the base, or NOT_USED
     map: Vector  # (n_base, 10 n)
     names: tuple[str, ...]  # (n_base,), of the chosen columns: each stands for the sum of its row of `map`
 
@@ -334,7 +266,5 @@ def find_base(chain: Chain) -> BaseParameters:
     columns = np.sort(order[:rank]).astype(np.int64)
     base_map = scipy.linalg.lstsq(W[:, columns], W)[0]
     base_map[np.abs(base_map) < _RANK_TOLERANCE] = 0.0
-    place = np.full(PER_LINK * n, NOT_USED, dtype=np.int64)
-    place[columns] = np.arange(rank)
     names = tuple(f"{LINK_PARAMETERS[column % PER_LINK]}_{column // PER_LINK + 1}" for column in columns)
-    return BaseParameters(columns, place, base_map, names)
+    return BaseParameters(columns, base_map, names)

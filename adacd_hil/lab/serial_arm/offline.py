@@ -44,7 +44,7 @@ import scipy.linalg
 
 from adacd_hil.compiled import compiled
 from adacd_hil.lab.serial_arm import chain
-from adacd_hil.lab.serial_arm.chain import BaseParameters, Chain, Indices, Scratch
+from adacd_hil.lab.serial_arm.chain import BaseParameters, Chain, Indices
 from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import external_torque
 from adacd_hil.scheme.identify import estimator
@@ -58,6 +58,7 @@ _UNKNOWN_LINK = (
     *(2.0,) * 3,
     *(1.0,) * 6,
 )  # kg, kg m, kg m²: no link of an arm that a human works beside has more
+_UNKNOWN_JOINT = (10.0, 10.0, 1.0, 2.0)  # F_v, Nm s/rad; F_c and torque offset, Nm; rotor's inertia, kg m²
 
 
 @dataclass(frozen=True)
@@ -151,29 +152,12 @@ class ModelEstimate:
     P: Vector
 
 
-def prior(
-    model: ArmModel,
-    theta_full: Vector | None = None,
-    deviation_full: Vector | None = None,
-    F_v: float = 10.0,
-    F_c: float = 10.0,
-    offset_Nm: float = 1.0,
-    rotor_kg_m2: float = 2.0,
-) -> ModelEstimate:
-    """Return the estimate before any motion.
-
-    theta_full (10 n,): the designer's parameters; None: zero. deviation_full (10 n,): their standard deviations; None:
-    those of any link that a human could stand beside. F_v, F_c, offset_Nm, rotor_kg_m2: standard deviations from zero,
-    in Nm s/rad, Nm, Nm, kg m².
-    """
-    n = model.joints
-    deviation = np.tile(_UNKNOWN_LINK, n) if deviation_full is None else deviation_full
-    rest = np.repeat([F_v, F_c, offset_Nm, *((rotor_kg_m2,) if model.has_rotors else ())], n) ** 2
-    theta = np.zeros(len(model.parameter_names))
-    if theta_full is not None:
-        theta[model.place_of("base")] = model.base.map @ theta_full
-    links = (model.base.map * deviation**2) @ model.base.map.T
-    return ModelEstimate(theta, scipy.linalg.block_diag(links, np.diag(rest)))
+def prior(model: ArmModel) -> ModelEstimate:
+    """Return the estimate before any motion: zero, with deviations of any arm that a human could stand beside."""
+    n, map_to_base = model.joints, model.base.map
+    links = (map_to_base * np.tile(_UNKNOWN_LINK, n) ** 2) @ map_to_base.T
+    rest = np.repeat(_UNKNOWN_JOINT if model.has_rotors else _UNKNOWN_JOINT[:-1], n) ** 2
+    return ModelEstimate(np.zeros(len(model.parameter_names)), scipy.linalg.block_diag(links, np.diag(rest)))
 
 
 def with_payload(
@@ -183,7 +167,7 @@ def with_payload(
 
     mass_kg: standard deviation of the mass, from zero. at_m: in the frame of the last link.
     """
-    change = np.zeros(model.base.place.size)
+    change = np.zeros(model.base.map.shape[1])
     change[-chain.PER_LINK :] = chain.point_mass(mass_kg, at_m)
     in_base = np.zeros(estimate.theta.size)
     in_base[model.place_of("base")] = model.base.map @ change
@@ -206,15 +190,13 @@ class OfflineCertificate:
         return float(np.min(self.margins))
 
 
-@dataclass(frozen=True)
-class FilteredTorque:
-    """Measured torque and residual (k, n) of a record behind the filter of the fit, Nm.
+class FilteredRecord(NamedTuple):
+    """A record behind a filter, (k, n), Nm; unit (k,): the filter's output for a constant 1 Nm."""
 
-    unit (k,): the filter's output for a constant 1 Nm.
-    """
-
-    torque: Vector
-    residual: Vector  # measured minus predicted
+    tau_ext_hat: Vector  # predicted minus measured torque
+    deviation: Vector  # of tau_ext_hat, by noise and P
+    friction: Vector  # that a joint at standstill may hold
+    tau_f: Vector  # measured torque
     unit: Vector
 
 
@@ -276,10 +258,10 @@ def parameter_deviation(
     scores -= scores.mean(axis=0)
     spread = scores @ estimate.P
     kinds.append(spread.T @ spread * _PARTS / (_PARTS - 1))
-    gains = _noise_gains(settings.fit_cutoff_rad_s, settings, is_smoothed=True)
+    gain, _, R = _noise_gains(settings.fit_cutoff_rad_s, settings, is_smoothed=True)
     lack_square = np.maximum(squares / count - filtered_noise_Nm(settings) ** 2, 0.0)
     repeats = max(count / settings.fit_every / (0.5 * estimate.theta.size), 1.0)
-    noise_Nm = np.sqrt(np.array(settings.noise_Nm) ** 2 + lack_square * repeats / (gains.R * gains.torque**2))
+    noise_Nm = np.sqrt(np.array(settings.noise_Nm) ** 2 + lack_square * repeats / (R * gain**2))
     wide = before
     for record in records:
         wide = identify(model, record, wide, replace(settings, noise_Nm=tuple(noise_Nm.tolist())))
@@ -287,13 +269,12 @@ def parameter_deviation(
     return np.asarray(np.sqrt(np.max([np.diag(kind) for kind in kinds], axis=0)))
 
 
-def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredTorque:
-    """Return measured torque and residual of a record behind the filter of the fit.
+def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredRecord:
+    """Return a record behind the filter of the fit, its external torque by the frozen estimate.
 
     Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
     """
-    trace = _trace(model, record, estimate, settings, estimate.theta)
-    return FilteredTorque(trace.tau_f, -trace.tau_ext_hat, trace.unit)
+    return _trace(model, record, estimate, settings, estimate.theta)
 
 
 def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tuple[Vector, Vector]:
@@ -311,17 +292,17 @@ def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tupl
 
 def mass_terms(model: ArmModel, q: Vector, dq: Vector) -> Vector:
     """Return the row (p,) whose product with theta is dq' M(q) dq, twice the kinetic energy, rotors included."""
-    n, p = model.joints, len(model.parameter_names)
-    Y_p, Y_h = np.zeros((n, p)), np.zeros((n, p))
-    chain.fill(model.chain, model.base.place, q, dq, chain.new_scratch(model.chain), Y_p, Y_h)
-    _fill_rotors(dq, model.place_of("rotor").start if model.has_rotors else chain.NOT_USED, Y_p)
+    Y_p = np.zeros((model.joints, len(model.parameter_names)))
+    Y_p[:, model.place_of("base")] = chain.split_regressor(model.chain, q, dq)[0][:, model.base.columns]
+    if model.has_rotors:
+        Y_p[:, model.place_of("rotor")] = np.diag(dq)
     return np.asarray(dq @ Y_p)
 
 
 def filtered_noise_Nm(settings: OfflineSettings) -> Vector:
     """Return the rms noise of each torque sensor (n,), Nm, behind the filter of the fit."""
-    gains = _noise_gains(settings.fit_cutoff_rad_s, settings, is_smoothed=True)
-    return gains.torque * np.array(settings.noise_Nm)
+    gain, _, _ = _noise_gains(settings.fit_cutoff_rad_s, settings, is_smoothed=True)
+    return gain * np.array(settings.noise_Nm)
 
 
 def certify(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> OfflineCertificate:
@@ -384,17 +365,7 @@ def find_contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[
     return tuple(contacts)
 
 
-class _Trace(NamedTuple):
-    """Results of `_run` for each sample, (k, n)."""
-
-    tau_ext_hat: Vector
-    deviation: Vector  # of tau_ext_hat, by noise and P
-    friction: Vector  # that a joint at standstill may hold
-    tau_f: Vector
-    unit: Vector  # (k,), the filter's answer to a constant 1
-
-
-def _threshold(trace: _Trace, settings: OfflineSettings, lack_Nm: Vector) -> Vector:
+def _threshold(trace: FilteredRecord, settings: OfflineSettings, lack_Nm: Vector) -> Vector:
     """Return the threshold of each sample and joint (k, n), Nm: `deviations` times the deviation, plus held friction.
 
     lack_Nm (n,): of the model's certificate, added to the deviation by squares.
@@ -402,50 +373,12 @@ def _threshold(trace: _Trace, settings: OfflineSettings, lack_Nm: Vector) -> Vec
     return settings.deviations * np.sqrt(trace.deviation**2 + lack_Nm**2) + trace.friction
 
 
-class _Memory(NamedTuple):
-    """Memory of filters from one sample to the next, and scratch. `_new_memory` has the shapes."""
+def _noise_gains(cutoff_rad_s: float, settings: OfflineSettings, is_smoothed: bool) -> tuple[float, float, float]:
+    """Return the gains for white noise of a torque sensor and of a velocity, 1/s, behind the filters of this cut-off.
 
-    Y_p: Vector
-    Y_h: Vector
-    input_old: Vector
-    S: Vector
-    W_f: Vector
-    W: Vector
-    W_scaled: Vector
-    WP: Vector
-    tau_old: Vector
-    tau_f: Vector
-    tau: Vector
-    tau_f_hat: Vector
-    tau_scaled: Vector
-    standstill: Vector
-    unit: Vector
-    through: Vector
-    noise: Vector
-    Y_unit: Vector
-    Y_rest: Vector
-    v: Vector
-    K: Vector
-
-
-def _new_memory(joints: int, count: int) -> _Memory:
-    """Return the memory before the first sample, all zeros. count: number of parameters, p."""
-    columns, joint, parameter = (joints, count), (joints,), (count,)
-    return _Memory(*(np.zeros(shape) for shape in (*(columns,) * 8, *(joint,) * 9, *(columns,) * 2, *(parameter,) * 2)))
-
-
-class _NoiseGains(NamedTuple):
-    """The filters' gains: standard deviation of their output for white noise of 1, and the cost of its correlation."""
-
-    torque: float
-    velocity: float  # of M delta_dq, 1/s
-    R: float  # variance that a sample of the fit counts with, in units of the filtered torque's
-
-
-def _noise_gains(cutoff_rad_s: float, settings: OfflineSettings, is_smoothed: bool) -> _NoiseGains:
-    """Return the gains for white noise of a torque sensor and of a velocity behind the filters of this cut-off.
-
-    is_smoothed: behind the second low-pass, too. By the filters' two states x: x_new = A x + B u, y = C x + D u.
+    A gain is the standard deviation of the output for noise of 1; of the velocity's noise that of M delta_dq. The third
+    value is the variance that a sample of the fit counts with, in units of the filtered torque's. is_smoothed: behind
+    the second low-pass, too. By the filters' two states x: x_new = A x + B u, y = C x + D u.
     Torque: y_1 = F u. Velocity: y_1 = a (u - F u). With V = A V A' + B B' the variance of y is C V C' + D², its
     covariance over j samples C A^(j - 1) (A V C' + B D).
     """
@@ -464,7 +397,7 @@ def _noise_gains(cutoff_rad_s: float, settings: OfflineSettings, is_smoothed: bo
             later = C @ power @ np.linalg.solve(np.eye(2) - power @ A, A @ V @ C + B * D)
             R += 2.0 * later / variance
         gains.append(math.sqrt(variance))
-    return _NoiseGains(gains[0], gains[1], R)
+    return gains[0], gains[1], R
 
 
 def _trace(
@@ -478,7 +411,7 @@ def _trace(
     at: int = 0,
     length: int = 1,
     rows: tuple[Vector, Vector] | None = None,
-) -> _Trace:
+) -> FilteredRecord:
     """Run a record through the smoothed filter of the fit, or without theta_M through the one of detection.
 
     Returns external torque, deviation and friction of each sample. is_learning: correct theta and P of `estimate`,
@@ -495,33 +428,28 @@ def _trace(
     is_smoothed = theta_M is not None
     cutoff_rad_s = settings.fit_cutoff_rad_s if is_smoothed else settings.detection_cutoff_rad_s
     hold = torque_filter.first_order_hold(cutoff_rad_s, cutoff_rad_s, settings.period_s)
-    gains = _noise_gains(cutoff_rad_s, settings, is_smoothed)
-    memory = _new_memory(n, estimate.theta.size)
-    memory.Y_h[:, model.place_of("offset")] = np.eye(n)
+    gain, velocity_gain, R = _noise_gains(cutoff_rad_s, settings, is_smoothed)
     shapes = (*(record.q.shape,) * 4, record.q.shape[:1])
-    trace = _Trace(*(np.zeros(shape) for shape in shapes))
+    trace = FilteredRecord(*(np.zeros(shape) for shape in shapes))
     _run(
         model.chain,
-        model.base.place,
-        model.place_of("F_v").start,
-        model.place_of("rotor").start if model.has_rotors else chain.NOT_USED,
+        model.base.columns,
+        model.has_rotors,
         record.q,
         record.dq,
         record.tau_J,
         hold,
         cutoff_rad_s,
         hold.decay if is_smoothed else 0.0,
-        gains.torque * np.array(settings.noise_Nm),
-        gains.R,
-        gains.velocity * settings.velocity_noise_rad_s,
+        gain * np.array(settings.noise_Nm),
+        R,
+        velocity_gain * settings.velocity_noise_rad_s,
         settings.fit_every,
         settings.standstill_rad_s,
         is_learning,
         np.ascontiguousarray(estimate.theta if theta_M is None else theta_M),
         np.ascontiguousarray(estimate.theta),
         np.ascontiguousarray(estimate.P),
-        chain.new_scratch(model.chain),
-        memory,
         trace,
         np.zeros((0, 0)) if scores is None else scores,
         at,
@@ -534,9 +462,8 @@ def _trace(
 @compiled
 def _run(
     arm: Chain,
-    place: Indices,
-    friction_column: int,
-    rotor_column: int,
+    columns: Indices,
+    has_rotors: bool,
     q: Vector,
     dq: Vector,
     tau_J: Vector,
@@ -552,9 +479,7 @@ def _run(
     theta_M: Vector,
     theta: Vector,
     P: Vector,
-    scratch: Scratch,
-    m: _Memory,
-    trace: _Trace,
+    trace: FilteredRecord,
     scores: Vector,
     at: int,
     length: int,
@@ -562,131 +487,81 @@ def _run(
 ) -> None:
     """Filter a record, write each sample's external torque to `trace`, and correct theta and P if is_learning.
 
-    smoothing: part that the second pole keeps over a period; 0 without one. noise_Nm (n,): of the filtered torque. R:
-    variance of a sample of the fit in units of noise_Nm². passed_rad_s2: the velocity's noise behind the filter, still
-    to be multiplied by the mass matrix, of theta_M. scores, at, length, rows: as of `_trace`; arrays of size 0 stay
-    unused, and so does an empty P.
+    columns: of the base parameters. smoothing: part that the second pole keeps over a period; 0 without one. noise_Nm
+    (n,): of the filtered torque. R: variance of a sample of the fit in units of noise_Nm². passed_rad_s2: the
+    velocity's noise behind the filter, still to be multiplied by the mass matrix, of theta_M. scores, at, length, rows:
+    as of `_trace`; arrays of size 0 stay unused, and so does an empty P.
     """
-    n = q.shape[1]
-    F_c = theta[friction_column + n : friction_column + 2 * n]
-    offset_column = friction_column + 2 * n
-    a = cutoff_rad_s
+    n, p, a = q.shape[1], theta.size, cutoff_rad_s
+    F_v, F_c, offset = columns.size, columns.size + n, columns.size + 2 * n
+    Y_p, Y_h, input_old = np.zeros((n, p)), np.zeros((n, p)), np.zeros((n, p))
+    S, W_f, W = np.zeros((n, p)), np.zeros((n, p)), np.zeros((n, p))
+    tau_old, tau_f, tau, tau_f_hat = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    standstill, through, v, K = np.zeros(n), np.zeros(n), np.zeros(p), np.zeros(p)
+    for i in range(n):
+        Y_h[i, offset + i] = 1.0
     for k in range(q.shape[0]):
-        chain.fill(arm, place, q[k], dq[k], scratch, m.Y_p, m.Y_h)
-        chain.fill_friction(dq[k], friction_column, m.Y_h)
-        _fill_rotors(dq[k], rotor_column, m.Y_p)
+        momentum, remainder = chain.split_regressor(arm, q[k], dq[k])
+        Y_p[:, :F_v] = momentum[:, columns]
+        Y_h[:, :F_v] = remainder[:, columns]
+        chain.fill_friction(dq[k], F_v, Y_h)
+        if has_rotors:
+            _fill_rotors(dq[k], Y_p)
         if k == 0:
-            torque_filter.resume(a, a, m.Y_p, m.Y_h, tau_J[k], m.input_old, m.tau_old, m.S, m.W_f)
+            torque_filter.resume(a, a, Y_p, Y_h, tau_J[k], input_old, tau_old, S, W_f)
         else:
-            torque_filter.advance_torque(hold, m.tau_old, tau_J[k], m.tau_f)
-            torque_filter.advance_regressor(hold, a, a, m.Y_p, m.Y_h, m.input_old, m.S, m.W_f)
-        _smooth(smoothing, m)
-        external_torque.follow_standstill(dq[k], standstill_rad_s, hold.decay, m.standstill)
-        external_torque.predict(m.W, theta, m.tau_f_hat)
-        external_torque.estimate_external(m.tau, m.tau_f_hat, 1.0, trace.tau_ext_hat[k])
+            torque_filter.advance_torque(hold, tau_old, tau_J[k], tau_f)
+            torque_filter.advance_regressor(hold, a, a, Y_p, Y_h, input_old, S, W_f)
+        tau[:] = tau_f + smoothing * (tau - tau_f)
+        W[:] = W_f + smoothing * (W - W_f)
+        external_torque.follow_standstill(dq[k], standstill_rad_s, hold.decay, standstill)
+        external_torque.predict(W, theta, tau_f_hat)
+        external_torque.estimate_external(tau, tau_f_hat, 1.0, trace.tau_ext_hat[k])
         if passed_rad_s2 > 0.0 and k % fit_every == 0:
-            _fill_mass(arm, place, rotor_column, q[k], theta_M, scratch, m.unit, m.Y_unit, m.Y_rest, m.through)
-        for i in range(n):
-            m.noise[i] = np.sqrt(noise_Nm[i] ** 2 + passed_rad_s2**2 * m.through[i])
-        if P.shape[0] > 0:
-            fill_deviation(m.W, P, m.noise, m.WP, trace.deviation[k])
-        trace.unit[k] = m.W[0, offset_column]
-        for i in range(n):
-            trace.friction[k, i] = m.standstill[i] * max(F_c[i], 0.0)
-            trace.tau_f[k, i] = m.tau[i]
+            through[:] = _squared_mass(arm, columns, has_rotors, q[k], theta_M)
+        passed = passed_rad_s2**2 * through
+        if P.size > 0:
+            trace.deviation[k] = residual_deviation(W, P, np.sqrt(noise_Nm**2 + passed))
+        trace.friction[k] = standstill * np.maximum(theta[F_c:offset], 0.0)
+        trace.tau_f[k] = tau
+        trace.unit[k] = W[0, offset]
         if k % fit_every == fit_every - 1:
-            _weigh(noise_Nm, R, passed_rad_s2, m)
-            if rows[0].shape[0] > 0:
-                rows[0][k // fit_every] = m.W
-                rows[1][k // fit_every] = m.tau
-            if scores.shape[0] > 0:
-                _add_score(theta, m, scores[(at + k) // length])
+            if rows[0].size > 0:
+                rows[0][k // fit_every] = W
+                rows[1][k // fit_every] = tau
+            weight = 1.0 / np.sqrt(R * noise_Nm**2 + passed)
+            W_scaled = np.expand_dims(weight, 1) * W
+            if scores.size > 0:
+                scores[(at + k) // length] += (weight * (tau - tau_f_hat)) @ W_scaled
             if is_learning:
-                estimator.update(m.W_scaled, m.tau_scaled, 1.0, True, theta, P, m.v, m.K)
+                estimator.update(W_scaled, weight * tau, 1.0, True, theta, P, v, K)
 
 
 @compiled
-def _smooth(smoothing: float, m: _Memory) -> None:
-    """Advance torque and regressor, `tau` and `W` of the memory, by one sample behind the second pole.
-
-    smoothing 0 copies them.
-    """
-    for i in range(m.W.shape[0]):
-        m.tau[i] = m.tau_f[i] + smoothing * (m.tau[i] - m.tau_f[i])
-        for j in range(m.W.shape[1]):
-            m.W[i, j] = m.W_f[i, j] + smoothing * (m.W[i, j] - m.W_f[i, j])
-
-
-@compiled
-def _weigh(noise_Nm: Vector, R: float, passed_rad_s2: float, m: _Memory) -> None:
-    """Write torque and regressor of a sample, divided by its standard deviation, to `tau_scaled` and `W_scaled`."""
-    for i in range(m.W.shape[0]):
-        weight = 1.0 / np.sqrt(R * noise_Nm[i] ** 2 + passed_rad_s2**2 * m.through[i])
-        m.tau_scaled[i] = weight * m.tau[i]
-        for j in range(m.W.shape[1]):
-            m.W_scaled[i, j] = weight * m.W[i, j]
-
-
-@compiled
-def _add_score(theta: Vector, m: _Memory, score: Vector) -> None:
-    """Add W' r of a sample, both scaled by `_weigh`, to score (p,); r: residual with theta. Overwrites `tau_f_hat`."""
-    external_torque.predict(m.W_scaled, theta, m.tau_f_hat)
-    for i in range(m.W.shape[0]):
-        for j in range(m.W.shape[1]):
-            score[j] += (m.tau_scaled[i] - m.tau_f_hat[i]) * m.W_scaled[i, j]
-
-
-@compiled
-def _fill_mass(
-    arm: Chain,
-    place: Indices,
-    rotor_column: int,
-    q: Vector,
-    theta: Vector,
-    scratch: Scratch,
-    unit: Vector,
-    Y_unit: Vector,
-    Y_rest: Vector,
-    through: Vector,
-) -> None:
-    """Write to `through` (n,) the diagonal of M M', with the mass matrix M of theta at q.
-
-    unit (n,), Y_unit and Y_rest (n, p) are scratch, overwritten; other columns of Y_unit than inertial ones must be
-    zero.
-    """
-    through[:] = 0.0
-    for j in range(q.shape[0]):
-        unit[:] = 0.0
+def _squared_mass(arm: Chain, columns: Indices, has_rotors: bool, q: Vector, theta: Vector) -> Vector:
+    """Return the diagonal (n,) of M M', with the mass matrix M of theta at q. columns: of the base parameters."""
+    n = q.size
+    found, Y_p = np.zeros(n), np.zeros((n, theta.size))
+    for j in range(n):
+        unit = np.zeros(n)
         unit[j] = 1.0
-        chain.fill(arm, place, q, unit, scratch, Y_unit, Y_rest)
-        _fill_rotors(unit, rotor_column, Y_unit)
-        for i in range(q.shape[0]):
-            mass = 0.0
-            for column in range(theta.shape[0]):
-                mass += Y_unit[i, column] * theta[column]
-            through[i] += mass * mass
+        Y_p[:, : columns.size] = chain.split_regressor(arm, q, unit)[0][:, columns]
+        if has_rotors:
+            _fill_rotors(unit, Y_p)
+        found += (Y_p @ theta) ** 2
+    return found
 
 
 @compiled
-def _fill_rotors(dq: Vector, rotor_column: int, Y_p: Vector) -> None:
-    """Write dq to the columns of the rotors' inertia in Y_p, one per joint from `rotor_column` on.
-
-    NOT_USED: write nothing.
-    """
-    if rotor_column != chain.NOT_USED:
-        for i in range(dq.shape[0]):
-            Y_p[i, rotor_column + i] = dq[i]
+def _fill_rotors(dq: Vector, Y_p: Vector) -> None:
+    """Write dq to the columns of the rotors' inertia in Y_p, the last ones, one per joint."""
+    n, p = Y_p.shape
+    for i in range(n):
+        Y_p[i, p - n + i] = dq[i]
 
 
 @compiled
-def fill_deviation(W_f: Vector, P: Vector, noise_Nm: Vector, WP: Vector, deviation: Vector) -> None:
-    """Write the standard deviation (n,) of tau_f - W_f theta, sqrt(noise² + w P w'), to `deviation`.
-
-    WP (n, p) is scratch.
-    """
-    np.dot(W_f, P, WP)
-    for i in range(W_f.shape[0]):
-        variance = noise_Nm[i] * noise_Nm[i]
-        for j in range(W_f.shape[1]):
-            variance += WP[i, j] * W_f[i, j]
-        deviation[i] = np.sqrt(max(variance, 0.0))
+def residual_deviation(W_f: Vector, P: Vector, noise_Nm: Vector) -> Vector:
+    """Return the standard deviation (n,) of tau_f - W_f theta: sqrt(noise² + w P w')."""
+    found: Vector = np.sqrt(np.maximum(noise_Nm**2 + ((W_f @ P) * W_f).sum(axis=1), 0.0))
+    return found

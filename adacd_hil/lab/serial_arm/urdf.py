@@ -85,8 +85,9 @@ class SerialArm:
 class _Joint:
     """One joint as the URDF has it. kind: one of `MOVING`, or "fixed", also for a locked one.
 
-    origin: the joint's frame in the parent link's. axis (3,): unit vector in the joint's frame. A fixed joint has
-    placeholders for axis, limits and friction.
+    origin: the joint's frame in the parent link's. axis (3,): unit vector in the joint's frame. numbers: limits and
+    dynamics in the order of `SerialArm`: low, high, velocity, torque, damping, friction. A fixed joint has placeholders
+    for axis and numbers.
     """
 
     name: str
@@ -95,12 +96,7 @@ class _Joint:
     child: str
     origin: FramePose
     axis: Vector
-    low: float
-    high: float
-    velocity: float
-    effort: float
-    damping: float
-    friction: float
+    numbers: tuple[float, ...]
 
 
 def read_urdf(
@@ -164,22 +160,17 @@ def _assemble(
     moving: list[_Joint] = []
     placed: list[FramePose] = []
     places: dict[str, tuple[int, FramePose]] = {}
-    here = FramePose(np.eye(3), np.zeros(3))
-    following: str | None = roots[0]
-    while following is not None:
-        index = len(moving) - 1
-        outward = _merge(following, index, children, places)
+    outward = _merge(roots[0], BASE, children, places)
+    while outward:
         if len(outward) > 1:
             raise UrdfError(
                 f"the arm branches: joints {_list([joint.name for joint in outward])} move on the same link; "
                 "lock those that are no part of it"
             )
-        following = None
-        if outward:
-            here = places[outward[0].parent][1]
-            moving.append(outward[0])
-            placed.append(here.then(outward[0].origin))
-            following = outward[0].child
+        joint = outward[0]
+        moving.append(joint)
+        placed.append(places[joint.parent][1].then(joint.origin))
+        outward = _merge(joint.child, len(moving) - 1, children, places)
     lost = [link for link in children if link in carried and link not in places]
     if lost:
         raise UrdfError(f'link "{lost[0]}" hangs on a loop, not on the root')
@@ -192,18 +183,19 @@ def _assemble(
         np.array([float(joint.kind == "prismatic") for joint in moving]),
         np.array(gravity_m_s2, dtype=np.float64),
     )
+    low, high, velocity, torque, damping, friction = np.array([joint.numbers for joint in moving]).T
     return SerialArm(
         name,
         chain,
         tuple(joint.name for joint in moving),
         tuple(joint.child for joint in moving),
         places,
-        np.array([joint.low for joint in moving]),
-        np.array([joint.high for joint in moving]),
-        np.array([joint.velocity for joint in moving]),
-        np.array([joint.effort for joint in moving]),
-        np.array([joint.damping for joint in moving]),
-        np.array([joint.friction for joint in moving]),
+        low,
+        high,
+        velocity,
+        torque,
+        damping,
+        friction,
         links,
     )
 
@@ -235,23 +227,17 @@ def _merge(
 
 def _moved(parameters: Vector, pose: FramePose) -> Vector:
     """Return the parameters (10,) of a body in another frame; pose: of the body's frame in that one."""
-    mass, moment, inertia = parameters[0], parameters[1:4], _symmetric(parameters[4:])
+    mass, moment, inertia = parameters[0], parameters[1:4], symmetric(parameters[4:])
     at, turned = pose.translation, pose.rotation @ moment
     about = pose.rotation @ inertia @ pose.rotation.T
     about += 2.0 * (at @ turned) * np.eye(3) - np.outer(at, turned) - np.outer(turned, at)
     about += mass * ((at @ at) * np.eye(3) - np.outer(at, at))
-    return np.concatenate([[mass], turned + mass * at, _six(about)])
+    return np.concatenate([[mass], turned + mass * at, about[np.tril_indices(3)]])
 
 
-def _symmetric(six: Vector) -> Vector:
+def symmetric(six: Vector) -> Vector:
     """Return the symmetric matrix (3, 3) of its elements (xx, xy, yy, xz, yz, zz)."""
-    xx, xy, yy, xz, yz, zz = six
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
-
-def _six(matrix: Vector) -> Vector:
-    """Return (xx, xy, yy, xz, yz, zz) of a symmetric matrix (3, 3)."""
-    return np.array([matrix[0, 0], matrix[0, 1], matrix[1, 1], matrix[0, 2], matrix[1, 2], matrix[2, 2]])
+    return np.asarray(six[np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])])
 
 
 def _read_inertial(link: Element, name: str) -> Vector:
@@ -270,7 +256,7 @@ def _read_inertial(link: Element, name: str) -> Vector:
     six = np.array([_number(inertia_element, key, where) for key in ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")])
     if mass < 0.0:
         raise UrdfError(f"{where}: mass {mass:g} kg is negative")
-    if np.min(np.linalg.eigvalsh(_symmetric(six))) < -1e-12 * np.max(np.abs(six)):
+    if np.min(np.linalg.eigvalsh(symmetric(six))) < -1e-12 * np.max(np.abs(six)):
         raise UrdfError(f"{where}: the inertia is not positive semidefinite")
     about_mass_centre = np.concatenate([[mass, 0.0, 0.0, 0.0], six])
     return _moved(about_mass_centre, _read_origin(inertial, where))
@@ -297,8 +283,7 @@ def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bo
         ends.append(link)
     origin = _read_origin(joint, where)
     if kind == "fixed":
-        rest = np.zeros(3), -math.inf, math.inf, math.inf, math.inf, 0.0, 0.0
-        return _Joint(name, kind, ends[0], ends[1], origin, *rest)
+        return _Joint(name, kind, ends[0], ends[1], origin, np.zeros(3), ())
     if _only(joint, "mimic", where) is not None:
         raise UrdfError(f"{where}: <mimic> is not supported; lock the joint if it is no part of the arm")
     axis_element, limit = _only(joint, "axis", where), _only(joint, "limit", where)
@@ -322,7 +307,8 @@ def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bo
     )
     if min(damping, friction) < 0.0:
         raise UrdfError(f"{where}: <dynamics> damping {damping:g}, friction {friction:g}: neither may be negative")
-    return _Joint(name, kind, ends[0], ends[1], origin, axis / length, low, high, velocity, effort, damping, friction)
+    numbers = low, high, velocity, effort, damping, friction
+    return _Joint(name, kind, ends[0], ends[1], origin, axis / length, numbers)
 
 
 def _read_origin(element: Element, where: str) -> FramePose:
