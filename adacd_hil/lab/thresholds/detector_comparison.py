@@ -16,7 +16,8 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from adacd_hil.lab.detectors import detectors
+from adacd_hil.lab.detectors.detector_registry import detectors
+from adacd_hil.lab.detectors.detectors import DetectorBank
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
 from adacd_hil.lab.thresholds.false_alarms import TailCalibration, TooLittleMotionError
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, calibrate_all
@@ -176,16 +177,15 @@ def _ratios(
     `before` samples without and `after` samples with a step of `torque_Nm`; phases_s: time from sample `before` of the
     part to the onset.
     """
-    period_s = statistics.motion.period_s
+    period_s, places_of = statistics.motion.period_s, detectors()
     largest = np.zeros((len(found), len(starts), after, JOINTS))
     for k, (start, phase_s) in enumerate(zip(starts.tolist(), phases_s.tolist(), strict=True)):
         z = statistics.z[start : start + before + after].copy()
         z[before:] += torque_Nm * step_shape(after, phase_s, period_s)[:, None]
         held_Nm = statistics.held_Nm[start : start + before + after]
-        shown = detectors.DetectorBank(statistics.settings, statistics.weights, period_s).take_stream(z, held_Nm)
+        shown = DetectorBank(statistics.weights, period_s).take_stream(z, held_Nm)
         for place, (name, (thresholds, _)) in enumerate(found.items()):
-            rows = list(statistics.settings.detectors[name])
-            over = (shown[before:, rows] / thresholds).max(axis=1)
+            over = (shown[before:, places_of[name]] / thresholds).max(axis=1)
             largest[place, k] = np.maximum.accumulate(over, axis=0)
     return largest
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from adacd_hil.lab.detectors import detectors
+from adacd_hil.lab.detectors.detectors import make_stream
 from adacd_hil.log.log_files import CONFIG_NAME, LogError
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import Milestones, Progress, is_armed_in, settings_of
@@ -280,13 +280,10 @@ def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
     return replace(part, **{name: getattr(part, name)[rows] for name in (*_COLUMNS, "is_free")})
 
 
-def torque_streams(
-    pieces: Iterable[Motion], lag_s: float, standstill_rad_s: float
-) -> Iterator[tuple[Motion, tuple[Vector, Vector]]]:
+def torque_streams(pieces: Iterable[Motion], lag_s: float) -> Iterator[tuple[Motion, tuple[Vector, Vector]]]:
     """Yield each piece of a motion, and its stream for the detectors: z, and the torque that friction may hold.
 
-    Both (n, 2), Nm. The stream goes on from piece to piece. lag_s: by which dq is older than tau_J. standstill_rad_s: a
-    slower joint stands still.
+    Both (n, 2), Nm. The stream goes on from piece to piece. lag_s: by which dq is older than tau_J.
     """
     last: list[Vector] | None = None  # last sample of the previous piece
     for motion in pieces:
@@ -295,6 +292,6 @@ def torque_streams(
         if before is not None:
             columns = [np.concatenate(pair) for pair in zip(before, columns, strict=True)]
         q, dq, tau_J, theta, interval_s = columns
-        z, held_Nm = detectors.make_stream(q, dq, tau_J, theta, interval_s, lag_s, standstill_rad_s)
+        z, held_Nm = make_stream(q, dq, tau_J, theta, interval_s, lag_s)
         skipped = int(before is not None)
         yield motion, (z[skipped:], held_Nm[skipped:])

@@ -13,7 +13,14 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.lab.detectors import detectors
+from adacd_hil.lab.detectors.detector_registry import CUTOFFS_RAD_S, FIRST_ORDER, SMOOTHED, channels, detectors
+from adacd_hil.lab.detectors.detectors import (
+    SMOOTHING_RAD_S,
+    VELOCITY_LAG_S,
+    DetectorBank,
+    likelihood_weights,
+    make_stream,
+)
 from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
 from adacd_hil.lab.thresholds.false_alarms import (
     BLOCK_S,
@@ -53,7 +60,7 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
 
     It is within 0 and `_LONGEST_LAG_S`. If the torque never changes, all are `VELOCITY_LAG_S`.
     """
-    z, _ = detectors.make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
+    z, _ = make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
     moving = motion.is_free & (np.abs(motion.dq) > 0.02).all(axis=1)
     _, slope_gain = gains((_MODEL_RAD_S,), motion.period_s, 0.0)
     top, bottom = np.zeros(JOINTS), np.zeros(JOINTS)
@@ -66,7 +73,7 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
         # the noise of the torque has a slope, too, which is not in the stream
         bottom[i] = float(by @ by) - by.size * (slope_gain * float(white_noise(motion.tau_J[:, i]))) ** 2
     if not (bottom > 0.0).any():
-        return detectors.VELOCITY_LAG_S, np.full(JOINTS, detectors.VELOCITY_LAG_S)
+        return VELOCITY_LAG_S, np.full(JOINTS, VELOCITY_LAG_S)
     known = np.maximum(bottom, 0.0)
     lag_s = min(max(float(top[known > 0.0].sum() / known.sum()), 0.0), _LONGEST_LAG_S)
     each = np.where(known > 0.0, top / np.where(known > 0.0, known, 1.0), lag_s)
@@ -80,7 +87,6 @@ class Statistics:
     held_Nm: torque that friction may hold. lag_s: by which dq is older than tau_J; lag_of_joint_s: the same by joint.
     """
 
-    settings: detectors.DetectorBankSettings
     weights: Vector  # (n, ages, L), of the likelihood channels
     peaks: Vector  # (B, channels, n), of all motion; NaN where not all samples of a block are free
     z: Vector  # (N, n), 0 where not free
@@ -96,9 +102,7 @@ class Statistics:
         return counted_hours(self.peaks[:, 0, 0])
 
 
-def run_detectors(
-    logs: Sequence[LoggedMotion], settings: detectors.DetectorBankSettings, progress: Progress = lambda _: None
-) -> Statistics:
+def run_detectors(logs: Sequence[LoggedMotion], progress: Progress = lambda _: None) -> Statistics:
     """Run every detector over the motion of logs; return their statistics, and the lag and weights that they used.
 
     progress: called with a line on the cycles read. Raises LogError if a log can't be read or the logs differ in period
@@ -106,38 +110,31 @@ def run_detectors(
     """
     motion = sample_of(logs)
     lag_s, lag_of_joint_s = find_lag(motion)
-    _, (z, held_Nm) = next(torque_streams([motion], lag_s, settings.standstill_rad_s))
+    _, (z, held_Nm) = next(torque_streams([motion], lag_s))
     free = motion.is_free
     z[~free] = 0.0
     held_Nm[~free] = 0.0
     try:
-        weights = detectors.likelihood_weights(z[free], settings, lag_s, motion.period_s)
+        weights = likelihood_weights(z[free], lag_s, motion.period_s)
     except ValueError as error:
         raise TooLittleMotionError(f"{free.sum()} contact-free samples: {error}") from None
-    bank = detectors.DetectorBank(settings, weights, motion.period_s)
-    peaks = _peaks(logs, bank, lag_s, settings, progress)
-    return Statistics(settings, weights, peaks, z, held_Nm, free, motion, lag_s, lag_of_joint_s)
+    peaks = _peaks(logs, DetectorBank(weights, motion.period_s), lag_s, progress)
+    return Statistics(weights, peaks, z, held_Nm, free, motion, lag_s, lag_of_joint_s)
 
 
-def _peaks(
-    logs: Sequence[LoggedMotion],
-    bank: detectors.DetectorBank,
-    lag_s: float,
-    settings: detectors.DetectorBankSettings,
-    progress: Progress,
-) -> Vector:
+def _peaks(logs: Sequence[LoggedMotion], bank: DetectorBank, lag_s: float, progress: Progress) -> Vector:
     """Return the largest statistic per block of `BLOCK_S`, channel and joint (B, channels, n) over all logs in turn.
 
     NaN in blocks that are not wholly free of contact. A block may begin in one log and end in the next.
     """
     block = round(BLOCK_S / logs[0].period_s)
     free = np.concatenate([log.is_free for log in logs])
-    peaks = np.zeros((-(-len(free) // block), len(settings.channels), JOINTS))
+    peaks = np.zeros((-(-len(free) // block), len(channels()), JOINTS))
     rest = np.empty((0, JOINTS)), np.empty((0, JOINTS))  # less than a block
     place = 0
     milestones = Milestones(lambda count: progress(f"{log.path}: running the detectors, {count} of {len(free)} cycles"))
     for log in logs:
-        for motion, new in torque_streams(log.pieces(), lag_s, settings.standstill_rad_s):
+        for motion, new in torque_streams(log.pieces(), lag_s):
             for column in new:
                 column[~motion.is_free] = 0.0
             z, held_Nm = (np.concatenate(pair) for pair in zip(rest, new, strict=True))
@@ -210,9 +207,9 @@ def calibrate_all(
     """
     found: dict[str, tuple[Vector, TailCalibration]] = {}
     missing: list[str] = []
-    for name, places in statistics.settings.detectors.items():
+    for name, places in detectors().items():
         try:
-            found[name] = calibrate_detector(statistics.peaks[:, list(places), :], rate_per_h)
+            found[name] = calibrate_detector(statistics.peaks[:, places], rate_per_h)
         except TooLittleMotionError as error:
             missing.append(name)
             problem = error
@@ -227,16 +224,16 @@ def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence
     logs: names of the logs, stored in the result. Raises TooLittleMotionError if no detector's tail can be fitted.
     """
     calibrated, missing = calibrate_all(statistics, rate_per_h)
-    rows, channels = [], []
+    rows, channel_rows = [], []
     limits = channel_limits(statistics, rate_per_h)
+    names, places_of = channels(), detectors()
     for name, (thresholds, calibration) in calibrated.items():
-        places = statistics.settings.detectors[name]
-        check = check_prediction(statistics.peaks[:, list(places), :]) or (None, None)
+        places = places_of[name]
+        check = check_prediction(statistics.peaks[:, places]) or (None, None)
         rows.append(DetectorRow(name, calibration.rate_bound_per_h, calibration.bound / calibration.threshold, *check))
         for threshold, place in zip(thresholds.tolist(), places, strict=True):
-            channel = statistics.settings.channels[place]
-            limit, achievable_Nm = limits.get(channel, ((), ()))
-            channels.append(ChannelRow(name, channel, tuple(threshold), limit, achievable_Nm))
+            limit, achievable_Nm = limits.get(names[place], ((), ()))
+            channel_rows.append(ChannelRow(name, names[place], tuple(threshold), limit, achievable_Nm))
     return Thresholds(
         rate_per_h=rate_per_h,
         hours=statistics.hours,
@@ -245,7 +242,7 @@ def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence
         logs=tuple(logs),
         missing=missing,
         detectors=tuple(rows),
-        channels=tuple(channels),
+        channels=tuple(channel_rows),
     )
 
 
@@ -274,7 +271,7 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
 
     Both per joint.
     """
-    settings, motion, free = statistics.settings, statistics.motion, statistics.is_free
+    motion, free = statistics.motion, statistics.is_free
     places = np.flatnonzero(free)
     masses = np.array([mass_matrix(motion.q[k], motion.theta[k]) for k in places[:: max(1, places.size // 200)]])
     largest = np.linalg.norm(masses, axis=2).max(axis=0)
@@ -302,8 +299,8 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
             )
         )
     limits: dict[str, tuple[tuple[str, ...], tuple[float, ...]]] = {}
-    for kind, more in (("first-order", ()), ("smoothed", (settings.smoothing_rad_s,))):
-        for cutoff in settings.cutoff_rad_s:
+    for names, more in ((FIRST_ORDER, ()), (SMOOTHED, (SMOOTHING_RAD_S,))):
+        for name, cutoff in zip(names, CUTOFFS_RAD_S, strict=True):
             split = [
                 find_limits(
                     statistics.z[free, i],
@@ -317,8 +314,8 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
                 )
                 for i in range(JOINTS)
             ]
-            largest_causes = tuple(max(causes, key=lambda name: causes[name]) for causes, _ in split)
-            limits[f"{kind} {cutoff:g}"] = largest_causes, tuple(achievable for _, achievable in split)
+            largest_causes = tuple(max(causes, key=lambda cause: causes[cause]) for causes, _ in split)
+            limits[name] = largest_causes, tuple(achievable for _, achievable in split)
     return limits
 
 
@@ -337,5 +334,5 @@ def thresholds_of_logs(
         if log.parameters < len(PARAMETER_NAMES):
             raise LogError(f"log {path} has {log.parameters} parameters")
         logs.append(log)
-    statistics = run_detectors(logs, detectors.DetectorBankSettings(), progress)
+    statistics = run_detectors(logs, progress)
     return compute_thresholds(statistics, rate_per_h, [str(path) for path in paths]), statistics

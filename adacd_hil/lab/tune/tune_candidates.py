@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.lab.detectors import detectors
+from adacd_hil.lab.detectors.detector_registry import detectors
+from adacd_hil.lab.detectors.detectors import DetectorBank
 from adacd_hil.lab.thresholds.detector_comparison import WARM_UP_S
 from adacd_hil.lab.thresholds.free_motion import torque_streams
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, run_detectors
@@ -254,24 +255,24 @@ class ShownLog:
         return [self._trials[window.number] for window in self._windows]
 
 
-def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: None) -> list[Observed]:
-    """Run all detectors over logs; return the statistics of each, in the order of `DetectorBankSettings.detectors`.
+def observe_detectors(logs: Sequence[TunedLog], progress: Progress) -> list[Observed]:
+    """Run all detectors over logs; return the statistics of each, in the order of `detectors`.
 
     progress: called with a line on the cycles read. Raises LogError if a log can't be read or the logs differ in period
     or number of parameters, TooLittleMotionError if motion is too short.
     """
-    settings = detectors.DetectorBankSettings()
-    statistics = run_detectors([log.motion for log in logs], settings, progress)
+    places_of = detectors()
+    statistics = run_detectors([log.motion for log in logs], progress)
     is_chosen_on = chosen_blocks(logs)
-    trials: dict[str, list[Trial]] = {name: [] for name in settings.detectors}
+    trials: dict[str, list[Trial]] = {name: [] for name in places_of}
     for log in logs:
         for trial in _trials(log, statistics):
-            for name, rows in settings.detectors.items():
-                trials[name].append(rising(trial._replace(statistic=trial.statistic[:, list(rows), :])))
+            for name, places in places_of.items():
+                trials[name].append(rising(trial._replace(statistic=trial.statistic[:, places])))
     has_truth = any(log.windows is not None for log in logs)
     return [
-        Observed(name, statistics.peaks[:, list(rows), :], is_chosen_on, tuple(trials[name]) if has_truth else None)
-        for name, rows in settings.detectors.items()
+        Observed(name, statistics.peaks[:, places], is_chosen_on, tuple(trials[name]) if has_truth else None)
+        for name, places in places_of.items()
     ]
 
 
@@ -292,15 +293,14 @@ def _trials(log: TunedLog, statistics: Statistics) -> Iterator[Trial]:
     before = round(WARM_UP_S / log.motion.period_s)
     held = tuple(np.empty((0, statistics.z.shape[1])) for _ in range(2))  # stream that contacts may still need
     end = 0
-    streams = torque_streams(log.motion.pieces(), statistics.lag_s, statistics.settings.standstill_rad_s)
-    for motion, new in streams:
+    for motion, new in torque_streams(log.motion.pieces(), statistics.lag_s):
         held = tuple(np.concatenate(pair) for pair in zip(held, new, strict=True))
         end += len(motion.q)
         begin = end - len(held[0])
         for window in [window for window in waiting if window.last < end]:
             first = max(window.first - before, 0)
             rows = slice(first - begin, window.last + 1 - begin)
-            bank = detectors.DetectorBank(statistics.settings, statistics.weights, log.motion.period_s)
+            bank = DetectorBank(statistics.weights, log.motion.period_s)
             shown = bank.take_stream(held[0][rows], held[1][rows])
             since_s = (log.t_ns[window.first : window.last + 1] - log.t_ns[window.first]) * 1e-9
             yield Trial(since_s, shown[window.first - first :], window.is_chosen_on)
