@@ -126,7 +126,6 @@ class LiveServer:
         """Serve what `told` sets up. ring: the writer's messages; writer: socket to it."""
         self._most_viewers = told.live.most_viewers
         self._topics = topics = LiveTopics(told.live, told.setup.channels, told.ids, told.start_ns)
-        self._known = {channel["id"] for channel in topics.advertised}
         self._ring = ring
         self._writer = writer
         self._admission = Admission(told.live)
@@ -261,7 +260,7 @@ class LiveServer:
         """Serve one viewer until it disconnects. One that asks for too many subscriptions is disconnected."""
         viewer = Viewer(connection)
         viewer.put(self._info)
-        viewer.put(json.dumps({"op": "advertise", "channels": self._topics.advertised}))
+        viewer.put(json.dumps({"op": "advertise", "channels": list(self._topics.advertised.values())}))
         viewer.put(_TIME.pack(_TIME_DATA, self._time_ns))
         self._viewers.add(viewer)
         sending = asyncio.create_task(viewer.send_all())
@@ -306,7 +305,7 @@ class LiveServer:
         for number, channel in asked:
             if len(viewer.subscriptions) >= _SUBSCRIPTIONS_PER_TOPIC * len(self._topics.advertised):
                 return False
-            if channel not in self._known or number in viewer.subscriptions or not 0 <= number < 2**32:
+            if channel not in self._topics.advertised or number in viewer.subscriptions or not 0 <= number < 2**32:
                 viewer.put(_status(_ERROR, "a subscription to no topic, or with a number that is taken"))
                 continue
             viewer.subscriptions[number] = channel
