@@ -285,7 +285,7 @@ def test_never_is_a_dash_and_null_and_the_worst_rank():
         DelayRow(name, 1, delay, (0.0,) * len(STEPS_NM), (0.5,))
         for name, delay in (("b", never), ("a", (3.0,) * len(never)))
     )
-    comparison = Comparison(1.0, 2.0, (0.1,), (fast, slow), ())
+    comparison = Comparison(1.0, 2.0, (fast, slow), ())
     assert comparison.ranking == ("a", "b")
     assert comparison.table()[1][1][2] == "–"
     assert plain_values(comparison.by_key())["rows"][0]["delay_ms"][0] is None

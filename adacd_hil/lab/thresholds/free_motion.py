@@ -84,8 +84,8 @@ class LoggedMotion:
     period_s: float
     parameters: int
     is_free: Mask
-    bounds_ns: tuple[int, int] | None = None
-    level_rad: float = 0.0
+    bounds_ns: tuple[int, int] | None
+    level_rad: float
 
     def pieces(self) -> Iterator[Motion]:
         """Yield the samples piece by piece, in the order of time. Raises LogError if the log can't be read."""
@@ -110,8 +110,7 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
 
     Raises LogError if the log can't be read.
     """
-    stream = LogStream(path, TOPICS)
-    for piece in stream:
+    for piece in LogStream(path, TOPICS):
         scheme = piece.series[SCHEME.name]
         if bounds_ns is not None and len(scheme):
             if scheme.t_ns[0] >= bounds_ns[1]:
@@ -130,8 +129,7 @@ def read_motion(
     called with a line on the cycles read. watch: called with each piece of /scheme. Raises LogError if the log can't be
     read, has no /scheme or no measured period, or no sample is free of contact.
     """
-    bounds_ns = None
-    where = ""
+    bounds_ns, where = None, ""
     if not stretch.is_whole:
         bounds_ns, where = stretch.bounds_ns(begin_of_log(path)), f" {stretch.text}"
     period_s = _period(path, bounds_ns, where)

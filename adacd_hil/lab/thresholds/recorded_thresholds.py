@@ -45,7 +45,7 @@ from adacd_hil.lab.thresholds.free_motion import (
 )
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Milestones, Progress
-from adacd_hil.log.time_window import WHOLE, TimeWindow
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.model.regressor import mass_matrix
 
@@ -237,7 +237,7 @@ def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence
     return Thresholds(
         rate_per_h=rate_per_h,
         hours=statistics.hours,
-        is_extrapolated=any(calibration.is_extrapolated for _, calibration in calibrated.values()),
+        is_extrapolated=any(calibration.extrapolation > 1.0 for _, calibration in calibrated.values()),
         lag_s=statistics.lag_s,
         logs=tuple(logs),
         missing=missing,
@@ -271,56 +271,50 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
 
     Both per joint.
     """
-    motion, free = statistics.motion, statistics.is_free
+    motion, free, period_s = statistics.motion, statistics.is_free, statistics.motion.period_s
     places = np.flatnonzero(free)
     masses = np.array([mass_matrix(motion.q[k], motion.theta[k]) for k in places[:: max(1, places.size // 200)]])
-    largest = np.linalg.norm(masses, axis=2).max(axis=0)
-    sensing = []
+    largest = np.linalg.norm(masses, axis=2).max(axis=0).tolist()
+    torque_gain, momentum_gain = gains((), period_s, statistics.lag_s)
+    poles_of: dict[str, tuple[float, ...]] = {
+        name: (cutoff,) for name, cutoff in zip(FIRST_ORDER, CUTOFFS_RAD_S, strict=True)
+    }
+    poles_of |= {name: (cutoff, SMOOTHING_RAD_S) for name, cutoff in zip(SMOOTHED, CUTOFFS_RAD_S, strict=True)}
+    by_joint: dict[str, list[tuple[str, float]]] = {name: [] for name in poles_of}
     for i in range(JOINTS):
-        torque_LSB = resolution(motion.tau_J[free, i])
-        moves = statistics.held_Nm[free, i] == 0.0
-        x = low_pass(statistics.z[free, i], (_MODEL_RAD_S,), motion.period_s)[moves]
-        direction = low_pass(np.sign(motion.dq[free, i]), (_MODEL_RAD_S,), motion.period_s)[moves]
-        velocity_LSB = resolution(motion.dq[free, i])
-        # the slope of the velocity's noise dominates single samples: no other part is as fast
-        torque_gain, momentum_gain = gains((), motion.period_s, statistics.lag_s)
-        noise = float(white_noise(motion.tau_J[free, i]))
-        fast = mean_square(statistics.z[free, i][moves]) - (torque_gain * noise) ** 2
-        rest = fast / momentum_gain**2 - (float(largest[i]) * velocity_LSB) ** 2 / 12.0
-        sensing.append(
-            Sensing(
-                torque_noise_Nm=max(noise**2 - torque_LSB**2 / 12.0, 0.0) ** 0.5,
-                torque_LSB_Nm=torque_LSB,
-                velocity_LSB_rad_s=velocity_LSB,
-                mass_row_kg_m2=float(largest[i]),
-                momentum_noise_Nms=max(rest, 0.0) ** 0.5,
-                lag_error_s=float(statistics.lag_of_joint_s[i] - statistics.lag_s),
-                friction_error_Nm=float(x @ direction) / max(float(direction @ direction), 1e-300),
-            )
+        z, held_Nm, tau_J, dq = (
+            column[free, i] for column in (statistics.z, statistics.held_Nm, motion.tau_J, motion.dq)
         )
-    limits: dict[str, tuple[tuple[str, ...], tuple[float, ...]]] = {}
-    for names, more in ((FIRST_ORDER, ()), (SMOOTHED, (SMOOTHING_RAD_S,))):
-        for name, cutoff in zip(names, CUTOFFS_RAD_S, strict=True):
-            split = [
-                find_limits(
-                    statistics.z[free, i],
-                    motion.tau_J[free, i],
-                    statistics.held_Nm[free, i],
-                    sensing[i],
-                    (cutoff, *more),
-                    motion.period_s,
-                    statistics.lag_s,
-                    rate_per_h,
-                )
-                for i in range(JOINTS)
-            ]
-            largest_causes = tuple(max(causes, key=lambda cause: causes[cause]) for causes, _ in split)
-            limits[name] = largest_causes, tuple(achievable for _, achievable in split)
+        moves = held_Nm == 0.0
+        x, direction = (low_pass(series, (_MODEL_RAD_S,), period_s)[moves] for series in (z, np.sign(dq)))
+        torque_LSB, velocity_LSB = resolution(tau_J), resolution(dq)
+        # the slope of the velocity's noise dominates single samples: no other part is as fast
+        noise = float(white_noise(tau_J))
+        fast = mean_square(z[moves]) - (torque_gain * noise) ** 2
+        rest = fast / momentum_gain**2 - (largest[i] * velocity_LSB) ** 2 / 12.0
+        sensing = Sensing(
+            torque_noise_Nm=max(noise**2 - torque_LSB**2 / 12.0, 0.0) ** 0.5,
+            torque_LSB_Nm=torque_LSB,
+            velocity_LSB_rad_s=velocity_LSB,
+            mass_row_kg_m2=largest[i],
+            momentum_noise_Nms=max(rest, 0.0) ** 0.5,
+            lag_error_s=float(statistics.lag_of_joint_s[i] - statistics.lag_s),
+            friction_error_Nm=float(x @ direction) / max(float(direction @ direction), 1e-300),
+        )
+        for name, poles_rad_s in poles_of.items():
+            causes, achievable_Nm = find_limits(
+                z, tau_J, held_Nm, sensing, poles_rad_s, period_s, statistics.lag_s, rate_per_h
+            )
+            by_joint[name].append((max(causes, key=lambda cause: causes[cause]), achievable_Nm))
+    limits = {}
+    for name, found in by_joint.items():
+        largest_causes, achievables_Nm = zip(*found, strict=True)
+        limits[name] = largest_causes, achievables_Nm
     return limits
 
 
 def thresholds_of_logs(
-    paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None
+    paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow, progress: Progress
 ) -> tuple[Thresholds, Statistics]:
     """Return all detectors' thresholds from the contact-free motion of logs, and the statistics that they come from.
 

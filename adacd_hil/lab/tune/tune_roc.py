@@ -157,13 +157,8 @@ class Choice:
 
     @property
     def extrapolation(self) -> float:
-        """Rate of one alarm in the time that thresholds are chosen on, over the wanted rate; infinite without a tail.
-
-        Up to 1 nothing is extrapolated.
-        """
-        if self.calibration is None:
-            return math.inf
-        return 1.0 / (self.calibration.rate_per_h * self.calibration.tail.hours)
+        """That of the calibration, on the half that thresholds are chosen on; infinite without a tail."""
+        return math.inf if self.calibration is None else self.calibration.extrapolation
 
     @property
     def method(self) -> str:
