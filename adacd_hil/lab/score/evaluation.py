@@ -31,7 +31,6 @@ from adacd_hil.lab.score.run_arrays import (
     Run,
     Section,
     is_realtime,
-    rows_of,
     section_at,
     split_sections,
 )
@@ -79,11 +78,16 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
     detections = find_detections(run)
     score = judge_run(run, contacts_of(run), detections)
     sections = split_sections(run)
-    adaptation_s = {
-        section.label: section.duration_s if section.is_complete else None
-        for section in sections
-        if section.kind == "adaptation"
-    }
+    adaptation_s: dict[str, float | None] = {}
+    parameters: dict[str, dict[str, tuple[float | None, float]]] = {}
+    payload_kg: dict[str, float | None] = {}
+    for section in (section for section in sections if section.kind == "adaptation"):
+        adaptation_s[section.label] = section.duration_s if section.is_complete else None
+        row = last_row(run, section)
+        theta, _ = _model_in(run, row)
+        _, payload_kg[section.label] = _model_in(run, row - int(section.is_complete))  # its own last cycle
+        estimates = zip(run.parameter_names, run.theta_hat[row].tolist(), strict=True)
+        parameters[section.label] = {name: (theta.get(name), value) for name, value in estimates}
     has_truth = run.truth is not None
     false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
     faults = find_faults(run)
@@ -92,11 +96,10 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
         adaptation_s=adaptation_s,
         frozen_residual_max_Nm=gathered.untouched.residuals(sections),
         contacts=list_contacts(run, sections, detections, score),
-        false_alarms=len(false_s) if has_truth else None,
         false_alarms_s=false_s if has_truth else None,
         missed=score.missed if has_truth else None,
-        parameters=_parameters(run, sections),
-        payload_kg=_payloads(run, sections),
+        parameters=parameters,
+        payload_kg=payload_kg,
         fault=faults[0].reason if faults else None,
         fault_s=faults[0].at_s if faults else None,
         cycle={
@@ -116,46 +119,13 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
     return replace(metrics, paper=compare_with_paper(run, metrics), findings=findings)
 
 
-def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, tuple[float | None, float]]]:
-    """Return (true, identified) of each parameter at the end of each adaptation, by the adaptation's label and by name.
-
-    The true value is None without the truth.
-    """
-    found = {}
-    for section in sections:
-        if section.kind != "adaptation":
-            continue
-        row = last_row(run, section)
-        theta = true_parameters(run, int(run.cycle[row]))
-        found[section.label] = {
-            name: (theta.get(name), float(run.theta_hat[row, column]))
-            for column, name in enumerate(run.parameter_names)
-        }
-    return found
-
-
-def true_parameters(run: Run, cycle: int) -> dict[str, float]:
-    """Return the true parameters in a cycle by name; {} if the truth is missing or empty."""
-    row = None if run.truth is None else run.truth.model_row(cycle)
-    if run.truth is None or row is None:
-        return {}
-    return dict(zip(PARAMETER_NAMES, run.truth.theta[row].tolist(), strict=True))
-
-
-def _payloads(run: Run, sections: tuple[Section, ...]) -> dict[str, float | None]:
-    """Return the true payload at the end of each adaptation, kg, by label; the value is None without the truth."""
-    payloads: dict[str, float | None] = {}
-    time_s = run.time_s()
-    for section in sections:
-        if section.kind == "adaptation":
-            row = rows_of(time_s, section, float(time_s[-1])).stop - 1
-            payloads[section.label] = _payload_at(run, int(run.cycle[row]))
-    return payloads
-
-
-def _payload_at(run: Run, cycle: int) -> float | None:
-    row = None if run.truth is None else run.truth.model_row(cycle)
-    return None if run.truth is None or row is None else float(run.truth.payload_kg[row])
+def _model_in(run: Run, row: int) -> tuple[dict[str, float], float | None]:
+    """Return the true parameters in a cycle by name, and the true payload, kg; {} and None without the truth."""
+    place = None if run.truth is None else run.truth.model_row(int(run.cycle[row]))
+    if run.truth is None or place is None:
+        return {}, None
+    theta = dict(zip(PARAMETER_NAMES, run.truth.theta[place].tolist(), strict=True))
+    return theta, float(run.truth.payload_kg[place])
 
 
 def list_contacts(
@@ -164,11 +134,8 @@ def list_contacts(
     """Return the true contacts with the detection that found each; without the truth, each detection as a contact."""
     if run.truth is None:
         return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, run.first_contact))
-    raised = {detection.t_ns: detection for detection in detections}
-    return tuple(
-        _contact(run, sections, contact, None if contact.detected_ns is None else raised[contact.detected_ns])
-        for contact in score.contacts
-    )
+    raised: dict[int | None, Detection] = {detection.t_ns: detection for detection in detections}
+    return tuple(_contact(run, sections, contact, raised.get(contact.detected_ns)) for contact in score.contacts)
 
 
 def _reported(run: Run, detection: Detection | None) -> dict[str, Any]:

@@ -14,9 +14,9 @@ from scipy.optimize import brentq
 
 from adacd_hil.lab.score.run_arrays import Run
 from adacd_hil.log.logged_run import Cycles, Mask, begins_alarm, is_armed_in
-from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.records import SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
-from adacd_hil.score.emulator_truth import HostCycles, placed_contact
+from adacd_hil.score.emulator_truth import HostCycles, placed_contact, threshold_in_force
 from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge, true_contacts
 
 
@@ -78,24 +78,17 @@ def placed_in(
     return tuple(placed)
 
 
-def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
-    """Return after how long a torque step crosses a threshold behind a first-order low-pass, s; None if never.
+def step_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float | None) -> float | None:
+    """Return after how long a torque step crosses a threshold behind one or two first-order low-passes, s.
 
-    Closed form: t = -ln(1 - h / |tau|) / a.
-    """
-    if not abs(tau_ext_Nm) > threshold_Nm:
-        return None
-    return -math.log1p(-threshold_Nm / abs(tau_ext_Nm)) / a_rad_s
-
-
-def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float) -> float | None:
-    """Return after how long a torque step crosses a threshold behind two first-order low-passes, s; None if never.
-
-    The response rises steadily, so that there is one crossing.
+    None if never. b_rad_s: cut-off of the second one, None without it: then t = -ln(1 - h / |tau|) / a. The response
+    rises steadily, so that there is one crossing.
     """
     if not abs(tau_ext_Nm) > threshold_Nm:
         return None
     wanted = threshold_Nm / abs(tau_ext_Nm)
+    if b_rad_s is None:
+        return -math.log1p(-wanted) / a_rad_s
     return float(brentq(lambda t_s: step_response(t_s, a_rad_s, b_rad_s) - wanted, 0.0, 40.0 / min(a_rad_s, b_rad_s)))
 
 
@@ -115,13 +108,10 @@ class FilterChannel:
 
         None if never.
         """
-        delays_s = []
-        for joint in range(JOINTS):
-            tau, h = float(tau_ext[joint]), float(self.threshold[joint])
-            if self.smoothing_rad_s is None:
-                delays_s.append(detection_delay_s(tau, h, self.cutoff_rad_s))
-            else:
-                delays_s.append(two_pole_delay_s(tau, h, self.cutoff_rad_s, self.smoothing_rad_s))
+        delays_s = [
+            step_delay_s(tau, h, self.cutoff_rad_s, self.smoothing_rad_s)
+            for tau, h in zip(tau_ext.tolist(), self.threshold.tolist(), strict=True)
+        ]
         return min((delay_s for delay_s in delays_s if delay_s is not None), default=None)
 
     def respond(self, tau_ext: Vector, cycle: Cycles, period_s: float) -> Vector:
@@ -133,12 +123,6 @@ class FilterChannel:
         if self.smoothing_rad_s is None:
             return response
         return filtered(response, cycle, period_s, self.smoothing_rad_s)
-
-
-def threshold_in(run: Run, row: int) -> Vector:
-    """Return the threshold of `tau_ext_hat` in a row, Nm (2,); at a joint without detection, the configured one."""
-    configured = np.array(run.settings.detector.threshold_Nm)
-    return np.where(np.isfinite(run.threshold[row]), run.threshold[row], configured)
 
 
 def row_at(run: Run, time_s: float) -> int:
@@ -153,9 +137,11 @@ def row_at(run: Run, time_s: float) -> int:
 
 def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
     """Return the filters that detect at `time_s`, s since motion start, with thresholds: the paper's, or the bank."""
+    row = row_at(run, time_s)
     if run.certified is None:
-        return (FilterChannel(run.a_rad_s, None, threshold_in(run, row_at(run, time_s))),)
-    thresholds = run.certified.threshold[row_at(run, time_s)]
+        in_force = threshold_in_force(run.threshold[row], run.settings)
+        return (FilterChannel(run.a_rad_s, None, in_force),)
+    thresholds = run.certified.threshold[row]
     return tuple(
         FilterChannel(cutoff, smoothing, threshold)
         for (cutoff, smoothing), threshold in zip(channels_of(run.settings), thresholds, strict=True)
