@@ -110,11 +110,6 @@ def test_a_whitened_window_has_a_sigma_of_one_on_coloured_noise():
         assert 0.88 < through.std() <= 1.02
 
 
-def test_the_covariance_of_a_moving_average_is_found():
-    z = scipy.signal.lfilter([1.0, 0.5], [1.0], np.random.default_rng(6).standard_normal(200_000))
-    np.testing.assert_allclose(autocovariance(z, 4), [1.25, 0.5, 0.0, 0.0], atol=0.02)
-
-
 @pytest.mark.parametrize(
     ("call", "words"),
     [
