@@ -35,7 +35,15 @@ from adacd_hil.lab.score.run_arrays import (
     split_sections,
 )
 from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_causes, find_faults
-from adacd_hil.lab.score.run_judge import channels_at, contacts_of, find_detections, judge_run, row_at
+from adacd_hil.lab.score.run_judge import (
+    channels_at,
+    contacts_of,
+    find_detections,
+    ideal_response,
+    judge_run,
+    row_at,
+    step_delay_s,
+)
 from adacd_hil.lab.score.verdict import compare_with_paper, list_findings
 from adacd_hil.log.logged_run import Cycles
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
@@ -220,9 +228,13 @@ def _contact(
     is_seen = since_s <= delay_s + _window_s(run)
     until_final, links = _touches(run, onset_s, onset_s + delay_s + _window_s(run) if reported else float(time_s[-1]))
     channels = channels_at(run, onset_s)
-    steps_s = [delay for channel in channels if (delay := channel.step_delay_s(until_alarm)) is not None]
-    responses = [channel.respond(contact.tau_ext, contact.cycle, run.settings.bus.period_s) for channel in channels]
-    is_over = [np.abs(response) > channel.threshold for response, channel in zip(responses, channels, strict=True)]
+    steps_s = [step_delay_s(until_alarm, threshold, a_rad_s, b_rad_s) for a_rad_s, b_rad_s, threshold in channels]
+    crossed_s = [delay for delay in steps_s if delay is not None]
+    period_s = run.settings.bus.period_s
+    is_over = [
+        np.abs(ideal_response(contact.tau_ext, contact.cycle, period_s, a_rad_s, b_rad_s)) > threshold
+        for a_rad_s, b_rad_s, threshold in channels
+    ]
     over = np.flatnonzero(np.any(is_over, axis=(0, 2)))
     peak = until_final[np.argmax(np.abs(until_final), axis=0), range(JOINTS)]
     return ReportedContact(
@@ -234,7 +246,7 @@ def _contact(
         end_s=float(time_s[-1]),
         is_armed=contact.is_armed,
         delay_ms=contact.delay_ms,
-        law_ms=min(steps_s) * 1e3 if steps_s else None,
+        law_ms=min(crossed_s) * 1e3 if crossed_s else None,
         ideal_ms=float(time_s[over[0]] - onset_s) * 1e3 if over.size else None,
         link_ok=None if reported.get("link_detected") is None else reported["link_detected"] in links,
         direction_ok=_is_direction_right(reported.get("direction"), until_final.sum(axis=0)),

@@ -6,7 +6,7 @@ Shapes and units as in `adacd_hil.lab.score.run_arrays`.
 import math
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,51 +78,31 @@ def placed_in(
     return tuple(placed)
 
 
-def step_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float | None) -> float | None:
-    """Return after how long a torque step crosses a threshold behind one or two first-order low-passes, s.
+def step_delay_s(tau_ext: Vector, threshold: Vector, a_rad_s: float, b_rad_s: float | None) -> float | None:
+    """Return after how long a torque step, Nm (2,), crosses the threshold, Nm (2,), at the faster joint, s.
 
-    None if never. b_rad_s: cut-off of the second one, None without it: then t = -ln(1 - h / |tau|) / a. The response
-    rises steadily, so that there is one crossing.
+    None if never. a_rad_s: cut-off of a first-order low-pass; b_rad_s: of a second one behind it, None without it: then
+    t = -ln(1 - h / |tau|) / a. The response rises steadily, so that there is one crossing.
     """
-    if not abs(tau_ext_Nm) > threshold_Nm:
-        return None
-    wanted = threshold_Nm / abs(tau_ext_Nm)
+    pairs = zip(np.abs(tau_ext).tolist(), threshold.tolist(), strict=True)
+    shares = [h / tau for tau, h in pairs if tau > h]
     if b_rad_s is None:
-        return -math.log1p(-wanted) / a_rad_s
-    return float(brentq(lambda t_s: step_response(t_s, a_rad_s, b_rad_s) - wanted, 0.0, 40.0 / min(a_rad_s, b_rad_s)))
+        return min((-math.log1p(-share) / a_rad_s for share in shares), default=None)
+    longest_s = 40.0 / min(a_rad_s, b_rad_s)
+    found = (
+        brentq(lambda t_s, share: step_response(t_s, a_rad_s, b_rad_s) - share, 0.0, longest_s, (share,))
+        for share in shares
+    )
+    return min(map(float, found), default=None)
 
 
-@dataclass(frozen=True)
-class FilterChannel:
-    """A filter with its threshold, Nm (2,).
+def ideal_response(tau_ext: Vector, cycle: Cycles, period_s: float, a_rad_s: float, b_rad_s: float | None) -> Vector:
+    """Return a true torque, Nm (n, 2), behind one low-pass or, unless `b_rad_s` is None, two; from rest.
 
-    It is of first order; unless `smoothing_rad_s` is None, a second one is behind it.
+    Each sample is held until the next one. cycle (n,): numbers of their cycles.
     """
-
-    cutoff_rad_s: float
-    smoothing_rad_s: float | None
-    threshold: Vector
-
-    def step_delay_s(self, tau_ext: Vector) -> float | None:
-        """Return after how long a step of tau_ext, Nm (2,), crosses the threshold at the faster joint, s.
-
-        None if never.
-        """
-        delays_s = [
-            step_delay_s(tau, h, self.cutoff_rad_s, self.smoothing_rad_s)
-            for tau, h in zip(tau_ext.tolist(), self.threshold.tolist(), strict=True)
-        ]
-        return min((delay_s for delay_s in delays_s if delay_s is not None), default=None)
-
-    def respond(self, tau_ext: Vector, cycle: Cycles, period_s: float) -> Vector:
-        """Return the channel's output, Nm (n, 2), for a true torque (n, 2), from rest at the first sample.
-
-        Each sample is held until the next one. cycle (n,): numbers of their cycles.
-        """
-        response = filtered(tau_ext, cycle, period_s, self.cutoff_rad_s)
-        if self.smoothing_rad_s is None:
-            return response
-        return filtered(response, cycle, period_s, self.smoothing_rad_s)
+    response = filtered(tau_ext, cycle, period_s, a_rad_s)
+    return response if b_rad_s is None else filtered(response, cycle, period_s, b_rad_s)
 
 
 def row_at(run: Run, time_s: float) -> int:
@@ -135,17 +115,16 @@ def row_at(run: Run, time_s: float) -> int:
     return min(row, len(t_ns) - 1)
 
 
-def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
-    """Return the filters that detect at `time_s`, s since motion start, with thresholds: the paper's, or the bank."""
+def channels_at(run: Run, time_s: float) -> list[tuple[float, float | None, Vector]]:
+    """Return the filters that detect at `time_s`, s since motion start: the paper's, or the bank.
+
+    Of each its cut-off and, unless it is None, that of a second one behind it, rad/s, and its threshold, Nm (2,).
+    """
     row = row_at(run, time_s)
     if run.certified is None:
-        in_force = threshold_in_force(run.threshold[row], run.settings)
-        return (FilterChannel(run.a_rad_s, None, in_force),)
+        return [(run.a_rad_s, None, threshold_in_force(run.threshold[row], run.settings))]
     thresholds = run.certified.threshold[row]
-    return tuple(
-        FilterChannel(cutoff, smoothing, threshold)
-        for (cutoff, smoothing), threshold in zip(channels_of(run.settings), thresholds, strict=True)
-    )
+    return [(*cutoffs, threshold) for cutoffs, threshold in zip(channels_of(run.settings), thresholds, strict=True)]
 
 
 def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[Detection]) -> Score:
