@@ -296,12 +296,11 @@ class UntouchedGatherer:
         if is_frozen:
             free = free & is_armed_in(piece.state[rows])
         before = self._residuals.get(section.label, Residual(None, None, 0))
-        identified, cad = before.identified, before.cad
-        if is_frozen:
-            identified = _larger_pair(identified, piece.tau_ext_hat[rows][free])
-        if piece.has_cad:
-            cad = _larger_pair(cad, piece.tau_ext_hat_cad[rows][free])
-        self._residuals[section.label] = Residual(identified, cad, before.cycles + int(free.sum()))
+        self._residuals[section.label] = Residual(
+            _larger_pair(before.identified, piece.tau_ext_hat[rows][free]) if is_frozen else None,
+            _larger_pair(before.cad, piece.tau_ext_hat_cad[rows][free]) if piece.has_cad else None,
+            before.cycles + int(free.sum()),
+        )
 
     def _add_margin(self, piece: Run, section: Section, rows: slice, free: Mask) -> None:
         assert piece.certified is not None
