@@ -58,7 +58,7 @@ PLACES = {
     "detect": (f"{_LIBRARY}.array_detection", "detect"),
     "fit": (f"{_LIBRARY}.array_detection", "fit"),
     "load": (f"{_LIBRARY}.loaded_run", "load"),
-    "register_detector": ("adacd_hil.lab.detectors.detectors", "register"),
+    "register_detector": ("adacd_hil.lab.detectors.detector_registry", "register"),
 }
 
 

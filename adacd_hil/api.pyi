@@ -1,6 +1,6 @@
 from adacd_hil.lab.detectors.detector_registry import StreamDetector as Detector
 from adacd_hil.lab.detectors.detector_registry import check_contract as check_detector
-from adacd_hil.lab.detectors.detectors import register as register_detector
+from adacd_hil.lab.detectors.detector_registry import register as register_detector
 from adacd_hil.lab.library.array_detection import ArrayContact, ArrayError, detect, fit
 from adacd_hil.lab.library.array_detection import ArrayDetection as Detection
 from adacd_hil.lab.library.array_detection import FittedModel as Model

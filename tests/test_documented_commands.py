@@ -24,7 +24,7 @@ from foreign_arms import record, urdf_text
 from adacd_hil.api import load
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.cli.output import ExitCode
-from adacd_hil.lab.detectors.detectors import DetectorBankSettings, unregister
+from adacd_hil.lab.detectors.detector_registry import detectors, unregister
 from adacd_hil.lab.logs.python_can_files import McapReader
 from firmware_sim.cli.emulator_main import EmulatorExit
 
@@ -274,7 +274,7 @@ def test_a_python_example_runs(page, documents, folder, capsys):
         }
         assert np.array_equal(names["arrays"]["tau_J"], run["tau_J"])
     elif page == "detectors.md":
-        assert "magnitude" in DetectorBankSettings().detectors
+        assert "magnitude" in detectors()
         unregister("magnitude")
 
 

@@ -301,9 +301,9 @@ def placed_contact(
     """Return a contact on the clock of a run, with the times in which it explains alarms.
 
     times_ns: of onset and end. row: index of the first of the host's cycles at the onset or after it. a_rad_s: cut-off
-    of the scheme's slowest filter. While detection is off, the threshold of the settings counts.
+    of the scheme's slowest filter.
     """
-    threshold = np.where(np.isfinite(host.threshold[row]), host.threshold[row], settings.detector.threshold_Nm)
+    threshold = threshold_in_force(host.threshold[row], settings)
     after_s = forgotten_after_s(contact.tau_ext, contact.cycle, settings.bus.period_s, a_rad_s, threshold)
     return replace(
         contact,
@@ -312,6 +312,11 @@ def placed_contact(
         is_armed=bool(is_armed_in(host.before[row])),
         is_reacting=bool(is_interrupted(host.before[row])),
     )
+
+
+def threshold_in_force(threshold: Vector, settings: Settings) -> Vector:
+    """Return a cycle's threshold of `tau_ext_hat`, Nm (2,); at a joint without detection, that of the settings."""
+    return np.where(np.isfinite(threshold), threshold, settings.detector.threshold_Nm)
 
 
 KnownContacts = tuple[tuple[TrueContact, ...], EmulatorSpan]

@@ -176,7 +176,7 @@ def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossing
     crossings_ns: times at which a scheme, replayed on another scheme's motion, first exceeds a threshold. While it
     still reacts it can raise no alarm: then a crossing finds a contact that began meanwhile (`is_reacting`).
     """
-    onsets, until = _bounds(contacts)
+    onsets, until = explained_times(contacts)
     about = contacts_of_alarms(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()
     found = _first(about, [alarm.t_ns for alarm in alarms])
     crossed = _first(contacts_of_alarms(np.array(crossings_ns, np.int64), onsets, until).tolist(), crossings_ns)
@@ -185,7 +185,7 @@ def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossing
             found.setdefault(place, crossed[place])
     unexplained = [alarm for alarm, place in zip(alarms, about, strict=True) if place < 0]
     return Score(
-        _judged(contacts, found),
+        tuple(replace(contact, detected_ns=found.get(place)) for place, contact in enumerate(contacts)),
         tuple(alarm for alarm in unexplained if alarm.is_known),
         tuple(alarm for alarm in alarms if not alarm.is_known),
     )
@@ -213,7 +213,7 @@ class StreamJudge:
         least that begin before the last sample and aren't forgotten before the first.
         """
         rows = np.flatnonzero(is_over)
-        about = contacts_of_alarms(t_ns[rows], *_bounds(contacts))
+        about = contacts_of_alarms(t_ns[rows], *explained_times(contacts))
         first = _first(about.tolist(), t_ns[rows].tolist())
         self._found = {contacts[place].number: at_ns for place, at_ns in first.items()} | self._found
         false_ns = t_ns[rows[(about < 0) & is_judged[rows]]]
@@ -228,7 +228,7 @@ class StreamJudge:
         return Score(tuple(judged), tuple(self._false))
 
 
-def _bounds(contacts: Sequence[TrueContact]) -> tuple[Times, Times]:
+def explained_times(contacts: Sequence[TrueContact]) -> tuple[Times, Times]:
     """Return onsets of contacts (k,), and the last instants at which they explain an alarm, ns."""
     onsets = np.array([contact.onset_ns for contact in contacts], np.int64)
     return onsets, explained_until(onsets, np.array([contact.forgotten_ns for contact in contacts], np.int64))
@@ -239,11 +239,6 @@ def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
     first = dict(zip(reversed(about), reversed(times_ns), strict=True))
     first.pop(-1, None)
     return first
-
-
-def _judged(contacts: Sequence[TrueContact], found: dict[int, int]) -> tuple[TrueContact, ...]:
-    """Return the contacts with their times of detection; found: these times, ns, by the contact's index."""
-    return tuple(replace(contact, detected_ns=found.get(place)) for place, contact in enumerate(contacts))
 
 
 def contact_bounds(index: NDArray[Any], attempt: Times | None) -> list[tuple[int, int]]:

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hand_made_run import FIRST_CYCLE, A, C, M, P, R, S, contact_report, make_certified_run, make_run, react, touch
 
@@ -10,7 +11,7 @@ from adacd_hil.lab.report.run_page import report_page
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.run_arrays import split_sections
-from adacd_hil.lab.score.run_judge import two_pole_delay_s
+from adacd_hil.lab.score.run_judge import step_delay_s
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction, SchemeState
 
@@ -63,16 +64,8 @@ def test_a_contact_while_adapting_has_its_delay_and_is_not_missed():
     assert metrics.missed == 0
 
 
-def test_a_log_that_ended_as_nobody_meant_it_to_is_not_good():
-    run = make_certified_run()
-    assert evaluate(run).is_clean
-    metrics = evaluate(replace(run, broken_off="control process died"))
-    assert not metrics.is_clean
-    assert metrics.verdict.startswith("The run was broken off: control process died")
-
-
 def margin_of(run, label, channel):
-    return evaluate(run).evidence.margins[label][channel].margin
+    return tuple(evaluate(run).evidence.margins[label][channel].margin)
 
 
 def test_the_margin_is_the_smallest_threshold_over_residual():
@@ -240,8 +233,8 @@ def test_what_a_report_does_not_know_is_none():
 
 def test_a_step_behind_two_low_passes_takes_as_long_as_it_should_and_below_the_threshold_for_ever():
     # 1 - (1 + x) exp(-x) is 0.5 at x = 1.67835.
-    assert two_pole_delay_s(-2.0, 1.0, 100.0, 100.0) == pytest.approx(0.0167835, rel=1e-4)
-    assert [two_pole_delay_s(tau_ext_Nm, 1.0, 10.0, 200.0) for tau_ext_Nm in (0.0, 1.0)] == [None, None]
+    assert step_delay_s(np.array((-2.0, 0.1)), np.ones(2), 100.0, 100.0) == pytest.approx(0.0167835, rel=1e-4)
+    assert step_delay_s(np.array((0.0, 1.0)), np.ones(2), 10.0, 200.0) is None
 
 
 def test_the_law_is_that_of_the_fastest_channel():

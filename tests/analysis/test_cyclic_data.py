@@ -153,8 +153,15 @@ def test_a_run_that_never_booted_has_its_cause_as_verdict():
     assert evaluate(replace(run, events=())).verdict == "No cycle was run: the log does not say why."
 
 
-def test_what_broke_a_run_off_makes_it_unclean():
-    metrics = evaluate(make_run(events=(said(9000, "run", "can0 went away"), said(0, "run", "hello", "info"))))
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"events": (said(9000, "run", "can0 went away"), said(0, "run", "hello", "info"))},
+        {"broken_off": "can0 went away"},
+    ],
+)
+def test_what_broke_a_run_off_makes_it_unclean(changes):
+    metrics = evaluate(make_run(**changes))
     assert metrics.verdict.startswith("The run was broken off: can0 went away; no contact")
     assert metrics.is_clean is False
 

@@ -91,7 +91,7 @@ def test_what_is_found_shows_more_than_the_start_within_the_limits(search, found
     before, after = search.figures(search.present), search.figures(found)
     assert after.excitation_Nm2s > 2.0 * before.excitation_Nm2s
     assert after.cost < before.cost
-    for name, limits in search.limits.by_figure().items():
+    for name, limits in search.limits().items():
         assert (np.array(getattr(after, name)) <= np.array(limits) * (1.0 + TOLERANCE)).all()
 
 
@@ -104,7 +104,7 @@ def test_without_a_model_of_the_arm_torque_has_no_limit_and_the_lag_no_column(se
     settings = small_settings()
     blind = Search(dataclasses.replace(settings, arm=dataclasses.replace(settings.arm, cad_theta=())))
     figures = blind.figures(blind.present)
-    assert (figures.torque_Nm, blind.limits.by_figure()["torque_Nm"]) == (None, None)
+    assert (figures.torque_Nm, blind.limits()["torque_Nm"]) == (None, None)
     assert figures.excitation_Nm2s >= search.figures(search.present).excitation_Nm2s
 
 

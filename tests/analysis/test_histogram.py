@@ -22,11 +22,8 @@ def test_a_histogram_in_plain_values_leaves_out_empty_ends():
     assert plain["edges"] == pytest.approx([10.0, 11.220185, 12.589254])
 
 
-def test_a_value_on_a_bound_belongs_to_the_upper_bin():
+def test_a_value_on_a_bound_belongs_to_the_upper_bin_and_trailing_empty_bins_are_left_out():
     assert doubling_bins(np.array([0, 9, 10, 19, 20, 1000]), 10.0, 4) == [(10.0, 2), (20.0, 2), (40.0, 1), (INF, 1)]
-
-
-def test_trailing_empty_bins_are_left_out():
     assert doubling_bins(np.array([1, 15]), 10.0, 4) == [(10.0, 1), (20.0, 1)]
 
 

@@ -69,15 +69,14 @@ def test_only_what_armed_detection_missed_or_raised_counts_against_it_and_nothin
     assert [alarm.t_ns for alarm in score.unjudged] == [30 * MS]
 
 
-@pytest.mark.parametrize(("is_reacting", "delay_ms"), [(True, 4.0), (False, None)])
-def test_a_crossing_finds_a_contact_that_begins_while_the_scheme_still_reacts(is_reacting, delay_ms):
+@pytest.mark.parametrize(
+    ("is_reacting", "alarms_ms", "delay_ms"),
+    [(True, (), 4.0), (False, (), None), (True, (120,), 20.0)],
+    ids=["alone", "not reacting", "an alarm outweighs it"],
+)
+def test_a_crossing_finds_a_contact_that_begins_while_the_scheme_still_reacts(is_reacting, alarms_ms, delay_ms):
     window = touch(100, 300, is_armed=False, is_reacting=is_reacting)
-    assert found_ms(judge([window], [], crossings_ns=[104 * MS, 150 * MS])) == [delay_ms]
-
-
-def test_an_alarm_outweighs_a_crossing():
-    window = touch(100, 300, is_armed=False, is_reacting=True)
-    assert found_ms(judge([window], alarms(120), crossings_ns=[104 * MS])) == [20.0]
+    assert found_ms(judge([window], alarms(*alarms_ms), crossings_ns=[104 * MS, 150 * MS])) == [delay_ms]
 
 
 def test_of_a_stretch_only_what_begins_in_it_counts():

@@ -14,7 +14,7 @@ from called import called
 from hang import HANG_S
 from sweep_work import Dying, Work
 
-from adacd_hil.lab.tune.sweep import Plan, SweepStore, plan_logs, plan_scenarios, replay_task, run_sweep
+from adacd_hil.lab.tune.sweep import Plan, Subject, SweepStore, log_subjects, plan_of, replay_task, run_sweep
 from adacd_hil.lab.tune.workers import connect
 from adacd_hil.log.log_files import LogError
 
@@ -23,8 +23,8 @@ parquet = pytest.importorskip("pyarrow.parquet")
 THRESHOLDS = [{"detector.threshold_Nm": "0.1"}, {"detector.threshold_Nm": "0.4"}]
 
 
-def plan_of(seeds=range(1, 6), variants=THRESHOLDS, version="1") -> Plan:
-    return plan_scenarios(["paper"], seeds, variants, "paper", "", version)
+def plan_of_runs(seeds=range(1, 6), variants=THRESHOLDS) -> Plan:
+    return plan_of([Subject(scenario="paper", seed=seed) for seed in seeds], variants, "paper", "", "1")
 
 
 class ThreadWorkers:
@@ -101,7 +101,7 @@ def test_no_process_outlives_the_sweep(tmp_path, number, status):
 
 
 def sweep(folder: Path, client, work, plan=None, rows_per_task=2):
-    plan = plan or plan_of()
+    plan = plan or plan_of_runs()
     lines: list[str] = []
     store = SweepStore(folder)
     outcome = run_sweep(plan, work, store, client, lines.append, rows_per_task)
@@ -121,7 +121,7 @@ def test_every_row_is_computed_and_stands_in_the_order_of_the_plan_though_a_task
 
 
 def test_a_sweep_that_is_begun_again_computes_what_is_missing(tmp_path, client):
-    sweep(tmp_path, client, Work(tmp_path), plan_of(range(1, 4)))
+    sweep(tmp_path, client, Work(tmp_path), plan_of_runs(range(1, 4)))
     work = Work(tmp_path)
     outcome, rows, _ = sweep(tmp_path, client, work)
     assert (outcome.computed, outcome.found, len(rows)) == (4, 6, 10)
@@ -141,22 +141,26 @@ def test_a_task_that_always_fails_leaves_rows_that_say_why_and_are_computed_the_
 def test_a_key_changes_with_all_that_a_result_depends_on(tmp_path):
     log = tmp_path / "run.mcap"
     log.write_bytes(b"one")
-    first = list(plan_logs([log], THRESHOLDS, "", "", "1").row_keys())
+
+    def keys(variants=THRESHOLDS, config="", profile="", version="1"):
+        return list(plan_of(log_subjects([log]), variants, config, profile, version).row_keys())
+
+    first = keys()
     assert len(set(first)) == 2
-    assert list(plan_logs([log], THRESHOLDS, "", "", "1").row_keys()) == first
+    assert keys() == first
     for other in (
-        plan_logs([log], [{"detector.threshold_Nm": "0.3"}, {"filter.a_rad_s": "0.1"}], "", "", "1"),
-        plan_logs([log], THRESHOLDS, "paper", "", "1"),
-        plan_logs([log], THRESHOLDS, "", "S", "1"),
-        plan_logs([log], THRESHOLDS, "", "", "2"),
+        keys([{"detector.threshold_Nm": "0.3"}, {"filter.a_rad_s": "0.1"}]),
+        keys(config="paper"),
+        keys(profile="S"),
+        keys(version="2"),
     ):
-        assert not set(first) & set(other.row_keys())
+        assert not set(first) & set(other)
     log.write_bytes(b"another")
-    assert not set(first) & set(plan_logs([log], THRESHOLDS, "", "", "1").row_keys())
+    assert not set(first) & set(keys())
 
 
 def test_tasks_are_of_one_subject_and_of_so_many_rows_at_most():
-    plan = plan_of(range(1, 3), [{"filter.a_rad_s": str(value)} for value in range(10, 17)])
+    plan = plan_of_runs(range(1, 3), [{"filter.a_rad_s": str(value)} for value in range(10, 17)])
     tasks = list(plan.tasks(frozenset(), 3))
     assert [(task.subject.seed, len(task.rows)) for task in tasks] == [(1, 3), (1, 3), (1, 1), (2, 3), (2, 3), (2, 1)]
 
@@ -184,7 +188,7 @@ def test_a_part_that_is_damaged_is_named(tmp_path, client):
 
 def test_a_row_of_a_log_says_what_its_replay_came_to(log, whole):
     variants = [{}, {"detector.threshold_Nm": "9.0"}, {"detector.threshold_Nm": "-1"}]
-    (task,) = plan_logs([log], variants, "", "", "1").tasks(frozenset(), 10)
+    (task,) = plan_of(log_subjects([log]), variants, "", "", "1").tasks(frozenset(), 10)
     own, deaf, wrong = replay_task(task)
     assert [row["key"] for row in (own, deaf, wrong)] == [row.key for row in task.rows]
     assert (own["status"], own["identical"], own["cycles"], own["attempts"]) == ("ok", True, whole.cycles, 2)

@@ -13,7 +13,7 @@ import pytest
 from called import called
 from scheme.smooth_motion import torque_of
 
-from adacd_hil.lab.detectors.detectors import DetectorBankSettings, register, unregister
+from adacd_hil.lab.detectors.detector_registry import detectors, register, unregister
 from adacd_hil.lab.thresholds import free_motion as module
 from adacd_hil.lab.thresholds.detector_comparison import (
     STEPS_NM,
@@ -44,7 +44,6 @@ T = 1e-3
 THETA = np.array([0.3841, 0.06825, 0.04035, 0.12, 0.06, 0.15, 0.08])
 LAG_S = 1.5e-3
 RATES = np.array([1.7, 2.9])
-SETTINGS = DetectorBankSettings()
 
 
 def positions(t_s):
@@ -107,7 +106,7 @@ def motion_of(log, count=20_000):
 
 def statistics_of(logs, count=20_000):
     with logs_of(logs, count) as paths:
-        return run_detectors([read_motion(path) for path in paths], SETTINGS)
+        return run_detectors([read_motion(path) for path in paths])
 
 
 @pytest.fixture(scope="module")
@@ -277,7 +276,7 @@ def test_a_detector_that_is_registered_is_in_the_thresholds_and_in_the_report(tm
     assert "mean of 20" in report["ranking"]
     delays = {row["detector"]: row["delay_ms"] for row in report["rows"] if row["joint"] == 1}
     assert delays["mean of 20"][-1] < delays["paper"][0]
-    assert "mean of 20" not in SETTINGS.detectors
+    assert "mean of 20" not in detectors()
 
 
 def test_never_is_a_dash_and_null_and_the_worst_rank():
@@ -286,7 +285,7 @@ def test_never_is_a_dash_and_null_and_the_worst_rank():
         DelayRow(name, 1, delay, (0.0,) * len(STEPS_NM), (0.5,))
         for name, delay in (("b", never), ("a", (3.0,) * len(never)))
     )
-    comparison = Comparison(1.0, 2.0, (0.1,), (fast, slow), ())
+    comparison = Comparison(1.0, 2.0, (fast, slow), ())
     assert comparison.ranking == ("a", "b")
     assert comparison.table()[1][1][2] == "–"
     assert plain_values(comparison.by_key())["rows"][0]["delay_ms"][0] is None

@@ -80,7 +80,8 @@ def test_a_viewer_receives_every_topic_at_its_rate_as_the_file_has_it(watched):
 
 
 def decode(topic, payload):
-    schema = Schema(id=1, name=topic.type_name, encoding="ros2msg", data=topic.text.encode())
+    name, text = topic
+    schema = Schema(id=1, name=name, encoding="ros2msg", data=text.encode())
     return DecoderFactory().decoder_for("cdr", schema)(payload)
 
 

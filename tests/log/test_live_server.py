@@ -25,7 +25,7 @@ from adacd_hil.lab.live import server as server_module
 from adacd_hil.lab.live.admission import FULL, NOTICES, Admission
 from adacd_hil.lab.live.feed import ServerSetup
 from adacd_hil.lab.live.live_view import LiveView
-from adacd_hil.lab.live.server import listen, make_server, url_of
+from adacd_hil.lab.live.server import LiveServer, listen, url_of
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.ring import Ring, RingReader
 from adacd_hil.log.types.topics import run_channels
@@ -440,7 +440,7 @@ def test_the_live_view_ends_when_the_writer_dies(tmp_path):
 class Unstarted(NamedTuple):
     """A server that listens and has not begun to serve; `writer`: what the log's writer tells it through."""
 
-    server: server_module.LiveServer
+    server: LiveServer
     listening: socket.socket
     address: tuple[str, int]
     writer: socket.socket
@@ -451,7 +451,7 @@ def unstarted():
     ring = Ring(2**16)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     reader = RingReader(ring.descriptor)
-    server = make_server(ServerSetup(SETUP, setup_of(None), CHANNEL_IDS, EPOCH_NS), reader, theirs)
+    server = LiveServer(ServerSetup(SETUP, setup_of(None), CHANNEL_IDS, EPOCH_NS), reader, theirs)
     listening = listen(SETUP)
     yield Unstarted(server, listening, listening.getsockname(), ours)
     for end in (ours, theirs, ring):

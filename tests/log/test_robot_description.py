@@ -51,9 +51,9 @@ def tip_by_urdf(text, q):
 
 def tip_by_transforms(transforms):
     place = pinocchio.SE3.Identity()
-    for transform in transforms:
-        turn = pinocchio.Quaternion(np.array(transform.rotation))
-        place = place * pinocchio.SE3(turn, np.array(transform.translation))
+    for _, _, translation, rotation in transforms:
+        turn = pinocchio.Quaternion(np.array(rotation))
+        place = place * pinocchio.SE3(turn, np.array(translation))
     return place.translation
 
 

@@ -8,7 +8,8 @@ import pytest
 from documents import ROOT
 
 from adacd_hil.lab.detectors import detector_registry
-from adacd_hil.lab.detectors.detectors import DetectorBank, DetectorBankSettings, register, unregister
+from adacd_hil.lab.detectors.detector_registry import ONSET_SAMPLES, channels, detectors, register, unregister
+from adacd_hil.lab.detectors.detectors import DetectorBank
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings, with_todays_keys
 from adacd_hil.settings.parsing import parse
@@ -54,8 +55,7 @@ def test_the_example_passes_its_own_test(lab):
 
 
 def test_a_package_s_detector_stands_among_those_of_thresholds(lab):
-    settings = DetectorBankSettings()
-    assert settings.detectors["mean of 20"] == (len(settings.channels) - 1,)
+    assert detectors()["mean of 20"] == [len(channels()) - 1]
 
 
 def test_two_packages_with_one_name_are_refused_by_their_names(tmp_path, monkeypatch):
@@ -72,7 +72,7 @@ def test_two_packages_with_one_name_are_refused_by_their_names(tmp_path, monkeyp
     for _ in looked_up_anew():
         for _ in range(2):  # said again, not forgotten
             with pytest.raises(DetectorError, match=r"twin of package .*-lab 1.0 can't be used: .* already, of"):
-                _ = DetectorBankSettings().registered
+                detector_registry.registered()
 
 
 def test_a_package_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
@@ -81,7 +81,7 @@ def test_a_package_that_cannot_be_imported_is_named(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "lab_detectors", raising=False)
     for _ in looked_up_anew():
         with pytest.raises(DetectorError, match=r"mean of 20 of package lab-detectors 1.0 .* ImportError: no libfoo"):
-            _ = DetectorBankSettings().registered
+            detector_registry.registered()
 
 
 class Broken:
@@ -120,10 +120,9 @@ def test_a_detector_that_breaks_the_contract_is_refused(way):
 
 
 def test_a_statistic_that_stops_being_a_number_after_the_check_is_no_threshold():
-    settings = DetectorBankSettings()
     register("its name", lambda _: Broken("late"))
     try:
-        bank = DetectorBank(settings, np.zeros((2, len(settings.onset_samples), 128)), 1e-3)
+        bank = DetectorBank(np.zeros((2, len(ONSET_SAMPLES), 128)), 1e-3)
         bank.take_stream(np.ones((900, 2)), np.zeros((900, 2)))
         with pytest.raises(DetectorError, match=r"^detector its name .* gives nan for sample 0 of joint 1$"):
             bank.take_stream(np.ones((900, 2)), np.zeros((900, 2)))

@@ -46,7 +46,7 @@ def search(config: str, profile: str | None, seconds: float, seed: int, out: Pat
     return {
         "present": present,
         "found": task.figures(found),
-        "limits": task.limits.by_figure(),
+        "limits": task.limits(),
         "excitation": found,
     }
 
@@ -70,7 +70,7 @@ def as_text(outcome: dict[str, Any]) -> str:
     return format_table(("", "present", "found", "limit"), rows, (1, 2, 3))
 
 
-def _cell(value: float | tuple[float, float] | list[float] | None, form: str) -> str:
+def _cell(value: float | list[float] | None, form: str) -> str:
     if value is None:
         return "–"
-    return " / ".join(form.format(one) for one in value) if isinstance(value, tuple | list) else form.format(value)
+    return " / ".join(form.format(one) for one in value) if isinstance(value, list) else form.format(value)

@@ -152,7 +152,7 @@ def _plan(
     """
     from adacd_hil import __version__
     from adacd_hil.compiled import program_digest
-    from adacd_hil.lab.tune.sweep import plan_logs, plan_scenarios
+    from adacd_hil.lab.tune.sweep import Subject, log_subjects, plan_of
     from adacd_hil.settings.configuration_files import load_settings
     from adacd_hil.settings.setting_keys import apply_settings, parse_variations
 
@@ -162,12 +162,14 @@ def _plan(
         apply_settings(base, changes)
     version = f"{__version__} {program_digest()}"
     if logs:
-        return plan_logs(_files(logs), variants, config, profile, version)
+        return plan_of(log_subjects(_files(logs)), variants, config, profile, version)
     from firmware_sim.scenario.scenario import load_scenario
 
     for scenario in scenarios:
         load_scenario(scenario, base.arm.profile, None)
-    return plan_scenarios(scenarios, _seeds(seeds), variants, config, profile, version)
+    numbers = _seeds(seeds)
+    runs = (Subject(scenario=scenario, seed=seed) for scenario in scenarios for seed in numbers)
+    return plan_of(runs, variants, config, profile, version)
 
 
 def _files(logs: Sequence[Path]) -> list[Path]:

@@ -156,7 +156,7 @@ def _cells(checked: "Found") -> tuple[str, ...]:
     return (
         "–" if checked.contacts is None else f"{len(checked.delays_ms)} of {checked.contacts}",
         "–" if checked.contacts is None else f"{100 * low:.0f}–{100 * high:.0f} %",
-        *("–" if each is None else f"{each:.1f}" for each in delay_figures(checked.delays_ms)),
+        *("–" if each is None else f"{each:.1f}" for each in delay_figures(checked.delays_ms).values()),
         str(checked.alarms),
         f"{checked.rate_bound_per_h:.3g}",
     )
@@ -167,7 +167,7 @@ def _row(candidate: "Candidate") -> tuple[str, ...]:
     from adacd_hil.lab.tune.tune import slowest_adaptation
 
     outcome = candidate.outcome
-    median_ms, _, _ = delay_figures(outcome.delays_ms)
+    median_ms = delay_figures(outcome.delays_ms)["median"]
     return (
         candidate.name,
         ", ".join(f"{each:.3g}" for each in candidate.choice.thresholds.reshape(-1)),

@@ -1,4 +1,4 @@
-"""Registered detectors: their sources, and their common contract.
+"""Detectors by name, and their channels: the built-in ones, and registered ones with their common contract.
 
 A detector is registered by `register`, or by an entry point of the group `adacd_hil.detectors` in a lab's own package:
 the entry point's name is the detector's, its object a function that begins one, as for `register`. Entry points are
@@ -9,9 +9,9 @@ and on those before it. `check_contract` plays noise before a detector is taken:
 """
 
 import importlib.metadata
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from itertools import pairwise
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -42,70 +42,106 @@ Maker = Callable[[float], StreamDetector]
 """Begins a detector on a stream of a period, s."""
 
 
-class Registered(NamedTuple):
-    """A registered detector. make: begins one. origin: package of its entry point; "" if `register` added it."""
-
-    make: Maker
-    origin: str
-
-
-_REGISTERED: dict[str, Registered] = {}
+CUTOFFS_RAD_S: Final = (10.0, 50.0, 200.0)
+"""Of the first-order and smoothed channels."""
+OBSERVERS_RAD_S: Final = (25.0, 100.0)
+"""Gains of the momentum observers."""
+ONSET_SAMPLES: Final = (4, 8, 16, 32, 64, 128)
+"""Ages of the steps that the likelihood ratio knows."""
+FIRST_ORDER: Final = tuple(f"first-order {a:g}" for a in CUTOFFS_RAD_S)
+SMOOTHED: Final = tuple(f"smoothed {a:g}" for a in CUTOFFS_RAD_S)
+_OBSERVERS: Final = tuple(f"observer {gain:g}" for gain in OBSERVERS_RAD_S)
+_LIKELIHOODS: Final = tuple(f"likelihood {age}" for age in ONSET_SAMPLES)
+OWN_CHANNELS: Final = (*FIRST_ORDER, *SMOOTHED, "band-pass", *_OBSERVERS, *_LIKELIHOODS, "cusum")
+"""The built-in channels, in the order of the statistics."""
+_OWN_DETECTORS: Final = {
+    "paper": FIRST_ORDER[:1],
+    "bank": FIRST_ORDER,
+    "smoothed bank": (*FIRST_ORDER[1:], *SMOOTHED),
+    "band-pass": ("band-pass",),
+    **{name: (name,) for name in _OBSERVERS},
+    "likelihood ratio": _LIKELIHOODS,
+    "cusum": ("cusum",),
+}
+"""The built-in detectors with their channels."""
+_REGISTERED: dict[str, Maker] = {}
+_ORIGINS: dict[str, str] = {}
+"""Packages of the detectors that entry points added."""
 _LOADED: list[str] = []
 
 
-def registered(reserved: Collection[str]) -> Mapping[str, Registered]:
+def channels() -> tuple[str, ...]:
+    """Return the names of all channels in the order of the statistics, those of registered detectors last.
+
+    Raises DetectorError if one of these can't be used.
+    """
+    return (*OWN_CHANNELS, *registered())
+
+
+def detectors() -> dict[str, list[int]]:
+    """Return the indices in `channels` of each detector's channels, by its name, built-in ones first.
+
+    A joint is over a detector's threshold if one of these channels is over its own. Raises DetectorError if a
+    registered detector can't be used.
+    """
+    names = channels()
+    members = _OWN_DETECTORS | {name: (name,) for name in registered()}
+    return {name: [names.index(channel) for channel in members[name]] for name in members}
+
+
+def registered() -> Mapping[str, Maker]:
     """Return all registered detectors by name; the first call loads the entry points.
 
-    reserved: names of the built-in ones. Raises DetectorError for an entry point that can't be loaded, breaks the
-    contract, or has a name that is taken; then the next call loads them again.
+    Raises DetectorError for an entry point that can't be loaded, breaks the contract, or has a name that is taken; then
+    the next call loads them again.
     """
     if not _LOADED:
         _LOADED.append(ENTRY_POINTS)
         try:
             for entry in sorted(importlib.metadata.entry_points(group=ENTRY_POINTS), key=lambda entry: entry.name):
-                _load(entry, reserved)
+                _load(entry)
         except DetectorError:
             forget_loaded()
             raise
     return _REGISTERED
 
 
-def _load(entry: importlib.metadata.EntryPoint, reserved: Collection[str]) -> None:
+def _load(entry: importlib.metadata.EntryPoint) -> None:
     """Register the detector of an entry point.
 
     Raises DetectorError if it can't be loaded, breaks the contract, or its name is taken.
     """
     package = f"package {entry.dist.name} {entry.dist.version}" if entry.dist is not None else entry.value
     try:
-        add(entry.name, entry.load(), reserved, package)
+        register(entry.name, entry.load())
     except Exception as error:
         raise DetectorError(f"detector {entry.name} of {package} can't be used: {describe_error(error)}") from error
+    _ORIGINS[entry.name] = package
 
 
 def forget_loaded() -> None:
     """Remove the detectors of entry points, so that the next look-up loads them again; those of `register` stay."""
     _LOADED.clear()
-    for name in [name for name, found in _REGISTERED.items() if found.origin]:
-        del _REGISTERED[name]
+    for name in list(_ORIGINS):
+        unregister(name)
 
 
-def add(name: str, make: Maker, reserved: Collection[str], origin: str = "") -> None:
-    """Check a detector's contract and register it. make: begins one on a stream of a given period, s.
+def register(name: str, make: Maker) -> None:
+    """Register a detector under a name, for this process. make: begins one on a stream of a period, s.
 
-    origin: package of its entry point, "" without one. reserved: names of the built-in detectors and channels. Raises
-    ValueError for a name that is taken, and for a detector that doesn't keep the contract.
+    Raises ValueError for a name that is taken, and for a detector that breaks the contract.
     """
-    if name in _REGISTERED or name in reserved:
-        known = _REGISTERED.get(name)
-        where = f", of {known.origin}" if known is not None and known.origin else ""
+    if name in (*_REGISTERED, *OWN_CHANNELS, *_OWN_DETECTORS):
+        where = f", of {_ORIGINS[name]}" if name in _ORIGINS else ""
         raise ValueError(f"there is a detector or channel {name} already{where}")
     check_contract(name, make)
-    _REGISTERED[name] = Registered(make, origin)
+    _REGISTERED[name] = make
 
 
-def remove(name: str) -> None:
-    """Remove a registered detector by its name. Raises KeyError if there is none."""
+def unregister(name: str) -> None:
+    """Remove a registered detector from this process by its name. Raises KeyError if there is none."""
     del _REGISTERED[name]
+    _ORIGINS.pop(name, None)
 
 
 def check_contract(name: str, make: Maker, period_s: float = 1e-3) -> None:

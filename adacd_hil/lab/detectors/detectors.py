@@ -35,7 +35,6 @@ Sources: De Luca and Mattone, "Sensorless robot collision detection and hybrid f
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Final
 
@@ -43,8 +42,14 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 
 from adacd_hil.compiled import compiled
-from adacd_hil.lab.detectors import detector_registry
-from adacd_hil.lab.detectors.detector_registry import Maker, Registered
+from adacd_hil.lab.detectors.detector_registry import (
+    CUTOFFS_RAD_S,
+    OBSERVERS_RAD_S,
+    ONSET_SAMPLES,
+    OWN_CHANNELS,
+    registered,
+    statistics_of,
+)
 from adacd_hil.records import Vector
 from adacd_hil.scheme.model import regressor
 from adacd_hil.structured import PerJoint, Structured, packed, zeros_of
@@ -52,99 +57,14 @@ from adacd_hil.structured import PerJoint, Structured, packed, zeros_of
 VELOCITY_LAG_S: Final = 1.25e-3
 """The emulated drives: 1.59 ms of their tracking loop less 0.34 ms, since a commanded torque is a step at the start of
 the interval and not a straight line over it."""
-LIKELIHOOD: Final = "likelihood"
-"""First part of the names of its channels."""
-
-
-def register(name: str, make: Maker) -> None:
-    """Register a detector under a name, for this process. make: begins one on a stream of a period, s.
-
-    Raises ValueError for a name that is taken, and for a detector that breaks the contract of `detector_registry`.
-    """
-    detector_registry.add(name, make, DetectorBankSettings().built_in)
-
-
-def unregister(name: str) -> None:
-    """Remove a registered detector from this process by its name. Raises KeyError if there is none."""
-    detector_registry.remove(name)
-
-
-@dataclass(frozen=True)
-class DetectorBankSettings:
-    """Parameters of the detectors of one stream."""
-
-    cutoff_rad_s: tuple[float, ...] = (10.0, 50.0, 200.0)
-    """Of the first-order and smoothed channels."""
-    smoothing_rad_s: float = 200.0
-    """The second pole of the smoothed channels."""
-    band_rad_s: tuple[float, float] = (10.0, 100.0)
-    """Lower and upper cut-off of the band-pass."""
-    observer_rad_s: tuple[float, ...] = (25.0, 100.0)
-    """Gains of the momentum observers."""
-    onset_samples: tuple[int, ...] = (4, 8, 16, 32, 64, 128)
-    """Ages of the steps that the likelihood ratio knows."""
-    drift_Nm: float = 0.02
-    """Smoothed torque that cusum ignores."""
-    standstill_rad_s: float = 2e-3
-    """A slower joint stands still; five times the velocity's noise."""
-
-    @property
-    def own_channels(self) -> tuple[str, ...]:
-        """Names of the built-in channels, in the order of the statistics."""
-        return (
-            *(f"first-order {a:g}" for a in self.cutoff_rad_s),
-            *(f"smoothed {a:g}" for a in self.cutoff_rad_s),
-            "band-pass",
-            *(f"observer {gain:g}" for gain in self.observer_rad_s),
-            *(f"{LIKELIHOOD} {age}" for age in self.onset_samples),
-            "cusum",
-        )
-
-    @property
-    def channels(self) -> tuple[str, ...]:
-        """Names of all channels in the order of the statistics, those of registered detectors last.
-
-        Raises DetectorError if one of these can't be used.
-        """
-        return (*self.own_channels, *self.registered)
-
-    @property
-    def registered(self) -> Mapping[str, Registered]:
-        """The registered detectors by name; the first use loads entry points.
-
-        Raises DetectorError if one can't be used.
-        """
-        return detector_registry.registered(self.built_in)
-
-    @property
-    def built_in(self) -> frozenset[str]:
-        """Names that no registered detector may have: those of built-in channels and detectors."""
-        return frozenset((*self.own_channels, *self.own_detectors))
-
-    @property
-    def detectors(self) -> dict[str, tuple[int, ...]]:
-        """Indices in `channels` of each detector's channels, by its name, built-in ones first.
-
-        A joint is over a detector's threshold if one of these channels is over its own. Raises DetectorError if a
-        registered detector can't be used.
-        """
-        first = len(self.own_channels)
-        return self.own_detectors | {name: (first + place,) for place, name in enumerate(self.registered)}
-
-    @property
-    def own_detectors(self) -> dict[str, tuple[int, ...]]:
-        """Indices in `own_channels` of each built-in detector's channels, by its name."""
-        count, gains, ages = len(self.cutoff_rad_s), len(self.observer_rad_s), len(self.onset_samples)
-        detectors = {
-            "paper": (0,),
-            "bank": tuple(range(count)),
-            "smoothed bank": (*range(1, count), *range(count, 2 * count)),
-            "band-pass": (2 * count,),
-        }
-        for place, gain in enumerate(self.observer_rad_s):
-            detectors[f"observer {gain:g}"] = (2 * count + 1 + place,)
-        first = 2 * count + 1 + gains
-        return detectors | {"likelihood ratio": tuple(range(first, first + ages)), "cusum": (first + ages,)}
+SMOOTHING_RAD_S: Final = 200.0
+"""The second pole of the smoothed channels."""
+BAND_RAD_S: Final = (10.0, 100.0)
+"""Lower and upper cut-off of the band-pass."""
+DRIFT_NM: Final = 0.02
+"""Smoothed torque that cusum ignores."""
+STANDSTILL_RAD_S: Final = 2e-3
+"""A slower joint stands still; five times the velocity's noise."""
 
 
 def likelihood_windows(
@@ -220,17 +140,17 @@ class DetectorConstants:
     drift_Nm: float
 
 
-def constants_of(settings: DetectorBankSettings, weights: Vector, period_s: float) -> Structured:
-    """Return the settings and the joints' likelihood weights (n, N, L) as the record that the compiled `step` reads."""
+def constants_of(weights: Vector, period_s: float) -> Structured:
+    """Return the detectors' constants with the joints' likelihood weights (n, N, L), for the compiled `step`."""
     return packed(
         DetectorConstants(
             period_s=period_s,
-            decay=np.exp(-np.array(settings.cutoff_rad_s) * period_s),
-            smoothing=math.exp(-settings.smoothing_rad_s * period_s),
-            band=np.exp(-np.array(settings.band_rad_s) * period_s),
-            gain=np.array(settings.observer_rad_s),
+            decay=np.exp(-np.array(CUTOFFS_RAD_S) * period_s),
+            smoothing=math.exp(-SMOOTHING_RAD_S * period_s),
+            band=np.exp(-np.array(BAND_RAD_S) * period_s),
+            gain=np.array(OBSERVERS_RAD_S),
             weights=weights,
-            drift_Nm=settings.drift_Nm,
+            drift_Nm=DRIFT_NM,
         )
     )
 
@@ -318,15 +238,14 @@ def record(
 class DetectorBank:
     """All detectors, built-in and registered, on one stream, from its beginning."""
 
-    def __init__(self, settings: DetectorBankSettings, weights: Vector, period_s: float) -> None:
+    def __init__(self, weights: Vector, period_s: float) -> None:
         """Begin all detectors on one stream of a period, s. weights (n, N, L): the joints' likelihood weights.
 
         Raises DetectorError if a registered detector can't be used.
         """
-        self._constants = constants_of(settings, weights, period_s)
+        self._constants = constants_of(weights, period_s)
         self._memory = new_memory(self._constants)
-        self._channels = len(settings.channels)
-        self._registered = {name: found.make(period_s) for name, found in settings.registered.items()}
+        self._registered = {name: make(period_s) for name, make in registered().items()}
 
     def take_stream(self, z: Vector, held_Nm: Vector, block_samples: int = 1) -> Vector:
         """Process N more samples (N, n); return the largest statistic of each block of them.
@@ -335,17 +254,16 @@ class DetectorBank:
         standing joint. One sample per block keeps every statistic. The next call continues the stream with a new block.
         Raises DetectorError if a registered detector raises an error, or breaks its contract.
         """
-        count, joints = z.shape
-        own = np.empty((-(-count // block_samples), self._channels - len(self._registered), joints))
+        if not len(z):
+            return np.empty((0, len(OWN_CHANNELS) + len(self._registered), z.shape[1]))
+        starts = np.arange(0, len(z), block_samples)
+        own = np.empty((len(starts), len(OWN_CHANNELS), z.shape[1]))
         record(self._constants, self._memory, z, held_Nm, block_samples, own)
-        if not self._registered or not count:
-            return np.concatenate((own, np.zeros((own.shape[0], len(self._registered), joints))), axis=1)
-        starts = np.arange(0, count, block_samples)
         further = [
-            np.maximum.reduceat(detector_registry.statistics_of(name, detector, z, held_Nm), starts)
+            np.maximum.reduceat(statistics_of(name, detector, z, held_Nm), starts)[:, None]
             for name, detector in self._registered.items()
         ]
-        return np.concatenate((own, np.stack(further, axis=1)), axis=1)
+        return np.concatenate((own, *further), axis=1)
 
 
 @compiled
@@ -356,8 +274,6 @@ def stream(
     theta: Vector,
     interval_s: Vector,
     lag_s: float,
-    standstill_rad_s: float,
-    first_coulomb: int,
     z: Vector,
     held_Nm: Vector,
 ) -> None:
@@ -366,8 +282,7 @@ def stream(
     q, dq, tau_J (N, 2), theta (N, p), interval_s (N,). The first sample has z = 0, and so has one whose interval is not
     positive, because the motion before it is unknown. Both ends of an interval are judged by the theta of its end, so
     that a change of theta is not a torque. q1 counts from the level, for the direction of gravity; the rest is
-    independent of its zero. lag_s, standstill_rad_s: as of `make_stream`. first_coulomb: column of joint 1's Coulomb
-    friction in theta.
+    independent of its zero. lag_s: as of `make_stream`.
     """
     count, joints = q.shape
     Y_p = np.zeros((2, joints, theta.shape[1]))
@@ -377,10 +292,10 @@ def stream(
         regressor.fill_momentum(q[k], dq[k], Y_p[new])
         regressor.fill_remainder(q[k], dq[k], 0.0, Y_h[new])
         for i in range(joints):
-            stands = abs(dq[k, i]) < standstill_rad_s
+            stands = abs(dq[k, i]) < STANDSTILL_RAD_S
             if stands:
-                Y_h[new, i, first_coulomb + i] = 0.0
-            held_Nm[k, i] = max(theta[k, first_coulomb + i], 0.0) if stands else 0.0
+                Y_h[new, i, regressor.F_C1 + i] = 0.0
+            held_Nm[k, i] = max(theta[k, regressor.F_C1 + i], 0.0) if stands else 0.0
             z[k, i] = 0.0
             if k == 0 or not interval_s[k] > 0.0:
                 continue
@@ -397,31 +312,26 @@ def make_stream(
     tau_J: Vector,
     theta: Vector,
     interval_s: Vector,
-    lag_s: float = VELOCITY_LAG_S,
-    standstill_rad_s: float = 2e-3,
+    lag_s: float,
 ) -> tuple[Vector, Vector]:
     """Return the stream z of a recording, and the friction that may hold a standing joint, both (N, 2), Nm.
 
     q, dq, tau_J (N, 2), q1 from the level; theta (p,), or (N, p) if it changes, p = 7 or 9; interval_s (N,): time since
     the sample before, 0 or less where samples are missing between. lag_s: by which dq is older than tau_J.
-    standstill_rad_s: a slower joint stands still.
     """
     z, held_Nm = np.zeros(q.shape), np.zeros(q.shape)
     every = np.ascontiguousarray(np.broadcast_to(theta, (q.shape[0], np.shape(theta)[-1])))
-    stream(q, dq, tau_J, every, interval_s, lag_s, standstill_rad_s, regressor.F_C1, z, held_Nm)
+    stream(q, dq, tau_J, every, interval_s, lag_s, z, held_Nm)
     return z, held_Nm
 
 
-def likelihood_weights(z: Vector, settings: DetectorBankSettings, lag_s: float, period_s: float) -> Vector:
+def likelihood_weights(z: Vector, lag_s: float, period_s: float) -> Vector:
     """Return the likelihood weights (n, N, L) of all joints, from a contact-free stream z (n_samples, n), Nm.
 
-    lag_s: as of `likelihood_windows`. L is the largest age of `onset_samples` plus 16. Raises ValueError if z has fewer
+    lag_s: as of `likelihood_windows`. L is the largest age of `ONSET_SAMPLES` plus 16. Raises ValueError if z has fewer
     than 10 L samples, or a joint's variance is 0.
     """
-    length = max(settings.onset_samples) + 16
+    length = max(ONSET_SAMPLES) + 16
     return np.array(
-        [
-            likelihood_windows(autocovariance(z[:, i], length), settings.onset_samples, lag_s, period_s)
-            for i in range(z.shape[1])
-        ]
-    ).reshape(z.shape[1], len(settings.onset_samples), length)
+        [likelihood_windows(autocovariance(column, length), ONSET_SAMPLES, lag_s, period_s) for column in z.T]
+    )

@@ -25,14 +25,6 @@ MOST_MESSAGE_BYTES = 16 * 1024 * 1024
 """Longer messages don't come from our server."""
 
 
-class LiveTopic(NamedTuple):
-    """A topic that the server offers, with the name and the text of its schema."""
-
-    name: str
-    type_name: str
-    text: str
-
-
 class LiveMessage(NamedTuple):
     """A message; log_ns as in the file: since 1970 in real time, since the beginning in lockstep."""
 
@@ -50,8 +42,8 @@ class LiveClient:
         Raises LogError after OPEN_TIMEOUT_S, or for data that is no log of adacd-hil. The messages received so far are
         returned by `receive`.
         """
-        self.topics: dict[str, LiveTopic] = {}
-        """By name."""
+        self.topics: dict[str, tuple[str, str]] = {}
+        """Name and text of the schema of each topic that the server offers."""
         self.is_open = True
         """Whether more can come."""
         self._connection = connection
@@ -119,7 +111,7 @@ class LiveClient:
         subscriptions = []
         for channel in word["channels"]:
             name = channel["topic"]
-            self.topics[name] = LiveTopic(name, channel["schemaName"], channel["schema"])
+            self.topics[name] = channel["schemaName"], channel["schema"]
             subscription = {"id": channel["id"], "channelId": channel["id"]}
             self._names[channel["id"]] = name
             if name == DESCRIPTION_TOPIC:
@@ -135,7 +127,7 @@ class LiveClient:
         Raises LogError if the message doesn't fit its schema, or if the schema has no fixed size.
         """
         if message.topic not in self._dtypes:
-            self._dtypes[message.topic] = payload_dtype(self.topics[message.topic].text)
+            self._dtypes[message.topic] = payload_dtype(self.topics[message.topic][1])
         try:
             return np.frombuffer(message.payload, self._dtypes[message.topic])[0]
         except (ValueError, IndexError):

@@ -254,8 +254,8 @@ class LiveTopics:
         types[self.transforms] = (TRANSFORMS_TOPIC, TRANSFORMS)
         types[self.scene] = (SCENE_TOPIC, SCENE)
         types[self.robot] = (DESCRIPTION_TOPIC, STRING)
-        self.advertised = [_advertise(number, *named) for number, named in types.items()]
-        """As the protocol describes channels."""
+        self.advertised = {number: _advertise(number, *named) for number, named in types.items()}
+        """Channels by number, as the protocol describes them."""
         self._description = pack_string(setup.robot_description)
 
     def description(self) -> Shown:

@@ -18,6 +18,7 @@ Point = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Color = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0 to 1."""
+ORIGIN: Point = (0.0, 0.0, 0.0)
 UPRIGHT: Quaternion = (0.0, 0.0, 0.0, 1.0)
 
 
@@ -26,39 +27,14 @@ TRANSFORMS = foreign_type("tf2_msgs/msg/TFMessage")
 SCENE = foreign_type("foxglove_msgs/msg/SceneUpdate")
 
 
-class Transform(NamedTuple):
-    """Pose of the frame `child` in the frame `parent`."""
-
-    parent: str
-    child: str
-    translation: Point
-    rotation: Quaternion
-
-
-class Arrow(NamedTuple):
-    """An arrow that begins at `tail` and points along +x, turned by `rotation`."""
-
-    tail: Point
-    rotation: Quaternion
-    length_m: float
-    color: Color
-
-
-class Sphere(NamedTuple):
-    """A sphere."""
-
-    centre: Point
-    diameter_m: float
-    color: Color
-
-
-class Label(NamedTuple):
-    """A text that always faces the viewer."""
-
-    centre: Point
-    text: str
-    height_m: float
-    color: Color
+Transform = tuple[str, str, Point, Quaternion]
+"""Pose of a frame in another: names of that other one and of the frame, translation, rotation."""
+Arrow = tuple[Point, Quaternion, float, Color]
+"""Tail, rotation from +x, length in m, colour."""
+Sphere = tuple[float, Color]
+"""Diameter in m and colour; the frame's origin is its centre."""
+Label = tuple[Point, str, float, Color]
+"""Centre, text, height in m and colour of a text that always faces the viewer."""
 
 
 class Entity(NamedTuple):
@@ -113,11 +89,11 @@ def pack_transforms(time_ns: int, transforms: tuple[Transform, ...]) -> bytes:
     """Return a payload of tf2_msgs/msg/TFMessage with these poses; time_ns: log time of all."""
     payload = _Payload()
     payload.put("I", len(transforms))
-    for transform in transforms:
+    for parent, child, translation, rotation in transforms:
         payload.time(time_ns)
-        payload.text(transform.parent)
-        payload.text(transform.child)
-        payload.put("d", *transform.translation, *transform.rotation)
+        payload.text(parent)
+        payload.text(child)
+        payload.put("d", *translation, *rotation)
     return payload.bytes()
 
 
@@ -132,21 +108,20 @@ def pack_scene(time_ns: int, entities: tuple[Entity, ...]) -> bytes:
         payload.time(entity.lifetime_ns)
         payload.put("?", True)  # moves with its frame
         payload.put("I", 0, len(entity.arrows))  # no metadata
-        for arrow in entity.arrows:
-            head_m = min(0.4 * arrow.length_m, 0.04)
-            sizes_m = arrow.length_m - head_m, 0.012, head_m, 0.03
-            payload.put("d", *arrow.tail, *arrow.rotation, *sizes_m, *arrow.color)
+        for tail, rotation, length_m, color in entity.arrows:
+            head_m = min(0.4 * length_m, 0.04)
+            payload.put("d", *tail, *rotation, length_m - head_m, 0.012, head_m, 0.03, *color)
         payload.put("I", 0, len(entity.spheres))  # no cubes
-        for sphere in entity.spheres:
-            payload.put("d", *sphere.centre, *UPRIGHT, *[sphere.diameter_m] * 3, *sphere.color)
+        for diameter_m, color in entity.spheres:
+            payload.put("d", *ORIGIN, *UPRIGHT, *[diameter_m] * 3, *color)
         payload.put("I", 0, 0, 0, len(entity.labels))  # no cylinders, lines, triangles
-        for label in entity.labels:
-            payload.put("d", *label.centre, *UPRIGHT)
+        for centre, text, height_m, color in entity.labels:
+            payload.put("d", *centre, *UPRIGHT)
             payload.put("?", True)
-            payload.put("d", label.height_m)
+            payload.put("d", height_m)
             payload.put("?", False)
-            payload.put("d", *label.color)
-            payload.text(label.text)
+            payload.put("d", *color)
+            payload.text(text)
         payload.put("I", 0)  # no models
     return payload.bytes()
 
@@ -185,13 +160,12 @@ def about_z(angle_rad: float) -> Quaternion:
 def transforms_of(shape: Shape, q: Vector) -> tuple[Transform, ...]:
     """Return the poses of the robot description's frames at the joint positions q (2,), rad: base, both links, tip."""
     half_rad = 0.5 * shape.tilt_rad
-    origin = (0.0, 0.0, 0.0)
     elbow, end = ((length_m, 0.0, 0.0) for length_m in shape.link_length_m)
     return (
-        Transform(WORLD, BASE, origin, (math.sin(half_rad), 0.0, 0.0, math.cos(half_rad))),
-        Transform(BASE, LINK_NAMES[0], origin, about_z(q[0] - shape.level_rad)),
-        Transform(LINK_NAMES[0], LINK_NAMES[1], elbow, about_z(q[1])),
-        Transform(LINK_NAMES[1], TIP, end, UPRIGHT),
+        (WORLD, BASE, ORIGIN, (math.sin(half_rad), 0.0, 0.0, math.cos(half_rad))),
+        (BASE, LINK_NAMES[0], ORIGIN, about_z(q[0] - shape.level_rad)),
+        (LINK_NAMES[0], LINK_NAMES[1], elbow, about_z(q[1])),
+        (LINK_NAMES[1], TIP, end, UPRIGHT),
     )
 
 
@@ -208,10 +182,13 @@ def draw_joints(state: SchemeState, tau_ext_hat: Vector, threshold: Vector) -> t
     entities = []
     for index, link in enumerate(LINK_NAMES):
         share = residual_over_threshold(float(tau_ext_hat[index]), float(threshold[index]))
-        sphere = Sphere((0.0, 0.0, 0.0), _diameter_m(share), _color(share))
-        label = Label((0.0, 0.0, 0.5 * _ABOVE_M), _joint_text(float(tau_ext_hat[index]), share), _LABEL_HEIGHT_M, INK)
+        is_off = math.isnan(share)
+        text = f"{tau_ext_hat[index]:+.3f} Nm" + ("" if is_off else f", {100.0 * share:.0f} %")
+        label = ((0.0, 0.0, 0.5 * _ABOVE_M), text, _LABEL_HEIGHT_M, INK)
+        grown = 0.0 if is_off else min(share, 1.0)
+        sphere = (SMALLEST_SPHERE_M + grown * (LARGEST_SPHERE_M - SMALLEST_SPHERE_M), _color(share))
         entities.append(Entity(JOINT_NAMES[index], link, spheres=(sphere,), labels=(label,)))
-    label = Label((0.0, 0.0, _ABOVE_M), state.name, 1.5 * _LABEL_HEIGHT_M, INK)
+    label = ((0.0, 0.0, _ABOVE_M), state.name, 1.5 * _LABEL_HEIGHT_M, INK)
     return (*entities, Entity("state", BASE, labels=(label,)))
 
 
@@ -233,8 +210,8 @@ def draw_contact(shape: Shape, report: ContactReport) -> Entity:
     text = f"{report.level.name} link {report.link}: {sign}{abs(force_N):.1f} N"
     if on_link_2 and report.location is Location.KNOWN:
         text += f" at {report.lever_m:.2f} m"
-    arrow = Arrow(tail, about_z(-side * 0.5 * math.pi), arrow_m, color)
-    label = Label((place_m, side * (arrow_m + 0.03), 0.5 * _ABOVE_M), text, _LABEL_HEIGHT_M, INK)
+    arrow = (tail, about_z(-side * 0.5 * math.pi), arrow_m, color)
+    label = ((place_m, side * (arrow_m + 0.03), 0.5 * _ABOVE_M), text, _LABEL_HEIGHT_M, INK)
     return Entity("contact", LINK_NAMES[report.link - 1], (arrow,), labels=(label,), lifetime_ns=ARROW_LIFETIME_NS)
 
 
@@ -249,19 +226,9 @@ def _force(shape: Shape, report: ContactReport) -> tuple[float, bool]:
     return report.force_N, report.location is Location.KNOWN
 
 
-def _diameter_m(share: float) -> float:
-    if math.isnan(share):
-        return SMALLEST_SPHERE_M
-    return SMALLEST_SPHERE_M + min(share, 1.0) * (LARGEST_SPHERE_M - SMALLEST_SPHERE_M)
-
-
 def _color(share: float) -> Color:
     if math.isnan(share):
         return GREY
     if share < NEAR:
         return GREEN
     return YELLOW if share < 1.0 else RED
-
-
-def _joint_text(tau_ext_hat: float, share: float) -> str:
-    return f"{tau_ext_hat:+.3f} Nm" + ("" if math.isnan(share) else f", {100.0 * share:.0f} %")

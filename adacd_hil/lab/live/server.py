@@ -13,6 +13,7 @@ It runs with lower priority than the writer, and ends with it.
 
 import asyncio
 import contextlib
+import functools
 import html
 import json
 import logging
@@ -22,7 +23,6 @@ import socket
 import struct
 import sys
 from collections import defaultdict, deque
-from collections.abc import Mapping
 from http import HTTPStatus
 from pathlib import Path
 from string import Template
@@ -122,13 +122,13 @@ class Viewer:
 class LiveServer:
     """Serves viewers the messages of a ring buffer that the log's writer fills, until the writer ends or dies."""
 
-    def __init__(self, setup: LiveView, topics: LiveTopics, ring: RingReader, writer: socket.socket) -> None:
-        self._setup = setup
-        self._topics = topics
-        self._known = {channel["id"] for channel in topics.advertised}
+    def __init__(self, told: ServerSetup, ring: RingReader, writer: socket.socket) -> None:
+        """Serve what `told` sets up. ring: the writer's messages; writer: socket to it."""
+        self._most_viewers = told.live.most_viewers
+        self._topics = topics = LiveTopics(told.live, told.setup.channels, told.ids, told.start_ns)
         self._ring = ring
         self._writer = writer
-        self._admission = Admission(setup)
+        self._admission = Admission(told.live)
         self._viewers: set[Viewer] = set()
         self._connections: set[Connection] = set()
         self._admitted: set[Connection] = set()
@@ -136,7 +136,16 @@ class LiveServer:
         self._is_watched = False
         self._time_ns = topics.latest_ns
         self._noticed: set[str] = set()
-        self._session = secrets.token_hex(8)
+        self._info = json.dumps(
+            {
+                "op": "serverInfo",
+                "name": "adacd-hil",
+                "capabilities": ["time"],
+                "supportedEncodings": [],
+                "metadata": {},
+                "sessionId": secrets.token_hex(8),
+            }
+        )
         self._notices: int | None = None
 
     async def run(self, listening: socket.socket, notices: int | None = None) -> None:
@@ -146,6 +155,8 @@ class LiveServer:
         """
         self._notices = notices
         loop = asyncio.get_running_loop()
+        most = self._most_viewers + OPENING
+        connection = functools.partial(_CountedConnection, self._connections, self._admitted, most)
         server = await serve(
             self._attend,
             sock=listening,
@@ -159,7 +170,7 @@ class LiveServer:
             close_timeout=LINGER_S,
             max_size=_MOST_REQUEST_BYTES,
             logger=_no_logger(),
-            create_connection=cast(Any, self._counted),  # which may be any factory
+            create_connection=cast(Any, connection),  # which may be any factory
         )
         self._writer.setblocking(False)
         loop.add_reader(self._writer, self._hear)
@@ -219,15 +230,6 @@ class LiveServer:
 
     # -- viewers --------------------------------------------------------------------------------------------------
 
-    def _counted(self, *given: Any, **named: Any) -> ServerConnection:
-        """Return a connection that is counted while it lasts, and aborted if there are too many.
-
-        Too many are more than the admitted viewers and `OPENING`. given, named: arguments of ServerConnection.
-        """
-        return _CountedConnection(
-            self._connections, self._admitted, self._setup.most_viewers + OPENING, *given, **named
-        )
-
     def _judge(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the answer to a refused request, or the page for a browser.
 
@@ -239,7 +241,7 @@ class LiveServer:
         refusal = self._admission.refuse(origins, hosts, None if is_page else protocols)
         if refusal is None and is_page:
             return _page(connection, hosts[0])
-        if refusal is None and len(self._admitted) >= self._setup.most_viewers:
+        if refusal is None and len(self._admitted) >= self._most_viewers:
             refusal = FULL
         if refusal is None:
             self._admitted.add(connection)
@@ -257,8 +259,8 @@ class LiveServer:
     async def _attend(self, connection: ServerConnection) -> None:
         """Serve one viewer until it disconnects. One that asks for too many subscriptions is disconnected."""
         viewer = Viewer(connection)
-        viewer.put(json.dumps(self._describe()))
-        viewer.put(json.dumps({"op": "advertise", "channels": self._topics.advertised}))
+        viewer.put(self._info)
+        viewer.put(json.dumps({"op": "advertise", "channels": list(self._topics.advertised.values())}))
         viewer.put(_TIME.pack(_TIME_DATA, self._time_ns))
         self._viewers.add(viewer)
         sending = asyncio.create_task(viewer.send_all())
@@ -274,16 +276,6 @@ class LiveServer:
             sending.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                 await sending
-
-    def _describe(self) -> Mapping[str, Any]:
-        return {
-            "op": "serverInfo",
-            "name": "adacd-hil",
-            "capabilities": ["time"],
-            "supportedEncodings": [],
-            "metadata": {},
-            "sessionId": self._session,
-        }
 
     def _obey(self, viewer: Viewer, data: Data) -> bool:
         """Carry out a viewer's request; return False if it asks for too many subscriptions.
@@ -313,7 +305,7 @@ class LiveServer:
         for number, channel in asked:
             if len(viewer.subscriptions) >= _SUBSCRIPTIONS_PER_TOPIC * len(self._topics.advertised):
                 return False
-            if channel not in self._known or number in viewer.subscriptions or not 0 <= number < 2**32:
+            if channel not in self._topics.advertised or number in viewer.subscriptions or not 0 <= number < 2**32:
                 viewer.put(_status(_ERROR, "a subscription to no topic, or with a number that is taken"))
                 continue
             viewer.subscriptions[number] = channel
@@ -420,18 +412,6 @@ def url_of(setup: LiveView, listening: socket.socket) -> str:
     return f"ws://{host}:{listening.getsockname()[1]}"
 
 
-def make_server(told: ServerSetup, ring: RingReader, writer: socket.socket) -> LiveServer:
-    """Return the server of a log's live view. told: setup from the writer; ring: its messages; writer: socket to it."""
-    topics = LiveTopics(told.live, told.setup.channels, told.ids, told.start_ns)
-    return LiveServer(told.live, topics, ring, writer)
-
-
-async def _serve(
-    told: ServerSetup, ring: RingReader, writer: socket.socket, listening: socket.socket, notices: int
-) -> None:
-    await make_server(told, ring, writer).run(listening, notices)
-
-
 def main(socket_descriptor: int, ring_descriptor: int, notices: int) -> None:
     """Serve the live view: send the writer the address or an error, then serve until the writer ends.
 
@@ -447,7 +427,7 @@ def main(socket_descriptor: int, ring_descriptor: int, notices: int) -> None:
         writer.send(json.dumps({"error": " ".join(str(error).split())}).encode())
         return
     writer.send(json.dumps({"error": "", "url": url_of(told.live, listening)}).encode())
-    asyncio.run(_serve(told, RingReader(ring_descriptor), writer, listening, notices))
+    asyncio.run(LiveServer(told, RingReader(ring_descriptor), writer).run(listening, notices))
 
 
 if __name__ == "__main__":

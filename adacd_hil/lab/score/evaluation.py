@@ -31,12 +31,19 @@ from adacd_hil.lab.score.run_arrays import (
     Run,
     Section,
     is_realtime,
-    rows_of,
     section_at,
     split_sections,
 )
 from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_causes, find_faults
-from adacd_hil.lab.score.run_judge import channels_at, contacts_of, find_detections, judge_run, row_at
+from adacd_hil.lab.score.run_judge import (
+    channels_at,
+    contacts_of,
+    find_detections,
+    ideal_response,
+    judge_run,
+    row_at,
+    step_delay_s,
+)
 from adacd_hil.lab.score.verdict import compare_with_paper, list_findings
 from adacd_hil.log.logged_run import Cycles
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, ContactReport, Location, SchemeState, Vector
@@ -79,11 +86,16 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
     detections = find_detections(run)
     score = judge_run(run, contacts_of(run), detections)
     sections = split_sections(run)
-    adaptation_s = {
-        section.label: section.duration_s if section.is_complete else None
-        for section in sections
-        if section.kind == "adaptation"
-    }
+    adaptation_s: dict[str, float | None] = {}
+    parameters: dict[str, dict[str, tuple[float | None, float]]] = {}
+    payload_kg: dict[str, float | None] = {}
+    for section in (section for section in sections if section.kind == "adaptation"):
+        adaptation_s[section.label] = section.duration_s if section.is_complete else None
+        row = last_row(run, section)
+        theta, _ = _model_in(run, row)
+        _, payload_kg[section.label] = _model_in(run, row - int(section.is_complete))  # its own last cycle
+        estimates = zip(run.parameter_names, run.theta_hat[row].tolist(), strict=True)
+        parameters[section.label] = {name: (theta.get(name), value) for name, value in estimates}
     has_truth = run.truth is not None
     false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
     faults = find_faults(run)
@@ -92,11 +104,10 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
         adaptation_s=adaptation_s,
         frozen_residual_max_Nm=gathered.untouched.residuals(sections),
         contacts=list_contacts(run, sections, detections, score),
-        false_alarms=len(false_s) if has_truth else None,
         false_alarms_s=false_s if has_truth else None,
         missed=score.missed if has_truth else None,
-        parameters=_parameters(run, sections),
-        payload_kg=_payloads(run, sections),
+        parameters=parameters,
+        payload_kg=payload_kg,
         fault=faults[0].reason if faults else None,
         fault_s=faults[0].at_s if faults else None,
         cycle={
@@ -116,46 +127,13 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
     return replace(metrics, paper=compare_with_paper(run, metrics), findings=findings)
 
 
-def _parameters(run: Run, sections: tuple[Section, ...]) -> dict[str, dict[str, tuple[float | None, float]]]:
-    """Return (true, identified) of each parameter at the end of each adaptation, by the adaptation's label and by name.
-
-    The true value is None without the truth.
-    """
-    found = {}
-    for section in sections:
-        if section.kind != "adaptation":
-            continue
-        row = last_row(run, section)
-        theta = true_parameters(run, int(run.cycle[row]))
-        found[section.label] = {
-            name: (theta.get(name), float(run.theta_hat[row, column]))
-            for column, name in enumerate(run.parameter_names)
-        }
-    return found
-
-
-def true_parameters(run: Run, cycle: int) -> dict[str, float]:
-    """Return the true parameters in a cycle by name; {} if the truth is missing or empty."""
-    row = None if run.truth is None else run.truth.model_row(cycle)
-    if run.truth is None or row is None:
-        return {}
-    return dict(zip(PARAMETER_NAMES, run.truth.theta[row].tolist(), strict=True))
-
-
-def _payloads(run: Run, sections: tuple[Section, ...]) -> dict[str, float | None]:
-    """Return the true payload at the end of each adaptation, kg, by label; the value is None without the truth."""
-    payloads: dict[str, float | None] = {}
-    time_s = run.time_s()
-    for section in sections:
-        if section.kind == "adaptation":
-            row = rows_of(time_s, section, float(time_s[-1])).stop - 1
-            payloads[section.label] = _payload_at(run, int(run.cycle[row]))
-    return payloads
-
-
-def _payload_at(run: Run, cycle: int) -> float | None:
-    row = None if run.truth is None else run.truth.model_row(cycle)
-    return None if run.truth is None or row is None else float(run.truth.payload_kg[row])
+def _model_in(run: Run, row: int) -> tuple[dict[str, float], float | None]:
+    """Return the true parameters in a cycle by name, and the true payload, kg; {} and None without the truth."""
+    place = None if run.truth is None else run.truth.model_row(int(run.cycle[row]))
+    if run.truth is None or place is None:
+        return {}, None
+    theta = dict(zip(PARAMETER_NAMES, run.truth.theta[place].tolist(), strict=True))
+    return theta, float(run.truth.payload_kg[place])
 
 
 def list_contacts(
@@ -164,11 +142,8 @@ def list_contacts(
     """Return the true contacts with the detection that found each; without the truth, each detection as a contact."""
     if run.truth is None:
         return tuple(_unproven(run, number, sections, d) for number, d in enumerate(detections, run.first_contact))
-    raised = {detection.t_ns: detection for detection in detections}
-    return tuple(
-        _contact(run, sections, contact, None if contact.detected_ns is None else raised[contact.detected_ns])
-        for contact in score.contacts
-    )
+    raised: dict[int | None, Detection] = {detection.t_ns: detection for detection in detections}
+    return tuple(_contact(run, sections, contact, raised.get(contact.detected_ns)) for contact in score.contacts)
 
 
 def _reported(run: Run, detection: Detection | None) -> dict[str, Any]:
@@ -253,9 +228,13 @@ def _contact(
     is_seen = since_s <= delay_s + _window_s(run)
     until_final, links = _touches(run, onset_s, onset_s + delay_s + _window_s(run) if reported else float(time_s[-1]))
     channels = channels_at(run, onset_s)
-    steps_s = [delay for channel in channels if (delay := channel.step_delay_s(until_alarm)) is not None]
-    responses = [channel.respond(contact.tau_ext, contact.cycle, run.settings.bus.period_s) for channel in channels]
-    is_over = [np.abs(response) > channel.threshold for response, channel in zip(responses, channels, strict=True)]
+    steps_s = [step_delay_s(until_alarm, threshold, a_rad_s, b_rad_s) for a_rad_s, b_rad_s, threshold in channels]
+    crossed_s = [delay for delay in steps_s if delay is not None]
+    period_s = run.settings.bus.period_s
+    is_over = [
+        np.abs(ideal_response(contact.tau_ext, contact.cycle, period_s, a_rad_s, b_rad_s)) > threshold
+        for a_rad_s, b_rad_s, threshold in channels
+    ]
     over = np.flatnonzero(np.any(is_over, axis=(0, 2)))
     peak = until_final[np.argmax(np.abs(until_final), axis=0), range(JOINTS)]
     return ReportedContact(
@@ -267,7 +246,7 @@ def _contact(
         end_s=float(time_s[-1]),
         is_armed=contact.is_armed,
         delay_ms=contact.delay_ms,
-        law_ms=min(steps_s) * 1e3 if steps_s else None,
+        law_ms=min(crossed_s) * 1e3 if crossed_s else None,
         ideal_ms=float(time_s[over[0]] - onset_s) * 1e3 if over.size else None,
         link_ok=None if reported.get("link_detected") is None else reported["link_detected"] in links,
         direction_ok=_is_direction_right(reported.get("direction"), until_final.sum(axis=0)),

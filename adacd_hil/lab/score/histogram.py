@@ -18,7 +18,7 @@ def log_counts(values: Values) -> NDArray[np.int64]:
 
     A value on an edge belongs to the upper bin.
     """
-    return np.bincount(np.searchsorted(EDGES, values, side="right"), minlength=EDGES.size + 1)
+    return np.histogram(values, (-np.inf, *EDGES, np.inf))[0]
 
 
 def histogram_by_key(counts: NDArray[np.int64]) -> dict[str, Any]:
@@ -36,9 +36,8 @@ def doubling_bins(values: Values, first: float, count: int) -> list[tuple[float,
     except the first.
     """
     bounds = [first * 2.0**power for power in range(count - 1)] + [float("inf")]
-    places = np.searchsorted(bounds, values, side="right")
-    counts = np.bincount(places, minlength=count)
-    bins = [(bound, int(amount)) for bound, amount in zip(bounds, counts, strict=True)]
+    counts, _ = np.histogram(values, [-np.inf, *bounds])
+    bins = list(zip(bounds, counts.tolist(), strict=True))
     while len(bins) > 1 and bins[-1][1] == 0:
         bins.pop()
     return bins

@@ -114,10 +114,10 @@ class BesideGatherer:
         score = self._judge.score(self._contacts(run, sections))
         has_truth = run.truth is not None
         false_s = tuple((alarm.t_ns - run.zero_ns) * 1e-9 for alarm in score.false_alarms)
-        labels = {kind: [section.label for section in sections if section.kind == kind] for kind in _LEARNT_OR_WATCHED}
+        learnt, watched = ([each.label for each in sections if each.kind == kind] for kind in _LEARNT_OR_WATCHED)
         return Beside(
-            adaptation_s={label: self._adaptation_s.get(label) for label in labels["adaptation"]},
-            frozen_residual_max_Nm={label: _pair(self._largest.get(label)) for label in labels["detection"]},
+            adaptation_s={label: self._adaptation_s.get(label) for label in learnt},
+            frozen_residual_max_Nm={label: _pair(self._largest.get(label)) for label in watched},
             contacts=tuple(
                 {
                     "number": contact.number,
@@ -209,24 +209,16 @@ class MarginGatherer:
         """Return the margins of each channel over all cycles added so far; () before the first."""
         if self._residual is None or self._share is None:
             return ()
-        found = []
-        for place, (cutoff, smoothing) in enumerate(self._channels):
-            residual, share = self._residual[place].tolist(), self._share[place].tolist()
-            middle = [distribution.median() for distribution in self._thresholds[place]]
-            found.append(
-                ChannelMargin(
-                    cutoff_rad_s=cutoff,
-                    smoothing_rad_s=smoothing,
-                    residual_max_Nm=(residual[0], residual[1]),
-                    threshold_Nm=(middle[0], middle[1]),
-                    margin=(_inverse(share[0]), _inverse(share[JOINTS - 1])),
-                )
+        return tuple(
+            ChannelMargin(
+                cutoff_rad_s=cutoff,
+                smoothing_rad_s=smoothing,
+                residual_max_Nm=self._residual[place].tolist(),
+                threshold_Nm=[distribution.median() for distribution in self._thresholds[place]],
+                margin=[1.0 / share if share > 0.0 else np.inf for share in self._share[place].tolist()],
             )
-        return tuple(found)
-
-
-def _inverse(share: float) -> float:
-    return 1.0 / share if share > 0.0 else float("inf")
+            for place, (cutoff, smoothing) in enumerate(self._channels)
+        )
 
 
 class UntouchedGatherer:
@@ -304,12 +296,11 @@ class UntouchedGatherer:
         if is_frozen:
             free = free & is_armed_in(piece.state[rows])
         before = self._residuals.get(section.label, Residual(None, None, 0))
-        identified, cad = before.identified, before.cad
-        if is_frozen:
-            identified = _larger_pair(identified, piece.tau_ext_hat[rows][free])
-        if piece.has_cad:
-            cad = _larger_pair(cad, piece.tau_ext_hat_cad[rows][free])
-        self._residuals[section.label] = Residual(identified, cad, before.cycles + int(free.sum()))
+        self._residuals[section.label] = Residual(
+            _larger_pair(before.identified, piece.tau_ext_hat[rows][free]) if is_frozen else None,
+            _larger_pair(before.cad, piece.tau_ext_hat_cad[rows][free]) if piece.has_cad else None,
+            before.cycles + int(free.sum()),
+        )
 
     def _add_margin(self, piece: Run, section: Section, rows: slice, free: Mask) -> None:
         assert piece.certified is not None

@@ -155,7 +155,7 @@ class ParameterEstimate:
 
 @dataclass(frozen=True)
 class ChannelMargin:
-    """A channel of the bank over a section, in cycles free of contact; pairs are by joint.
+    """A channel of the bank over a section, in cycles free of contact; lists are by joint.
 
     cutoff_rad_s, smoothing_rad_s: of its one or two filters, None: one. residual_max_Nm: largest |residual|.
     threshold_Nm: median of the threshold. margin: smallest threshold / |residual| of a cycle; inf if the residual was 0
@@ -164,9 +164,9 @@ class ChannelMargin:
 
     cutoff_rad_s: float
     smoothing_rad_s: float | None
-    residual_max_Nm: tuple[float, float]
-    threshold_Nm: tuple[float, float]
-    margin: tuple[float, float]
+    residual_max_Nm: list[float]
+    threshold_Nm: list[float]
+    margin: list[float]
 
 
 @dataclass(frozen=True)
@@ -333,7 +333,7 @@ class Metrics:
     """The content of the report, see the module's first lines for the definitions.
 
     fault, fault_s: the first one of the run, None without one. cycle: number, duration, clock and scheduler of all
-    cycles. false_alarms, missed and false_alarms_s: None without the truth. evidence: None for the paper's scheme.
+    cycles. missed and false_alarms_s: None without the truth. evidence: None for the paper's scheme.
     findings: a clause each, the gravest first.
     """
 
@@ -341,7 +341,6 @@ class Metrics:
     adaptation_s: dict[str, float | None]
     frozen_residual_max_Nm: dict[str, Residual]
     contacts: tuple[ReportedContact, ...]
-    false_alarms: int | None
     false_alarms_s: tuple[float, ...] | None
     missed: int | None
     parameters: dict[str, dict[str, tuple[float | None, float]]]
@@ -357,6 +356,11 @@ class Metrics:
     armed_false_alarms: int | None  # of them those in MONITOR
     paper: tuple[PaperRow, ...] = ()
     findings: tuple[Finding, ...] = ()
+
+    @property
+    def false_alarms(self) -> int | None:
+        """Number of false alarms; None without the truth."""
+        return None if self.false_alarms_s is None else len(self.false_alarms_s)
 
     @property
     def verdict(self) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from adacd_hil.lab.score.rates import CONFIDENCE_TEXT
 from adacd_hil.records import SchemeState
 from adacd_hil.score.judge import Score
-from adacd_hil.score.wording import NONE, found_text, number_of
+from adacd_hil.score.wording import NONE, number_of
 
 _MORE_DIGITS: Final = 3
 
@@ -121,33 +121,17 @@ def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
     return f"{count} in that time: by counting alone, at most {bound_per_h:.3g} per hour at {CONFIDENCE_TEXT}"
 
 
-def delay_figures(delays_ms: Sequence[float]) -> tuple[float | None, float | None, float | None]:
-    """Return median, 90th percentile and largest of delays; three times None without delays."""
-    if not delays_ms:
-        return None, None, None
-    median, p90, largest = np.quantile(delays_ms, (0.5, 0.9, 1.0)).tolist()
-    return median, p90, largest
+def delay_figures(delays_ms: Sequence[float]) -> dict[str, float | None]:
+    """Return `median`, `p90` and `max` of delays, by these names; None without delays."""
+    figures = np.quantile(delays_ms, (0.5, 0.9, 1.0)).tolist() if delays_ms else (None, None, None)
+    return dict(zip(("median", "p90", "max"), figures, strict=True))
 
 
 def delays_phrase(delays_ms: Sequence[float]) -> str:
     """Return a phrase with median, 90th percentile and largest of delays, beginning with a comma; "" without delays."""
     if not delays_ms:
         return ""
-    return ", after {:.1f} ms (median), {:.1f} (p90), {:.1f} (largest)".format(*delay_figures(delays_ms))
-
-
-def share_phrase(delays_ms: Sequence[float], contacts: int, bounds: tuple[float, float]) -> str:
-    """Return a phrase with the number of contacts found, the bounds of their share (0…1) in percent, and their delays.
-
-    delays_ms: of each contact found.
-    """
-    found = found_text(len(delays_ms), contacts)
-    return f"{found} contacts found ({100 * bounds[0]:.0f} to {100 * bounds[1]:.0f} %){delays_phrase(delays_ms)}"
-
-
-def rate_phrase(alarms: int, hours: float, bound_per_h: float) -> str:
-    """Return a phrase with the number of false alarms, the hours, and the `CONFIDENCE_TEXT` bound of their rate."""
-    return f"{alarms} false alarms in {hours:.4f} h, {CONFIDENCE_TEXT} bound {bound_per_h:.3g} per hour"
+    return ", after {:.1f} ms (median), {:.1f} (p90), {:.1f} (largest)".format(*delay_figures(delays_ms).values())
 
 
 def percent_text(share: float) -> str:

@@ -6,7 +6,7 @@ Shapes and units as in `adacd_hil.lab.score.run_arrays`.
 import math
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,9 @@ from scipy.optimize import brentq
 
 from adacd_hil.lab.score.run_arrays import Run
 from adacd_hil.log.logged_run import Cycles, Mask, begins_alarm, is_armed_in
-from adacd_hil.records import JOINTS, SchemeState, Vector
+from adacd_hil.records import SchemeState, Vector
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
-from adacd_hil.score.emulator_truth import HostCycles, placed_contact
+from adacd_hil.score.emulator_truth import HostCycles, placed_contact, threshold_in_force
 from adacd_hil.score.judge import Detection, Score, TrueContact, filtered, judge, true_contacts
 
 
@@ -78,67 +78,31 @@ def placed_in(
     return tuple(placed)
 
 
-def detection_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float) -> float | None:
-    """Return after how long a torque step crosses a threshold behind a first-order low-pass, s; None if never.
+def step_delay_s(tau_ext: Vector, threshold: Vector, a_rad_s: float, b_rad_s: float | None) -> float | None:
+    """Return after how long a torque step, Nm (2,), crosses the threshold, Nm (2,), at the faster joint, s.
 
-    Closed form: t = -ln(1 - h / |tau|) / a.
+    None if never. a_rad_s: cut-off of a first-order low-pass; b_rad_s: of a second one behind it, None without it: then
+    t = -ln(1 - h / |tau|) / a. The response rises steadily, so that there is one crossing.
     """
-    if not abs(tau_ext_Nm) > threshold_Nm:
-        return None
-    return -math.log1p(-threshold_Nm / abs(tau_ext_Nm)) / a_rad_s
+    pairs = zip(np.abs(tau_ext).tolist(), threshold.tolist(), strict=True)
+    shares = [h / tau for tau, h in pairs if tau > h]
+    if b_rad_s is None:
+        return min((-math.log1p(-share) / a_rad_s for share in shares), default=None)
+    longest_s = 40.0 / min(a_rad_s, b_rad_s)
+    found = (
+        brentq(lambda t_s, share: step_response(t_s, a_rad_s, b_rad_s) - share, 0.0, longest_s, (share,))
+        for share in shares
+    )
+    return min(map(float, found), default=None)
 
 
-def two_pole_delay_s(tau_ext_Nm: float, threshold_Nm: float, a_rad_s: float, b_rad_s: float) -> float | None:
-    """Return after how long a torque step crosses a threshold behind two first-order low-passes, s; None if never.
+def ideal_response(tau_ext: Vector, cycle: Cycles, period_s: float, a_rad_s: float, b_rad_s: float | None) -> Vector:
+    """Return a true torque, Nm (n, 2), behind one low-pass or, unless `b_rad_s` is None, two; from rest.
 
-    The response rises steadily, so that there is one crossing.
+    Each sample is held until the next one. cycle (n,): numbers of their cycles.
     """
-    if not abs(tau_ext_Nm) > threshold_Nm:
-        return None
-    wanted = threshold_Nm / abs(tau_ext_Nm)
-    return float(brentq(lambda t_s: step_response(t_s, a_rad_s, b_rad_s) - wanted, 0.0, 40.0 / min(a_rad_s, b_rad_s)))
-
-
-@dataclass(frozen=True)
-class FilterChannel:
-    """A filter with its threshold, Nm (2,).
-
-    It is of first order; unless `smoothing_rad_s` is None, a second one is behind it.
-    """
-
-    cutoff_rad_s: float
-    smoothing_rad_s: float | None
-    threshold: Vector
-
-    def step_delay_s(self, tau_ext: Vector) -> float | None:
-        """Return after how long a step of tau_ext, Nm (2,), crosses the threshold at the faster joint, s.
-
-        None if never.
-        """
-        delays_s = []
-        for joint in range(JOINTS):
-            tau, h = float(tau_ext[joint]), float(self.threshold[joint])
-            if self.smoothing_rad_s is None:
-                delays_s.append(detection_delay_s(tau, h, self.cutoff_rad_s))
-            else:
-                delays_s.append(two_pole_delay_s(tau, h, self.cutoff_rad_s, self.smoothing_rad_s))
-        return min((delay_s for delay_s in delays_s if delay_s is not None), default=None)
-
-    def respond(self, tau_ext: Vector, cycle: Cycles, period_s: float) -> Vector:
-        """Return the channel's output, Nm (n, 2), for a true torque (n, 2), from rest at the first sample.
-
-        Each sample is held until the next one. cycle (n,): numbers of their cycles.
-        """
-        response = filtered(tau_ext, cycle, period_s, self.cutoff_rad_s)
-        if self.smoothing_rad_s is None:
-            return response
-        return filtered(response, cycle, period_s, self.smoothing_rad_s)
-
-
-def threshold_in(run: Run, row: int) -> Vector:
-    """Return the threshold of `tau_ext_hat` in a row, Nm (2,); at a joint without detection, the configured one."""
-    configured = np.array(run.settings.detector.threshold_Nm)
-    return np.where(np.isfinite(run.threshold[row]), run.threshold[row], configured)
+    response = filtered(tau_ext, cycle, period_s, a_rad_s)
+    return response if b_rad_s is None else filtered(response, cycle, period_s, b_rad_s)
 
 
 def row_at(run: Run, time_s: float) -> int:
@@ -151,15 +115,16 @@ def row_at(run: Run, time_s: float) -> int:
     return min(row, len(t_ns) - 1)
 
 
-def channels_at(run: Run, time_s: float) -> tuple[FilterChannel, ...]:
-    """Return the filters that detect at `time_s`, s since motion start, with thresholds: the paper's, or the bank."""
+def channels_at(run: Run, time_s: float) -> list[tuple[float, float | None, Vector]]:
+    """Return the filters that detect at `time_s`, s since motion start: the paper's, or the bank.
+
+    Of each its cut-off and, unless it is None, that of a second one behind it, rad/s, and its threshold, Nm (2,).
+    """
+    row = row_at(run, time_s)
     if run.certified is None:
-        return (FilterChannel(run.a_rad_s, None, threshold_in(run, row_at(run, time_s))),)
-    thresholds = run.certified.threshold[row_at(run, time_s)]
-    return tuple(
-        FilterChannel(cutoff, smoothing, threshold)
-        for (cutoff, smoothing), threshold in zip(channels_of(run.settings), thresholds, strict=True)
-    )
+        return [(run.a_rad_s, None, threshold_in_force(run.threshold[row], run.settings))]
+    thresholds = run.certified.threshold[row]
+    return [(*cutoffs, threshold) for cutoffs, threshold in zip(channels_of(run.settings), thresholds, strict=True)]
 
 
 def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[Detection]) -> Score:

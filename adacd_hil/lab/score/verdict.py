@@ -13,6 +13,7 @@ from typing import Final, TypeGuard
 import numpy as np
 
 from adacd_hil.lab.score.metrics import (
+    Beside,
     CertifiedEvidence,
     CyclicData,
     Fault,
@@ -68,7 +69,8 @@ def list_findings(
     grave += evidence.revoked if is_revoked(evidence) else ()
     grave += filter(None, [_blind_text(run)])
     if is_margin_below_1(evidence):
-        grave.append(f"a residual was over its threshold with nobody touching the arm: {_margin_text(evidence)}")
+        margin = f"smallest margin {evidence.smallest_margin:.2f}"
+        grave.append(f"a residual was over its threshold with nobody touching the arm: {margin}")
     findings = [*(Finding(text, True) for text in grave), Finding(found, has_wrong)]
     misread = [contact for contact in metrics.contacts if contact.link_ok is False or contact.direction_ok is False]
     if misread:
@@ -128,7 +130,7 @@ def headlines(metrics: Metrics) -> list[str]:
     return [textwrap.shorten(text[:1].upper() + text[1:], _HEADLINE_LETTERS, placeholder=" …") for text in plain]
 
 
-def is_margin_below_1(evidence: CertifiedEvidence | None) -> bool:
+def is_margin_below_1(evidence: CertifiedEvidence | None) -> TypeGuard[CertifiedEvidence]:
     """Return whether some residual was over its threshold in a cycle free of contact; False without margins."""
     return evidence is not None and evidence.smallest_margin is not None and evidence.smallest_margin < 1.0
 
@@ -136,11 +138,6 @@ def is_margin_below_1(evidence: CertifiedEvidence | None) -> bool:
 def is_revoked(evidence: CertifiedEvidence | None) -> TypeGuard[CertifiedEvidence]:
     """Return whether some certificate was taken back; False for the paper's scheme."""
     return evidence is not None and bool(evidence.revoked)
-
-
-def _margin_text(evidence: CertifiedEvidence | None) -> str:
-    margin = None if evidence is None else evidence.smallest_margin
-    return "" if margin is None else f"smallest margin {margin:.2f}"
 
 
 def _fault_texts(faults: tuple[Fault, ...]) -> list[str]:
@@ -276,11 +273,9 @@ def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
         "The CAD model's, with payload": _residual_text(cad, 1),
     }
     ours = same | _figures(
-        metrics.adaptation_s,
+        metrics,
         [residual.identified for residual in frozen],
         [(contact.is_armed, contact.detected_s, contact.delay_ms) for contact in metrics.contacts],
-        metrics.missed,
-        metrics.false_alarms,
     )
     if run.truth is None:
         ours["Contacts detected"] = str(len(metrics.contacts))
@@ -300,11 +295,9 @@ def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
     theirs, beside = dict.fromkeys(ours, NONE), evidence.paper_beside
     if beside is not None:
         theirs = same | _figures(
-            beside.adaptation_s,
+            beside,
             [beside.frozen_residual_max_Nm[label] for label in detections],
             [(contact["is_armed"], contact["detected_s"], contact["delay_ms"]) for contact in beside.contacts],
-            beside.missed,
-            beside.false_alarms,
         )
     papers = _PAPERS | dict.fromkeys(_COUNTED, NONE)
     rows = [PaperRow(quantity, paper, theirs[quantity], ours[quantity]) for quantity, paper in papers.items()]
@@ -327,17 +320,12 @@ def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
 
 
 def _figures(
-    adaptation_s: dict[str, float | None],
+    found: Metrics | Beside,
     frozen: list[tuple[float, float] | None],
     contacts: list[tuple[bool, float | None, float | None]],
-    missed: int | None,
-    false_alarms: int | None,
 ) -> dict[str, str]:
-    """Return a scheme's figures as text by quantity. contacts: is_armed, detected at, s, and delay, ms, of each.
-
-    missed, false_alarms: None: unknown.
-    """
-    times_s = list(adaptation_s.values())
+    """Return a scheme's figures as text by quantity. contacts: is_armed, detected at, s, and delay, ms, of each."""
+    times_s = list(found.adaptation_s.values())
     seen = [at_s for _, at_s, _ in contacts if at_s is not None]
     delays_ms = [delay_ms for is_armed, _, delay_ms in contacts if is_armed and delay_ms is not None]
     armed = sum(is_armed for is_armed, _, _ in contacts)
@@ -347,9 +335,9 @@ def _figures(
         "Frozen residual without payload, joints 1 / 2": _residual_text(frozen, 0),
         "Frozen residual with payload, joints 1 / 2": _residual_text(frozen, 1),
         "First contact detected at": f"{seen[0]:.2f} s" if seen else NONE,
-        "Contacts detected": NONE if missed is None else found_text(len(delays_ms), armed),
+        "Contacts detected": NONE if found.missed is None else found_text(len(delays_ms), armed),
         "Median delay": f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else NONE,
-        "False alarms": NONE if false_alarms is None else str(false_alarms),
+        "False alarms": NONE if found.false_alarms is None else str(found.false_alarms),
     }
 
 

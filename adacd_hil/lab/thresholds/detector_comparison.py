@@ -16,7 +16,8 @@ from typing import Any, Final
 import numpy as np
 from matplotlib.figure import Figure
 
-from adacd_hil.lab.detectors import detectors
+from adacd_hil.lab.detectors.detector_registry import detectors
+from adacd_hil.lab.detectors.detectors import DetectorBank
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
 from adacd_hil.lab.thresholds.false_alarms import TailCalibration, TooLittleMotionError
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, calibrate_all
@@ -32,7 +33,6 @@ WARM_UP_S: Final = 0.6  # until the slowest filter has forgotten earlier samples
 _ONSETS: Final = 200
 _ROC_RATES_PER_H: Final = tuple(10.0 ** (0.25 * k) for k in range(-12, 9))
 NAME: Final = "detectors"
-_LATE: Final = math.inf
 
 
 @dataclass(frozen=True)
@@ -46,19 +46,18 @@ class DelayRow:
     joint: int
     delay_ms: tuple[float, ...]
     found: tuple[float, ...]
-    roc: tuple[float, ...]  # share of steps of ROC_STEP_NM found in ROC_WITHIN_S, per rate of the comparison
+    roc: tuple[float, ...]  # share of steps of ROC_STEP_NM found in ROC_WITHIN_S, per rate of `_ROC_RATES_PER_H`
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """All detectors at one rate of false alarms. hours: of motion. rates_per_h: those of `DelayRow.roc`.
+    """All detectors at one rate of false alarms. hours: of motion.
 
     rows: one per detector and joint.
     """
 
     rate_per_h: float
     hours: float
-    rates_per_h: tuple[float, ...]
     rows: tuple[DelayRow, ...]
     missing: tuple[str, ...]
     """Detectors whose tail can't be fitted from this motion."""
@@ -83,7 +82,7 @@ class Comparison:
             "steps_Nm": STEPS_NM,
             "roc_step_Nm": ROC_STEP_NM,
             "roc_within_s": ROC_WITHIN_S,
-            "roc_rates_per_h": self.rates_per_h,
+            "roc_rates_per_h": _ROC_RATES_PER_H,
             "ranking": self.ranking,
             "missing": self.missing,
             "rows": self.rows,
@@ -142,7 +141,7 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
     )  # (steps, detectors, onsets, after, n), largest ratio so far
     delays_ms = _delays_ms(ratios, phases_s, period_s)
     until = round(ROC_WITHIN_S / period_s)
-    largest = _ratios(statistics, found, chosen, phases_s, ROC_STEP_NM, before, after)[:, :, until]
+    largest = ratios[STEPS_NM.index(ROC_STEP_NM), :, :, until]
     rows = []
     for place, (name, (_, calibration)) in enumerate(found.items()):
         tail = calibration.tail
@@ -158,7 +157,7 @@ def compare_detectors(statistics: Statistics, rate_per_h: float, onsets: int = _
                     tuple((largest[place, :, i] > factor).mean().item() for factor in factors),
                 )
             )
-    return Comparison(rate_per_h, statistics.hours, _ROC_RATES_PER_H, tuple(rows), missing)
+    return Comparison(rate_per_h, statistics.hours, tuple(rows), missing)
 
 
 def _ratios(
@@ -176,16 +175,15 @@ def _ratios(
     `before` samples without and `after` samples with a step of `torque_Nm`; phases_s: time from sample `before` of the
     part to the onset.
     """
-    period_s = statistics.motion.period_s
+    period_s, places_of = statistics.motion.period_s, detectors()
     largest = np.zeros((len(found), len(starts), after, JOINTS))
     for k, (start, phase_s) in enumerate(zip(starts.tolist(), phases_s.tolist(), strict=True)):
         z = statistics.z[start : start + before + after].copy()
         z[before:] += torque_Nm * step_shape(after, phase_s, period_s)[:, None]
         held_Nm = statistics.held_Nm[start : start + before + after]
-        shown = detectors.DetectorBank(statistics.settings, statistics.weights, period_s).take_stream(z, held_Nm)
+        shown = DetectorBank(statistics.weights, period_s).take_stream(z, held_Nm)
         for place, (name, (thresholds, _)) in enumerate(found.items()):
-            rows = list(statistics.settings.detectors[name])
-            over = (shown[before:, rows] / thresholds).max(axis=1)
+            over = (shown[before:, places_of[name]] / thresholds).max(axis=1)
             largest[place, k] = np.maximum.accumulate(over, axis=0)
     return largest
 
@@ -197,9 +195,10 @@ def _delays_ms(ratios: Vector, phases_s: Vector, period_s: float) -> Vector:
     """
     over = ratios > 1.0
     first = over.argmax(axis=-2) * period_s - phases_s[:, None]
-    return np.where(over[..., -1, :], np.maximum(first, 0.0) * 1e3, _LATE)
+    return np.where(over[..., -1, :], np.maximum(first, 0.0) * 1e3, np.inf)
 
 
+_DELAY_TICKS_MS: Final = (1, 2, 5, 10, 20, 50, 100)
 _LOOKS: Final = ("alarm", "cad", "identified", "joint1", "joint2", "bar", "beside", "muted")
 
 
@@ -216,13 +215,13 @@ def draw_comparison(comparison: Comparison) -> Drawing:
             look = {"color": colours[row.detector], "linewidth": 2.0 if row.detector == comparison.ranking[0] else 1.1}
             shown = np.where(np.isfinite(row.delay_ms), row.delay_ms, np.nan)
             (lines[row.detector],) = delays.plot(STEPS_NM, shown, marker="o", markersize=3.0, **look)
-            shares.plot(comparison.rates_per_h, np.array(row.roc) * 100.0, **look)
+            shares.plot(_ROC_RATES_PER_H, np.array(row.roc) * 100.0, **look)
         for i in range(JOINTS):
             delays, shares = grid[0, i], grid[1, i]
             delays.set(xscale="log", yscale="log", xlabel="step of external torque, Nm", ylabel="median delay, ms")
             delays.set_title(f"Joint {i + 1}")
             delays.set_xticks(STEPS_NM, [f"{torque:g}" for torque in STEPS_NM])
-            delays.set_yticks([1, 2, 5, 10, 20, 50, 100], ["1", "2", "5", "10", "20", "50", "100"])
+            delays.set_yticks(_DELAY_TICKS_MS, [f"{delay_ms:g}" for delay_ms in _DELAY_TICKS_MS])
             delays.minorticks_off()
             shares.set(xscale="log", ylim=(-3.0, 103.0), xlabel="predicted false alarms per hour", ylabel="found, %")
             shares.set_title(f"Joint {i + 1}")

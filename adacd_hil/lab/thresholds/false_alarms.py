@@ -70,7 +70,6 @@ class Tail:
     rate_per_h: float  # of alarms above u
     hours: float
     count: int  # clusters above u
-    largest: float  # value observed
 
     def rate_at(self, threshold: float) -> float:
         """Return the alarms per hour that the tail predicts at a threshold; `self.rate_per_h` at or below `self.level`.
@@ -159,7 +158,7 @@ def fit_tail(peaks: Vector) -> Tail:
     if found.size < least // 2:
         raise TooLittleMotionError(f"only {found.size} peaks stand apart in {hours:.2f} h: the tail can't be fitted")
     scale, shape = _moments_fit(np.sort(found - level))
-    return Tail(level, float(scale), float(shape), found.size / hours, hours, found.size, float(found.max()))
+    return Tail(level, float(scale), float(shape), found.size / hours, hours, found.size)
 
 
 @dataclass(frozen=True)
@@ -170,8 +169,12 @@ class TailCalibration:
     bound: float  # upper confidence bound of the threshold
     rate_per_h: float  # wanted
     rate_bound_per_h: float  # upper confidence bound of the rate at `threshold`
-    is_extrapolated: bool  # the wanted rate is below one alarm in the recorded time
     tail: Tail
+
+    @property
+    def extrapolation(self) -> float:
+        """Rate of one alarm in the recorded time over the wanted rate; up to 1 nothing is extrapolated."""
+        return 1.0 / (self.rate_per_h * self.tail.hours)
 
 
 def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
@@ -186,7 +189,7 @@ def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
         threshold = threshold_by_count(peaks, alarms)
         deviation = 1.6448536269514722 * math.sqrt(alarms)
         bound = threshold_by_count(peaks, max(alarms - deviation, 0.0))
-        return TailCalibration(threshold, bound, rate_per_h, (alarms + deviation) / tail.hours, False, tail)
+        return TailCalibration(threshold, bound, rate_per_h, (alarms + deviation) / tail.hours, tail)
     generator = np.random.default_rng(0)
     threshold = tail.threshold_at(rate_per_h)
     excesses = clusters(peaks, tail.level) - tail.level
@@ -194,9 +197,7 @@ def calibrate(peaks: Vector, rate_per_h: float) -> TailCalibration:
     rates = np.maximum(generator.poisson(tail.count, _RESAMPLES) / tail.hours, 1e-9)
     bound = tail.level + float(np.quantile(_excesses(rate_per_h, *fits, rates), CONFIDENCE))
     rate_bound = float(np.quantile(_rates(threshold - tail.level, *fits, rates), CONFIDENCE))
-    return TailCalibration(
-        threshold, max(bound, threshold), rate_per_h, max(rate_bound, rate_per_h), rate_per_h * tail.hours < 1.0, tail
-    )
+    return TailCalibration(threshold, max(bound, threshold), rate_per_h, max(rate_bound, rate_per_h), tail)
 
 
 def largest_ratio(peaks: Vector, thresholds: Vector) -> Vector:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
-from adacd_hil.lab.detectors import detectors
+from adacd_hil.lab.detectors.detectors import make_stream
 from adacd_hil.log.log_files import CONFIG_NAME, LogError
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import Milestones, Progress, is_armed_in, settings_of
@@ -84,8 +84,8 @@ class LoggedMotion:
     period_s: float
     parameters: int
     is_free: Mask
-    bounds_ns: tuple[int, int] | None = None
-    level_rad: float = 0.0
+    bounds_ns: tuple[int, int] | None
+    level_rad: float
 
     def pieces(self) -> Iterator[Motion]:
         """Yield the samples piece by piece, in the order of time. Raises LogError if the log can't be read."""
@@ -110,8 +110,7 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
 
     Raises LogError if the log can't be read.
     """
-    stream = LogStream(path, TOPICS)
-    for piece in stream:
+    for piece in LogStream(path, TOPICS):
         scheme = piece.series[SCHEME.name]
         if bounds_ns is not None and len(scheme):
             if scheme.t_ns[0] >= bounds_ns[1]:
@@ -130,8 +129,7 @@ def read_motion(
     called with a line on the cycles read. watch: called with each piece of /scheme. Raises LogError if the log can't be
     read, has no /scheme or no measured period, or no sample is free of contact.
     """
-    bounds_ns = None
-    where = ""
+    bounds_ns, where = None, ""
     if not stretch.is_whole:
         bounds_ns, where = stretch.bounds_ns(begin_of_log(path)), f" {stretch.text}"
     period_s = _period(path, bounds_ns, where)
@@ -280,13 +278,10 @@ def _part(motion: Motion, rows: Mask, was_chosen: bool) -> Motion:
     return replace(part, **{name: getattr(part, name)[rows] for name in (*_COLUMNS, "is_free")})
 
 
-def torque_streams(
-    pieces: Iterable[Motion], lag_s: float, standstill_rad_s: float
-) -> Iterator[tuple[Motion, tuple[Vector, Vector]]]:
+def torque_streams(pieces: Iterable[Motion], lag_s: float) -> Iterator[tuple[Motion, tuple[Vector, Vector]]]:
     """Yield each piece of a motion, and its stream for the detectors: z, and the torque that friction may hold.
 
-    Both (n, 2), Nm. The stream goes on from piece to piece. lag_s: by which dq is older than tau_J. standstill_rad_s: a
-    slower joint stands still.
+    Both (n, 2), Nm. The stream goes on from piece to piece. lag_s: by which dq is older than tau_J.
     """
     last: list[Vector] | None = None  # last sample of the previous piece
     for motion in pieces:
@@ -295,6 +290,6 @@ def torque_streams(
         if before is not None:
             columns = [np.concatenate(pair) for pair in zip(before, columns, strict=True)]
         q, dq, tau_J, theta, interval_s = columns
-        z, held_Nm = detectors.make_stream(q, dq, tau_J, theta, interval_s, lag_s, standstill_rad_s)
+        z, held_Nm = make_stream(q, dq, tau_J, theta, interval_s, lag_s)
         skipped = int(before is not None)
         yield motion, (z[skipped:], held_Nm[skipped:])

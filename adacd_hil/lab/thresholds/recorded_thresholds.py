@@ -13,7 +13,14 @@ from typing import Final
 
 import numpy as np
 
-from adacd_hil.lab.detectors import detectors
+from adacd_hil.lab.detectors.detector_registry import CUTOFFS_RAD_S, FIRST_ORDER, SMOOTHED, channels, detectors
+from adacd_hil.lab.detectors.detectors import (
+    SMOOTHING_RAD_S,
+    VELOCITY_LAG_S,
+    DetectorBank,
+    likelihood_weights,
+    make_stream,
+)
 from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
 from adacd_hil.lab.thresholds.false_alarms import (
     BLOCK_S,
@@ -38,7 +45,7 @@ from adacd_hil.lab.thresholds.free_motion import (
 )
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Milestones, Progress
-from adacd_hil.log.time_window import WHOLE, TimeWindow
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.model.regressor import mass_matrix
 
@@ -53,7 +60,7 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
 
     It is within 0 and `_LONGEST_LAG_S`. If the torque never changes, all are `VELOCITY_LAG_S`.
     """
-    z, _ = detectors.make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
+    z, _ = make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
     moving = motion.is_free & (np.abs(motion.dq) > 0.02).all(axis=1)
     _, slope_gain = gains((_MODEL_RAD_S,), motion.period_s, 0.0)
     top, bottom = np.zeros(JOINTS), np.zeros(JOINTS)
@@ -66,7 +73,7 @@ def find_lag(motion: Motion) -> tuple[float, Vector]:
         # the noise of the torque has a slope, too, which is not in the stream
         bottom[i] = float(by @ by) - by.size * (slope_gain * float(white_noise(motion.tau_J[:, i]))) ** 2
     if not (bottom > 0.0).any():
-        return detectors.VELOCITY_LAG_S, np.full(JOINTS, detectors.VELOCITY_LAG_S)
+        return VELOCITY_LAG_S, np.full(JOINTS, VELOCITY_LAG_S)
     known = np.maximum(bottom, 0.0)
     lag_s = min(max(float(top[known > 0.0].sum() / known.sum()), 0.0), _LONGEST_LAG_S)
     each = np.where(known > 0.0, top / np.where(known > 0.0, known, 1.0), lag_s)
@@ -80,7 +87,6 @@ class Statistics:
     held_Nm: torque that friction may hold. lag_s: by which dq is older than tau_J; lag_of_joint_s: the same by joint.
     """
 
-    settings: detectors.DetectorBankSettings
     weights: Vector  # (n, ages, L), of the likelihood channels
     peaks: Vector  # (B, channels, n), of all motion; NaN where not all samples of a block are free
     z: Vector  # (N, n), 0 where not free
@@ -96,9 +102,7 @@ class Statistics:
         return counted_hours(self.peaks[:, 0, 0])
 
 
-def run_detectors(
-    logs: Sequence[LoggedMotion], settings: detectors.DetectorBankSettings, progress: Progress = lambda _: None
-) -> Statistics:
+def run_detectors(logs: Sequence[LoggedMotion], progress: Progress = lambda _: None) -> Statistics:
     """Run every detector over the motion of logs; return their statistics, and the lag and weights that they used.
 
     progress: called with a line on the cycles read. Raises LogError if a log can't be read or the logs differ in period
@@ -106,38 +110,31 @@ def run_detectors(
     """
     motion = sample_of(logs)
     lag_s, lag_of_joint_s = find_lag(motion)
-    _, (z, held_Nm) = next(torque_streams([motion], lag_s, settings.standstill_rad_s))
+    _, (z, held_Nm) = next(torque_streams([motion], lag_s))
     free = motion.is_free
     z[~free] = 0.0
     held_Nm[~free] = 0.0
     try:
-        weights = detectors.likelihood_weights(z[free], settings, lag_s, motion.period_s)
+        weights = likelihood_weights(z[free], lag_s, motion.period_s)
     except ValueError as error:
         raise TooLittleMotionError(f"{free.sum()} contact-free samples: {error}") from None
-    bank = detectors.DetectorBank(settings, weights, motion.period_s)
-    peaks = _peaks(logs, bank, lag_s, settings, progress)
-    return Statistics(settings, weights, peaks, z, held_Nm, free, motion, lag_s, lag_of_joint_s)
+    peaks = _peaks(logs, DetectorBank(weights, motion.period_s), lag_s, progress)
+    return Statistics(weights, peaks, z, held_Nm, free, motion, lag_s, lag_of_joint_s)
 
 
-def _peaks(
-    logs: Sequence[LoggedMotion],
-    bank: detectors.DetectorBank,
-    lag_s: float,
-    settings: detectors.DetectorBankSettings,
-    progress: Progress,
-) -> Vector:
+def _peaks(logs: Sequence[LoggedMotion], bank: DetectorBank, lag_s: float, progress: Progress) -> Vector:
     """Return the largest statistic per block of `BLOCK_S`, channel and joint (B, channels, n) over all logs in turn.
 
     NaN in blocks that are not wholly free of contact. A block may begin in one log and end in the next.
     """
     block = round(BLOCK_S / logs[0].period_s)
     free = np.concatenate([log.is_free for log in logs])
-    peaks = np.zeros((-(-len(free) // block), len(settings.channels), JOINTS))
+    peaks = np.zeros((-(-len(free) // block), len(channels()), JOINTS))
     rest = np.empty((0, JOINTS)), np.empty((0, JOINTS))  # less than a block
     place = 0
     milestones = Milestones(lambda count: progress(f"{log.path}: running the detectors, {count} of {len(free)} cycles"))
     for log in logs:
-        for motion, new in torque_streams(log.pieces(), lag_s, settings.standstill_rad_s):
+        for motion, new in torque_streams(log.pieces(), lag_s):
             for column in new:
                 column[~motion.is_free] = 0.0
             z, held_Nm = (np.concatenate(pair) for pair in zip(rest, new, strict=True))
@@ -210,9 +207,9 @@ def calibrate_all(
     """
     found: dict[str, tuple[Vector, TailCalibration]] = {}
     missing: list[str] = []
-    for name, places in statistics.settings.detectors.items():
+    for name, places in detectors().items():
         try:
-            found[name] = calibrate_detector(statistics.peaks[:, list(places), :], rate_per_h)
+            found[name] = calibrate_detector(statistics.peaks[:, places], rate_per_h)
         except TooLittleMotionError as error:
             missing.append(name)
             problem = error
@@ -227,25 +224,25 @@ def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence
     logs: names of the logs, stored in the result. Raises TooLittleMotionError if no detector's tail can be fitted.
     """
     calibrated, missing = calibrate_all(statistics, rate_per_h)
-    rows, channels = [], []
+    rows, channel_rows = [], []
     limits = channel_limits(statistics, rate_per_h)
+    names, places_of = channels(), detectors()
     for name, (thresholds, calibration) in calibrated.items():
-        places = statistics.settings.detectors[name]
-        check = check_prediction(statistics.peaks[:, list(places), :]) or (None, None)
+        places = places_of[name]
+        check = check_prediction(statistics.peaks[:, places]) or (None, None)
         rows.append(DetectorRow(name, calibration.rate_bound_per_h, calibration.bound / calibration.threshold, *check))
         for threshold, place in zip(thresholds.tolist(), places, strict=True):
-            channel = statistics.settings.channels[place]
-            limit, achievable_Nm = limits.get(channel, ((), ()))
-            channels.append(ChannelRow(name, channel, tuple(threshold), limit, achievable_Nm))
+            limit, achievable_Nm = limits.get(names[place], ((), ()))
+            channel_rows.append(ChannelRow(name, names[place], tuple(threshold), limit, achievable_Nm))
     return Thresholds(
         rate_per_h=rate_per_h,
         hours=statistics.hours,
-        is_extrapolated=any(calibration.is_extrapolated for _, calibration in calibrated.values()),
+        is_extrapolated=any(calibration.extrapolation > 1.0 for _, calibration in calibrated.values()),
         lag_s=statistics.lag_s,
         logs=tuple(logs),
         missing=missing,
         detectors=tuple(rows),
-        channels=tuple(channels),
+        channels=tuple(channel_rows),
     )
 
 
@@ -274,56 +271,50 @@ def channel_limits(statistics: Statistics, rate_per_h: float) -> dict[str, tuple
 
     Both per joint.
     """
-    settings, motion, free = statistics.settings, statistics.motion, statistics.is_free
+    motion, free, period_s = statistics.motion, statistics.is_free, statistics.motion.period_s
     places = np.flatnonzero(free)
     masses = np.array([mass_matrix(motion.q[k], motion.theta[k]) for k in places[:: max(1, places.size // 200)]])
-    largest = np.linalg.norm(masses, axis=2).max(axis=0)
-    sensing = []
+    largest = np.linalg.norm(masses, axis=2).max(axis=0).tolist()
+    torque_gain, momentum_gain = gains((), period_s, statistics.lag_s)
+    poles_of: dict[str, tuple[float, ...]] = {
+        name: (cutoff,) for name, cutoff in zip(FIRST_ORDER, CUTOFFS_RAD_S, strict=True)
+    }
+    poles_of |= {name: (cutoff, SMOOTHING_RAD_S) for name, cutoff in zip(SMOOTHED, CUTOFFS_RAD_S, strict=True)}
+    by_joint: dict[str, list[tuple[str, float]]] = {name: [] for name in poles_of}
     for i in range(JOINTS):
-        torque_LSB = resolution(motion.tau_J[free, i])
-        moves = statistics.held_Nm[free, i] == 0.0
-        x = low_pass(statistics.z[free, i], (_MODEL_RAD_S,), motion.period_s)[moves]
-        direction = low_pass(np.sign(motion.dq[free, i]), (_MODEL_RAD_S,), motion.period_s)[moves]
-        velocity_LSB = resolution(motion.dq[free, i])
-        # the slope of the velocity's noise dominates single samples: no other part is as fast
-        torque_gain, momentum_gain = gains((), motion.period_s, statistics.lag_s)
-        noise = float(white_noise(motion.tau_J[free, i]))
-        fast = mean_square(statistics.z[free, i][moves]) - (torque_gain * noise) ** 2
-        rest = fast / momentum_gain**2 - (float(largest[i]) * velocity_LSB) ** 2 / 12.0
-        sensing.append(
-            Sensing(
-                torque_noise_Nm=max(noise**2 - torque_LSB**2 / 12.0, 0.0) ** 0.5,
-                torque_LSB_Nm=torque_LSB,
-                velocity_LSB_rad_s=velocity_LSB,
-                mass_row_kg_m2=float(largest[i]),
-                momentum_noise_Nms=max(rest, 0.0) ** 0.5,
-                lag_error_s=float(statistics.lag_of_joint_s[i] - statistics.lag_s),
-                friction_error_Nm=float(x @ direction) / max(float(direction @ direction), 1e-300),
-            )
+        z, held_Nm, tau_J, dq = (
+            column[free, i] for column in (statistics.z, statistics.held_Nm, motion.tau_J, motion.dq)
         )
-    limits: dict[str, tuple[tuple[str, ...], tuple[float, ...]]] = {}
-    for kind, more in (("first-order", ()), ("smoothed", (settings.smoothing_rad_s,))):
-        for cutoff in settings.cutoff_rad_s:
-            split = [
-                find_limits(
-                    statistics.z[free, i],
-                    motion.tau_J[free, i],
-                    statistics.held_Nm[free, i],
-                    sensing[i],
-                    (cutoff, *more),
-                    motion.period_s,
-                    statistics.lag_s,
-                    rate_per_h,
-                )
-                for i in range(JOINTS)
-            ]
-            largest_causes = tuple(max(causes, key=lambda name: causes[name]) for causes, _ in split)
-            limits[f"{kind} {cutoff:g}"] = largest_causes, tuple(achievable for _, achievable in split)
+        moves = held_Nm == 0.0
+        x, direction = (low_pass(series, (_MODEL_RAD_S,), period_s)[moves] for series in (z, np.sign(dq)))
+        torque_LSB, velocity_LSB = resolution(tau_J), resolution(dq)
+        # the slope of the velocity's noise dominates single samples: no other part is as fast
+        noise = float(white_noise(tau_J))
+        fast = mean_square(z[moves]) - (torque_gain * noise) ** 2
+        rest = fast / momentum_gain**2 - (largest[i] * velocity_LSB) ** 2 / 12.0
+        sensing = Sensing(
+            torque_noise_Nm=max(noise**2 - torque_LSB**2 / 12.0, 0.0) ** 0.5,
+            torque_LSB_Nm=torque_LSB,
+            velocity_LSB_rad_s=velocity_LSB,
+            mass_row_kg_m2=largest[i],
+            momentum_noise_Nms=max(rest, 0.0) ** 0.5,
+            lag_error_s=float(statistics.lag_of_joint_s[i] - statistics.lag_s),
+            friction_error_Nm=float(x @ direction) / max(float(direction @ direction), 1e-300),
+        )
+        for name, poles_rad_s in poles_of.items():
+            causes, achievable_Nm = find_limits(
+                z, tau_J, held_Nm, sensing, poles_rad_s, period_s, statistics.lag_s, rate_per_h
+            )
+            by_joint[name].append((max(causes, key=lambda cause: causes[cause]), achievable_Nm))
+    limits = {}
+    for name, found in by_joint.items():
+        largest_causes, achievables_Nm = zip(*found, strict=True)
+        limits[name] = largest_causes, achievables_Nm
     return limits
 
 
 def thresholds_of_logs(
-    paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None
+    paths: Sequence[Path], rate_per_h: float, stretch: TimeWindow, progress: Progress
 ) -> tuple[Thresholds, Statistics]:
     """Return all detectors' thresholds from the contact-free motion of logs, and the statistics that they come from.
 
@@ -337,5 +328,5 @@ def thresholds_of_logs(
         if log.parameters < len(PARAMETER_NAMES):
             raise LogError(f"log {path} has {log.parameters} parameters")
         logs.append(log)
-    statistics = run_detectors(logs, detectors.DetectorBankSettings(), progress)
+    statistics = run_detectors(logs, progress)
     return compute_thresholds(statistics, rate_per_h, [str(path) for path in paths]), statistics

@@ -18,7 +18,6 @@ Shapes: N samples, K harmonics; q, dq, ddq (N, 2); W (N, 2, p). Units: rad, rad/
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -65,10 +64,10 @@ class Figures:
     excitation_Nm2s: float
     condition: float
     inertia_Nm2s: float
-    travel_deg: tuple[float, float]
-    velocity_deg_s: tuple[float, float]
-    acceleration_deg_s2: tuple[float, float]
-    torque_Nm: tuple[float, float] | None
+    travel_deg: list[float]
+    velocity_deg_s: list[float]
+    acceleration_deg_s2: list[float]
+    torque_Nm: list[float] | None
     """None: unknown without a CAD model."""
 
     @property
@@ -78,21 +77,6 @@ class Figures:
         The search minimises it; it may be negative.
         """
         return _cost_of(self.excitation_Nm2s, self.condition, self.inertia_Nm2s)
-
-
-class ExcitationLimits(NamedTuple):
-    """Limits of a motion, each (2,). travel_rad: largest |q|; torque_Nm: infinite without a CAD model."""
-
-    travel_rad: Vector
-    velocity_rad_s: Vector
-    acceleration_rad_s2: Vector
-    torque_Nm: Vector
-
-    def by_figure(self) -> dict[str, list[float] | None]:
-        """Return the limits by the names of the peaks in `Figures`, in their units, in pairs; None: no limit."""
-        degrees = zip(("travel_deg", "velocity_deg_s", "acceleration_deg_s2"), self[:3], strict=True)
-        torque = self.torque_Nm.tolist() if np.all(np.isfinite(self.torque_Nm)) else None
-        return {name: np.degrees(limit).tolist() for name, limit in degrees} | {"torque_Nm": torque}
 
 
 @compiled
@@ -132,14 +116,12 @@ class Search:
                 f"`excitation` has {counts} harmonics; the same number for both joints, at least 2, expected"
             )
         self._amplitude = np.radians(settings.trajectory.amplitude_deg)
-        self.limits = ExcitationLimits(
+        self._limits = (
             self._amplitude,
             np.minimum(np.radians(settings.reaction.velocity_limit_deg_s), arm.velocity_limit_rad_s),
             np.radians(settings.reaction.acceleration_limit_deg_s2),
-            np.maximum(TORQUE_SHARE * np.array(arm.torque_limit_Nm), _SMALLEST)
-            if arm.cad_theta
-            else np.full(JOINTS, np.inf),
-        )
+            np.maximum(TORQUE_SHARE * np.array(arm.torque_limit_Nm), _SMALLEST),
+        )  # of |q|, |dq|, |ddq| and the CAD model's torque, each (2,)
         self._theta = settings.cad_theta if arm.cad_theta else None
         self._base = len(settings.estimator.parameter_names)
         scale = constants_of(settings)["scale"][0]
@@ -155,6 +137,16 @@ class Search:
         self._rad_s = 2.0 * np.pi / self._period_s * self._order
         self._cosine, self._sine = (wave(np.outer(elapsed_s, self._rad_s)) for wave in (np.cos, np.sin))
 
+    def limits(self) -> dict[str, list[float] | None]:
+        """Return the limits by the names of the peaks in `Figures`, in their units, by joint; None: no limit."""
+        travel, velocity, acceleration = np.degrees(self._limits[:3]).tolist()
+        return {
+            "travel_deg": travel,
+            "velocity_deg_s": velocity,
+            "acceleration_deg_s2": acceleration,
+            "torque_Nm": None if self._theta is None else self._limits[3].tolist(),
+        }
+
     def figures(self, excitation: ExcitationSettings) -> Figures:
         """Return the figures of a motion at the samples of the search.
 
@@ -163,15 +155,15 @@ class Search:
         motion = self.motion_of(np.array(excitation.cosine), np.array(excitation.sine))
         W = self._regressors(motion)
         smallest, largest, inertia = self._shown(W)
-        travel, velocity, acceleration = np.degrees(np.abs(motion).max(axis=1))
+        travel, velocity, acceleration = np.degrees(np.abs(motion).max(axis=1)).tolist()
         return Figures(
             smallest,
             largest / max(smallest, _SMALLEST),
             inertia,
-            _pair(travel),
-            _pair(velocity),
-            _pair(acceleration),
-            None if self._theta is None else _pair(np.abs(W @ self._theta).max(axis=0)),
+            travel,
+            velocity,
+            acceleration,
+            None if self._theta is None else np.abs(W @ self._theta).max(axis=0).tolist(),
         )
 
     def overshoot(self, excitation: ExcitationSettings) -> float:
@@ -267,8 +259,8 @@ class Search:
 
     def _used(self, motion: Vector, W: Vector) -> list[Vector]:
         """Return the share of each limit that a motion uses at each sample, (N, 2) per limit; over 1: exceeded."""
-        parts = [np.abs(value) / limit for value, limit in zip(motion, self.limits[:3], strict=True)]
-        return parts if self._theta is None else [*parts, np.abs(W @ self._theta) / self.limits.torque_Nm]
+        values = motion if self._theta is None else (*motion, W @ self._theta)
+        return [np.abs(value) / limit for value, limit in zip(values, self._limits, strict=False)]
 
     def _shown(self, dynamic: Vector) -> tuple[float, float, float]:
         """Return smallest and largest eigenvalue of the fit's information, and the smallest of the inertia's, Nm² s.
@@ -314,7 +306,3 @@ class Search:
 
 def _cost_of(smallest: float, condition: float, inertia: float) -> float:
     return float(-np.log(max(smallest, _SMALLEST)) - 0.5 * np.log(max(inertia, _SMALLEST)) + 0.25 * np.log(condition))
-
-
-def _pair(values: Vector) -> tuple[float, float]:
-    return float(values[0]), float(values[1])

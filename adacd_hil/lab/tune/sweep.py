@@ -19,7 +19,7 @@ import json
 import os
 import statistics
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,40 +117,23 @@ class Plan:
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
-def plan_logs(
-    logs: Sequence[Path], variants: Sequence[Mapping[str, str]], config: str, profile: str, version: str
-) -> Plan:
-    """Return the plan of a sweep that replays each log, each once, with each variant of the settings.
-
-    variants: values as TOML, by key; none: the settings as they are. config: name or file, "" for the log's own.
-    version: of the code. Raises OSError if a log's size and date can't be read.
-    """
-    subjects = []
+def log_subjects(logs: Iterable[Path]) -> Iterator[Subject]:
+    """Yield the subject of each log. Raises OSError if a log's size and date can't be read."""
     for path in logs:
         status = path.stat()
-        subjects.append(Subject(log=str(path.resolve()), stamp=f"{status.st_size}/{status.st_mtime_ns}"))
-    return Plan(tuple(dict.fromkeys(subjects)), _tuples(variants), config, profile, version)
+        yield Subject(log=str(path.resolve()), stamp=f"{status.st_size}/{status.st_mtime_ns}")
 
 
-def plan_scenarios(
-    scenarios: Sequence[str],
-    seeds: Sequence[int],
-    variants: Sequence[Mapping[str, str]],
-    config: str,
-    profile: str,
-    version: str,
+def plan_of(
+    subjects: Iterable[Subject], variants: Iterable[Mapping[str, str]], config: str, profile: str, version: str
 ) -> Plan:
-    """Return the plan of a sweep that runs the emulated arm with each scenario, seed and variant of the settings.
+    """Return the plan of a sweep that replays or runs each subject, each once, with each variant of the settings.
 
-    variants: values as TOML, by key; none: the settings as they are. config: name or file, "" for the one of emulated
-    runs. profile: "" for the default arm. version: of the code.
+    variants: values as TOML, by key; none: the settings as they are. config: name or file, "" for the log's own, or
+    that of emulated runs. profile: of an emulated arm, "" for the default. version: of the code.
     """
-    subjects = (Subject(scenario=scenario, seed=seed) for scenario in scenarios for seed in seeds)
-    return Plan(tuple(dict.fromkeys(subjects)), _tuples(variants), config, profile, version)
-
-
-def _tuples(variants: Sequence[Mapping[str, str]]) -> tuple[Changes, ...]:
-    return tuple(dict.fromkeys(tuple(changes.items()) for changes in variants)) or ((),)
+    changes = dict.fromkeys(tuple(variant.items()) for variant in variants)
+    return Plan(tuple(dict.fromkeys(subjects)), tuple(changes) or ((),), config, profile, version)
 
 
 SET: Final = "set."
@@ -189,24 +172,24 @@ def replay_task(task: Task) -> list[Values]:
     """
     subject = task.subject
     path = Path(subject.log)
-    found: dict[str, Values] = {}
-    variants: dict[str, Settings] = {}
     try:
-        own = LogSource(path).settings
-        base = own
+        base = LogSource(path).settings
         if task.config:
-            base = keep_log_settings(own, load_settings(task.config, task.profile or own.arm.profile))
+            base = keep_log_settings(base, load_settings(task.config, task.profile or base.arm.profile))
     except REFUSALS as refusal:
         return [failed(subject, row, str(refusal)) for row in task.rows]
+    variants: dict[SweepRow, Settings] = {}
+    results: dict[SweepRow, Replay | str] = {}
     for row in task.rows:
         try:
-            variants[row.key] = apply_settings(base, dict(row.changes))
+            variants[row] = apply_settings(base, dict(row.changes))
         except ConfigError as refusal:
-            found[row.key] = failed(subject, row, str(refusal))
-    rows = [row for row in task.rows if row.key in variants]
-    for row, result in zip(rows, _replay_all(path, list(variants.values())), strict=True):
-        found[row.key] = failed(subject, row, result) if isinstance(result, str) else finished(subject, row, result)
-    return [found[row.key] for row in task.rows]
+            results[row] = str(refusal)
+    results |= zip(variants, _replay_all(path, list(variants.values())), strict=True)
+    return [
+        failed(subject, row, result) if isinstance(result := results[row], str) else finished(subject, row, result)
+        for row in task.rows
+    ]
 
 
 def _replay_all(path: Path, variants: list[Settings]) -> list[Replay | str]:
@@ -270,15 +253,8 @@ class SweepStore:
 
     def done(self) -> frozenset[str]:
         """Return the keys of all rows in the parts with status "ok". Raises LogError if a part can't be read."""
-        keys: set[str] = set()
-        for path in self._paths():
-            table = self._read(path, ["key", "status"])
-            keys.update(
-                key
-                for key, status in zip(*(table[name].to_pylist() for name in table.column_names), strict=True)
-                if status == "ok"
-            )
-        return frozenset(keys)
+        rows = (row for path in self._paths() for row in self._read(path, ["key", "status"]).to_pylist())
+        return frozenset(row["key"] for row in rows if row["status"] == "ok")
 
     def write_part(self, rows: Iterable[Values]) -> None:
         """Write rows as the next part of the folder, whole or not at all. Raises LogError if it can't be written."""

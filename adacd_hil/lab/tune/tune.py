@@ -27,7 +27,7 @@ from adacd_hil import __version__
 from adacd_hil.clock import wall_ns
 from adacd_hil.lab.drawing import COLOURS, Drawing, note, style, write_figures
 from adacd_hil.lab.score.rates import CONFIDENCE_TEXT, least_rate_per_h
-from adacd_hil.lab.score.report_wording import delay_figures, delays_phrase, rate_phrase, share_phrase
+from adacd_hil.lab.score.report_wording import delay_figures, delays_phrase
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError
 from adacd_hil.lab.tune.tune_candidates import (
     candidates,
@@ -50,10 +50,10 @@ from adacd_hil.lab.tune.tune_roc import (
     tuning_by_key,
 )
 from adacd_hil.log.logged_run import Progress
-from adacd_hil.log.time_window import WHOLE, TimeWindow
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.replay.replay import replay_many
 from adacd_hil.replay.replayed_outcome import Replay
-from adacd_hil.score.wording import number_of
+from adacd_hil.score.wording import found_text, number_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
@@ -69,7 +69,7 @@ def tune(
     rate_per_h: float,
     config: str | None,
     progress: Progress,
-    stretch: TimeWindow = WHOLE,
+    stretch: TimeWindow,
 ) -> Tuning:
     """Find thresholds, filter and gain for a rate of false alarms from logs; write no file.
 
@@ -93,16 +93,16 @@ def tune(
         notes.append(f"the detectors can't be compared: {error}")
     tried = candidates(logs[0].settings) if has_truth else [{}]
     settings = logs[0].settings
-    tried, choices = _choices(logs, tried, rate_per_h, progress, notes)
+    chosen = _choices(logs, tried, rate_per_h, progress, notes)
     changes = [
         filter_and_gain | thresholds_as_changes(apply_settings(settings, filter_and_gain), choice.thresholds)
-        for filter_and_gain, choice in zip(tried, choices, strict=True)
+        for filter_and_gain, choice in chosen
     ]
     own, *outcomes = replay_all(logs, [{}, *changes], progress)
     notes += own.notes
     judged = [
         Candidate(name_of(filter_and_gain), change, choice, outcome, problems_of(choice, outcome, own, rate_per_h))
-        for filter_and_gain, change, choice, outcome in zip(tried, changes, choices, outcomes, strict=True)
+        for (filter_and_gain, choice), change, outcome in zip(chosen, changes, outcomes, strict=True)
     ]
     if len(judged) > 1 and judged[0].choice.extrapolation > FARTHEST:
         notes.append(f"a rate of {rate_per_h:g} per hour is too far from this motion to choose filter and gain by it")
@@ -115,13 +115,13 @@ def _choices(
     rate_per_h: float,
     progress: Progress,
     notes: list[str],
-) -> tuple[list[Changes], list[Choice]]:
-    """Return the filters and gains of `tried` that show free motion, and the choice of thresholds for each.
+) -> list[tuple[Changes, Choice]]:
+    """Return the filters and gains of `tried` that show free motion, each with its choice of thresholds.
 
     Those without are dropped, with a line in `notes`. Raises TooLittleMotionError if the unchanged settings, {}, have
     none.
     """
-    chosen: list[tuple[Changes, Choice]] = []
+    chosen = []
     for changes, observed in zip(tried, observe_candidates(logs, tried, progress), strict=True):
         try:
             chosen.append((changes, choose(observed, rate_per_h)))
@@ -129,7 +129,7 @@ def _choices(
             if not changes:
                 raise TooLittleMotionError(f"{error}, with the settings to start from") from None
             notes.append(f"{name_of(changes)}: {error}")
-    return [changes for changes, _ in chosen], [choice for _, choice in chosen]
+    return chosen
 
 
 def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: Progress) -> list[TuningOutcome]:
@@ -138,28 +138,24 @@ def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: 
     variants: changed settings, {} for the logs' own. Raises LogError, ConfigError or CodecError if a log, a variant or
     a contract can't be used.
     """
-    results: list[list[tuple[TunedLog, Replay]]] = [[] for _ in variants]
+    by_log = []
     for log in logs:
         progress(f"replaying {log.path} with the thresholds found")
         settings = [apply_settings(log.settings, changes) for changes in variants]
-        replays = replay_many(log.path, settings, progress, stretch=log.stretch)
-        for gathered, found in zip(results, replays, strict=True):
-            gathered.append((log, found))
-    return [_outcome(gathered) for gathered in results]
+        by_log.append(replay_many(log.path, settings, progress, stretch=log.stretch))
+    return [_outcome(logs, replays) for replays in zip(*by_log, strict=True)]
 
 
-def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
-    """Return the outcome of all logs' replays with one variant; contacts count where the logged scheme was armed.
-
-    replays: each log with its replay.
-    """
-    took_s = [each for _, found in replays for each in found.adaptation_s]
-    judged = [(found, found.score) for _, found in replays if found.score is not None]
-    armed = {(log.path, window.number) for log, _ in replays for window in log.windows or () if window.is_armed}
+def _outcome(logs: Sequence[TunedLog], replays: Sequence[Replay]) -> TuningOutcome:
+    """Return the outcome of each log's replay with one variant; contacts count where the logged scheme was armed."""
+    took_s = [each for found in replays for each in found.adaptation_s]
+    judged = [(found, found.score) for found in replays if found.score is not None]
+    armed = {(log.path, window.number) for log in logs for window in log.windows or () if window.is_armed}
     contacts = [
         contact
-        for log, found in replays
-        for contact in (() if found.score is None else found.score.contacts)
+        for log, found in zip(logs, replays, strict=True)
+        if found.score is not None
+        for contact in found.score.contacts
         if (log.path, contact.number) in armed
     ]
     delays = [contact.delay_ms for contact in contacts if contact.delay_ms is not None]
@@ -171,7 +167,7 @@ def _outcome(replays: Sequence[tuple[TunedLog, Replay]]) -> TuningOutcome:
         hours=sum(found.monitored_s for found, _ in judged) / 3600.0,
         delays_ms=tuple(delays),
         armed_false_alarms=sum(score.armed_false_alarms for _, score in judged),
-        notes=tuple(f"{log.path}: {note}" for log, found in replays for note in found.notes),
+        notes=tuple(f"{log.path}: {note}" for log, found in zip(logs, replays, strict=True) for note in found.notes),
     )
 
 
@@ -211,7 +207,7 @@ def _delays(candidate: Candidate) -> tuple[float, ...]:
     inf if no contact was found.
     """
     figures = delay_figures(candidate.choice.chosen.delays_ms)
-    return tuple(math.inf if each is None else each for each in figures)
+    return tuple(math.inf if each is None else each for each in figures.values())
 
 
 def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
@@ -278,10 +274,13 @@ def _plain(path: Path) -> str:
 
 def in_words(found: Found) -> str:
     """Return the effect of thresholds as a phrase: false alarms, their rate, and contacts found if these are known."""
-    text = rate_phrase(found.alarms, found.hours, found.rate_bound_per_h)
+    bound = f"{CONFIDENCE_TEXT} bound {found.rate_bound_per_h:.3g} per hour"
+    text = f"{found.alarms} false alarms in {found.hours:.4f} h, {bound}"
     if found.contacts is None:
         return text
-    return f"{text}; {share_phrase(found.delays_ms, found.contacts, found.share_bounds)}"
+    low, high = found.share_bounds
+    share = f"{found_text(len(found.delays_ms), found.contacts)} contacts found ({100 * low:.0f} to {100 * high:.0f} %)"
+    return f"{text}; {share}{delays_phrase(found.delays_ms)}"
 
 
 def slowest_adaptation(outcome: TuningOutcome) -> str:
@@ -377,18 +376,14 @@ def draw_delays(tuning: Tuning) -> Drawing:
     title = "Delay at the chosen thresholds"
     with _axes(title) as (figure, axes):
         for choice, look in _curves(tuning):
-            delays, contacts = _all_delays(choice)
+            delays = sorted((*choice.chosen.delays_ms, *choice.checked.delays_ms))
+            contacts = (choice.chosen.contacts or 0) + (choice.checked.contacts or 0)
             shares = 100.0 * np.arange(len(delays) + 1) / max(contacts, 1)
             axes.step([0.0, *delays], shares, where="post", **look)
         axes.set(ylim=(-3.0, 103.0), xlabel="time since the onset, ms", ylabel="contacts found, %")
         note(axes, f"for {tuning.rate_per_h:g} false alarms per hour")
     caption = "Contacts of all logs; what a curve lacks to 100 % is never found."
     return Drawing("delays", title, caption, figure)
-
-
-def _all_delays(choice: Choice) -> tuple[Sequence[float], int]:
-    halves = (choice.chosen, choice.checked)
-    return sorted(delay for half in halves for delay in half.delays_ms), sum(half.contacts or 0 for half in halves)
 
 
 def write_tuning(tuning: Tuning, out_dir: Path) -> tuple[Path, ...]:

@@ -17,14 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.lab.detectors import detectors
+from adacd_hil.lab.detectors.detector_registry import detectors
+from adacd_hil.lab.detectors.detectors import DetectorBank
 from adacd_hil.lab.thresholds.detector_comparison import WARM_UP_S
 from adacd_hil.lab.thresholds.free_motion import torque_streams
 from adacd_hil.lab.thresholds.recorded_thresholds import Statistics, run_detectors
 from adacd_hil.lab.tune.tune_roc import Changes, Observed, Trial, TunedLog, Window, rising
 from adacd_hil.log.logged_run import Progress, is_armed_in
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.replay.replay import Watch, replay_many
+from adacd_hil.replay.replay import replay_many
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import bounds_of
@@ -99,13 +100,9 @@ def thresholds_as_changes(settings: Settings, thresholds: Vector) -> Changes:
     if settings.scheme == "certified":
         factor = up * float(thresholds[0, 0])
         own = {name: factor * getattr(settings.certified, name) for name in ("noise_sigmas", "model_sigmas")}
-        bounds = {name: bounds_of(CertifiedSettings, name) for name in own}
-        return {f"certified.{name}": in_toml(_within(value, bounds[name])) for name, value in own.items()}
-    return {"detector.threshold_Nm": in_toml([_within(up * each, _THRESHOLDS_NM) for each in thresholds[0].tolist()])}
-
-
-def _within(value: float, bounds: tuple[float, float]) -> float:
-    return min(max(value, bounds[0]), bounds[1])
+        within = {name: float(np.clip(value, *bounds_of(CertifiedSettings, name))) for name, value in own.items()}
+        return {f"certified.{name}": in_toml(value) for name, value in within.items()}
+    return {"detector.threshold_Nm": in_toml(np.clip(up * thresholds[0], *_THRESHOLDS_NM).tolist())}
 
 
 def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progress: Progress) -> list[Observed]:
@@ -113,14 +110,7 @@ def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progr
 
     Raises LogError, ConfigError or CodecError if a log, a candidate's settings or a contract can't be used.
     """
-    gathered: list[list[ShownLog]] = [[] for _ in tried]
-    for log in logs:
-        progress(f"replaying {log.path} with {len(tried)} filters and gains")
-        variants = [_monitoring(apply_settings(log.settings, changes)) for changes in tried]
-        shown = [ShownLog(log, settings) for settings in variants]
-        replay_many(log.path, variants, progress, watch=_show_to(shown), stretch=log.stretch)
-        for place, one in enumerate(shown):
-            gathered[place].append(one)
+    by_log = [_replayed(log, tried, progress) for log in logs]
     has_truth = any(log.windows is not None for log in logs)
     return [
         Observed(
@@ -129,13 +119,23 @@ def observe_candidates(logs: Sequence[TunedLog], tried: Sequence[Changes], progr
             np.concatenate([log.is_chosen_on for log in logs]),
             tuple(trial for one in all_logs for trial in one.trials()) if has_truth else None,
         )
-        for changes, all_logs in zip(tried, gathered, strict=True)
+        for changes, all_logs in zip(tried, zip(*by_log, strict=True), strict=True)
     ]
 
 
-def _show_to(shown: "Sequence[ShownLog]") -> Watch:
-    """Return a watcher for `replay_many` that passes each batch of replayed cycles to the `ShownLog` of its variant."""
-    return lambda place, ticks, batch: shown[place].take_stretch(ticks, batch)
+def _replayed(log: TunedLog, tried: Sequence[Changes], progress: Progress) -> "list[ShownLog]":
+    """Replay a log with every candidate; return the statistics of each on it."""
+    progress(f"replaying {log.path} with {len(tried)} filters and gains")
+    variants = [_monitoring(apply_settings(log.settings, changes)) for changes in tried]
+    shown = [ShownLog(log, settings) for settings in variants]
+    replay_many(
+        log.path,
+        variants,
+        progress,
+        watch=lambda place, ticks, batch: shown[place].take_stretch(ticks, batch),
+        stretch=log.stretch,
+    )
+    return shown
 
 
 def name_of(changes: Mapping[str, str]) -> str:
@@ -170,9 +170,7 @@ class ShownLog:
         self._channels = 1 if self._is_certified else JOINTS
         self._peaks = np.full((len(log.is_chosen_on), 1, self._channels), -np.inf)
         self._windows = [window for window in log.windows or () if window.is_armed]
-        self._open = sorted(self._windows, key=lambda window: window.first)  # those whose last cycle is yet to come
-        self._parts: dict[int, list[tuple[Vector, Vector]]] = {}  # by number of a window: since_s and statistic
-        self._trials: dict[int, Trial] = {}
+        self._parts: dict[Window, list[Trial]] = {}  # of the contacts at whose onset the candidate was armed
 
     def take_stretch(self, ticks: Ticks, batch: SchemeBatch) -> None:
         """Add a batch of replayed cycles to the largest statistics per block, and to those of the contacts in it.
@@ -193,12 +191,9 @@ class ShownLog:
             starts = np.flatnonzero(np.diff(blocks, prepend=-1))
             largest = np.maximum.reduceat(statistic[counted], starts, axis=0)
             self._peaks[blocks[starts]] = np.maximum(self._peaks[blocks[starts]], largest)
-        for window in self._open:
-            if window.first > rows[-1]:
-                break
-            self._take_window(window, rows, statistic, is_armed)
-        for window in [window for window in self._open if window.last <= rows[-1]]:
-            self._close(window)
+        for window in self._windows:
+            if window.first <= rows[-1] and rows[0] <= window.last:
+                self._take_window(window, rows, statistic, is_armed)
 
     def _take_window(self, window: Window, rows: Places, statistic: Vector, is_armed: NDArray[np.bool_]) -> None:
         """Add the cycles of a batch that lie in a contact. rows, statistic, is_armed: of the batch, one per cycle.
@@ -207,20 +202,10 @@ class ShownLog:
         """
         first, end = np.searchsorted(rows, (window.first, window.last + 1)).tolist()
         if first < len(rows) and rows[first] == window.first and is_armed[first]:
-            self._parts[window.number] = []
-        if window.number in self._parts:
+            self._parts[window] = []
+        if window in self._parts:
             since_s = (self._log.t_ns[rows[first:end]] - self._log.t_ns[window.first]) * 1e-9
-            self._parts[window.number].append((since_s, statistic[first:end].copy()))
-
-    def _close(self, window: Window) -> None:
-        """Store a contact's statistics as a trial, and take it off the open contacts.
-
-        The trial is empty if the candidate wasn't armed.
-        """
-        self._open.remove(window)
-        parts = self._parts.pop(window.number, None) or [(np.zeros(0), np.zeros((0, 1, self._channels)))]
-        since_s, statistic = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-        self._trials[window.number] = rising(Trial(since_s, statistic, window.is_chosen_on))
+            self._parts[window].append(rising(Trial(since_s, statistic[first:end], window.is_chosen_on)))
 
     def _statistic_of(self, block: Vector) -> Vector:
         """Return the statistic that chosen thresholds are compared with (k, 1, channels), from k cycles of /scheme.
@@ -247,31 +232,34 @@ class ShownLog:
     def trials(self) -> list[Trial]:
         """Return the statistics during each contact for which the logged scheme was armed, in the order of the log.
 
-        Call it after the last batch: it ends contacts that are still open.
+        Empty where the candidate wasn't armed. Call it after the last batch.
         """
-        for window in list(self._open):
-            self._close(window)
-        return [self._trials[window.number] for window in self._windows]
+        return [self._trial(window) for window in self._windows]
+
+    def _trial(self, window: Window) -> Trial:
+        unarmed = Trial(np.zeros(0), np.zeros((0, 1, self._channels)), window.is_chosen_on)
+        since_s, statistic, _ = zip(*self._parts.get(window, [unarmed]), strict=True)
+        return rising(Trial(np.concatenate(since_s), np.concatenate(statistic), window.is_chosen_on))
 
 
-def observe_detectors(logs: Sequence[TunedLog], progress: Progress = lambda _: None) -> list[Observed]:
-    """Run all detectors over logs; return the statistics of each, in the order of `DetectorBankSettings.detectors`.
+def observe_detectors(logs: Sequence[TunedLog], progress: Progress) -> list[Observed]:
+    """Run all detectors over logs; return the statistics of each, in the order of `detectors`.
 
     progress: called with a line on the cycles read. Raises LogError if a log can't be read or the logs differ in period
     or number of parameters, TooLittleMotionError if motion is too short.
     """
-    settings = detectors.DetectorBankSettings()
-    statistics = run_detectors([log.motion for log in logs], settings, progress)
+    places_of = detectors()
+    statistics = run_detectors([log.motion for log in logs], progress)
     is_chosen_on = chosen_blocks(logs)
-    trials: dict[str, list[Trial]] = {name: [] for name in settings.detectors}
+    trials: dict[str, list[Trial]] = {name: [] for name in places_of}
     for log in logs:
         for trial in _trials(log, statistics):
-            for name, rows in settings.detectors.items():
-                trials[name].append(rising(trial._replace(statistic=trial.statistic[:, list(rows), :])))
+            for name, places in places_of.items():
+                trials[name].append(rising(trial._replace(statistic=trial.statistic[:, places])))
     has_truth = any(log.windows is not None for log in logs)
     return [
-        Observed(name, statistics.peaks[:, list(rows), :], is_chosen_on, tuple(trials[name]) if has_truth else None)
-        for name, rows in settings.detectors.items()
+        Observed(name, statistics.peaks[:, places], is_chosen_on, tuple(trials[name]) if has_truth else None)
+        for name, places in places_of.items()
     ]
 
 
@@ -292,15 +280,14 @@ def _trials(log: TunedLog, statistics: Statistics) -> Iterator[Trial]:
     before = round(WARM_UP_S / log.motion.period_s)
     held = tuple(np.empty((0, statistics.z.shape[1])) for _ in range(2))  # stream that contacts may still need
     end = 0
-    streams = torque_streams(log.motion.pieces(), statistics.lag_s, statistics.settings.standstill_rad_s)
-    for motion, new in streams:
+    for motion, new in torque_streams(log.motion.pieces(), statistics.lag_s):
         held = tuple(np.concatenate(pair) for pair in zip(held, new, strict=True))
         end += len(motion.q)
         begin = end - len(held[0])
         for window in [window for window in waiting if window.last < end]:
             first = max(window.first - before, 0)
             rows = slice(first - begin, window.last + 1 - begin)
-            bank = detectors.DetectorBank(statistics.settings, statistics.weights, log.motion.period_s)
+            bank = DetectorBank(statistics.weights, log.motion.period_s)
             shown = bank.take_stream(held[0][rows], held[1][rows])
             since_s = (log.t_ns[window.first : window.last + 1] - log.t_ns[window.first]) * 1e-9
             yield Trial(since_s, shown[window.first - first :], window.is_chosen_on)

@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import math
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -40,7 +40,7 @@ from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.replay.log_source import LogSource
 from adacd_hil.score.emulator_truth import HostCycles, contacts_beside, placed_contacts
-from adacd_hil.score.judge import Times, TrueContact, explained_until
+from adacd_hil.score.judge import Times, TrueContact, explained_times
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import changed_keys, keep_log_settings
@@ -135,7 +135,7 @@ class Found(NamedTuple):
         return plain | {
             "found": len(self.delays_ms),
             "share_bounds": self.share_bounds,
-            "delay_ms": dict(zip(("median", "p90", "max"), delay_figures(self.delays_ms), strict=True)),
+            "delay_ms": delay_figures(self.delays_ms),
         }
 
 
@@ -157,13 +157,8 @@ class Choice:
 
     @property
     def extrapolation(self) -> float:
-        """Rate of one alarm in the time that thresholds are chosen on, over the wanted rate; infinite without a tail.
-
-        Up to 1 nothing is extrapolated.
-        """
-        if self.calibration is None:
-            return math.inf
-        return 1.0 / (self.calibration.rate_per_h * self.calibration.tail.hours)
+        """That of the calibration, on the half that thresholds are chosen on; infinite without a tail."""
+        return math.inf if self.calibration is None else self.calibration.extrapolation
 
     @property
     def method(self) -> str:
@@ -273,7 +268,7 @@ class TunedLog:
     t_ns: NDArray[np.int64]  # (N,)
     windows: tuple[Window, ...] | None
     is_chosen_on: NDArray[np.bool_]
-    stretch: TimeWindow = WHOLE
+    stretch: TimeWindow
 
     @property
     def block(self) -> int:
@@ -324,14 +319,17 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeW
     truth = contacts_beside(path, progress)
     blocks = -(-len(index.t_ns) // round(BLOCK_S / motion.period_s))
     tenths = np.arange(blocks) * _TENTHS // blocks
-    is_chosen_on = np.full(blocks, place % 2 == 0) if count > 1 else tenths % 2 == 0
+    is_all_chosen_on = None if count == 1 else place % 2 == 0
+    is_chosen_on = tenths % 2 == 0 if is_all_chosen_on is None else np.full(blocks, is_all_chosen_on)
     windows = None
     if truth is not None:
         begins = _begins(motion, parts)
         contacts = [
-            contact for contact in _on_cycles(truth[0], begins) if stretch.is_whole or index.cycle[0] <= contact.onset
+            contact.counted_from(begins[contact.attempt]) for contact in truth[0] if contact.attempt < len(begins)
         ]
-        windows = _windows(placed_contacts(contacts, index, own), index.t_ns, None if count == 1 else place)
+        if not stretch.is_whole:
+            contacts = [contact for contact in contacts if index.cycle[0] <= contact.onset]
+        windows = _windows(placed_contacts(contacts, index, own), index.t_ns, is_all_chosen_on)
         is_free = motion.is_free & host_span(truth[1], np.array(begins)).covers(index.cycle)
         apart = round(APART_S / motion.period_s)
         for window in windows:
@@ -382,24 +380,13 @@ def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
     return begins
 
 
-def _on_cycles(contacts: Sequence[TrueContact], begins: Sequence[int]) -> Iterator[TrueContact]:
-    """Yield the contacts with cycles counted as the host does; skip those of attempts that the log lacks.
-
-    begins: first cycle of each attempt.
-    """
-    for contact in contacts:
-        if contact.attempt < len(begins):
-            yield contact.counted_from(begins[contact.attempt])
-
-
-def _windows(contacts: Sequence[TrueContact], t_ns: Times, place: int | None) -> tuple[Window, ...]:
+def _windows(contacts: Sequence[TrueContact], t_ns: Times, is_all_chosen_on: bool | None) -> tuple[Window, ...]:
     """Return the window of each contact in a log.
 
-    place: index of the log, by which all its contacts are in one half; None: they alternate by their number. t_ns (N,):
-    times of the log's cycles.
+    is_all_chosen_on: whether all its contacts are in the half that thresholds are chosen on; None: they alternate by
+    their number. t_ns (N,): times of the log's cycles.
     """
-    onsets_ns = np.array([contact.onset_ns for contact in contacts], np.int64)
-    until_ns = explained_until(onsets_ns, np.array([contact.forgotten_ns for contact in contacts], np.int64))
+    onsets_ns, until_ns = explained_times(contacts)
     firsts = np.searchsorted(t_ns, onsets_ns).tolist()
     lasts = (np.searchsorted(t_ns, until_ns, side="right") - 1).tolist()
     return tuple(
@@ -408,7 +395,7 @@ def _windows(contacts: Sequence[TrueContact], t_ns: Times, place: int | None) ->
             first=first,
             last=max(last, first),
             is_armed=contact.is_armed,
-            is_chosen_on=(contact.number if place is None else place) % 2 == (1 if place is None else 0),
+            is_chosen_on=contact.number % 2 == 1 if is_all_chosen_on is None else is_all_chosen_on,
         )
         for contact, first, last in zip(contacts, firsts, lasts, strict=True)
     )
@@ -529,7 +516,7 @@ def _outcome(outcome: TuningOutcome) -> dict[str, Any]:
         "missed": outcome.missed,
         "false_alarms": outcome.false_alarms,
         "monitored_h": outcome.hours,
-        "delay_ms": dict(zip(("median", "p90", "max"), delay_figures(outcome.delays_ms), strict=True)),
+        "delay_ms": delay_figures(outcome.delays_ms),
     }
 
 
