@@ -21,7 +21,7 @@ from adacd_hil.device.canopen_bus import (
     find_variable,
 )
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, shows_mode, torque_limit_permille
-from adacd_hil.device.drive_units import name_velocity_unit, read_drive_units
+from adacd_hil.device.drive_units import name_velocity_unit, read_drive_units, unit_prefix
 from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, ScaleSettings
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
@@ -323,7 +323,6 @@ def _enter_mode(slave: Slave, codec: Codec) -> None:
 
 NEWTON_METRE = 0x00560100
 """0x6131 without its prefix: numerator Nm, denominator 1."""
-PREFIX_SHIFT = 24  # of 0x6131: power of ten, signed
 
 
 def check_sensor(slave: Slave, codec: Codec) -> str:
@@ -344,8 +343,7 @@ def check_sensor(slave: Slave, codec: Codec) -> str:
                 f"unit 0x6131:{channel} = 0x{unit:08X}, 0x{NEWTON_METRE:08X} (Nm) expected",
                 f"set 0x6131:{channel} of the sensor to newton metres with the maker's tool",
             )
-        prefix = unit >> PREFIX_SHIFT
-        prefix -= 256 if prefix > 127 else 0
+        prefix = unit_prefix(unit)
     if slave.has(0x6132, channel):
         digits = prefix - math.log10(scale)
         if abs(digits - round(digits)) > 1e-9:

@@ -92,7 +92,7 @@ def _angle_rad(unit: int | None) -> float | None:
     if not unit:
         return None
     angle_rad = _ANGLES_RAD.get(unit >> 16 & 0xFF)
-    return None if angle_rad is None else angle_rad * 10.0 ** _prefix(unit)
+    return None if angle_rad is None else angle_rad * 10.0 ** unit_prefix(unit)
 
 
 def _velocity_rad_s(unit: int | None, increments: float | None, gear_ratio: float) -> float | None:
@@ -100,12 +100,12 @@ def _velocity_rad_s(unit: int | None, increments: float | None, gear_ratio: floa
     if not unit or (time_s := _TIMES_S.get(unit >> 8 & 0xFF)) is None:
         return None
     if unit >> 16 & 0xFF == _INCREMENTS:
-        return None if not increments else 10.0 ** _prefix(unit) * math.tau / increments / time_s
+        return None if not increments else 10.0 ** unit_prefix(unit) * math.tau / increments / time_s
     angle_rad = _angle_rad(unit)
     return None if angle_rad is None else angle_rad / time_s / gear_ratio
 
 
-def _prefix(unit: int) -> int:
+def unit_prefix(unit: int) -> int:
     """Return the power of ten of a unit's code."""
     prefix = unit >> 24 & 0xFF
     return prefix - 256 if prefix > 127 else prefix
@@ -116,7 +116,7 @@ def name_velocity_unit(unit: int) -> str:
     numerator, denominator = unit >> 16 & 0xFF, unit >> 8 & 0xFF
     if numerator not in _NAMES or denominator not in _TIME_NAMES:
         return f"0x{unit:08X}"
-    power = f"10^{_prefix(unit)} " if _prefix(unit) else ""
+    power = f"10^{unit_prefix(unit)} " if unit_prefix(unit) else ""
     if (numerator, denominator) == (_REVOLUTION, 0x47):
         return f"{power}rpm"
     return f"{power}{_NAMES[numerator]}/{_TIME_NAMES[denominator]}"

@@ -225,6 +225,11 @@ def test_velocities_that_nobody_filled_in_are_derived(read):
     assert not idle.has_velocities
 
 
+def test_a_joint_at_rest_has_no_derived_velocity(read):
+    resting = read(table(lambda k, q, tau: f"{0.005 * k:.3f},0.7,{tau}"))
+    assert not resting.stretches[0].record.dq.any()
+
+
 @pytest.mark.parametrize(("unit", "turn"), [("rad", 2.0 * np.pi), ("deg", 360.0)])
 def test_a_position_that_jumps_by_a_turn_goes_on(read, unit, turn):
     def angle(k: int) -> float:

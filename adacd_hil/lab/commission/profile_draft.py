@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 from adacd_hil.device.canopen_bus import EdsVariable, find_variable
 from adacd_hil.device.device_files import load_profile, profile_names
-from adacd_hil.device.device_setup import CST_SUPPORTED, NEWTON_METRE, PREFIX_SHIFT
-from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, name_velocity_unit, read_drive_units
+from adacd_hil.device.device_setup import CST_SUPPORTED, NEWTON_METRE
+from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, name_velocity_unit, read_drive_units, unit_prefix
 from adacd_hil.device.eds_file import read_eds
 from adacd_hil.device.profile import (
     HOST_SIGNALS,
@@ -735,8 +735,7 @@ class _SensorWriter(_ProfileWriter):
         unit, digits = self.number(0x6131, 1), self.number(0x6132, 1)
         if unit is None or digits is None or unit & 0x00FFFFFF != NEWTON_METRE:
             return None
-        prefix = unit >> PREFIX_SHIFT
-        exponent = (prefix - 256 if prefix > 127 else prefix) - digits
+        exponent = unit_prefix(unit) - digits
         return 10.0**exponent if abs(exponent) < 12 else None
 
     def _torque(self) -> _Place:

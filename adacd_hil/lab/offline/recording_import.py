@@ -295,9 +295,10 @@ def derivative_window(described: RecordingMap, period_s: float) -> int:
 def derive(q: Vector, period_s: float, window: int) -> Vector:
     """Derive velocities (k, n) from positions, without delay: the slope of a cubic over `window` samples.
 
-    Raises ValueError if k is below `window`.
+    The velocity of a joint at rest is exactly 0. Raises ValueError if k is below `window`.
     """
-    return np.asarray(savgol_filter(q, window, _DEGREE, deriv=1, delta=period_s, axis=0), np.float64)
+    travel = q - q[0]  # of a constant position, rounding leaves a velocity with a sign
+    return np.asarray(savgol_filter(travel, window, _DEGREE, deriv=1, delta=period_s, axis=0), np.float64)
 
 
 def _noise(parts: list[Vector], given: Vector) -> list[float]:
