@@ -216,7 +216,7 @@ class McapFile(ChunkedFile):
     def __init__(
         self, sink: Sink, channels: tuple[LogChannel, ...], attachments: dict[str, bytes], metadata: dict[str, str]
     ) -> None:
-        super().__init__(sink, ROS_PROFILE)
+        super().__init__(sink.write, ROS_PROFILE)
         self.ids: dict[int, int] = {}
         """The file's channel ids, by our channel ids."""
         self.types = {channel.id: channel.type for channel in channels}

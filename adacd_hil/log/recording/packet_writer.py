@@ -5,7 +5,7 @@ The order: cycle after cycle, each frame followed by its decoded message, then t
 
 import struct
 from collections import defaultdict
-from typing import Any, NamedTuple
+from typing import Any
 
 from adacd_hil.log.recording.log_file import McapFile
 from adacd_hil.log.recording.packet import Packet
@@ -29,14 +29,6 @@ _BODY = len(ENCAPSULATION) + _STAMP.size
 """Offset of a body in a payload, bytes: after the stamp, with which all types begin."""
 
 
-class _Decoder(NamedTuple):
-    """Decoder of a message of the DBC: our number of its topic, and the struct of its values."""
-
-    channel: int
-    message: MessageTable
-    body: struct.Struct
-
-
 class PacketWriter:
     """Writes the contents of packets as messages of a file."""
 
@@ -51,10 +43,7 @@ class PacketWriter:
         self._epoch_ns = epoch_ns
         self._latest_ns: dict[int, int] = defaultdict(int)  # log time of each of our channels
         self._decoders = {
-            message.can_id: _Decoder(
-                ChannelId.DECODED_FIRST + index, message, struct.Struct(f"<{len(message.signals)}d")
-            )
-            for index, message in enumerate(messages)
+            message.can_id: (channel, message) for channel, message in enumerate(messages, ChannelId.DECODED_FIRST)
         }
         scheme: Any = file.types[ChannelId.SCHEME].dtype.fields if ChannelId.SCHEME in file.types else {}
         starts = [scheme[name][1] for name in ("q", "dq", "tau_J") if name in scheme]
@@ -124,10 +113,11 @@ class PacketWriter:
             channel = ChannelId.TO_CAN_BUS if is_tx else ChannelId.FROM_CAN_BUS
             payload = pack_can_frame(stamp, can_id, data, len(data), is_error)
         self._add(channel, t_ns, publish_ns, payload)
-        decoder = self._decoders.get(can_id)
-        if decoder is not None and len(data) == decoder.message.length and not is_error:
-            body = decoder.body.pack(*decoder.message.decode(data))
-            self._add(decoder.channel, t_ns, publish_ns, ENCAPSULATION + stamp + body)
+        number, message = self._decoders.get(can_id, (0, None))
+        if message is not None and len(data) == message.length and not is_error:
+            values = message.decode(data)
+            body = struct.pack(f"<{len(values)}d", *values)
+            self._add(number, t_ns, publish_ns, ENCAPSULATION + stamp + body)
 
     def _add_event(self, time_ns: int, event: Event) -> None:
         self._add(ChannelId.EVENTS, time_ns, time_ns, pack_log(_stamp(time_ns), event))

@@ -64,7 +64,7 @@ class Recorder:
         self,
         path: Path,
         *,
-        messages: Iterable[MessageTable] | None = None,
+        messages: Iterable[MessageTable] = (),
         parameter_count: int = len(PARAMETER_NAMES),
         further_count: int = 0,
         channel_count: int = 0,
@@ -78,7 +78,7 @@ class Recorder:
     ) -> None:
         """Create the file, which must not exist (see run_folder.py), and start the writer.
 
-        messages: of the DBC, by default the package's. The counts: see `run_channels`; by default those of the paper's
+        messages: of the DBC, whose frames are decoded. The counts: see `run_channels`; by default those of the paper's
         scheme. attachments, metadata: at the file's beginning. epoch_ns: added to t_ns for the log's times; 0 in
         lockstep. blocking: lockstep. channels: of a log that is no run's. settings: sizes of parts and buffer. live:
         live view to open. Raises LogExistsError if a log is there already, LogError if the file or the writer can't be
@@ -98,7 +98,7 @@ class Recorder:
         self._summary: LogSummary | None = None
         self._is_blocking = blocking
         self._unannounced = 0  # bytes in the ring since the writer was last woken
-        is_run, told = channels is None, plain_tables(_own_messages() if messages is None else messages)
+        is_run, told = channels is None, plain_tables(messages)
         try:
             channels = channels or run_channels(parameter_count, told, further_count, channel_count)
         except LogError as error:
@@ -283,10 +283,3 @@ def _create(path: Path, is_run: bool) -> int:
         raise LogExistsError(f"{path} is being written by another run; choose another folder with --out") from None
     except OSError as error:
         raise LogError(f"log {path} can't be created: {error.strerror}") from None
-
-
-def _own_messages() -> Iterable[MessageTable]:
-    # Takes 0.2 s; callers with a codec pass its messages instead.
-    from adacd_hil.wire.dbc_contract import load_codec
-
-    return load_codec().messages.values()
