@@ -227,6 +227,13 @@ def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
     return contacts
 
 
+def report_values(series: Series) -> Iterator[dict[str, Any]]:
+    """Yield the fields of each report of /contact that the log has, values by name; those of enums are numbers."""
+    names = [name for name in ContactReport._fields if name in series.fields]
+    for record in series.records:
+        yield {name: record[name].tolist() for name in names}
+
+
 Time = TypeVar("Time", int, float)
 
 

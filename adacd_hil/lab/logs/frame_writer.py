@@ -1,7 +1,6 @@
 """Writes frames from anywhere to an MCAP file with the topics and types of our logs."""
 
 import re
-import struct
 from typing import IO
 
 from mcap.writer import Writer
@@ -23,9 +22,8 @@ from adacd_hil.log.types.message_types import (
     FD_FRAME,
     pack_can_frame,
     pack_fd_frame,
+    pack_stamp,
 )
-
-_STAMP = struct.Struct("<II")
 
 
 class FrameWriter:
@@ -59,7 +57,7 @@ class FrameWriter:
             channel_id = self._ids[key] = self._add_channel(frame)
         topic = self._topics[channel_id]
         log_time_ns = self._latest_ns[topic] = max(frame.t_ns, self._latest_ns.get(topic, 0))
-        stamp = _STAMP.pack(*divmod(frame.t_ns, 1_000_000_000))
+        stamp = pack_stamp(frame.t_ns)
         if frame.is_fd:
             payload = pack_fd_frame(stamp, frame.can_id, frame.data, frame.is_error, frame.is_extended)
         else:

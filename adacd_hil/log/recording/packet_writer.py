@@ -17,6 +17,7 @@ from adacd_hil.log.types.message_types import (
     pack_fd_frame,
     pack_joint_state,
     pack_log,
+    pack_stamp,
 )
 from adacd_hil.log.types.topics import ChannelId
 from adacd_hil.records import JOINTS, Event
@@ -24,8 +25,7 @@ from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 from adacd_hil.wire.message_table import MessageTable
 
-_STAMP = struct.Struct("<II")
-_BODY = len(ENCAPSULATION) + _STAMP.size
+_BODY = len(ENCAPSULATION) + len(pack_stamp(0))
 """Offset of a body in a payload, bytes: after the stamp, with which all types begin."""
 
 
@@ -73,7 +73,7 @@ class PacketWriter:
             self._add_event(time_ns, Event("warning", "log", f"{missing} packets are missing before this"))
         for is_tx, frame in packet.frames:
             self._add_frame(is_tx, frame, time_ns)
-        stamp = _stamp(time_ns)
+        stamp = pack_stamp(time_ns)
         for channel, body in packet.messages:
             payload = ENCAPSULATION + stamp + body
             self._add(channel, time_ns, time_ns, payload)
@@ -105,7 +105,7 @@ class PacketWriter:
         self.frames += 1
         can_id, data, t_ns, is_error = frame
         t_ns += self._epoch_ns
-        stamp = _stamp(t_ns)
+        stamp = pack_stamp(t_ns)
         if len(data) > CLASSIC_BYTES:
             channel = ChannelId.TO_CAN_BUS_FD if is_tx else ChannelId.FROM_CAN_BUS_FD
             payload = pack_fd_frame(stamp, can_id, data, is_error)
@@ -120,7 +120,7 @@ class PacketWriter:
             self._add(number, t_ns, publish_ns, ENCAPSULATION + stamp + body)
 
     def _add_event(self, time_ns: int, event: Event) -> None:
-        self._add(ChannelId.EVENTS, time_ns, time_ns, pack_log(_stamp(time_ns), event))
+        self._add(ChannelId.EVENTS, time_ns, time_ns, pack_log(pack_stamp(time_ns), event))
 
     def _add(self, channel: int, t_ns: int, publish_ns: int, payload: bytes) -> None:
         """Add a message; raise its log time to the topic's last one if earlier: readers expect ascending times."""
@@ -131,8 +131,3 @@ class PacketWriter:
         self._file.add_message(number, log_ns, payload, publish_ns)
         if self.shown is not None:
             self.shown.append(LoggedMessage(number, log_ns, publish_ns, payload))
-
-
-def _stamp(time_ns: int) -> bytes:
-    """Return a time as the 8 bytes of a builtin_interfaces/Time."""
-    return _STAMP.pack(*divmod(time_ns, 1_000_000_000))
