@@ -158,9 +158,7 @@ class _FileCheck:
             case Opcode.HEADER:
                 self._header(record)
             case Opcode.SCHEMA:
-                schema = parse(opcode, record.body)
-                self._definitions.schema(schema, record.offset, self._is_summary)
-                self._chunks.content.schema(schema, record.offset)
+                self._definitions.schema(parse(opcode, record.body), record.offset, self._is_summary)
             case Opcode.CHANNEL:
                 self._definitions.channel(parse(opcode, record.body), record.offset, self._is_summary)
             case Opcode.CHUNK:

@@ -85,7 +85,7 @@ class ChunkCheck:
         self._findings = findings
         self._opening = Opening()
         self._definitions = definitions
-        self.content = ContentCheck(findings)
+        self._content = ContentCheck(findings)
         self._latest: ChunkFacts | None = None  # whose indexes may follow
         self._expected: dict[int, NDArray[Any]] | None = None  # entries of its indexes; None where it can't be opened
         self._offsets: dict[int, int] = {}
@@ -129,13 +129,13 @@ class ChunkCheck:
     def _compare_times(self, chunk: Chunk, contents: Contents, offset: int) -> None:
         if not len(contents.starts):
             return
-        first, last = int(contents.log_times.min()), int(contents.log_times.max())
-        if chunk.message_start_time != first:
-            text = f"a chunk begins at {chunk.message_start_time}, its earliest message at {first}"
-            self._findings.add_finding("chunk-times", text, offset)
-        if chunk.message_end_time != last:
-            text = f"a chunk ends at {chunk.message_end_time}, its latest message at {last}"
-            self._findings.add_finding("chunk-times", text, offset)
+        for verb, which, said, real in (
+            ("begins", "earliest", chunk.message_start_time, int(contents.log_times.min())),
+            ("ends", "latest", chunk.message_end_time, int(contents.log_times.max())),
+        ):
+            if said != real:
+                text = f"a chunk {verb} at {said}, its {which} message at {real}"
+                self._findings.add_finding("chunk-times", text, offset)
 
     def _expect(self, contents: Contents, facts: ChunkFacts) -> None:
         """Store the message indexes that the chunk must have, and its channels."""
@@ -203,7 +203,6 @@ class ChunkCheck:
             parsed = parse(definition.opcode, definition.body)
             if definition.opcode == Opcode.SCHEMA:
                 self._definitions.schema(parsed, offset, is_summary=False)
-                self.content.schema(parsed, offset)
             else:
                 self._definitions.channel(parsed, offset, is_summary=False)
                 if definition.offset < first_at.get(parsed.id, len(contents.data)):
@@ -219,7 +218,7 @@ class ChunkCheck:
             if len(later):
                 self.first_later_than_zero_ns = min(self.first_later_than_zero_ns, int(later.min()))
             self.end_ns = max(self.end_ns, int(contents.log_times.max()))
-            self.content.messages(contents, self._definitions, offset)
+            self._content.messages(contents, self._definitions, offset)
 
     def compare(self, index: ChunkIndex, offset: int) -> None:
         """Compare a chunk index of the summary with its chunk; add findings. offset: of the index in the file."""
@@ -256,7 +255,6 @@ class SummaryCheck:
         self._chunks = chunks
         self._attachments: dict[int, AttachmentIndex] = {}  # the indexes that the summary must have, by offset
         self._metadata: dict[int, MetadataIndex] = {}
-        self._attachment_count = self._metadata_count = 0
         self._indexed: set[int] = set()
         self._start = 0  # of the summary; 0: not reached so far
         self._groups: list[list[int]] = []  # opcode, start, end of each
@@ -264,8 +262,7 @@ class SummaryCheck:
         self._offset_start = 0
 
     def attachment(self, record: RawRecord, attachment: Attachment) -> None:
-        """Count an attachment, and store the index that the summary must have for it."""
-        self._attachment_count += 1
+        """Store the index that the summary must have for an attachment."""
         self._attachments[record.offset] = AttachmentIndex(
             offset=record.offset,
             length=HEAD.size + len(record.body),
@@ -277,8 +274,7 @@ class SummaryCheck:
         )
 
     def metadata(self, record: RawRecord, name: str) -> None:
-        """Count a metadata record, and store the index that the summary must have for it."""
-        self._metadata_count += 1
+        """Store the index that the summary must have for a metadata record."""
         self._metadata[record.offset] = MetadataIndex(record.offset, HEAD.size + len(record.body), name)
 
     def record(self, record: RawRecord) -> None:
@@ -322,8 +318,8 @@ class SummaryCheck:
             self._findings.add_finding(rule, text, offset)
         self._indexed.add(index.offset)
 
-    def _check_counted_channels(self, statistics: Statistics | None, offset: int) -> None:
-        if statistics is None or not statistics.channel_message_counts:
+    def _check_counted_channels(self, statistics: Statistics, offset: int) -> None:
+        if not statistics.channel_message_counts:
             return
         needed = {*self._definitions.channels, *statistics.channel_message_counts}
         for channel in sorted(needed - self._definitions.summary_channels):
@@ -399,8 +395,8 @@ class SummaryCheck:
         total = int(chunks.counts.sum())
         pairs = {
             "messages": (statistics.message_count, total),
-            "attachments": (statistics.attachment_count, self._attachment_count),
-            "metadata records": (statistics.metadata_count, self._metadata_count),
+            "attachments": (statistics.attachment_count, len(self._attachments)),
+            "metadata records": (statistics.metadata_count, len(self._metadata)),
             "chunks": (statistics.chunk_count, len(chunks.facts)),
         }
         for what, (said, real) in pairs.items():
