@@ -81,9 +81,10 @@ class SchemeComparison:
         """
         records = scheme.records
         self.cycles += len(records)
-        self._compare_whole("stamp_ns", scheme.t_ns, ticks.t_ns, ticks)
+        self._note(SCHEME.name, "stamp_ns", scheme.t_ns != ticks.t_ns, scheme.t_ns, ticks.t_ns, ticks)
         for name in _HEAD:
-            self._compare_whole(name, records[name], getattr(batch, name), ticks)
+            logged, replayed = records[name], getattr(batch, name)
+            self._note(SCHEME.name, name, logged != replayed, logged, replayed, ticks)
         known = scheme.fields
         self.missing_fields = [name for name in self._layout.slices if name not in known]
         if not self.missing_fields and _same_bits(scheme.block, batch.block):
@@ -92,12 +93,6 @@ class SchemeComparison:
             if name in known:
                 logged = np.ascontiguousarray(records[name], np.float64).reshape(len(records), -1)
                 self._compare_reals(name, logged, np.ascontiguousarray(batch.block[:, place]), ticks)
-
-    def _compare_whole(self, name: str, logged: NDArray[Any], replayed: NDArray[Any], ticks: Ticks) -> None:
-        """Compare a field of whole numbers, logged and replayed (n,) each, and note the cycles in which it differs."""
-        is_other = np.asarray(logged != replayed)
-        if is_other.any():
-            self._note(SCHEME.name, name, is_other, logged, replayed, ticks)
 
     def _compare_reals(self, name: str, logged: Vector, replayed: Vector, ticks: Ticks) -> None:
         """Compare a float field, logged and replayed (n, k) each, and note the cycles in which it differs.
@@ -109,8 +104,7 @@ class SchemeComparison:
         is_other = np.asarray(logged.view(np.uint64) != replayed.view(np.uint64))
         if self._tolerance:
             is_other &= ~self._is_near(name, logged, replayed)
-        if is_other.any():
-            self._note(SCHEME.name, name, is_other, logged, replayed, ticks)
+        self._note(SCHEME.name, name, is_other, logged, replayed, ticks)
 
     def _is_near(self, name: str, logged: Vector, replayed: Vector) -> NDArray[np.bool_]:
         """Return where a field's values (n, k) are equal, or differ by no more than the tolerance; two NaN are equal.
@@ -134,9 +128,7 @@ class SchemeComparison:
             theirs: NDArray[Any] = getattr(logged, name)
             ours: NDArray[Any] = getattr(decoded, name)
             bits = np.uint64 if theirs.dtype == np.float64 else theirs.dtype
-            is_other = np.asarray(theirs.view(bits) != ours.view(bits))
-            if is_other.any():
-                self._note(ARM.name, name, is_other, theirs, ours, ticks)
+            self._note(ARM.name, name, theirs.view(bits) != ours.view(bits), theirs, ours, ticks)
 
     def _note(
         self,
@@ -148,6 +140,8 @@ class SchemeComparison:
         ticks: Ticks,
     ) -> None:
         """Count the values of (n,) or (n, k) that differ, where is_other is True; keep the first `shown` of them."""
+        if not is_other.any():
+            return
         is_other, logged, replayed = (each.reshape(len(each), -1) for each in (is_other, logged, replayed))
         rows, columns = np.nonzero(is_other)
         self.count += len(rows)

@@ -213,7 +213,8 @@ _PLACES: Final = {
 
 
 def _card(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, Any]:
-    entries = _found(contact) if contact.detected_s is not None else [("found", _why_not(contact))]
+    why_not = "missed" if contact.is_armed else f"detection was off: {state_words(contact.state)}"
+    entries = _found(contact) if contact.detected_s is not None else [("found", why_not)]
     entries += _torques(contact)
     if contact.link is not None:
         force = number_text(contact.true_force_N, 1, "N") if contact.true_force_N is not None else NONE
@@ -234,10 +235,6 @@ def _kind(contact: ReportedContact) -> str:
     words = [contact.level, contact.kind if contact.kind != "UNKNOWN" else None, contact.reaction]
     kind = " · ".join(word.lower().replace("_", " ") for word in words if word)
     return kind + (" · two-sided" if contact.is_two_sided else "")
-
-
-def _why_not(contact: ReportedContact) -> str:
-    return "missed" if contact.is_armed else f"detection was off: {state_words(contact.state)}"
 
 
 def _found(contact: ReportedContact) -> list[tuple[str, str]]:

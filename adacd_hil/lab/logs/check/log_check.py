@@ -61,7 +61,7 @@ class _FileCheck:
         self._definitions = DefinitionCheck(self.findings)
         self._chunks = ChunkCheck(self.findings, self._definitions)
         self._summary = SummaryCheck(self.findings, self._definitions, self._chunks)
-        self._is_summary = False  # DataEnd is behind
+        self.is_ended = False  # DataEnd is behind: what follows is the summary
         self._crc = 0  # of the section so far
         self._counts = dict.fromkeys(_ONCE, 0)
         self._has_trailer = False
@@ -90,11 +90,6 @@ class _FileCheck:
         topics = {number: channel.topic for number, channel in self._definitions.channels.items()}
         counts = {number: int(self._chunks.counts[number]) for number in topics}
         self.messages, self.frames = int(self._chunks.counts.sum()), count_frames(topics, counts)
-
-    @property
-    def is_ended(self) -> bool:
-        """Whether the file has a DataEnd."""
-        return self._counts[Opcode.DATA_END] > 0
 
     def _gap(self, gap: FileGap) -> None:
         """Add a finding on bytes that form no record, and add them to the CRC."""
@@ -136,7 +131,7 @@ class _FileCheck:
             self.findings.without_crc[_DATA_SECTION] += 1
         elif stored != self._crc:
             self.findings.add_finding("data-crc", "the data section fails its CRC", record.offset)
-        self._is_summary = True
+        self.is_ended = True
         self._crc = 0
 
     def _judge(self, record: RawRecord) -> None:
@@ -148,19 +143,19 @@ class _FileCheck:
         if opcode not in set(Opcode):
             self.findings.add_finding("unknown-record", f"{name_of(opcode)} of {len(record.body)} bytes", record.offset)
             return
-        if opcode in (_DATA if self._is_summary else _SUMMARY):
-            where = "summary" if self._is_summary else "data section"
+        if opcode in (_DATA if self.is_ended else _SUMMARY):
+            where = "summary" if self.is_ended else "data section"
             self.findings.add_finding("place", f"{name_of(opcode)} in the {where}", record.offset)
             return
-        if self._is_summary:
+        if self.is_ended:
             self._summary.record(record)
         match opcode:
             case Opcode.HEADER:
                 self._header(record)
             case Opcode.SCHEMA:
-                self._definitions.schema(parse(opcode, record.body), record.offset, self._is_summary)
+                self._definitions.schema(parse(opcode, record.body), record.offset, self.is_ended)
             case Opcode.CHANNEL:
-                self._definitions.channel(parse(opcode, record.body), record.offset, self._is_summary)
+                self._definitions.channel(parse(opcode, record.body), record.offset, self.is_ended)
             case Opcode.CHUNK:
                 self._chunks.chunk(record)
             case Opcode.MESSAGE_INDEX:
