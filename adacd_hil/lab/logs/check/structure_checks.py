@@ -242,6 +242,10 @@ class ChunkCheck:
             self._findings.add_finding("chunk-index", text, offset)
 
 
+_INDEXES: dict[int, str] = {Opcode.ATTACHMENT_INDEX: "attachment-index", Opcode.METADATA_INDEX: "metadata-index"}
+"""Indexes of single records, and their rules."""
+
+
 class SummaryCheck:
     """Compares the summary of a file with the data section.
 
@@ -253,8 +257,8 @@ class SummaryCheck:
         self._findings = findings
         self._definitions = definitions
         self._chunks = chunks
-        self._attachments: dict[int, AttachmentIndex] = {}  # the indexes that the summary must have, by offset
-        self._metadata: dict[int, MetadataIndex] = {}
+        self._expected: dict[int, dict[int, Any]] = {opcode: {} for opcode in _INDEXES}
+        """The indexes that the summary must have, by the offset of their record."""
         self._indexed: set[int] = set()
         self._start = 0  # of the summary; 0: not reached so far
         self._groups: list[list[int]] = []  # opcode, start, end of each
@@ -263,7 +267,7 @@ class SummaryCheck:
 
     def attachment(self, record: RawRecord, attachment: Attachment) -> None:
         """Store the index that the summary must have for an attachment."""
-        self._attachments[record.offset] = AttachmentIndex(
+        self._expected[Opcode.ATTACHMENT_INDEX][record.offset] = AttachmentIndex(
             offset=record.offset,
             length=HEAD.size + len(record.body),
             log_time=attachment.log_time,
@@ -275,7 +279,8 @@ class SummaryCheck:
 
     def metadata(self, record: RawRecord, name: str) -> None:
         """Store the index that the summary must have for a metadata record."""
-        self._metadata[record.offset] = MetadataIndex(record.offset, HEAD.size + len(record.body), name)
+        length = HEAD.size + len(record.body)
+        self._expected[Opcode.METADATA_INDEX][record.offset] = MetadataIndex(record.offset, length, name)
 
     def record(self, record: RawRecord) -> None:
         """Store the place of a record of the summary.
@@ -293,21 +298,20 @@ class SummaryCheck:
             self._groups.append([record.opcode, record.offset, record.end])
         if record.opcode == Opcode.CHUNK_INDEX:
             self._chunks.compare(parse(record.opcode, record.body), record.offset)
-        elif record.opcode == Opcode.ATTACHMENT_INDEX:
-            self._compare("attachment-index", self._attachments, parse(record.opcode, record.body), record.offset)
-        elif record.opcode == Opcode.METADATA_INDEX:
-            self._compare("metadata-index", self._metadata, parse(record.opcode, record.body), record.offset)
+        elif record.opcode in _INDEXES:
+            self._compare(record.opcode, parse(record.opcode, record.body), record.offset)
         elif record.opcode == Opcode.STATISTICS:
             if self.statistics is not None:
                 self._findings.add_finding("statistics", "there is more than one Statistics", record.offset)
             self.statistics = parse(record.opcode, record.body)
             self._check_counted_channels(self.statistics, record.offset)
 
-    def _compare(self, rule: str, expected: Mapping[int, Any], index: Any, offset: int) -> None:
-        """Compare an index of the summary with the expected ones, by offset; add a finding on a wrong or second one.
+    def _compare(self, opcode: int, index: Any, offset: int) -> None:
+        """Compare an index of an attachment or metadata with the expected ones; add a finding on a wrong or second one.
 
-        rule: "attachment-index" or "metadata-index".
+        opcode: of the index; offset: where it is in the file.
         """
+        rule, expected = _INDEXES[opcode], self._expected[opcode]
         kind = rule.removesuffix("-index")
         if index.offset in self._indexed:
             self._findings.add_finding(rule, f"the {kind} at byte {index.offset} is indexed more than once", offset)
@@ -367,12 +371,9 @@ class SummaryCheck:
             self._check_needed_channels()
         if self._chunks.has_outside and Opcode.CHUNK_INDEX in kinds:
             self._findings.add_finding("unindexed-messages", "there are messages outside chunks, which no index has")
-        for rule, opcode, expected in (
-            ("attachment-index", Opcode.ATTACHMENT_INDEX, self._attachments),
-            ("metadata-index", Opcode.METADATA_INDEX, self._metadata),
-        ):
+        for opcode, rule in _INDEXES.items():
             if opcode in kinds:
-                for offset in sorted(set(expected) - self._indexed):
+                for offset in sorted(set(self._expected[opcode]) - self._indexed):
                     self._findings.add_finding(rule, f"a record has no {rule.replace('-', ' ')}", offset)
 
     def _check_needed_channels(self) -> None:
@@ -395,8 +396,8 @@ class SummaryCheck:
         total = int(chunks.counts.sum())
         pairs = {
             "messages": (statistics.message_count, total),
-            "attachments": (statistics.attachment_count, len(self._attachments)),
-            "metadata records": (statistics.metadata_count, len(self._metadata)),
+            "attachments": (statistics.attachment_count, len(self._expected[Opcode.ATTACHMENT_INDEX])),
+            "metadata records": (statistics.metadata_count, len(self._expected[Opcode.METADATA_INDEX])),
             "chunks": (statistics.chunk_count, len(chunks.facts)),
         }
         for what, (said, real) in pairs.items():
