@@ -76,7 +76,7 @@ def test_the_summary_counts_what_was_written(run, recorded, log, others):
     contacts = sum(cycle.contact is not None for cycle in run.cycles)
     events = sum(cycle.event is not None for cycle in run.cycles)
     messages = len(run.frames) + len(decodable(run)) + 5 * COUNT + contacts + events
-    assert recorded[1][1:-1] == (len(run.frames), messages, 0, True, "", 1)
+    assert recorded[1][1:-1] == (len(run.frames), messages, 0, "", 1)
     assert 0 < recorded[1].queue_peak_bytes < 4 * 2**20
     assert sum(map(len, others.values())) == messages
     assert (log.problem, log.is_complete) == ("", True)
@@ -246,7 +246,7 @@ def test_a_run_without_a_cycle_is_a_complete_log_and_is_closed_once(tmp_path):
     summary = recorder.close()
     log = read_log(tmp_path / "run.mcap")
     assert recorder.close() is summary
-    assert summary[1:] == (0, 0, 0, True, "", 1, 0)
+    assert summary[1:] == (0, 0, 0, "", 1, 0)
     assert log.is_complete
     assert log.scheme.block.shape[0] == 0
     assert log.frames.shape == (0,)

@@ -41,17 +41,21 @@ _FORMAT_VERSION = "1"
 class LogSummary(NamedTuple):
     """Result of a log. `frames` and `messages` are 0 if the writer died; `error`: in one line, or "".
 
-    is_complete: no error, and no packet dropped. parts: number of files.
+    parts: number of files.
     """
 
     path: Path  # of the first part
     frames: int
     messages: int
     dropped: int  # packets (cycles and events) that are not in the log
-    is_complete: bool
-    error: str = ""
-    parts: int = 1
-    queue_peak_bytes: int = 0  # most that the writer found waiting for it
+    error: str
+    parts: int
+    queue_peak_bytes: int  # most that the writer found waiting for it
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether there was no error, and no packet was dropped."""
+        return not self.error and self.dropped == 0
 
 
 class Recorder:
@@ -227,18 +231,14 @@ class Recorder:
         word: the writer's last message, None if it died or is silent. Without it the writer is ended, the log is
         incomplete, its counts are 0, and the packets that it had not written count as dropped.
         """
-        error = ""
-        if word is None:
-            error = self._end_writer()
+        error = self._end_writer() if word is None else word["error"]
         self._process.wait()
         peak = self._ring.peak
         if word is not None:
-            dropped = self.dropped + int(word["lost"])
-            counts = int(word["frames"]), int(word["messages"]), dropped
-            is_complete = not word["error"] and dropped == 0
-            return LogSummary(self.path, *counts, is_complete, word["error"], int(word["parts"]), peak)
+            counts = int(word["frames"]), int(word["messages"]), self.dropped + int(word["lost"])
+            return LogSummary(self.path, *counts, error, int(word["parts"]), peak)
         self.dropped += self._ring.packets - self._ring.written
-        return LogSummary(self.path, 0, 0, self.dropped, False, error, max(1, len(find_parts(self.path))), peak)
+        return LogSummary(self.path, 0, 0, self.dropped, error, max(1, len(find_parts(self.path))), peak)
 
     def _end_writer(self) -> str:
         """Return the error of a silent writer in words: its exit status if it ends within DEATH_TIMEOUT_S.
