@@ -1,7 +1,7 @@
 """A log as a stream of pieces (`LogStream`), or as one piece (`read_log`).
 
 A piece has one structured array per topic, frames in the order of the bus, and events. Cut and damaged files are read
-as far as they are intact; `is_complete` and `problem` report the damage.
+as far as they are intact; `problem` reports the damage.
 
 On two processors one reads, checks and decompresses ahead while the other gathers the messages; topics outside the
 request cost only their decompression.
@@ -361,11 +361,6 @@ class LogStream:
             lost and f"recovered without {lost}",
         )
         return "; ".join(filter(None, (*self._problems, *said)))
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether all that was read so far is whole, no packet was dropped, and a recovered log had lost nothing."""
-        return not self.problem
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
         """Return the events of a piece; [] for a log without events."""
