@@ -64,7 +64,6 @@ class LogCopy:
             self._replacement = Replacement(path, is_log=is_copy)
             self._hidden = self._replacement.beside.open("wb")
         self._file = ChunkedFile(self._write, _common_profile(log.parts.values()))
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._metadata: set[str] = set()
         self._topics: dict[int, str] = {}  # by the copy's number of the channel
         self._counts: Counter[int] = Counter()  # messages of each of its channels
@@ -117,10 +116,7 @@ class LogCopy:
             schema = self._log.definitions.schemas.get(channel.schema_id)
             if schema is None:
                 return
-            key = schema.name, schema.encoding, schema.data
-            if key not in self._schemas:
-                self._schemas[key] = self._file.define_schema(*key)
-            schema_id = self._schemas[key]
+            schema_id = self._file.define_schema(schema.name, schema.encoding, schema.data)
         if len(self._topics) + 1 >= CHANNEL_NUMBERS:
             raise LogError(f"more than {CHANNEL_NUMBERS - 1} channels don't go into one file")
         number = self._file.define_channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)

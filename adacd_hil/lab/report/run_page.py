@@ -95,10 +95,10 @@ def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, descri
     elbow = _along((0.0, 0.0), angles[0], l1)
     tip = _along(elbow, angles[1], l2)
     reach = l1 + l2
-    touched = 0 if push is None else push.link
-    lines = (((0.0, 0.0), elbow), (elbow, tip))
-    kinds = ("link touched" if number == touched else "link" for number in (1, 2))
-    first, second = (Stroke(*line, kind) for line, kind in zip(lines, kinds, strict=True))
+    kinds = ["link", "link"]
+    if push is not None:
+        kinds[push.link - 1] = "link touched"
+    first, second = Stroke((0.0, 0.0), elbow, kinds[0]), Stroke(elbow, tip, kinds[1])
     force, arrowhead = ([], []) if push is None else _arrow(push, (first, second), angles, reach)
     tails = [stroke.start for stroke in force if stroke.kind.startswith("force")]
     xs, ys = zip((0.0, 0.0), elbow, tip, *tails, strict=True)

@@ -40,6 +40,7 @@ class ChunkedFile:
         self._stream = _Stream()
         self._chunk_full = CHUNK_BYTES  # value of `record_bytes` at which the chunk in progress is full
         self._packets = 0  # that are complete with the chunk
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._writer = Writer(self._stream, chunk_size=_UNLIMITED, enable_data_crcs=True)  # type: ignore[arg-type]
         self._writer.start(profile, library)
 
@@ -60,8 +61,10 @@ class ChunkedFile:
 
         Return its number in the file, that of an equal one if there is one.
         """
-        number: int = self._writer.register_schema(name, encoding, data)
-        return number
+        key = name, encoding, data
+        if key not in self._schemas:
+            self._schemas[key] = self._writer.register_schema(*key)
+        return self._schemas[key]
 
     def define_channel(self, topic: str, message_encoding: str, schema: int, metadata: dict[str, str]) -> int:
         """Define a channel, in the chunk in progress; return its number in the file. schema: 0 for none."""

@@ -231,13 +231,10 @@ class McapFile(ChunkedFile):
 
     def _define(self, channels: tuple[LogChannel, ...]) -> None:
         """Define schemas and channels, with which the first chunk begins; store the channels' numbers in `ids`."""
-        schemas: dict[str, int] = {}
         for channel in channels:
-            name, text = channel.type.name, channel.type.text
-            if name not in schemas:
-                schemas[name] = self.define_schema(name, "ros2msg", text.encode())
+            schema = self.define_schema(channel.type.name, "ros2msg", channel.type.text.encode())
             metadata = {QOS_KEY: "", **({FIELDS_KEY: " ".join(channel.type.fields)} if channel.type.fields else {})}
-            self.ids[channel.id] = self.define_channel(channel.topic, "cdr", schemas[name], metadata)
+            self.ids[channel.id] = self.define_channel(channel.topic, "cdr", schema, metadata)
 
     def finish(self, summary: dict[str, str]) -> None:
         """Write the chunk in progress and `summary` as metadata, then end the file."""
