@@ -64,7 +64,7 @@ class TrendQuantity:
 class Trend:
     """The runs of an arm with a judge's figures, the oldest first; left_out: its other runs.
 
-    quantities: thresholds, friction and offsets. margins (n, 1), nan where not known. sentence: on the last change of
+    quantities: thresholds, friction and offsets. margins (n,), nan where not known. sentence: on the last change of
     the thresholds; further: on those of friction and offsets, () without runs.
     """
 
@@ -87,11 +87,11 @@ class Trend:
             "runs": names,
             "started": [None if run.started is None else run.started.isoformat() for run in self.runs],
             "left_out": [{"run": run.name, "status": run.status, "verdict": run.verdict} for run in self.left_out],
-            "margin": _rows(self.margins),
+            "margin": self.margins,
             **{
                 each.name: {
-                    "values": _rows(each.values),
-                    "std": _rows(each.std),
+                    "values": each.values,
+                    "std": each.std,
                     "changes": [_change_json(change) for change in each.changes],
                 }
                 for each in self.quantities
@@ -145,7 +145,7 @@ def _trend(arm: str, runs: Sequence[RunSummary], threshold_share: float) -> Tren
         tuple(judged),
         tuple(run for run in runs if not run.is_judged),
         found,
-        margins=np.array([[math.nan if run.margin is None else run.margin] for run in judged]).reshape(-1, 1),
+        margins=np.array([math.nan if run.margin is None else run.margin for run in judged]),
         sentence=_threshold_sentence(judged, found[0]),
         further=drifts,
     )
@@ -266,11 +266,6 @@ def _drift_sentence(quantity: TrendQuantity, what: str) -> str:
 def _when(run: RunSummary) -> str:
     date = "" if run.started is None else f" of {run.started:%Y-%m-%d %H:%M}"
     return f"run {run.name}{date}"
-
-
-def _rows(values: Vector) -> Vector:
-    """Return values (n, k) unchanged, but (n, 1) as (n,)."""
-    return values[:, 0] if values.shape[1] == 1 else values
 
 
 def _change_json(change: TrendChange) -> dict[str, Any]:
