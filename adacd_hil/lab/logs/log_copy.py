@@ -32,7 +32,7 @@ from adacd_hil.log.log_parts import COPY_ENDINGS, DROPPED_KEY
 from adacd_hil.log.mcap.chunked_file import ChunkedFile
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end
-from adacd_hil.log.types.record_arrays import count_frames
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 """A message record before its payload: opcode, length, channel, sequence, log time, publish time."""
@@ -131,7 +131,7 @@ class LogCopy:
         self._follow()
         self._file.flush()
         summary = {
-            "frames": str(count_frames(self._topics, self._counts)),
+            "frames": str(sum(count for number, count in self._counts.items() if self._topics[number] in FRAME_TOPICS)),
             "messages": str(self._file.messages),
             DROPPED_KEY: str(self._log.dropped),
             ENDING_KEY: ending,

@@ -31,7 +31,7 @@ from adacd_hil.log.mcap.mcap_records import Definitions, FileEnd, RawRecord, che
 from adacd_hil.log.mcap.record_layout import MAGIC, MESSAGE_HEAD
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.types.message_types import LOG, payload_dtype
-from adacd_hil.log.types.record_arrays import count_frames
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS
 from adacd_hil.log.types.unpacking import log_time_ns, unpack_log
 from adacd_hil.records import ContactLevel, Event
@@ -272,8 +272,7 @@ class _InfoView:
             info.start_ns, info.end_ns = self._start_ns, self._end_ns
         info.messages = self._counts.total()
         info.cycles = self._counts[CYCLE.name]
-        topics = dict(enumerate(self._counts))
-        info.frames = count_frames(topics, {place: self._counts[topic] for place, topic in topics.items()})
+        info.frames = sum(self._counts[topic] for topic in FRAME_TOPICS)
         info.contacts = len(self._contact_cycles)
         info.collisions = sum(level == ContactLevel.COLLISION for level in self._contact_cycles.values())
         for topic, (name, size) in self._channels.items():

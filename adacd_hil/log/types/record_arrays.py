@@ -73,11 +73,6 @@ FRAME_TOPICS = {
 """The topics of frames and their types."""
 
 
-def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
-    """Return the number of bus frames in a file; topics, counts: topic and number of messages by channel id."""
-    return sum(count for channel, count in counts.items() if topics.get(channel) in FRAME_TOPICS)
-
-
 def is_of_frames(topic: Topic) -> bool:
     """Return whether a topic has the name and the type of one of ours with bus frames."""
     return FRAME_TOPICS.get(topic.name) == topic.type_name

@@ -32,7 +32,7 @@ from adacd_hil.log.log_files import (
 from adacd_hil.log.log_parts import DROPPED_KEY, LOST_KEY, PLANNED_ENDINGS, missing_parts, parts_of
 from adacd_hil.log.mcap.mcap_records import RawRecord, attachment_crc_fits, crc_of, name_of, parse
 from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, crc32
-from adacd_hil.log.types.record_arrays import count_frames
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 
 _DATA = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA}
 _SUMMARY = {
@@ -87,9 +87,9 @@ class _FileCheck:
             end += len(MAGIC)
         self._chunks.end_indexes()
         self._finish(end)
-        topics = {number: channel.topic for number, channel in self._definitions.channels.items()}
-        counts = {number: int(self._chunks.counts[number]) for number in topics}
-        self.messages, self.frames = int(self._chunks.counts.sum()), count_frames(topics, counts)
+        counts, channels = self._chunks.counts, self._definitions.channels
+        self.messages = int(counts.sum())
+        self.frames = sum(int(counts[number]) for number in channels if channels[number].topic in FRAME_TOPICS)
 
     def _gap(self, gap: FileGap) -> None:
         """Add a finding on bytes that form no record, and add them to the CRC."""
