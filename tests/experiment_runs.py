@@ -18,8 +18,7 @@ from typing import Any
 
 from hang import HANG_S
 from mcap.reader import make_reader
-
-from adacd_hil.log.reader import topic_bytes
+from topic_bytes import topic_bytes
 
 BIN = Path(sys.executable).parent
 PAPER = ("--config", "paper")

@@ -231,7 +231,7 @@ class CycleRig(Rig):
         self.cycle = Cycle(*host, pacer, operator, lambda _: None, self.clock)
         self.cycle.compile()
         self._path = folder / "run.mcap"
-        self.recorder = Recorder(self._path, blocking=True)
+        self.recorder = Recorder(self._path, messages=CODEC.messages.values(), blocking=True)
 
     def run(self) -> RunResult:
         """Boot and run. Raises BusError, DeviceError."""

@@ -165,7 +165,7 @@ def bench_log(output: object, wire: bytes) -> None:
     """Time handing a cycle with seven frames to the logger's process, without waiting for it."""
     frames = [(False, Frame(0x181, wire, 0))] * 7
     with tempfile.TemporaryDirectory() as folder:
-        recorder = Recorder(Path(folder) / "bench.mcap", blocking=False)
+        recorder = Recorder(Path(folder) / "bench.mcap", messages=load_codec().messages.values(), blocking=False)
         message = pack_scheme(output, Request.NONE)  # type: ignore[arg-type]
 
         def hand_over() -> None:

@@ -40,7 +40,7 @@ from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.record_layout import MESSAGE_HEAD
 from adacd_hil.log.recording.log_file import McapFile, Sink
 from adacd_hil.log.types.message_types import MessageType
-from adacd_hil.log.types.record_arrays import count_frames
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 from adacd_hil.log.types.topics import LogChannel
 
 SECOND_NS: Final = 1_000_000_000
@@ -189,7 +189,7 @@ class Writer:
     def _end(self, ending: str) -> None:
         self._file.flush()
         topics = {channel.id: channel.topic for channel in self._log.channels}
-        frames = count_frames(topics, self._counts)
+        frames = sum(count for number, count in self._counts.items() if topics.get(number) in FRAME_TOPICS)
         self._file.finish(
             {ENDING_KEY: ending, DROPPED_KEY: "0", "frames": str(frames), "messages": str(self._file.messages)}
         )

@@ -1,13 +1,8 @@
-"""A walk over all parts of a log, as if they were one file.
-
-The intact messages of a cut or damaged file are kept; a missing or damaged part costs only itself and raises no
-error.
-"""
+"""A walk over one part of a log: attachments, metadata, and messages as far as the file is intact."""
 
 import contextlib
 import operator
 from collections.abc import Callable, Collection, Iterator
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +12,11 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 
 from adacd_hil.file_access import open_input
 from adacd_hil.log.log_files import (
-    CONTINUED,
-    ENDING_KEY,
-    PART_KEY,
     RUN_METADATA,
-    SUMMARY_METADATA,
     LogError,
     failing_as,
-    part_path,
 )
-from adacd_hil.log.log_parts import parts_of, summary_count
-from adacd_hil.log.mcap.chunks import Block, Item, read_blocks
+from adacd_hil.log.mcap.chunks import Block, read_blocks
 from adacd_hil.log.mcap.mcap_records import (
     CHANNEL_NUMBERS,
     DEFINITIONS,
@@ -39,10 +28,9 @@ from adacd_hil.log.mcap.mcap_records import (
     walk,
 )
 from adacd_hil.log.mcap.record_layout import HEAD, record_dtype
-from adacd_hil.log.types.record_arrays import UNKNOWN, UNWANTED, PieceBuilder, RawPiece, Topic
+from adacd_hil.log.types.record_arrays import UNKNOWN, UNWANTED, Piece, PieceBuilder, Topic
 
 PayloadLayout = Callable[[Channel, Schema], "np.dtype[Any] | None"]
-_COUNTS = {"frames", "messages", "dropped"}
 _NOT_OF_HEAD = set(Opcode) - {Opcode.ATTACHMENT, Opcode.METADATA}
 
 
@@ -101,138 +89,7 @@ def run_metadata(path: Path) -> dict[str, str]:
     return {}
 
 
-def _read_items(path: Path, is_ahead: bool = True) -> Iterator[Item]:
-    """Yield the contents of a file from front to end: blocks of chunks, attachments, metadata, problems.
-
-    is_ahead: a thread decompresses chunks in advance. Raises LogError if the file can't be read or isn't MCAP.
-    """
-    with failing_as(f"log {path} can't be read"), open_input(path) as file:
-        yield from read_blocks(file, str(path), is_ahead=is_ahead)
-
-
-class LogWalk:
-    """The content of a log with all its parts: attachments, metadata and summary of the run, topics, messages.
-
-    The constructor reads the heads of the parts; `pieces` reads the rest.
-    """
-
-    def __init__(self, path: Path, topics: Collection[str] | None = None) -> None:
-        """Find the parts of the log whose first part is `path`.
-
-        topics: names of the topics whose messages are read; None: all. Raises LogError when no part can be read.
-        """
-        self.attachments: dict[str, bytes] = {}
-        self.metadata: dict[str, str] = {}
-        self.summary: dict[str, str] = {}
-        self.parts = 0
-        self.topics: dict[str, Topic] = {}
-        """The requested topics that are defined in the parts walked so far."""
-        self.path = path
-        self._wanted = topics
-        self._plan: list[tuple[Path, int] | str] = []  # files and numbers of parts, and problems where they would be
-        self._problems: list[str] = []
-        self._is_alone = False
-        self._find_parts()
-
-    @property
-    def problem(self) -> str:
-        """Missing and damaged parts in one line, as far as `pieces` has walked; "" for a whole log, and before."""
-        return "; ".join(self._problems)
-
-    def layout(self, channel: Channel, schema: Schema) -> "np.dtype[Any] | None":  # noqa: ARG002 (a subclass's)
-        """Return the numpy type of a channel's payloads; None: they vary in size, as here. Subclasses override it."""
-        return None
-
-    def _find_parts(self) -> None:
-        """Plan the walk: readable parts by ascending number, a problem for each missing, unreadable or foreign one.
-
-        Foreign: of another log. Raises the first part's LogError if no part can be read.
-        """
-        parts = parts_of(self.path)
-        self._is_alone = list(parts) == [0]
-        first_error: LogError | None = None
-        for before, number in pairwise((-1, *parts)):
-            self._plan += self._missing(before + 1, number)
-            try:
-                head = read_head(parts[number])
-            except LogError as error:
-                first_error = first_error or error
-                self._plan.append(str(error))
-                continue
-            self._plan_part(head, parts[number], number)
-        if first_error is not None and all(isinstance(step, str) for step in self._plan):
-            raise first_error
-        self._last = max(parts)
-
-    def _plan_part(self, head: Extras, path: Path, number: int) -> None:
-        """Add a part to the plan, and its metadata and attachments to the log's.
-
-        A part of another log is a problem instead. number: by its name.
-        """
-        metadata = head.metadata.get(RUN_METADATA, {})
-        said = metadata.pop(PART_KEY, str(number))
-        is_foreign = bool(self.metadata and metadata) and metadata != self.metadata
-        if is_foreign or (said != str(number) and not self._is_alone):
-            self._plan.append(f"{path.name} is a part of another log")
-            return
-        if said != str(number):
-            self._plan.append(f"{path.name} is part {said} of a log")
-            number = int(said) if said.isdecimal() else number
-        self._plan.append((path, number))
-        self.metadata = self.metadata or metadata
-        self.attachments = {**head.attachments, **self.attachments}
-
-    def _missing(self, start: int, stop: int) -> list[str]:
-        """Return one line that names the first and the last missing part of those from start to stop - 1.
-
-        [] if there are none.
-        """
-        names = [part_path(self.path, number).name for number in sorted({start, stop - 1})] if start < stop else []
-        return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []
-
-    def pieces(self, cycles: int, epoch_ns: int, is_ahead: bool = True) -> Iterator[RawPiece]:
-        """Yield the messages of all parts in pieces of `cycles` cycles; topics, summary and problem grow meanwhile.
-
-        epoch_ns: offset of the times in the file from those of frames. is_ahead: a thread decompresses chunks in
-        advance. Each call begins with the first part and clears summary and problem.
-        """
-        builder = PieceBuilder(cycles, epoch_ns)
-        self._problems, self.summary, self.parts = [], {}, 0
-        joined = -1
-        for step in self._plan:
-            if isinstance(step, str):
-                self._problems.append(step)
-                continue
-            path, joined = step
-            walk = _PartWalk(path, builder, self.layout, self._wanted)
-            for piece in walk.pieces(is_ahead):
-                self.topics = {topic.name: topic for topic in builder.topics}
-                yield piece
-            self.topics = {topic.name: topic for topic in builder.topics}
-            if walk.problem:
-                self._problems.append(walk.problem if self._is_alone else f"{path.name}: {walk.problem}")
-            self._problems += [f"{path.name}: {name} has another type than before" for name in sorted(walk.other_types)]
-            self.parts += 1
-            self.attachments = {**walk.extras.attachments, **self.attachments}
-            self._sum_up(walk.extras.metadata.get(SUMMARY_METADATA, {}))
-        if joined == self._last and self.summary.get(ENDING_KEY) == CONTINUED:
-            self._problems += self._missing(self._last + 1, self._last + 2)
-        if not builder.is_empty:
-            yield builder.take_piece()
-
-    def _sum_up(self, summary: dict[str, str]) -> None:
-        """Add a part's summary to the log's: add up counts, replace other entries.
-
-        A part without a summary removes the log's ending.
-        """
-        both = self.summary.keys() & summary.keys() & _COUNTS
-        sums = {key: str(summary_count(self.summary, key) + summary_count(summary, key)) for key in both}
-        self.summary = {**self.summary, **summary, **sums}
-        if not summary:
-            self.summary.pop(ENDING_KEY, None)
-
-
-class _PartWalk:
+class PartWalk:
     """The walk over one file; keeps its attachments, metadata and first problem."""
 
     def __init__(
@@ -254,23 +111,24 @@ class _PartWalk:
         """Keep the first problem of the file."""
         self.problem = self.problem or problem
 
-    def pieces(self, is_ahead: bool) -> Iterator[RawPiece]:
+    def pieces(self, is_ahead: bool) -> Iterator[Piece]:
         """Read the file; yield a piece whenever enough cycles are gathered; keep attachments, metadata and problems.
 
-        is_ahead: a thread decompresses chunks in advance.
+        is_ahead: a thread decompresses chunks in advance. Raises LogError if the file can't be read or isn't MCAP.
         """
-        for item in _read_items(self._path, is_ahead):
-            if isinstance(item, Block):
-                yield from self._take_block(item)
-            elif isinstance(item, RawRecord):
-                try:
-                    self.extras.add_record(item)
-                except LogError:
-                    self._note(f"damaged at byte {item.offset + HEAD.size}")
-            else:
-                self._note(item.text)
+        with failing_as(f"log {self._path} can't be read"), open_input(self._path) as file:
+            for item in read_blocks(file, str(self._path), is_ahead=is_ahead):
+                if isinstance(item, Block):
+                    yield from self._take_block(item)
+                elif isinstance(item, RawRecord):
+                    try:
+                        self.extras.add_record(item)
+                    except LogError:
+                        self._note(f"damaged at byte {item.offset + HEAD.size}")
+                else:
+                    self._note(item.text)
 
-    def _take_block(self, block: Block) -> Iterator[RawPiece]:
+    def _take_block(self, block: Block) -> Iterator[Piece]:
         """Gather the messages of some chunks, `block`, each by the definitions before it; yield full pieces.
 
         Note the chunks' problems: damage, and messages of another length than their schema says.
@@ -294,7 +152,7 @@ class _PartWalk:
             self._builder.wrong = 0
             self._note("a message is not as long as its schema says")
 
-    def _take_messages(self, block: Block, messages: slice) -> Iterator[RawPiece]:
+    def _take_messages(self, block: Block, messages: slice) -> Iterator[Piece]:
         """Gather consecutive messages of some chunks, the slice `messages` of those in `block`; yield full pieces.
 
         Of a channel that isn't defined yet, search the definition in the file's summary first.

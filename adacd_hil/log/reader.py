@@ -1,7 +1,7 @@
 """A log as a stream of pieces (`LogStream`), or as one piece (`read_log`).
 
 A piece has one structured array per topic, frames in the order of the bus, and events. Cut and damaged files are read
-as far as they are intact; `is_complete` and `problem` report the damage.
+as far as they are intact; `problem` reports the damage.
 
 On two processors one reads, checks and decompresses ahead while the other gathers the messages; topics outside the
 request cost only their decompression.
@@ -9,6 +9,7 @@ request cost only their decompression.
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -16,9 +17,19 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from adacd_hil.log.log_files import EPOCH_KEY, FIELDS_KEY, LogError
-from adacd_hil.log.log_parts import DROPPED_KEY, LOST_KEY, log_in
-from adacd_hil.log.log_walk import LogWalk
+from adacd_hil.log.log_files import (
+    CONTINUED,
+    ENDING_KEY,
+    EPOCH_KEY,
+    FIELDS_KEY,
+    PART_KEY,
+    RUN_METADATA,
+    SUMMARY_METADATA,
+    LogError,
+    part_path,
+)
+from adacd_hil.log.log_parts import DROPPED_KEY, LOST_KEY, log_in, parts_of, summary_count
+from adacd_hil.log.log_walk import Extras, PartWalk, read_head
 from adacd_hil.log.mcap.record_layout import record_dtype
 from adacd_hil.log.types.message_types import (
     CAN_FRAME,
@@ -30,7 +41,15 @@ from adacd_hil.log.types.message_types import (
     LOG,
     MessageType,
 )
-from adacd_hil.log.types.record_arrays import FRAME_DTYPE, FRAME_TOPICS, LONG_FRAME_DTYPE, Topic
+from adacd_hil.log.types.record_arrays import (
+    FRAME_DTYPE,
+    FRAME_TOPICS,
+    LONG_FRAME_DTYPE,
+    Piece,
+    PieceBuilder,
+    Series,
+    Topic,
+)
 from adacd_hil.log.types.topics import CONTACT, CONTROL, CYCLE, DECODED, EVENTS, SCHEME, run_channels
 from adacd_hil.log.types.truth_topic import TRUTH, truth_channels
 from adacd_hil.log.types.unpacking import contact_report, log_time_ns, unpack_log
@@ -40,17 +59,17 @@ from adacd_hil.records import (
     Event,
     FaultReason,
     SchemeState,
-    Vector,
 )
 
 __all__ = [
     "FRAME_DTYPE",
     "LONG_FRAME_DTYPE",
+    "LogStream",
     "LoggedEvent",
+    "Piece",
     "RunLog",
     "Series",
     "read_log",
-    "topic_bytes",
 ]
 
 _KNOWN = {
@@ -59,7 +78,7 @@ _KNOWN = {
     JOINT_STATE.name: JOINT_STATE_DTYPE,
 }
 _EVERY_CYCLE = 1 << 62
-_NOT_FIELDS = ("record_length", "log_time", "publish_time", "sec", "nanosec")
+_COUNTS = {"frames", "messages", "dropped"}
 
 
 class LoggedEvent(NamedTuple):
@@ -67,59 +86,6 @@ class LoggedEvent(NamedTuple):
 
     t_ns: int
     event: Event
-
-
-class Series:
-    """The messages of one topic: `series["tau_J"]` is float64 (n, 2), a copy; a field of one number is (n,).
-
-    `series[name]` raises KeyError for an unknown field.
-    """
-
-    def __init__(self, records: NDArray[Any], epoch_ns: int) -> None:
-        self.records = records
-        """The records as they are in the file (n,), structured."""
-        self._epoch_ns = epoch_ns
-
-    def __len__(self) -> int:
-        return len(self.records)
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """Names of the fields, without the times."""
-        return tuple(name for name in self.records.dtype.names or () if name not in _NOT_FIELDS)
-
-    def __getitem__(self, name: str) -> NDArray[Any]:
-        if name not in self.fields:
-            raise KeyError(f"no field {name!r}; there are {', '.join(self.fields)}")
-        return self.records[name].copy()
-
-    @property
-    def t_ns(self) -> NDArray[np.int64]:
-        """Time of each message (n,), ns, on the clock of the run."""
-        stamp_ns = self.records["sec"].astype(np.int64) * 1_000_000_000 + self.records["nanosec"]
-        return np.asarray(stamp_ns - self._epoch_ns, np.int64)
-
-    def part(self, rows: slice | NDArray[np.bool_]) -> "Series":
-        """Return the messages in a slice, or those where a mask (n,) is True."""
-        return Series(self.records[rows], self._epoch_ns)
-
-    def between(self, first_ns: int, end_ns: int) -> "Series":
-        """Return the messages with times from `first_ns` on and before `end_ns`."""
-        t_ns = self.t_ns
-        return self.part((t_ns >= first_ns) & (t_ns < end_ns))
-
-    @property
-    def block(self) -> Vector:
-        """Float64 values of each message (n, k), from the first float64 field on: in our own topics the logged block.
-
-        (n, 0) for a topic without float64 fields.
-        """
-        fields: Mapping[str, Any] = self.records.dtype.fields or {}
-        offsets = [int(fields[name][1]) for name in self.fields if fields[name][0].base == np.dtype("<f8")]
-        if not offsets:
-            return np.empty((len(self), 0))
-        rows = np.ascontiguousarray(self.records).view(np.uint8).reshape(len(self), self.records.dtype.itemsize)
-        return rows[:, min(offsets) :].copy().view(np.float64)
 
 
 @dataclass(frozen=True)
@@ -198,19 +164,6 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
     )
 
 
-def topic_bytes(path: str | Path, topic: str) -> bytes:
-    """Return the payloads of a topic, one after the other: equal for two logs that hold the same, bit for bit.
-
-    path: the first part of a log, or the folder of a run. Raises LogError if no part can be read, or if the log lacks
-    the topic.
-    """
-    walk = LogWalk(log_in(path), (topic,))
-    found = [payload for piece in walk.pieces(_EVERY_CYCLE, 0) for payload in piece.payloads.get(topic, ())]
-    if topic not in walk.topics:
-        raise LogError(f"log {path} has no topic {topic}")
-    return b"".join(found)
-
-
 def _own_layout(message_type: MessageType) -> "np.dtype[Any] | None":
     """Return the numpy type of the payloads of a message type of ours or of bus frames; None if their size varies."""
     if message_type.name in _KNOWN:
@@ -246,26 +199,6 @@ def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
     return topics
 
 
-def _series_of(
-    rows: Mapping[str, NDArray[np.uint8]], topics: Mapping[str, Topic], own: Mapping[str, Topic], epoch_ns: int
-) -> dict[str, Series]:
-    """Return a series for each topic of fixed size: each of ours, even if it is empty, and all others of the log.
-
-    rows: the records of topics (n, size). topics: those of the log; own: ours. One of ours that has another type in the
-    log is empty.
-    """
-    series = {}
-    for name, topic in {**topics, **own}.items():
-        found = topics.get(name, topic)
-        if found.type_name != topic.type_name or found.dtype is None:
-            found = topic
-        if found.dtype is not None:
-            is_there = found is topics.get(name) and name in rows
-            records = rows[name].view(found.dtype)[:, 0] if is_there else np.empty(0, found.dtype)
-            series[name] = Series(records, epoch_ns)
-    return series
-
-
 _STATES: Final = {"state": SchemeState, "previous_state": SchemeState, "fault": FaultReason}
 
 
@@ -294,6 +227,13 @@ def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
     return contacts
 
 
+def report_values(series: Series) -> Iterator[dict[str, Any]]:
+    """Yield the fields of each report of /contact that the log has, values by name; those of enums are numbers."""
+    names = [name for name in ContactReport._fields if name in series.fields]
+    for record in series.records:
+        yield {name: record[name].tolist() for name in names}
+
+
 Time = TypeVar("Time", int, float)
 
 
@@ -309,25 +249,11 @@ def each_once(reports: Iterable[tuple[Time, ContactReport]]) -> list[tuple[Time,
     return list(found.values())
 
 
-class Piece(NamedTuple):
-    """A stretch of a log that ends with whole cycles: consecutive pieces have all of it, in the order of the file.
-
-    The records of a cycle are those with one publish time, one after the other in the file. An event that happens
-    between two cycles counts as one.
-    """
-
-    series: Mapping[str, Series]
-    """Requested topics of fixed size without those of bus frames; our own ones are there even when empty."""
-    frames: NDArray[Any]
-    """(n,) of reader.FRAME_DTYPE, or LONG_FRAME_DTYPE in a piece with FD frames; both ways, in the order of the bus."""
-    payloads: Mapping[str, list[bytes]]
-    """Requested topics of varying size, such as /events."""
-
-
-class LogStream(LogWalk):
+class LogStream:
     """A log read from front to back in constant memory, all parts as one: iterate for its pieces.
 
-    Damaged and missing parts are left out; `problem` names them.
+    The constructor reads the heads of the parts, the iteration the rest; each begins with the first part. The intact
+    messages of a cut or damaged file are kept; a missing or damaged part costs only itself, and `problem` names it.
     """
 
     def __init__(
@@ -343,12 +269,70 @@ class LogStream(LogWalk):
         thread opens chunks ahead, for a caller without a thread of its own for the reading. Raises LogError if no part
         of it can be read.
         """
-        super().__init__(log_in(path), topics)
-        self.epoch_ns = _number(self.metadata, EPOCH_KEY, 0)
+        self.path = log_in(path)
+        self.attachments: dict[str, bytes] = {}
+        self.metadata: dict[str, str] = {}
+        self.summary: dict[str, str] = {}
+        self.parts = 0
+        self.topics: dict[str, Topic] = {}
+        """The requested topics that are defined in the parts read so far."""
+        self._wanted = topics
         self._cycles_per_piece = cycles_per_piece
         self._is_ahead = is_ahead
+        self._plan: list[tuple[Path, int] | str] = []  # files and numbers of parts, and problems where they would be
+        self._problems: list[str] = []
+        self._is_alone = False
+        self._find_parts()
+        self.epoch_ns = _number(self.metadata, EPOCH_KEY, 0)
 
-    def layout(self, channel: Channel, schema: Schema) -> "np.dtype[Any] | None":
+    def _find_parts(self) -> None:
+        """Plan the reading: readable parts by ascending number, a problem for each missing, unreadable or foreign one.
+
+        Foreign: of another log. Raises the first part's LogError if no part can be read.
+        """
+        parts = parts_of(self.path)
+        self._is_alone = list(parts) == [0]
+        first_error: LogError | None = None
+        for before, number in pairwise((-1, *parts)):
+            self._plan += self._missing(before + 1, number)
+            try:
+                head = read_head(parts[number])
+            except LogError as error:
+                first_error = first_error or error
+                self._plan.append(str(error))
+                continue
+            self._plan_part(head, parts[number], number)
+        if first_error is not None and all(isinstance(step, str) for step in self._plan):
+            raise first_error
+        self._last = max(parts)
+
+    def _plan_part(self, head: Extras, path: Path, number: int) -> None:
+        """Add a part to the plan, and its metadata and attachments to the log's.
+
+        A part of another log is a problem instead. number: by its name.
+        """
+        metadata = head.metadata.get(RUN_METADATA, {})
+        said = metadata.pop(PART_KEY, str(number))
+        is_foreign = bool(self.metadata and metadata) and metadata != self.metadata
+        if is_foreign or (said != str(number) and not self._is_alone):
+            self._plan.append(f"{path.name} is a part of another log")
+            return
+        if said != str(number):
+            self._plan.append(f"{path.name} is part {said} of a log")
+            number = int(said) if said.isdecimal() else number
+        self._plan.append((path, number))
+        self.metadata = self.metadata or metadata
+        self.attachments = {**head.attachments, **self.attachments}
+
+    def _missing(self, start: int, stop: int) -> list[str]:
+        """Return one line that names the first and the last missing part of those from start to stop - 1.
+
+        [] if there are none.
+        """
+        names = [part_path(self.path, number).name for number in sorted({start, stop - 1})] if start < stop else []
+        return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []
+
+    def _layout(self, channel: Channel, schema: Schema) -> "np.dtype[Any] | None":
         """Return the numpy type of a channel's payloads; None if their size varies, or their schema can't be read."""
         if schema.name == JOINT_STATE.name and not self.metadata:
             return None  # others have any number of joints
@@ -360,7 +344,10 @@ class LogStream(LogWalk):
 
     def empty(self) -> Piece:
         """Return a piece without messages, with all of our own topics."""
-        return Piece(_series_of({}, {}, _own_topics(self.metadata), self.epoch_ns), np.empty(0, FRAME_DTYPE), {})
+        own = {
+            name: Series(np.empty(0, topic.dtype), self.epoch_ns) for name, topic in _own_topics(self.metadata).items()
+        }
+        return Piece(own, np.empty(0, FRAME_DTYPE), {})
 
     @property
     def problem(self) -> str:
@@ -373,12 +360,7 @@ class LogStream(LogWalk):
             f"{dropped} packets never reached the log" if dropped != "0" else "",
             lost and f"recovered without {lost}",
         )
-        return "; ".join(filter(None, (super().problem, *said)))
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether all that was read so far is whole, no packet was dropped, and a recovered log had lost nothing."""
-        return not self.problem
+        return "; ".join(filter(None, (*self._problems, *said)))
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
         """Return the events of a piece; [] for a log without events."""
@@ -394,14 +376,54 @@ class LogStream(LogWalk):
         return {name: each for name, each in piece.payloads.items() if found[name].type_name == JOINT_STATE.name}
 
     def __iter__(self) -> Iterator[Piece]:
+        types = _own_topics(self.metadata)
         own = {
-            name: topic
-            for name, topic in _own_topics(self.metadata).items()
-            if self._wanted is None or name in self._wanted
+            name: series for name, series in self.empty().series.items() if self._wanted is None or name in self._wanted
         }
-        for piece in self.pieces(self._cycles_per_piece, self.epoch_ns, self._is_ahead):
-            there = {name: each for name, each in self.topics.items() if name in piece.records}
-            yield Piece(_series_of(piece.records, there, own, self.epoch_ns), piece.frames, piece.payloads)
+        for piece in self._pieces():
+            absent = {
+                name: series
+                for name, series in own.items()
+                if name not in piece.series or self.topics[name].type_name != types[name].type_name
+            }
+            yield piece._replace(series={**piece.series, **absent})
+
+    def _pieces(self) -> Iterator[Piece]:
+        """Yield the messages of all parts in pieces; topics, summary and problem, empty at first, grow meanwhile."""
+        builder = PieceBuilder(self._cycles_per_piece, self.epoch_ns)
+        self._problems, self.summary, self.parts = [], {}, 0
+        joined = -1
+        for step in self._plan:
+            if isinstance(step, str):
+                self._problems.append(step)
+                continue
+            path, joined = step
+            walk = PartWalk(path, builder, self._layout, self._wanted)
+            for piece in walk.pieces(self._is_ahead):
+                self.topics = {topic.name: topic for topic in builder.topics}
+                yield piece
+            self.topics = {topic.name: topic for topic in builder.topics}
+            if walk.problem:
+                self._problems.append(walk.problem if self._is_alone else f"{path.name}: {walk.problem}")
+            self._problems += [f"{path.name}: {name} has another type than before" for name in sorted(walk.other_types)]
+            self.parts += 1
+            self.attachments = {**walk.extras.attachments, **self.attachments}
+            self._sum_up(walk.extras.metadata.get(SUMMARY_METADATA, {}))
+        if joined == self._last and self.summary.get(ENDING_KEY) == CONTINUED:
+            self._problems += self._missing(self._last + 1, self._last + 2)
+        if not builder.is_empty:
+            yield builder.take_piece()
+
+    def _sum_up(self, summary: dict[str, str]) -> None:
+        """Add a part's summary to the log's: add up counts, replace other entries.
+
+        A part without a summary removes the log's ending.
+        """
+        both = self.summary.keys() & summary.keys() & _COUNTS
+        sums = {key: str(summary_count(self.summary, key) + summary_count(summary, key)) for key in both}
+        self.summary = {**self.summary, **summary, **sums}
+        if not summary:
+            self.summary.pop(ENDING_KEY, None)
 
 
 def start_of_log(path: Path) -> int | None:

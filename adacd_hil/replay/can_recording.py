@@ -162,9 +162,12 @@ class RecordingAgainstLog(LogSource):
         CodecError for an invalid DBC.
         """
         super().__init__(against)
-        self._recording = load_recording(path, self.settings, self.codec)
+        recording = load_recording(path, self.settings, self.codec)
+        shift = _find_cycle(recording, self.codec, against) - int(recording.number[0])
+        self._recording = recording._replace(
+            number=recording.number + shift, owner=recording.owner + shift, since=recording.since + shift
+        )
         self._recorded = path
-        self._align(_find_cycle(self._recording, self.codec, against))
         self._given = 0
         self._missing = 0
 
@@ -192,14 +195,6 @@ class RecordingAgainstLog(LogSource):
         frames = recording.in_time(number[is_there], t_ns[is_there], slice(self._given, end))
         self._given = end
         return piece._replace(series=series, frames=frames)
-
-    def _align(self, cycle: int) -> None:
-        """Renumber the recording's cycles as the run's; cycle: the run's number of the recording's first cycle."""
-        recording = self._recording
-        shift = cycle - int(recording.number[0])
-        self._recording = recording._replace(
-            number=recording.number + shift, owner=recording.owner + shift, since=recording.since + shift
-        )
 
     def notes(self) -> list[str]:
         """Return the gaps and defects of log and recording that can't be replayed or compared, a line each."""

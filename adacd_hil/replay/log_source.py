@@ -19,10 +19,10 @@ from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, SHOWN, LogError
 from adacd_hil.log.logged_run import settings_of
-from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log
+from adacd_hil.log.reader import LoggedEvent, LogStream, Piece, Series, begin_of_log, report_values
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS, joined_frames
 from adacd_hil.log.types.topics import ARM, CONTACT, CYCLE, EVENTS, SCHEME
-from adacd_hil.records import CERTIFICATE_EVENTS, ArmBatch, ContactReport, SchemeState
+from adacd_hil.records import CERTIFICATE_EVENTS, ArmBatch, SchemeState
 from adacd_hil.replay.logged_arms import has_arms, logged_arms
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import parse_toml
@@ -336,7 +336,9 @@ class LogSource:
                 raise LogError(f"log {self._path} has {lacks}: it can't be replayed so")
             piece = self._piece(read)
             events = [logged for logged in self._stream.events(piece) if logged.event.name in self._said]
-            yield Part(self._splitter.split(piece), contact_records(piece.series[CONTACT.name]), events, self._said)
+            reports = piece.series[CONTACT.name]
+            contacts = dict(zip(reports.t_ns.tolist(), report_values(reports), strict=True))
+            yield Part(self._splitter.split(piece), contacts, events, self._said)
 
     @property
     def start_ns(self) -> int:
@@ -386,10 +388,3 @@ def _has_anchors(attachments: Mapping[str, bytes]) -> bool:
     """Return whether the log's configuration has the tare's `drift_Nm_sqrt_s`: its version knew anchors then."""
     tare = parse_toml(attachments[CONFIG_NAME]).get("tare")
     return isinstance(tare, dict) and "drift_Nm_sqrt_s" in tare
-
-
-def contact_records(series: Series) -> dict[int, dict[str, Any]]:
-    """Return the fields of each logged contact report, values by name, by the time at which it was made, ns."""
-    names = [name for name in ContactReport._fields if name in series.fields]
-    rows = zip(series.t_ns.tolist(), series.records, strict=True)
-    return {t_ns: {name: record[name].tolist() for name in names} for t_ns, record in rows}

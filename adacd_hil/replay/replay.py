@@ -34,7 +34,6 @@ from adacd_hil.replay.replayed_outcome import OutcomeGatherer, Replay
 from adacd_hil.replay.scheme_comparison import (
     TOLERANCE,
     Asking,
-    RequestCheck,
     SchemeComparison,
     ScriptOf,
     different_arithmetic,
@@ -54,25 +53,15 @@ Watch = Callable[[int, Ticks, SchemeBatch], None]
 """Is shown the decisions of each variant, by its place among them, as they are made."""
 
 
-def replay(
-    path: Path,
-    settings: Settings | None = None,
-    progress: Progress = lambda _: None,
-    *,
-    tolerance: float | None = None,
-    script_of: ScriptOf | None = None,
-) -> Replay:
-    """Replay a log with its own settings, or with others, and return the outcome.
+def replay(path: Path, script_of: ScriptOf | None = None) -> Replay:
+    """Replay a log with its own settings, compare each decision with the log, and return the outcome.
 
-    With its own settings, each decision is compared with the log. progress: prints a line about the work. tolerance: of
-    the comparison; None: exact, or `TOLERANCE` where the log's numbers were computed on another kind of machine.
     script_of: plays the user of a configuration; with it, the requests of a run without typed requests are compared.
     Raises LogError, ConfigError or CodecError if the log, its attachments or a device can't be read.
     """
     source, remarks = LogSource(path), list[str]()
     truth = contacts_beside(path, remarks.append)
-    own = [settings or source.settings]
-    return replay_source(source, own, truth, progress, tolerance, script_of, remarks=remarks)[0]
+    return replay_source(source, [source.settings], truth, script_of=script_of, remarks=remarks)[0]
 
 
 def replay_many(
@@ -116,7 +105,6 @@ class _Player:
         self.settings = settings
         self.cycles = self.monitored = self.uncovered = 0  # in the stretch; uncovered: monitored without the truth
         self.comparison = comparison
-        self.requests = RequestCheck()
         self.gatherer = OutcomeGatherer(settings, truth)
         self.attempts = 0
         self._asking = asking
@@ -126,7 +114,7 @@ class _Player:
         self._reports: dict[int, ContactReport] = {}  # of this part, by time
         self._cycles: dict[int, int] = {}
 
-    def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool = True) -> SchemeBatch:
+    def play(self, stretch: CycleStretch, arms: ArmBatch, part: Part, is_told: bool) -> SchemeBatch:
         """Run the scheme on the cycles of `stretch`, in piece `part` of the log; gather and return its decisions.
 
         arms: the arm's states in these cycles (n,). is_told: the cycles are reported: compare and count them, too.
@@ -171,7 +159,7 @@ class _Player:
         self.comparison.compare(stretch.scheme, ticks, batch)
         if asked is None:  # whatever a user could ask is believed
             asked = _known(stretch.requests)
-        self.requests.compare(ticks, stretch.requests, asked)
+        self.comparison.compare_requests(ticks, stretch.requests, asked)
         times = ticks.t_ns[batch.contact_places].tolist()
         self._reports |= zip(times, batch.contacts, strict=True)
         self._cycles |= zip(times, ticks.cycle[batch.contact_places].tolist(), strict=True)
@@ -247,10 +235,12 @@ def replay_source(
 ) -> list[Replay]:
     """Replay a source, once for each of the settings; shown: mismatches that are kept.
 
-    truth: the true contacts, None if unknown; remarks: on it, for the notes of each replay. progress, tolerance,
-    script_of: as for `replay`. stretch: the part that is compared and reported; watch sees all from the beginning of
-    the log on. by_frames: decode the frames and compare each state with the log's. Raises LogError if the source can't
-    be read, or no cycle of the stretch can be replayed; ConfigError if a device can't be loaded.
+    truth: the true contacts, None if unknown; remarks: on it, for the notes of each replay. progress: prints a line
+    about the work. tolerance: of the comparison; None: exact, or `TOLERANCE` where the log's numbers were computed on
+    another kind of machine. script_of: as for `replay`. stretch: the part that is compared and reported; watch sees all
+    from the beginning of the log on. by_frames: decode the frames and compare each state with the log's. Raises
+    LogError if the source can't be read, or no cycle of the stretch can be replayed; ConfigError if a device can't be
+    loaded.
     """
     bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
@@ -445,7 +435,7 @@ def _result(
     if behind_gap:
         notes.append(f"{number_of(behind_gap, 'detection')} behind missing cycles may stem from them, not judged")
     if comparison is not None:
-        for cycle, t_ns, logged, asked in player.requests.unexplained:
+        for cycle, t_ns, logged, asked in comparison.unexplained:
             comparison.add_mismatch(Mismatch(SCHEME.name, "request", "", cycle, t_ns, str(logged), str(asked)))
         if comparison.missing_fields:
             notes.append(f"{SCHEME.name} lacks {', '.join(comparison.missing_fields)}, an older format")
@@ -459,7 +449,7 @@ def _result(
         attempts=player.attempts,
         states=tuple(each for each in gatherer.transitions if each.t_ns >= first_ns),
         contacts=tuple(each for each in gatherer.reports if each[0] >= first_ns),
-        adaptations=tuple(each for each in gatherer.adaptations if each.t_ns >= first_ns),
+        adaptation_s=tuple(took_s for t_ns, took_s in gatherer.adaptations if t_ns >= first_ns),
         parameters=dict(zip(player.settings.estimator.parameter_names, gatherer.theta_hat, strict=False)),
         score=score,
         detections_ns=tuple(t_ns for t_ns in gatherer.detections_ns if t_ns >= first_ns),

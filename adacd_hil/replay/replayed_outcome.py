@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed_in
-from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState, Vector
+from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
 from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.score.distribution import Distribution
@@ -38,14 +38,6 @@ class StateChange(NamedTuple):
     fault: FaultReason
 
 
-class Adaptation(NamedTuple):
-    """An adaptation: its beginning, the time until MONITOR, None if it never got there, and its last estimate."""
-
-    t_ns: int
-    took_s: float | None
-    theta_hat: tuple[float, ...]
-
-
 class OutcomeGatherer:
     """Gathers the outcome of one replay from its decisions: states, reports, alarms, adaptations, sensitivity, score.
 
@@ -55,9 +47,8 @@ class OutcomeGatherer:
     def __init__(self, settings: Settings, truth: KnownContacts | None) -> None:
         self.transitions: list[StateChange] = []
         self.reports: list[tuple[int, ContactReport]] = []  # with the time of each, ns
-        self.adaptations: list[Adaptation] = []
+        self.adaptations: list[tuple[int, float | None]] = []  # beginning, ns; duration, s, None: never in MONITOR
         self.theta_hat: tuple[float, ...] = ()
-        self.state = SchemeState.INIT
         self._settings = settings
         self._truth = truth
         self._contacts: list[TrueContact] = []  # of this attempt, on the host's cycles
@@ -73,7 +64,7 @@ class OutcomeGatherer:
         self._bank = (slices["tau_ext_bank"], slices["threshold_bank"]) if "threshold_bank" in slices else None
         self._push = PushGatherer(settings) if self._bank else None
         self._thresholds = tuple(Distribution() for _ in range(JOINTS))
-        self._began: tuple[int, int] | None = None  # cycle and time of the adaptation in progress
+        self._began_ns: int | None = None  # of the adaptation in progress
         self._crossings: list[int] = []  # times at which some joint crosses its threshold
         self._was_over = False
 
@@ -109,13 +100,11 @@ class OutcomeGatherer:
                     SchemeState(batch.previous_state[row]),
                     SchemeState(batch.state[row]),
                     FaultReason(batch.fault[row]),
-                ),
-                batch.block[row, self._theta],
+                )
             )
         for row, report in zip(batch.contact_places.tolist(), batch.contacts, strict=True):
             self.reports.append((int(ticks.t_ns[row]), report))
         self.theta_hat = tuple(batch.block[-1, self._theta].tolist())
-        self.state = SchemeState(batch.state[-1])
 
     def _keep(self, ticks: Ticks, batch: SchemeBatch) -> None:
         """Keep the host's cycles next to the begin and end of each true contact, and the first and last of the stretch.
@@ -153,24 +142,23 @@ class OutcomeGatherer:
         threshold, push = (tuple(joint["p50"] for joint in each) for each in (pushes.threshold_Nm, pushes.push_Nm))
         return threshold, push
 
-    def _enter(self, transition: StateChange, theta_hat: Vector) -> None:
-        """Record a change of state, and the beginning or end of an adaptation by it; theta_hat (p,): estimate there."""
+    def _enter(self, transition: StateChange) -> None:
+        """Record a change of state, and the beginning or end of an adaptation by it."""
         self.transitions.append(transition)
         state = transition.state
-        if state is SchemeState.ADAPT and self._began is None:
-            self._began = transition.cycle, transition.t_ns
-        elif state is SchemeState.MONITOR and transition.previous in LEARNING and self._began is not None:
-            took_s = (transition.t_ns - self._began[1]) * 1e-9
-            self.adaptations.append(Adaptation(self._began[1], took_s, tuple(theta_hat.tolist())))
-            self._began = None
+        if state is SchemeState.ADAPT and self._began_ns is None:
+            self._began_ns = transition.t_ns
+        elif state is SchemeState.MONITOR and transition.previous in LEARNING and self._began_ns is not None:
+            self.adaptations.append((self._began_ns, (transition.t_ns - self._began_ns) * 1e-9))
+            self._began_ns = None
         elif state in (SchemeState.FAULT, SchemeState.PAYLOAD):
             self._give_up()
 
     def _give_up(self) -> None:
         """Record an adaptation in progress, if there is one, as one that never reached MONITOR."""
-        if self._began is not None:
-            self.adaptations.append(Adaptation(self._began[1], None, self.theta_hat))
-            self._began = None
+        if self._began_ns is not None:
+            self.adaptations.append((self._began_ns, None))
+            self._began_ns = None
 
     def begin_attempt(self, attempt: int, cycle: int) -> None:
         """End the attempt in progress and begin another.
@@ -229,11 +217,11 @@ class Replay:
     not the log's. arms_compared: cycles whose state, decoded from frames, was compared with the log's. monitored_s: in
     MONITOR. mismatches: the first ones, `mismatch_count` of them in all, by field in `mismatched_fields`. contacts:
     reports with their times, ns. parameters: the estimate of the last cycle. score: of contacts and alarms that begin
-    in the stretch, None if the truth is not known. adaptations: that begin in it. zero_ns: time of the first ADAPT of
-    the log, 0 without one. ending: the last change of state, which may be before the stretch, None without one.
-    threshold_Nm: median in MONITOR of each joint's lowest threshold of all channels, nan if it never monitored;
-    push_Nm: of the smallest push found within `PUSH_WITHIN`, an estimate, () in the paper's scheme. attempts,
-    threshold_Nm, push_Nm: from the log's beginning.
+    in the stretch, None if the truth is not known. adaptation_s: duration of each adaptation that begins in it, None if
+    it never got to MONITOR. zero_ns: time of the first ADAPT of the log, 0 without one. ending: the last change of
+    state, which may be before the stretch, None without one. threshold_Nm: median in MONITOR of each joint's lowest
+    threshold of all channels, nan if it never monitored; push_Nm: of the smallest push found within `PUSH_WITHIN`, an
+    estimate, () in the paper's scheme. attempts, threshold_Nm, push_Nm: from the log's beginning.
     """
 
     settings: Settings
@@ -244,7 +232,7 @@ class Replay:
     attempts: int
     states: tuple[StateChange, ...]
     contacts: tuple[tuple[int, ContactReport], ...]
-    adaptations: tuple[Adaptation, ...]
+    adaptation_s: tuple[float | None, ...]
     parameters: dict[str, float]
     score: Score | None
     detections_ns: tuple[int, ...]
@@ -268,11 +256,6 @@ class Replay:
     def is_whole(self) -> bool:
         """Whether there are no `notes`: all that the log should have could be compared and judged."""
         return not self.notes
-
-    @property
-    def adaptation_s(self) -> tuple[float | None, ...]:
-        """Duration of each adaptation, s; None if it never reached MONITOR."""
-        return tuple(adaptation.took_s for adaptation in self.adaptations)
 
     def time_s(self, t_ns: int) -> float:
         """Return a time in s since the first ADAPT, from ns of the run's clock.

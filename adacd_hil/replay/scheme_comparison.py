@@ -64,6 +64,9 @@ class SchemeComparison:
         self.cycles = self.arms = 0  # cycles whose decisions, and whose arms, were compared
         self.missing_fields: list[str] = []
         """Fields that the log's format lacks."""
+        self.unexplained: list[tuple[int, int, int, int]] = []
+        """Requests that the script doesn't make, or that the log lacks: cycle, time, logged, of the script."""
+        self._interrupt: tuple[int, int] | None = None  # cycle and time of a FINISH that isn't in the script
         self._shown = shown
         self._tolerance = tolerance
         self._layout: Layout = layout_of(settings)
@@ -78,9 +81,10 @@ class SchemeComparison:
         """
         records = scheme.records
         self.cycles += len(records)
-        self._compare_whole("stamp_ns", scheme.t_ns, ticks.t_ns, ticks)
+        self._note(SCHEME.name, "stamp_ns", scheme.t_ns != ticks.t_ns, scheme.t_ns, ticks.t_ns, ticks)
         for name in _HEAD:
-            self._compare_whole(name, records[name], getattr(batch, name), ticks)
+            logged, replayed = records[name], getattr(batch, name)
+            self._note(SCHEME.name, name, logged != replayed, logged, replayed, ticks)
         known = scheme.fields
         self.missing_fields = [name for name in self._layout.slices if name not in known]
         if not self.missing_fields and _same_bits(scheme.block, batch.block):
@@ -89,12 +93,6 @@ class SchemeComparison:
             if name in known:
                 logged = np.ascontiguousarray(records[name], np.float64).reshape(len(records), -1)
                 self._compare_reals(name, logged, np.ascontiguousarray(batch.block[:, place]), ticks)
-
-    def _compare_whole(self, name: str, logged: NDArray[Any], replayed: NDArray[Any], ticks: Ticks) -> None:
-        """Compare a field of whole numbers, logged and replayed (n,) each, and note the cycles in which it differs."""
-        is_other = np.asarray(logged != replayed)
-        if is_other.any():
-            self._note(SCHEME.name, name, is_other, logged, replayed, ticks)
 
     def _compare_reals(self, name: str, logged: Vector, replayed: Vector, ticks: Ticks) -> None:
         """Compare a float field, logged and replayed (n, k) each, and note the cycles in which it differs.
@@ -106,8 +104,7 @@ class SchemeComparison:
         is_other = np.asarray(logged.view(np.uint64) != replayed.view(np.uint64))
         if self._tolerance:
             is_other &= ~self._is_near(name, logged, replayed)
-        if is_other.any():
-            self._note(SCHEME.name, name, is_other, logged, replayed, ticks)
+        self._note(SCHEME.name, name, is_other, logged, replayed, ticks)
 
     def _is_near(self, name: str, logged: Vector, replayed: Vector) -> NDArray[np.bool_]:
         """Return where a field's values (n, k) are equal, or differ by no more than the tolerance; two NaN are equal.
@@ -131,9 +128,7 @@ class SchemeComparison:
             theirs: NDArray[Any] = getattr(logged, name)
             ours: NDArray[Any] = getattr(decoded, name)
             bits = np.uint64 if theirs.dtype == np.float64 else theirs.dtype
-            is_other = np.asarray(theirs.view(bits) != ours.view(bits))
-            if is_other.any():
-                self._note(ARM.name, name, is_other, theirs, ours, ticks)
+            self._note(ARM.name, name, theirs.view(bits) != ours.view(bits), theirs, ours, ticks)
 
     def _note(
         self,
@@ -145,13 +140,15 @@ class SchemeComparison:
         ticks: Ticks,
     ) -> None:
         """Count the values of (n,) or (n, k) that differ, where is_other is True; keep the first `shown` of them."""
+        if not is_other.any():
+            return
         is_other, logged, replayed = (each.reshape(len(each), -1) for each in (is_other, logged, replayed))
         rows, columns = np.nonzero(is_other)
         self.count += len(rows)
         self.fields[f"{topic}.{name}"] += len(rows)
         for row, column in zip(rows[: self._shown].tolist(), columns[: self._shown].tolist(), strict=True):
             names = self._names.get(name, ("",) if logged.shape[1] == 1 else _JOINTS)
-            values = (_text(side[row, column].item()) for side in (logged, replayed))
+            values = (repr(side[row, column].item()) for side in (logged, replayed))
             self._keep(Mismatch(topic, name, names[column], int(ticks.cycle[row]), int(ticks.t_ns[row]), *values))
 
     def add_mismatch(self, mismatch: Mismatch) -> None:
@@ -188,7 +185,7 @@ class SchemeComparison:
                 continue
             for field, place, there, here in _contact_values(theirs, ours):
                 if not self._is_same(there, here):
-                    self.add_mismatch(Mismatch(CONTACT.name, field, place, *where, _text(there), _text(here)))
+                    self.add_mismatch(Mismatch(CONTACT.name, field, place, *where, repr(there), repr(here)))
 
     def _is_same(self, logged: float, replayed: float) -> bool:
         """Return whether two values have the same bits, or are finite reals within the tolerance of each other.
@@ -215,6 +212,24 @@ class SchemeComparison:
             logged_text, replayed_text = _event_text(theirs and theirs.event), _event_text(ours)
             self.add_mismatch(Mismatch(EVENTS.name, name, "", cycle, t_ns, logged_text, replayed_text))
 
+    def compare_requests(self, ticks: Ticks, logged: NDArray[np.uint8], asked: NDArray[np.uint8]) -> None:
+        """Compare logged requests of a stretch (n,) with the script's (n,); keep the differences in `unexplained`.
+
+        The first FINISH that isn't in the script may be an interrupt; if the script asks for FINISH later, in a cycle
+        where the log doesn't, it was none. Faults that the host's own checks requested are no difference.
+        """
+        for row in np.flatnonzero(logged != asked).tolist():
+            cycle, t_ns = int(ticks.cycle[row]), int(ticks.t_ns[row])
+            if logged[row] in _OWN_CHECKS:
+                continue
+            if logged[row] == Request.FINISH and self._interrupt is None:
+                self._interrupt = cycle, t_ns
+            else:
+                self.unexplained.append((cycle, t_ns, int(logged[row]), int(asked[row])))
+        if self._interrupt is not None and ((asked == Request.FINISH) & (logged != Request.FINISH)).any():
+            self.unexplained.append((*self._interrupt, int(Request.FINISH), int(Request.NONE)))
+            self._interrupt = None
+
 
 def _event_text(event: Event | None) -> str:
     return repr("no event" if event is None else f"{event.level}: {event.message}")
@@ -222,11 +237,6 @@ def _event_text(event: Event | None) -> str:
 
 def _same_bits(first: Vector, second: Vector) -> bool:
     return first.shape == second.shape and bool(np.array_equal(first.view(np.uint64), second.view(np.uint64)))
-
-
-def _text(value: float) -> str:
-    """Return a value as text that reads back to the same bits."""
-    return repr(value)
 
 
 def _contact_values(logged: Mapping[str, Any], replayed: ContactReport) -> Iterator[tuple[str, str, float, float]]:
@@ -363,31 +373,3 @@ class Asking:
         for at_s in self._times_s:  # as many cycles as others may be due before it, one each
             is_due[np.flatnonzero((elapsed_s >= at_s) & is_alive)[: len(self._times_s) + 1]] = True
         return [row for row in np.flatnonzero(is_due).tolist() if row >= first]
-
-
-class RequestCheck:
-    """Compares the logged requests with the script's. The first FINISH that isn't in the script may be an interrupt.
-
-    If the script asks for FINISH later, in a cycle where the log doesn't, it was no interrupt.
-    """
-
-    def __init__(self) -> None:
-        self.interrupts: list[tuple[int, int]] = []  # cycle and time
-        self.unexplained: list[tuple[int, int, int, int]] = []  # cycle, time, logged, of the script
-
-    def compare(self, ticks: Ticks, logged: NDArray[np.uint8], asked: NDArray[np.uint8]) -> None:
-        """Compare logged requests of a stretch (n,) with the script's (n,); keep the differences.
-
-        The first request to finish goes to `interrupts`, any other difference to `unexplained`. Faults that the host's
-        own checks requested are no difference. A later FINISH of the script moves the interrupt to `unexplained`.
-        """
-        for row in np.flatnonzero(logged != asked).tolist():
-            cycle, t_ns = int(ticks.cycle[row]), int(ticks.t_ns[row])
-            if logged[row] in _OWN_CHECKS:
-                continue
-            if logged[row] == Request.FINISH and not self.interrupts:
-                self.interrupts.append((cycle, t_ns))
-            else:
-                self.unexplained.append((cycle, t_ns, int(logged[row]), int(asked[row])))
-        if self.interrupts and ((asked == Request.FINISH) & (logged != Request.FINISH)).any():
-            self.unexplained.append((*self.interrupts.pop(), int(Request.FINISH), int(Request.NONE)))

@@ -59,14 +59,13 @@ _HELD: Final = 30_000
 class TruthTable(NamedTuple):
     """The truth in an emulator's log: kept rows on the emulator's own cycles, and its metadata.
 
-    problem: missing parts, or ""; is_complete: it is whole and no record was dropped on the way to it. span: attempt
-    and cycle of the first and of the last record; None if the emulator never cycled.
+    problem: missing parts and records that were dropped on the way to it, or "". span: attempt and cycle of the first
+    and of the last record; None if the emulator never cycled.
     """
 
     rows: Truth
     metadata: Mapping[str, str]
     problem: str
-    is_complete: bool
     span: EmulatorSpan | None = None
 
 
@@ -203,7 +202,7 @@ class _TruthRows:
             model_attempt=attempt,
         )
         span = None if self._first is None or self._last is None else (_place(self._first), _place(self._last))
-        return TruthTable(truth, stream.metadata, stream.problem, stream.is_complete, span)
+        return TruthTable(truth, stream.metadata, stream.problem, span)
 
 
 def _place(row: NDArray[Any]) -> tuple[int, int]:

@@ -160,7 +160,7 @@ def test_what_happens_to_the_arm_after_its_host_has_died_is_none_of_the_host_s()
         payload_kg=np.zeros(1),
         theta=np.zeros((1, 7)),
     )
-    truth = host_truth(TruthTable(rows, {}, "", True), np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
+    truth = host_truth(TruthTable(rows, {}, ""), np.zeros(1, np.int64), 100, np.linspace(0.0, 0.4, 5))
     assert truth.cycle.tolist() == [98, 99, 100]
     columns = (truth.tau_ext, truth.contact_link, truth.contact_index, truth.force_N, truth.time_s)
     assert [len(column) for column in columns] == [3] * 5
@@ -246,7 +246,7 @@ def truth_at(cycles, attempt=0):
     nothing = np.zeros(len(cycles))
     cycle, attempts = np.array(cycles), np.full(len(cycles), attempt)
     truth = Truth(cycle, np.zeros((len(cycles), 2)), nothing, nothing, nothing, nothing, attempt=attempts)
-    return TruthTable(truth, {}, "", True)
+    return TruthTable(truth, {}, "")
 
 
 def test_the_truth_of_a_cycle_that_was_skipped_between_two_pieces_lies_between_them():

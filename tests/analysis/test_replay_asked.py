@@ -11,7 +11,7 @@ from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import Request
 from adacd_hil.replay.replay import replay
-from adacd_hil.replay.scheme_comparison import RequestCheck
+from adacd_hil.replay.scheme_comparison import SchemeComparison
 from adacd_hil.settings.run_settings import RequestSettings
 
 
@@ -30,9 +30,9 @@ def test_one_finish_that_is_not_in_the_script_is_an_interrupt(logged, asked, une
     """unexplained: cycle, logged and asked."""
     cycle = np.arange(100)
     columns = [np.array([requests.get(k, 0) for k in cycle], np.uint8) for requests in (logged, asked)]
-    check = RequestCheck()
-    check.compare(Ticks(cycle, cycle * 1_000_000, np.ones_like(cycle)), *columns)
-    assert [(k, was, is_) for k, _, was, is_ in check.unexplained] == unexplained
+    comparison = SchemeComparison(settings_of_run())
+    comparison.compare_requests(Ticks(cycle, cycle * 1_000_000, np.ones_like(cycle)), *columns)
+    assert [(k, was, is_) for k, _, was, is_ in comparison.unexplained] == unexplained
 
 
 def test_what_the_user_asked_before_a_fault_and_asks_again_after_it_is_the_scripts(tmp_path):

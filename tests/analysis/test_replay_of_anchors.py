@@ -6,7 +6,7 @@ import pytest
 
 from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.control.operator import ScriptedOperator
-from adacd_hil.log import log_walk
+from adacd_hil.log import reader
 from adacd_hil.log.reader import read_log
 from adacd_hil.records import CERTIFICATE_EVENTS
 from adacd_hil.replay.log_source import LogSource
@@ -86,14 +86,14 @@ def test_a_log_from_before_the_anchors_is_asked_for_no_certificate(leant_on, mon
     assert now == {"margin", *CERTIFICATE_EVENTS}
     config = to_toml(LogSource(leant_on).settings).split("\n")
     before = "\n".join(line for line in config if not line.startswith("drift_Nm_sqrt_s"))
-    read_head = log_walk.read_head
+    read_head = reader.read_head
 
-    def head_of_before(path: Path) -> log_walk.Extras:
+    def head_of_before(path: Path) -> reader.Extras:
         head = read_head(path)
         head.attachments["config.toml"] = before.encode()
         return head
 
-    monkeypatch.setattr(log_walk, "read_head", head_of_before)
+    monkeypatch.setattr(reader, "read_head", head_of_before)
     (then,) = {part.said for part in LogSource(leant_on).parts(with_frames=False)}
     assert then == {"margin"}
 

@@ -172,8 +172,8 @@ def test_a_threshold_has_changed_by_a_share_of_it_and_the_settings_that_did_are_
 def test_an_offset_that_creeps_adds_up_and_one_within_its_deviations_does_not():
     creeping = [(0.001 * day, 0.0) for day in range(10)]
     (trend,) = trends(series(offset_Nm=creeping, offset_std_Nm=[(0.001, 0.001)] * 10))
-    assert [(change.run.name, change.joint) for change in trend.offsets.changes] == [("r6", 1)]
-    assert trend.offsets.changes[0].sigmas == pytest.approx(6.0 / 2.0**0.5)
+    assert [(change.run.name, change.joint) for change in trend.quantities[2].changes] == [("r6", 1)]
+    assert trend.quantities[2].changes[0].sigmas == pytest.approx(6.0 / 2.0**0.5)
     assert "last with run r6 of 2026-01-07 00:00: joint 1 0.000 → 0.006 Nm, 4.2 deviations since r0" in trend.further[1]
     (trend,) = trends(series(offset_Nm=creeping, offset_std_Nm=[(0.01, 0.001)] * 10))
     assert trend.further[1] == "Torque offsets: no change beyond what the certificates' uncertainty explains."
@@ -181,7 +181,7 @@ def test_an_offset_that_creeps_adds_up_and_one_within_its_deviations_does_not():
 
 def test_what_has_no_deviation_is_not_said_to_have_changed():
     (trend,) = trends(series(friction_Nm=[(0.1, 0.1), (0.9, 0.9)]))
-    assert trend.friction.changes == ()
+    assert trend.quantities[1].changes == ()
     assert trend.further[0].startswith(
         "Friction can't be compared: that takes two certificates with a deviation, there are 0."
     )

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from fuzz_frames import CanFrame, damaged, foreign, fuzz, play_short_run, record_legal_traffic
 from fuzz_receivers import CODEC, FRAMES_PER_CYCLE, HOST_SERVICES, BenchReceiver, HostReceiver
+from topic_bytes import topic_bytes
 
 from adacd_hil.clock import VirtualClock
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.network import Master
-from adacd_hil.log.reader import topic_bytes
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.embedded_bus import EmbeddedBus

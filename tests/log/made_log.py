@@ -69,7 +69,7 @@ def make_log(
 ):
     """Make a log: in each chunk a message of every topic for each of its numbers; `times`: log and publish time."""
     target = MemorySink()
-    file = ChunkedFile(target, profile, library)
+    file = ChunkedFile(target.write, profile, library)
     for name, data in attachments.items():
         file.add_attachment(Attachment(create_time=0, log_time=0, name=name, media_type="text/plain", data=data))
     if run is not None:

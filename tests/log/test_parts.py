@@ -7,10 +7,11 @@ import pytest
 from made_log import read_by_mcap
 from mcap.reader import make_reader
 from recorded_run import feed, make_run, payloads, record, start
+from topic_bytes import topic_bytes
 
 from adacd_hil.lab.logs.check.log_check import check_log
 from adacd_hil.log.log_files import LogExistsError, find_parts, part_path
-from adacd_hil.log.reader import read_log, topic_bytes
+from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.settings.run_settings import LogSettings
 

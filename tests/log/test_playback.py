@@ -3,7 +3,8 @@
 import pytest
 
 from adacd_hil.clock import VirtualClock
-from adacd_hil.lab.logs.playback import LEAD_NS, LOOP_PAUSE_NS, Lateness, PlayedFrame, play, repeat
+from adacd_hil.lab.logs.playback import LEAD_NS, LOOP_PAUSE_NS, Lateness, play, repeat
+from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 
 BEGIN_NS = 1_000_000_000
@@ -28,7 +29,7 @@ def played(times_ns, stalls=None, **options):
     bus = EmbeddedBus(clock)
     sent = []
     bus.attach(lambda frame: sent.append((frame.can_id, frame.t_ns - BEGIN_NS - LEAD_NS)))
-    frames = [PlayedFrame(t_ns, number, b"x") for number, t_ns in enumerate(times_ns)]
+    frames = [Frame(number, b"x", t_ns) for number, t_ns in enumerate(times_ns)]
     return sent, play(bus, clock, frames, **options)
 
 
@@ -71,7 +72,7 @@ def test_playback_stops_when_asked():
 
 
 def test_a_recording_is_repeated_by_one_clock():
-    recording = [PlayedFrame(500, 1, b""), PlayedFrame(900, 2, b"")]
+    recording = [Frame(1, b"", 500), Frame(2, b"", 900)]
     twice = list(repeat(lambda: recording, 2))
     second_ns = 900 + LOOP_PAUSE_NS
     assert [(frame.t_ns, frame.can_id) for frame in twice] == [(500, 1), (900, 2), (second_ns, 1), (second_ns + 400, 2)]
@@ -80,7 +81,7 @@ def test_a_recording_is_repeated_by_one_clock():
 
 
 def test_a_recording_is_repeated_for_ever_unless_it_is_empty():
-    endless = repeat(lambda: [PlayedFrame(0, 1, b"")], 0)
+    endless = repeat(lambda: [Frame(1, b"", 0)], 0)
     assert [next(endless).t_ns for _ in range(4)][-1] == 3 * LOOP_PAUSE_NS
     assert list(repeat(list, 0)) == []
 

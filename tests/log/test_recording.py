@@ -20,9 +20,10 @@ from recorded_run import (
     record,
     start,
 )
+from topic_bytes import topic_bytes
 
 from adacd_hil import __version__
-from adacd_hil.log.reader import read_log, topic_bytes
+from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.log.viewer_layout import viewer_layout
 from adacd_hil.records import scheme_layout
@@ -75,7 +76,7 @@ def test_the_summary_counts_what_was_written(run, recorded, log, others):
     contacts = sum(cycle.contact is not None for cycle in run.cycles)
     events = sum(cycle.event is not None for cycle in run.cycles)
     messages = len(run.frames) + len(decodable(run)) + 5 * COUNT + contacts + events
-    assert recorded[1][1:-1] == (len(run.frames), messages, 0, True, "", 1)
+    assert recorded[1][1:-1] == (len(run.frames), messages, 0, "", 1)
     assert 0 < recorded[1].queue_peak_bytes < 4 * 2**20
     assert sum(map(len, others.values())) == messages
     assert (log.problem, log.is_complete) == ("", True)
@@ -213,7 +214,7 @@ def test_the_viewer_layout_names_topics_and_fields_that_exist():
         assert f" {field.split('[')[0]} " in types[topic], path
 
 
-def test_two_runs_in_lockstep_give_the_same_file_and_one_bit_shows_in_its_topic(run, recorded, others, tmp_path):
+def test_two_runs_in_lockstep_give_the_same_file_and_one_bit_shows_in_its_topic(run, recorded, tmp_path):
     path, messages = recorded[0], CODEC_FD.messages.values()
     record(tmp_path / "again.mcap", run, messages=messages)
     assert (tmp_path / "again.mcap").read_bytes() == path.read_bytes()
@@ -224,7 +225,6 @@ def test_two_runs_in_lockstep_give_the_same_file_and_one_bit_shows_in_its_topic(
     assert sum(a != b for a, b in zip(ours, theirs, strict=True)) in range(1, 9)
     for topic in ("/control", "/cycle", "/events", "/from_can_bus", "/to_can_bus_fd"):
         assert topic_bytes(path, topic) == topic_bytes(tmp_path / "other.mcap", topic)
-        assert topic_bytes(path, topic) == b"".join(message.data for message, _ in others[topic])
 
 
 def test_in_real_time_the_log_has_wall_time_and_the_reader_gives_back_ours(tmp_path):
@@ -246,7 +246,7 @@ def test_a_run_without_a_cycle_is_a_complete_log_and_is_closed_once(tmp_path):
     summary = recorder.close()
     log = read_log(tmp_path / "run.mcap")
     assert recorder.close() is summary
-    assert summary[1:] == (0, 0, 0, True, "", 1, 0)
+    assert summary[1:] == (0, 0, 0, "", 1, 0)
     assert log.is_complete
     assert log.scheme.block.shape[0] == 0
     assert log.frames.shape == (0,)

@@ -24,8 +24,9 @@ from pathlib import Path
 
 import pytest
 from experiment_runs import Played, emulator, run_on_vcan
+from topic_bytes import topic_bytes
 
-from adacd_hil.log.reader import read_log, topic_bytes
+from adacd_hil.log.reader import read_log
 
 pytestmark = [
     pytest.mark.vcan,

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from experiment_runs import firmware_sim, run_on_vcan
 from rig import play_lockstep
+from topic_bytes import topic_bytes
 
-from adacd_hil.log.reader import topic_bytes
 from adacd_hil.settings.arm_settings import LockstepSettings
 from adacd_hil.settings.run_settings import OperatorSettings, RequestSettings
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from adacd_hil.lab.logs.frame_choice import FrameChoice
-    from adacd_hil.lab.logs.playback import PlayedFrame
+    from adacd_hil.wire.bus import Frame
 
 _BLOCK = 256
 """Most frames that are prepared between two sends."""
@@ -148,19 +148,19 @@ class Playback:
     withheld: int = 0
     problem: str = ""
 
-    def frames(self) -> "Iterator[PlayedFrame]":
+    def frames(self) -> "Iterator[Frame]":
         """Yield the chosen frames, read ahead by a thread; add those left out to `unsendable` and `withheld`.
 
         Raises LogError if the recording can't be read.
         """
-        from adacd_hil.lab.logs.playback import PlayedFrame
+        from adacd_hil.wire.bus import Frame
 
         for piece in _ahead(self._pieces()):
             for start in range(0, len(piece), _BLOCK):
                 block = piece[start : start + _BLOCK]
                 names = ("t_ns", "can_id", "length")
                 for t_ns, can_id, length, data in zip(*(block[n].tolist() for n in names), block["data"], strict=True):
-                    yield PlayedFrame(t_ns, can_id, data[:length].tobytes())
+                    yield Frame(can_id, data[:length].tobytes(), t_ns)
 
     def _pieces(self) -> "Iterator[NDArray[Any]]":
         """Yield arrays of the chosen frames that are sent; add the others to the counts.

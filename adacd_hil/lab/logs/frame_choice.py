@@ -24,12 +24,12 @@ class FrameChoice:
     no bound; `can_ids` empty: all.
     """
 
-    only: Side = "both"
-    host_ids: frozenset[int] = frozenset()
-    device_ids: frozenset[int] = frozenset()
-    can_ids: frozenset[int] = frozenset()
-    start_ns: int | None = None
-    end_ns: int | None = None
+    only: Side
+    host_ids: frozenset[int]
+    device_ids: frozenset[int]
+    can_ids: frozenset[int]
+    start_ns: int | None
+    end_ns: int | None
 
     def pieces(self, source: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
         """Yield the chosen frames of each array of a recording's frames, in turn; arrays without any are skipped."""
@@ -66,10 +66,6 @@ class FrameChoice:
 def sides(codec: Codec | DbcDecoder) -> tuple[frozenset[int], frozenset[int]]:
     """Return the identifiers that a contract's host sends, and all others: those that its devices send."""
     return (
-        _ids(message.can_id for message in codec.messages.values() if HOST in message.senders),
-        _ids(message.can_id for message in codec.messages.values() if HOST not in message.senders),
+        frozenset(message.can_id for message in codec.messages.values() if HOST in message.senders),
+        frozenset(message.can_id for message in codec.messages.values() if HOST not in message.senders),
     )
-
-
-def _ids(can_ids: Iterable[int]) -> frozenset[int]:
-    return frozenset(can_ids)

@@ -41,17 +41,16 @@ def opened_bag(path: Path) -> Iterator[Bag]:
     Raises LogError for any error of its reader, also within the block; a LogError or ConfigError of the block passes.
     """
     try:
+        begin = b""
         if not path.is_dir():
             with open_input(path) as file:
-                is_mcap, is_ros1 = (file.peek(16).startswith(magic) for magic in (MAGIC, _BAG_MAGIC))
-            with _opened_mcap(path) if is_mcap else _opened_rosbag(path, is_ros1) as bag:
-                yield bag
-        else:
-            if not (path / "metadata.yaml").is_file():
-                instead = f"; name {path / LOG_NAME}" if (path / LOG_NAME).is_file() else ""
-                raise LogError(f"folder {path} is no rosbag: it has no metadata.yaml{instead}")
-            with _opened_rosbag(path, is_ros1=False) as bag:
-                yield bag
+                begin = file.peek(16)
+        elif not (path / "metadata.yaml").is_file():
+            instead = f"; name {path / LOG_NAME}" if (path / LOG_NAME).is_file() else ""
+            raise LogError(f"folder {path} is no rosbag: it has no metadata.yaml{instead}")
+        is_ros1 = begin.startswith(_BAG_MAGIC)
+        with _opened_mcap(path) if begin.startswith(MAGIC) else _opened_rosbag(path, is_ros1) as bag:
+            yield bag
     except (LogError, ConfigError):
         raise
     except OSError as error:

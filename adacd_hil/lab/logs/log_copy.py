@@ -32,7 +32,7 @@ from adacd_hil.log.log_parts import COPY_ENDINGS, DROPPED_KEY
 from adacd_hil.log.mcap.chunked_file import ChunkedFile
 from adacd_hil.log.mcap.chunks import Contents
 from adacd_hil.log.mcap.mcap_records import CHANNEL_NUMBERS, read_end
-from adacd_hil.log.types.record_arrays import count_frames
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 
 _MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 """A message record before its payload: opcode, length, channel, sequence, log time, publish time."""
@@ -52,11 +52,18 @@ class LogCopy:
         """
         if path.exists() and any(part.exists() and path.samefile(part) for part in log.parts.values()):
             raise LogError(f"{path} is the log itself; --out names another file")
+        if is_part_name(path):
+            raise LogError(f"log {path} would be taken for a part of the log beside it; give another name")
+        is_copy = _is_copy(path)
+        if path.is_file() and not path.is_symlink() and path.stat().st_size and not is_copy:
+            raise LogError(f"log {path} can't be created: what is there is no result of these commands")
+        self._path = path
         self._log = log
         self._wanted = topics
-        self._target = _CopyTarget(path)
-        self._file = ChunkedFile(self._target, _common_profile(log.parts.values()))
-        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        with failing_as(f"log {path} can't be created"):
+            self._replacement = Replacement(path, is_log=is_copy)
+            self._hidden = self._replacement.beside.open("wb")
+        self._file = ChunkedFile(self._write, _common_profile(log.parts.values()))
         self._metadata: set[str] = set()
         self._topics: dict[int, str] = {}  # by the copy's number of the channel
         self._counts: Counter[int] = Counter()  # messages of each of its channels
@@ -109,10 +116,7 @@ class LogCopy:
             schema = self._log.definitions.schemas.get(channel.schema_id)
             if schema is None:
                 return
-            key = schema.name, schema.encoding, schema.data
-            if key not in self._schemas:
-                self._schemas[key] = self._file.define_schema(*key)
-            schema_id = self._schemas[key]
+            schema_id = self._file.define_schema(schema.name, schema.encoding, schema.data)
         if len(self._topics) + 1 >= CHANNEL_NUMBERS:
             raise LogError(f"more than {CHANNEL_NUMBERS - 1} channels don't go into one file")
         number = self._file.define_channel(channel.topic, channel.message_encoding, schema_id, channel.metadata)
@@ -127,7 +131,7 @@ class LogCopy:
         self._follow()
         self._file.flush()
         summary = {
-            "frames": str(count_frames(self._topics, self._counts)),
+            "frames": str(sum(count for number, count in self._counts.items() if self._topics[number] in FRAME_TOPICS)),
             "messages": str(self._file.messages),
             DROPPED_KEY: str(self._log.dropped),
             ENDING_KEY: ending,
@@ -136,13 +140,21 @@ class LogCopy:
         }
         self._file.add_metadata(SUMMARY_METADATA, summary)
         self._file.complete()
-        self._target.commit()
+        with failing_as(f"log {self._path} can't be written"):
+            self._hidden.close()
+            self._replacement.commit(is_durable=True)
+
+    def _write(self, data: bytes, _packets: int) -> None:
+        with failing_as(f"log {self._path} can't be written"):
+            self._hidden.write(data)
 
     def __enter__(self) -> "LogCopy":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._target.discard()
+        with contextlib.suppress(OSError):
+            self._hidden.close()
+        self._replacement.discard()  # no effect once it has been committed
 
 
 def _common_profile(sources: Iterable[Path]) -> str:
@@ -153,44 +165,6 @@ def _common_profile(sources: Iterable[Path]) -> str:
 
 def _is_ros(header: Header) -> bool:
     return header.profile == ROS_PROFILE or (header.profile == "" and header.library.startswith(f"{PRODUCT} "))
-
-
-class _CopyTarget:
-    """A temporary file beside its final name; `commit` gives it that name."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        if is_part_name(path):
-            raise LogError(f"log {path} would be taken for a part of the log beside it; give another name")
-        if path.is_file() and not path.is_symlink() and path.stat().st_size and not _is_copy(path):
-            raise LogError(f"log {path} can't be created: what is there is no result of these commands")
-        with failing_as(f"log {path} can't be created"):
-            self._replacement = Replacement(path, is_log=_is_copy(path))
-            self._file = self._replacement.beside.open("wb")
-
-    def write(self, data: bytes, packets: int = 0) -> int:
-        del packets
-        try:
-            self._file.write(data)
-        except OSError as error:
-            raise self._error(error) from None
-        return len(data)
-
-    def commit(self) -> None:
-        try:
-            self._file.close()
-            self._replacement.commit(is_durable=True)
-        except OSError as error:
-            raise self._error(error) from None
-
-    def discard(self) -> None:
-        """Close and remove the temporary file, unless `commit` has been called."""
-        with contextlib.suppress(OSError):
-            self._file.close()
-        self._replacement.discard()
-
-    def _error(self, error: OSError) -> LogError:
-        return LogError(f"log {self._path} can't be written: {error.strerror}")
 
 
 def _is_copy(path: Path) -> bool:

@@ -5,14 +5,13 @@ A file whose summary can't be trusted is read whole, as far as it is readable.
 
 import struct
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Metadata, Statistics
+from mcap.records import Attachment, Metadata, Statistics
 
 from adacd_hil.file_access import open_input
 from adacd_hil.lab.logs.payload_sizes import payload_size
@@ -32,7 +31,7 @@ from adacd_hil.log.mcap.mcap_records import Definitions, FileEnd, RawRecord, che
 from adacd_hil.log.mcap.record_layout import MAGIC, MESSAGE_HEAD
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.log.types.message_types import LOG, payload_dtype
-from adacd_hil.log.types.record_arrays import count_frames
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS
 from adacd_hil.log.types.unpacking import log_time_ns, unpack_log
 from adacd_hil.records import ContactLevel, Event
@@ -235,7 +234,7 @@ class _InfoView:
         for channel in definitions.channels.values():
             if channel.topic not in _READ:
                 continue
-            payloads = list(_payloads(contents, channel.id))
+            payloads = [contents.payload(place) for place in np.flatnonzero(contents.channels == channel.id).tolist()]
             self._bytes[channel.topic] += sum(map(len, payloads))
             schema = definitions.schemas.get(channel.schema_id)
             if schema is None:
@@ -243,7 +242,8 @@ class _InfoView:
             if channel.topic == EVENTS.name and schema.name == LOG.name:
                 self._take_events(payloads)
             elif channel.topic == CONTACT.name and payload_size(channel, schema) is not None:
-                self._take_contacts(payloads, payload_dtype(schema.data.decode(), _fields(channel)))
+                fields = tuple(channel.metadata.get(FIELDS_KEY, "").split())
+                self._take_contacts(payloads, payload_dtype(schema.data.decode(), fields))
 
     def _take_events(self, payloads: list[bytes]) -> None:
         for payload in payloads:
@@ -272,8 +272,7 @@ class _InfoView:
             info.start_ns, info.end_ns = self._start_ns, self._end_ns
         info.messages = self._counts.total()
         info.cycles = self._counts[CYCLE.name]
-        topics = dict(enumerate(self._counts))
-        info.frames = count_frames(topics, {place: self._counts[topic] for place, topic in topics.items()})
+        info.frames = sum(self._counts[topic] for topic in FRAME_TOPICS)
         info.contacts = len(self._contact_cycles)
         info.collisions = sum(level == ContactLevel.COLLISION for level in self._contact_cycles.values())
         for topic, (name, size) in self._channels.items():
@@ -282,12 +281,3 @@ class _InfoView:
             total = count * size if size is not None else seen
             rate_hz = count / info.duration_s if info.duration_s > 0 else 0.0
             info.topics.append(TopicInfo(topic, name, count, rate_hz, total))
-
-
-def _fields(channel: Channel) -> tuple[str, ...]:
-    return tuple(channel.metadata.get(FIELDS_KEY, "").split())
-
-
-def _payloads(contents: Contents, channel: int) -> Iterator[bytes]:
-    for place in np.flatnonzero(contents.channels == channel).tolist():
-        yield contents.payload(place)

@@ -6,10 +6,10 @@ once, in the order of the recording.
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from typing import Final, NamedTuple
+from typing import Final
 
 from adacd_hil.clock import Clock
-from adacd_hil.wire.bus import Bus
+from adacd_hil.wire.bus import Bus, Frame
 
 LEAD_NS: Final = 5_000_000
 """Time from the call to the first frame."""
@@ -21,14 +21,6 @@ _BUCKET_NS = 1_000
 _STOP_NS = 50_000_000
 """Longest pause between two looks at `is_stopped`."""
 _MOST_AT_ONCE = 64
-
-
-class PlayedFrame(NamedTuple):
-    """A frame of a recording. t_ns: by any clock, only differences matter."""
-
-    t_ns: int
-    can_id: int
-    data: bytes
 
 
 class Lateness:
@@ -61,7 +53,7 @@ class Lateness:
 def play(
     bus: Bus,
     clock: Clock,
-    frames: Iterable[PlayedFrame],
+    frames: Iterable[Frame],
     *,
     speed: float = 1.0,
     longest_pause_ns: int | None = None,
@@ -69,8 +61,9 @@ def play(
 ) -> Lateness:
     """Send frames at their times until they end or `is_stopped` returns True; return how late they were sent.
 
-    speed: 2 plays twice as fast. longest_pause_ns: longer pauses of the recording are shortened to this; None: none is.
-    A frame with an earlier time than the one before is sent with it. Raises BusError if the bus fails.
+    frames: their times are by any clock, only differences matter. speed: 2 plays twice as fast. longest_pause_ns:
+    longer pauses of the recording are shortened to this; None: none is. A frame with an earlier time than the one
+    before is sent with it. Raises BusError if the bus fails.
     """
     lateness = Lateness()
     for due_ns, group in _grouped(_scheduled(frames, clock, speed, longest_pause_ns)):
@@ -85,7 +78,7 @@ def play(
     return lateness
 
 
-def repeat(frames: Callable[[], Iterable[PlayedFrame]], times: int) -> Iterator[PlayedFrame]:
+def repeat(frames: Callable[[], Iterable[Frame]], times: int) -> Iterator[Frame]:
     """Yield the frames of a recording `times` times in a row, with times that continue; 0: forever.
 
     Each repetition begins `LOOP_PAUSE_NS` after the last frame before. Ends at once if the recording is empty. `frames`
@@ -106,8 +99,8 @@ def repeat(frames: Callable[[], Iterable[PlayedFrame]], times: int) -> Iterator[
 
 
 def _scheduled(
-    frames: Iterable[PlayedFrame], clock: Clock, speed: float, longest_pause_ns: int | None
-) -> Iterator[tuple[int, PlayedFrame]]:
+    frames: Iterable[Frame], clock: Clock, speed: float, longest_pause_ns: int | None
+) -> Iterator[tuple[int, Frame]]:
     """Yield each frame with the time at which it is due, ns of `clock`; the times never decrease."""
     begin_ns, first_ns, cut_ns, latest_ns = 0, None, 0, 0
     for frame in frames:
@@ -121,9 +114,9 @@ def _scheduled(
         yield begin_ns + round((latest_ns - first_ns - cut_ns) / speed), frame
 
 
-def _grouped(scheduled: Iterable[tuple[int, PlayedFrame]]) -> Iterator[tuple[int, list[PlayedFrame]]]:
+def _grouped(scheduled: Iterable[tuple[int, Frame]]) -> Iterator[tuple[int, list[Frame]]]:
     """Yield due time and frames of each group with the same due time, `_MOST_AT_ONCE` frames at most."""
-    group: list[PlayedFrame] = []
+    group: list[Frame] = []
     group_ns = 0
     for due_ns, frame in scheduled:
         if group and (due_ns != group_ns or len(group) == _MOST_AT_ONCE):

@@ -28,18 +28,13 @@ class LogRecovery(NamedTuple):
     losses: Losses
 
 
-def default_out(path: Path) -> Path:
-    """Return the path of the result of recovering `path`, such as run.recovered.mcap."""
-    return path.with_name(f"{path.stem}.{RECOVERED}{path.suffix}")
-
-
 def recover(path: Path, out: Path | None = None, progress: Callable[[str], None] = lambda _: None) -> LogRecovery:
     """Save the trusted records of all parts of a log to the new log `out`. path: the log's first part.
 
-    out: None: `default_out`. progress: called with a line per part. Raises LogError if no record can be trusted, a file
-    can't be read or written, or `out` is the log itself.
+    out: None: such as run.recovered.mcap. progress: called with a line per part. Raises LogError if no record can be
+    trusted, a file can't be read or written, or `out` is the log itself.
     """
-    out = out or default_out(path)
+    out = out or path.with_name(f"{path.stem}.{RECOVERED}{path.suffix}")
     log = SalvagedLog(path, progress)
     with LogCopy(out, log) as copy:
         for item in log:

@@ -185,17 +185,14 @@ def data_table(data: CyclicData) -> Table | None:
     """
     if not data.cycles:
         return None
-    rows = [
-        (name, _share(share), _share(worst))
-        for name, share, worst in (
-            ("cycles that lacked a frame in time", data.incomplete, data.worst_incomplete),
-            ("cycles that went by older data", data.aged, None),
-        )
+    rows: list[tuple[str, float | None, float | None]] = [
+        ("cycles that lacked a frame in time", data.incomplete, data.worst_incomplete),
+        ("cycles that went by older data", data.aged, None),
     ]
     for name, shares in data.devices.items():
-        rows.append((f"{name}: no new data", _share(shares.no_new_data), _share(shares.worst_no_new_data)))
-        rows.append((f"{name}: repeated", _share(shares.repeated), _share(shares.worst_repeated)))
-    return make_table(("", "share", "worst second"), rows)
+        rows.append((f"{name}: no new data", shares.no_new_data, shares.worst_no_new_data))
+        rows.append((f"{name}: repeated", shares.repeated, shares.worst_repeated))
+    return make_table(("", "share", "worst second"), [(name, *map(_share, values)) for name, *values in rows])
 
 
 def _share(share: float | None) -> str:

@@ -95,10 +95,10 @@ def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, descri
     elbow = _along((0.0, 0.0), angles[0], l1)
     tip = _along(elbow, angles[1], l2)
     reach = l1 + l2
-    touched = 0 if push is None else push.link
-    lines = (((0.0, 0.0), elbow), (elbow, tip))
-    kinds = ("link touched" if number == touched else "link" for number in (1, 2))
-    first, second = (Stroke(*line, kind) for line, kind in zip(lines, kinds, strict=True))
+    kinds = ["link", "link"]
+    if push is not None:
+        kinds[push.link - 1] = "link touched"
+    first, second = Stroke((0.0, 0.0), elbow, kinds[0]), Stroke(elbow, tip, kinds[1])
     force, arrowhead = ([], []) if push is None else _arrow(push, (first, second), angles, reach)
     tails = [stroke.start for stroke in force if stroke.kind.startswith("force")]
     xs, ys = zip((0.0, 0.0), elbow, tip, *tails, strict=True)
@@ -213,7 +213,8 @@ _PLACES: Final = {
 
 
 def _card(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, Any]:
-    entries = _found(contact) if contact.detected_s is not None else [("found", _why_not(contact))]
+    why_not = "missed" if contact.is_armed else f"detection was off: {state_words(contact.state)}"
+    entries = _found(contact) if contact.detected_s is not None else [("found", why_not)]
     entries += _torques(contact)
     if contact.link is not None:
         force = number_text(contact.true_force_N, 1, "N") if contact.true_force_N is not None else NONE
@@ -234,10 +235,6 @@ def _kind(contact: ReportedContact) -> str:
     words = [contact.level, contact.kind if contact.kind != "UNKNOWN" else None, contact.reaction]
     kind = " · ".join(word.lower().replace("_", " ") for word in words if word)
     return kind + (" · two-sided" if contact.is_two_sided else "")
-
-
-def _why_not(contact: ReportedContact) -> str:
-    return "missed" if contact.is_armed else f"detection was off: {state_words(contact.state)}"
 
 
 def _found(contact: ReportedContact) -> list[tuple[str, str]]:

@@ -101,9 +101,12 @@ def _motion(run: Run) -> Iterator[TracePanel]:
         ("dq", "Measured velocity dq", "rad/s"),
         ("tau_J", "Measured joint torque tau_J", "Nm"),
     ):
-        values = getattr(run.motion, name)
-        traces = (Trace(f"joint {j + 1}", values[:, j], FINEST[unit], f"joint{j + 1}") for j in range(JOINTS))
-        yield TracePanel(name, title, unit, tuple(traces))
+        yield TracePanel(name, title, unit, _joint_traces(getattr(run.motion, name), unit))
+
+
+def _joint_traces(values: Vector, unit: str) -> tuple[Trace, ...]:
+    """Return a trace for each joint's values (n, 2) in a unit of FINEST."""
+    return tuple(Trace(f"joint {j + 1}", values[:, j], FINEST[unit], f"joint{j + 1}") for j in range(JOINTS))
 
 
 def _residuals(run: Run) -> Iterator[TracePanel]:
@@ -166,10 +169,8 @@ def _channels(run: Run) -> Iterator[TracePanel]:
             for channel, label in enumerate(labels)
         )
         yield TracePanel(f"channels{joint + 1}", f"Residual channels, joint {joint + 1}", "Nm", traces[::-1])
-    shares = _shares(stream)
-    traces = tuple(Trace(f"joint {j + 1}", shares[:, j], FINEST["×"], f"joint{j + 1}") for j in range(JOINTS))
     title = "Largest residual over its threshold, any channel (an alarm at 1)"
-    yield TracePanel("share", title, "×", traces, levels=(1.0,), near=1.5)
+    yield TracePanel("share", title, "×", _joint_traces(_shares(stream), "×"), levels=(1.0,), near=1.5)
 
 
 def _shares(stream: CertifiedStream) -> Vector:

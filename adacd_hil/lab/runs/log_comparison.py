@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
-from adacd_hil.log.reader import LogStream, Series, begin_of_log, each_once
+from adacd_hil.log.reader import LogStream, Series, begin_of_log, each_once, report_values
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import CONTACT, CYCLE, SCHEME
 from adacd_hil.records import ContactReport, SchemeState
@@ -91,7 +91,8 @@ class RunReader:
             contacts = self._wanted(piece.series[CONTACT.name])
             self.contact_fields.update(contacts.fields)
             times_s = ((contacts.t_ns - self.zero_ns) * 1e-9).tolist()
-            self._contacts = each_once((*self._contacts, *zip(times_s, _reports(contacts), strict=True)))
+            reports = (ContactReport(**values) for values in report_values(contacts))  # enums stay numbers
+            self._contacts = each_once((*self._contacts, *zip(times_s, reports, strict=True)))
             cycles = self._wanted(piece.series[CYCLE.name])
             for name in _TIMES:
                 if name in cycles.fields:
@@ -121,13 +122,6 @@ class RunReader:
             name.removesuffix("_ns"): times.low_percentiles() if name == "slack_ns" else times.percentiles()
             for name, times in self._times.items()
         }
-
-
-def _reports(contacts: Series) -> Iterator[ContactReport]:
-    """Yield the records of /contact as reports; enums stay numbers, and fields that the log lacks have defaults."""
-    there = [name for name in ContactReport._fields if name in contacts.fields]
-    for record in contacts.records:
-        yield ContactReport(**{name: record[name].tolist() for name in there})
 
 
 def _name_of(state: int) -> str:

@@ -98,7 +98,7 @@ def _track_of(trend: Trend, name: str) -> Track:
                 traces.append(Trace("from", value - spread, _FINEST, colour, is_dashed=True))
                 traces.append(Trace("to", value + spread, _FINEST, colour, is_dashed=True))
         panels.append(TracePanel(f"{name}-{number}", each.title, "", tuple(traces)))
-    margin = (Trace("run", trend.margins[dated, 0], _FINEST, "beside"),)
+    margin = (Trace("run", trend.margins[dated], _FINEST, "beside"),)
     panels.append(TracePanel(f"{name}-margin", "Margin: smallest threshold over residual", "×", margin, levels=(1.0,)))
     return Track(name, np.array(at_s, np.float64), tuple(panels))
 

@@ -37,8 +37,8 @@ from adacd_hil.settings.configuration import Settings
 DEEPEST: Final = 4
 """Levels below a folder in which its runs are looked for."""
 GOOD, NOT_GOOD, NOT_JUDGED, BROKEN, RUNNING = STATUSES
-CERTIFIED, IDENTIFIED, TAKEN_BACK, NO_CERTIFICATE = CERTIFICATES = ("certified", "identified", "taken back", "none")
-"""`identified`: by the paper's scheme, which issues no certificates."""
+CERTIFIED, IDENTIFIED, TAKEN_BACK, NO_CERTIFICATE = "certified", "identified", "taken back", "none"
+"""States of a certificate. `identified`: by the paper's scheme, which issues no certificates."""
 _MOST_REPORT_BYTES: Final = 64 << 20
 _DATED: Final = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[-:]?(\d\d)[-:]?(\d\d)")
 _MOTION_START: Final = "-> ADAPT"
@@ -50,7 +50,7 @@ Pair = tuple[float, float]
 
 
 class CertificateState(NamedTuple):
-    """The last certificate of a run: its state, of CERTIFICATES, and when it got it, s since motion start.
+    """The last certificate of a run: its state, such as CERTIFIED, and when it got it, s since motion start.
 
     given: number of certificates of the run.
     """
@@ -337,12 +337,13 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
     armed = [contact for contact in table["contacts"] if _flag(contact["is_armed"])]
     false_alarms = table["false_alarms"]
     has_truth = false_alarms is not None
+    configured_Nm = None if summary.settings is None else summary.settings.detector.threshold_Nm
     return dataclasses.replace(
         summary,
         status=GOOD if is_good else NOT_GOOD,
         verdict=one_line(_text(table["verdict"]) + missing),
         certificate=_reported_certificate(summary, table),
-        threshold_Nm=_threshold(table) if certified is not None else _configured_threshold(summary.settings),
+        threshold_Nm=configured_Nm if certified is None else _threshold(table),
         margin=None if certified is None else _number(certified["smallest_margin"]),
         found=sum(contact["detected_s"] is not None for contact in armed),
         expected=len(armed) if has_truth else None,
@@ -385,10 +386,6 @@ def _threshold(table: Mapping[str, Any]) -> Pair | None:
             rows = [_pair(channel["threshold_Nm"]) for channel in channels]
             return min(row[0] for row in rows), min(row[1] for row in rows)
     return None
-
-
-def _configured_threshold(settings: Settings | None) -> Pair | None:
-    return None if settings is None else settings.detector.threshold_Nm
 
 
 def _first_model(table: Mapping[str, Any]) -> dict[str, Any]:

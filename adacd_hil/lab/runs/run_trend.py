@@ -64,24 +64,17 @@ class TrendQuantity:
 class Trend:
     """The runs of an arm with a judge's figures, the oldest first; left_out: its other runs.
 
-    margins (n, 1), nan where not known. sentence: on the last change of the thresholds; further: on those of friction
-    and offsets, () without runs.
+    quantities: thresholds, friction and offsets. margins (n,), nan where not known. sentence: on the last change of
+    the thresholds; further: on those of friction and offsets, () without runs.
     """
 
     arm: str
     runs: tuple[RunSummary, ...]
     left_out: tuple[RunSummary, ...]
-    thresholds: TrendQuantity
-    friction: TrendQuantity
-    offsets: TrendQuantity
+    quantities: tuple[TrendQuantity, TrendQuantity, TrendQuantity]
     margins: Vector
     sentence: str
     further: tuple[str, ...]
-
-    @property
-    def quantities(self) -> tuple[TrendQuantity, ...]:
-        """Thresholds, friction and offsets: the quantities whose changes are found."""
-        return self.thresholds, self.friction, self.offsets
 
     def by_key(self) -> dict[str, Any]:
         """Return the trend by the keys of `trend --json`: runs, margins, sentences, and values and changes by quantity.
@@ -94,11 +87,11 @@ class Trend:
             "runs": names,
             "started": [None if run.started is None else run.started.isoformat() for run in self.runs],
             "left_out": [{"run": run.name, "status": run.status, "verdict": run.verdict} for run in self.left_out],
-            "margin": _rows(self.margins),
+            "margin": self.margins,
             **{
                 each.name: {
-                    "values": _rows(each.values),
-                    "std": _rows(each.std),
+                    "values": each.values,
+                    "std": each.std,
                     "changes": [_change_json(change) for change in each.changes],
                 }
                 for each in self.quantities
@@ -136,29 +129,23 @@ def arm_of(run: RunSummary) -> str:
 def _trend(arm: str, runs: Sequence[RunSummary], threshold_share: float) -> Trend:
     """Return the trend of one arm: its judged runs, the changes of each quantity, and sentences on these."""
     judged = [run for run in runs if run.is_judged]
-    unknown = [None] * len(judged)
-    speed = f"{FRICTION_AT_RAD_S:g} rad/s"
-    thresholds = _columns([run.threshold_Nm for run in judged])
-    friction, friction_std = (
-        _columns([getattr(run, name) for run in judged]) for name in ("friction_Nm", "friction_std_Nm")
-    )
-    offset, offset_std = (_columns([getattr(run, name) for run in judged]) for name in ("offset_Nm", "offset_std_Nm"))
 
-    def quantity(name: str, title: str, values: Vector, std: Vector, share: float | None) -> TrendQuantity:
-        return TrendQuantity(name, title, values, std, _changes(judged, values, std, share))
+    def quantity(stem: str, title: str, share: float | None = None) -> TrendQuantity:
+        values, std = (_columns([getattr(run, f"{stem}{end}", None) for run in judged]) for end in ("_Nm", "_std_Nm"))
+        return TrendQuantity(f"{stem}_Nm", title, values, std, _changes(judged, values, std, share))
 
     found = (
-        quantity("threshold_Nm", "Smallest threshold, median, Nm", thresholds, _columns(unknown), threshold_share),
-        quantity("friction_Nm", f"Friction at {speed}, Nm", friction, friction_std, None),
-        quantity("offset_Nm", "Torque offset, Nm", offset, offset_std, None),
+        quantity("threshold", "Smallest threshold, median, Nm", threshold_share),  # it has no deviation
+        quantity("friction", f"Friction at {FRICTION_AT_RAD_S:g} rad/s, Nm"),
+        quantity("offset", "Torque offset, Nm"),
     )
     drifts = (_drift_sentence(found[1], "friction"), _drift_sentence(found[2], "torque offsets")) if judged else ()
     return Trend(
         arm,
         tuple(judged),
         tuple(run for run in runs if not run.is_judged),
-        *found,
-        margins=np.array([[math.nan if run.margin is None else run.margin] for run in judged]).reshape(-1, 1),
+        found,
+        margins=np.array([math.nan if run.margin is None else run.margin for run in judged]),
         sentence=_threshold_sentence(judged, found[0]),
         further=drifts,
     )
@@ -279,11 +266,6 @@ def _drift_sentence(quantity: TrendQuantity, what: str) -> str:
 def _when(run: RunSummary) -> str:
     date = "" if run.started is None else f" of {run.started:%Y-%m-%d %H:%M}"
     return f"run {run.name}{date}"
-
-
-def _rows(values: Vector) -> Vector:
-    """Return values (n, k) unchanged, but (n, 1) as (n,)."""
-    return values[:, 0] if values.shape[1] == 1 else values
 
 
 def _change_json(change: TrendChange) -> dict[str, Any]:

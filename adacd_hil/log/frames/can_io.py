@@ -42,11 +42,6 @@ def time_ns(message: can.Message) -> int:
     return round(Decimal(repr(seconds)) * 1_000_000_000)  # the digits that a text had
 
 
-def channel_name(channel: object) -> str:
-    """Return the name of a python-can channel as text; "" for None."""
-    return "" if channel is None else str(channel)
-
-
 def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
     """Convert a python-can message to a frame, and add `start_ns` to its time.
 
@@ -69,7 +64,7 @@ def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
         can_id=message.arbitration_id,
         data=data,
         length=length,
-        channel=channel_name(message.channel),
+        channel="" if message.channel is None else str(message.channel),
         is_tx=not message.is_rx,
         is_error=message.is_error_frame,
         is_extended=message.is_extended_id,

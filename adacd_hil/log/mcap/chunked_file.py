@@ -1,13 +1,13 @@
-"""An MCAP file in small chunks, by mcap's writer; a chunk, with its index, reaches the target in one write.
+"""An MCAP file in small chunks, by mcap's writer; a chunk, with its index, is handed on in one call.
 
-A damaged file needs small chunks, and CRCs of chunks and of the whole data section. A chunk ends behind a packet, so a
-target that counts packets knows which of them are on the disk.
+A damaged file needs small chunks, and CRCs of chunks and of the whole data section. A chunk ends behind a packet, so
+who counts packets knows which of them are on the disk.
 
 mcap's writer keeps 1.5 KB a chunk in memory until the file ends: 3 MB for a part of 512 MiB, some 60 MB for an hour of
 a run at 1 kHz whose parts have no limit.
 """
 
-from typing import Protocol
+from collections.abc import Callable
 
 from mcap.records import Attachment
 from mcap.writer import LIBRARY_IDENTIFIER, Writer
@@ -25,30 +25,22 @@ _UNLIMITED = 1 << 62
 """Chunk size for mcap's writer, whose own limit would end a chunk within a packet."""
 
 
-class Target(Protocol):
-    """The target that a file is written to."""
-
-    def write(self, data: bytes, packets: int = 0) -> int:
-        """Write the next bytes of the file; return their number.
-
-        packets: number of log packets that are complete with them.
-        """
-
-
 class ChunkedFile:
-    """One MCAP file that is written to a target, chunk by chunk. messages: their number so far.
+    """One MCAP file that is written chunk by chunk. messages: their number so far.
 
     Nothing of a message is written before its chunk: call `complete` at the end.
     """
 
-    def __init__(self, target: Target, profile: str = "", library: str = LIBRARY) -> None:
+    def __init__(self, write: Callable[[bytes, int], object], profile: str = "", library: str = LIBRARY) -> None:
+        """Begin a file. write: takes its next bytes, and the number of log packets that are complete with them."""
         self.messages = 0
         self.record_bytes = 0
         """Bytes of the messages so far, before compression."""
-        self._target = target
+        self._write = write
         self._stream = _Stream()
         self._chunk_full = CHUNK_BYTES  # value of `record_bytes` at which the chunk in progress is full
         self._packets = 0  # that are complete with the chunk
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._writer = Writer(self._stream, chunk_size=_UNLIMITED, enable_data_crcs=True)  # type: ignore[arg-type]
         self._writer.start(profile, library)
 
@@ -69,8 +61,10 @@ class ChunkedFile:
 
         Return its number in the file, that of an equal one if there is one.
         """
-        number: int = self._writer.register_schema(name, encoding, data)
-        return number
+        key = name, encoding, data
+        if key not in self._schemas:
+            self._schemas[key] = self._writer.register_schema(*key)
+        return self._schemas[key]
 
     def define_channel(self, topic: str, message_encoding: str, schema: int, metadata: dict[str, str]) -> int:
         """Define a channel, in the chunk in progress; return its number in the file. schema: 0 for none."""
@@ -106,13 +100,13 @@ class ChunkedFile:
         self._pass_on()
 
     def _pass_on(self, packets: int = 0) -> bool:
-        """Write to the target all bytes that mcap's writer has made since the last call.
+        """Hand on all bytes that mcap's writer has made since the last call; return False if there are none.
 
-        Return False if there are none. packets: number of log packets that are complete with them.
+        packets: number of log packets that are complete with them.
         """
         data = self._stream.take()
         if data:
-            self._target.write(data, packets)
+            self._write(data, packets)
         return bool(data)
 
 

@@ -117,17 +117,13 @@ def _decompress(compression: str, data: bytes, most_bytes: int) -> bytes:
     return opened
 
 
-def _decompressor() -> zstandard.ZstdDecompressor:
-    return zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
-
-
 def _unzstd(data: bytes, most_bytes: int) -> bytes:
     """Return zstd data decompressed, at most `most_bytes` + 1 if their size isn't stated.
 
     Raises ChunkError if they state a larger one.
     """
     size = zstandard.frame_content_size(data)
-    decompressor = _decompressor()
+    decompressor = zstandard.ZstdDecompressor(max_window_size=MOST_BYTES)
     if size > most_bytes:
         raise ChunkError(f"claims {size} bytes, more than {most_bytes}")
     if size >= 0:

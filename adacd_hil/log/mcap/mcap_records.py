@@ -13,25 +13,11 @@ import struct
 from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import IO, Any, NamedTuple
 
+from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    MessageIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-    SummaryOffset,
-)
+from mcap.records import Channel, Footer, Schema
 
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, crc32
@@ -94,22 +80,6 @@ _RUN_BYTES = 40 << 10
 """Read at once of message indexes. A chunk of ours has 33 KB of them, in 30 records."""
 _INDEX_HEAD = 6
 """Bytes of a message index before its entries: its channel, how many bytes they have."""
-_READERS: dict[int, Any] = {
-    Opcode.HEADER: Header.read,
-    Opcode.FOOTER: Footer.read,
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
-    Opcode.CHUNK: Chunk.read,
-    Opcode.MESSAGE_INDEX: MessageIndex.read,
-    Opcode.CHUNK_INDEX: ChunkIndex.read,
-    Opcode.ATTACHMENT: Attachment.read,
-    Opcode.ATTACHMENT_INDEX: AttachmentIndex.read,
-    Opcode.STATISTICS: Statistics.read,
-    Opcode.METADATA: Metadata.read,
-    Opcode.METADATA_INDEX: MetadataIndex.read,
-    Opcode.SUMMARY_OFFSET: SummaryOffset.read,
-    Opcode.DATA_END: DataEnd.read,
-}
 
 
 class RawRecord(NamedTuple):
@@ -147,6 +117,10 @@ def name_of(opcode: int) -> str:
     if opcode not in set(Opcode):
         return f"record 0x{opcode:02x}"
     return "".join(word.capitalize() for word in Opcode(opcode).name.split("_"))
+
+
+_READERS: dict[int, Any] = {opcode: getattr(records, name_of(opcode)).read for opcode in _SHAPES}
+"""mcap's classes have the names of the specification."""
 
 
 def parse(opcode: int, body: bytes) -> Any:

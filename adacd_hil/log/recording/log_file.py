@@ -216,7 +216,7 @@ class McapFile(ChunkedFile):
     def __init__(
         self, sink: Sink, channels: tuple[LogChannel, ...], attachments: dict[str, bytes], metadata: dict[str, str]
     ) -> None:
-        super().__init__(sink, ROS_PROFILE)
+        super().__init__(sink.write, ROS_PROFILE)
         self.ids: dict[int, int] = {}
         """The file's channel ids, by our channel ids."""
         self.types = {channel.id: channel.type for channel in channels}
@@ -231,13 +231,10 @@ class McapFile(ChunkedFile):
 
     def _define(self, channels: tuple[LogChannel, ...]) -> None:
         """Define schemas and channels, with which the first chunk begins; store the channels' numbers in `ids`."""
-        schemas: dict[str, int] = {}
         for channel in channels:
-            name, text = channel.type.name, channel.type.text
-            if name not in schemas:
-                schemas[name] = self.define_schema(name, "ros2msg", text.encode())
+            schema = self.define_schema(channel.type.name, "ros2msg", channel.type.text.encode())
             metadata = {QOS_KEY: "", **({FIELDS_KEY: " ".join(channel.type.fields)} if channel.type.fields else {})}
-            self.ids[channel.id] = self.define_channel(channel.topic, "cdr", schemas[name], metadata)
+            self.ids[channel.id] = self.define_channel(channel.topic, "cdr", schema, metadata)
 
     def finish(self, summary: dict[str, str]) -> None:
         """Write the chunk in progress and `summary` as metadata, then end the file."""

@@ -5,7 +5,7 @@ The order: cycle after cycle, each frame followed by its decoded message, then t
 
 import struct
 from collections import defaultdict
-from typing import Any, NamedTuple
+from typing import Any
 
 from adacd_hil.log.recording.log_file import McapFile
 from adacd_hil.log.recording.packet import Packet
@@ -17,6 +17,7 @@ from adacd_hil.log.types.message_types import (
     pack_fd_frame,
     pack_joint_state,
     pack_log,
+    pack_stamp,
 )
 from adacd_hil.log.types.topics import ChannelId
 from adacd_hil.records import JOINTS, Event
@@ -24,17 +25,8 @@ from adacd_hil.wire.bus import Frame
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 from adacd_hil.wire.message_table import MessageTable
 
-_STAMP = struct.Struct("<II")
-_BODY = len(ENCAPSULATION) + _STAMP.size
+_BODY = len(ENCAPSULATION) + len(pack_stamp(0))
 """Offset of a body in a payload, bytes: after the stamp, with which all types begin."""
-
-
-class _Decoder(NamedTuple):
-    """Decoder of a message of the DBC: our number of its topic, and the struct of its values."""
-
-    channel: int
-    message: MessageTable
-    body: struct.Struct
 
 
 class PacketWriter:
@@ -51,10 +43,7 @@ class PacketWriter:
         self._epoch_ns = epoch_ns
         self._latest_ns: dict[int, int] = defaultdict(int)  # log time of each of our channels
         self._decoders = {
-            message.can_id: _Decoder(
-                ChannelId.DECODED_FIRST + index, message, struct.Struct(f"<{len(message.signals)}d")
-            )
-            for index, message in enumerate(messages)
+            message.can_id: (channel, message) for channel, message in enumerate(messages, ChannelId.DECODED_FIRST)
         }
         scheme: Any = file.types[ChannelId.SCHEME].dtype.fields if ChannelId.SCHEME in file.types else {}
         starts = [scheme[name][1] for name in ("q", "dq", "tau_J") if name in scheme]
@@ -84,7 +73,7 @@ class PacketWriter:
             self._add_event(time_ns, Event("warning", "log", f"{missing} packets are missing before this"))
         for is_tx, frame in packet.frames:
             self._add_frame(is_tx, frame, time_ns)
-        stamp = _stamp(time_ns)
+        stamp = pack_stamp(time_ns)
         for channel, body in packet.messages:
             payload = ENCAPSULATION + stamp + body
             self._add(channel, time_ns, time_ns, payload)
@@ -116,7 +105,7 @@ class PacketWriter:
         self.frames += 1
         can_id, data, t_ns, is_error = frame
         t_ns += self._epoch_ns
-        stamp = _stamp(t_ns)
+        stamp = pack_stamp(t_ns)
         if len(data) > CLASSIC_BYTES:
             channel = ChannelId.TO_CAN_BUS_FD if is_tx else ChannelId.FROM_CAN_BUS_FD
             payload = pack_fd_frame(stamp, can_id, data, is_error)
@@ -124,13 +113,14 @@ class PacketWriter:
             channel = ChannelId.TO_CAN_BUS if is_tx else ChannelId.FROM_CAN_BUS
             payload = pack_can_frame(stamp, can_id, data, len(data), is_error)
         self._add(channel, t_ns, publish_ns, payload)
-        decoder = self._decoders.get(can_id)
-        if decoder is not None and len(data) == decoder.message.length and not is_error:
-            body = decoder.body.pack(*decoder.message.decode(data))
-            self._add(decoder.channel, t_ns, publish_ns, ENCAPSULATION + stamp + body)
+        number, message = self._decoders.get(can_id, (0, None))
+        if message is not None and len(data) == message.length and not is_error:
+            values = message.decode(data)
+            body = struct.pack(f"<{len(values)}d", *values)
+            self._add(number, t_ns, publish_ns, ENCAPSULATION + stamp + body)
 
     def _add_event(self, time_ns: int, event: Event) -> None:
-        self._add(ChannelId.EVENTS, time_ns, time_ns, pack_log(_stamp(time_ns), event))
+        self._add(ChannelId.EVENTS, time_ns, time_ns, pack_log(pack_stamp(time_ns), event))
 
     def _add(self, channel: int, t_ns: int, publish_ns: int, payload: bytes) -> None:
         """Add a message; raise its log time to the topic's last one if earlier: readers expect ascending times."""
@@ -141,8 +131,3 @@ class PacketWriter:
         self._file.add_message(number, log_ns, payload, publish_ns)
         if self.shown is not None:
             self.shown.append(LoggedMessage(number, log_ns, publish_ns, payload))
-
-
-def _stamp(time_ns: int) -> bytes:
-    """Return a time as the 8 bytes of a builtin_interfaces/Time."""
-    return _STAMP.pack(*divmod(time_ns, 1_000_000_000))

@@ -41,17 +41,21 @@ _FORMAT_VERSION = "1"
 class LogSummary(NamedTuple):
     """Result of a log. `frames` and `messages` are 0 if the writer died; `error`: in one line, or "".
 
-    is_complete: no error, and no packet dropped. parts: number of files.
+    parts: number of files.
     """
 
     path: Path  # of the first part
     frames: int
     messages: int
     dropped: int  # packets (cycles and events) that are not in the log
-    is_complete: bool
-    error: str = ""
-    parts: int = 1
-    queue_peak_bytes: int = 0  # most that the writer found waiting for it
+    error: str
+    parts: int
+    queue_peak_bytes: int  # most that the writer found waiting for it
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether there was no error, and no packet was dropped."""
+        return not self.error and self.dropped == 0
 
 
 class Recorder:
@@ -64,7 +68,7 @@ class Recorder:
         self,
         path: Path,
         *,
-        messages: Iterable[MessageTable] | None = None,
+        messages: Iterable[MessageTable] = (),
         parameter_count: int = len(PARAMETER_NAMES),
         further_count: int = 0,
         channel_count: int = 0,
@@ -78,7 +82,7 @@ class Recorder:
     ) -> None:
         """Create the file, which must not exist (see run_folder.py), and start the writer.
 
-        messages: of the DBC, by default the package's. The counts: see `run_channels`; by default those of the paper's
+        messages: of the DBC, whose frames are decoded. The counts: see `run_channels`; by default those of the paper's
         scheme. attachments, metadata: at the file's beginning. epoch_ns: added to t_ns for the log's times; 0 in
         lockstep. blocking: lockstep. channels: of a log that is no run's. settings: sizes of parts and buffer. live:
         live view to open. Raises LogExistsError if a log is there already, LogError if the file or the writer can't be
@@ -98,7 +102,7 @@ class Recorder:
         self._summary: LogSummary | None = None
         self._is_blocking = blocking
         self._unannounced = 0  # bytes in the ring since the writer was last woken
-        is_run, told = channels is None, plain_tables(_own_messages() if messages is None else messages)
+        is_run, told = channels is None, plain_tables(messages)
         try:
             channels = channels or run_channels(parameter_count, told, further_count, channel_count)
         except LogError as error:
@@ -227,18 +231,14 @@ class Recorder:
         word: the writer's last message, None if it died or is silent. Without it the writer is ended, the log is
         incomplete, its counts are 0, and the packets that it had not written count as dropped.
         """
-        error = ""
-        if word is None:
-            error = self._end_writer()
+        error = self._end_writer() if word is None else word["error"]
         self._process.wait()
         peak = self._ring.peak
         if word is not None:
-            dropped = self.dropped + int(word["lost"])
-            counts = int(word["frames"]), int(word["messages"]), dropped
-            is_complete = not word["error"] and dropped == 0
-            return LogSummary(self.path, *counts, is_complete, word["error"], int(word["parts"]), peak)
+            counts = int(word["frames"]), int(word["messages"]), self.dropped + int(word["lost"])
+            return LogSummary(self.path, *counts, error, int(word["parts"]), peak)
         self.dropped += self._ring.packets - self._ring.written
-        return LogSummary(self.path, 0, 0, self.dropped, False, error, max(1, len(find_parts(self.path))), peak)
+        return LogSummary(self.path, 0, 0, self.dropped, error, max(1, len(find_parts(self.path))), peak)
 
     def _end_writer(self) -> str:
         """Return the error of a silent writer in words: its exit status if it ends within DEATH_TIMEOUT_S.
@@ -283,10 +283,3 @@ def _create(path: Path, is_run: bool) -> int:
         raise LogExistsError(f"{path} is being written by another run; choose another folder with --out") from None
     except OSError as error:
         raise LogError(f"log {path} can't be created: {error.strerror}") from None
-
-
-def _own_messages() -> Iterable[MessageTable]:
-    # Takes 0.2 s; callers with a codec pass its messages instead.
-    from adacd_hil.wire.dbc_contract import load_codec
-
-    return load_codec().messages.values()

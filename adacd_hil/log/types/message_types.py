@@ -49,7 +49,8 @@ _PRIMITIVES = {
     "float32": "f",
     "float64": "d",
 }
-_STAMP_END = 8
+_STAMP = struct.Struct("<II")
+_STAMP_END = _STAMP.size
 _MOST_PAYLOAD_BYTES = 1 << 20
 _FIELD_LINE = re.compile(r"(?P<type>[a-z0-9]+)(\[(?P<size>[0-9]{1,9})\])?\s+(?P<name>[a-z][a-z0-9_]*)\s*(#.*)?")
 
@@ -242,6 +243,11 @@ FD_FRAME_DTYPE = np.dtype(
 """The longest payload; others end after `count` bytes of data."""
 
 LEVELS = {"info": 2, "warning": 3, "error": 4}
+
+
+def pack_stamp(time_ns: int) -> bytes:
+    """Return a time as the 8 bytes of a builtin_interfaces/Time."""
+    return _STAMP.pack(*divmod(time_ns, 1_000_000_000))
 
 
 def pack_can_frame(

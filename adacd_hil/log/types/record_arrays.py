@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from adacd_hil.log.types.message_types import FD_FRAME, LOG, MAX_DATA
 from adacd_hil.log.types.topics import FROM_CAN_BUS, FROM_CAN_BUS_FD, TO_CAN_BUS, TO_CAN_BUS_FD
 from adacd_hil.log.types.unpacking import is_log
+from adacd_hil.records import Vector
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, MAX_STANDARD_ID
 
 if TYPE_CHECKING:
@@ -70,11 +71,6 @@ FRAME_TOPICS = {
     topic.name: topic.channel().type.name for topic in (TO_CAN_BUS, FROM_CAN_BUS, TO_CAN_BUS_FD, FROM_CAN_BUS_FD)
 }
 """The topics of frames and their types."""
-
-
-def count_frames(topics: Mapping[int, str], counts: Mapping[int, int]) -> int:
-    """Return the number of bus frames in a file; topics, counts: topic and number of messages by channel id."""
-    return sum(count for channel, count in counts.items() if topics.get(channel) in FRAME_TOPICS)
 
 
 def is_of_frames(topic: Topic) -> bool:
@@ -194,19 +190,82 @@ def receivable_frames(frames: NDArray[Any]) -> NDArray[Any]:
 Numbers = NDArray[np.int64]
 
 
-class RawPiece(NamedTuple):
-    """Messages of a stretch of a log that ends with whole cycles, by topic. payloads: of the topics of varying size."""
+_NOT_FIELDS = ("record_length", "log_time", "publish_time", "sec", "nanosec")
 
-    records: dict[str, NDArray[np.uint8]]  # (n, size of a record): numpy would not copy bytes outside of fields
-    frames: NDArray[Any]  # (n,) of FRAME_DTYPE, or of LONG_FRAME_DTYPE where a frame is FD
-    payloads: dict[str, list[bytes]]
+
+class Series:
+    """The messages of one topic: `series["tau_J"]` is float64 (n, 2), a copy; a field of one number is (n,).
+
+    `series[name]` raises KeyError for an unknown field.
+    """
+
+    def __init__(self, records: NDArray[Any], epoch_ns: int) -> None:
+        self.records = records
+        """The records as they are in the file (n,), structured."""
+        self._epoch_ns = epoch_ns
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the fields, without the times."""
+        return tuple(name for name in self.records.dtype.names or () if name not in _NOT_FIELDS)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        if name not in self.fields:
+            raise KeyError(f"no field {name!r}; there are {', '.join(self.fields)}")
+        return self.records[name].copy()
+
+    @property
+    def t_ns(self) -> NDArray[np.int64]:
+        """Time of each message (n,), ns, on the clock of the run."""
+        stamp_ns = self.records["sec"].astype(np.int64) * 1_000_000_000 + self.records["nanosec"]
+        return np.asarray(stamp_ns - self._epoch_ns, np.int64)
+
+    def part(self, rows: slice | NDArray[np.bool_]) -> "Series":
+        """Return the messages in a slice, or those where a mask (n,) is True."""
+        return Series(self.records[rows], self._epoch_ns)
+
+    def between(self, first_ns: int, end_ns: int) -> "Series":
+        """Return the messages with times from `first_ns` on and before `end_ns`."""
+        t_ns = self.t_ns
+        return self.part((t_ns >= first_ns) & (t_ns < end_ns))
+
+    @property
+    def block(self) -> Vector:
+        """Float64 values of each message (n, k), from the first float64 field on: in our own topics the logged block.
+
+        (n, 0) for a topic without float64 fields.
+        """
+        fields: Mapping[str, Any] = self.records.dtype.fields or {}
+        offsets = [int(fields[name][1]) for name in self.fields if fields[name][0].base == np.dtype("<f8")]
+        if not offsets:
+            return np.empty((len(self), 0))
+        rows = np.ascontiguousarray(self.records).view(np.uint8).reshape(len(self), self.records.dtype.itemsize)
+        return rows[:, min(offsets) :].copy().view(np.float64)
+
+
+class Piece(NamedTuple):
+    """A stretch of a log that ends with whole cycles: consecutive pieces have all of it, in the order of the file.
+
+    The records of a cycle are those with one publish time, one after the other in the file. An event that happens
+    between two cycles counts as one.
+    """
+
+    series: Mapping[str, Series]
+    """Requested topics of fixed size without those of bus frames; of a stream our own ones even when empty."""
+    frames: NDArray[Any]
+    """(n,) of FRAME_DTYPE, or LONG_FRAME_DTYPE in a piece with FD frames; both ways, in the order of the bus."""
+    payloads: Mapping[str, list[bytes]]
+    """Requested topics of varying size, such as /events."""
 
 
 class PieceBuilder:
     """Gathers messages by topic, until a piece has enough cycles. The slot of a topic is its index in `topics`."""
 
     def __init__(self, cycles: int, epoch_ns: int) -> None:
-        """Gather pieces of at most `cycles` cycles; epoch_ns: subtracted from the file's times of frames."""
+        """Gather pieces of at most `cycles` cycles; epoch_ns: offset of the times in the file from t_ns."""
         self.topics: list[Topic] = []
         self.wrong = 0
         """Messages that weren't as long as their schema says."""
@@ -214,7 +273,7 @@ class PieceBuilder:
         self._epoch_ns = epoch_ns
         self._cycles = 0  # of the piece: how often the publish time has risen
         self._latest_ns = np.iinfo(np.int64).min
-        self._rows: list[list[NDArray[np.uint8]]] = []
+        self._rows: list[list[NDArray[np.uint8]]] = []  # (n, size of a record): numpy copies no bytes outside of fields
         self._payloads: list[list[bytes]] = []
         self._frames: list[NDArray[Any]] = []
 
@@ -230,7 +289,7 @@ class PieceBuilder:
         self._payloads.append([])
         return len(self.topics) - 1
 
-    def add_messages(self, contents: "Contents", messages: slice, slots: NDArray[np.int32]) -> Iterator[RawPiece]:
+    def add_messages(self, contents: "Contents", messages: slice, slots: NDArray[np.int32]) -> Iterator[Piece]:
         """Gather consecutive messages of chunks; yield each piece that is full.
 
         messages: which of `contents`. slots (n,): index in `topics` for each message; UNWANTED: it is skipped.
@@ -251,16 +310,17 @@ class PieceBuilder:
         self._gather(contents, messages.start + start, slots[start:])
         self._cycles = int(cycles[-1])
 
-    def take_piece(self) -> RawPiece:
-        """Return the records, frames and payloads gathered since the last piece, and begin a new piece."""
-        records, payloads = {}, {}
+    def take_piece(self) -> Piece:
+        """Return what has been gathered since the last piece, and begin a new piece."""
+        series, payloads = {}, {}
         for topic, rows, texts in zip(self.topics, self._rows, self._payloads, strict=True):
             if topic.dtype is None:
                 payloads[topic.name] = texts
             elif not is_of_frames(topic):
-                records[topic.name] = np.concatenate((np.empty((0, topic.dtype.itemsize), np.uint8), *rows))
+                whole = np.concatenate((np.empty((0, topic.dtype.itemsize), np.uint8), *rows))
+                series[topic.name] = Series(whole.view(topic.dtype)[:, 0], self._epoch_ns)
                 rows.clear()
-        piece = RawPiece(records, joined_frames(self._frames), payloads)
+        piece = Piece(series, joined_frames(self._frames), payloads)
         self._payloads = [[] for _ in self.topics]
         self._frames = []
         return piece

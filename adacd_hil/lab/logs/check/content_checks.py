@@ -38,11 +38,13 @@ class DefinitionCheck:
         self._findings = findings
         self._summary_only: list[tuple[str, int, int]] = []
         self._duplicates: set[str] = set()
+        self._read: set[int] = set()  # schemas whose text was read
 
     def schema(self, schema: Schema, offset: int, is_summary: bool) -> None:
         """Check a schema by the rules and against an earlier one with its number, and store it; add findings.
 
-        offset: of its record or chunk in the file. is_summary: it stands in the summary.
+        The text of the first of each number is read. offset: of its record or chunk in the file. is_summary: it stands
+        in the summary.
         """
         name = f"schema {schema.id}"
         if schema.id == 0:
@@ -53,13 +55,16 @@ class DefinitionCheck:
             self._findings.add_finding("empty-schema", f"{name} ({schema.name!r}) is empty", offset)
         known = self.schemas.get(schema.id)
         if known is not None:
-            pairs = (("name", "name"), ("encoding", "encoding"), ("data", "data"))
-            self._compare(name, known, schema, pairs, offset)
+            self._compare(name, known, schema, ("name", "encoding", "data"), offset)
         self._place("schema", schema.id, schema.id in self.schemas, offset, is_summary)
         if is_summary:
             self.summary_schemas.add(schema.id)
         else:
             self.schemas.setdefault(schema.id, schema)
+        if schema.encoding == "ros2msg" and schema.id not in self._read:
+            self._read.add(schema.id)
+            if problem := text_problem(schema.data):
+                self._findings.add_finding("schema-text", f"{name} ({schema.name}): {problem}", offset)
 
     def channel(self, channel: Channel, offset: int, is_summary: bool) -> None:
         """Check a channel by the rules and against an earlier one with its number, and store it; add findings.
@@ -69,13 +74,8 @@ class DefinitionCheck:
         name = f"channel {channel.id}"
         known = self.channels.get(channel.id)
         if known is not None:
-            pairs = (
-                ("schema", "schema_id"),
-                ("topic", "topic"),
-                ("message encoding", "message_encoding"),
-                ("metadata", "metadata"),
-            )
-            self._compare(name, known, channel, pairs, offset)
+            fields = ("schema_id", "topic", "message_encoding", "metadata")
+            self._compare(name, known, channel, fields, offset)
         is_defined = channel.schema_id in self.schemas or (is_summary and channel.schema_id in self.summary_schemas)
         if channel.schema_id and not is_defined:
             text = f"{name} ({channel.topic}) has the schema {channel.schema_id}, which is not defined"
@@ -88,14 +88,11 @@ class DefinitionCheck:
             self.channels.setdefault(channel.id, channel)
             self.all_channels[channel.id] = channel
 
-    def _compare(
-        self, name: str, known: object, other: object, pairs: tuple[tuple[str, str], ...], offset: int
-    ) -> None:
-        different = [what for what, field in pairs if getattr(known, field) != getattr(other, field)]
+    def _compare(self, name: str, known: object, other: object, fields: tuple[str, ...], offset: int) -> None:
+        different = [field for field in fields if getattr(known, field) != getattr(other, field)]
         if different:
-            self._findings.add_finding(
-                "redefinition", f"{name} is defined again with another {', '.join(different)}", offset
-            )
+            words = ", ".join(field.removesuffix("_id").replace("_", " ") for field in different)
+            self._findings.add_finding("redefinition", f"{name} is defined again with another {words}", offset)
 
     def _place(self, kind: str, number: int, is_known: bool, offset: int, is_summary: bool) -> None:
         """Note a definition that only the summary has.
@@ -129,23 +126,15 @@ class DefinitionCheck:
 
 
 class ContentCheck:
-    """Checks the messages of a file, their order and payloads, and the texts of schemas."""
+    """Checks the messages of a file, their order and payloads."""
 
     def __init__(self, findings: Findings) -> None:
         self._findings = findings
         self._described: set[int] = set()
-        self._read: set[int] = set()  # schemas
         self._latest = np.zeros(CHANNEL_NUMBERS, np.uint64)  # log time of each channel
         self._sizes = np.full(CHANNEL_NUMBERS, _ANY_SIZE, np.int64)
         self._is_cdr = np.zeros(CHANNEL_NUMBERS, np.bool_)
         self._checks: dict[int, Callable[[bytes], bool]] = {}  # of payloads that don't have that size
-
-    def schema(self, schema: Schema, offset: int) -> None:
-        """Check the text of a ros2msg schema, the first of each number only; add a finding if it can't be read."""
-        if schema.encoding == "ros2msg" and schema.id not in self._read:
-            self._read.add(schema.id)
-            if problem := text_problem(schema.data):
-                self._findings.add_finding("schema-text", f"schema {schema.id} ({schema.name}): {problem}", offset)
 
     def messages(self, contents: Contents, definitions: DefinitionCheck, offset: int) -> None:
         """Check times and cdr payloads of the messages of a chunk; add findings. offset: of the chunk in the file.

@@ -32,7 +32,7 @@ from adacd_hil.log.log_files import (
 from adacd_hil.log.log_parts import DROPPED_KEY, LOST_KEY, PLANNED_ENDINGS, missing_parts, parts_of
 from adacd_hil.log.mcap.mcap_records import RawRecord, attachment_crc_fits, crc_of, name_of, parse
 from adacd_hil.log.mcap.record_layout import HEAD, MAGIC, crc32
-from adacd_hil.log.types.record_arrays import count_frames
+from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 
 _DATA = {Opcode.CHUNK, Opcode.MESSAGE, Opcode.MESSAGE_INDEX, Opcode.ATTACHMENT, Opcode.METADATA}
 _SUMMARY = {
@@ -61,7 +61,7 @@ class _FileCheck:
         self._definitions = DefinitionCheck(self.findings)
         self._chunks = ChunkCheck(self.findings, self._definitions)
         self._summary = SummaryCheck(self.findings, self._definitions, self._chunks)
-        self._is_summary = False  # DataEnd is behind
+        self.is_ended = False  # DataEnd is behind: what follows is the summary
         self._crc = 0  # of the section so far
         self._counts = dict.fromkeys(_ONCE, 0)
         self._has_trailer = False
@@ -87,14 +87,9 @@ class _FileCheck:
             end += len(MAGIC)
         self._chunks.end_indexes()
         self._finish(end)
-        topics = {number: channel.topic for number, channel in self._definitions.channels.items()}
-        counts = {number: int(self._chunks.counts[number]) for number in topics}
-        self.messages, self.frames = int(self._chunks.counts.sum()), count_frames(topics, counts)
-
-    @property
-    def is_ended(self) -> bool:
-        """Whether the file has a DataEnd."""
-        return self._counts[Opcode.DATA_END] > 0
+        counts, channels = self._chunks.counts, self._definitions.channels
+        self.messages = int(counts.sum())
+        self.frames = sum(int(counts[number]) for number in channels if channels[number].topic in FRAME_TOPICS)
 
     def _gap(self, gap: FileGap) -> None:
         """Add a finding on bytes that form no record, and add them to the CRC."""
@@ -136,7 +131,7 @@ class _FileCheck:
             self.findings.without_crc[_DATA_SECTION] += 1
         elif stored != self._crc:
             self.findings.add_finding("data-crc", "the data section fails its CRC", record.offset)
-        self._is_summary = True
+        self.is_ended = True
         self._crc = 0
 
     def _judge(self, record: RawRecord) -> None:
@@ -148,21 +143,19 @@ class _FileCheck:
         if opcode not in set(Opcode):
             self.findings.add_finding("unknown-record", f"{name_of(opcode)} of {len(record.body)} bytes", record.offset)
             return
-        if opcode in (_DATA if self._is_summary else _SUMMARY):
-            where = "summary" if self._is_summary else "data section"
+        if opcode in (_DATA if self.is_ended else _SUMMARY):
+            where = "summary" if self.is_ended else "data section"
             self.findings.add_finding("place", f"{name_of(opcode)} in the {where}", record.offset)
             return
-        if self._is_summary:
+        if self.is_ended:
             self._summary.record(record)
         match opcode:
             case Opcode.HEADER:
                 self._header(record)
             case Opcode.SCHEMA:
-                schema = parse(opcode, record.body)
-                self._definitions.schema(schema, record.offset, self._is_summary)
-                self._chunks.content.schema(schema, record.offset)
+                self._definitions.schema(parse(opcode, record.body), record.offset, self.is_ended)
             case Opcode.CHANNEL:
-                self._definitions.channel(parse(opcode, record.body), record.offset, self._is_summary)
+                self._definitions.channel(parse(opcode, record.body), record.offset, self.is_ended)
             case Opcode.CHUNK:
                 self._chunks.chunk(record)
             case Opcode.MESSAGE_INDEX:

@@ -85,7 +85,7 @@ class ChunkCheck:
         self._findings = findings
         self._opening = Opening()
         self._definitions = definitions
-        self.content = ContentCheck(findings)
+        self._content = ContentCheck(findings)
         self._latest: ChunkFacts | None = None  # whose indexes may follow
         self._expected: dict[int, NDArray[Any]] | None = None  # entries of its indexes; None where it can't be opened
         self._offsets: dict[int, int] = {}
@@ -129,13 +129,13 @@ class ChunkCheck:
     def _compare_times(self, chunk: Chunk, contents: Contents, offset: int) -> None:
         if not len(contents.starts):
             return
-        first, last = int(contents.log_times.min()), int(contents.log_times.max())
-        if chunk.message_start_time != first:
-            text = f"a chunk begins at {chunk.message_start_time}, its earliest message at {first}"
-            self._findings.add_finding("chunk-times", text, offset)
-        if chunk.message_end_time != last:
-            text = f"a chunk ends at {chunk.message_end_time}, its latest message at {last}"
-            self._findings.add_finding("chunk-times", text, offset)
+        for verb, which, said, real in (
+            ("begins", "earliest", chunk.message_start_time, int(contents.log_times.min())),
+            ("ends", "latest", chunk.message_end_time, int(contents.log_times.max())),
+        ):
+            if said != real:
+                text = f"a chunk {verb} at {said}, its {which} message at {real}"
+                self._findings.add_finding("chunk-times", text, offset)
 
     def _expect(self, contents: Contents, facts: ChunkFacts) -> None:
         """Store the message indexes that the chunk must have, and its channels."""
@@ -203,7 +203,6 @@ class ChunkCheck:
             parsed = parse(definition.opcode, definition.body)
             if definition.opcode == Opcode.SCHEMA:
                 self._definitions.schema(parsed, offset, is_summary=False)
-                self.content.schema(parsed, offset)
             else:
                 self._definitions.channel(parsed, offset, is_summary=False)
                 if definition.offset < first_at.get(parsed.id, len(contents.data)):
@@ -219,7 +218,7 @@ class ChunkCheck:
             if len(later):
                 self.first_later_than_zero_ns = min(self.first_later_than_zero_ns, int(later.min()))
             self.end_ns = max(self.end_ns, int(contents.log_times.max()))
-            self.content.messages(contents, self._definitions, offset)
+            self._content.messages(contents, self._definitions, offset)
 
     def compare(self, index: ChunkIndex, offset: int) -> None:
         """Compare a chunk index of the summary with its chunk; add findings. offset: of the index in the file."""
@@ -243,6 +242,10 @@ class ChunkCheck:
             self._findings.add_finding("chunk-index", text, offset)
 
 
+_INDEXES: dict[int, str] = {Opcode.ATTACHMENT_INDEX: "attachment-index", Opcode.METADATA_INDEX: "metadata-index"}
+"""Indexes of single records, and their rules."""
+
+
 class SummaryCheck:
     """Compares the summary of a file with the data section.
 
@@ -254,9 +257,8 @@ class SummaryCheck:
         self._findings = findings
         self._definitions = definitions
         self._chunks = chunks
-        self._attachments: dict[int, AttachmentIndex] = {}  # the indexes that the summary must have, by offset
-        self._metadata: dict[int, MetadataIndex] = {}
-        self._attachment_count = self._metadata_count = 0
+        self._expected: dict[int, dict[int, Any]] = {opcode: {} for opcode in _INDEXES}
+        """The indexes that the summary must have, by the offset of their record."""
         self._indexed: set[int] = set()
         self._start = 0  # of the summary; 0: not reached so far
         self._groups: list[list[int]] = []  # opcode, start, end of each
@@ -264,9 +266,8 @@ class SummaryCheck:
         self._offset_start = 0
 
     def attachment(self, record: RawRecord, attachment: Attachment) -> None:
-        """Count an attachment, and store the index that the summary must have for it."""
-        self._attachment_count += 1
-        self._attachments[record.offset] = AttachmentIndex(
+        """Store the index that the summary must have for an attachment."""
+        self._expected[Opcode.ATTACHMENT_INDEX][record.offset] = AttachmentIndex(
             offset=record.offset,
             length=HEAD.size + len(record.body),
             log_time=attachment.log_time,
@@ -277,9 +278,9 @@ class SummaryCheck:
         )
 
     def metadata(self, record: RawRecord, name: str) -> None:
-        """Count a metadata record, and store the index that the summary must have for it."""
-        self._metadata_count += 1
-        self._metadata[record.offset] = MetadataIndex(record.offset, HEAD.size + len(record.body), name)
+        """Store the index that the summary must have for a metadata record."""
+        length = HEAD.size + len(record.body)
+        self._expected[Opcode.METADATA_INDEX][record.offset] = MetadataIndex(record.offset, length, name)
 
     def record(self, record: RawRecord) -> None:
         """Store the place of a record of the summary.
@@ -297,21 +298,20 @@ class SummaryCheck:
             self._groups.append([record.opcode, record.offset, record.end])
         if record.opcode == Opcode.CHUNK_INDEX:
             self._chunks.compare(parse(record.opcode, record.body), record.offset)
-        elif record.opcode == Opcode.ATTACHMENT_INDEX:
-            self._compare("attachment-index", self._attachments, parse(record.opcode, record.body), record.offset)
-        elif record.opcode == Opcode.METADATA_INDEX:
-            self._compare("metadata-index", self._metadata, parse(record.opcode, record.body), record.offset)
+        elif record.opcode in _INDEXES:
+            self._compare(record.opcode, parse(record.opcode, record.body), record.offset)
         elif record.opcode == Opcode.STATISTICS:
             if self.statistics is not None:
                 self._findings.add_finding("statistics", "there is more than one Statistics", record.offset)
             self.statistics = parse(record.opcode, record.body)
             self._check_counted_channels(self.statistics, record.offset)
 
-    def _compare(self, rule: str, expected: Mapping[int, Any], index: Any, offset: int) -> None:
-        """Compare an index of the summary with the expected ones, by offset; add a finding on a wrong or second one.
+    def _compare(self, opcode: int, index: Any, offset: int) -> None:
+        """Compare an index of an attachment or metadata with the expected ones; add a finding on a wrong or second one.
 
-        rule: "attachment-index" or "metadata-index".
+        opcode: of the index; offset: where it is in the file.
         """
+        rule, expected = _INDEXES[opcode], self._expected[opcode]
         kind = rule.removesuffix("-index")
         if index.offset in self._indexed:
             self._findings.add_finding(rule, f"the {kind} at byte {index.offset} is indexed more than once", offset)
@@ -322,8 +322,8 @@ class SummaryCheck:
             self._findings.add_finding(rule, text, offset)
         self._indexed.add(index.offset)
 
-    def _check_counted_channels(self, statistics: Statistics | None, offset: int) -> None:
-        if statistics is None or not statistics.channel_message_counts:
+    def _check_counted_channels(self, statistics: Statistics, offset: int) -> None:
+        if not statistics.channel_message_counts:
             return
         needed = {*self._definitions.channels, *statistics.channel_message_counts}
         for channel in sorted(needed - self._definitions.summary_channels):
@@ -371,12 +371,9 @@ class SummaryCheck:
             self._check_needed_channels()
         if self._chunks.has_outside and Opcode.CHUNK_INDEX in kinds:
             self._findings.add_finding("unindexed-messages", "there are messages outside chunks, which no index has")
-        for rule, opcode, expected in (
-            ("attachment-index", Opcode.ATTACHMENT_INDEX, self._attachments),
-            ("metadata-index", Opcode.METADATA_INDEX, self._metadata),
-        ):
+        for opcode, rule in _INDEXES.items():
             if opcode in kinds:
-                for offset in sorted(set(expected) - self._indexed):
+                for offset in sorted(set(self._expected[opcode]) - self._indexed):
                     self._findings.add_finding(rule, f"a record has no {rule.replace('-', ' ')}", offset)
 
     def _check_needed_channels(self) -> None:
@@ -399,8 +396,8 @@ class SummaryCheck:
         total = int(chunks.counts.sum())
         pairs = {
             "messages": (statistics.message_count, total),
-            "attachments": (statistics.attachment_count, self._attachment_count),
-            "metadata records": (statistics.metadata_count, self._metadata_count),
+            "attachments": (statistics.attachment_count, len(self._expected[Opcode.ATTACHMENT_INDEX])),
+            "metadata records": (statistics.metadata_count, len(self._expected[Opcode.METADATA_INDEX])),
             "chunks": (statistics.chunk_count, len(chunks.facts)),
         }
         for what, (said, real) in pairs.items():
