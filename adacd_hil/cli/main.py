@@ -21,7 +21,7 @@ from adacd_hil.cli.options import (
 )
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, complain
 from adacd_hil.extras import pip_command
-from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE, CommandGroup
 from adacd_hil.printable import one_line
 from adacd_hil.terminal import is_interrupted, open_terminals
 
@@ -42,7 +42,7 @@ def cli() -> None:
 
 @cli.command(epilog=EPILOG)
 @on_bus
-@click.option("--tare", type=GivenPath(dir_okay=False), help="Offsets that `adacd-hil tare` wrote.")
+@click.option("--tare", type=GIVEN_FILE, help="Offsets that `adacd-hil tare` wrote.")
 @click.option(
     "--without-anchor",
     is_flag=True,
@@ -50,7 +50,7 @@ def cli() -> None:
 )
 @click.option(
     "--history",
-    type=WrittenPath(dir_okay=False),
+    type=WRITTEN_FILE,
     help="File of the arm's certificates: the last one is compared, this run's are added.",
 )
 @click.option(

@@ -12,10 +12,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from adacd_hil.cli.completion import complete_channel, complete_configuration, complete_interface, complete_setting
+from adacd_hil.cli.completion import (
+    complete_channel,
+    complete_configuration,
+    complete_interface,
+    complete_run,
+    complete_setting,
+)
 from adacd_hil.cli.output import CommandError, ExitCode, explained
 from adacd_hil.extras import install_command
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenPath
 from adacd_hil.log.log_files import MOST_VIEWERS
 from adacd_hil.settings.toml_files import builtin_names
 
@@ -45,8 +51,25 @@ config_option = click.option(
 profile_option = click.option(
     "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
 )
-
-
+log_argument = click.argument("log", type=GIVEN_FILE, shell_complete=complete_run)
+logs_argument = click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+interface_option = functools.partial(
+    click.option,
+    "-i",
+    "--interface",
+    help="python-can interface, such as socketcan.",
+    shell_complete=complete_interface,
+)
+channel_option = functools.partial(
+    click.option,
+    "-c",
+    "--channel",
+    help="Channel of that interface, such as can0.",
+    shell_complete=complete_channel,
+)
+bitrate_option = click.option(
+    "-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it."
+)
 set_option = click.option(
     "--set",
     "changes",
@@ -64,7 +87,7 @@ def run_folder_option(name: str) -> Callable[..., Any]:
     """
     return click.option(
         "--out",
-        type=WrittenPath(file_okay=False),
+        type=WRITTEN_FOLDER,
         help=f"Folder, without a log so far; default: a new one by date, to which runs/latest and runs/{name} lead.",
     )
 
@@ -99,55 +122,18 @@ def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]
 
 
 _BUS_OPTIONS = (  # last first: click lists them the other way round
-    click.option("--dbc", type=GivenPath(dir_okay=False), help="The contract; default: the configuration's."),
+    click.option("--dbc", type=GIVEN_FILE, help="The contract; default: the configuration's."),
     profile_option,
     config_option,
-    click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it."),
+    bitrate_option,
 )
 
 
-def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
-    """Return decorators that add --channel and --interface to a command; is_required: it can't be called without."""
-    return (
-        click.option(
-            "-c",
-            "--channel",
-            required=is_required,
-            help="Channel of that interface, such as can0.",
-            shell_complete=complete_channel,
-        ),
-        click.option(
-            "-i",
-            "--interface",
-            required=is_required,
-            help="python-can interface, such as socketcan.",
-            shell_complete=complete_interface,
-        ),
-    )
-
-
-def on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
+def on_bus(command: Callable[..., ExitCode], is_required: bool = True) -> Callable[..., None]:
     """Return a command with the options of a bus; it receives a `Connection` as its first argument.
 
-    It ends the process with its exit status, as `explained`.
-    """
-    return _connected(command, is_required=True)
-
-
-def on_bus_or_url(help_text: str) -> Callable[[Callable[..., ExitCode]], Callable[..., None]]:
-    """Return a decorator that adds the options of a bus and --url to a command.
-
-    The command receives the URL as its first argument, or without --url a `Connection`. help_text: of --url.
-    """
-    url_option = click.option("--url", help=help_text)
-    return lambda command: url_option(_connected(command, is_required=False))
-
-
-def _connected(command: Callable[..., ExitCode], is_required: bool) -> Callable[..., None]:
-    """Return a command, as `explained`, with the options of a bus; it receives a `Connection`, or the URL, first.
-
-    is_required: click refuses a call without --interface or --channel; otherwise it ends with a CommandError, unless
-    there is a URL.
+    It ends the process with its exit status, as `explained`. is_required: click refuses a call without --interface or
+    --channel; otherwise it ends with a CommandError, unless there is a --url: the command then receives that first.
     """
 
     @functools.wraps(command)
@@ -172,9 +158,13 @@ def _connected(command: Callable[..., ExitCode], is_required: bool) -> Callable[
         return command(Connection(interface, channel, bitrate, config, profile, dbc), **own)
 
     decorated: Callable[..., None] = explained(connect)
-    for option in (*_BUS_OPTIONS, *_where(is_required)):
+    for option in (*_BUS_OPTIONS, channel_option(required=is_required), interface_option(required=is_required)):
         decorated = option(decorated)
     return decorated
+
+
+on_bus_or_url = functools.partial(on_bus, is_required=False)
+"""Decorates a command that has an option --url, too."""
 
 
 LIVE_ENTRY_POINTS: Final = "adacd_hil.live"

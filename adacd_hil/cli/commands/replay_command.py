@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.completion import complete_run, complete_setting
-from adacd_hil.cli.options import FiniteRange, json_option, profile_option, set_option, stretch_options
+from adacd_hil.cli.completion import complete_setting
+from adacd_hil.cli.options import FiniteRange, json_option, logs_argument, profile_option, set_option, stretch_options
 from adacd_hil.cli.output import (
     CommandError,
     ExitCode,
@@ -19,7 +19,7 @@ from adacd_hil.cli.output import (
     one_by_one,
     quoted,
 )
-from adacd_hil.given_path import GivenPath
+from adacd_hil.given_path import GIVEN_FILE, GivenPath
 from adacd_hil.log.log_files import SHOWN
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.printable import in_line
@@ -44,7 +44,7 @@ _MOST_COLUMNS = 6
 
 
 @click.command(epilog=_EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+@logs_argument
 @set_option
 @click.option(
     "--vary",
@@ -55,7 +55,7 @@ _MOST_COLUMNS = 6
 )
 @click.option("--config", metavar="NAME|FILE", help="Settings as a whole; needed for recordings without a log.")
 @profile_option
-@click.option("--dbc", type=GivenPath(dir_okay=False), help="Contract of a recording without a log.")
+@click.option("--dbc", type=GIVEN_FILE, help="Contract of a recording without a log.")
 @click.option("--against", type=GivenPath(), help="Log of the run that a recording is of, to compare with.")
 @click.option("--frames", "by_frames", is_flag=True, help="Decode the frames, and compare the arm's states, too.")
 @click.option(

@@ -6,10 +6,10 @@ from typing import Any
 
 import click
 
-from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
-from adacd_hil.cli.options import json_option
+from adacd_hil.cli.completion import complete_run
+from adacd_hil.cli.options import channel_option, interface_option, json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quoted, show, suggest
-from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE, GivenPath
 from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.plain_values import json_text
@@ -21,9 +21,9 @@ def _pair(name: str, help_text: str, kind: Any = float) -> Callable[..., Any]:
 
 
 @click.command("init", epilog=EPILOG)
-@click.argument("out", metavar="[FILE]", type=WrittenPath(dir_okay=False), default=Path("my-arm.toml"))
-@click.option("-i", "--interface", help="python-can interface; default: socketcan.", shell_complete=complete_interface)
-@click.option("-c", "--channel", help="Channel of that interface, such as can0.", shell_complete=complete_channel)
+@click.argument("out", metavar="[FILE]", type=WRITTEN_FILE, default=Path("my-arm.toml"))
+@interface_option(help="python-can interface; default: socketcan.")
+@channel_option()
 @click.option("-b", "--bitrate", type=click.IntRange(10_000, 1_000_000), help="bit/s of the bus.")
 @click.option("--no-bus", "is_busless", is_flag=True, help="Without hardware: an arm to rehearse.")
 @click.option("--from", "log", type=GivenPath(), help="Take all from the log of a run.", shell_complete=complete_run)

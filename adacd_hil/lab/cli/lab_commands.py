@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from adacd_hil.cli.completion import complete_run, complete_scenario, complete_truth
+from adacd_hil.cli.completion import complete_scenario, complete_truth
 from adacd_hil.cli.options import (
     HOST,
     PORT,
@@ -15,6 +15,7 @@ from adacd_hil.cli.options import (
     config_option,
     json_option,
     live_options,
+    logs_argument,
     on_bus,
     on_bus_or_url,
     profile_option,
@@ -33,7 +34,7 @@ from adacd_hil.cli.output import (
     print_and_write,
     writable_folder,
 )
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import WRITTEN_FILE, WRITTEN_FOLDER
 from adacd_hil.lab.cli.compare_command import compare
 from adacd_hil.lab.cli.history_command import history
 from adacd_hil.lab.cli.identify_command import identify
@@ -106,7 +107,7 @@ def demo(
 @click.option("--poses", type=int, help="Poses to measure in; default: tare.poses.")
 @click.option("--seconds", type=float, help="Measured time per pose; default: tare.window_s.")
 @click.option("--auto-zero", is_flag=True, help="Let the sensors set their own zero (0x6125) before.")
-@click.option("--out", type=WrittenPath(dir_okay=False), default=Path(TARE_NAME), show_default=True)
+@click.option("--out", type=WRITTEN_FILE, default=Path(TARE_NAME), show_default=True)
 @clock_option(default="realtime")
 @json_option
 def tare(
@@ -131,8 +132,8 @@ def tare(
 
 
 @click.command(epilog=EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
-@click.option("--out", type=WrittenPath(file_okay=False), help="Folder; default: beside each log.")
+@logs_argument
+@click.option("--out", type=WRITTEN_FOLDER, help="Folder; default: beside each log.")
 @json_option
 @explained
 @stretch_options
@@ -154,12 +155,12 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Ti
 
 
 @click.command(epilog=EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+@logs_argument
 @rate_option
-@click.option("--out", type=WrittenPath(dir_okay=False), help="Write the thresholds here, as TOML.")
+@click.option("--out", type=WRITTEN_FILE, help="Write the thresholds here, as TOML.")
 @click.option(
     "--report",
-    type=WrittenPath(file_okay=False),
+    type=WRITTEN_FOLDER,
     help="Compare the detectors; JSON, PNG and SVG go here.",
 )
 @json_option
@@ -203,7 +204,7 @@ def thresholds(
 @click.option(
     "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the climbs' starting points."
 )
-@click.option("--out", type=WrittenPath(dir_okay=False), help="Write a configuration with it here.")
+@click.option("--out", type=WRITTEN_FILE, help="Write a configuration with it here.")
 @json_option
 @explained
 def excitation(
@@ -286,7 +287,7 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 @on_bus
 @click.option("--seconds", type=FiniteRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test.")
 @click.option("--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: the arm isn't held.")
-@click.option("--out", type=WrittenPath(file_okay=False), help="Folder for a log; default: none.")
+@click.option("--out", type=WRITTEN_FOLDER, help="Folder for a log; default: none.")
 @json_option
 def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
     """Test the connection: cycles at zero torque, and the share of them that brings complete fresh data.
@@ -318,7 +319,8 @@ def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode
 
 
 @click.command(epilog=EPILOG)
-@on_bus_or_url(f"Watch the live view of a run instead, such as ws://{HOST}:{PORT}.")
+@click.option("--url", help=f"Watch the live view of a run instead, such as ws://{HOST}:{PORT}.")
+@on_bus_or_url
 @click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
 @click.option("--once", is_flag=True, help=f"Listen for {PLAIN_S:g} s, print one table, end.")
 @click.option("--seconds", type=FiniteRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")

@@ -10,11 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
-from adacd_hil.cli.options import FiniteRange, json_option
+from adacd_hil.cli.options import (
+    FiniteRange,
+    bitrate_option,
+    channel_option,
+    interface_option,
+    json_option,
+    log_argument,
+)
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.given_path import GivenPath
 from adacd_hil.lab.cli.log_command import dbc_option, find_dbc
 from adacd_hil.printable import in_line
 from adacd_hil.scheduling import freeze_garbage, request_realtime
@@ -45,18 +50,10 @@ def hex_id(text: str) -> int:
 
 
 @click.command("play", epilog=EPILOG)
-@click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
-@click.option(
-    "-i",
-    "--interface",
-    required=True,
-    help="python-can interface, such as socketcan.",
-    shell_complete=complete_interface,
-)
-@click.option(
-    "-c", "--channel", required=True, help="Channel of that interface, such as vcan0.", shell_complete=complete_channel
-)
-@click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it.")
+@log_argument
+@interface_option(required=True)
+@channel_option(required=True, help="Channel of that interface, such as vcan0.")
+@bitrate_option
 @click.option("--fd", "is_fd", is_flag=True, help="Open the bus for CAN FD; default: as the contract is.")
 @click.option(
     "--speed",

@@ -20,7 +20,7 @@ from adacd_hil.cli.output import (
     explained,
     format_table,
 )
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import WRITTEN_FILE, GivenPath
 from adacd_hil.lab.stated_bounds import MEANT_SHARE, STATUSES, THRESHOLD_SHARE
 from adacd_hil.log.log_files import LOG_NAME, LogError
 from adacd_hil.printable import in_line
@@ -111,14 +111,14 @@ _folder_argument = click.argument("folder", type=GivenPath(file_okay=False), def
     "--verdict", "statuses", multiple=True, type=click.Choice(STATUSES), help="Runs with this verdict; repeatable."
 )
 @click.option("--judge", "is_judging", is_flag=True, help="Read the whole log of each run without a report.")
-@click.option("--csv", "csv_path", type=WrittenPath(dir_okay=False), help="Write the table here.")
+@click.option("--csv", "csv_path", type=WRITTEN_FILE, help="Write the table here.")
 @click.option(
     "--parquet",
     "parquet_path",
-    type=WrittenPath(dir_okay=False),
+    type=WRITTEN_FILE,
     help="Write the table here as Parquet, for DuckDB and others.",
 )
-@click.option("--html", "html_path", type=WrittenPath(dir_okay=False), help="Write a page that leads to the reports.")
+@click.option("--html", "html_path", type=WRITTEN_FILE, help="Write a page that leads to the reports.")
 @json_option
 @_filtered
 def runs(
@@ -160,9 +160,7 @@ def runs(
     show_default=True,
     help=f"A threshold that differs by more than this share has changed; {MEANT_SHARE:g} of it where settings have.",
 )
-@click.option(
-    "--out", type=WrittenPath(dir_okay=False), metavar="FILE.html", help="Write a page with its curves and tables."
-)
+@click.option("--out", type=WRITTEN_FILE, metavar="FILE.html", help="Write a page with its curves and tables.")
 @json_option
 @_filtered
 def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "RunFilter") -> ExitCode:

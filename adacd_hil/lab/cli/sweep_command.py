@@ -12,7 +12,7 @@ import click
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
 from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained
-from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenPath
 from adacd_hil.log.log_files import LOG_NAME, SHOWN
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
@@ -64,7 +64,7 @@ _SEEDS = "1"
 @click.option("--tls-ca-file", type=GIVEN_FILE, help="For tls://: CA that signs the cluster's certificates; PEM.")
 @click.option("--tls-cert", type=GIVEN_FILE, help="For tls://: this client's certificate; PEM.")
 @click.option("--tls-key", type=GIVEN_FILE, help="For tls://: its key, unless the certificate's file has it; PEM.")
-@click.option("--out", required=True, type=WrittenPath(file_okay=False), help="Folder of the results.")
+@click.option("--out", required=True, type=WRITTEN_FOLDER, help="Folder of the results.")
 @json_option
 @explained
 def sweep(
