@@ -2,7 +2,8 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +15,9 @@ from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line
+
+if TYPE_CHECKING:
+    from adacd_hil.cli.connection import Connection
 
 
 def _pair(name: str, help_text: str, kind: Any = float) -> Callable[..., Any]:
@@ -74,17 +78,18 @@ def init(
     On a terminal, asks for values without an option. Scans the bus by SDO uploads only; never enables a drive. Unknown
     values are guesses, listed in the file as `assumed`; `doctor` asks for each.
     """
-    from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
+    from adacd_hil.cli.connection import Connection
+    from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting
     from adacd_hil.lab.cli.logged_arm import draft_from_log
 
     interview = Interview(takes_proposals)
     writing = DraftFiles(out, is_forced)
     writing.require_free(out)
-    options = InitOptions(**given)
+    options = SimpleNamespace(**given)
     if log is None:
         text, summary = Drafting(options, interview, writing).draft()
     else:
-        text, summary = draft_from_log(log, options, interview, writing)
+        text, summary = draft_from_log(log, options, writing)
     bus, code = summary.pop("bus", None), ExitCode.OK
     if doctor and bus is None:
         raise CommandError("--doctor needs a bus: run `adacd-hil doctor` where the arm is", ExitCode.USAGE)
@@ -100,11 +105,9 @@ def init(
         if not as_json:
             show(report.as_text())
     if bus is not None and interview.confirm(doctor, "Check host, bus and arm now (`doctor`)?"):
-        from adacd_hil.cli.connection import Connection
         from adacd_hil.lab.cli import doctor_command
 
-        connection = Connection(bus["interface"], bus["channel"], bus["bitrate"], str(out), None, None)
-        findings, doctor_code = doctor_command.examine(connection, False)
+        findings, doctor_code = doctor_command.examine(bus, False)
         code = code or doctor_code
         summary["doctor"] = doctor_command.as_json(findings)
         if not as_json:
@@ -112,7 +115,7 @@ def init(
     if as_json:
         print(json_text(summary))
     else:
-        suggest(*next_of_init(str(out), bus))
+        suggest(*_next(bus or Connection("socketcan", "can0", None, str(out), None, None)))
     return code
 
 
@@ -125,19 +128,13 @@ def as_text(summary: dict[str, Any]) -> str:
     return "\n".join(map(in_line, lines))
 
 
-def next_of_init(file: str, bus: dict[str, Any] | None) -> tuple[str, ...]:
-    """Return the commands to suggest after a draft, from rehearsal to the first run. file: the configuration.
-
-    bus: interface, channel and bitrate on which the arm was found; None: socketcan's can0.
-    """
-    from adacd_hil.cli.connection import Connection
-
-    bus = bus or {"interface": "socketcan", "channel": "can0", "bitrate": None}
-    arm = Connection(bus["interface"], bus["channel"], bus["bitrate"], file, None, None).arguments
-    tare = quoted(Path(file).with_name(TARE_NAME))
+def _next(arm: "Connection") -> tuple[str, ...]:
+    """Return the commands to suggest after a draft of an arm, from rehearsal to the first run."""
+    file = Path(arm.config)
+    tare = quoted(file.with_name(TARE_NAME))
     return (
-        f"adacd-hil demo --config {quoted(Path(file))}   # rehearse",
-        f"adacd-hil doctor {arm}",
-        f"adacd-hil tare {arm} --out {tare}   # the zero of the torque sensors; don't touch the arm",
-        f"adacd-hil run {arm} --tare {tare}   # moves the arm",
+        f"adacd-hil demo --config {quoted(file)}   # rehearse",
+        f"adacd-hil doctor {arm.arguments}",
+        f"adacd-hil tare {arm.arguments} --out {tare}   # the zero of the torque sensors; don't touch the arm",
+        f"adacd-hil run {arm.arguments} --tare {tare}   # moves the arm",
     )
