@@ -29,7 +29,7 @@ def judge(
     period_us: int | None,
     bitrate: int | None,
     data_bitrate: int | None,
-    arms: int | None = None,
+    arms: int | None,
 ) -> tuple[Codec, Budget, list[str]]:
     """Compute whether the frames of a contract meet their deadlines; return its codec, the budget, and remarks.
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -50,7 +50,6 @@ from adacd_hil.settings.toml_text import to_toml
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
-    from adacd_hil.control.session import LiveView
     from adacd_hil.log.time_window import TimeWindow
 
 
@@ -77,17 +76,7 @@ if TYPE_CHECKING:
 @json_option
 @explained
 @live_options
-def demo(
-    config: str,
-    scenario: str,
-    truth: str | None,
-    out: Path | None,
-    seed: int | None,
-    clock: str,
-    profile: str | None,
-    as_json: bool,
-    live: "LiveView | None",
-) -> ExitCode:
+def demo(as_json: bool, **options: Any) -> ExitCode:
     """Play the paper's experiment, or another scenario, with an emulated arm in this process, and report it.
 
     The arm is that of the configuration: a file of your own arm is rehearsed; missing values are assumed, and listed.
@@ -97,7 +86,7 @@ def demo(
     """
     from adacd_hil.lab.cli.demo_command import next_of_report, play
 
-    report, code = play(config, scenario, profile, seed, clock, out, live, truth)
+    report, code = play(**options)
     answer(as_json, report.content, report.as_text(), *next_of_report(report.html_path))
     return code
 
@@ -110,15 +99,7 @@ def demo(
 @click.option("--out", type=WRITTEN_FILE, default=Path(TARE_NAME), show_default=True)
 @clock_option(default="realtime")
 @json_option
-def tare(
-    connection: "Connection",
-    poses: int | None,
-    seconds: float | None,
-    auto_zero: bool,
-    out: Path,
-    clock: str,
-    as_json: bool,
-) -> ExitCode:
+def tare(connection: "Connection", out: Path, as_json: bool, **options: Any) -> ExitCode:
     """Measure the offsets of the joint torque sensors at rest, with the drives disabled, and store them.
 
     With more than one pose, the arm is moved by hand in between. Exit status 1: refused, for the reason given; the
@@ -126,7 +107,7 @@ def tare(
     """
     from adacd_hil.lab.cli.tare_command import as_text, tare_on_bus
 
-    found, backup = tare_on_bus(connection, clock, out, poses, seconds, auto_zero)
+    found, backup = tare_on_bus(connection, out, **options)
     answer(as_json, {"file": out, "backup": backup, **vars(found)}, as_text(found, out, backup))
     return ExitCode.OK
 
@@ -166,14 +147,7 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Ti
 @json_option
 @explained
 @stretch_options
-def thresholds(
-    logs: tuple[Path, ...],
-    rate_per_h: float,
-    out: Path | None,
-    report: Path | None,
-    as_json: bool,
-    stretch: "TimeWindow",
-) -> ExitCode:
+def thresholds(out: Path | None, report: Path | None, as_json: bool, **options: Any) -> ExitCode:
     """Find every detector's thresholds for a rate of false alarms, from contact-free motion in these logs.
 
     Each comes with the cause that limits it, and with the rate that half of the motion predicts for the other half.
@@ -183,7 +157,7 @@ def thresholds(
     from adacd_hil.lab.thresholds.detector_comparison import write_comparison
 
     with writable_folder(out):
-        found, comparison = command.find(logs, rate_per_h, report is not None, stretch)
+        found, comparison = command.find(is_compared=report is not None, **options)
         text = command.as_json(found, comparison) if as_json else command.as_text(found, comparison)
         print_and_write(text, out, to_toml(found), as_json)
     if report is not None and comparison is not None:
@@ -207,9 +181,7 @@ def thresholds(
 @click.option("--out", type=WRITTEN_FILE, help="Write a configuration with it here.")
 @json_option
 @explained
-def excitation(
-    config: str, profile: str | None, seconds: float, seed: int, out: Path | None, as_json: bool
-) -> ExitCode:
+def excitation(config: str, out: Path | None, as_json: bool, **options: Any) -> ExitCode:
     """Search the motion that identifies a model soonest, within the limits of the arm and its trajectory.
 
     Prints the figures of the configuration's excitation beside those of the one found.
@@ -218,7 +190,7 @@ def excitation(
     from adacd_hil.plain_values import json_text
 
     with writable_folder(out):
-        found = command.search(config, profile, seconds, seed, out)
+        found = command.search(config, out, **options)
         text = json_text(found) if as_json else command.as_text(found)
         print_and_write(text, out, command.as_toml(config, found["excitation"]), as_json)
     return ExitCode.OK
@@ -245,19 +217,11 @@ def excitation(
 )
 @json_option
 @explained
-def budget(
-    dbc: str | None,
-    config: str,
-    period_us: int | None,
-    bitrate: int | None,
-    data_bitrate: int | None,
-    arms: int | None,
-    as_json: bool,
-) -> ExitCode:
+def budget(as_json: bool, **options: Any) -> ExitCode:
     """Check whether the frames of a contract meet their deadlines: bits, response times, time left for the host."""
     from adacd_hil.lab.cli import budget_command as budgets
 
-    found = budgets.judge(dbc, config, period_us, bitrate, data_bitrate, arms)
+    found = budgets.judge(**options)
     answer(as_json, budgets.as_json(*found), budgets.as_text(*found))
     return ExitCode.OK if found[1].is_fit else ExitCode.FAILURE
 
@@ -289,14 +253,14 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 @click.option("--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: the arm isn't held.")
 @click.option("--out", type=WRITTEN_FOLDER, help="Folder for a log; default: none.")
 @json_option
-def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
+def commtest(connection: "Connection", as_json: bool, **options: Any) -> ExitCode:
     """Test the connection: cycles at zero torque, and the share of them that brings complete fresh data.
 
     The drives are not enabled unless asked for.
     """
     from adacd_hil.lab.cli.commtest_command import as_text, run_commtest
 
-    result, code = run_commtest(connection, seconds, is_enabling, out)
+    result, code = run_commtest(connection, **options)
     answer(as_json, result, as_text(result))
     return code
 

@@ -55,36 +55,34 @@ def as_text(tare: Tare, path: Path, backup: Path | None) -> str:
 
 def tare_on_bus(
     connection: Connection,
-    clock_name: str,
     out: Path,
+    clock: str,
     poses: int | None,
     seconds: float | None,
-    is_auto_zeroing: bool,
+    auto_zero: bool,
 ) -> tuple[Tare, Path | None]:
     """Tare the sensors of an arm on a bus, and write file `out`; return the tare, and the copy of an older file.
 
     The copy is None without one. poses, seconds: number of poses, and time per pose; None: those of the configuration.
-    clock_name: "lockstep" or "realtime". is_auto_zeroing: the sensors set their own zero first. Raises CommandError if
+    clock: "lockstep" or "realtime". auto_zero: the sensors set their own zero first. Raises CommandError if
     the tare is refused or the arm not found; ConfigError, CodecError if configuration, contract or an older file can't
     be used; BusError if the bus fails; OSError if the file can't be written.
     """
     interface, channel = connection.interface, connection.channel
-    check_clock(clock_name, interface, channel)
+    check_clock(clock, interface, channel)
     settings = _with_options(connection.settings(), poses, seconds)
-    check_shared(clock_name, settings)
+    check_shared(clock, settings)
     # A file that isn't a tare is not overwritten.
     old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
     devices = place_devices(settings)
     codec = load_contract(settings, devices)
-    clock = make_clock(clock_name)
-    bus = connection.open(clock, codec, settings, devices)
+    timer = make_clock(clock)
+    bus = connection.open(timer, codec, settings, devices)
     try:
         with Progress() as progress, closing(bus):
-            if not isinstance(clock, VirtualClock):
-                refuse_company(bus, clock, settings, codec, devices)
-            session = TareSession(
-                settings, codec, devices, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress
-            )
+            if not isinstance(timer, VirtualClock):
+                refuse_company(bus, timer, settings, codec, devices)
+            session = TareSession(settings, codec, devices, bus, timer, interface, old_offset_Nm, auto_zero, progress)
             with never_stopped(), on_interrupt(session.interrupt, signal.SIGTSTP):
                 tare = session.run()
     except TareRefusedError as reason:

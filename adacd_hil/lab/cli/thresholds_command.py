@@ -7,13 +7,13 @@ from adacd_hil.lab.cli.given_logs import different_logs
 from adacd_hil.lab.score.rates import CONFIDENCE_TEXT
 from adacd_hil.lab.thresholds.detector_comparison import Comparison, compare_detectors
 from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
-from adacd_hil.log.time_window import WHOLE, TimeWindow
+from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.plain_values import json_text
 from adacd_hil.progress_lines import Progress
 
 
 def find(
-    logs: tuple[Path, ...], rate_per_h: float, is_compared: bool, stretch: TimeWindow = WHOLE
+    logs: tuple[Path, ...], rate_per_h: float, is_compared: bool, stretch: TimeWindow
 ) -> tuple[Thresholds, Comparison | None]:
     """Return the thresholds of all detectors for a rate of false alarms, from contact-free motion in logs.
 
