@@ -301,13 +301,13 @@ def monitor(
 
     listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
     if not isinstance(place, str):
-        return watch(place, node_id, listened_s, listened_s is None, as_json)
+        return watch(place, node_id, listened_s, as_json)
     if node_id is not None:
         raise CommandError("--node has no effect with --url", ExitCode.USAGE)
     require_extra("--url", "websockets")
     from adacd_hil.lab.cli.live_monitor import watch_live
 
-    return watch_live(place, listened_s, listened_s is None, as_json)
+    return watch_live(place, listened_s, as_json)
 
 
 COMMANDS: Final[Sequence[click.Command]] = (
