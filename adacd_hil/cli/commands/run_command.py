@@ -23,7 +23,7 @@ from adacd_hil.cli.connection import (
     on_interrupt,
 )
 from adacd_hil.cli.console_operator import ConsoleOperator
-from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
+from adacd_hil.cli.output import CommandError, ExitCode, exit_code, is_terminal, quoted, run_folder, text_of
 from adacd_hil.clock import wall_ns
 from adacd_hil.control.configuration_check import guesses_in_brief
 from adacd_hil.control.history_file import Origin, UsedHistory, use_history
@@ -117,7 +117,7 @@ def run_on_bus(
         drop_old_frames(bus, interface)
         operator: Operator = ScriptedOperator(settings.operator)
         progress = stack.enter_context(Progress())
-        if sys.stdin is not None and sys.stdin.isatty():
+        if is_terminal():
             operator = ConsoleOperator(ScriptedOperator(settings.operator), tell=progress)
         session = Session(
             settings,
@@ -158,7 +158,7 @@ def ask_first_run(history: UsedHistory) -> None:
 
     Do nothing if the arm has a history, or without a terminal.
     """
-    if not history.is_first_run or sys.stdin is None or not sys.stdin.isatty():
+    if not history.is_first_run or not is_terminal():
         return
     print(
         f"{history.path} does not exist: this is the arm's first run.\nA touch while it learns would be learnt as "
@@ -183,7 +183,7 @@ def ask_without_anchor(joints: list[int], arguments: str) -> None:
         "`arm.holding_torque_Nm` is unknown or large"
     )
     remedy = f"`adacd-hil tare {arguments}` first, then `run --tare tare.toml`"
-    if sys.stdin is None or not sys.stdin.isatty():
+    if not is_terminal():
         raise CommandError(f"{unknown}; {remedy}, or `run --without-anchor`", ExitCode.USAGE)
     print(
         in_line(
@@ -263,4 +263,4 @@ def as_text(result: dict[str, Any]) -> str:
         for what, shares in (("no frame in time", data["no_new_data"]), ("repeated frames", data["repeated"])):
             lines += [f"{name}: {what} in {share:.2%} of the cycles" for name, share in shares.items() if share]
         lines += [f"over its limit: {line}" for line in data["excesses"]]
-    return "\n".join(in_line(line) for line in lines)
+    return text_of(lines)

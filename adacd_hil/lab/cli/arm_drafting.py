@@ -278,11 +278,12 @@ class Drafting:
         keys: dict[str, None] = {}
         for kind, names in ((DRIVE, facts.drive.value), (SENSOR, facts.sensor.value)):
             for joint, name in enumerate(names):
-                draft = self._drafts.get((kind, joint))
-                if draft is not None and name not in profile_names():
-                    keys |= dict.fromkeys(f"{name}: {key}" for key in draft.guessed)
-                elif name in profile_names():
-                    keys |= dict.fromkeys(f"{name}: {key}" for key in load_profile(name, kind).settings.assumed)
+                guessed: Iterable[str] = ()
+                if name in profile_names():
+                    guessed = load_profile(name, kind).settings.assumed
+                elif (kind, joint) in self._drafts:
+                    guessed = self._drafts[kind, joint].guessed
+                keys |= dict.fromkeys(f"{name}: {key}" for key in guessed)
         return list(keys)
 
     # -- devices

@@ -9,12 +9,11 @@ import click
 
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import channel_option, interface_option, json_option
-from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quoted, show, suggest
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quoted, show, suggest, text_of
 from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE, GivenPath
 from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.plain_values import json_text
-from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
@@ -125,7 +124,7 @@ def as_text(summary: dict[str, Any]) -> str:
     lines += [f"warning: {line}" for line in summary["warnings"]]
     if summary["assumed"]:
         lines.append(f"guesses, which `adacd-hil doctor` asks for: {', '.join(summary['assumed'])}")
-    return "\n".join(map(in_line, lines))
+    return text_of(lines)
 
 
 def _next(arm: "Connection") -> tuple[str, ...]:

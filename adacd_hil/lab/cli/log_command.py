@@ -17,6 +17,7 @@ from adacd_hil.cli.output import (
     format_table,
     one_by_one,
     tell,
+    text_of,
 )
 from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE, CommandGroup, WrittenPath
 from adacd_hil.printable import in_line
@@ -215,7 +216,7 @@ def check_as_text(check: "LogCheck") -> str:
         lines.append(f"and {left_out} more of these")
     verdict = "clean" if not check.errors + check.warnings else f"{check.errors} errors, {check.warnings} warnings"
     lines.append(f"{check.path}: {verdict}; {check.messages} messages in {check.files} files")
-    return "\n".join(in_line(line) for line in lines)
+    return text_of(lines)
 
 
 def _recovery(recovery: "LogRecovery") -> dict[str, Any]:
@@ -247,7 +248,7 @@ def recovery_as_text(recovery: "LogRecovery") -> str:
     if recovery.losses.unvouched:
         lines.append(f"{recovery.losses.unvouched} messages are unchecked: {recovery.path.name} has no checksums")
     lines.append(f"lost: {lost}" if lost else "nothing was lost")
-    return "\n".join(in_line(line) for line in lines)
+    return text_of(lines)
 
 
 TABLES = ("parquet", "csv")

@@ -84,12 +84,8 @@ def _differences(settings: Settings, base: str, path: Path, warnings: list[str])
             continue
         comment = f"{known.meaning}: as in {path.name}"
         entries.append(Entry(key, value, comment, key in settings.assumed))
-    entries += [Entry(key, None, "not known", True) for key in settings.assumed if _is_unset(settings, key)]
-    return entries
-
-
-def _is_unset(settings: Settings, key: str) -> bool:
-    return key in known_keys() and value_of(settings, key) is None
+    unset = (key for key in settings.assumed if key in known_keys() and value_of(settings, key) is None)
+    return [*entries, *(Entry(key, None, "not known", True) for key in unset)]
 
 
 def _placed(entry: Entry, files: DraftFiles, options: SimpleNamespace) -> Entry:

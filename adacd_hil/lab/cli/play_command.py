@@ -18,10 +18,9 @@ from adacd_hil.cli.options import (
     json_option,
     log_argument,
 )
-from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained, text_of
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.cli.log_command import dbc_option, find_dbc
-from adacd_hil.printable import in_line
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.can_interface import is_virtual
@@ -253,7 +252,7 @@ def _as_text(described: dict[str, Any]) -> str:
         lines.append(f"{described['unsendable']} frames can't be sent: remote, error or short FD frames")
     if described["problem"]:
         lines.append(f"warning: {described['problem']}")
-    return "\n".join(in_line(line) for line in lines)
+    return text_of(lines)
 
 
 def may_move_an_arm(interface: str, channel: str) -> bool:

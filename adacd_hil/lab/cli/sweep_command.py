@@ -11,10 +11,9 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained
+from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained, text_of
 from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenPath
 from adacd_hil.log.log_files import LOG_NAME, SHOWN
-from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 
 if TYPE_CHECKING:
@@ -131,7 +130,7 @@ def sweep(
     lines = [verdict, *(f"{key}: {value}" for key, value in result.items()), *notes[:SHOWN]]
     if len(notes) > SHOWN:
         lines.append(f"and {len(notes) - SHOWN} more notes, see the table")
-    answer(as_json, result | {"notes": notes}, "\n".join(map(in_line, lines)), _next(table, outcome.failed))
+    answer(as_json, result | {"notes": notes}, text_of(lines), _next(table, outcome.failed))
     return ExitCode.PARTIAL if outcome.failed or notes else ExitCode.OK
 
 

@@ -5,7 +5,7 @@ from contextlib import closing
 from pathlib import Path
 
 from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
-from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode, text_of
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
@@ -14,7 +14,6 @@ from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.lab.commission.tare import TareRefusedError
 from adacd_hil.lab.commission.tare_session import TareSession
-from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.setting_keys import apply_settings
@@ -50,7 +49,7 @@ def as_text(tare: Tare, path: Path, backup: Path | None) -> str:
         lines.append("gravity ({}): a4 = {:.4f} Nm, a5 = {:.4f} Nm".format(tare.gravity_model, *tare.gravity_Nm))
     kept = "" if backup is None else f"; the one before is {backup}"
     lines.append(f"{path}{kept}")
-    return "\n".join(in_line(line) for line in lines)
+    return text_of(lines)
 
 
 def tare_on_bus(
