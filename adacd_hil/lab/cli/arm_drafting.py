@@ -242,9 +242,8 @@ class Drafting:
         for question in _QUESTIONS:
             if (given := question.given(self.options)) is None:
                 continue
-            key = question.key.partition(".")[2]
             named = names[question.kind].value
-            owned = [getattr(self._profile(question.kind, named[i], i).scale, key) for i in range(2)]
+            owned = [getattr(self._profile(question.kind, named[i], i).scale, question.name) for i in range(2)]
             wrong = [
                 joint
                 for joint, value in enumerate(question.read(given))
@@ -255,7 +254,7 @@ class Drafting:
             if len(wrong) > (1 if question.units else 0):
                 joint = wrong[0]
                 raise CommandError(
-                    f"{question.option.split()[0]}: profile {named[joint]} of joint {joint + 1} has its "
+                    f"{question.option}: profile {named[joint]} of joint {joint + 1} has its "
                     f"own `{question.key}` = {owned[joint]:g}; correct it in a profile that `extends` that one, or "
                     f"give the EDS, --{question.kind}-eds FILE",
                     ExitCode.USAGE,
@@ -543,7 +542,7 @@ class Drafting:
             if question.option not in self._answers:
                 proposal = Fact(question.propose(guessed.get(question.key, 1.0)))
                 self._answers[question.option] = self.interview.ask(
-                    question.option,
+                    f"{question.option} {'UNIT' if question.units else 'A B'}",
                     question.given(self.options),
                     question.text,
                     question.read,
@@ -857,7 +856,7 @@ def _both(values: Iterable[float | None]) -> Pair | None:
 
 _ESSENTIAL = {"scale.increments_per_joint_rev", "scale.torque_Nm", "scale.rated_torque_count_Nm"}
 """Keys of a profile that, as guesses, make `devices` of the configuration a guess, too."""
-_VELOCITY_UNITS = {
+_VELOCITY_UNITS: dict[str, float] = {
     "increment/s": 0x00B50300,
     "rpm": 0x00B44700,
     "0.1rpm": 0xFFB44700,
@@ -872,25 +871,30 @@ _TORQUE_UNITS_NM = {"mNm": 1e-3, "µNm": 1e-6, "uNm": 1e-6, "Nm": 1.0, "0.01Nm":
 class ScaleQuestion:
     """A question about a value that an EDS may leave open. kind: of the device.
 
-    key: in its profile, such as "scale.torque_Nm". option: that answers it, with the names of its values, such as
-    "--gear A B". explanation: printed on `?`. units: for a question about a unit, the worth of each name.
+    name: in `scale` of its profile, such as "torque_Nm". option: that answers it. explanation: printed on `?`. units:
+    for a question about a unit, the worth of each name.
     """
 
     kind: str
-    key: str
+    name: str
     option: str
     text: str
     explanation: str
     units: dict[str, float] = field(default_factory=dict)
 
     @property
+    def key(self) -> str:
+        """Key of the value in the profile."""
+        return f"scale.{self.name}"
+
+    @property
     def answer(self) -> str:
         """Key of the answer in `answers` of `draft_profile`."""
-        return "velocity_unit" if self.key == "scale.velocity_rad_s" else self.key.partition(".")[2]
+        return "velocity_unit" if self.name == "velocity_rad_s" else self.name
 
     def given(self, options: SimpleNamespace) -> Any:
         """Return the value of the question's option, None if the option is absent."""
-        return getattr(options, self.option.split()[0].lstrip("-").replace("-", "_"))
+        return getattr(options, self.option.lstrip("-").replace("-", "_"))
 
     def propose(self, value: float) -> Any:
         """Return a guessed value as an answer to the question: for both joints, or as the name of its unit.
@@ -907,62 +911,61 @@ class ScaleQuestion:
         Raises ConfigError for an unknown unit, no two numbers, or a value that a profile doesn't accept.
         """
         if not self.units:
-            first, second = _numbers(value, float, self.option.split()[0])
+            first, second = _numbers(value, float, self.option)
         elif value in self.units:
             first = second = self.units[value]
         else:
-            raise ConfigError(f"{self.option.split()[0]}: {value!r} must be one of {', '.join(self.units)}")
-        name = self.key.partition(".")[2]
+            raise ConfigError(f"{self.option}: {value!r} must be one of {', '.join(self.units)}")
         if self.answer != "velocity_unit":
-            parse(ScaleSettings, {name: first})
-            parse(ScaleSettings, {name: second})
+            parse(ScaleSettings, {self.name: first})
+            parse(ScaleSettings, {self.name: second})
         if min(first, second) <= 0.0:
-            raise ConfigError(f"{self.option.split()[0]}: {min(first, second):g} must be above 0")
+            raise ConfigError(f"{self.option}: {min(first, second):g} must be above 0")
         return first, second
 
 
 _QUESTIONS = (
     ScaleQuestion(
         DRIVE,
-        "scale.gear_ratio",
-        "--gear A B",
+        "gear_ratio",
+        "--gear",
         "Gear of joint 1 and 2: motor revolutions per revolution of the joint",
         "0x6076 is the motor's torque, and velocities are the motor's; 1 without a gear",
     ),
     ScaleQuestion(
         DRIVE,
-        "scale.gear_efficiency",
-        "--gear-efficiency A B",
+        "gear_efficiency",
+        "--gear-efficiency",
         "Efficiency of these gears, 0 to 1; 1 where it is not known",
         "part of the motor's torque that leaves the gear, 0.6 to 0.9 mostly",
     ),
     ScaleQuestion(
         DRIVE,
-        "scale.increments_per_joint_rev",
-        "--increments A B",
+        "increments_per_joint_rev",
+        "--increments",
         "Position increments per revolution of joint 1 and 2",
         "counts of 0x6064: increments per motor revolution times the gear; turn the joint by hand and look",
     ),
     ScaleQuestion(
         DRIVE,
-        "scale.velocity_rad_s",
-        "--velocity-unit UNIT",
+        "velocity_rad_s",
+        "--velocity-unit",
         "Unit of the drives' velocity 0x606C: increment/s, rpm, 0.1rpm, mrpm, deg/s or rad/s, of the motor",
         "the drive's manual has it under 0x606C or 0x60A9",
-        {name: float(code) for name, code in _VELOCITY_UNITS.items()},
+        _VELOCITY_UNITS,
     ),
     ScaleQuestion(
         DRIVE,
-        "scale.rated_torque_count_Nm",
-        "--rated-torque-unit UNIT",
+        "rated_torque_count_Nm",
+        "--rated-torque-unit",
         "Unit of the drives' rated torque 0x6076: mNm, µNm, Nm or 0.01Nm",
         "mNm by CiA 402-2; an EPOS4 has µNm",
         _TORQUE_UNITS_NM,
     ),
     ScaleQuestion(
         SENSOR,
-        "scale.torque_Nm",
-        "--torque-count-nm A B",
+        "torque_Nm",
+        "--torque-count-nm",
         "One count of the torque sensors of joint 1 and 2, Nm",
         "in the sensor's data sheet, or by a known weight",
     ),
