@@ -199,13 +199,12 @@ _OPTIONS = (  # last first: click lists them the other way round
 )
 
 
-def require_extra(asked_for: str, *modules: str) -> None:
-    """Raise CommandError if one of `modules` is not installed, with the command that installs the extra `live`.
+def require_live(asked_for: str) -> None:
+    """Raise CommandError if the extra `live` is not installed, with the command that installs it.
 
-    asked_for: the option that needs them.
+    asked_for: the option that needs it.
     """
-    missing = [module for module in modules if find_spec(module) is None]
-    if missing:
+    if find_spec("websockets") is None:
         raise CommandError(f"{asked_for} needs the extra `live`: {install_command('live')}", ExitCode.USAGE)
 
 
@@ -241,7 +240,7 @@ def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str,
     origins, names, most_viewers: as of --live-origin, --live-name and --live-viewers.
     Raises CommandError if no or more than one package serves one, an origin is wrong, or the port can't be listened on.
     """
-    require_extra("--live", "websockets")
+    require_live("--live")
     try:
         (view,) = entry_points(group=LIVE_ENTRY_POINTS)
     except ValueError:

@@ -397,20 +397,19 @@ class Drafting:
                 named = tuple(self.writing.beside(name, kind) for name in given)
                 facts[kind] = Fact(self._complete(kind, named, devices), "given")
                 continue
-            from_eds = tuple(drafted.get((kind, joint), "") for joint in range(2))
-            chosen = tuple(from_eds[joint] or names[joint] for joint in range(2))
-            for joint, name in enumerate(chosen):
-                if not name and devices and self.interview.is_asking:
-                    asked = self._ask_eds(kind, joint, devices[joint])
-                    chosen = tuple(asked if other == joint else known for other, known in enumerate(chosen))
+            chosen = [drafted.get((kind, joint)) or names[joint] for joint in range(2)]
+            for joint, device in enumerate(devices):
+                if not chosen[joint] and self.interview.is_asking:
+                    chosen[joint] = self._ask_eds(kind, joint, device)
             if not any(chosen) and not devices:
                 facts[kind] = Fact((f"adacd-{kind}",) * 2)
             elif all(chosen):
-                source = "from the EDS" if all(from_eds) else "recognised by vendor and product"
+                are_of_eds = all((kind, joint) in drafted for joint in range(2))
+                source = "from the EDS" if are_of_eds else "recognised by vendor and product"
                 completed = self._complete(kind, chosen, devices)
                 facts[kind] = Fact(completed, "" if self.guessed & set(completed) else source)
             else:
-                joint = 0 if not chosen[0] else 1
+                joint = chosen.index("")
                 title = devices[joint].title if devices else "the device"
                 raise CommandError(
                     f"{kind} of joint {joint + 1} ({in_line(title)}) has no built-in profile: give --eds FILE, its "
@@ -556,7 +555,7 @@ class Drafting:
                 drafts = drafted()
         return drafts
 
-    def _complete(self, kind: str, names: tuple[str, ...], devices: Sequence[RecognisedDevice]) -> tuple[str, ...]:
+    def _complete(self, kind: str, names: Sequence[str], devices: Sequence[RecognisedDevice]) -> tuple[str, ...]:
         """Return the profiles' names; a shipped one with guesses is replaced by an extension if answers replace some.
 
         An extension is a profile that `extends` it by the answers. The extensions are added to the files to be written.

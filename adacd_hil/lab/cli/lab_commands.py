@@ -19,7 +19,7 @@ from adacd_hil.cli.options import (
     on_bus,
     on_bus_or_url,
     profile_option,
-    require_extra,
+    require_live,
     run_folder_option,
     stretch_options,
 )
@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     shell_complete=complete_truth,
 )
 @run_folder_option("demo")
-@click.option("--seed", type=click.IntRange(min=0), default=None, help="Noise of the emulated sensors.")
+@click.option("--seed", type=click.IntRange(min=0), help="Noise of the emulated sensors.")
 @clock_option(default="lockstep")
 @profile_option
 @json_option
@@ -304,7 +304,7 @@ def monitor(
         return watch(place, node_id, listened_s, as_json)
     if node_id is not None:
         raise CommandError("--node has no effect with --url", ExitCode.USAGE)
-    require_extra("--url", "websockets")
+    require_live("--url")
     from adacd_hil.lab.cli.live_monitor import watch_live
 
     return watch_live(place, listened_s, as_json)

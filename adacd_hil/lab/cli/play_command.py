@@ -117,7 +117,7 @@ def play(
         start_ns=None if start_s is None else round(start_s * 1e9),
         end_ns=None if end_s is None else round(end_s * 1e9),
     )
-    playback = Playback(log, choice, is_harmless=may_move_an_arm(interface, channel) and not commands)
+    playback = Playback(log, choice, is_harmless=not (commands or is_virtual(interface, channel)))
     open_frames(log)  # errors of the recording come before errors of the bus
     clock = MonotonicClock()
     from adacd_hil.wire.open_bus import open_bus
@@ -253,11 +253,6 @@ def _as_text(described: dict[str, Any]) -> str:
     if described["problem"]:
         lines.append(f"warning: {described['problem']}")
     return text_of(lines)
-
-
-def may_move_an_arm(interface: str, channel: str) -> bool:
-    """Return whether real drives may receive frames on this channel: True unless it is certainly virtual."""
-    return not is_virtual(interface, channel)
 
 
 def _ahead(pieces: "Iterator[NDArray[Any]]") -> "Iterator[NDArray[Any]]":

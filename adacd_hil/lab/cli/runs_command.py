@@ -210,15 +210,13 @@ def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progre
             near = nearest_name(arm, [*known, *sorted({run.config for run in found if run.config})])
             hint = f"did you mean {near!r}?" if near else f"there are {', '.join(known) or 'none that is named'}"
             raise CommandError(f"no run of arm {arm!r} in {folder}; {hint}", ExitCode.USAGE)
-    # The verdict is filtered after judging, which may change it.
-    taken = [run for run in found if dataclasses.replace(asked, statuses=()).takes(run)] if is_judging else found
-    if is_judging:
-        waiting = sum(run.status == NOT_JUDGED for run in taken)
-        if waiting:
-            logs = "1 log" if waiting == 1 else f"{waiting} logs"
-            progress(f"reading {logs} without a report; `adacd-hil report` keeps the figures")
-        taken = [judged(run) for run in taken]
-    return [run for run in run_table.in_order(taken) if asked.takes(run)]
+    if is_judging:  # which may change the verdict: it is filtered afterwards
+        with_any_verdict = dataclasses.replace(asked, statuses=())
+        found = [run for run in found if with_any_verdict.takes(run)]
+        if waiting := sum(run.status == NOT_JUDGED for run in found):
+            progress(f"reading {counted(waiting, 'log')} without a report; `adacd-hil report` keeps the figures")
+        found = [judged(run) for run in found]
+    return [run for run in run_table.in_order(found) if asked.takes(run)]
 
 
 def _page(found: list["RunSummary"], path: Path) -> str:

@@ -13,7 +13,6 @@ from adacd_hil.cli.output import (
     format_table,
     print_and_write,
     quoted,
-    show,
     suggest,
     writable_folder,
 )
@@ -83,12 +82,11 @@ def tune(
         with Progress() as progress:
             found = find(paths, rate_per_h, config, progress, stretch)
         text = json_text(tuning_by_key(found)) if as_json else _as_text(found)
-        if base is None or found.best is None:
-            print(text) if as_json else show(text, *_next(paths[0], found, None))
-        else:
-            print_and_write(text, out, suggested_toml(found, found.best, *base), as_json)
-            if not as_json:
-                suggest(*_next(paths[0], found, out))
+        content = "" if base is None or found.best is None else suggested_toml(found, found.best, *base)
+        written = out if content else None
+        print_and_write(text, written, content, as_json)
+        if not as_json:
+            suggest(*_next(paths[0], found, written))
     if report is not None:
         from adacd_hil.lab.tune.tune import write_tuning
 
