@@ -494,8 +494,8 @@ class Drafting:
         """Draft profiles of an EDS; add them and the EDS to the files to be written.
 
         Asks for values that the EDS leaves open; guesses and remarks become warnings, a profile with an `_ESSENTIAL`
-        guess one of `guessed`. ratings: by joint (0, 1) to draft for. Return the profiles' file names
-        by kind and joint; joints with equal drafts share one.
+        guess one of `guessed`. ratings: by joint (0, 1) to draft for. Return the profiles' file names by kind and
+        joint; joints with equal drafts share one.
         """
         drafts = self._draft(eds, kind, ratings)
         self.writing.add_file(self.writing.out.parent / eds.name, eds.read_bytes())
@@ -587,11 +587,10 @@ class Drafting:
         """Return the geometry, and the sources of lengths, masses and gravity's direction, "" for a guess.
 
         It is the URDF's, else that of given or asked lengths and masses; without masses `cad_theta` is (). Raises
-        CommandError for options that exclude each other, or a URDF that can't be used.
+        CommandError for options that exclude each other, ConfigError for a URDF that can't be used.
         """
         options, interview = self.options, self.interview
-        urdf, arm = options.urdf, None
-        if urdf is not None:
+        if options.urdf is not None:
             if options.length_m is not None or options.mass_kg is not None:
                 raise CommandError(
                     "--urdf gives lengths and masses: leave out --length-m and --mass-kg", ExitCode.USAGE
@@ -601,18 +600,15 @@ class Drafting:
                     "--urdf gives the direction of gravity; --mounting floor, wall or ceiling gives that of its root",
                     ExitCode.USAGE,
                 )
-            try:
-                arm = _read_urdf(urdf, options.locked)
-            except ConfigError as error:
-                raise CommandError(str(error), ExitCode.USAGE) from None
-        elif options.length_m is None and interview.is_asking:
 
-            def read(text: str) -> tuple[Path, PlanarArm] | None:
-                return None if text == "-" else (Path(text), _read_urdf(Path(text), options.locked))
+        def read(path: Path | str) -> tuple[Path, PlanarArm] | None:
+            return None if path == "-" else (Path(path), _read_urdf(Path(path), options.locked))
 
-            found, _ = interview.ask("--urdf", None, "URDF of the arm, - for none", read, Fact("-"))
-            urdf, arm = found or (None, None)
-        if urdf is not None and arm is not None:
+        described = None
+        if options.urdf is not None or (options.length_m is None and interview.is_asking):
+            described, _ = interview.ask("--urdf", options.urdf, "URDF of the arm, - for none", read, Fact("-"))
+        if described is not None:
+            urdf, arm = described
             if not arm.is_tip_known:
                 self.warnings.append(f"{urdf} has no frame at the tip: the length of link 2 is a guess")
             source = f"URDF {urdf.name}"
@@ -629,13 +625,13 @@ class Drafting:
             Fact((0.35, 0.30)),
         )
         mounting_deg, gravity_source = self._ask_mounting()
-        mass_kg = options.mass_kg
-        if mass_kg is None and interview.is_asking:
+        mass_kg = None
+        if options.mass_kg is not None or interview.is_asking:
             question = "Masses of the links in kg, - for unknown"
-            mass_kg, _ = interview.ask("--mass-kg", None, question, _masses, Fact("-"))
+            mass_kg, _ = interview.ask("--mass-kg", options.mass_kg, question, _masses, Fact("-"))
         if mass_kg is None:
             return PlanarArm(length_m, (), mounting_deg), length_source, "", gravity_source
-        arm = uniform_rods(length_m, _masses(mass_kg) or (0.0, 0.0), mounting_deg)
+        arm = uniform_rods(length_m, mass_kg, mounting_deg)
         self.warnings.append("inertia is that of uniform rods, without motors and gears")
         return arm, length_source, "given masses, as uniform rods", gravity_source
 
@@ -685,22 +681,19 @@ class Drafting:
         """Ask how a URDF's root is mounted, and read the URDF again with its root so turned.
 
         arm: read with the root's z axis up. Return the arm as mounted, and a phrase on the mounting; the given arm if
-        neither option nor user answers. Raises CommandError for a wrong option.
+        neither option nor user answers. Raises ConfigError for a wrong option.
         """
         interview, given = self.interview, self.options.mounting
         if given is None and not interview.is_asking:
             return arm, "its root's z axis up"
         question = "Mounting of the URDF's root: floor (z up), wall (x down), ceiling (z down), or its pitch in deg"
-        try:
-            pitch_deg, _ = interview.ask(
-                "--mounting",
-                given,
-                question,
-                lambda text: _word_or_deg("--mounting", text, _PITCHES_DEG, -180.0, 180.0),
-                Fact("floor"),
-            )
-        except ConfigError as error:
-            raise CommandError(str(error), ExitCode.USAGE) from None
+        pitch_deg, _ = interview.ask(
+            "--mounting",
+            given,
+            question,
+            lambda text: _word_or_deg("--mounting", text, _PITCHES_DEG, -180.0, 180.0),
+            Fact("floor"),
+        )
         mounted = "its root's z axis up" if pitch_deg == 0.0 else f"its root pitched by {pitch_deg:g} deg"
         return _read_urdf(urdf, self.options.locked, pitch_deg), mounted
 
