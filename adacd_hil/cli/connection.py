@@ -109,11 +109,13 @@ def check_shared(name: str, settings: Settings) -> None:
         )
 
 
-def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> Bus:
-    """Return the bus wrapped for lockstep: only modelled time passes on it.
+def model_time(bus: Bus, clock: Clock, codec: Codec, settings: Settings) -> Bus:
+    """Return the bus wrapped for lockstep: only modelled time passes on it. Return it as it is in real time.
 
     Raises CodecError if the contract has no message Sync, or lacks one of the devices' cyclic frames.
     """
+    if not isinstance(clock, VirtualClock):
+        return bus
     # Imported here: it belongs to lockstep and isn't needed in real time.
     from adacd_hil.wire.lockstep_bus import make_lockstep_bus
 
@@ -198,7 +200,7 @@ class Connection:
         """
         can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings, devices)
         bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)
-        return model_time(bus, clock, codec, settings) if isinstance(clock, VirtualClock) else bus
+        return model_time(bus, clock, codec, settings)
 
     @contextmanager
     def bus(self, clock: Clock, is_fd: bool) -> Iterator[Bus]:

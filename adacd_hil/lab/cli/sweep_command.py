@@ -19,9 +19,9 @@ from adacd_hil.progress_lines import Progress
 if TYPE_CHECKING:
     from adacd_hil.lab.tune.sweep import Plan, SweepRow, Task, Values
 
-_SIMULATED_CONFIG = "certified"
-_SEEDS = "1"
+_CONFIG = "certified"
 """Configuration of simulated runs without --config."""
+_SEEDS = "1"
 
 
 @click.command(
@@ -156,7 +156,7 @@ def _plan(
     from adacd_hil.settings.setting_keys import apply_settings, parse_variations
 
     variants = parse_variations(vary)
-    base = load_settings(config or "certified", profile or None)
+    base = load_settings(config or _CONFIG, profile or None)
     for changes in variants:  # refuse invalid settings before the first run
         apply_settings(base, changes)
     version = f"{__version__} {program_digest()}"
@@ -214,7 +214,7 @@ def _simulate(task: "Task", row: "SweepRow") -> "Values":
 
     subject = task.subject
     try:
-        cast = resolve(task.config or _SIMULATED_CONFIG, subject.scenario, task.profile or None, subject.seed)
+        cast = resolve(task.config or _CONFIG, subject.scenario, task.profile or None, subject.seed)
         settings = apply_settings(cast.settings, dict(row.changes))
         with tempfile.TemporaryDirectory(prefix="adacd-hil-sweep-") as name:
             summary, _ = run_embedded(cast._replace(settings=settings), "lockstep", Path(name))

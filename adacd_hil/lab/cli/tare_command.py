@@ -15,7 +15,6 @@ from adacd_hil.device.strangers import refuse_company
 from adacd_hil.lab.commission.tare import TareRefusedError
 from adacd_hil.lab.commission.tare_session import TareSession
 from adacd_hil.progress_lines import Progress
-from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.setting_keys import apply_settings
 
 
@@ -69,7 +68,9 @@ def tare_on_bus(
     """
     interface, channel = connection.interface, connection.channel
     check_clock(clock, interface, channel)
-    settings = _with_options(connection.settings(), poses, seconds)
+    given = {"tare.poses": poses, "tare.window_s": seconds}
+    changes = {key: repr(value) for key, value in given.items() if value is not None}
+    settings = apply_settings(connection.settings(), changes)
     check_shared(clock, settings)
     # A file that isn't a tare is not overwritten.
     old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
@@ -89,12 +90,3 @@ def tare_on_bus(
     except DeviceError as reason:
         raise CommandError(reason.line, ExitCode.BUS_MISSING) from None
     return tare, write_tare(tare, out)
-
-
-def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:
-    """Return the settings with `tare.poses` and `tare.window_s` replaced by number and seconds, unless None.
-
-    Raises ConfigError for a value out of bounds.
-    """
-    given = {"tare.poses": poses, "tare.window_s": seconds}
-    return apply_settings(settings, {key: repr(value) for key, value in given.items() if value is not None})
