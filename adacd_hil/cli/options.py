@@ -98,6 +98,13 @@ clock_option = functools.partial(
 )
 
 
+def with_options(command: Callable[..., Any], *options: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a command with options, which its help lists in this order."""
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
 def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
     """Return a command with --from and --until, which receives both as `stretch`, a `TimeWindow`.
 
@@ -116,17 +123,11 @@ def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]
         stretch = TimeWindow(-math.inf if from_s is None else from_s, math.inf if until_s is None else until_s)
         return command(*args, stretch=stretch, **kwargs)
 
-    until = click.option("--until", "until_s", type=float, help="End before here, s since the beginning of the log.")
-    begin = click.option("--from", "from_s", type=float, help="Begin here, s since the beginning of the log.")
-    return begin(until(bounded))
-
-
-_BUS_OPTIONS = (  # last first: click lists them the other way round
-    click.option("--dbc", type=GIVEN_FILE, help="The contract; default: the configuration's."),
-    profile_option,
-    config_option,
-    bitrate_option,
-)
+    return with_options(
+        bounded,
+        click.option("--from", "from_s", type=float, help="Begin here, s since the beginning of the log."),
+        click.option("--until", "until_s", type=float, help="End before here, s since the beginning of the log."),
+    )
 
 
 def on_bus(command: Callable[..., ExitCode], is_required: bool = True) -> Callable[..., None]:
@@ -157,10 +158,15 @@ def on_bus(command: Callable[..., ExitCode], is_required: bool = True) -> Callab
             raise CommandError("give --interface and --channel, or --url", ExitCode.USAGE)
         return command(Connection(interface, channel, bitrate, config, profile, dbc), **own)
 
-    decorated: Callable[..., None] = explained(connect)
-    for option in (*_BUS_OPTIONS, channel_option(required=is_required), interface_option(required=is_required)):
-        decorated = option(decorated)
-    return decorated
+    return with_options(
+        explained(connect),
+        interface_option(required=is_required),
+        channel_option(required=is_required),
+        bitrate_option,
+        config_option,
+        profile_option,
+        click.option("--dbc", type=GIVEN_FILE, help="The contract; default: the configuration's."),
+    )
 
 
 on_bus_or_url = functools.partial(on_bus, is_required=False)
@@ -172,16 +178,13 @@ LIVE_ENTRY_POINTS: Final = "adacd_hil.live"
 PORT = 8765
 """Default port of Foxglove and Lichtblick."""
 HOST = "127.0.0.1"
-_OPTIONS = (  # last first: click lists them the other way round
+_LIVE_OPTIONS = (
+    click.option("--live", "is_live", is_flag=True, help="Serve the log to Foxglove, Lichtblick and `monitor --url`."),
     click.option(
-        "--live-viewers",
-        type=click.IntRange(1, 1000),
-        default=MOST_VIEWERS,
-        show_default=True,
-        help="Viewers at a time.",
+        "--live-port", type=click.IntRange(0, 65535), default=PORT, show_default=True, help="0: any that is free."
     ),
     click.option(
-        "--live-name", multiple=True, metavar="NAME", help="A further name of this machine, by which viewers find it."
+        "--live-host", default=HOST, show_default=True, help="Address to listen on; 0.0.0.0: all, for any viewer."
     ),
     click.option(
         "--live-origin",
@@ -190,12 +193,15 @@ _OPTIONS = (  # last first: click lists them the other way round
         help="A web page that may watch, in addition to Foxglove's and this machine's, such as https://view.lab.example.",
     ),
     click.option(
-        "--live-host", default=HOST, show_default=True, help="Address to listen on; 0.0.0.0: all, for any viewer."
+        "--live-name", multiple=True, metavar="NAME", help="A further name of this machine, by which viewers find it."
     ),
     click.option(
-        "--live-port", type=click.IntRange(0, 65535), default=PORT, show_default=True, help="0: any that is free."
+        "--live-viewers",
+        type=click.IntRange(1, 1000),
+        default=MOST_VIEWERS,
+        show_default=True,
+        help="Viewers at a time.",
     ),
-    click.option("--live", "is_live", is_flag=True, help="Serve the log to Foxglove, Lichtblick and `monitor --url`."),
 )
 
 
@@ -228,10 +234,7 @@ def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
         live = _live_view(live_host, live_port, live_origin, live_name, live_viewers) if is_live else None
         return command(*args, live=live, **own)
 
-    decorated: Callable[..., ExitCode] = run
-    for option in _OPTIONS:
-        decorated = option(decorated)
-    return decorated
+    return with_options(run, *_LIVE_OPTIONS)
 
 
 def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int) -> "LiveView":

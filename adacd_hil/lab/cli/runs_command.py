@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.options import FiniteRange, json_option
+from adacd_hil.cli.options import FiniteRange, json_option, with_options
 from adacd_hil.cli.output import (
     RUNS,
     CommandError,
@@ -60,20 +60,6 @@ def _end_of_date(text: str) -> datetime:
     return _local_date(text, timedelta(days=1, microseconds=-1))
 
 
-_FILTER_OPTIONS = (  # last first: click lists them the other way round
-    click.option("--until", type=_end_of_date, metavar="DATE", help="Runs begun until then, that day included."),
-    click.option("--since", type=_local_date, metavar="DATE", help="Runs begun since then."),
-    click.option("--scenario", "scenarios", multiple=True, metavar="NAME", help="Runs of this scenario; repeatable."),
-    click.option(
-        "--arm",
-        "arms",
-        multiple=True,
-        metavar="NAME",
-        help="Runs of this arm or configuration, or a pattern; repeatable.",
-    ),
-)
-
-
 def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
     """Return a command with added options that choose runs; it receives them as `asked`, a `RunFilter`.
 
@@ -96,10 +82,21 @@ def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
             raise CommandError(f"--since {since} is after --until {until}", ExitCode.USAGE)
         return command(*args, asked=RunFilter(arms, statuses, scenarios, since, until), **own)
 
-    decorated: Callable[..., Any] = explained(chosen)
-    for option in _FILTER_OPTIONS:
-        decorated = option(decorated)
-    return decorated
+    return with_options(
+        explained(chosen),
+        click.option(
+            "--arm",
+            "arms",
+            multiple=True,
+            metavar="NAME",
+            help="Runs of this arm or configuration, or a pattern; repeatable.",
+        ),
+        click.option(
+            "--scenario", "scenarios", multiple=True, metavar="NAME", help="Runs of this scenario; repeatable."
+        ),
+        click.option("--since", type=_local_date, metavar="DATE", help="Runs begun since then."),
+        click.option("--until", type=_end_of_date, metavar="DATE", help="Runs begun until then, that day included."),
+    )
 
 
 _folder_argument = click.argument("folder", type=GivenPath(file_okay=False), default=RUNS, required=False)
