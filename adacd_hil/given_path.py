@@ -43,6 +43,10 @@ class WrittenPath(GivenPath):
         return path
 
 
+WRITTEN_FILE = WrittenPath(dir_okay=False)
+WRITTEN_FOLDER = WrittenPath(file_okay=False)
+
+
 class CommandGroup(click.Group):
     """A group of commands that lists whole summaries, folded; click cuts them to one line."""
 

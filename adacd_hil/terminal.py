@@ -141,6 +141,11 @@ def painted(text: str, stream: "TextIO | Terminal") -> str:
 class Terminal(io.TextIOBase):
     """A standard stream without a buffer, safe for threads. Once its reader has gone, writes are dropped."""
 
+    encoding = "utf-8"
+    """Whatever the locale."""
+    errors = "backslashreplace"
+    """Characters that UTF-8 can't encode, as in file names, are written in hexadecimal."""
+
     def __init__(self, descriptor: int, name: str, is_needed: bool) -> None:
         """Write to `descriptor`. is_needed: an error of writing, as of a full disk, is raised; otherwise it is ignored.
 
@@ -156,16 +161,6 @@ class Terminal(io.TextIOBase):
             self._is_ready = stat.S_ISREG(os.fstat(descriptor).st_mode)  # a file never blocks
         except OSError:
             self._is_gone = True
-
-    @property
-    def encoding(self) -> str:  # type: ignore[override]
-        """UTF-8, whatever the locale."""
-        return "utf-8"
-
-    @property
-    def errors(self) -> str:  # type: ignore[override]
-        """Characters that UTF-8 can't encode, as in file names, are written in hexadecimal."""
-        return "backslashreplace"
 
     def fileno(self) -> int:
         """Return the descriptor."""

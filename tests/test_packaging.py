@@ -157,8 +157,4 @@ def test_pip_installs_the_example_of_a_detector_and_its_name_is_known(tmp_path: 
         "(point,) = entry_points(group='adacd_hil.detectors', name='mean of 20');"
         "assert point.load() is MeanOfTwenty; check_detector('mean of 20', MeanOfTwenty); print('kept')"
     )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), str(ROOT)))}
-    ran = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, timeout=120
-    )
-    assert ran.stdout.strip() == "kept"
+    assert _run(tmp_path, code, PYTHONPATH=os.pathsep.join((str(tmp_path), str(ROOT)))) == "kept\n"

@@ -5,7 +5,7 @@ import shlex
 import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -109,11 +109,13 @@ def check_shared(name: str, settings: Settings) -> None:
         )
 
 
-def model_time(bus: Bus, clock: VirtualClock, codec: Codec, settings: Settings) -> Bus:
-    """Return the bus wrapped for lockstep: only modelled time passes on it.
+def model_time(bus: Bus, clock: Clock, codec: Codec, settings: Settings) -> Bus:
+    """Return the bus wrapped for lockstep: only modelled time passes on it. Return it as it is in real time.
 
     Raises CodecError if the contract has no message Sync, or lacks one of the devices' cyclic frames.
     """
+    if not isinstance(clock, VirtualClock):
+        return bus
     # Imported here: it belongs to lockstep and isn't needed in real time.
     from adacd_hil.wire.lockstep_bus import make_lockstep_bus
 
@@ -198,7 +200,7 @@ class Connection:
         """
         can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings, devices)
         bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)
-        return model_time(bus, clock, codec, settings) if isinstance(clock, VirtualClock) else bus
+        return model_time(bus, clock, codec, settings)
 
     @contextmanager
     def bus(self, clock: Clock, is_fd: bool) -> Iterator[Bus]:
@@ -224,18 +226,23 @@ def raise_interrupt() -> NoReturn:
 
 
 @contextmanager
-def never_stopped() -> Iterator[None]:
+def _handling(handler: Callable[..., object] | signal.Handlers, *numbers: signal.Signals) -> Iterator[None]:
+    """Handle these signals while the block runs; then restore their handlers."""
+    previous = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, before in previous.items():
+            signal.signal(number, before)
+
+
+def never_stopped() -> AbstractContextManager[None]:
     """Ignore SIGTTIN and SIGTTOU in the block, by which a terminal stops a background process that reads or writes it.
 
     A stopped process would send no commands to a moving arm. Reading such a terminal raises OSError instead. Restore
     the handlers after the block.
     """
-    previous = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGTTIN, signal.SIGTTOU)}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+    return _handling(signal.SIG_IGN, signal.SIGTTIN, signal.SIGTTOU)
 
 
 @contextmanager
@@ -253,13 +260,8 @@ def on_interrupt(interrupt: Callable[[], None], *further: signal.Signals) -> Ite
         hurry()
         interrupt()
 
-    previous = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, *further)}
-    if previous[signal.SIGHUP] is signal.SIG_IGN:  # started to outlive its terminal
-        del previous[signal.SIGHUP]
-    for number in previous:
-        signal.signal(number, handle)
-    try:
+    numbers = [signal.SIGINT, signal.SIGTERM, *further]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # else it was started to outlive its terminal
+        numbers.append(signal.SIGHUP)
+    with _handling(handle, *numbers):
         yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
-from adacd_hil.clock import VirtualClock
 from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
@@ -24,7 +23,6 @@ from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import RequestSettings
 from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.budget import describe_excess
-from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.embedded_bus import EmbeddedBus
 from firmware_sim.bench.bench import Bench
 from firmware_sim.bench.bench_time import TruthLog
@@ -114,7 +112,7 @@ def run_embedded(
     contract = cast.contract or playable_contract(codec)
     clock = make_clock(clock_name)
     embedded = EmbeddedBus(clock)
-    bus: Bus = model_time(embedded, clock, codec, settings) if isinstance(clock, VirtualClock) else embedded
+    bus = model_time(embedded, clock, codec, settings)
     out.mkdir(parents=True, exist_ok=True)
     host = {CONFIG_DIGEST_KEY: config_digest(to_toml(settings))}
     with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep", metadata=host, scenario=scenario) as truth:

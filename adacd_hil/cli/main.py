@@ -3,8 +3,7 @@
 import sys
 from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
-from pathlib import Path
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Any, Final, NoReturn
 
 import click
 
@@ -21,13 +20,12 @@ from adacd_hil.cli.options import (
 )
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, complain
 from adacd_hil.extras import pip_command
-from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE, CommandGroup
 from adacd_hil.printable import one_line
 from adacd_hil.terminal import is_interrupted, open_terminals
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
-    from adacd_hil.control.session import LiveView
 
 
 @click.group(
@@ -42,7 +40,7 @@ def cli() -> None:
 
 @cli.command(epilog=EPILOG)
 @on_bus
-@click.option("--tare", type=GivenPath(dir_okay=False), help="Offsets that `adacd-hil tare` wrote.")
+@click.option("--tare", type=GIVEN_FILE, help="Offsets that `adacd-hil tare` wrote.")
 @click.option(
     "--without-anchor",
     is_flag=True,
@@ -50,7 +48,7 @@ def cli() -> None:
 )
 @click.option(
     "--history",
-    type=WrittenPath(dir_okay=False),
+    type=WRITTEN_FILE,
     help="File of the arm's certificates: the last one is compared, this run's are added.",
 )
 @click.option(
@@ -63,17 +61,7 @@ def cli() -> None:
 @clock_option(default="realtime")
 @json_option
 @live_options
-def run(
-    connection: "Connection",
-    tare: Path | None,
-    without_anchor: bool,
-    history: Path | None,
-    scenario: str | None,
-    out: Path | None,
-    clock: str,
-    as_json: bool,
-    live: "LiveView | None",
-) -> ExitCode:
+def run(connection: "Connection", as_json: bool, **options: Any) -> ExitCode:
     """Run the scheme on an arm, real or emulated, that is on a bus.
 
     On a terminal, type `ack` to acknowledge a stop, `payload` before and `changed` after changing the payload, `accept`
@@ -83,7 +71,7 @@ def run(
     """
     from adacd_hil.cli.commands.run_command import as_text, next_of_run, run_on_bus
 
-    result, code = run_on_bus(connection, clock, out, tare, live, history, scenario, without_anchor)
+    result, code = run_on_bus(connection, **options)
     answer(as_json, result, as_text(result), *next_of_run(result))
     return code
 

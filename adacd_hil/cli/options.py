@@ -12,10 +12,16 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from adacd_hil.cli.completion import complete_channel, complete_configuration, complete_interface, complete_setting
+from adacd_hil.cli.completion import (
+    complete_channel,
+    complete_configuration,
+    complete_interface,
+    complete_run,
+    complete_setting,
+)
 from adacd_hil.cli.output import CommandError, ExitCode, explained
 from adacd_hil.extras import install_command
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenPath
 from adacd_hil.log.log_files import MOST_VIEWERS
 from adacd_hil.settings.toml_files import builtin_names
 
@@ -45,8 +51,25 @@ config_option = click.option(
 profile_option = click.option(
     "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
 )
-
-
+log_argument = click.argument("log", type=GIVEN_FILE, shell_complete=complete_run)
+logs_argument = click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+interface_option = functools.partial(
+    click.option,
+    "-i",
+    "--interface",
+    help="python-can interface, such as socketcan.",
+    shell_complete=complete_interface,
+)
+channel_option = functools.partial(
+    click.option,
+    "-c",
+    "--channel",
+    help="Channel of that interface, such as can0.",
+    shell_complete=complete_channel,
+)
+bitrate_option = click.option(
+    "-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it."
+)
 set_option = click.option(
     "--set",
     "changes",
@@ -64,7 +87,7 @@ def run_folder_option(name: str) -> Callable[..., Any]:
     """
     return click.option(
         "--out",
-        type=WrittenPath(file_okay=False),
+        type=WRITTEN_FOLDER,
         help=f"Folder, without a log so far; default: a new one by date, to which runs/latest and runs/{name} lead.",
     )
 
@@ -73,6 +96,13 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print the re
 clock_option = functools.partial(
     click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="Clock of the cycles."
 )
+
+
+def with_options(command: Callable[..., Any], *options: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a command with options, which its help lists in this order."""
+    for option in reversed(options):
+        command = option(command)
+    return command
 
 
 def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
@@ -93,61 +123,18 @@ def stretch_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]
         stretch = TimeWindow(-math.inf if from_s is None else from_s, math.inf if until_s is None else until_s)
         return command(*args, stretch=stretch, **kwargs)
 
-    until = click.option("--until", "until_s", type=float, help="End before here, s since the beginning of the log.")
-    begin = click.option("--from", "from_s", type=float, help="Begin here, s since the beginning of the log.")
-    return begin(until(bounded))
-
-
-_BUS_OPTIONS = (  # last first: click lists them the other way round
-    click.option("--dbc", type=GivenPath(dir_okay=False), help="The contract; default: the configuration's."),
-    profile_option,
-    config_option,
-    click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it."),
-)
-
-
-def _where(is_required: bool) -> tuple[Callable[..., Any], ...]:
-    """Return decorators that add --channel and --interface to a command; is_required: it can't be called without."""
-    return (
-        click.option(
-            "-c",
-            "--channel",
-            required=is_required,
-            help="Channel of that interface, such as can0.",
-            shell_complete=complete_channel,
-        ),
-        click.option(
-            "-i",
-            "--interface",
-            required=is_required,
-            help="python-can interface, such as socketcan.",
-            shell_complete=complete_interface,
-        ),
+    return with_options(
+        bounded,
+        click.option("--from", "from_s", type=float, help="Begin here, s since the beginning of the log."),
+        click.option("--until", "until_s", type=float, help="End before here, s since the beginning of the log."),
     )
 
 
-def on_bus(command: Callable[..., ExitCode]) -> Callable[..., None]:
+def on_bus(command: Callable[..., ExitCode], is_required: bool = True) -> Callable[..., None]:
     """Return a command with the options of a bus; it receives a `Connection` as its first argument.
 
-    It ends the process with its exit status, as `explained`.
-    """
-    return _connected(command, is_required=True)
-
-
-def on_bus_or_url(help_text: str) -> Callable[[Callable[..., ExitCode]], Callable[..., None]]:
-    """Return a decorator that adds the options of a bus and --url to a command.
-
-    The command receives the URL as its first argument, or without --url a `Connection`. help_text: of --url.
-    """
-    url_option = click.option("--url", help=help_text)
-    return lambda command: url_option(_connected(command, is_required=False))
-
-
-def _connected(command: Callable[..., ExitCode], is_required: bool) -> Callable[..., None]:
-    """Return a command, as `explained`, with the options of a bus; it receives a `Connection`, or the URL, first.
-
-    is_required: click refuses a call without --interface or --channel; otherwise it ends with a CommandError, unless
-    there is a URL.
+    It ends the process with its exit status, as `explained`. is_required: click refuses a call without --interface or
+    --channel; otherwise it ends with a CommandError, unless there is a --url: the command then receives that first.
     """
 
     @functools.wraps(command)
@@ -171,10 +158,19 @@ def _connected(command: Callable[..., ExitCode], is_required: bool) -> Callable[
             raise CommandError("give --interface and --channel, or --url", ExitCode.USAGE)
         return command(Connection(interface, channel, bitrate, config, profile, dbc), **own)
 
-    decorated: Callable[..., None] = explained(connect)
-    for option in (*_BUS_OPTIONS, *_where(is_required)):
-        decorated = option(decorated)
-    return decorated
+    return with_options(
+        explained(connect),
+        interface_option(required=is_required),
+        channel_option(required=is_required),
+        bitrate_option,
+        config_option,
+        profile_option,
+        click.option("--dbc", type=GIVEN_FILE, help="The contract; default: the configuration's."),
+    )
+
+
+on_bus_or_url = functools.partial(on_bus, is_required=False)
+"""Decorates a command that has an option --url, too."""
 
 
 LIVE_ENTRY_POINTS: Final = "adacd_hil.live"
@@ -182,16 +178,13 @@ LIVE_ENTRY_POINTS: Final = "adacd_hil.live"
 PORT = 8765
 """Default port of Foxglove and Lichtblick."""
 HOST = "127.0.0.1"
-_OPTIONS = (  # last first: click lists them the other way round
+_LIVE_OPTIONS = (
+    click.option("--live", "is_live", is_flag=True, help="Serve the log to Foxglove, Lichtblick and `monitor --url`."),
     click.option(
-        "--live-viewers",
-        type=click.IntRange(1, 1000),
-        default=MOST_VIEWERS,
-        show_default=True,
-        help="Viewers at a time.",
+        "--live-port", type=click.IntRange(0, 65535), default=PORT, show_default=True, help="0: any that is free."
     ),
     click.option(
-        "--live-name", multiple=True, metavar="NAME", help="A further name of this machine, by which viewers find it."
+        "--live-host", default=HOST, show_default=True, help="Address to listen on; 0.0.0.0: all, for any viewer."
     ),
     click.option(
         "--live-origin",
@@ -200,22 +193,24 @@ _OPTIONS = (  # last first: click lists them the other way round
         help="A web page that may watch, in addition to Foxglove's and this machine's, such as https://view.lab.example.",
     ),
     click.option(
-        "--live-host", default=HOST, show_default=True, help="Address to listen on; 0.0.0.0: all, for any viewer."
+        "--live-name", multiple=True, metavar="NAME", help="A further name of this machine, by which viewers find it."
     ),
     click.option(
-        "--live-port", type=click.IntRange(0, 65535), default=PORT, show_default=True, help="0: any that is free."
+        "--live-viewers",
+        type=click.IntRange(1, 1000),
+        default=MOST_VIEWERS,
+        show_default=True,
+        help="Viewers at a time.",
     ),
-    click.option("--live", "is_live", is_flag=True, help="Serve the log to Foxglove, Lichtblick and `monitor --url`."),
 )
 
 
-def require_extra(asked_for: str, *modules: str) -> None:
-    """Raise CommandError if one of `modules` is not installed, with the command that installs the extra `live`.
+def require_live(asked_for: str) -> None:
+    """Raise CommandError if the extra `live` is not installed, with the command that installs it.
 
-    asked_for: the option that needs them.
+    asked_for: the option that needs it.
     """
-    missing = [module for module in modules if find_spec(module) is None]
-    if missing:
+    if find_spec("websockets") is None:
         raise CommandError(f"{asked_for} needs the extra `live`: {install_command('live')}", ExitCode.USAGE)
 
 
@@ -239,10 +234,7 @@ def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
         live = _live_view(live_host, live_port, live_origin, live_name, live_viewers) if is_live else None
         return command(*args, live=live, **own)
 
-    decorated: Callable[..., ExitCode] = run
-    for option in _OPTIONS:
-        decorated = option(decorated)
-    return decorated
+    return with_options(run, *_LIVE_OPTIONS)
 
 
 def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int) -> "LiveView":
@@ -251,7 +243,7 @@ def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str,
     origins, names, most_viewers: as of --live-origin, --live-name and --live-viewers.
     Raises CommandError if no or more than one package serves one, an origin is wrong, or the port can't be listened on.
     """
-    require_extra("--live", "websockets")
+    require_live("--live")
     try:
         (view,) = entry_points(group=LIVE_ENTRY_POINTS)
     except ValueError:

@@ -74,6 +74,11 @@ def tell(line: str) -> None:
     print(in_line(line), file=sys.stderr, flush=True)
 
 
+def is_terminal() -> bool:
+    """Return whether stdin is a terminal, on which a user can type answers."""
+    return sys.stdin is not None and sys.stdin.isatty()
+
+
 class CommandError(Exception):
     """Ends a command with one line and an exit code."""
 
@@ -196,6 +201,11 @@ def complain_of(refused: Iterable[Exception]) -> ExitCode:
     """
     codes = [complain(error) for error in {str(error): error for error in refused}.values()]
     return codes[0] if codes else ExitCode.OK
+
+
+def text_of(lines: Iterable[str]) -> str:
+    """Return lines as a text, the control characters and line ends in each of them escaped."""
+    return "\n".join(map(in_line, lines))
 
 
 def format_table(

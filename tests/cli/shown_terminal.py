@@ -5,8 +5,9 @@ import os
 import pty
 import re
 import struct
+import sys
 import termios
-from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 _SEQUENCE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
@@ -41,13 +42,15 @@ class Shown(NamedTuple):
         return shown
 
 
-def show_on_terminal(command: Sequence[str], columns: int, rows: int, environment: Mapping[str, str]) -> Shown:
-    """Run a command whose streams are all a terminal."""
+def show_on_terminal(program: str, *words: str, columns: int = 60, **environment: str) -> Shown:
+    """Run a Python program whose streams are all a terminal with colours, 24 lines high."""
+    kept = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "LINES", "NO_COLOR", "TERM")}
     process, terminal = pty.fork()
     if not process:
         try:
-            fcntl.ioctl(0, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
-            os.execve(command[0], command, dict(environment))
+            fcntl.ioctl(0, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+            whole = {**kept, "TERM": "xterm", "PYTHONPATH": str(Path.cwd()), **environment}
+            os.execve(sys.executable, [sys.executable, "-c", program, *words], whole)
         finally:
             os._exit(127)
     written = b""

@@ -14,7 +14,6 @@ from called import called
 from adacd_hil.cli.connection import check_autonomy, check_clock, on_interrupt
 from adacd_hil.cli.embedded_run import USER, resolve
 from adacd_hil.cli.output import CommandError, ExitCode
-from adacd_hil.lab.cli.play_command import may_move_an_arm
 from adacd_hil.scheduling import RealtimeGrant, scheduler_name
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import OperatorSettings
@@ -94,7 +93,6 @@ def test_what_kind_an_interface_is_says_whether_a_wire_is_behind_it(monkeypatch,
     monkeypatch.setattr("adacd_hil.wire.can_interface.read_link", lambda _: InterfaceState("bus", True, kind, 16, 10))
     monkeypatch.setattr("adacd_hil.cli.connection.can_interfaces", lambda: ["bus"])
     assert is_virtual("socketcan", "bus") == expected
-    assert may_move_an_arm("socketcan", "bus") != expected
     assert is_refused("lockstep", "socketcan", "bus") != expected
     assert not is_refused("realtime", "socketcan", "bus")
 

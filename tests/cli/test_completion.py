@@ -13,7 +13,7 @@ ENOUGH_S = 0.6
 """Of a processor. On an idle one an answer takes 0.1 to 0.25 s; where others compute beside, up to twice that."""
 
 
-def ask(folder: Path, line: str, shell: str = "bash") -> list[str]:
+def ask(folder: Path, line: str, shell: str) -> list[str]:
     """Give what the shell is answered when the cursor stands at the end of a line."""
     words = line.split(" ")
     if shell == "bash":
@@ -42,36 +42,29 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("line", "answer"),
+    ("shell", "line", "answer"),
     [
-        ("adacd-hil demo --config ce", ["certified"]),
-        ("adacd-hil demo --config my", ["my-arm.toml"]),
-        ("adacd-hil demo --scenario two-p", ["two-people", "two-pushes-in-a-row"]),
-        ("adacd-hil config check dem", ["demo", "demo_paper"]),
-        ("adacd-hil config docs arm.ca", ["arm.cad_theta"]),
-        ("adacd-hil config docs exc", ["excitation"]),
-        ("adacd-hil replay --set reaction.sta", ["reaction.start="]),
-        ("adacd-hil replay --set reaction.start=", ["desired", "measured"]),
-        ("adacd-hil run -i socketcand", ["socketcand"]),
-        ("adacd-hil report runs/", ["runs/2026-11-25T10-00-00", "runs/2026-11-24T10-00-00"]),
+        ("bash", "adacd-hil demo --config ce", ["certified"]),
+        ("bash", "adacd-hil demo --config my", ["my-arm.toml"]),
+        ("bash", "adacd-hil demo --scenario two-p", ["two-people", "two-pushes-in-a-row"]),
+        ("bash", "adacd-hil config check dem", ["demo", "demo_paper"]),
+        ("bash", "adacd-hil config docs arm.ca", ["arm.cad_theta"]),
+        ("bash", "adacd-hil config docs exc", ["excitation"]),
+        ("bash", "adacd-hil replay --set reaction.sta", ["reaction.start="]),
+        ("bash", "adacd-hil replay --set reaction.start=", ["desired", "measured"]),
+        ("bash", "adacd-hil run -i socketcand", ["socketcand"]),
+        ("bash", "adacd-hil report runs/", ["runs/2026-11-25T10-00-00", "runs/2026-11-24T10-00-00"]),
+        ("zsh", "adacd-hil replay --set reaction.start=", ["reaction.start=desired", "reaction.start=measured"]),
     ],
 )
-def test_bash_is_answered(folder, line, answer):
-    assert ask(folder, line) == answer
-
-
-@pytest.mark.slow
-def test_zsh_gets_key_and_value_in_one_word(folder):
-    assert ask(folder, "adacd-hil replay --set reaction.start=", "zsh") == [
-        "reaction.start=desired",
-        "reaction.start=measured",
-    ]
+def test_a_shell_is_answered_and_zsh_gets_key_and_value_in_one_word(folder, shell, line, answer):
+    assert ask(folder, line, shell) == answer
 
 
 @pytest.mark.slow
 def test_an_answer_takes_no_longer_than_a_person_waits(folder):
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    ask(folder, "adacd-hil replay --set reac")
+    ask(folder, "adacd-hil replay --set reac", "bash")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert (after.ru_utime - before.ru_utime) + (after.ru_stime - before.ru_stime) < ENOUGH_S
 

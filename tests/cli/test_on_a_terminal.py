@@ -1,9 +1,7 @@
 """What the programs show on a terminal: no line longer than it is wide, colours only where they are wanted."""
 
 import json
-import os
 import re
-import sys
 from pathlib import Path
 
 import click
@@ -94,9 +92,8 @@ HELPS = [(*words, "--help") for words in (*commands_of(host, HOST), *commands_of
 
 def play(folder: Path, commands: list[tuple[str, ...]], columns: int, **environment: str) -> Shown:
     """Play commands in a process on a terminal; of each, its output and `status N`."""
-    kept = {key: value for key, value in os.environ.items() if key not in ("COLUMNS", "LINES", "NO_COLOR", "TERM")}
-    words = [sys.executable, "-c", f"import os; os.chdir({str(folder)!r})\n{PLAY}", json.dumps(commands)]
-    return show_on_terminal(words, columns, 24, {**kept, "TERM": "xterm", "PYTHONPATH": str(Path.cwd()), **environment})
+    program = f"import os; os.chdir({str(folder)!r})\n{PLAY}"
+    return show_on_terminal(program, json.dumps(commands), columns=columns, **environment)
 
 
 @pytest.fixture(scope="module")
@@ -164,8 +161,7 @@ def test_help_is_whole_on_a_terminal(folder):
 
 @pytest.mark.slow
 def test_an_emulator_that_compiles_counts_in_one_line_and_leaves_nothing():
-    environment = {**os.environ, "TERM": "xterm", "PYTHONPATH": str(Path.cwd()), "NO_COLOR": "1"}
-    shown = show_on_terminal([sys.executable, "-c", COUNT], 60, 24, environment)
+    shown = show_on_terminal(COUNT, NO_COLOR="1")
     written = [piece.removeprefix("\x1b[2K") for line in shown.text.split("\r\n") for piece in line.split("\r")]
     counts = [piece for piece in written if piece.startswith("compiling ")]
     assert len(counts) > 10
@@ -186,8 +182,7 @@ suggest("adacd-hil report runs/2026-11-25T10-00-00 --out /srv/reports/of/the/lef
 
 @pytest.mark.slow
 def test_a_command_that_may_be_typed_next_can_be_copied_from_a_narrow_terminal():
-    environment = {**os.environ, "TERM": "xterm", "PYTHONPATH": str(Path.cwd())}
-    shown = show_on_terminal([sys.executable, "-c", SUGGEST], 60, 24, environment)
+    shown = show_on_terminal(SUGGEST)
     assert shown.text.startswith("\x1b[1mnext:\x1b[0m ")
     assert shown.lines == [
         "next: adacd-hil report runs/2026-11-25T10-00-00 --out \\",

@@ -6,9 +6,17 @@ import click
 
 from adacd_hil.cli.completion import complete_configuration, complete_setting
 from adacd_hil.cli.options import json_option, profile_option, set_option
-from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained, format_table
+from adacd_hil.cli.output import (
+    CommandError,
+    ExitCode,
+    answer,
+    counted,
+    explain_statuses,
+    explained,
+    format_table,
+    text_of,
+)
 from adacd_hil.given_path import CommandGroup
-from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
     from adacd_hil.settings.setting_keys import KnownKey
@@ -98,7 +106,7 @@ def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCod
         lines += [f"{name}: error: {line}" for line in found.errors]
         lines += [f"{name}: warning: {line}" for line in found.warnings]
         lines.append(f"{name}: {counted(len(found.errors), 'error')}, {counted(len(found.warnings), 'warning')}")
-    answer(as_json, described, "\n".join(map(in_line, lines)))
+    answer(as_json, described, text_of(lines))
     return ExitCode.USAGE if any(found.errors for found in findings.values()) else ExitCode.OK
 
 

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.completion import complete_run, complete_setting
-from adacd_hil.cli.options import FiniteRange, json_option, profile_option, set_option, stretch_options
+from adacd_hil.cli.completion import complete_setting
+from adacd_hil.cli.options import FiniteRange, json_option, logs_argument, profile_option, set_option, stretch_options
 from adacd_hil.cli.output import (
     CommandError,
     ExitCode,
@@ -19,7 +19,7 @@ from adacd_hil.cli.output import (
     one_by_one,
     quoted,
 )
-from adacd_hil.given_path import GivenPath
+from adacd_hil.given_path import GIVEN_FILE, GivenPath
 from adacd_hil.log.log_files import SHOWN
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.printable import in_line
@@ -43,7 +43,7 @@ _MOST_COLUMNS = 6
 
 
 @click.command(epilog=_EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+@logs_argument
 @set_option
 @click.option(
     "--vary",
@@ -54,7 +54,7 @@ _MOST_COLUMNS = 6
 )
 @click.option("--config", metavar="NAME|FILE", help="Settings as a whole; needed for recordings without a log.")
 @profile_option
-@click.option("--dbc", type=GivenPath(dir_okay=False), help="Contract of a recording without a log.")
+@click.option("--dbc", type=GIVEN_FILE, help="Contract of a recording without a log.")
 @click.option("--against", type=GivenPath(), help="Log of the run that a recording is of, to compare with.")
 @click.option("--frames", "by_frames", is_flag=True, help="Decode the frames, and compare the arm's states, too.")
 @click.option(
@@ -66,20 +66,7 @@ _MOST_COLUMNS = 6
 @json_option
 @explained
 @stretch_options
-def replay(
-    logs: tuple[Path, ...],
-    changes: tuple[str, ...],
-    vary: tuple[str, ...],
-    config: str | None,
-    profile: str | None,
-    dbc: Path | None,
-    against: Path | None,
-    by_frames: bool,
-    tolerance: float | None,
-    shown: int,
-    as_json: bool,
-    stretch: "TimeWindow",
-) -> ExitCode:
+def replay(logs: tuple[Path, ...], shown: int, as_json: bool, stretch: "TimeWindow", **options: Any) -> ExitCode:
     """Replay logs: what the arm reported once more through the scheme.
 
     Without other settings, every field of /scheme and every contact report is compared with the log, bit for bit; a
@@ -96,19 +83,20 @@ def replay(
     With --from and --until, only that stretch is compared and printed. The replay still begins with the log, because
     filters and model depend on earlier cycles.
     """
-    configured = config, profile, dbc
     with Progress() as progress:
         results, refused = one_by_one(
-            logs,
-            lambda path: _replay_one(
-                path, changes, vary, configured, against, by_frames, tolerance, shown, stretch, progress
-            ),
+            logs, lambda path: _replay_one(path, progress, shown=shown, stretch=stretch, **options)
         )
     if results:
         described = [_as_json(*result, shown, stretch) for result in results]
         text = "\n\n".join(_as_text(*result, shown, stretch) for result in results)
         first, (own, *_), _ = results[0]
-        answer(as_json, described, text, *_next(first, own, has_changes=bool(changes or vary or config)))
+        answer(
+            as_json,
+            described,
+            text,
+            *_next(first, own, has_changes=any(options[name] for name in ("changes", "vary", "config"))),
+        )
     codes = [_code(replays) for _, replays, _ in results]
     order = [ExitCode.OK, ExitCode.PARTIAL, ExitCode.FAILURE]
     return complain_of(refused) or max(codes, key=order.index)
@@ -133,21 +121,22 @@ _Result = tuple[Path, "list[Replay]", list[str]]
 
 def _replay_one(
     given: Path,
+    progress: Progress,
     changes: tuple[str, ...],
     vary: tuple[str, ...],
-    configured: tuple[str | None, str | None, Path | None],
+    config: str | None,
+    profile: str | None,
+    dbc: Path | None,
     against: Path | None,
     by_frames: bool,
     tolerance: float | None,
     shown: int,
     stretch: "TimeWindow",
-    progress: Any,
 ) -> _Result:
     """Replay one log or recording with its own settings, and with each variant that the options ask for.
 
-    Return its path, the replays (own settings first), and the variants' names. configured: --config, --profile and
-    --dbc; the others as of the options. Raises CommandError, ConfigError, CodecError or LogError for a wrong option, or
-    a file that can't be read.
+    Return its path, the replays (own settings first), and the variants' names. Parameters: as the options. Raises
+    CommandError, ConfigError, CodecError or LogError for a wrong option, or a file that can't be read.
     """
     from adacd_hil.control.operator import ScriptedOperator
     from adacd_hil.replay.replay import replay_source
@@ -161,10 +150,9 @@ def _replay_one(
         refuse_log_settings,
     )
 
-    source, is_alone = _open(given, configured, against)
+    source, is_alone = _open(given, config, profile, dbc, against)
     own = source.settings
     base = own
-    config, _, _ = configured
     if config is not None and not is_alone:
         base = keep_log_settings(own, load_settings(config, own.arm.profile))
     for asked in (parse_changes(changes), *(parse_variations(vary) if vary else ())):
@@ -193,11 +181,11 @@ def _replay_one(
 
 
 def _open(
-    given: Path, configured: tuple[str | None, str | None, Path | None], against: Path | None
+    given: Path, config: str | None, profile: str | None, dbc: Path | None, against: Path | None
 ) -> "tuple[ReplaySource, bool]":
     """Return a log or a recording, and whether it is a recording without a log.
 
-    configured: --config, --profile and --dbc. against: log of the run that a recording is of. Raises CommandError for
+    against: log of the run that a recording is of. Raises CommandError for
     a recording without a log and without --config, and for --profile or --dbc where a log has its own; LogError,
     ConfigError or CodecError if one can't be read or used.
     """
@@ -209,7 +197,6 @@ def _open(
     from adacd_hil.wire.dbc_contract import load_codec
 
     path = log_in(given)
-    config, profile, dbc = configured
     if against is not None or path.suffix.lower() == ".mcap" or not path.exists():
         if unused := [name for name, value in (("--profile", profile), ("--dbc", dbc)) if value is not None]:
             raise CommandError(f"{unused[0]} is for a recording without a log: a log has its own", ExitCode.USAGE)

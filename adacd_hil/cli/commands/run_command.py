@@ -23,13 +23,13 @@ from adacd_hil.cli.connection import (
     on_interrupt,
 )
 from adacd_hil.cli.console_operator import ConsoleOperator
-from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
+from adacd_hil.cli.output import CommandError, ExitCode, exit_code, is_terminal, quoted, run_folder, text_of
 from adacd_hil.clock import wall_ns
 from adacd_hil.control.configuration_check import guesses_in_brief
 from adacd_hil.control.history_file import Origin, UsedHistory, use_history
 from adacd_hil.control.operator import Operator, ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
-from adacd_hil.control.tare_file import TARED, use_tare
+from adacd_hil.control.tare_file import TARED, UsedTare, use_tare
 from adacd_hil.dates import format_date
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
@@ -69,61 +69,62 @@ def drop_old_frames(bus: Bus, interface: str) -> None:
 
 def run_on_bus(
     connection: Connection,
-    clock_name: str,
+    clock: str,
     out: Path | None,
-    tare_path: Path | None = None,
-    live: LiveView | None = None,
-    history_path: Path | None = None,
-    scenario: str | None = None,
-    without_anchor: bool = False,
+    tare: Path | None,
+    live: LiveView | None,
+    history: Path | None,
+    scenario: str | None,
+    without_anchor: bool,
 ) -> tuple[dict[str, Any], ExitCode]:
     """Run the scheme on a bus until its end; return the result, see `summarise`, and the exit status.
 
-    out: folder of the log; None: a new one by date. tare_path, history_path: files with the offsets of a tare, and with
-    the arm's certificates; this run's are added. scenario: name of an emulated arm's scenario, whose user makes the
-    requests. without_anchor: the user accepts that no anchor bounds the torque offsets. live: serves the log to
-    viewers.
+    clock: "lockstep" or "realtime". out: folder of the log; None: a new one by date. tare, history: files with the
+    offsets of a tare, and with the arm's certificates; this run's are added. live: serves the log to viewers. scenario:
+    name of an emulated arm's scenario, whose user makes the requests. without_anchor: the user accepts that no anchor
+    bounds the torque offsets.
+
     Raises CommandError for options that don't fit the bus, or if the user declines; ConfigError or CodecError for
     settings or files that can't be used, BusMissingError for the bus, LogError or OSError for the folder and log.
     """
     interface, channel = connection.interface, connection.channel
-    check_clock(clock_name, interface, channel)
+    check_clock(clock, interface, channel)
     settings = connection.settings() if scenario is None else rehearsed_settings(connection, scenario)
-    check_shared(clock_name, settings)
+    check_shared(clock, settings)
     check_autonomy(settings, interface, channel)
-    tare = None
-    if tare_path is not None:
-        tare = use_tare(tare_path, settings, wall_ns())
-        settings = tare.apply(settings)
-    history = None
-    if history_path is not None:
+    files: list[UsedTare | UsedHistory] = []
+    if tare is not None:
+        files.append(use_tare(tare, settings, wall_ns()))
+        settings = files[-1].apply(settings)
+    known = None
+    if history is not None:
         if settings.scheme != "certified":
             raise CommandError(f"--history: scheme {settings.scheme!r} has no certificates", ExitCode.USAGE)
-        history = use_history(history_path, wall_ns())
-        settings = history.apply(settings)
-        ask_first_run(history)
+        known = use_history(history, wall_ns())
+        settings = known.apply(settings)
+        ask_first_run(known)
+        files.append(known)
     if settings.scheme == "certified" and not without_anchor and may_be_hardware(interface, channel):
         ask_without_anchor(unanchored_joints(settings), connection.arguments)
-    files = [file for file in (tare, history) if file is not None]
     devices = place_devices(settings)
     codec = load_contract(settings, devices)
-    if clock_name == "realtime" and (excess := describe_excess(codec, settings)):
+    if clock == "realtime" and (excess := describe_excess(codec, settings)):
         raise ConfigError(excess)
-    clock = make_clock(clock_name)
+    timer = make_clock(clock)
     with run_folder(out, (LOG_NAME,), "run") as folder, ExitStack() as stack, never_stopped():
-        bus = connection.open(clock, codec, settings, devices)
+        bus = connection.open(timer, codec, settings, devices)
         stack.callback(bus.close)
         drop_old_frames(bus, interface)
         operator: Operator = ScriptedOperator(settings.operator)
         progress = stack.enter_context(Progress())
-        if sys.stdin is not None and sys.stdin.isatty():
+        if is_terminal():
             operator = ConsoleOperator(ScriptedOperator(settings.operator), tell=progress)
         session = Session(
             settings,
             codec,
             devices,
             bus,
-            clock,
+            timer,
             operator,
             folder.path,
             interface,
@@ -141,10 +142,10 @@ def run_on_bus(
         with on_interrupt(session.interrupt, signal.SIGTSTP):  # Ctrl-Z parks: a stopped process would send no commands
             summary = session.run()
     code, described = exit_code(summary), summarise(summary)
-    if history is not None and summary.certificates:
+    if known is not None and summary.certificates:
         origin = Origin(format_date(wall_ns()), str(summary.log.path), settings.arm.profile, __version__)
         try:
-            described["history"] = history.add_certificates(summary.certificates, summary.identities, origin)
+            described["history"] = known.add_certificates(summary.certificates, summary.identities, origin)
         except (OSError, ConfigError) as error:
             described["history_error"] = str(error)
             print(in_line(f"adacd-hil: the certificate is not in the history: {error}"), file=sys.stderr)
@@ -157,7 +158,7 @@ def ask_first_run(history: UsedHistory) -> None:
 
     Do nothing if the arm has a history, or without a terminal.
     """
-    if not history.is_first_run or sys.stdin is None or not sys.stdin.isatty():
+    if not history.is_first_run or not is_terminal():
         return
     print(
         f"{history.path} does not exist: this is the arm's first run.\nA touch while it learns would be learnt as "
@@ -182,7 +183,7 @@ def ask_without_anchor(joints: list[int], arguments: str) -> None:
         "`arm.holding_torque_Nm` is unknown or large"
     )
     remedy = f"`adacd-hil tare {arguments}` first, then `run --tare tare.toml`"
-    if sys.stdin is None or not sys.stdin.isatty():
+    if not is_terminal():
         raise CommandError(f"{unknown}; {remedy}, or `run --without-anchor`", ExitCode.USAGE)
     print(
         in_line(
@@ -262,4 +263,4 @@ def as_text(result: dict[str, Any]) -> str:
         for what, shares in (("no frame in time", data["no_new_data"]), ("repeated frames", data["repeated"])):
             lines += [f"{name}: {what} in {share:.2%} of the cycles" for name, share in shares.items() if share]
         lines += [f"over its limit: {line}" for line in data["excesses"]]
-    return "\n".join(in_line(line) for line in lines)
+    return text_of(lines)

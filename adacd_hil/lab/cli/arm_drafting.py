@@ -3,12 +3,15 @@
 import math
 import os
 import tempfile
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from adacd_hil import __version__
+from adacd_hil.cli.connection import Connection
 from adacd_hil.cli.output import CommandError, ExitCode, quoted, tell
 from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.control.configuration_check import ConfigurationFindings, examine_configuration
@@ -64,43 +67,6 @@ _SHOWN_SHARE = 1e-5
 """Relative difference of a value as it was given and as a profile has it, by the digits that are written."""
 
 
-@dataclass(frozen=True)
-class InitOptions:
-    """Values of the options of `init`, pairs for joint 1 and 2; None, () or False: not given.
-
-    is_busless: --no-bus. locked: --lock. Other fields have the name of their option.
-    """
-
-    interface: str | None = None
-    channel: str | None = None
-    bitrate: int | None = None
-    is_busless: bool = False
-    urdf: Path | None = None
-    locked: tuple[str, ...] = ()
-    length_m: Pair | None = None
-    mass_kg: Pair | None = None
-    is_upright: bool | None = None
-    mounting: str | None = None
-    at_zero: str | None = None
-    rated_torque_nm: Pair | None = None
-    torque_limit_nm: Pair | None = None
-    position_limit_deg: Pair | None = None
-    velocity_limit_deg_s: Pair | None = None
-    drive: tuple[str, str] | None = None
-    sensor: tuple[str, str] | None = None
-    drive_node: tuple[int, int] | None = None
-    sensor_node: tuple[int, int] | None = None
-    eds: tuple[Path, ...] = ()
-    drive_eds: tuple[Path, ...] = ()
-    sensor_eds: tuple[Path, ...] = ()
-    gear: Pair | None = None
-    gear_efficiency: Pair | None = None
-    increments: Pair | None = None
-    velocity_unit: str | None = None
-    rated_torque_unit: str | None = None
-    torque_count_nm: Pair | None = None
-
-
 @dataclass
 class DraftFiles:
     """Files to be written all together. Existing files stay unless `--force` is given, `is_forced`.
@@ -129,6 +95,20 @@ class DraftFiles:
         if not (path.is_file() and path.read_bytes() == data):
             self.require_free(path)
         self.contents[path] = data
+
+    def beside(self, name: str, kind: str) -> str:
+        """Return a profile's name as the configuration states it: a built-in name, or a path relative to its folder.
+
+        If profile or EDS are in that folder, they are added unchanged to the files to be written. Raises ConfigError if
+        the profile can't be read.
+        """
+        profile = load_profile(name, kind)
+        if name in profile_names():
+            return name
+        for path in (Path(name), profile.eds):
+            if path.resolve().parent == self.out.resolve().parent:
+                self.contents[path] = path.read_bytes()
+        return os.path.relpath(name, self.out.parent)
 
     def examine(self, text: str) -> ConfigurationFindings:
         """Check a configuration's text together with the added files, as `config check`; return the findings.
@@ -161,14 +141,15 @@ class DraftFiles:
 class Drafting:
     """One draft of an arm's configuration: answers, devices found, drafted profiles.
 
-    bus: interface, channel and bitrate used, None without a bus. warnings: a line each. bitrate: of the bus, None if
+    options: values of `init`'s options by their names, pairs for joint 1 and 2; None, () or False: not given. bus: that
+    of the arm with the drafted configuration, None without a bus. warnings: a line each. bitrate: of the bus, None if
     unknown.
     """
 
-    def __init__(self, options: InitOptions, interview: Interview, writing: DraftFiles) -> None:
+    def __init__(self, options: SimpleNamespace, interview: Interview, writing: DraftFiles) -> None:
         self.options, self.interview, self.writing = options, interview, writing
         self.warnings: list[str] = []
-        self.bus: dict[str, Any] | None = None
+        self.bus: Connection | None = None
         self.bitrate = options.bitrate
         self.guessed: set[str] = set()
         """Profiles in which the scale of a count is a guess."""
@@ -179,13 +160,14 @@ class Drafting:
     def draft(self) -> tuple[str, dict[str, Any]]:
         """Scan the bus, ask the user, derive the other values; return the text of a configuration, and a summary.
 
-        The summary is for JSON. Writes no file; adds device profiles to `writing`. Raises CommandError without an
-        answer, for options that exclude each other, or if the configuration would have errors; ConfigError for a URDF,
-        EDS or value that can't be used, BusMissingError if the bus can't be opened, BusError if it fails.
+        The summary is for JSON, but for the `Connection` under "bus". Writes no file; adds device profiles to
+        `writing`. Raises CommandError without an answer, for options that exclude each other, or if the configuration
+        would have errors; ConfigError for a URDF, EDS or value that can't be used, BusMissingError if the bus can't be
+        opened, BusError if it fails.
         """
         facts = self._gather()
         title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]}"
-        title += f" from {self.bus['interface']} {self.bus['channel']}." if self.bus else " without hardware."
+        title += f" from {self.bus.interface} {self.bus.channel}." if self.bus else " without hardware."
         for period_us in _PERIODS_US if facts.period_us in _PERIODS_US else (facts.period_us,):
             entries, warnings = draft_arm(facts._replace(period_us=period_us))
             text = draft_as_toml(entries, title, quoted(self.writing.out))
@@ -206,37 +188,33 @@ class Drafting:
     def _gather(self) -> ArmFacts:
         """Return devices, profiles, geometry and limits of the arm: by options, bus and URDF, else by the user."""
         options = self.options
-        drives, sensors = self._find_devices()
-        drive, sensor = self._profiles(drives, sensors)
-        profiles = [self._profile(DRIVE, drive.value[joint], joint) for joint in range(2)]
-        self._check_used({DRIVE: drive.value, SENSOR: sensor.value})
-        scales = [profile.scale for profile in profiles]
+        devices = self._find_devices()
+        names = self._profiles(devices)
+        profiles = [self._profile(DRIVE, names[DRIVE].value[joint], joint) for joint in range(2)]
+        self._check_used(names)
         geometry, length_source, mass_source, gravity_source = self._ask_geometry()
-        ratings = [device.ratings for device in drives]
+        ratings = [device.ratings for device in devices[DRIVE]]
         rated = self._rated(ratings, profiles, geometry)
-        torque = self._limit("torque_limit_Nm", "--torque-limit-nm", _torque_proposals(rated, ratings, geometry))
-        usual, usual_devices = ArmSettings(), DevicesSettings()
-        scaled = list(zip(ratings, scales, strict=False))
-        by_drives = [rating.position_limit_deg(scale) for rating, scale in scaled]
-        proposal = _limit_proposal(
-            geometry.position_limit_deg, by_drives, "0x607D of the drives", usual.position_limit_deg
-        )
-        position = self._limit("position_limit_deg", "--position-limit-deg", proposal)
-        by_drives = [rating.velocity_limit_deg_s(scale) for rating, scale in scaled]
-        source = "0x6080 of the drives, by their gears"
-        proposal = _limit_proposal(geometry.velocity_limit_deg_s, by_drives, source, usual.velocity_limit_deg_s)
-        velocity = self._limit("velocity_limit_deg_s", "--velocity-limit-deg-s", proposal)
+        torque = self._limit("torque_limit_Nm", _torque_proposals(rated, ratings, geometry))
+        scaled = [(rating, profile.scale) for rating, profile in zip(ratings, profiles, strict=False)]
+        by_drives = _both(rating.position_limit_deg(scale) for rating, scale in scaled)
+        proposal = _limit_proposal("position_limit_deg", geometry, by_drives, "0x607D of the drives")
+        position = self._limit("position_limit_deg", proposal)
+        by_drives = _both(rating.velocity_limit_deg_s(scale) for rating, scale in scaled)
+        proposal = _limit_proposal("velocity_limit_deg_s", geometry, by_drives, "0x6080 of the drives, by their gears")
+        velocity = self._limit("velocity_limit_deg_s", proposal)
+        usual = DevicesSettings()
         nodes = [
             Fact(tuple(device.node.node_id for device in found), "found on the bus")
             if found
             else Fact(given or default, "given" if given else "")
             for found, given, default in (
-                (drives, options.drive_node, usual_devices.drive_node),
-                (sensors, options.sensor_node, usual_devices.sensor_node),
+                (devices[DRIVE], options.drive_node, usual.drive_node),
+                (devices[SENSOR], options.sensor_node, usual.sensor_node),
             )
         ]
         half = load_settings("fd_500us")
-        is_half = all(name.endswith("-500us") for name in (*drive.value, *sensor.value))
+        is_half = all(name.endswith("-500us") for fact in names.values() for name in fact.value)
         return ArmFacts(
             geometry,
             length_source,
@@ -246,8 +224,8 @@ class Drafting:
             torque,
             position,
             velocity,
-            drive,
-            sensor,
+            names[DRIVE],
+            names[SENSOR],
             nodes[0],
             nodes[1],
             half.bus.period_us if is_half else _PERIODS_US[0],
@@ -255,7 +233,7 @@ class Drafting:
             self.bitrate,
         )
 
-    def _check_used(self, names: dict[str, Any]) -> None:
+    def _check_used(self, names: Mapping[str, Fact]) -> None:
         """Raise CommandError if an option gives a value of `scale` other than a joint's profile has.
 
         The option would be without effect. names: profiles by kind. A unit may differ in one of both profiles; that of
@@ -264,8 +242,8 @@ class Drafting:
         for question in _QUESTIONS:
             if (given := question.given(self.options)) is None:
                 continue
-            key = question.key.partition(".")[2]
-            owned = [getattr(self._profile(question.kind, names[question.kind][i], i).scale, key) for i in range(2)]
+            named = names[question.kind].value
+            owned = [getattr(self._profile(question.kind, named[i], i).scale, question.name) for i in range(2)]
             wrong = [
                 joint
                 for joint, value in enumerate(question.read(given))
@@ -276,7 +254,7 @@ class Drafting:
             if len(wrong) > (1 if question.units else 0):
                 joint = wrong[0]
                 raise CommandError(
-                    f"{question.option.split()[0]}: profile {names[question.kind][joint]} of joint {joint + 1} has its "
+                    f"{question.option}: profile {named[joint]} of joint {joint + 1} has its "
                     f"own `{question.key}` = {owned[joint]:g}; correct it in a profile that `extends` that one, or "
                     f"give the EDS, --{question.kind}-eds FILE",
                     ExitCode.USAGE,
@@ -299,36 +277,33 @@ class Drafting:
         keys: dict[str, None] = {}
         for kind, names in ((DRIVE, facts.drive.value), (SENSOR, facts.sensor.value)):
             for joint, name in enumerate(names):
-                draft = self._drafts.get((kind, joint))
-                if draft is not None and name not in profile_names():
-                    keys |= dict.fromkeys(f"{name}: {key}" for key in draft.guessed)
-                elif name in profile_names():
-                    keys |= dict.fromkeys(f"{name}: {key}" for key in load_profile(name, kind).settings.assumed)
+                guessed: Iterable[str] = ()
+                if name in profile_names():
+                    guessed = load_profile(name, kind).settings.assumed
+                elif (kind, joint) in self._drafts:
+                    guessed = self._drafts[kind, joint].guessed
+                keys |= dict.fromkeys(f"{name}: {key}" for key in guessed)
         return list(keys)
 
     # -- devices
 
-    def _find_devices(self) -> tuple[list[RecognisedDevice], list[RecognisedDevice]]:
-        """Scan the bus, if there is one; return the drives and the sensors of joint 1 and 2, [] without a bus.
+    def _find_devices(self) -> dict[str, list[RecognisedDevice]]:
+        """Scan the bus, if there is one; return the devices of joint 1 and 2 by kind, [] without a bus.
 
         Sets `bus` and `bitrate`. Raises CommandError if fewer than two of a kind answer, BusMissingError if the bus
         can't be opened, BusError if it fails.
         """
         channel = self._ask_channel()
         if channel is None:
-            return [], []
+            return {DRIVE: [], SENSOR: []}
         interface = self.options.interface or "socketcan"
-
         clock = MonotonicClock()
-        bus = open_bus(interface, channel, clock, None, self.options.bitrate, False)
-        try:
+        with closing(open_bus(interface, channel, clock, None, self.options.bitrate, False)) as bus:
             found = survey(bus, clock, progress=tell)
             kinds = dict.fromkeys(self.options.drive_node or (), DRIVE)
             kinds |= dict.fromkeys(self.options.sensor_node or (), SENSOR)
             devices = recognise(bus, clock, found.nodes, kinds)
-        finally:
-            bus.close()
-        self.bus = {"interface": interface, "channel": channel, "bitrate": self.options.bitrate}
+        self.bus = Connection(interface, channel, self.options.bitrate, str(self.writing.out), None, None)
         link = read_link(channel) if interface == "socketcan" else None
         self.bitrate = (None if link is None else link.bitrate) or self.bitrate
         for device in devices:
@@ -340,10 +315,7 @@ class Drafting:
                     f"node {node.node_id}: {node.device_text}, neither drive nor sensor by 0x1000; give --drive-node "
                     "or --sensor-node for such a node"
                 )
-        chosen = [
-            self._choose_two(devices, kind, getattr(self.options, f"{kind}_node"), channel) for kind in (DRIVE, SENSOR)
-        ]
-        return chosen[0], chosen[1]
+        return {kind: self._choose_two(devices, kind, channel) for kind in (DRIVE, SENSOR)}
 
     def _ask_channel(self) -> str | None:
         """Return the channel of the arm's bus, by option or user; None for an arm without hardware.
@@ -356,7 +328,7 @@ class Drafting:
         if options.is_busless:
             return None
         if options.channel is not None:
-            return options.channel
+            return str(options.channel)
         if options.interface not in (None, "socketcan"):
             raise CommandError(f"--interface {options.interface} needs --channel", ExitCode.USAGE)
         present = can_interfaces()
@@ -378,13 +350,11 @@ class Drafting:
         channel, _ = self.interview.ask("--channel or --no-bus", None, question, read, proposal)
         return None if channel == _NO_BUS else channel
 
-    def _choose_two(
-        self, devices: Sequence[RecognisedDevice], kind: str, given: tuple[int, int] | None, channel: str
-    ) -> list[RecognisedDevice]:
+    def _choose_two(self, devices: Sequence[RecognisedDevice], kind: str, channel: str) -> list[RecognisedDevice]:
         """Return the drives, or the sensors, of joint 1 and 2: as given, as the user answers, or by ascending node id.
 
-        kind: "drive" or "sensor". given: node ids of the option. channel: of the bus, for the error. A proposal that
-        was taken is added to `warnings`. Raises CommandError if fewer than two answer.
+        kind: "drive" or "sensor". channel: of the bus, for the error. A proposal that was taken is added to `warnings`.
+        Raises CommandError if fewer than two answer.
         """
         known = {device.node.node_id: device for device in devices if device.kind == kind}
         option, nodes = f"--{kind}-node", " ".join(map(str, known)) or "none"
@@ -406,51 +376,47 @@ class Drafting:
 
         # Of more than two, as of two arms, only the user can choose.
         proposal = Fact(tuple(known) if len(known) == 2 else None, "in the order of the node ids")
+        given = getattr(self.options, f"{kind}_node")
         answer, source = self.interview.ask(option, given, f"Node ids of the {kind}s of joint 1 and 2", read, proposal)
         if source != "given":
             self.warnings.append(f"{kind}s of joint 1 and 2 are nodes {nodes}, {source}: `doctor --move` checks it")
         return answer
 
-    def _profiles(self, drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]) -> tuple[Fact, Fact]:
-        """Return the names of the profiles of the drives and of the sensors, drafted from an EDS if one is given.
+    def _profiles(self, found: Mapping[str, Sequence[RecognisedDevice]]) -> dict[str, Fact]:
+        """Return the names of the profiles of both joints by kind, drafted from an EDS if one is given.
 
         Without a bus and an EDS, they are the emulated devices' profiles, a guess. Raises CommandError if a device has
         neither a profile nor an EDS.
         """
-        options = self.options
-        drafted = self._draft_profiles([*drives, *sensors])
-        found = choose_family(drives, sensors) if drives else (("",) * 2, ("",) * 2)
-        facts = []
-        for kind, devices, names, default in (
-            (DRIVE, drives, found[0], "adacd-drive"),
-            (SENSOR, sensors, found[1], "adacd-sensor"),
-        ):
-            given = getattr(options, kind)
+        drafted = self._draft_profiles(found)
+        families = choose_family(*found.values()) if found[DRIVE] else (("",) * 2, ("",) * 2)
+        facts: dict[str, Fact] = {}
+        for (kind, devices), names in zip(found.items(), families, strict=True):
+            given = getattr(self.options, kind)
             if given is not None:
-                named = tuple(self.beside(name, kind) for name in given)
-                facts.append(Fact(self._complete(kind, named, devices), "given"))
+                named = tuple(self.writing.beside(name, kind) for name in given)
+                facts[kind] = Fact(self._complete(kind, named, devices), "given")
                 continue
-            from_eds = tuple(drafted.get((kind, joint), "") for joint in range(2))
-            chosen = tuple(from_eds[joint] or names[joint] for joint in range(2))
-            for joint, name in enumerate(chosen):
-                if not name and devices and self.interview.is_asking:
-                    asked = self._ask_eds(kind, joint, devices[joint])
-                    chosen = tuple(asked if other == joint else known for other, known in enumerate(chosen))
+            chosen = [drafted.get((kind, joint)) or names[joint] for joint in range(2)]
+            for joint, device in enumerate(devices):
+                if not chosen[joint] and self.interview.is_asking:
+                    chosen[joint] = self._ask_eds(kind, joint, device)
             if not any(chosen) and not devices:
-                facts.append(Fact((default, default)))
+                facts[kind] = Fact((f"adacd-{kind}",) * 2)
             elif all(chosen):
-                source = "from the EDS" if all(from_eds) else "recognised by vendor and product"
+                are_of_eds = all((kind, joint) in drafted for joint in range(2))
+                source = "from the EDS" if are_of_eds else "recognised by vendor and product"
                 completed = self._complete(kind, chosen, devices)
-                facts.append(Fact(completed, "" if self.guessed & set(completed) else source))
+                facts[kind] = Fact(completed, "" if self.guessed & set(completed) else source)
             else:
-                joint = 0 if not chosen[0] else 1
+                joint = chosen.index("")
                 title = devices[joint].title if devices else "the device"
                 raise CommandError(
                     f"{kind} of joint {joint + 1} ({in_line(title)}) has no built-in profile: give --eds FILE, its "
                     f"maker's, or --{kind} PROFILE PROFILE",
                     ExitCode.USAGE,
                 )
-        return facts[0], facts[1]
+        return facts
 
     def _ask_eds(self, kind: str, joint: int, device: RecognisedDevice) -> str:
         """Ask for the EDS of a device without a profile; draft that profile, and return its file name.
@@ -467,25 +433,11 @@ class Drafting:
         question = f"EDS of the {kind} of joint {joint + 1} ({in_line(device.title)})"
         return self.interview.ask("--eds FILE", None, question, read)[0]
 
-    def beside(self, name: str, kind: str) -> str:
-        """Return a profile's name as the configuration states it: a built-in name, or a path relative to its folder.
-
-        If profile or EDS are in that folder, they are added unchanged to the files to be written. Raises ConfigError if
-        the profile can't be read.
-        """
-        profile = load_profile(name, kind)
-        if name in profile_names():
-            return name
-        for path in (Path(name), profile.eds):
-            if path.resolve().parent == self.writing.out.resolve().parent:
-                self.writing.contents[path] = path.read_bytes()
-        return os.path.relpath(name, self.writing.out.parent)
-
-    def _draft_profiles(self, devices: Sequence[RecognisedDevice]) -> dict[tuple[str, int], str]:
+    def _draft_profiles(self, devices: Mapping[str, Sequence[RecognisedDevice]]) -> dict[tuple[str, int], str]:
         """Draft profiles of each given EDS, beside the configuration; return their file names by kind and joint (0, 1).
 
-        devices: found on the bus; [] without a bus: of two EDS of a kind, the first is of joint 1. Raises CommandError
-        for an EDS beside named profiles, or that fits no device, or a device that has another EDS already.
+        devices: found on the bus by kind; [] without a bus: of two EDS of a kind, the first is of joint 1. Raises
+        CommandError for an EDS beside named profiles, or that fits no device, or a device that has another EDS already.
         """
         names: dict[tuple[str, int], str] = {}
         files = self._eds_files()
@@ -496,7 +448,7 @@ class Drafting:
                     ExitCode.USAGE,
                 )
             identity = identity_of(eds)
-            same = [device for device in devices if device.kind == kind]
+            same = devices[kind]
             fitting = [
                 joint
                 for joint in range(2)
@@ -541,32 +493,31 @@ class Drafting:
     def _add_drafts(self, eds: Path, kind: str, ratings: dict[int, DeviceRatings]) -> dict[tuple[str, int], str]:
         """Draft profiles of an EDS; add them and the EDS to the files to be written.
 
-        Asks for values that the EDS leaves open. ratings: by joint (0, 1) to draft for. Return the profiles' file names
-        by kind and joint; joints with equal drafts share one.
+        Asks for values that the EDS leaves open; guesses and remarks become warnings, a profile with an `_ESSENTIAL`
+        guess one of `guessed`. ratings: by joint (0, 1) to draft for. Return the profiles' file names by kind and
+        joint; joints with equal drafts share one.
         """
         drafts = self._draft(eds, kind, ratings)
-        folder, stem = self.writing.out.parent, f"{self.writing.out.stem}-{eds.stem}"
-        self.writing.add_file(folder / eds.name, eds.read_bytes())
+        self.writing.add_file(self.writing.out.parent / eds.name, eds.read_bytes())
         names: dict[tuple[str, int], str] = {}
-        texts: dict[str, str] = {}
+        files: dict[str, str] = {}
         for joint, draft in drafts.items():
-            name = texts.setdefault(draft.text, f"{stem}.toml" if not texts else f"{stem}-{joint + 1}.toml")
-            names[kind, joint] = name
-            self._note(kind, joint, name, draft)
-        for text, name in texts.items():
-            self.writing.add_file(folder / name, text)
+            name = names[kind, joint] = self._add_profile(draft.text, eds.stem, files)
+            self._drafts[kind, joint] = draft
+            for line in (*draft.guesses, *draft.remarks):
+                if (warning := f"{name}: {line}") not in self.warnings:
+                    self.warnings.append(warning)
+            self.guessed |= {name} if _ESSENTIAL & draft.guessed.keys() else set()
         return names
 
-    def _note(self, kind: str, joint: int, name: str, draft: ProfileDraft) -> None:
-        """Store a draft by kind and joint; add its guesses and remarks to the warnings, each once. name: of its file.
+    def _add_profile(self, text: str, stem: str, files: dict[str, str]) -> str:
+        """Add the text of a joint's profile to the files to be written; return the file's name, with `stem` in it.
 
-        If a guess is `_ESSENTIAL`, add the name to `guessed`.
+        files: names by text, of the joint before; equal texts share a file.
         """
-        self._drafts[kind, joint] = draft
-        for line in (*draft.guesses, *draft.remarks):
-            if (warning := f"{name}: {line}") not in self.warnings:
-                self.warnings.append(warning)
-        self.guessed |= {name} if _ESSENTIAL & draft.guessed.keys() else set()
+        name = files.setdefault(text, f"{self.writing.out.stem}-{stem}{'-2' if files else ''}.toml")
+        self.writing.add_file(self.writing.out.parent / name, text)
+        return name
 
     def _draft(
         self, eds: Path, kind: str, ratings: dict[int, DeviceRatings], among: Collection[str] | None = None
@@ -590,7 +541,7 @@ class Drafting:
             if question.option not in self._answers:
                 proposal = Fact(question.propose(guessed.get(question.key, 1.0)))
                 self._answers[question.option] = self.interview.ask(
-                    question.option,
+                    f"{question.option} {'UNIT' if question.units else 'A B'}",
                     question.given(self.options),
                     question.text,
                     question.read,
@@ -604,13 +555,13 @@ class Drafting:
                 drafts = drafted()
         return drafts
 
-    def _complete(self, kind: str, names: tuple[str, ...], devices: Sequence[RecognisedDevice]) -> tuple[str, ...]:
+    def _complete(self, kind: str, names: Sequence[str], devices: Sequence[RecognisedDevice]) -> tuple[str, ...]:
         """Return the profiles' names; a shipped one with guesses is replaced by an extension if answers replace some.
 
         An extension is a profile that `extends` it by the answers. The extensions are added to the files to be written.
         A shipped profile whose guesses all stay is added to `guessed`.
         """
-        completed, texts = list(names), dict[str, str]()
+        completed, files = list(names), dict[str, str]()
         for joint, name in enumerate(names):
             if name not in profile_names():
                 continue
@@ -622,15 +573,12 @@ class Drafting:
             left = [key for key in draft.guessed if key in profile.settings.assumed]
             if len(left) < len(profile.settings.assumed):
                 text = _extension(name, profile.settings.scale, draft.settings.scale, left)
-                file = f"{self.writing.out.stem}-{name}.toml" if not texts else f"{self.writing.out.stem}-{name}-2.toml"
-                completed[joint] = texts.setdefault(text, file)
+                completed[joint] = self._add_profile(text, name, files)
                 self._drafts[kind, joint] = draft._replace(
                     guessed={key: draft.guessed[key] for key in left}, remarks=()
                 )
             else:
                 self.guessed.add(name)
-        for text, file in texts.items():
-            self.writing.add_file(self.writing.out.parent / file, text)
         return tuple(completed)
 
     # -- the arm
@@ -639,11 +587,10 @@ class Drafting:
         """Return the geometry, and the sources of lengths, masses and gravity's direction, "" for a guess.
 
         It is the URDF's, else that of given or asked lengths and masses; without masses `cad_theta` is (). Raises
-        CommandError for options that exclude each other, or a URDF that can't be used.
+        CommandError for options that exclude each other, ConfigError for a URDF that can't be used.
         """
         options, interview = self.options, self.interview
-        urdf, arm = options.urdf, None
-        if urdf is not None:
+        if options.urdf is not None:
             if options.length_m is not None or options.mass_kg is not None:
                 raise CommandError(
                     "--urdf gives lengths and masses: leave out --length-m and --mass-kg", ExitCode.USAGE
@@ -653,18 +600,15 @@ class Drafting:
                     "--urdf gives the direction of gravity; --mounting floor, wall or ceiling gives that of its root",
                     ExitCode.USAGE,
                 )
-            try:
-                arm = _read_urdf(urdf, options.locked)
-            except ConfigError as error:
-                raise CommandError(str(error), ExitCode.USAGE) from None
-        elif options.length_m is None and interview.is_asking:
 
-            def read(text: str) -> tuple[Path, PlanarArm] | None:
-                return None if text == "-" else (Path(text), _read_urdf(Path(text), options.locked))
+        def read(path: Path | str) -> tuple[Path, PlanarArm] | None:
+            return None if path == "-" else (Path(path), _read_urdf(Path(path), options.locked))
 
-            found, _ = interview.ask("--urdf", None, "URDF of the arm, - for none", read, Fact("-"))
-            urdf, arm = found or (None, None)
-        if urdf is not None and arm is not None:
+        described = None
+        if options.urdf is not None or (options.length_m is None and interview.is_asking):
+            described, _ = interview.ask("--urdf", options.urdf, "URDF of the arm, - for none", read, Fact("-"))
+        if described is not None:
+            urdf, arm = described
             if not arm.is_tip_known:
                 self.warnings.append(f"{urdf} has no frame at the tip: the length of link 2 is a guess")
             source = f"URDF {urdf.name}"
@@ -681,13 +625,13 @@ class Drafting:
             Fact((0.35, 0.30)),
         )
         mounting_deg, gravity_source = self._ask_mounting()
-        mass_kg = options.mass_kg
-        if mass_kg is None and interview.is_asking:
+        mass_kg = None
+        if options.mass_kg is not None or interview.is_asking:
             question = "Masses of the links in kg, - for unknown"
-            mass_kg, _ = interview.ask("--mass-kg", None, question, _masses, Fact("-"))
+            mass_kg, _ = interview.ask("--mass-kg", options.mass_kg, question, _masses, Fact("-"))
         if mass_kg is None:
             return PlanarArm(length_m, (), mounting_deg), length_source, "", gravity_source
-        arm = uniform_rods(length_m, _masses(mass_kg) or (0.0, 0.0), mounting_deg)
+        arm = uniform_rods(length_m, mass_kg, mounting_deg)
         self.warnings.append("inertia is that of uniform rods, without motors and gears")
         return arm, length_source, "given masses, as uniform rods", gravity_source
 
@@ -709,7 +653,7 @@ class Drafting:
             "--mounting or --flat",
             given,
             "Mounting of the base: flat (joint axes vertical), floor, wall, ceiling, or the tilt of the plane in deg",
-            lambda text: (text.casefold(), _tilt(text)),
+            lambda text: (text.casefold(), _word_or_deg("--mounting", text, _TILTS_DEG, 0.0, 90.0)),
             Fact("flat"),
             "on floor, wall and ceiling the joint axes are level and all of gravity acts; a tilt of 0 is flat",
         )
@@ -726,7 +670,7 @@ class Drafting:
             "--at-zero",
             options.at_zero,
             "Link 1 at q1 = 0 points down, up, level (+q1 lifts it), or down only at q1 = (deg)",
-            _hanging,
+            lambda text: _word_or_deg("--at-zero", text, _HANGING_DEG, -180.0, 180.0),
             Fact(usual or "level", f"as usual of an arm on {mounting}" if usual else ""),
             "q1 = 0 is where the drive reads 0, or `arm.zero_deg`; 90: level, and +q1 lowers it",
         )
@@ -737,16 +681,19 @@ class Drafting:
         """Ask how a URDF's root is mounted, and read the URDF again with its root so turned.
 
         arm: read with the root's z axis up. Return the arm as mounted, and a phrase on the mounting; the given arm if
-        neither option nor user answers. Raises CommandError for a wrong option.
+        neither option nor user answers. Raises ConfigError for a wrong option.
         """
         interview, given = self.interview, self.options.mounting
         if given is None and not interview.is_asking:
             return arm, "its root's z axis up"
         question = "Mounting of the URDF's root: floor (z up), wall (x down), ceiling (z down), or its pitch in deg"
-        try:
-            pitch_deg, _ = interview.ask("--mounting", given, question, _pitch, Fact("floor"))
-        except ConfigError as error:
-            raise CommandError(str(error), ExitCode.USAGE) from None
+        pitch_deg, _ = interview.ask(
+            "--mounting",
+            given,
+            question,
+            lambda text: _word_or_deg("--mounting", text, _PITCHES_DEG, -180.0, 180.0),
+            Fact("floor"),
+        )
         mounted = "its root's z axis up" if pitch_deg == 0.0 else f"its root pitched by {pitch_deg:g} deg"
         return _read_urdf(urdf, self.options.locked, pitch_deg), mounted
 
@@ -759,34 +706,32 @@ class Drafting:
         `geometry`.
         """
         scales = [profile.scale for profile in profiles]
-        by_drives = [rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False)]
-        drafts = [self._drafts.get((DRIVE, joint)) for joint in range(2)]
-        by_eds = [None if draft is None else draft.rated_torque_Nm for draft in drafts]
+        drafts = [draft for joint in range(2) if (draft := self._drafts.get((DRIVE, joint))) is not None]
+        by_drives = _both(rating.rated_torque_Nm(scale) for rating, scale in zip(ratings, scales, strict=False))
+        by_eds = _both(draft.rated_torque_Nm for draft in drafts)
         is_known = not any(TORQUE_KEYS & set(profile.assumed) for profile in profiles)
-        are_of_eds = all(draft is not None and draft.is_rated_known for draft in drafts)
         if self.options.rated_torque_nm is None and is_known:
-            for pair, source in (
-                (by_drives, "0x6076 of the drives"),
-                (by_eds if are_of_eds else [], "0x6076 of their EDS"),
-            ):
-                if len(pair) == 2 and None not in pair:
-                    behind = " behind their gears" if any(scale.gear_ratio != 1.0 for scale in scales) else ""
-                    return Fact(_checked("rated_torque_Nm", (pair[0], pair[1])), source + behind)
+            behind = " behind their gears" if any(scale.gear_ratio != 1.0 for scale in scales) else ""
+            if by_drives is not None:
+                return Fact(_checked("rated_torque_Nm", by_drives), f"0x6076 of the drives{behind}")
+            if by_eds is not None and all(draft.is_rated_known for draft in drafts):
+                return Fact(_checked("rated_torque_Nm", by_eds), f"0x6076 of their EDS{behind}")
         proposal = Fact((12.0, 6.0))
         if geometry.effort_Nm is not None and min(geometry.effort_Nm) > 0.0:
             proposal = Fact(geometry.effort_Nm)  # a URDF's effort is a limit, no rating
         for pair in (by_eds, by_drives):
-            if len(pair) == 2 and None not in pair and _is_rating(pair):
-                proposal = Fact((pair[0], pair[1]))
-        return self._limit("rated_torque_Nm", "--rated-torque-nm", proposal)
+            with suppress(ConfigError):  # out of bounds: no proposal
+                proposal = proposal if pair is None else Fact(_checked("rated_torque_Nm", pair))
+        return self._limit("rated_torque_Nm", proposal)
 
-    def _limit(self, key: str, option: str, proposal: Fact) -> Fact:
+    def _limit(self, key: str, proposal: Fact) -> Fact:
         """Return the two values of `arm.KEY`, within its bounds, by option or user, with their source.
 
         proposal: for the user, or taken with `--yes`; an answer above a known one is added to the warnings. Raises
         ConfigError for a wrong option, CommandError without an answer.
         """
-        given = getattr(self.options, option[2:].replace("-", "_"))
+        given = getattr(self.options, key.lower())
+        option = f"--{key.lower().replace('_', '-')}"
         meaning = known_keys()[f"arm.{key}"].meaning
         value, source = self.interview.ask(
             f"{option} A B",
@@ -826,18 +771,6 @@ _TILTS_DEG = {"flat": 0.0, "floor": 90.0, "wall": 90.0, "ceiling": 90.0}
 _HANGING_DEG = {"down": 0.0, "up": 180.0, "level": -90.0}
 """The q1 at which link 1 hangs down, by its direction at q1 = 0."""
 _USUAL_POSES = {"floor": "up", "wall": "level", "ceiling": "down"}
-
-
-def _tilt(text: str) -> float:
-    return _word_or_deg("--mounting", text, _TILTS_DEG, 0.0, 90.0)
-
-
-def _pitch(text: str) -> float:
-    return _word_or_deg("--mounting", text, _PITCHES_DEG, -180.0, 180.0)
-
-
-def _hanging(text: str) -> float:
-    return _word_or_deg("--at-zero", text, _HANGING_DEG, -180.0, 180.0)
 
 
 def _word_or_deg(option: str, text: str, words: dict[str, float], low: float, high: float) -> float:
@@ -899,21 +832,23 @@ def _torque_proposals(rated: Fact, ratings: Sequence[DeviceRatings], geometry: P
     return Fact(limit, source if rated.source else "")
 
 
-def _limit_proposal(by_urdf: Pair | None, by_drives: list[float | None], source: str, default: Pair) -> Fact:
-    """Return as proposed limits the URDF's, else those of both drives, from `source`, else `default`, a guess.
-
-    by_drives: None for a drive that doesn't give one.
-    """
+def _limit_proposal(key: str, geometry: PlanarArm, by_drives: Pair | None, source: str) -> Fact:
+    """Return as proposed `arm.KEY` the URDF's, else that of both drives, from `source`, else the default, a guess."""
+    by_urdf = getattr(geometry, key)
     if by_urdf is not None:
         return Fact(by_urdf, "the URDF's")
-    if by_drives and None not in by_drives:
-        return Fact(tuple(by_drives), source)
-    return Fact(default)
+    return Fact(getattr(ArmSettings(), key)) if by_drives is None else Fact(by_drives, source)
+
+
+def _both(values: Iterable[float | None]) -> Pair | None:
+    """Return the values of joint 1 and 2; None unless both are known."""
+    known = [value for value in values if value is not None]
+    return (known[0], known[1]) if len(known) == 2 else None
 
 
 _ESSENTIAL = {"scale.increments_per_joint_rev", "scale.torque_Nm", "scale.rated_torque_count_Nm"}
 """Keys of a profile that, as guesses, make `devices` of the configuration a guess, too."""
-_VELOCITY_UNITS = {
+_VELOCITY_UNITS: dict[str, float] = {
     "increment/s": 0x00B50300,
     "rpm": 0x00B44700,
     "0.1rpm": 0xFFB44700,
@@ -928,25 +863,30 @@ _TORQUE_UNITS_NM = {"mNm": 1e-3, "µNm": 1e-6, "uNm": 1e-6, "Nm": 1.0, "0.01Nm":
 class ScaleQuestion:
     """A question about a value that an EDS may leave open. kind: of the device.
 
-    key: in its profile, such as "scale.torque_Nm". option: that answers it, with the names of its values, such as
-    "--gear A B". explanation: printed on `?`. units: for a question about a unit, the worth of each name.
+    name: in `scale` of its profile, such as "torque_Nm". option: that answers it. explanation: printed on `?`. units:
+    for a question about a unit, the worth of each name.
     """
 
     kind: str
-    key: str
+    name: str
     option: str
     text: str
     explanation: str
     units: dict[str, float] = field(default_factory=dict)
 
     @property
+    def key(self) -> str:
+        """Key of the value in the profile."""
+        return f"scale.{self.name}"
+
+    @property
     def answer(self) -> str:
         """Key of the answer in `answers` of `draft_profile`."""
-        return "velocity_unit" if self.key == "scale.velocity_rad_s" else self.key.partition(".")[2]
+        return "velocity_unit" if self.name == "velocity_rad_s" else self.name
 
-    def given(self, options: InitOptions) -> Any:
+    def given(self, options: SimpleNamespace) -> Any:
         """Return the value of the question's option, None if the option is absent."""
-        return getattr(options, self.option.split()[0].lstrip("-").replace("-", "_"))
+        return getattr(options, self.option.lstrip("-").replace("-", "_"))
 
     def propose(self, value: float) -> Any:
         """Return a guessed value as an answer to the question: for both joints, or as the name of its unit.
@@ -963,74 +903,65 @@ class ScaleQuestion:
         Raises ConfigError for an unknown unit, no two numbers, or a value that a profile doesn't accept.
         """
         if not self.units:
-            first, second = _numbers(value, float, self.option.split()[0])
+            first, second = _numbers(value, float, self.option)
         elif value in self.units:
             first = second = self.units[value]
         else:
-            raise ConfigError(f"{self.option.split()[0]}: {value!r} must be one of {', '.join(self.units)}")
-        name = self.key.partition(".")[2]
+            raise ConfigError(f"{self.option}: {value!r} must be one of {', '.join(self.units)}")
         if self.answer != "velocity_unit":
-            parse(ScaleSettings, {name: first})
-            parse(ScaleSettings, {name: second})
+            parse(ScaleSettings, {self.name: first})
+            parse(ScaleSettings, {self.name: second})
         if min(first, second) <= 0.0:
-            raise ConfigError(f"{self.option.split()[0]}: {min(first, second):g} must be above 0")
+            raise ConfigError(f"{self.option}: {min(first, second):g} must be above 0")
         return first, second
 
 
 _QUESTIONS = (
     ScaleQuestion(
         DRIVE,
-        "scale.gear_ratio",
-        "--gear A B",
+        "gear_ratio",
+        "--gear",
         "Gear of joint 1 and 2: motor revolutions per revolution of the joint",
         "0x6076 is the motor's torque, and velocities are the motor's; 1 without a gear",
     ),
     ScaleQuestion(
         DRIVE,
-        "scale.gear_efficiency",
-        "--gear-efficiency A B",
+        "gear_efficiency",
+        "--gear-efficiency",
         "Efficiency of these gears, 0 to 1; 1 where it is not known",
         "part of the motor's torque that leaves the gear, 0.6 to 0.9 mostly",
     ),
     ScaleQuestion(
         DRIVE,
-        "scale.increments_per_joint_rev",
-        "--increments A B",
+        "increments_per_joint_rev",
+        "--increments",
         "Position increments per revolution of joint 1 and 2",
         "counts of 0x6064: increments per motor revolution times the gear; turn the joint by hand and look",
     ),
     ScaleQuestion(
         DRIVE,
-        "scale.velocity_rad_s",
-        "--velocity-unit UNIT",
+        "velocity_rad_s",
+        "--velocity-unit",
         "Unit of the drives' velocity 0x606C: increment/s, rpm, 0.1rpm, mrpm, deg/s or rad/s, of the motor",
         "the drive's manual has it under 0x606C or 0x60A9",
-        {name: float(code) for name, code in _VELOCITY_UNITS.items()},
+        _VELOCITY_UNITS,
     ),
     ScaleQuestion(
         DRIVE,
-        "scale.rated_torque_count_Nm",
-        "--rated-torque-unit UNIT",
+        "rated_torque_count_Nm",
+        "--rated-torque-unit",
         "Unit of the drives' rated torque 0x6076: mNm, µNm, Nm or 0.01Nm",
         "mNm by CiA 402-2; an EPOS4 has µNm",
         _TORQUE_UNITS_NM,
     ),
     ScaleQuestion(
         SENSOR,
-        "scale.torque_Nm",
-        "--torque-count-nm A B",
+        "torque_Nm",
+        "--torque-count-nm",
         "One count of the torque sensors of joint 1 and 2, Nm",
         "in the sensor's data sheet, or by a known weight",
     ),
 )
-
-
-def _is_rating(pair: Sequence[float | None]) -> bool:
-    try:
-        _checked("rated_torque_Nm", (pair[0], pair[1]))
-    except ConfigError:
-        return False
-    return True
 
 
 def _drive_or_sensor(text: str) -> str:

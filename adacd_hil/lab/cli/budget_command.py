@@ -29,7 +29,7 @@ def judge(
     period_us: int | None,
     bitrate: int | None,
     data_bitrate: int | None,
-    arms: int | None = None,
+    arms: int | None,
 ) -> tuple[Codec, Budget, list[str]]:
     """Compute whether the frames of a contract meet their deadlines; return its codec, the budget, and remarks.
 
@@ -44,14 +44,12 @@ def judge(
         codec, period_us or declared_us or settings.bus.period_us, bitrate, data_bitrate, arms or settings.bus.arms
     )
     notes = list(budget.notes)
-    if period_us is None and settings.bus.period_us != budget.period_us:
-        notes.append(
-            f"configuration {settings.name} has bus.period_us = {settings.bus.period_us}, the DBC {budget.period_us}"
-        )
-    if bitrate is None and settings.devices.bitrate != budget.bitrate:
-        notes.append(
-            f"configuration {settings.name} has devices.bitrate = {settings.devices.bitrate}, the DBC {budget.bitrate}"
-        )
+    for key, given, own, found in (
+        ("bus.period_us", period_us, settings.bus.period_us, budget.period_us),
+        ("devices.bitrate", bitrate, settings.devices.bitrate, budget.bitrate),
+    ):
+        if given is None and own != found:
+            notes.append(f"configuration {settings.name} has {key} = {own}, the DBC {found}")
     return codec, budget, notes
 
 

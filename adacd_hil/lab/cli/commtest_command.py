@@ -39,7 +39,6 @@ from adacd_hil.wire.contract_attributes import read_bitrates
 
 LOG_NAME = "commtest.mcap"
 HTML_NAME = "commtest.html"
-_EXIT = {Verdict.GOOD: ExitCode.OK, Verdict.WARNING: ExitCode.OK, Verdict.NOT_SUFFICIENT: ExitCode.FAILURE}
 _FIRST_BIN_US = 10.0
 _BINS = 12
 
@@ -132,8 +131,9 @@ def _exit_code(test: CommunicationTest, fault: FaultReason, is_interrupted: bool
         return ExitCode.SAFETY_STOP
     if is_interrupted:
         return ExitCode.INTERRUPTED
-    code = _EXIT[test.verdict]
-    return ExitCode.PARTIAL if code is ExitCode.OK and has_lost_log else code
+    if test.verdict is Verdict.NOT_SUFFICIENT:
+        return ExitCode.FAILURE
+    return ExitCode.PARTIAL if has_lost_log else ExitCode.OK
 
 
 def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection, achieved: dict[str, str]) -> Recorder:

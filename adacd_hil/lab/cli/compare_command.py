@@ -63,19 +63,19 @@ def _as_text(found: "LogComparison") -> str:
     else:
         same = ", all the same" if found.is_same_where_whole else ""
         lines.append(f"{found.cycles} cycles compared{same}, {found.only[0]} and {found.only[1]} only in one")
-    if found.settings:
-        lines += ["", format_table(("setting", "1", "2"), [(key, *pair) for key, pair in found.settings.items()])]
-    if found.metadata:
-        lines += ["", format_table(("metadata", "1", "2"), [(key, *pair) for key, pair in found.metadata.items()])]
-    if found.fields:
-        rows = [
-            (each.field, f"{each.first_s:.3f} s", str(each.first_cycle), str(each.cycles), f"{each.largest:.3g}")
-            for each in found.fields
-        ]
-        lines += ["", format_table(("field", "differs from", "cycle", "cycles", "by at most"), rows, (1, 2, 3, 4))]
-    if found.contacts:
-        rows3 = [(contact_in_words(first), contact_in_words(second)) for first, second in found.contacts]
-        lines += ["", format_table(("contact in 1", "in 2"), rows3)]
+    fields = [
+        (each.field, f"{each.first_s:.3f} s", str(each.first_cycle), str(each.cycles), f"{each.largest:.3g}")
+        for each in found.fields
+    ]
+    contacts = [(contact_in_words(first), contact_in_words(second)) for first, second in found.contacts]
+    for head, rows in (
+        (("setting", "1", "2"), [(key, *pair) for key, pair in found.settings.items()]),
+        (("metadata", "1", "2"), [(key, *pair) for key, pair in found.metadata.items()]),
+        (("field", "differs from", "cycle", "cycles", "by at most"), fields),
+        (("contact in 1", "in 2"), contacts),
+    ):
+        if rows:
+            lines += ["", format_table(head, rows, (1, 2, 3, 4) if rows is fields else ())]
     lines += ["", format_table(("state", "1", "2"), _states(found))]
     lines += ["", format_table(("parameter", "1", "2"), _parameters(found))]
     lines += ["", format_table(("timing, µs", "1", "2"), _timing(found))]

@@ -18,31 +18,31 @@ if TYPE_CHECKING:
 
 def play(
     config: str,
-    scenario_name: str,
+    scenario: str,
     profile: str | None,
     seed: int | None,
-    clock_name: str,
+    clock: str,
     out: Path | None,
     live: LiveView | None = None,
     truth: str | None = None,
 ) -> tuple["Report", ExitCode]:
     """Play a scenario with an emulated arm, and write log and report; return report and exit status.
 
-    config, scenario_name, truth: names or files; truth: how the real arm differs from the configuration. profile, seed:
-    None: those of configuration and scenario. clock_name: "lockstep" or "realtime". out: folder; None: a new one by
+    config, scenario, truth: names or files; truth: how the real arm differs from the configuration. profile, seed:
+    None: those of configuration and scenario. clock: "lockstep" or "realtime". out: folder; None: a new one by
     date. live: shows the run. Raises ConfigError, CodecError for names or files that can't be used, LogError, OSError
     if log or report can't be written, CommandError for a run that failed.
     """
-    cast = resolve(config, scenario_name, profile, seed, truth)
-    settings, scenario = cast.settings, cast.scenario
-    what = "experiment" if scenario_name == SCENARIO else f"scenario {scenario.name}"
+    cast = resolve(config, scenario, profile, seed, truth)
+    settings = cast.settings
+    what = "experiment" if scenario == SCENARIO else f"scenario {cast.scenario.name}"
     with run_folder(out, (LOG_NAME, TRUTH_NAME), "demo") as folder, Progress() as progress:
-        arm = f"profile {settings.arm.profile}" if scenario.own_arm is None else "its own arm"
+        arm = f"profile {settings.arm.profile}" if cast.scenario.own_arm is None else "its own arm"
         progress(f"{what} of configuration {settings.name}, {arm}, in {folder.path}")
         for line in cast.assumed:
             progress(line)
         on_started = functools.partial(folder.link, progress)
-        summary, truth_path = run_embedded(cast, clock_name, folder.path, progress, live, on_started)
+        summary, truth_path = run_embedded(cast, clock, folder.path, progress, live, on_started)
         if summary.result is not None:
             played_s = summary.result.cycles * settings.bus.period_s
             pace = played_s / summary.elapsed_s
@@ -51,7 +51,7 @@ def play(
         from adacd_hil.lab.report.report_files import write_report
 
         try:
-            report = write_report(summary.log.path, truth_path, folder.path, config=config, scenario=scenario_name)
+            report = write_report(summary.log.path, truth_path, folder.path, config=config, scenario=scenario)
         except (OSError, LogError) as error:
             status = exit_code(summary)
             if status is ExitCode.OK:

@@ -1,10 +1,9 @@
 """Doctor: checks host, bus and arm one by one, each with a reason and a remedy."""
 
-import sys
 from typing import Any
 
 from adacd_hil.cli.connection import Connection, on_interrupt, raise_interrupt
-from adacd_hil.cli.output import ExitCode, format_table
+from adacd_hil.cli.output import ExitCode, format_table, is_terminal
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.commission.arm_checks import ARM_CHECKS, ArmExamination
 from adacd_hil.lab.commission.host_checks import (
@@ -65,7 +64,7 @@ def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], Exi
         def report(finding: Finding) -> None:
             progress.passing(f"{finding.name}: {finding.status.value}")
 
-        if is_moving and sys.stdin is not None and sys.stdin.isatty():
+        if is_moving and is_terminal():
             patient.ask = lambda line: progress(f">>> {line}")
         elif is_moving:
             patient.no_move_reason = "stdin is not a terminal"

@@ -24,7 +24,7 @@ _LABELS = (
 )
 
 
-def search(config: str, profile: str | None, seconds: float, seed: int, out: Path | None) -> dict[str, Any]:
+def search(config: str, out: Path | None, profile: str | None, seconds: float, seed: int) -> dict[str, Any]:
     """Search an excitation for a configuration; return the result by the keys of its JSON.
 
     `present`, None without one, and `found`: figures of the configuration's excitation and of the found one; `limits`:

@@ -8,7 +8,7 @@ import click
 from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained, format_table
 from adacd_hil.file_replacement import has_other_head, replace_file
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE
 from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
@@ -18,8 +18,8 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 @click.command(epilog=EPILOG)
-@click.argument("file", type=GivenPath(dir_okay=False))
-@click.option("--plot", type=WrittenPath(dir_okay=False), help="Draw it, as PNG.")
+@click.argument("file", type=GIVEN_FILE)
+@click.option("--plot", type=WRITTEN_FILE, help="Draw it, as PNG.")
 @json_option
 @explained
 def history(file: Path, plot: Path | None, as_json: bool) -> ExitCode:

@@ -10,7 +10,7 @@ from adacd_hil.cli.options import json_option
 from adacd_hil.cli.output import CommandError, ExitCode, answer, explain_statuses, explained, format_table, quoted, show
 from adacd_hil.file_access import write_new_file
 from adacd_hil.file_replacement import replace_file
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import WRITTEN_FILE, WRITTEN_FOLDER, GivenPath
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line
@@ -36,13 +36,13 @@ _RECORDING = GivenPath()
     )
 )
 @click.argument("recordings", nargs=-1, required=True, type=_RECORDING)
-@click.option("--map", "map_path", type=WrittenPath(dir_okay=False), help="TOML: meaning of the columns, and the arm.")
+@click.option("--map", "map_path", type=WRITTEN_FILE, help="TOML: meaning of the columns, and the arm.")
 @click.option("--init", "is_init", is_flag=True, help="Write that map: --init RECORDING URDF.")
 @click.option("--test", type=_RECORDING, help="Recording to test on; default: the last part of the last one fitted.")
 @click.option("--watch", multiple=True, type=_RECORDING, help="Recording in which to look for contacts; repeatable.")
 @click.option("--from", "start_s", type=float, default=0.0, show_default=True, help="Fit from this time on, s.")
 @click.option("--until", "end_s", type=float, default=float("inf"), help="Fit until this time, s; default: the end.")
-@click.option("--out", type=WrittenPath(file_okay=False), help="Folder for pictures and identify.json.")
+@click.option("--out", type=WRITTEN_FOLDER, help="Folder for pictures and identify.json.")
 @json_option
 @explained
 def identify(

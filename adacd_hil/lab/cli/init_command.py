@@ -2,18 +2,21 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
-from adacd_hil.cli.options import json_option
-from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quoted, show, suggest
-from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
+from adacd_hil.cli.completion import complete_run
+from adacd_hil.cli.options import channel_option, interface_option, json_option
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quoted, show, suggest, text_of
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE, GivenPath
 from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.plain_values import json_text
-from adacd_hil.printable import in_line
+
+if TYPE_CHECKING:
+    from adacd_hil.cli.connection import Connection
 
 
 def _pair(name: str, help_text: str, kind: Any = float) -> Callable[..., Any]:
@@ -21,9 +24,9 @@ def _pair(name: str, help_text: str, kind: Any = float) -> Callable[..., Any]:
 
 
 @click.command("init", epilog=EPILOG)
-@click.argument("out", metavar="[FILE]", type=WrittenPath(dir_okay=False), default=Path("my-arm.toml"))
-@click.option("-i", "--interface", help="python-can interface; default: socketcan.", shell_complete=complete_interface)
-@click.option("-c", "--channel", help="Channel of that interface, such as can0.", shell_complete=complete_channel)
+@click.argument("out", metavar="[FILE]", type=WRITTEN_FILE, default=Path("my-arm.toml"))
+@interface_option(help="python-can interface; default: socketcan.")
+@channel_option()
 @click.option("-b", "--bitrate", type=click.IntRange(10_000, 1_000_000), help="bit/s of the bus.")
 @click.option("--no-bus", "is_busless", is_flag=True, help="Without hardware: an arm to rehearse.")
 @click.option("--from", "log", type=GivenPath(), help="Take all from the log of a run.", shell_complete=complete_run)
@@ -74,17 +77,18 @@ def init(
     On a terminal, asks for values without an option. Scans the bus by SDO uploads only; never enables a drive. Unknown
     values are guesses, listed in the file as `assumed`; `doctor` asks for each.
     """
-    from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
+    from adacd_hil.cli.connection import Connection
+    from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting
     from adacd_hil.lab.cli.logged_arm import draft_from_log
 
     interview = Interview(takes_proposals)
     writing = DraftFiles(out, is_forced)
     writing.require_free(out)
-    options = InitOptions(**given)
+    options = SimpleNamespace(**given)
     if log is None:
         text, summary = Drafting(options, interview, writing).draft()
     else:
-        text, summary = draft_from_log(log, options, interview, writing)
+        text, summary = draft_from_log(log, options, writing)
     bus, code = summary.pop("bus", None), ExitCode.OK
     if doctor and bus is None:
         raise CommandError("--doctor needs a bus: run `adacd-hil doctor` where the arm is", ExitCode.USAGE)
@@ -100,11 +104,9 @@ def init(
         if not as_json:
             show(report.as_text())
     if bus is not None and interview.confirm(doctor, "Check host, bus and arm now (`doctor`)?"):
-        from adacd_hil.cli.connection import Connection
         from adacd_hil.lab.cli import doctor_command
 
-        connection = Connection(bus["interface"], bus["channel"], bus["bitrate"], str(out), None, None)
-        findings, doctor_code = doctor_command.examine(connection, False)
+        findings, doctor_code = doctor_command.examine(bus, False)
         code = code or doctor_code
         summary["doctor"] = doctor_command.as_json(findings)
         if not as_json:
@@ -112,7 +114,7 @@ def init(
     if as_json:
         print(json_text(summary))
     else:
-        suggest(*next_of_init(str(out), bus))
+        suggest(*_next(bus or Connection("socketcan", "can0", None, str(out), None, None)))
     return code
 
 
@@ -122,22 +124,16 @@ def as_text(summary: dict[str, Any]) -> str:
     lines += [f"warning: {line}" for line in summary["warnings"]]
     if summary["assumed"]:
         lines.append(f"guesses, which `adacd-hil doctor` asks for: {', '.join(summary['assumed'])}")
-    return "\n".join(map(in_line, lines))
+    return text_of(lines)
 
 
-def next_of_init(file: str, bus: dict[str, Any] | None) -> tuple[str, ...]:
-    """Return the commands to suggest after a draft, from rehearsal to the first run. file: the configuration.
-
-    bus: interface, channel and bitrate on which the arm was found; None: socketcan's can0.
-    """
-    from adacd_hil.cli.connection import Connection
-
-    bus = bus or {"interface": "socketcan", "channel": "can0", "bitrate": None}
-    arm = Connection(bus["interface"], bus["channel"], bus["bitrate"], file, None, None).arguments
-    tare = quoted(Path(file).with_name(TARE_NAME))
+def _next(arm: "Connection") -> tuple[str, ...]:
+    """Return the commands to suggest after a draft of an arm, from rehearsal to the first run."""
+    file = Path(arm.config)
+    tare = quoted(file.with_name(TARE_NAME))
     return (
-        f"adacd-hil demo --config {quoted(Path(file))}   # rehearse",
-        f"adacd-hil doctor {arm}",
-        f"adacd-hil tare {arm} --out {tare}   # the zero of the torque sensors; don't touch the arm",
-        f"adacd-hil run {arm} --tare {tare}   # moves the arm",
+        f"adacd-hil demo --config {quoted(file)}   # rehearse",
+        f"adacd-hil doctor {arm.arguments}",
+        f"adacd-hil tare {arm.arguments} --out {tare}   # the zero of the torque sensors; don't touch the arm",
+        f"adacd-hil run {arm.arguments} --tare {tare}   # moves the arm",
     )

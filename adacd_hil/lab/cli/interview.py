@@ -1,21 +1,15 @@
 """Questions to the user that options answer, too: asked on a terminal; elsewhere an error names the option."""
 
-import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import click
 
-from adacd_hil.cli.output import CommandError, ExitCode, tell
+from adacd_hil.cli.output import CommandError, ExitCode, is_terminal, tell
 from adacd_hil.printable import in_line
 from adacd_hil.settings.schema import ConfigError
 
 Answer = TypeVar("Answer")
-
-
-def is_terminal() -> bool:
-    """Return whether stdin is a terminal, on which a user can type answers."""
-    return sys.stdin is not None and sys.stdin.isatty()
 
 
 class Interview:

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from adacd_hil.cli.completion import complete_run, complete_scenario, complete_truth
+from adacd_hil.cli.completion import complete_scenario, complete_truth
 from adacd_hil.cli.options import (
     HOST,
     PORT,
@@ -15,10 +15,11 @@ from adacd_hil.cli.options import (
     config_option,
     json_option,
     live_options,
+    logs_argument,
     on_bus,
     on_bus_or_url,
     profile_option,
-    require_extra,
+    require_live,
     run_folder_option,
     stretch_options,
 )
@@ -33,7 +34,7 @@ from adacd_hil.cli.output import (
     print_and_write,
     writable_folder,
 )
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import WRITTEN_FILE, WRITTEN_FOLDER
 from adacd_hil.lab.cli.compare_command import compare
 from adacd_hil.lab.cli.history_command import history
 from adacd_hil.lab.cli.identify_command import identify
@@ -49,7 +50,6 @@ from adacd_hil.settings.toml_text import to_toml
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
-    from adacd_hil.control.session import LiveView
     from adacd_hil.log.time_window import TimeWindow
 
 
@@ -70,23 +70,13 @@ if TYPE_CHECKING:
     shell_complete=complete_truth,
 )
 @run_folder_option("demo")
-@click.option("--seed", type=click.IntRange(min=0), default=None, help="Noise of the emulated sensors.")
+@click.option("--seed", type=click.IntRange(min=0), help="Noise of the emulated sensors.")
 @clock_option(default="lockstep")
 @profile_option
 @json_option
 @explained
 @live_options
-def demo(
-    config: str,
-    scenario: str,
-    truth: str | None,
-    out: Path | None,
-    seed: int | None,
-    clock: str,
-    profile: str | None,
-    as_json: bool,
-    live: "LiveView | None",
-) -> ExitCode:
+def demo(as_json: bool, **options: Any) -> ExitCode:
     """Play the paper's experiment, or another scenario, with an emulated arm in this process, and report it.
 
     The arm is that of the configuration: a file of your own arm is rehearsed; missing values are assumed, and listed.
@@ -96,7 +86,7 @@ def demo(
     """
     from adacd_hil.lab.cli.demo_command import next_of_report, play
 
-    report, code = play(config, scenario, profile, seed, clock, out, live, truth)
+    report, code = play(**options)
     answer(as_json, report.content, report.as_text(), *next_of_report(report.html_path))
     return code
 
@@ -106,18 +96,10 @@ def demo(
 @click.option("--poses", type=int, help="Poses to measure in; default: tare.poses.")
 @click.option("--seconds", type=float, help="Measured time per pose; default: tare.window_s.")
 @click.option("--auto-zero", is_flag=True, help="Let the sensors set their own zero (0x6125) before.")
-@click.option("--out", type=WrittenPath(dir_okay=False), default=Path(TARE_NAME), show_default=True)
+@click.option("--out", type=WRITTEN_FILE, default=Path(TARE_NAME), show_default=True)
 @clock_option(default="realtime")
 @json_option
-def tare(
-    connection: "Connection",
-    poses: int | None,
-    seconds: float | None,
-    auto_zero: bool,
-    out: Path,
-    clock: str,
-    as_json: bool,
-) -> ExitCode:
+def tare(connection: "Connection", out: Path, as_json: bool, **options: Any) -> ExitCode:
     """Measure the offsets of the joint torque sensors at rest, with the drives disabled, and store them.
 
     With more than one pose, the arm is moved by hand in between. Exit status 1: refused, for the reason given; the
@@ -125,14 +107,14 @@ def tare(
     """
     from adacd_hil.lab.cli.tare_command import as_text, tare_on_bus
 
-    found, backup = tare_on_bus(connection, clock, out, poses, seconds, auto_zero)
+    found, backup = tare_on_bus(connection, out, **options)
     answer(as_json, {"file": out, "backup": backup, **vars(found)}, as_text(found, out, backup))
     return ExitCode.OK
 
 
 @click.command(epilog=EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
-@click.option("--out", type=WrittenPath(file_okay=False), help="Folder; default: beside each log.")
+@logs_argument
+@click.option("--out", type=WRITTEN_FOLDER, help="Folder; default: beside each log.")
 @json_option
 @explained
 @stretch_options
@@ -154,25 +136,18 @@ def report(logs: tuple[Path, ...], out: Path | None, as_json: bool, stretch: "Ti
 
 
 @click.command(epilog=EPILOG)
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+@logs_argument
 @rate_option
-@click.option("--out", type=WrittenPath(dir_okay=False), help="Write the thresholds here, as TOML.")
+@click.option("--out", type=WRITTEN_FILE, help="Write the thresholds here, as TOML.")
 @click.option(
     "--report",
-    type=WrittenPath(file_okay=False),
+    type=WRITTEN_FOLDER,
     help="Compare the detectors; JSON, PNG and SVG go here.",
 )
 @json_option
 @explained
 @stretch_options
-def thresholds(
-    logs: tuple[Path, ...],
-    rate_per_h: float,
-    out: Path | None,
-    report: Path | None,
-    as_json: bool,
-    stretch: "TimeWindow",
-) -> ExitCode:
+def thresholds(out: Path | None, report: Path | None, as_json: bool, **options: Any) -> ExitCode:
     """Find every detector's thresholds for a rate of false alarms, from contact-free motion in these logs.
 
     Each comes with the cause that limits it, and with the rate that half of the motion predicts for the other half.
@@ -182,7 +157,7 @@ def thresholds(
     from adacd_hil.lab.thresholds.detector_comparison import write_comparison
 
     with writable_folder(out):
-        found, comparison = command.find(logs, rate_per_h, report is not None, stretch)
+        found, comparison = command.find(is_compared=report is not None, **options)
         text = command.as_json(found, comparison) if as_json else command.as_text(found, comparison)
         print_and_write(text, out, to_toml(found), as_json)
     if report is not None and comparison is not None:
@@ -203,12 +178,10 @@ def thresholds(
 @click.option(
     "--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the climbs' starting points."
 )
-@click.option("--out", type=WrittenPath(dir_okay=False), help="Write a configuration with it here.")
+@click.option("--out", type=WRITTEN_FILE, help="Write a configuration with it here.")
 @json_option
 @explained
-def excitation(
-    config: str, profile: str | None, seconds: float, seed: int, out: Path | None, as_json: bool
-) -> ExitCode:
+def excitation(config: str, out: Path | None, as_json: bool, **options: Any) -> ExitCode:
     """Search the motion that identifies a model soonest, within the limits of the arm and its trajectory.
 
     Prints the figures of the configuration's excitation beside those of the one found.
@@ -217,7 +190,7 @@ def excitation(
     from adacd_hil.plain_values import json_text
 
     with writable_folder(out):
-        found = command.search(config, profile, seconds, seed, out)
+        found = command.search(config, out, **options)
         text = json_text(found) if as_json else command.as_text(found)
         print_and_write(text, out, command.as_toml(config, found["excitation"]), as_json)
     return ExitCode.OK
@@ -244,19 +217,11 @@ def excitation(
 )
 @json_option
 @explained
-def budget(
-    dbc: str | None,
-    config: str,
-    period_us: int | None,
-    bitrate: int | None,
-    data_bitrate: int | None,
-    arms: int | None,
-    as_json: bool,
-) -> ExitCode:
+def budget(as_json: bool, **options: Any) -> ExitCode:
     """Check whether the frames of a contract meet their deadlines: bits, response times, time left for the host."""
     from adacd_hil.lab.cli import budget_command as budgets
 
-    found = budgets.judge(dbc, config, period_us, bitrate, data_bitrate, arms)
+    found = budgets.judge(**options)
     answer(as_json, budgets.as_json(*found), budgets.as_text(*found))
     return ExitCode.OK if found[1].is_fit else ExitCode.FAILURE
 
@@ -286,16 +251,16 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 @on_bus
 @click.option("--seconds", type=FiniteRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test.")
 @click.option("--enable", "is_enabling", is_flag=True, help="Enable the drives, with zero torque: the arm isn't held.")
-@click.option("--out", type=WrittenPath(file_okay=False), help="Folder for a log; default: none.")
+@click.option("--out", type=WRITTEN_FOLDER, help="Folder for a log; default: none.")
 @json_option
-def commtest(connection: "Connection", seconds: float, is_enabling: bool, out: Path | None, as_json: bool) -> ExitCode:
+def commtest(connection: "Connection", as_json: bool, **options: Any) -> ExitCode:
     """Test the connection: cycles at zero torque, and the share of them that brings complete fresh data.
 
     The drives are not enabled unless asked for.
     """
     from adacd_hil.lab.cli.commtest_command import as_text, run_commtest
 
-    result, code = run_commtest(connection, seconds, is_enabling, out)
+    result, code = run_commtest(connection, **options)
     answer(as_json, result, as_text(result))
     return code
 
@@ -318,7 +283,8 @@ def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode
 
 
 @click.command(epilog=EPILOG)
-@on_bus_or_url(f"Watch the live view of a run instead, such as ws://{HOST}:{PORT}.")
+@click.option("--url", help=f"Watch the live view of a run instead, such as ws://{HOST}:{PORT}.")
+@on_bus_or_url
 @click.option("--node", "node_id", type=click.IntRange(1, 127), help="Show this node only.")
 @click.option("--once", is_flag=True, help=f"Listen for {PLAIN_S:g} s, print one table, end.")
 @click.option("--seconds", type=FiniteRange(0.1, 86_400.0), help="Listen for so long, print one table, end.")
@@ -335,13 +301,13 @@ def monitor(
 
     listened_s = seconds if seconds is not None else PLAIN_S if once or as_json else None
     if not isinstance(place, str):
-        return watch(place, node_id, listened_s, listened_s is None, as_json)
+        return watch(place, node_id, listened_s, as_json)
     if node_id is not None:
         raise CommandError("--node has no effect with --url", ExitCode.USAGE)
-    require_extra("--url", "websockets")
+    require_live("--url")
     from adacd_hil.lab.cli.live_monitor import watch_live
 
-    return watch_live(place, listened_s, listened_s is None, as_json)
+    return watch_live(place, listened_s, as_json)
 
 
 COMMANDS: Final[Sequence[click.Command]] = (

@@ -1,11 +1,8 @@
 """The live view in a terminal: state, residuals against their thresholds, parameters, contacts, events."""
 
-import contextlib
 import math
 import struct
-import sys
 from collections import deque
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,12 +10,11 @@ import numpy as np
 from adacd_hil.cli.connection import on_interrupt
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.lab.cli.monitor_command import Screen
+from adacd_hil.lab.cli.monitor_command import show_tables
 from adacd_hil.lab.live.client import LiveClient, LiveMessage, live_client
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, SCHEME
 from adacd_hil.log.types.unpacking import unpack_log
-from adacd_hil.plain_values import json_text
 from adacd_hil.printable import one_line
 from adacd_hil.records import (
     GRAVITY_PARAMETER_NAMES,
@@ -31,7 +27,6 @@ from adacd_hil.records import (
     Location,
     SchemeState,
 )
-from adacd_hil.terminal import fold, moves_cursor, terminal_columns, write_screen
 
 TOPICS = (SCHEME.name, CYCLE.name, CONTACT.name, EVENTS.name)
 _BAR_WIDTH = 40
@@ -44,12 +39,32 @@ class LiveMonitor:
     def __init__(self, client: LiveClient) -> None:
         self.messages = 0
         self._client = client
+        self._clock = MonotonicClock()
+        self._is_stopped = False
         self._begin_ns: int | None = None
         self._scheme: Any = None
         self._cycle: Any = None
         self._log_ns = 0
         self._contacts: deque[dict[str, Any]] = deque(maxlen=_CONTACTS)
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
+
+    def stop(self) -> None:
+        """Make the present and later `listen`s end after a message. Safe in a signal handler."""
+        self._is_stopped = True
+
+    def listen(self, duration_s: float) -> bool:
+        """Store the messages of a duration; after `stop`, or the end of the view, end earlier, and return False.
+
+        Raises LogError or the errors of `accept_message` for data that is no log of adacd-hil.
+        """
+        end_ns = self._clock.now_ns() + round(duration_s * 1e9)
+        while self._goes_on() and (left_ns := end_ns - self._clock.now_ns()) > 0:
+            if (message := self._client.receive(left_ns * 1e-9)) is not None:
+                self.accept_message(message)
+        return self._goes_on()
+
+    def _goes_on(self) -> bool:
+        return self._client.is_open and not self._is_stopped
 
     def accept_message(self, message: LiveMessage) -> None:
         """Store a message for `describe`: the last few events and contacts, the latest of /scheme and /cycle.
@@ -139,53 +154,20 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def watch_live(url: str, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
+def watch_live(url: str, seconds: float | None, as_json: bool) -> ExitCode:
     """Watch the live view of a run at a URL, and print its values at the end; return exit status OK.
 
-    seconds: None: until the user interrupts or the view ends. is_live: print them repeatedly meanwhile, too, unless
-    as_json is set. as_json: print JSON. Raises LogError if no view answers, or it doesn't serve a log of adacd-hil.
+    seconds: None: until the user interrupts or the view ends, and the values are printed repeatedly. as_json: print
+    JSON. Raises LogError if no view answers, or it doesn't serve a log of adacd-hil.
     """
-    clock = MonotonicClock()
-    screen = Screen(moves_cursor(sys.stdout) and is_live and not as_json, write_screen)
-    is_stopped = False
-
-    def stop() -> None:
-        nonlocal is_stopped
-        is_stopped = True
-
-    with live_client(url, TOPICS) as client, on_interrupt(stop):
+    with live_client(url, TOPICS) as client:
         monitor = LiveMonitor(client)
-        now_ns = clock.now_ns()
-        end_ns = None if seconds is None else now_ns + round(seconds * 1e9)
-        drawn_ns = now_ns
-        while client.is_open and not is_stopped and (end_ns is None or now_ns < end_ns):
-            due_ns = drawn_ns + round(screen.redraw_s * 1e9)
-            wake_ns = due_ns if end_ns is None else min(due_ns, end_ns)
-            if (message := client.receive(max(0.0, (wake_ns - now_ns) * 1e-9))) is not None:
-                with _decoding():
-                    monitor.accept_message(message)
-            now_ns = clock.now_ns()
-            if now_ns >= due_ns:
-                drawn_ns = now_ns
-                if is_live and not as_json:
-                    with _decoding():
-                        screen.draw_table(as_text(monitor.describe(), is_cut=screen.is_redrawn))
-        with _decoding():
-            described = {"url": url} | monitor.describe()
-    screen.end(json_text(described) if as_json else fold(as_text(described), terminal_columns()))
+        try:
+            with on_interrupt(monitor.stop):
+                show_tables(monitor.listen, lambda: {"url": url} | monitor.describe(), as_text, seconds, as_json)
+        except (ValueError, LookupError, OverflowError, struct.error):
+            raise LogError("it does not serve a log of adacd-hil") from None
     return ExitCode.OK
-
-
-@contextlib.contextmanager
-def _decoding() -> Iterator[None]:
-    """Return a context manager that turns decoding errors of its block into a LogError.
-
-    The server then doesn't serve a log of adacd-hil.
-    """
-    try:
-        yield
-    except (ValueError, LookupError, OverflowError, struct.error):
-        raise LogError("it does not serve a log of adacd-hil") from None
 
 
 def as_text(described: dict[str, Any], is_cut: bool = False) -> str:

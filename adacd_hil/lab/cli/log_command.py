@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.completion import complete_run
-from adacd_hil.cli.options import FiniteRange, json_option, stretch_options
+from adacd_hil.cli.options import FiniteRange, json_option, log_argument, logs_argument, stretch_options
 from adacd_hil.cli.output import (
     CommandError,
     ExitCode,
@@ -18,8 +17,9 @@ from adacd_hil.cli.output import (
     format_table,
     one_by_one,
     tell,
+    text_of,
 )
-from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE, CommandGroup, WrittenPath
 from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
 _TOLD_FAULTS = 5
 _AROUND_S = 1.0
-_log_argument = click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
-_out_option = click.option("--out", type=WrittenPath(dir_okay=False), metavar="FILE")
+_out_option = click.option("--out", type=WRITTEN_FILE, metavar="FILE")
 
 
 @click.group("log", cls=CommandGroup)
@@ -44,7 +43,7 @@ def log() -> None:
         OK="done", FAILURE="a log can't be read", USAGE="wrong usage", PARTIAL="a log is cut or lacks a part"
     )
 )
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+@logs_argument
 @json_option
 @explained
 def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
@@ -69,7 +68,7 @@ def info(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
         OK="clean", FAILURE="an error, or a log can't be read", USAGE="wrong usage", PARTIAL="warnings only"
     )
 )
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+@logs_argument
 @json_option
 @explained
 def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
@@ -93,7 +92,7 @@ def check(logs: tuple[Path, ...], as_json: bool) -> ExitCode:
         OK="without loss", FAILURE="no data to save, or the log can't be read", USAGE="wrong usage", PARTIAL="with loss"
     )
 )
-@_log_argument
+@log_argument
 @_out_option
 @json_option
 @explained
@@ -111,7 +110,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
 
 
 @log.command(epilog=explain_statuses(OK="done", FAILURE="no data there, or the log is damaged", USAGE="wrong usage"))
-@_log_argument
+@log_argument
 @click.option("--contact", type=click.IntRange(min=1), help="Cut around this contact, numbered from 1.")
 @click.option(
     "--around",
@@ -217,7 +216,7 @@ def check_as_text(check: "LogCheck") -> str:
         lines.append(f"and {left_out} more of these")
     verdict = "clean" if not check.errors + check.warnings else f"{check.errors} errors, {check.warnings} warnings"
     lines.append(f"{check.path}: {verdict}; {check.messages} messages in {check.files} files")
-    return "\n".join(in_line(line) for line in lines)
+    return text_of(lines)
 
 
 def _recovery(recovery: "LogRecovery") -> dict[str, Any]:
@@ -249,7 +248,7 @@ def recovery_as_text(recovery: "LogRecovery") -> str:
     if recovery.losses.unvouched:
         lines.append(f"{recovery.losses.unvouched} messages are unchecked: {recovery.path.name} has no checksums")
     lines.append(f"lost: {lost}" if lost else "nothing was lost")
-    return "\n".join(in_line(line) for line in lines)
+    return text_of(lines)
 
 
 TABLES = ("parquet", "csv")
@@ -281,9 +280,7 @@ def _refuse(ctx: click.Context, _param: click.Parameter, value: object) -> None:
         raise click.UsageError(_CONVERTED, ctx)
 
 
-dbc_option = click.option(
-    "--dbc", type=GivenPath(dir_okay=False), help="A DBC; default: the log's contract, else the arm's."
-)
+dbc_option = click.option("--dbc", type=GIVEN_FILE, help="A DBC; default: the log's contract, else the arm's.")
 
 
 @log.command(
@@ -296,7 +293,7 @@ dbc_option = click.option(
         INTERRUPTED="interrupted",
     ),
 )
-@click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
+@log_argument
 @click.option("--format", "kind", type=TableFormat(TABLES), required=True, help="Of the output.")
 @click.option("--out", type=WrittenPath(), help="Folder of the tables; default: beside LOG.")
 @click.option("--topic", "topics", multiple=True, metavar="TOPIC", help="A topic, or a pattern such as 'decoded/*'.")

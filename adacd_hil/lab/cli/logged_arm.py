@@ -1,6 +1,7 @@
 """An arm's configuration from the log of a run: its settings that differ from a built-in configuration."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from adacd_hil import __version__
@@ -9,8 +10,7 @@ from adacd_hil.clock import wall_ns
 from adacd_hil.dates import format_date
 from adacd_hil.device.contract import find_contract
 from adacd_hil.file_access import exists
-from adacd_hil.lab.cli.arm_drafting import DraftFiles, Drafting, InitOptions
-from adacd_hil.lab.cli.interview import Interview
+from adacd_hil.lab.cli.arm_drafting import DraftFiles
 from adacd_hil.lab.commission.arm_draft import Entry, draft_as_toml
 from adacd_hil.log.log_files import CONFIG_NAME
 from adacd_hil.log.log_parts import log_in
@@ -36,16 +36,14 @@ _NOT_TAKEN = {
 """Keys that belong to the run and not to the arm, each with a warning."""
 
 
-def draft_from_log(
-    log: Path, options: InitOptions, interview: Interview, files: DraftFiles
-) -> tuple[str, dict[str, Any]]:
+def draft_from_log(log: Path, options: SimpleNamespace, files: DraftFiles) -> tuple[str, dict[str, Any]]:
     """Return the text of a configuration for the arm of a log, and a summary for JSON; write no file.
 
-    Adds the device profiles to `files`, and checks the configuration with them. Raises LogError if the log can't be
-    read or lacks settings, CommandError for options other than --drive and --sensor, a missing profile, or a
-    configuration with errors.
+    options: as of `Drafting`. Adds the device profiles to `files`, and checks the configuration with them. Raises
+    LogError if the log can't be read or lacks settings, CommandError for options other than --drive and --sensor, a
+    missing profile, or a configuration with errors.
     """
-    given = [name for name in options.__dataclass_fields__ if getattr(options, name) not in (None, (), False)]
+    given = [name for name, value in vars(options).items() if value not in (None, (), False)]
     if further := [name for name in given if name not in ("drive", "sensor")]:
         option = f"--{further[0].removeprefix('is_').replace('_', '-')}"
         raise CommandError(f"--from takes the arm from the log: leave out {option}", ExitCode.USAGE)
@@ -55,12 +53,11 @@ def draft_from_log(
     base = "certified" if settings.scheme == "certified" else "paper"
     warnings: list[str] = []
     entries = _differences(settings, base, path, warnings)
-    devices = Drafting(options, interview, files)
-    entries = [_placed(entry, devices, options) for entry in entries]
+    entries = [_placed(entry, files, options) for entry in entries]
     for kind in ("drive", "sensor"):
         names = getattr(options, kind)
         if names is not None and all(entry.key != f"devices.{kind}" for entry in entries):
-            entries.append(Entry(f"devices.{kind}", tuple(devices.beside(name, kind) for name in names), "given"))
+            entries.append(Entry(f"devices.{kind}", tuple(files.beside(name, kind) for name in names), "given"))
     title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]} from the log {path.name}."
     written = draft_as_toml(entries, title, quoted(files.out), base)
     warnings += files.examine(written).mistakes
@@ -87,15 +84,11 @@ def _differences(settings: Settings, base: str, path: Path, warnings: list[str])
             continue
         comment = f"{known.meaning}: as in {path.name}"
         entries.append(Entry(key, value, comment, key in settings.assumed))
-    entries += [Entry(key, None, "not known", True) for key in settings.assumed if _is_unset(settings, key)]
-    return entries
+    unset = (key for key in settings.assumed if key in known_keys() and value_of(settings, key) is None)
+    return [*entries, *(Entry(key, None, "not known", True) for key in unset)]
 
 
-def _is_unset(settings: Settings, key: str) -> bool:
-    return key in known_keys() and value_of(settings, key) is None
-
-
-def _placed(entry: Entry, devices: Drafting, options: InitOptions) -> Entry:
+def _placed(entry: Entry, files: DraftFiles, options: SimpleNamespace) -> Entry:
     """Return an entry with paths as seen from the new configuration's folder; one not of `devices` unchanged.
 
     A contract that isn't there is left out. Raises CommandError if a device profile isn't there.
@@ -109,7 +102,7 @@ def _placed(entry: Entry, devices: Drafting, options: InitOptions) -> Entry:
                     f"the log names the device profile {name}, which is not here: give --{kind} PROFILE PROFILE",
                     ExitCode.USAGE,
                 )
-        return entry._replace(value=tuple(devices.beside(name, kind) for name in names))
+        return entry._replace(value=tuple(files.beside(name, kind) for name in names))
     if entry.key == "devices.contract" and entry.value:
         try:
             is_there = exists(find_contract(entry.value))

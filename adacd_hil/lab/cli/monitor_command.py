@@ -1,5 +1,6 @@
 """Monitor: a live table of the traffic on a bus. Listens only."""
 
+import math
 import shutil
 import sys
 from collections.abc import Callable
@@ -14,7 +15,7 @@ from adacd_hil.lab.stated_bounds import PLAIN_S
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import plain
 from adacd_hil.terminal import fold, moves_cursor, terminal_columns, write_screen
-from adacd_hil.wire.bus import Bus, Frame
+from adacd_hil.wire.bus import Bus, BusError, Frame
 from adacd_hil.wire.can_interface import carried_frames, read_link
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_attributes import read_bitrates
@@ -75,8 +76,8 @@ class Monitor:
         """Make the present and later `listen`s end after a few frames. Safe in a signal handler."""
         self.is_stopped = True
 
-    def listen(self, duration_s: float) -> None:
-        """Read frames from the bus into the view for a duration; it ends earlier after `stop`.
+    def listen(self, duration_s: float) -> bool:
+        """Read frames from the bus into the view for a duration; after `stop` end earlier, and return False.
 
         Raises BusError if the bus fails.
         """
@@ -88,7 +89,8 @@ class Monitor:
                 if self._view.frames % 256 == 0:
                     break
             if self.is_stopped:
-                return
+                break
+        return not self.is_stopped
 
     def _accept(self, frame: Frame) -> None:
         if self._bus.frames_lost != self._dropped:
@@ -121,33 +123,51 @@ class Monitor:
         return None if now is None or self._carried is None else max(0, now - self._carried - self._view.frames)
 
 
-def watch(connection: Connection, node_id: int | None, seconds: float | None, is_live: bool, as_json: bool) -> ExitCode:
+def show_tables(
+    listen: Callable[[float], bool],
+    describe: Callable[[], dict[str, Any]],
+    as_text: Callable[..., str],
+    seconds: float | None,
+    as_json: bool,
+) -> None:
+    """Listen for so many seconds, then print a table, or JSON; None: print tables until the listening ends.
+
+    listen: for a duration, s; False: it has ended. describe: returns what was heard, as_text: that as a table. The last
+    table is printed even if the bus fails.
+    """
+    screen = Screen(seconds is None and moves_cursor(sys.stdout), write_screen)
+    clock = MonotonicClock()
+    end_ns = math.inf if seconds is None else clock.now_ns() + seconds * 1e9
+
+    def end() -> None:
+        described = describe()
+        screen.end(json_text(described) if as_json else fold(as_text(described), terminal_columns()))
+
+    try:
+        while listen(min((end_ns - clock.now_ns()) * 1e-9, screen.redraw_s)) and clock.now_ns() < end_ns:
+            if seconds is None:
+                screen.draw_table(as_text(describe(), is_cut=screen.is_redrawn))
+    except BusError:
+        end()
+        raise
+    end()
+
+
+def watch(connection: Connection, node_id: int | None, seconds: float | None, as_json: bool) -> ExitCode:
     """Listen on a bus, and print a table of its traffic at the end; return exit status OK, also if interrupted.
 
-    seconds: None: until interrupted. is_live: print the table repeatedly meanwhile, too, unless as_json is set.
-    as_json: print JSON. node_id: show this node only. Raises ConfigError, CodecError if configuration or contract can't
-    be used, BusMissingError if the bus can't be opened, CommandError if it fails.
+    seconds: None: until interrupted, and the table is printed repeatedly. as_json: print JSON. node_id: show this node
+    only. Raises ConfigError, CodecError if configuration or contract can't be used, BusMissingError if the bus can't be
+    opened, CommandError if it fails.
     """
     clock = MonotonicClock()
     codec = connection.load_decoder()  # errors of the configuration come before errors of the bus
-    screen = Screen(moves_cursor(sys.stdout) and is_live and not as_json, write_screen)
     with connection.bus(clock, codec.is_fd) as bus:
         monitor = Monitor(connection, codec, bus, clock, node_id)
-        end_ns = None if seconds is None else clock.now_ns() + round(seconds * 1e9)
         with on_interrupt(monitor.stop):
-            if not is_live:
+            if seconds is not None:
                 print(f"listening on {bus.channel}", file=sys.stderr, flush=True)
-            try:
-                while True:
-                    left_s = screen.redraw_s if end_ns is None else (end_ns - clock.now_ns()) * 1e-9
-                    monitor.listen(min(left_s, screen.redraw_s))
-                    if monitor.is_stopped or (end_ns is not None and clock.now_ns() >= end_ns):
-                        break
-                    if is_live and not as_json:
-                        screen.draw_table(as_text(monitor.describe(), is_cut=screen.is_redrawn))
-            finally:  # the last table is printed even if the bus fails
-                described = monitor.describe()
-                screen.end(json_text(described) if as_json else fold(as_text(described), terminal_columns()))
+            show_tables(monitor.listen, monitor.describe, as_text, seconds, as_json)
     return ExitCode.OK
 
 

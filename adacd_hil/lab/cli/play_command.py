@@ -10,13 +10,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.completion import complete_channel, complete_interface, complete_run
-from adacd_hil.cli.options import FiniteRange, json_option
-from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained
+from adacd_hil.cli.options import (
+    FiniteRange,
+    bitrate_option,
+    channel_option,
+    interface_option,
+    json_option,
+    log_argument,
+)
+from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, explained, text_of
 from adacd_hil.clock import MonotonicClock
-from adacd_hil.given_path import GivenPath
 from adacd_hil.lab.cli.log_command import dbc_option, find_dbc
-from adacd_hil.printable import in_line
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.wire.bus import Bus, BusError
 from adacd_hil.wire.can_interface import is_virtual
@@ -45,18 +49,10 @@ def hex_id(text: str) -> int:
 
 
 @click.command("play", epilog=EPILOG)
-@click.argument("log", type=GivenPath(dir_okay=False), shell_complete=complete_run)
-@click.option(
-    "-i",
-    "--interface",
-    required=True,
-    help="python-can interface, such as socketcan.",
-    shell_complete=complete_interface,
-)
-@click.option(
-    "-c", "--channel", required=True, help="Channel of that interface, such as vcan0.", shell_complete=complete_channel
-)
-@click.option("-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it.")
+@log_argument
+@interface_option(required=True)
+@channel_option(required=True, help="Channel of that interface, such as vcan0.")
+@bitrate_option
 @click.option("--fd", "is_fd", is_flag=True, help="Open the bus for CAN FD; default: as the contract is.")
 @click.option(
     "--speed",
@@ -121,7 +117,7 @@ def play(
         start_ns=None if start_s is None else round(start_s * 1e9),
         end_ns=None if end_s is None else round(end_s * 1e9),
     )
-    playback = Playback(log, choice, is_harmless=may_move_an_arm(interface, channel) and not commands)
+    playback = Playback(log, choice, is_harmless=not (commands or is_virtual(interface, channel)))
     open_frames(log)  # errors of the recording come before errors of the bus
     clock = MonotonicClock()
     from adacd_hil.wire.open_bus import open_bus
@@ -256,12 +252,7 @@ def _as_text(described: dict[str, Any]) -> str:
         lines.append(f"{described['unsendable']} frames can't be sent: remote, error or short FD frames")
     if described["problem"]:
         lines.append(f"warning: {described['problem']}")
-    return "\n".join(in_line(line) for line in lines)
-
-
-def may_move_an_arm(interface: str, channel: str) -> bool:
-    """Return whether real drives may receive frames on this channel: True unless it is certainly virtual."""
-    return not is_virtual(interface, channel)
+    return text_of(lines)
 
 
 def _ahead(pieces: "Iterator[NDArray[Any]]") -> "Iterator[NDArray[Any]]":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from adacd_hil.cli.options import FiniteRange, json_option
+from adacd_hil.cli.options import FiniteRange, json_option, with_options
 from adacd_hil.cli.output import (
     RUNS,
     CommandError,
@@ -20,7 +20,7 @@ from adacd_hil.cli.output import (
     explained,
     format_table,
 )
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import WRITTEN_FILE, GivenPath
 from adacd_hil.lab.stated_bounds import MEANT_SHARE, STATUSES, THRESHOLD_SHARE
 from adacd_hil.log.log_files import LOG_NAME, LogError
 from adacd_hil.printable import in_line
@@ -60,20 +60,6 @@ def _end_of_date(text: str) -> datetime:
     return _local_date(text, timedelta(days=1, microseconds=-1))
 
 
-_FILTER_OPTIONS = (  # last first: click lists them the other way round
-    click.option("--until", type=_end_of_date, metavar="DATE", help="Runs begun until then, that day included."),
-    click.option("--since", type=_local_date, metavar="DATE", help="Runs begun since then."),
-    click.option("--scenario", "scenarios", multiple=True, metavar="NAME", help="Runs of this scenario; repeatable."),
-    click.option(
-        "--arm",
-        "arms",
-        multiple=True,
-        metavar="NAME",
-        help="Runs of this arm or configuration, or a pattern; repeatable.",
-    ),
-)
-
-
 def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
     """Return a command with added options that choose runs; it receives them as `asked`, a `RunFilter`.
 
@@ -96,10 +82,21 @@ def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
             raise CommandError(f"--since {since} is after --until {until}", ExitCode.USAGE)
         return command(*args, asked=RunFilter(arms, statuses, scenarios, since, until), **own)
 
-    decorated: Callable[..., Any] = explained(chosen)
-    for option in _FILTER_OPTIONS:
-        decorated = option(decorated)
-    return decorated
+    return with_options(
+        explained(chosen),
+        click.option(
+            "--arm",
+            "arms",
+            multiple=True,
+            metavar="NAME",
+            help="Runs of this arm or configuration, or a pattern; repeatable.",
+        ),
+        click.option(
+            "--scenario", "scenarios", multiple=True, metavar="NAME", help="Runs of this scenario; repeatable."
+        ),
+        click.option("--since", type=_local_date, metavar="DATE", help="Runs begun since then."),
+        click.option("--until", type=_end_of_date, metavar="DATE", help="Runs begun until then, that day included."),
+    )
 
 
 _folder_argument = click.argument("folder", type=GivenPath(file_okay=False), default=RUNS, required=False)
@@ -111,14 +108,14 @@ _folder_argument = click.argument("folder", type=GivenPath(file_okay=False), def
     "--verdict", "statuses", multiple=True, type=click.Choice(STATUSES), help="Runs with this verdict; repeatable."
 )
 @click.option("--judge", "is_judging", is_flag=True, help="Read the whole log of each run without a report.")
-@click.option("--csv", "csv_path", type=WrittenPath(dir_okay=False), help="Write the table here.")
+@click.option("--csv", "csv_path", type=WRITTEN_FILE, help="Write the table here.")
 @click.option(
     "--parquet",
     "parquet_path",
-    type=WrittenPath(dir_okay=False),
+    type=WRITTEN_FILE,
     help="Write the table here as Parquet, for DuckDB and others.",
 )
-@click.option("--html", "html_path", type=WrittenPath(dir_okay=False), help="Write a page that leads to the reports.")
+@click.option("--html", "html_path", type=WRITTEN_FILE, help="Write a page that leads to the reports.")
 @json_option
 @_filtered
 def runs(
@@ -160,9 +157,7 @@ def runs(
     show_default=True,
     help=f"A threshold that differs by more than this share has changed; {MEANT_SHARE:g} of it where settings have.",
 )
-@click.option(
-    "--out", type=WrittenPath(dir_okay=False), metavar="FILE.html", help="Write a page with its curves and tables."
-)
+@click.option("--out", type=WRITTEN_FILE, metavar="FILE.html", help="Write a page with its curves and tables.")
 @json_option
 @_filtered
 def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "RunFilter") -> ExitCode:
@@ -212,15 +207,13 @@ def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progre
             near = nearest_name(arm, [*known, *sorted({run.config for run in found if run.config})])
             hint = f"did you mean {near!r}?" if near else f"there are {', '.join(known) or 'none that is named'}"
             raise CommandError(f"no run of arm {arm!r} in {folder}; {hint}", ExitCode.USAGE)
-    # The verdict is filtered after judging, which may change it.
-    taken = [run for run in found if dataclasses.replace(asked, statuses=()).takes(run)] if is_judging else found
-    if is_judging:
-        waiting = sum(run.status == NOT_JUDGED for run in taken)
-        if waiting:
-            logs = "1 log" if waiting == 1 else f"{waiting} logs"
-            progress(f"reading {logs} without a report; `adacd-hil report` keeps the figures")
-        taken = [judged(run) for run in taken]
-    return [run for run in run_table.in_order(taken) if asked.takes(run)]
+    if is_judging:  # which may change the verdict: it is filtered afterwards
+        with_any_verdict = dataclasses.replace(asked, statuses=())
+        found = [run for run in found if with_any_verdict.takes(run)]
+        if waiting := sum(run.status == NOT_JUDGED for run in found):
+            progress(f"reading {counted(waiting, 'log')} without a report; `adacd-hil report` keeps the figures")
+        found = [judged(run) for run in found]
+    return [run for run in run_table.in_order(found) if asked.takes(run)]
 
 
 def _page(found: list["RunSummary"], path: Path) -> str:

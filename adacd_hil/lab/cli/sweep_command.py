@@ -11,18 +11,17 @@ import click
 
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
-from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained
-from adacd_hil.given_path import GIVEN_FILE, GivenPath, WrittenPath
+from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained, text_of
+from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenPath
 from adacd_hil.log.log_files import LOG_NAME, SHOWN
-from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 
 if TYPE_CHECKING:
     from adacd_hil.lab.tune.sweep import Plan, SweepRow, Task, Values
 
-_SIMULATED_CONFIG = "certified"
-_SEEDS = "1"
+_CONFIG = "certified"
 """Configuration of simulated runs without --config."""
+_SEEDS = "1"
 
 
 @click.command(
@@ -64,7 +63,7 @@ _SEEDS = "1"
 @click.option("--tls-ca-file", type=GIVEN_FILE, help="For tls://: CA that signs the cluster's certificates; PEM.")
 @click.option("--tls-cert", type=GIVEN_FILE, help="For tls://: this client's certificate; PEM.")
 @click.option("--tls-key", type=GIVEN_FILE, help="For tls://: its key, unless the certificate's file has it; PEM.")
-@click.option("--out", required=True, type=WrittenPath(file_okay=False), help="Folder of the results.")
+@click.option("--out", required=True, type=WRITTEN_FOLDER, help="Folder of the results.")
 @json_option
 @explained
 def sweep(
@@ -131,7 +130,7 @@ def sweep(
     lines = [verdict, *(f"{key}: {value}" for key, value in result.items()), *notes[:SHOWN]]
     if len(notes) > SHOWN:
         lines.append(f"and {len(notes) - SHOWN} more notes, see the table")
-    answer(as_json, result | {"notes": notes}, "\n".join(map(in_line, lines)), _next(table, outcome.failed))
+    answer(as_json, result | {"notes": notes}, text_of(lines), _next(table, outcome.failed))
     return ExitCode.PARTIAL if outcome.failed or notes else ExitCode.OK
 
 
@@ -157,7 +156,7 @@ def _plan(
     from adacd_hil.settings.setting_keys import apply_settings, parse_variations
 
     variants = parse_variations(vary)
-    base = load_settings(config or "certified", profile or None)
+    base = load_settings(config or _CONFIG, profile or None)
     for changes in variants:  # refuse invalid settings before the first run
         apply_settings(base, changes)
     version = f"{__version__} {program_digest()}"
@@ -217,7 +216,7 @@ def _simulate(task: "Task", row: "SweepRow") -> "Values":
 
     subject = task.subject
     try:
-        cast = resolve(task.config or _SIMULATED_CONFIG, subject.scenario, task.profile or None, subject.seed)
+        cast = resolve(task.config or _CONFIG, subject.scenario, task.profile or None, subject.seed)
         settings = apply_settings(cast.settings, dict(row.changes))
         with tempfile.TemporaryDirectory(prefix="adacd-hil-sweep-") as name:
             summary, _ = run_embedded(cast._replace(settings=settings), "lockstep", Path(name))

@@ -5,7 +5,7 @@ from contextlib import closing
 from pathlib import Path
 
 from adacd_hil.cli.connection import Connection, check_clock, check_shared, make_clock, never_stopped, on_interrupt
-from adacd_hil.cli.output import CommandError, ExitCode
+from adacd_hil.cli.output import CommandError, ExitCode, text_of
 from adacd_hil.clock import VirtualClock
 from adacd_hil.control.tare_file import Tare, read_tare, write_tare
 from adacd_hil.device.canopen_bus import DeviceError
@@ -14,9 +14,7 @@ from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.lab.commission.tare import TareRefusedError
 from adacd_hil.lab.commission.tare_session import TareSession
-from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
-from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.setting_keys import apply_settings
 
 
@@ -50,41 +48,41 @@ def as_text(tare: Tare, path: Path, backup: Path | None) -> str:
         lines.append("gravity ({}): a4 = {:.4f} Nm, a5 = {:.4f} Nm".format(tare.gravity_model, *tare.gravity_Nm))
     kept = "" if backup is None else f"; the one before is {backup}"
     lines.append(f"{path}{kept}")
-    return "\n".join(in_line(line) for line in lines)
+    return text_of(lines)
 
 
 def tare_on_bus(
     connection: Connection,
-    clock_name: str,
     out: Path,
+    clock: str,
     poses: int | None,
     seconds: float | None,
-    is_auto_zeroing: bool,
+    auto_zero: bool,
 ) -> tuple[Tare, Path | None]:
     """Tare the sensors of an arm on a bus, and write file `out`; return the tare, and the copy of an older file.
 
     The copy is None without one. poses, seconds: number of poses, and time per pose; None: those of the configuration.
-    clock_name: "lockstep" or "realtime". is_auto_zeroing: the sensors set their own zero first. Raises CommandError if
+    clock: "lockstep" or "realtime". auto_zero: the sensors set their own zero first. Raises CommandError if
     the tare is refused or the arm not found; ConfigError, CodecError if configuration, contract or an older file can't
     be used; BusError if the bus fails; OSError if the file can't be written.
     """
     interface, channel = connection.interface, connection.channel
-    check_clock(clock_name, interface, channel)
-    settings = _with_options(connection.settings(), poses, seconds)
-    check_shared(clock_name, settings)
+    check_clock(clock, interface, channel)
+    given = {"tare.poses": poses, "tare.window_s": seconds}
+    changes = {key: repr(value) for key, value in given.items() if value is not None}
+    settings = apply_settings(connection.settings(), changes)
+    check_shared(clock, settings)
     # A file that isn't a tare is not overwritten.
     old_offset_Nm = read_tare(out).offset_Nm if out.exists() else settings.arm.torque_offset_Nm
     devices = place_devices(settings)
     codec = load_contract(settings, devices)
-    clock = make_clock(clock_name)
-    bus = connection.open(clock, codec, settings, devices)
+    timer = make_clock(clock)
+    bus = connection.open(timer, codec, settings, devices)
     try:
         with Progress() as progress, closing(bus):
-            if not isinstance(clock, VirtualClock):
-                refuse_company(bus, clock, settings, codec, devices)
-            session = TareSession(
-                settings, codec, devices, bus, clock, interface, old_offset_Nm, is_auto_zeroing, progress
-            )
+            if not isinstance(timer, VirtualClock):
+                refuse_company(bus, timer, settings, codec, devices)
+            session = TareSession(settings, codec, devices, bus, timer, interface, old_offset_Nm, auto_zero, progress)
             with never_stopped(), on_interrupt(session.interrupt, signal.SIGTSTP):
                 tare = session.run()
     except TareRefusedError as reason:
@@ -92,12 +90,3 @@ def tare_on_bus(
     except DeviceError as reason:
         raise CommandError(reason.line, ExitCode.BUS_MISSING) from None
     return tare, write_tare(tare, out)
-
-
-def _with_options(settings: Settings, poses: int | None, seconds: float | None) -> Settings:
-    """Return the settings with `tare.poses` and `tare.window_s` replaced by number and seconds, unless None.
-
-    Raises ConfigError for a value out of bounds.
-    """
-    given = {"tare.poses": poses, "tare.window_s": seconds}
-    return apply_settings(settings, {key: repr(value) for key, value in given.items() if value is not None})

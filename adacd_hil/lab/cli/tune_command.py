@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.completion import complete_run
-from adacd_hil.cli.options import FiniteRange, json_option, stretch_options
+from adacd_hil.cli.options import FiniteRange, json_option, logs_argument, stretch_options
 from adacd_hil.cli.output import (
     ExitCode,
     explain_statuses,
@@ -14,11 +13,10 @@ from adacd_hil.cli.output import (
     format_table,
     print_and_write,
     quoted,
-    show,
     suggest,
     writable_folder,
 )
-from adacd_hil.given_path import GivenPath, WrittenPath
+from adacd_hil.given_path import WRITTEN_FILE, WRITTEN_FOLDER
 from adacd_hil.lab.cli.given_logs import different_logs
 from adacd_hil.lab.stated_bounds import LEAST_RATE_PER_H, MOST_RATE_PER_H
 from adacd_hil.plain_values import json_text
@@ -49,11 +47,11 @@ rate_option = click.option(
         INTERRUPTED="interrupted",
     )
 )
-@click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
+@logs_argument
 @rate_option
 @click.option("--config", metavar="NAME|FILE", help="Settings to start from and to extend; default: the logs' own.")
-@click.option("--out", type=WrittenPath(dir_okay=False), help="Write the suggested configuration here.")
-@click.option("--report", type=WrittenPath(file_okay=False), help="Folder for tune.json and the figures.")
+@click.option("--out", type=WRITTEN_FILE, help="Write the suggested configuration here.")
+@click.option("--report", type=WRITTEN_FOLDER, help="Folder for tune.json and the figures.")
 @json_option
 @explained
 @stretch_options
@@ -84,12 +82,11 @@ def tune(
         with Progress() as progress:
             found = find(paths, rate_per_h, config, progress, stretch)
         text = json_text(tuning_by_key(found)) if as_json else _as_text(found)
-        if base is None or found.best is None:
-            print(text) if as_json else show(text, *_next(paths[0], found, None))
-        else:
-            print_and_write(text, out, suggested_toml(found, found.best, *base), as_json)
-            if not as_json:
-                suggest(*_next(paths[0], found, out))
+        content = "" if base is None or found.best is None else suggested_toml(found, found.best, *base)
+        written = out if content else None
+        print_and_write(text, written, content, as_json)
+        if not as_json:
+            suggest(*_next(paths[0], found, written))
     if report is not None:
         from adacd_hil.lab.tune.tune import write_tuning
 
