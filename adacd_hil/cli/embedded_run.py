@@ -59,10 +59,10 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
 
     If the configuration describes an arm of one's own, the emulator plays that arm, unless a profile is given.
     Otherwise the profile is the given one, else the scenario's, else the configuration's. truth: name or file of the
-    emulated arm's true values. seed: None: the scenario's. A configuration without a script gets the demo's user, since
-    somebody must acknowledge; in a scenario other than SCENARIO the user only asks to finish at its end. A built-in arm
-    gets its motors' holding torque from its data sheet; an arm of one's own keeps the value of its file. Raises
-    ConfigError or CodecError if configuration, scenario or contract can't be used.
+    emulated arm's true values. seed: None: the scenario's. A configuration without a script gets the demo's, and its
+    acknowledgement of stops unless it has one; in a scenario other than SCENARIO the user only asks to finish at its
+    end. A built-in arm gets its motors' holding torque from its data sheet; an arm of one's own keeps the value of its
+    file. Raises ConfigError or CodecError if configuration, scenario or contract can't be used.
     """
     contract: EmulatedContract | None = None
     assumed: list[str] = []
@@ -75,7 +75,12 @@ def resolve(config: str, scenario_name: str, profile: str | None, seed: int | No
         scenario = load_scenario(scenario_name, settings.arm.profile, seed)
     operator = settings.operator
     if not operator.script:  # an emulated arm needs a scripted user
-        operator = load_settings(USER).operator
+        user = load_settings(USER).operator
+        operator = dataclasses.replace(
+            operator,
+            script=user.script,
+            acknowledge_after_s=operator.acknowledge_after_s or user.acknowledge_after_s,
+        )
     if scenario_name != SCENARIO:
         operator = dataclasses.replace(
             operator,

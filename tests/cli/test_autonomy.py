@@ -41,6 +41,10 @@ def test_a_configuration_without_a_script_gets_the_demo_s_user(tmp_path):
     mine.write_text('extends = "certified"\n[operator]\nscript = []\nacknowledge_after_s = 0.0\n')
     assert resolve(str(mine), "paper", None, None).settings.operator == load_settings(USER).operator
     assert resolve(str(mine), "push-link1", None, None).settings.operator.acknowledge_after_s == 0.6
+    mine.write_text('extends = "certified"\n[operator]\nacknowledge_after_s = 2.0\nacknowledge_faults = 3\n')
+    own = resolve(str(mine), "paper", None, None).settings.operator
+    assert (own.script, own.acknowledge_faults) == (load_settings(USER).operator.script, 3)
+    assert own.acknowledge_after_s == 2.0
     mine.write_text('extends = "certified"\n[operator]\nscript = [{ at_s = 1.0, request = "finish" }]\n')
     assert resolve(str(mine), "paper", None, None).settings.operator == load_settings(str(mine)).operator
 

@@ -22,7 +22,7 @@ from adacd_hil.lab.live.scene import (
     draw_contact,
     draw_joints,
     pack_scene,
-    residual_over_threshold,
+    threshold_shares,
 )
 from adacd_hil.records import ContactLevel, Location, SchemeState
 
@@ -44,8 +44,8 @@ def rgba(primitive):
 
 
 def test_each_joint_shows_how_near_its_residual_is():
-    residuals, thresholds = np.array([0.03, -0.15]), np.array([0.1, 0.1])
-    joint1, joint2, state = drawn(*draw_joints(SchemeState.MONITOR, residuals, thresholds))
+    residuals, shares = np.array([0.03, -0.15]), np.array([0.3, 1.5])
+    joint1, joint2, state = drawn(*draw_joints(SchemeState.MONITOR, residuals, shares))
     assert [(e.id, e.frame_id, e.frame_locked) for e in (joint1, joint2, state)] == [
         ("joint1", "link1", True),
         ("joint2", "link2", True),
@@ -66,15 +66,34 @@ def test_each_joint_shows_how_near_its_residual_is():
 
 def test_a_joint_is_yellow_from_half_of_the_threshold_and_grey_while_detection_is_off():
     residuals = np.array([0.05, 0.2])
-    near, off, _ = drawn(*draw_joints(SchemeState.ADAPT, residuals, np.array([0.1, math.inf])))
+    near, off, _ = drawn(*draw_joints(SchemeState.ADAPT, residuals, np.array([0.5, math.nan])))
     assert rgba(near.spheres[0]) == YELLOW
     assert (rgba(off.spheres[0]), off.spheres[0].size.y) == (GREY, SMALLEST_SPHERE_M)
     assert off.texts[0].text == "+0.200 Nm"
 
 
+def scheme_record(**fields):
+    values = {name: np.array(value, np.float64) for name, value in fields.items()}
+    record = np.zeros((), [(name, np.float64, value.shape) for name, value in values.items()])
+    for name, value in values.items():
+        record[name] = value
+    return record
+
+
 @pytest.mark.parametrize("threshold", [math.inf, math.nan, 0.0])
 def test_without_a_threshold_there_is_no_share(threshold):
-    assert math.isnan(residual_over_threshold(0.1, threshold))
+    record = scheme_record(tau_ext_hat=[0.1, -0.1], threshold=[threshold, 0.2])
+    np.testing.assert_array_equal(threshold_shares(record), [math.nan, 0.5])
+
+
+def test_of_several_channels_the_nearest_to_its_threshold_counts():
+    bank = scheme_record(
+        tau_ext_hat=[0.1, 0.1],
+        threshold=[1.0, 1.0],
+        tau_ext_bank=[[0.1, 0.1], [-0.9, 0.2]],
+        threshold_bank=[[1.0, math.inf], [1.0, math.inf]],
+    )
+    np.testing.assert_array_equal(threshold_shares(bank), [0.9, math.nan])
 
 
 OTHER = {"force_N": -18.5, "level": ContactLevel.CONTACT}

@@ -5,13 +5,12 @@ import struct
 from collections import deque
 from typing import Any
 
-import numpy as np
-
 from adacd_hil.cli.connection import on_interrupt
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.cli.monitor_command import show_tables
 from adacd_hil.lab.live.client import LiveClient, LiveMessage, live_client
+from adacd_hil.lab.live.scene import threshold_shares
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, SCHEME
 from adacd_hil.log.types.unpacking import unpack_log
@@ -19,7 +18,6 @@ from adacd_hil.printable import one_line
 from adacd_hil.records import (
     GRAVITY_PARAMETER_NAMES,
     JOINT_NAMES,
-    JOINTS,
     PARAMETER_NAMES,
     ContactKind,
     ContactLevel,
@@ -103,7 +101,7 @@ class LiveMonitor:
 
 
 def _describe_scheme(scheme: Any) -> dict[str, Any]:
-    shares = _shares(scheme)
+    shares = threshold_shares(scheme)
     joints = [
         {
             "joint": name,
@@ -124,18 +122,6 @@ def _describe_scheme(scheme: Any) -> dict[str, Any]:
         "joints": joints,
         "parameters": dict(zip(names, theta_hat, strict=True)),
     }
-
-
-def _shares(scheme: Any) -> Any:
-    """Return each joint's largest ratio of |external torque| to threshold (2,), over its channels.
-
-    NaN if detection is off.
-    """
-    has_bank = "tau_ext_bank" in scheme.dtype.names
-    torque, threshold = ("tau_ext_bank", "threshold_bank") if has_bank else ("tau_ext_hat", "threshold")
-    shares = np.abs(scheme[torque]) / np.where(np.isfinite(scheme[threshold]), scheme[threshold], np.nan)
-    by_joint = shares.reshape(-1, JOINTS)
-    return np.where(np.isnan(by_joint).all(axis=0), np.nan, np.nan_to_num(by_joint, nan=0.0).max(axis=0))
 
 
 def _describe_contact(contact: Any) -> dict[str, Any]:

@@ -37,6 +37,7 @@ from adacd_hil.lab.live.scene import (
     pack_scene,
     pack_string,
     pack_transforms,
+    threshold_shares,
     transforms_of,
 )
 from adacd_hil.log.log_files import LogError
@@ -298,7 +299,7 @@ class LiveTopics:
         elif channel == self._scheme and self.scene in wanted and self._scene_decimator.takes(log_ns):
             record = np.frombuffer(payload, self._scheme_dtype)[0]
             state = SchemeState(int(record["state"]))
-            yield self._draw(log_ns, *draw_joints(state, record["tau_ext_hat"], record["threshold"]))
+            yield self._draw(log_ns, *draw_joints(state, record["tau_ext_hat"], threshold_shares(record)))
 
     def _draw(self, log_ns: int, *entities: Entity) -> Shown:
         return Shown(self.scene, log_ns, pack_scene(log_ns, entities))

@@ -6,11 +6,13 @@ scene's primitives only arrows, spheres and texts are filled; lists of the other
 
 import math
 import struct
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from adacd_hil.log.robot_description import BASE, LINK_NAMES, TIP, WORLD
 from adacd_hil.log.types.message_types import ENCAPSULATION, MessageType, foreign_type
-from adacd_hil.records import JOINT_NAMES, ContactLevel, ContactReport, Location, SchemeState, Vector
+from adacd_hil.records import JOINT_NAMES, JOINTS, ContactLevel, ContactReport, Location, SchemeState, Vector
 
 TRANSFORMS_TOPIC, DESCRIPTION_TOPIC = "/tf", "/robot_description"
 """Topics that only the live view has; each viewer gets the last once, when it subscribes."""
@@ -169,19 +171,27 @@ def transforms_of(shape: Shape, q: Vector) -> tuple[Transform, ...]:
     )
 
 
-def residual_over_threshold(tau_ext_hat: float, threshold: float) -> float:
-    """Return |residual| / threshold of a joint; NaN while detection is off: the threshold is 0, infinite or NaN."""
-    return abs(tau_ext_hat) / threshold if 0.0 < threshold < math.inf else math.nan
+def threshold_shares(scheme: Any) -> Vector:
+    """Return each joint's largest |residual| / threshold (2,) over its channels, of a record of /scheme.
+
+    NaN while detection is off: the thresholds are 0, infinite or NaN.
+    """
+    has_bank = "tau_ext_bank" in scheme.dtype.names
+    torque, threshold = ("tau_ext_bank", "threshold_bank") if has_bank else ("tau_ext_hat", "threshold")
+    is_on = np.isfinite(scheme[threshold]) & (scheme[threshold] > 0.0)
+    shares = np.abs(scheme[torque]) / np.where(is_on, scheme[threshold], np.nan)
+    largest: Vector = np.fmax.reduce(shares.reshape(-1, JOINTS))
+    return largest
 
 
-def draw_joints(state: SchemeState, tau_ext_hat: Vector, threshold: Vector) -> tuple[Entity, ...]:
+def draw_joints(state: SchemeState, tau_ext_hat: Vector, shares: Vector) -> tuple[Entity, ...]:
     """Return three entities: a sphere and text at each joint, and the state's name above the base.
 
-    Size and colour of a sphere show residual over threshold. tau_ext_hat, threshold (2,), Nm.
+    Size and colour of a sphere show the joint's share. tau_ext_hat (2,), Nm; shares (2,): of `threshold_shares`.
     """
     entities = []
     for index, link in enumerate(LINK_NAMES):
-        share = residual_over_threshold(float(tau_ext_hat[index]), float(threshold[index]))
+        share = float(shares[index])
         is_off = math.isnan(share)
         text = f"{tau_ext_hat[index]:+.3f} Nm" + ("" if is_off else f", {100.0 * share:.0f} %")
         label = ((0.0, 0.0, 0.5 * _ABOVE_M), text, _LABEL_HEIGHT_M, INK)
