@@ -297,21 +297,24 @@ def compare_logs(
     a log's configuration.
     """
     readers = RunReader(first), RunReader(second)
-    period_s = readers[0].settings.bus.period_s
-    if not stretch.is_whole:
-        since_ns = [bound_ns - readers[0].zero_ns for bound_ns in stretch.bounds_ns(begin_of_log(first))]
-        bounds = [math.ceil(bound_ns * 1e-9 / period_s - 1e-6) for bound_ns in since_ns]
-        for reader in readers:
-            reader.only(*bounds)
-    differences = _Differences(period_s, readers[0].zero_cycle)
-    cycles, only = _walk_together(readers, differences, progress)
     one, two = readers
+    if not stretch.is_whole:
+        since_ns = [bound_ns - one.zero_ns for bound_ns in stretch.bounds_ns(begin_of_log(first))]
+        for reader in readers:
+            period_s = reader.settings.bus.period_s
+            start, end = (math.ceil(bound_ns * 1e-9 / period_s - 1e-6) for bound_ns in since_ns)
+            reader.only(start, end)
+    differences = _Differences(one.settings.bus.period_s, one.zero_cycle)
+    cycles, only = _walk_together(readers, differences, progress)
     for run in readers:
         if not stretch.is_whole and not run.cycles:
             raise LogError(f"log {run.path} has no cycle {stretch.text}")
     keys = [*one.metadata, *(key for key in two.metadata if key not in one.metadata)]
     metadata = {key: (one.metadata.get(key, ""), two.metadata.get(key, "")) for key in keys}
     notes = [f"{run.path}: {run.problem}" for run in readers if run.problem]
+    periods_us = [run.settings.bus.period_us for run in readers]
+    if periods_us[0] != periods_us[1]:
+        notes.append(f"cycles of {periods_us[0]} µs in 1, of {periods_us[1]} µs in 2: none is paired with another")
     contacts = tuple(match_contacts(one.contacts, two.contacts))
     fields = one.contact_fields & two.contact_fields
     found = [*differences.found.values(), *_contact_differences(contacts, fields, only == (0, 0))]
@@ -335,7 +338,7 @@ def compare_logs(
 def _walk_together(
     readers: tuple[RunReader, RunReader], differences: _Differences, progress: Progress
 ) -> tuple[int, tuple[int, int]]:
-    """Compare the cycles that both logs have, by cycles since motion start.
+    """Compare the cycles that both logs have, by cycles since motion start; none if their periods differ.
 
     Return their number, and the numbers of cycles that only the first, and only the second log has.
     """
@@ -343,7 +346,8 @@ def _walk_together(
     first, second = (_next_rows(stream) for stream in streams)
     common = 0
     milestones = Milestones(lambda count: progress(f"{count} cycles compared"))
-    while first is not None and second is not None:
+    are_paired = readers[0].settings.bus.period_us == readers[1].settings.bus.period_us
+    while are_paired and first is not None and second is not None:
         mine, theirs = (
             rows["cycle"].astype(np.int64) - reader.zero_cycle
             for rows, reader in zip((first, second), readers, strict=True)
