@@ -25,7 +25,6 @@ Shapes: joint vectors (2,); history (WIDE_SAMPLES + 1, 2), newest first.
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
-from adacd_hil.scheme.memory import Wide
 
 SMALLEST_UNIT = 0.05
 LARGEST_UNIT = 9.0
@@ -83,12 +82,6 @@ WIDE_SAMPLES = 5
 
 ONSET_FRACTION = 0.5
 """Part of the threshold below which a joint counts as untouched; above a frozen model's residual (0.07 of 0.15 Nm)."""
-
-
-@compiled
-def forget(wide: Wide) -> None:
-    """Set `history` to 0: the samples from which `undo_filter` forms its mean."""
-    wide.history[:] = 0.0
 
 
 @compiled

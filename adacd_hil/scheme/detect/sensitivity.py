@@ -329,11 +329,11 @@ def held_Nm(m: Memory, joint: int, still: float) -> float:
 @compiled
 def _static_friction(k: Constants, m: Memory, joint: int, load_Nm: float) -> float:
     """Return the largest friction, Nm, that the model in use allows for a joint at standstill under load_Nm."""
-    coulomb = int(k.first_coulomb) + joint
+    coulomb, joints = regressor.F_C1 + joint, m.filters.r.shape[1]
     total = max(m.models.theta[coulomb], 0.0) + np.sqrt(max(m.models.P[coulomb, coulomb], 0.0))
     further = 0.0
     for position in range(k.terms.shape[0]):
-        term = int(k.first_term) + position * m.filters.r.shape[1] + joint
+        term = int(k.first_offset) + (2 + position) * joints + joint
         if k.terms[position] == further_friction.STRIBECK:
             open_Nm = min(np.sqrt(max(m.models.P[term, term], 0.0)), STATIC_SHARE * total)
             further += max(m.models.theta[term], 0.0) + open_Nm

@@ -36,6 +36,7 @@ from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify import evidence
 from adacd_hil.scheme.identify.evidence import OFFSETS
 from adacd_hil.scheme.memory import AnchorConstants, Constants, Memory
+from adacd_hil.scheme.model.regressor import F_C1
 from adacd_hil.settings.configuration import Settings
 
 REST, TARE, ACCEPTED, LAST = range(4)
@@ -154,10 +155,10 @@ def is_within(k: Constants, m: Memory, theta: Vector, P: Vector) -> bool:
     Store the comparison as evidence. theta (p,), P (p, p): the model. A missing anchor bounds nothing. The last
     certificate is used only for a joint without a bound of `beta_Nm`.
     """
-    first_coulomb, is_within = int(k.first_coulomb), True
+    is_within = True
     evidence.fit(k, m, theta, P, min(np.max(m.sensitivity.unit), 1.0))
     for i in range(m.anchor.anchor_Nm.shape[1]):
-        q, friction = OFFSETS + i, ASYMMETRY * max(theta[first_coulomb + i], 0.0)
+        q, friction = OFFSETS + i, ASYMMETRY * max(theta[F_C1 + i], 0.0)
         for kind in range(KINDS):
             variance = _variance(k, m, kind, i) + friction**2 + MODEL_STD_NM**2
             if kind == LAST and np.min(m.evidence.limit[:LAST, q]) <= k.beta_Nm:

@@ -24,7 +24,7 @@ Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R, ring_st
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import sensitivity
 from adacd_hil.scheme.identify import estimator, fit_check, missing_torque
 from adacd_hil.scheme.memory import Constants, Memory
@@ -58,10 +58,9 @@ def begin_fit(k: Constants, m: Memory, is_payload: bool) -> None:
 
 
 @compiled
-def freeze(k: Constants, m: Memory) -> None:
+def freeze(m: Memory) -> None:
     """Move negative friction in the belief to 0, use the belief as the model, and empty the ring of waiting samples."""
-    first_coulomb = int(k.first_coulomb)
-    keep_non_negative(first_coulomb - JOINTS, first_coulomb + JOINTS, m.models.belief, m.models.P_belief)
+    keep_non_negative(regressor.F_V1, regressor.F_C2 + 1, m.models.belief, m.models.P_belief)
     _use(m)
     discard(m)
 

@@ -96,7 +96,7 @@ def is_compared(m: Memory) -> bool:
 @compiled
 def withhold(m: Memory, cause: int) -> None:
     """Set `withheld_by` to the contradiction that withholds or revokes the certificate; NOTHING: there is none."""
-    m.certificate.withheld_by = cause
+    m.withheld_by = cause
 
 
 @compiled

@@ -33,6 +33,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.memory import Constants, Memory, TermConstants
 from adacd_hil.scheme.model import filter_bank
+from adacd_hil.scheme.model.regressor import F_C1
 from adacd_hil.scheme.model.torque_by_place import PLACE_TERMS
 from adacd_hil.settings.configuration import Settings
 
@@ -142,7 +143,7 @@ def add(k: Constants, m: Memory, slot: int, joint: int) -> None:
     v[count + PLACE_TERMS * joint : count + PLACE_TERMS * (joint + 1)] = own.ring_X[slot, joint]
     r = -linalg.misfit(v, k.prior, m.ring.tau[slot, joint])
     linalg.add_row(v, r, R, own.L[joint], own.b)
-    own.ways[joint, 1 if v[int(k.first_coulomb) + joint] > 0.0 else 0] += 1.0
+    own.ways[joint, 1 if v[F_C1 + joint] > 0.0 else 0] += 1.0
     own.yy += r * r / R
     own.weight[joint] += 1.0 / R
 

@@ -79,7 +79,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     m.gaps.has_gap = 1.0
     filter_bank.forget(m)
     missing_torque.forget(m)
-    external_torque.forget(m.wide)
+    m.wide_history[:] = 0.0
     belief.begin_fit(k, m, is_payload)
     if is_payload and int(k.first_offset) > regressor.A5:
         filter_bank.rest(m)
@@ -94,7 +94,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
 def begin_test(constants: Structured, memory: Structured) -> None:
     """Use the belief, without negative friction, as the model, and begin its test, with all counts at 0."""
     k, m = constants[0], memory[0]
-    belief.freeze(k, m)
+    belief.freeze(m)
     margin.begin_sight(m)
     termination.begin_test(k, m, fit_check.late_square(m))
 
@@ -206,7 +206,7 @@ def _take_sample(
     filter_bank.take_sample(k, m, tau_J, is_seen)
     missing_torque.follow(m, m.filters.rates[:, filter_bank.LEARNT], k.smoothing, is_seen)
     filter_bank.fill_lag(cutoff, tau_J, m.filters.tau_f, int(k.first_offset) + q.shape[0], m.filters.W_f)
-    if k.has_cross_talk != 0.0:
+    if k.first_cross_talk < m.models.theta.shape[0]:
         filter_bank.fill_cross_talk(m.filters.tau_f, int(k.first_cross_talk), m.filters.W_f)
     filter_bank.smooth_learnt(k.smoothing, m.filters.W_f, m.filters.tau_f, m.filters.W_learnt, m.filters.tau_learnt)
     filter_bank.estimate_external(m.filters.tau_f, m.filters.W_f, m.models.theta, m.filters.r)
@@ -215,7 +215,7 @@ def _take_sample(
     sensitivity.follow_velocity_noise(k, m, dq, m.gaps.is_steady != 0.0)
     sensitivity.follow_friction(k, m, tau_J)
     external_torque.undo_filter(
-        m.filters.r[filter_bank.WIDE], k.decay[filter_bank.WIDE], m.wide.history, tau_ext_wide_hat
+        m.filters.r[filter_bank.WIDE], k.decay[filter_bank.WIDE], m.wide_history, tau_ext_wide_hat
     )
 
 
@@ -266,7 +266,7 @@ def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode
     if not is_complete:
         return 0
     certificate.withhold(m, certificate.contradicted_by(k, m))
-    return FITTED if m.certificate.withheld_by == certificate.NOTHING else WITHHELD
+    return FITTED if m.withheld_by == certificate.NOTHING else WITHHELD
 
 
 @compiled

@@ -33,7 +33,7 @@ from adacd_hil.scheme.kernel.kernel_samples import (
     put_between,
     put_sample,
 )
-from adacd_hil.scheme.memory import Limits, Motion, Sample, Wide
+from adacd_hil.scheme.memory import Limits, Motion, Sample
 from adacd_hil.scheme.model import regressor, torque_filter
 from adacd_hil.scheme.supervisor.transitions import (
     ADAPTED,
@@ -60,8 +60,8 @@ line is within 2.1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
 class PaperMemory:
     """The memory of the paper's scheme. mode: LEARN, then ARMED, of a step beside another scheme.
 
-    motion: evidence of the excitation. quiet_cycles: cycles in a row within beta, eq. (15). standstill, integral, peak:
-    see `external_torque`. last, between: q, dq, tau_J of the sample before, and of an interpolated one.
+    motion: evidence of the excitation. quiet_cycles: cycles in a row within beta, eq. (15). standstill, integral, peak,
+    wide_history: see `external_torque`. last, between: q, dq, tau_J of the sample before, and of an interpolated one.
     """
 
     has_gap: float
@@ -82,7 +82,7 @@ class PaperMemory:
     standstill: PerJoint
     integral: PerJoint
     peak: PerJoint
-    wide: Wide
+    wide_history: Annotated[Vector, "wide n"]
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     m.has_gap = 1.0
     m.W_f[:] = 0.0
     out.tau_f[:] = 0.0
-    external_torque.forget(m.wide)
+    m.wide_history[:] = 0.0
     m.mode = LEARN  # used by a step beside; in charge, the mode follows from the state
     estimator.reset_gain(c.P0, m.P)
     excitation.begin(m.motion)
@@ -279,7 +279,7 @@ def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: S
     external_torque.predict(m.W_f, c.theta_cad, out.tau_f_cad)
     external_torque.estimate_external(out.tau_f, out.tau_f_hat, c.dc_gain, out.tau_ext_hat)
     external_torque.estimate_external(out.tau_f, out.tau_f_cad, c.dc_gain, out.tau_ext_hat_cad)
-    external_torque.undo_filter(out.tau_ext_hat, c.decay, m.wide.history, out.tau_ext_wide_hat)
+    external_torque.undo_filter(out.tau_ext_hat, c.decay, m.wide_history, out.tau_ext_wide_hat)
 
 
 @compiled
