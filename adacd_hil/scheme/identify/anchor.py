@@ -184,19 +184,22 @@ def is_excluded(m: Memory, joint: int, offset_Nm: float) -> bool:
 
 
 @compiled
-def innovation(k: Constants, m: Memory, joint: int, offset_Nm: float, variance_Nm2: float) -> float:
+def _innovation(k: Constants, m: Memory, joint: int) -> float:
     """Return (o - a) / (P_oo + sigma_a² + b² t) for the joint's best known anchor, 1/Nm; 0 without an anchor.
 
-    o, P_oo: the fit's offset_Nm and variance_Nm2. theta less the offset's column of P times the result is the model
+    o, P_oo: the fit's offset and its variance. theta less the offset's column of P times the result is the model
     corrected by the anchor as by a measurement of the offset. joint: from 0.
     """
+    offset = int(k.first_offset) + joint
     kind = int(np.argmin(m.anchor.anchor_std[:, joint]))
     known = _variance(k, m, kind, joint)
     if known == np.inf:
         return 0.0
     if kind == REST:
         known += k.anchor.holding_Nm[joint] ** 2
-    return float((offset_Nm - m.anchor.anchor_Nm[kind, joint]) / (variance_Nm2 + known))
+    return float(
+        (m.models.belief[offset] - m.anchor.anchor_Nm[kind, joint]) / (m.models.P_belief[offset, offset] + known)
+    )
 
 
 def accept(m: Memory, offset_Nm: Vector, std_Nm: Vector) -> None:
@@ -265,7 +268,7 @@ def describe_refused(m: Memory, is_reading: bool) -> list[str]:
     lines = []
     for i, value in enumerate(judged_Nm(m).tolist()):
         for kind in range(KINDS):
-            expected, limit = float(m.anchor.anchor_Nm[kind, i]), float(m.evidence.limit[kind, OFFSETS + i])
+            expected, limit = m.anchor.anchor_Nm[kind, i], m.evidence.limit[kind, OFFSETS + i]
             if not abs(value - expected) <= limit:
                 what = (
                     f"reads {value:.3f} Nm at rest" if is_reading else f"has a fitted torque offset of {value:.3f} Nm"
@@ -287,7 +290,7 @@ def is_place_bounded(k: Constants, m: Memory) -> bool:
 
     Torque by place: it depends on the joint's position. True, without filling, for a model without such a torque.
     """
-    if k.position_torque_Nm == 0.0:
+    if not k.position_torque_Nm:
         return True
     is_place_bounded = True
     for i in range(m.anchor.by_place_Nm.shape[0]):
@@ -302,7 +305,7 @@ def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
     joints, first = m.anchor.by_place_Nm.shape[0], int(k.first_position)
     offset, largest = int(k.first_offset) + joint, 0.0
     P, theta = m.models.P_belief, m.models.belief
-    off = innovation(k, m, joint, theta[offset], P[offset, offset])
+    off = _innovation(k, m, joint)
     for s in range(int(m.fit_check.samples_kept)):
         torque = 0.0
         for term in range(m.regressor.X.shape[1]):
@@ -314,7 +317,7 @@ def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
 
 def describe_place(k: Constants, m: Memory) -> str:
     """Return each joint's last checked torque by place, and its bound, as text; "" if the model has no such torque."""
-    if k.position_torque_Nm == 0.0:
+    if not k.position_torque_Nm:
         return ""
     return (
         f"; torque by place up to {_by_joint(m.anchor.by_place_Nm)}, believed up to {float(k.position_torque_Nm):g} Nm"

@@ -93,8 +93,7 @@ def set_source(m: Memory, s: int, value: Vector, variance: Vector, slack: Vector
 @compiled
 def follow(m: Memory, period_s: float) -> None:
     """Add one period to the age of each source."""
-    for s in range(m.evidence.age_s.shape[0]):
-        m.evidence.age_s[s] += period_s
+    m.evidence.age_s[:] += period_s
 
 
 @compiled
@@ -174,7 +173,7 @@ def weigh(k: Constants, m: Memory, s: int, q: int) -> float:
     """
     own = m.evidence
     difference = own.fitted[q] - own.value[s, q]
-    if own.variance[s, q] == np.inf or (difference < 0.0 and k.evidence.less_counts[s, q] == 0.0):
+    if own.variance[s, q] == np.inf or (difference < 0.0 and not k.evidence.less_counts[s, q]):
         difference = 0.0 if np.isfinite(difference) else difference
     std = np.sqrt(own.variance[s, q] + own.fitted_variance[q])
     own.difference[s, q] = difference

@@ -187,7 +187,7 @@ def is_found(k: Constants, m: Memory) -> bool:
     """
     own = m.missing_torque
     own.rms_Nm[:] = 0.0
-    if k.position_torque_Nm != 0.0:
+    if k.position_torque_Nm:
         return False
     basic, full = own.basic, own.full
     without = log_evidence(m, own.b, scale_of(k, m, False), basic)
@@ -227,7 +227,7 @@ def _is_found_again(k: Constants, m: Memory) -> bool:
     own = m.missing_torque
     own.rms_Nm[:] = 0.0
     last_found, count, basic, full = own.last_found, m.models.belief.shape[0], own.basic, own.full
-    if k.position_torque_Nm != 0.0 or not np.any(last_found != 0.0):
+    if k.position_torque_Nm or not np.any(last_found):
         return False
     b = own.row
     b[:] = own.b
@@ -259,10 +259,8 @@ def _rms_Nm(m: Memory, joint: int) -> float:
     `full`: with a torque that depends on the position; `basic`: without. Overwrites `row`.
     """
     own = m.missing_torque
-    apart = own.row
-    for j in range(apart.shape[0]):
-        apart[j] = own.full[j] - own.basic[j]
-    square = linalg.quadratic(own.L[joint], apart)
+    own.row[:] = own.full - own.basic
+    square = linalg.quadratic(own.L[joint], own.row)
     return float(np.sqrt(square / max(own.weight[joint], 1e-12)))
 
 
@@ -286,8 +284,7 @@ def log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
     linalg.solve_lower(M, x)
     square = linalg.dot(x, x)
     linalg.solve_upper(M, x)
-    for j in range(count):
-        x[j] *= s[j]
+    x *= s
     return float(0.5 * (square - log_det))
 
 

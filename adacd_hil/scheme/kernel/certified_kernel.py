@@ -258,7 +258,8 @@ def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode
     if mode & REFINE:
         return _refine(k, m) if is_free else 0
     W_f, tau_f = m.filters.W_f[filter_bank.SLOW], m.filters.tau_f[filter_bank.SLOW]
-    if is_free and belief.learn_and_use(k, m):
+    if is_free and belief.learn(k, m):
+        belief.use(m)
         fit_check.follow(k, m, W_f, tau_f)
     is_complete = is_free and termination.follow(k, m, out.q, out.dq, W_f)
     if not is_complete:

@@ -181,7 +181,7 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     out.tau_f[:] = 0.0
     m.wide_history[:] = 0.0
     m.mode = LEARN  # used by a step beside; in charge, the mode follows from the state
-    estimator.reset_gain(c.P0, m.P)
+    m.P[:] = np.diag(c.P0)
     excitation.begin(m.motion)
     m.quiet_cycles = 0.0
     out.quiet_s = 0.0
