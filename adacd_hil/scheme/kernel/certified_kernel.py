@@ -225,9 +225,9 @@ def _watch(k: Constants, m: Memory, out: CertifiedBlock, is_fresh: bool) -> int:
     `collision_Nm`, too. is_fresh: False keeps the thresholds of the sample before.
     """
     if is_fresh:
-        sensitivity.fill_thresholds(k, m, m.sensitivity.h)
+        sensitivity.fill_thresholds(k, m)
         out.threshold[:] = m.sensitivity.h[filter_bank.SLOW]
-        sensitivity.fill_wide(k, m, filter_bank.WIDE)
+        sensitivity.fill_wide(k, m)
     joints = sensitivity.joints_over(m.filters.y, m.sensitivity.h)
     if not joints:
         return 0
@@ -290,7 +290,7 @@ def _test(k: Constants, m: Memory, dq: Vector) -> int:
     0 while the test goes on. WITHHELD: the model lacks a torque that depends on the position. Set `withheld_by` if
     refuted.
     """
-    sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_test_share, False)
+    sensitivity.follow_unit(k, m, False)
     margin.follow_test(k, m)
     result = termination.test(k, m, dq, m.filters.r[filter_bank.SLOW])
     if result >= 0:
@@ -309,7 +309,7 @@ def _refine(k: Constants, m: Memory) -> int:
     Return WITHHELD if later evidence contradicts the certificate, else 0; set `withheld_by` to the contradiction, or
     NOTHING.
     """
-    sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_share, True)
+    sensitivity.follow_unit(k, m, True)
     sensitivity.decay_strain(k, m)
     cause = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
     if belief.learn(k, m):
