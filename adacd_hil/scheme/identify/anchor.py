@@ -234,12 +234,7 @@ def tightest(k: Constants, m: Memory, joint: int) -> int | None:
 
 def open_joints(k: Constants, m: Memory) -> list[int]:
     """Return the joints, from 0, whose last judged torque offset no anchor bounds to `beta_Nm`."""
-    return [i for i in range(JOINTS) if tightest(k, m, i) is None]
-
-
-def is_anchored(k: Constants, m: Memory) -> bool:
-    """Return whether an anchor bounds the last judged torque offset of each joint to `beta_Nm`."""
-    return not open_joints(k, m)
+    return [i for i in range(JOINTS) if is_open(k, m, i)]
 
 
 def judged_Nm(m: Memory) -> Vector:

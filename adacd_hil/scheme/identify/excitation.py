@@ -105,12 +105,8 @@ def eigenvalue_range(information: Vector, scale: Vector, scratch: Vector) -> tup
         for j in range(count):
             for k in range(j):
                 _rotate(scratch, j, k)
-    smallest: float = scratch[0, 0]
-    largest: float = scratch[0, 0]
-    for j in range(1, count):
-        smallest = min(smallest, scratch[j, j])
-        largest = max(largest, scratch[j, j])
-    return max(smallest, 0.0), max(largest, 0.0)
+    values = np.diag(scratch)[:count]
+    return max(np.min(values), 0.0), max(np.max(values), 0.0)
 
 
 @compiled

@@ -23,7 +23,7 @@ Then the model is frozen, friction coefficients below zero put to zero, and test
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify.excitation import begin, begin_speeds, eigenvalue_range, gather, has_moved, widen
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model.regressor import is_positive_definite
@@ -122,8 +122,7 @@ def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dic
     """
     own = m.motion
     lines = []
-    joints = own.q_low.shape[0]
-    travel, speed = float(np.degrees(k.travel_rad)), float(np.degrees(k.velocity_rad_s))
+    travel, speed = np.degrees(k.travel_rad), np.degrees(k.velocity_rad_s)
     enough_samples = k.fit_cycles[int(m.models.is_payload)]
     if own.samples < enough_samples:
         lines.append(f"{own.samples:.0f} samples in a row are undisturbed, {enough_samples:.0f} needed")
@@ -139,11 +138,11 @@ def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dic
                 f"{k.condition:.2g} allowed: a motion that shows each of them, or a model with fewer "
                 "(estimator.gravity of an arm that hardly feels it)"
             )
-        for i in range(joints):
-            travelled = max(float(np.degrees(own.q_high[i] - own.q_low[i])), 0.0)
+        for i in range(JOINTS):
+            travelled = max(np.degrees(own.q_high[i] - own.q_low[i]), 0.0)
             if not travelled >= travel:
                 lines.append(f"joint {i + 1} has travelled {travelled:.1f} deg of {travel:g}: move it further")
-            fastest, slowest = float(np.degrees(own.dq_high[i])), float(np.degrees(own.dq_low[i]))
+            fastest, slowest = np.degrees(own.dq_high[i]), np.degrees(own.dq_low[i])
             if not (fastest >= speed and slowest <= -speed):
                 lines.append(
                     f"joint {i + 1} has moved at {min(slowest, 0.0):.1f} to {max(fastest, 0.0):.1f} deg/s, "
@@ -152,7 +151,7 @@ def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dic
     if not is_positive_definite(m.models.belief):
         lines.append("the estimated mass matrix is not positive definite: accelerate both joints harder")
     for j, name in enumerate(names):
-        std, enough = float(np.sqrt(m.models.P_belief[j, j])), float(k.enough_std[j])
+        std, enough = np.sqrt(m.models.P_belief[j, j]), k.enough_std[j]
         if not std <= enough:
             unit = units.get(name, "")
             lines.append(f"{name} is known to {std:.3g} {unit}, {enough:.3g} needed: {_motion_for(name)}")

@@ -120,8 +120,8 @@ def constants_of(settings: Settings) -> Structured:
     certified, names = settings.certified, parameter_names(settings)
     period_s = settings.bus.period_s
     cutoff = np.array(certified.cutoffs_rad_s)
-    decay, weight_old, weight_new = np.zeros_like(cutoff), np.zeros_like(cutoff), np.zeros_like(cutoff)
-    filter_bank.discretise(cutoff, period_s, decay, weight_old, weight_new)
+    decay, weight_old, weight_new = rates = np.zeros((3, cutoff.size))
+    filter_bank.discretise(cutoff, period_s, *rates)
     base = len(settings.estimator.parameter_names)
     theta_cad = np.zeros(len(names))
     theta_cad[: len(settings.arm.cad_theta)] = settings.arm.cad_theta

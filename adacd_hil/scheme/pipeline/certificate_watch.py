@@ -103,7 +103,7 @@ class CertificateWatch:
         self._refusal = None
         known_by, self._vouched_against = self._known_by(), ""
         k, m = self._k, self._m
-        level = "info" if anchor.is_anchored(k, m) else "warning"
+        level = "warning" if anchor.open_joints(k, m) else "info"
         by_place = anchor.describe_place(k, m)
         text = f"{anchor.describe(k, m)}; {margin.describe_sight(m)}; {known_by}{by_place}"
         self._is_standing = True
