@@ -311,19 +311,20 @@ def test_the_unit_keeps_to_its_bounds():
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "joints"),
+    ("place", "value", "h", "joints"),
     [
-        ((0, 0), 1.01, 0b01),
-        ((1, 0), -1.01, 0b01),
-        ((2, 1), 1.01, 0b10),
-        ((3, 1), np.nan, 0b10),
-        ((1, 0), 1.0, 0b00),
-        ((1, 0), -1.0, 0b00),
-        ((0, slice(None)), (2.0, -2.0), 0b11),
+        ((0, 0), 1.01, 1.0, 0b01),
+        ((1, 0), -1.01, 1.0, 0b01),
+        ((2, 1), 1.01, 1.0, 0b10),
+        ((3, 1), np.nan, 1.0, 0b10),
+        ((1, 0), 1.0, 1.0, 0b00),
+        ((1, 0), -1.0, 1.0, 0b00),
+        ((0, slice(None)), (2.0, -2.0), 1.0, 0b11),
+        ((0, 0), 0.0, np.nan, 0b11),
     ],
 )
-def test_a_joint_is_over_in_any_channel_and_what_is_no_number_is_over(place, value, joints):
-    y, h = np.zeros((5, 2)), np.ones((5, 2))
+def test_a_joint_is_over_in_any_channel_and_what_is_no_number_is_over(place, value, h, joints):
+    y, h = np.zeros((5, 2)), np.full((5, 2), h)
     y[place] = value
     assert sensitivity.joints_over(y, h) == joints
 
@@ -333,7 +334,3 @@ def test_a_bare_channel_alone_finds_no_push(smoothed, joints):
     y, h = np.zeros((5, 2)), np.ones((5, 2))
     y[4, 0], y[2, 0] = -1.5, smoothed
     assert sensitivity.joints_over(y, h) == joints
-
-
-def test_a_threshold_that_is_no_number_is_exceeded():
-    assert sensitivity.joints_over(np.zeros((5, 2)), np.full((5, 2), np.nan)) == 0b11
