@@ -365,10 +365,11 @@ class _Compilation(event.Listener):
         self._count.call_listeners()
 
     @contextmanager
-    def of(self, functions: Sequence[Any], on_first: Callable[[], None]) -> Iterator[None]:
-        """Count these functions in the block, and call `on_first` as the first one compiles.
+    def of(self, functions: Sequence[Any], on_first: Callable[[], None] = lambda: None) -> Iterator[None]:
+        """Count functions that compile in the block toward these functions and all that they call.
 
-        Do neither if a block around it counts already.
+        on_first: called before the first function is compiled, not at all if all come from the cache. Do neither if a
+        block around it counts already.
         """
         if self._on_first is not None or self._count.is_expecting:
             yield
@@ -385,10 +386,4 @@ class _Compilation(event.Listener):
 _compilation = _Compilation()
 event.register("numba:compile", _compilation)  # type: ignore[no-untyped-call]
 
-
-def compiling(functions: Sequence[Any], on_first: Callable[[], None] = lambda: None) -> Any:
-    """Return a context manager; functions that compile in it count toward these functions and all that they call.
-
-    on_first: called before the first function is compiled, not at all if all come from the cache.
-    """
-    return _compilation.of(functions, on_first)
+compiling = _compilation.of

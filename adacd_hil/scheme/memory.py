@@ -86,12 +86,6 @@ class Filters:
     y: EachChannel
 
 
-class Wide:
-    """The last external torques by the filter that is undone, newest first: written by `external_torque`."""
-
-    history: Annotated[Vector, "wide n"]
-
-
 class Models:
     """Model in use (theta, P), certified model and belief: written by `belief`.
 
@@ -299,12 +293,6 @@ class Earlier:
     has_lapsed: float
 
 
-class Certificate:
-    """Contradiction for which a certificate is withheld or taken back, or NOTHING: written by `certificate`."""
-
-    withheld_by: float
-
-
 class Doubt:
     """Evidence on the cause of a certified model's contacts: sums of `doubt`, which writes them.
 
@@ -362,12 +350,16 @@ class Watch:
 
 
 class Memory:
-    """The memory of the certified scheme."""
+    """The memory of the certified scheme.
+
+    wide_history: the last external torques by the filter that is undone, newest first, see `external_torque`.
+    withheld_by: contradiction for which a certificate is withheld or taken back, see `certificate`.
+    """
 
     gaps: Gaps
     regressor: Regressor
     filters: Filters
-    wide: Wide
+    wide_history: Annotated[Vector, "wide n"]
     models: Models
     candidate: Candidate
     ring: Ring
@@ -379,7 +371,7 @@ class Memory:
     anchor: Anchor
     fit_check: FitCheck
     earlier: Earlier
-    certificate: Certificate
+    withheld_by: float
     doubt: Doubt
     missing_torque: MissingTorque
     watch: Watch
@@ -484,9 +476,6 @@ class Constants:
     weight_old: Vector
     weight_new: Vector
     first_offset: float
-    first_coulomb: float
-    first_term: float
-    has_cross_talk: float
     first_cross_talk: float
     first_position: float
     position_torque_Nm: float

@@ -112,20 +112,12 @@ def test_after_a_touch_the_ring_holds_what_was_seen_since():
     np.testing.assert_array_equal(m.ring.tau[:3], tau_f[100 + EVERY - 1 : 100 + 3 * EVERY : EVERY])
 
 
-def test_a_payload_widens_the_belief_along_one_direction():
-    P = np.zeros((COUNT, COUNT))
-    direction = regressor.payload_direction((0.35, 0.30), COUNT, 0.0)
-    belief.add_payload(direction, 3.0, np.zeros(COUNT), P)
-    np.testing.assert_allclose(direction[:7], PAYLOAD_1KG)
-    np.testing.assert_allclose(P, 9.0 * np.outer(direction, direction))
-    assert np.linalg.matrix_rank(P) == 1
-
-
-def test_a_payload_that_is_no_point_mass_widens_each_parameter_by_its_own_rest():
-    P, direction = np.zeros((COUNT, COUNT)), regressor.payload_direction((0.35, 0.30), COUNT, 0.0)
+def test_a_payload_widens_the_belief_along_one_direction_and_each_parameter_by_its_own_rest():
+    P, direction = np.eye(COUNT), regressor.payload_direction((0.35, 0.30), COUNT, 0.0)
     rest_std = np.where(np.arange(COUNT) < 3, 0.02, 0.0)
-    belief.add_payload(direction, 0.0, rest_std, P)
-    np.testing.assert_allclose(np.diag(P), rest_std**2)
+    belief.add_payload(direction, 3.0, rest_std, P)
+    np.testing.assert_allclose(direction[:7], PAYLOAD_1KG)
+    np.testing.assert_allclose(P, np.eye(COUNT) + 9.0 * np.outer(direction, direction) + np.diag(rest_std**2))
 
 
 def test_a_payload_pulls_where_gravity_acts():

@@ -1,12 +1,10 @@
 """Push and hit told apart, on shapes that were not used to choose the bound."""
 
-import math
-
 import numpy as np
 import pytest
 
 from adacd_hil.records import ContactKind
-from adacd_hil.scheme.contact.contact_kind import classify, share_left
+from adacd_hil.scheme.contact.contact_kind import classify
 from adacd_hil.settings.scheme_settings import KIND_S
 
 SIGMA = np.array([0.03, 0.015])
@@ -47,6 +45,6 @@ def test_a_hand_that_changes_sides_still_pushes():
     assert classify(tau, SIGMA, PERIOD_S) is ContactKind.PUSH
 
 
-def test_nothing_at_all_leaves_nothing():
-    assert share_left(np.zeros((5, 2)), np.ones(2), 10) == 0.0
-    assert math.isfinite(share_left(np.ones((1, 2)), np.ones(2), 10))
+def test_nothing_at_all_is_no_push_and_one_sample_is_enough():
+    assert classify(np.zeros((5, 2)), np.ones(2), PERIOD_S) is ContactKind.HIT
+    assert classify(np.ones((1, 2)), np.ones(2), PERIOD_S) is ContactKind.PUSH

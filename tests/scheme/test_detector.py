@@ -37,26 +37,23 @@ def test_a_torque_step_is_detected_by_the_delay_law(size_Nm, delay_ms, sign, joi
 
 
 @pytest.mark.parametrize(
-    ("tau_ext_hat", "joints"),
+    ("tau_ext_hat", "threshold", "joints"),
     [
-        ((0.0, 0.0), 0b00),
-        ((0.2, 0.0), 0b01),
-        ((0.0, -0.2), 0b10),
-        ((-0.2, 0.2), 0b11),
-        ((0.15, -0.15), 0b00),
-        ((np.nextafter(0.15, 1.0), 0.0), 0b01),
-        ((np.nan, 0.0), 0b01),
-        ((0.0, np.nan), 0b10),
-        ((np.inf, -np.inf), 0b11),
+        ((0.0, 0.0), (0.15, 0.15), 0b00),
+        ((0.2, 0.0), (0.15, 0.15), 0b01),
+        ((0.0, -0.2), (0.15, 0.15), 0b10),
+        ((-0.2, 0.2), (0.15, 0.15), 0b11),
+        ((0.15, -0.15), (0.15, 0.15), 0b00),
+        ((np.nextafter(0.15, 1.0), 0.0), (0.15, 0.15), 0b01),
+        ((np.nan, 0.0), (0.15, 0.15), 0b01),
+        ((0.0, np.nan), (0.15, 0.15), 0b10),
+        ((np.inf, -np.inf), (0.15, 0.15), 0b11),
+        ((0.3, 0.3), (0.4, 0.1), 0b10),
+        ((0.3, 0.3), (0.1, 0.4), 0b01),
     ],
 )
-def test_the_joints_over_their_threshold_are_named(tau_ext_hat, joints):
-    assert joints_over(np.array(tau_ext_hat), np.array([0.15, 0.15])) == joints
-
-
-def test_each_joint_is_compared_with_its_own_threshold():
-    assert joints_over(np.array([0.3, 0.3]), np.array([0.4, 0.1])) == 0b10
-    assert joints_over(np.array([0.3, 0.3]), np.array([0.1, 0.4])) == 0b01
+def test_the_joints_over_their_threshold_are_named(tau_ext_hat, threshold, joints):
+    assert joints_over(np.array(tau_ext_hat), np.array(threshold)) == joints
 
 
 def test_thresholds_go_out_of_force_when_the_scheme_disarms():

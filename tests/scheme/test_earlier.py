@@ -141,8 +141,7 @@ class Compared:
         return self.agrees()
 
     def agrees(self):
-        unit = fit_check.unit_of(self.m.fit_check.fit_square, self.m.fit_check.fit_rows)
-        evidence.fit(self.k, self.m, self.m.models.belief, self.m.models.P_belief, unit)
+        evidence.fit(self.k, self.m, self.m.models.belief, self.m.models.P_belief, fit_check.fit_unit(self.m))
         return earlier.is_no_more(self.k, self.m)
 
 

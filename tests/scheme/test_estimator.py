@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from adacd_hil.scheme.identify.estimator import reset_gain, update
+from adacd_hil.scheme.identify.estimator import update
 
 R = 1000.0
 P0 = np.array([8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5])
@@ -13,8 +13,7 @@ THETA_TRUE = np.array([0.38, 0.07, 0.04, 0.12, 0.06, 0.15, 0.08])
 def run(columns, torque, P0=P0, R=R, is_least_squares=True):
     """Learn from W_f (n, 2, p) and tau_f (n, 2); return theta_hat and P."""
     count = P0.shape[0]
-    theta_hat, P, v, K = np.zeros(count), np.zeros((count, count)), np.zeros(count), np.zeros(count)
-    reset_gain(P0, P)
+    theta_hat, P, v, K = np.zeros(count), np.diag(P0), np.zeros(count), np.zeros(count)
     for W_f, tau_f in zip(columns, torque, strict=True):
         update(W_f, tau_f, R, is_least_squares, theta_hat, P, v, K)
     return theta_hat, P

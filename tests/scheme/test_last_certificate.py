@@ -89,8 +89,7 @@ class Asked:
     def agrees_with(self, name, change):
         self.m.models.belief = 0.1
         self.m.models.belief[NAMES.index(name)] += change
-        unit = fit_check.unit_of(self.m.fit_check.fit_square, self.m.fit_check.fit_rows)
-        evidence.fit(self.k, self.m, self.m.models.belief, self.m.models.P_belief, unit)
+        evidence.fit(self.k, self.m, self.m.models.belief, self.m.models.P_belief, fit_check.fit_unit(self.m))
         return certificate.is_no_more(self.k, self.m)
 
 

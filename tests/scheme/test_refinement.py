@@ -58,8 +58,10 @@ def test_a_candidate_that_explains_the_motion_better_takes_over_at_the_end_of_it
     assert refined.m.models.promotions == 1.0
 
 
-def test_a_worse_candidate_leaves_the_model_as_it_is():
+@pytest.mark.parametrize("anchor_std", [np.inf, 0.001], ids=["no anchor", "an anchor that excludes it"])
+def test_a_worse_candidate_leaves_the_model_as_it_is_and_is_not_said(anchor_std):
     refined = Refined(off_by(0.2), off_by(0.05))
+    refined.m.anchor.anchor_Nm[anchor.TARE], refined.m.anchor.anchor_std[anchor.TARE] = 5.0, anchor_std
     assert not any(refined.run())
     np.testing.assert_array_equal(refined.m.models.theta, off_by(0.05))
     assert refined.m.models.promotions == 0.0
@@ -108,13 +110,6 @@ def test_a_better_candidate_that_an_anchor_excludes_is_said_once_and_does_not_ta
     assert refined.run() == [False] * (CYCLES - 1) + [is_excluded]
     assert refined.has_taken_over is not is_excluded
     assert not refined.sample()  # the next test has begun
-
-
-def test_a_worse_candidate_that_an_anchor_excludes_is_not_said():
-    refined = Refined(off_by(0.2), off_by(0.05))
-    refined.m.anchor.anchor_Nm[anchor.TARE] = 5.0
-    refined.m.anchor.anchor_std[anchor.TARE] = 0.001
-    assert not any(refined.run())
 
 
 def test_after_a_test_the_next_begins_with_the_belief_as_it_is_then():

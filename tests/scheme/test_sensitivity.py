@@ -32,10 +32,9 @@ def known_arm(seed=1):
 
 
 def thresholds_of(m):
-    h = np.zeros((len(CHANNELS), 2))
     sensitivity.follow_friction(K, m, np.zeros(2))
-    sensitivity.fill_thresholds(K, m, h)
-    return h
+    sensitivity.fill_thresholds(K, m)
+    return m.sensitivity.h.copy()
 
 
 def noise_of(m):
@@ -125,7 +124,7 @@ def test_the_undone_filter_s_deviation_is_that_of_a_mean_of_five_samples():
     m = known_arm()
     m.sensitivity.doubt[:] = 0.3
     m.sensitivity.h[:] = [[0.5, 0.6], [0.3, 0.7], [0.4, 0.2], [0.9, 0.9], [0.8, 0.8]]
-    sensitivity.fill_wide(K, m, 1)
+    sensitivity.fill_wide(K, m)
     torque = CERTIFIED.torque_noise_Nm**2 * m.sensitivity.roughness / 5.0
     velocity = (
         2.0
@@ -234,11 +233,11 @@ def test_what_changes_first_or_by_much_is_no_step():
 def test_a_sensor_s_step_raises_the_thresholds_by_its_noise_and_its_pull():
     m, _ = stepped(0.1)
     _, fine = kernel_of()
-    h, h_fine = np.zeros((5, 2)), np.zeros((5, 2))
-    for memory, filled in ((m, h), (fine, h_fine)):
+    for memory in (m, fine):
         memory.models.P[:] = 0.0
         memory.models.theta[:] = 0.0
-        sensitivity.fill_thresholds(K, memory, filled)
+        sensitivity.fill_thresholds(K, memory)
+    h, h_fine = m.sensitivity.h, fine.sensitivity.h
     noise = K.noise.torque_gain * 0.1**2 / 12.0
     np.testing.assert_allclose(h[:, 0], np.sqrt(h_fine[:, 0] ** 2 + noise) + m.sensitivity.torque_pull_Nm[0], rtol=1e-9)
     np.testing.assert_array_equal(h[:, 1], h_fine[:, 1])
@@ -282,19 +281,20 @@ def units_after(share, count, unit=1.0, is_monitored=False, sign=lambda _: 1.0):
     believed += np.einsum("ij,jk,ik->i", m.filters.W_f[0], m.models.P, m.filters.W_f[0])
     for sample in range(count):
         m.filters.r[0] = sign(sample) * np.sqrt(share * believed)
-        sensitivity.follow_unit(K, m, 0, K.noise.unit_share, is_monitored)
+        sensitivity.follow_unit(K, m, is_monitored)
     return m.sensitivity.unit.copy()
 
 
-def test_the_unit_follows_the_residual_over_twenty_seconds():
-    left = (1.0 - T / sensitivity.UNIT_S) ** 1000
-    target = sensitivity.UNIT_PEAK * np.array([0.1, 1.0])
-    np.testing.assert_allclose(units_after(np.array([0.1, 1.0]), 1000), target + left * (1.0 - target), rtol=1e-10)
-
-
-def test_while_the_arm_is_monitored_the_unit_follows_an_error_of_both_signs():
-    swings = units_after(np.array([0.1, 1.0]), 1000, is_monitored=True, sign=lambda sample: (-1.0) ** sample)
-    np.testing.assert_allclose(swings, units_after(np.array([0.1, 1.0]), 1000), rtol=1e-3)
+@pytest.mark.parametrize(
+    ("is_monitored", "memory_s", "rtol"),
+    [(False, sensitivity.UNIT_TEST_S, 1e-10), (True, sensitivity.UNIT_S, 1e-3)],
+)
+def test_the_unit_follows_an_error_of_both_signs_in_its_own_time(is_monitored, memory_s, rtol):
+    left = (1.0 - T / memory_s) ** 1000
+    share = np.array([0.1, 1.0])
+    target = sensitivity.UNIT_PEAK * share
+    swings = units_after(share, 1000, is_monitored=is_monitored, sign=lambda sample: (-1.0) ** sample)
+    np.testing.assert_allclose(swings, target + left * (1.0 - target), rtol=rtol)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
@@ -311,19 +311,20 @@ def test_the_unit_keeps_to_its_bounds():
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "joints"),
+    ("place", "value", "h", "joints"),
     [
-        ((0, 0), 1.01, 0b01),
-        ((1, 0), -1.01, 0b01),
-        ((2, 1), 1.01, 0b10),
-        ((3, 1), np.nan, 0b10),
-        ((1, 0), 1.0, 0b00),
-        ((1, 0), -1.0, 0b00),
-        ((0, slice(None)), (2.0, -2.0), 0b11),
+        ((0, 0), 1.01, 1.0, 0b01),
+        ((1, 0), -1.01, 1.0, 0b01),
+        ((2, 1), 1.01, 1.0, 0b10),
+        ((3, 1), np.nan, 1.0, 0b10),
+        ((1, 0), 1.0, 1.0, 0b00),
+        ((1, 0), -1.0, 1.0, 0b00),
+        ((0, slice(None)), (2.0, -2.0), 1.0, 0b11),
+        ((0, 0), 0.0, np.nan, 0b11),
     ],
 )
-def test_a_joint_is_over_in_any_channel_and_what_is_no_number_is_over(place, value, joints):
-    y, h = np.zeros((5, 2)), np.ones((5, 2))
+def test_a_joint_is_over_in_any_channel_and_what_is_no_number_is_over(place, value, h, joints):
+    y, h = np.zeros((5, 2)), np.full((5, 2), h)
     y[place] = value
     assert sensitivity.joints_over(y, h) == joints
 
@@ -333,7 +334,3 @@ def test_a_bare_channel_alone_finds_no_push(smoothed, joints):
     y, h = np.zeros((5, 2)), np.ones((5, 2))
     y[4, 0], y[2, 0] = -1.5, smoothed
     assert sensitivity.joints_over(y, h) == joints
-
-
-def test_a_threshold_that_is_no_number_is_exceeded():
-    assert sensitivity.joints_over(np.zeros((5, 2)), np.full((5, 2), np.nan)) == 0b11

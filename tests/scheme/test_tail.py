@@ -107,13 +107,12 @@ def test_no_threshold_is_below_the_floor_and_a_floor_below_the_threshold_changes
     m = Tailed().m
     m.regressor.M[:] = [[0.4, 0.1], [0.1, 0.05]]
     m.sensitivity.hold[:], m.sensitivity.still[:], m.sensitivity.still_smooth[:] = 0.3, 0.2, 0.1
-    h, floored = np.zeros((5, 2)), np.zeros((5, 2))
-    sensitivity.fill_thresholds(K, m, h)
-    model = m.sensitivity.h_model.copy()
+    sensitivity.fill_thresholds(K, m)
+    h, model = m.sensitivity.h.copy(), m.sensitivity.h_model.copy()
     m.margin.tail_Nm[:] = model * [0.9, 1.5]
-    sensitivity.fill_thresholds(K, m, floored)
+    sensitivity.fill_thresholds(K, m)
     np.testing.assert_allclose(m.sensitivity.h_model, model, rtol=1e-12)
-    np.testing.assert_allclose(floored - h, model * [0.0, 0.5], rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(m.sensitivity.h - h, model * [0.0, 0.5], rtol=1e-10, atol=1e-15)
 
 
 def test_near_a_contact_its_block_and_the_one_before_do_not_count():

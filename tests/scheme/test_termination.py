@@ -39,5 +39,5 @@ def test_the_smallest_eigenvalue_is_that_of_lapack(seed, count):
     scale = random.uniform(0.01, 1.0, count)
     full = np.einsum("nij,nik->jk", columns, columns) * 1e-3
     expected = np.linalg.eigvalsh(scale[:, None] * full * scale)[0]
-    found = eigenvalue_range(information_of(columns), scale, np.zeros((count, count)))[0]
+    found = eigenvalue_range(information_of(columns), scale, np.full((count + 2, count + 2), -1.0))[0]
     np.testing.assert_allclose(found, expected, rtol=1e-8)

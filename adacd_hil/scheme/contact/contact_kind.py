@@ -11,7 +11,6 @@ contact of ISO/TS 15066.
 
 import numpy as np
 
-from adacd_hil.compiled import compiled
 from adacd_hil.records import ContactKind, Vector
 
 END_S = 0.01
@@ -24,25 +23,11 @@ to 100 ms left at most 0.142, the 301 pushes that rise in 0.2 to 1 s at least 0.
 def classify(tau_ext_wide_hat: Vector, sigma: Vector, period_s: float) -> ContactKind:
     """Return PUSH if the mean torque of the last END_S is at least LEFT times the largest torque, else HIT.
 
-    tau_ext_wide_hat: external torque (n, 2), Nm, with the filter undone, from the contact's beginning to the end of its
-    window; sigma: its standard deviation (2,), Nm.
+    HIT also without any torque. A torque is the root of the sum of the joints' squares, each in units of its standard
+    deviation. tau_ext_wide_hat: external torque (n, 2), Nm, with the filter undone, from the contact's beginning to the
+    end of its window; sigma: its standard deviation (2,), Nm.
     """
-    share = share_left(tau_ext_wide_hat, sigma, max(1, round(END_S / period_s)))
-    return ContactKind.PUSH if share >= LEFT else ContactKind.HIT
-
-
-@compiled
-def share_left(tau: Vector, sigma: Vector, end_samples: int) -> float:
-    """Return the ratio of the mean torque of the last `end_samples` to the largest torque; 0 without any torque.
-
-    tau (n, 2), sigma (2,): a torque is the root of the sum of the joints' squares, each in units of its standard
-    deviation.
-    """
-    count = tau.shape[0]
-    largest = 0.0
-    for k in range(count):
-        largest = max(largest, (tau[k, 0] / sigma[0]) ** 2 + (tau[k, 1] / sigma[1]) ** 2)
-    left = 0.0
-    for i in range(2):
-        left += (np.mean(tau[max(count - end_samples, 0) :, i]) / sigma[i]) ** 2
-    return float(np.sqrt(left / largest)) if largest > 0.0 else 0.0
+    torques = tau_ext_wide_hat / sigma
+    left = np.hypot(*np.mean(torques[-max(1, round(END_S / period_s)) :], axis=0))
+    largest = np.max(np.hypot(*torques.T))
+    return ContactKind.PUSH if left >= LEFT * largest > 0.0 else ContactKind.HIT

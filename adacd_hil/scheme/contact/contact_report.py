@@ -142,7 +142,6 @@ def compile_recalled(settings: Settings) -> None:
         rows = last_rows(every, count, count)
         tau, sigma = rows[:, TAU], rows[-1, SIGMA]
         localisation.on_link2(tau, rows[:, Q2], sigma, settings.arm.link_length_m)
-        classify(tau, sigma, settings.bus.period_s)
         _peak(tau[:, 0], sigma[0])
 
 

@@ -17,6 +17,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, ContactLevel, Reaction, SchemeState, Vector
 from adacd_hil.scheme.supervisor.supervisor import IS_REACTING, SupervisorMemory
@@ -135,9 +136,9 @@ def follow(
         return False
     joints = observation >> CONTACT_SHIFT
     level = _COLLISION if observation & COLLISION else _CONTACT
-    if m.is_reacting == 0:
+    if not m.is_reacting:
         m.is_reacting = 1
-        if joints == 0:  # a late host, for example
+        if not joints:  # a late host, for example
             _react(m, Reaction.STOP, tau_ext_hat, False)
             m.level, m.cause_link = _COLLISION, 0
             return False
@@ -147,9 +148,9 @@ def follow(
         m.is_two_sided = m.is_given_up = 0
         m.level, m.cause_link = level, m.link
         _choose(k, m, tau_ext_hat, is_valid)
-    elif m.link != 0:
+    elif m.link:
         _reconsider(k, m, level, supervisor.is_latched != 0, tau_ext_hat, is_valid)
-    return m.is_open != 0 and _is_due(k, m, cycle, joints, tau_ext)
+    return bool(m.is_open) and _is_due(k, m, cycle, joints, tau_ext)
 
 
 @compiled
@@ -158,9 +159,9 @@ def _leave(k: CourseConstants, m: CourseMemory, state: int) -> None:
 
     A report that is still due stays due, except in state FAULT.
     """
-    if m.is_reacting != 0:
+    if m.is_reacting:
         m.is_reacting, m.link = 0, 0
-        if k.is_kept == 0:
+        if not k.is_kept:
             m.reaction, m.level, m.cause_link = Reaction.NONE, _CONTACT, 0
     if state == SchemeState.FAULT:
         m.is_open = 0
@@ -176,13 +177,10 @@ def _is_due(k: CourseConstants, m: CourseMemory, cycle: int, joints: int, tau_ex
     for i in range(m.direction.shape[0]):
         if joints >> i & 1 and m.direction[i] == 0:
             m.direction[i] = int(np.sign(tau_ext[i]))
-    is_due = False
-    for due in k.due_cycles:
-        is_due = is_due or elapsed == due
     if elapsed >= k.due_cycles[-1]:
         m.is_open = 0
-        is_due = True
-    return is_due
+        return True
+    return bool(np.any(k.due_cycles == elapsed))
 
 
 @compiled
@@ -196,12 +194,12 @@ def _reconsider(
     """
     level = max(level, m.level)
     is_other = level != m.level or m.link != m.cause_link
-    if is_other and m.cause_link != 0 and m.is_given_up == 0:
+    if is_other and m.cause_link and not m.is_given_up:
         m.level, m.cause_link = level, m.link
         _choose(k, m, tau_ext_hat, is_valid)
     if is_latched and goes_on(m) and m.level == _CONTACT:
         _react(m, Reaction.STOP, tau_ext_hat, True)
-    if m.reaction == Reaction.WITHDRAW and (m.way[0] != 0.0 or m.way[1] != 0.0):
+    if m.reaction == Reaction.WITHDRAW and np.any(m.way):
         _judge(k, m, tau_ext_hat, is_valid)
 
 
@@ -245,10 +243,7 @@ def _judge(k: CourseConstants, m: CourseMemory, tau_ext_hat: Vector, is_valid: b
     m.cycles += 1
     if m.cycles <= k.blind_cycles:
         return
-    along_Nm, bound_Nm = 0.0, 0.0
-    for i in range(m.way.shape[0]):
-        along_Nm += tau_ext_hat[i] * m.way[i]
-        bound_Nm += abs(m.way[i]) * k.collision_Nm[i]
+    along_Nm, bound_Nm = linalg.dot(tau_ext_hat, m.way), linalg.dot(np.abs(m.way), k.collision_Nm)
     m.turned_cycles = m.turned_cycles + 1 if along_Nm < -bound_Nm else 0
     if m.turned_cycles >= TURNED_CYCLES:
         m.is_two_sided = m.is_given_up = 1

@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Location, Vector
 
@@ -40,11 +41,8 @@ TOP_PLACES = 16
 MODEL_SHARE = 0.015
 """Standard deviation of a large torque as a part of it: distortion of a blow by the mean and the velocity loop."""
 
-_KNOWN = int(Location.KNOWN)
-_SINGULAR = int(Location.SINGULAR)
-_UNCERTAIN = int(Location.UNCERTAIN)
-_BEYOND_TIP = int(Location.BEYOND_TIP)
-_INCONSISTENT = int(Location.INCONSISTENT)
+TIP_M = 0.03
+"""Distance past the tip up to which a touch, of the load for instance, counts as one of the link's end."""
 
 
 class Place(NamedTuple):
@@ -68,16 +66,12 @@ def on_link1(tau_1: float, sigma_1: float, length1_m: float) -> Place:
     return Place(Location.LINK_1, tau_1 / length1_m, sigma_1 / length1_m)
 
 
-def on_link2(
-    tau_ext_wide_hat: Vector, q2: Vector, sigma: Vector, length_m: tuple[float, float], tip_margin_m: float = 0.03
-) -> Place:
+def on_link2(tau_ext_wide_hat: Vector, q2: Vector, sigma: Vector, length_m: tuple[float, float]) -> Place:
     """Return the peak force and the lever arm of a contact on link 2, on the assumption of one touch without friction.
 
-    length_m: of both links. tip_margin_m: distance past the tip up to which a touch, of the load for instance, counts
-    as one of the link's end.
+    length_m: of both links.
     """
-    location, *values = _fit(tau_ext_wide_hat, q2, sigma, length_m[0], length_m[1], tip_margin_m)
-    return Place(Location(location), *values)
+    return Place(*_fit(tau_ext_wide_hat, q2, sigma, length_m[0], length_m[1]))
 
 
 def blind_angle(force_N: float, lever_m: float, threshold_2: float) -> float:
@@ -118,48 +112,36 @@ def _top(forces: Vector) -> float:
 
 @compiled
 def _fit(
-    tau: Vector, q2: Vector, sigma: Vector, length1_m: float, length2_m: float, tip_margin_m: float
-) -> tuple[int, float, float, float, float]:
-    """Fit one force across link 2 to the strong samples; return Location's number, force, its sigma, lever, its sigma.
+    tau: Vector, q2: Vector, sigma: Vector, length1_m: float, length2_m: float
+) -> tuple[Location, float, float, float, float]:
+    """Fit one force across link 2 to the strong samples; return location, force, its sigma, lever, its sigma.
 
     Lever: the force's arm from joint 2. Units: N and m. A sigma is inf if its value is unknown.
     """
-    count = tau.shape[0]
-    weight = np.zeros(count)
-    for k in range(count):
-        weight[k] = abs(tau[k, 0]) / sigma[0] + abs(tau[k, 1]) / sigma[1]
-    least = WORTH * np.max(weight)
+    weight = np.abs(tau[:, 0]) / sigma[0] + np.abs(tau[:, 1]) / sigma[1]
     strongest = int(np.argmax(weight))
     arm = length1_m * np.cos(q2[strongest])
     if abs(np.cos(q2[strongest])) < SQUARE_COSINE:
-        return _SINGULAR, 0.0, np.inf, 0.0, np.inf
-    squares, products = 0.0, 0.0
-    forces = np.empty(count)
-    strong = 0
-    for k in range(count):
-        if weight[k] < least:
-            continue
-        arm_k = length1_m * np.cos(q2[k])
-        force = (tau[k, 0] - tau[k, 1]) / arm_k
-        forces[strong] = force
-        strong += 1
-        squares += force * force
-        products += force * tau[k, 1]
-    force = _top(forces[:strong])
+        return Location.SINGULAR, 0.0, np.inf, 0.0, np.inf
+    strong = weight >= WORTH * np.max(weight)
+    tau_1, tau_2 = tau[:, 0][strong], tau[:, 1][strong]
+    forces = (tau_1 - tau_2) / (length1_m * np.cos(q2[strong]))
+    squares, products = linalg.dot(forces, forces), linalg.dot(forces, tau_2)
+    force = _top(forces)
     sigma_1 = np.hypot(sigma[0], MODEL_SHARE * tau[strongest, 0])
     sigma_2 = np.hypot(sigma[1], MODEL_SHARE * tau[strongest, 1])
     force_sigma = np.hypot(sigma_1, sigma_2) / abs(arm)
     if not squares > 0.0:
-        return _UNCERTAIN, force, force_sigma, 0.0, np.inf
+        return Location.UNCERTAIN, force, force_sigma, 0.0, np.inf
     lever = products / squares
     # Deviation of tau_2 - r F = tau_2 (1 + r / arm) - tau_1 r / arm. Neighbours share their noise: they count as one.
     share = lever / arm
     lever_sigma = np.hypot(sigma_2 * (1.0 + share), sigma_1 * share) / abs(force)
     margin = 3.0 * lever_sigma
-    if lever < -margin or lever > length2_m + tip_margin_m + max(margin, length2_m):
-        return _INCONSISTENT, force, force_sigma, lever, lever_sigma
-    if lever > length2_m + tip_margin_m + margin:
-        return _BEYOND_TIP, force, force_sigma, lever, lever_sigma
+    if lever < -margin or lever > length2_m + TIP_M + max(margin, length2_m):
+        return Location.INCONSISTENT, force, force_sigma, lever, lever_sigma
+    if lever > length2_m + TIP_M + margin:
+        return Location.BEYOND_TIP, force, force_sigma, lever, lever_sigma
     if lever_sigma > LARGEST_LEVER_SIGMA_M:
-        return _UNCERTAIN, force, force_sigma, lever, lever_sigma
-    return _KNOWN, force, force_sigma, lever, lever_sigma
+        return Location.UNCERTAIN, force, force_sigma, lever, lever_sigma
+    return Location.KNOWN, force, force_sigma, lever, lever_sigma

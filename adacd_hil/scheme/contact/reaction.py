@@ -97,17 +97,9 @@ class Withdrawal:
         way = share * distance
         if start is not None:
             way = np.copysign(np.maximum(np.abs(way) - np.sign(way) * (q_d - start), 0.0), way)
-        self._profiles = tuple(
-            _withdraw(
-                float(q_d[i]),
-                float(dq_d[i]),
-                float(way[i]),
-                float(position_limit[i]),
-                float(velocity_limit[i]),
-                float(acceleration_limit[i]),
-            )
-            for i in range(JOINTS)
-        )
+        limits = position_limit, velocity_limit, acceleration_limit
+        by_joint = zip(*(values.tolist() for values in (q_d, dq_d, way, *limits)), strict=True)
+        self._profiles = tuple(_withdraw(*values) for values in by_joint)
 
     @property
     def duration_s(self) -> float:

@@ -10,6 +10,11 @@ from numpy.typing import NDArray
 
 from adacd_hil.records import Vector
 
+HORIZON_BLOCKS = 3600.0
+"""Blocks over which the largest peak is expected: of 1 s each, an hour."""
+WARN_SHARE = 0.75
+"""Part of the reference below which a margin is reported."""
+
 
 class MarginWatch:
     """Monitors the distance of contact-free peaks from the thresholds during a run.
@@ -19,18 +24,12 @@ class MarginWatch:
     follow the last blocks; bounded tails stay below it.
     """
 
-    def __init__(
-        self, joints: int, horizon_blocks: float = 3600.0, memory_blocks: float = 300.0, warn_share: float = 0.75
-    ) -> None:
+    def __init__(self, joints: int, memory_blocks: float = 300.0) -> None:
         """Begin without blocks and without a reference.
 
-        horizon_blocks: blocks over which the largest peak is expected: 3600 blocks of 1 s are an hour.
         memory_blocks: memory of the mean and the deviation, and number of blocks after which the reference is set.
-        warn_share: part of the reference below which `warning` reports a margin.
         """
         self._forget = 1.0 / memory_blocks
-        self._horizon = math.log(horizon_blocks)
-        self._warn_share = warn_share
         self._mean = np.zeros(joints)
         self._square = np.zeros(joints)
         self._blocks = 0
@@ -64,19 +63,19 @@ class MarginWatch:
             return np.full(self._mean.shape, np.inf)
         scale = np.sqrt(np.maximum(self._square - self._mean**2, 0.0)) * math.sqrt(6.0) / math.pi
         # mode of the largest in the horizon: mean - Euler's constant * scale + ln(horizon) * scale
-        expected = self._mean + (self._horizon - 0.5772156649015329) * scale
+        expected = self._mean + (math.log(HORIZON_BLOCKS) - 0.5772156649015329) * scale
         return np.asarray(1.0 / np.maximum(expected, 1e-9))
 
     @property
     def warning(self) -> str:
-        """Text on joints with a margin below `warn_share` of the reference; "" without such a joint.
+        """Text on joints with a margin below WARN_SHARE of the reference; "" without such a joint.
 
         "" also without a reference. For example `joint 1: margin 1.4 x, was 2.1 x`.
         """
         if self.reference is None:
             return ""
         margin = self.margin
-        shrunk: NDArray[np.bool_] = margin < self._warn_share * self.reference
+        shrunk: NDArray[np.bool_] = margin < WARN_SHARE * self.reference
         return "; ".join(
             f"joint {i + 1}: margin {margin[i]:.1f} x, was {self.reference[i]:.1f} x" for i in np.flatnonzero(shrunk)
         )

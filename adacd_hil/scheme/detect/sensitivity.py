@@ -183,10 +183,7 @@ def follow_velocity_noise(k: Constants, m: Memory, dq: Vector, is_steady: bool) 
         if is_steady and floor > 0.0:
             square = (ddq - own.ddq_old[i]) ** 2 / floor
             square = min(square, JUMP**2 * own.roughness_now[i])
-            now = max(
-                own.roughness_now[i] + k.noise.roughness_share * (square - own.roughness_now[i]),
-                1.0,
-            )
+            now = max(own.roughness_now[i] + k.noise.roughness_share * (square - own.roughness_now[i]), 1.0)
             own.roughness_now[i] = now
             own.velocity_roughness[i] = max(now, own.roughness_kept[i])
         own.ddq_old[i] = ddq
@@ -216,10 +213,8 @@ def raise_strain(m: Memory, largest: float) -> None:
     """
     own = m.sensitivity
     for i in range(own.strain.shape[0]):
-        for c in range(m.filters.y.shape[0]):
-            if not (abs(m.filters.y[c, i]) <= own.h[c, i]):
-                own.strain[i] = min(STRAIN * own.strain[i], max(largest, own.strain[i]))
-                break
+        if not np.all(np.abs(m.filters.y[:, i]) <= own.h[:, i]):
+            own.strain[i] = min(STRAIN * own.strain[i], max(largest, own.strain[i]))
 
 
 @compiled
@@ -241,29 +236,29 @@ def decay_strain(k: Constants, m: Memory) -> None:
 
 
 @compiled
-def follow_unit(k: Constants, m: Memory, fit: int, share: float, is_monitored: bool) -> None:
+def follow_unit(k: Constants, m: Memory, is_monitored: bool) -> None:
     """Update `unit` (n,), a factor on the belief's variances, by one sample without contact.
 
-    share: the sample's weight. fit: index of the filter whose residual counts. In a faster one the velocity's noise
-    would count as the model's error. is_monitored: the unit is the smaller one of those of positive and of negative
-    residuals. Else it is that of all residuals, with which both signs begin. A joint with an infinite variance, as one
+    The slow filter's residual counts; in a faster one the velocity's noise would count as the model's error.
+    is_monitored: the unit is the smaller one of those of positive and of negative residuals. Else the model is in its
+    test, and the unit is that of all residuals, with which both signs begin. A joint with an infinite variance, as one
     at rest, keeps its unit.
     """
-    own = m.sensitivity
+    own, share = m.sensitivity, k.noise.unit_share if is_monitored else k.noise.unit_test_share
     for i in range(own.unit.shape[0]):
-        w = m.filters.W_f[fit, i]
-        believed = k.residual_Nm**2 + own.held[fit, i] ** 2
+        w, r = m.filters.W_f[filter_bank.SLOW, i], m.filters.r[filter_bank.SLOW, i]
+        believed = k.residual_Nm**2 + own.held[filter_bank.SLOW, i] ** 2
         for j in range(w.shape[0]):
             believed += w[j] * linalg.dot(m.models.P[j], w)
         if not np.isfinite(believed):
             continue
-        square = UNIT_PEAK * m.filters.r[fit, i] ** 2 / believed
+        square = UNIT_PEAK * r**2 / believed
         if not is_monitored:
             own.unit[i] = _approach(own.unit[i], square, share)
             own.unit_by_sign[:, i] = own.unit[i]
             continue
         for sign in range(2):
-            has_sign = m.filters.r[fit, i] > 0.0 if sign else m.filters.r[fit, i] < 0.0
+            has_sign = r > 0.0 if sign else r < 0.0
             own.unit_by_sign[sign, i] = _approach(own.unit_by_sign[sign, i], 2.0 * square if has_sign else 0.0, share)
         own.unit[i] = np.min(own.unit_by_sign[:, i])
 
@@ -276,13 +271,11 @@ def _approach(unit: float, square: float, share: float) -> float:
 
 
 @compiled
-def fill_thresholds(k: Constants, m: Memory, h: Vector) -> None:
-    """Fill h (2 C - 1, n) with the present thresholds of all channels, Nm; update `doubt` and `h_model` of `m`."""
-    own = m.sensitivity
-    filters = m.filters.r.shape[0]
+def fill_thresholds(k: Constants, m: Memory) -> None:
+    """Fill h (2 C - 1, n) with the present thresholds of all channels, Nm; update `doubt` and `h_model`."""
+    own, h, filters = m.sensitivity, m.sensitivity.h, m.filters.r.shape[0]
     for i in range(h.shape[1]):
-        momentum = momentum_noise(m, i)
-        hold = own.hold[i]
+        momentum, hold = momentum_noise(m, i), own.hold[i]
         for c in range(filters):
             g = k.model_sigmas * np.sqrt(_doubt(k, m, m.filters.W_f[c, i], own.unit[i]))
             own.doubt[c, i] = g + k.smoothing * (own.doubt[c, i] - g)
@@ -329,11 +322,11 @@ def held_Nm(m: Memory, joint: int, still: float) -> float:
 @compiled
 def _static_friction(k: Constants, m: Memory, joint: int, load_Nm: float) -> float:
     """Return the largest friction, Nm, that the model in use allows for a joint at standstill under load_Nm."""
-    coulomb = int(k.first_coulomb) + joint
+    coulomb, joints = regressor.F_C1 + joint, m.filters.r.shape[1]
     total = max(m.models.theta[coulomb], 0.0) + np.sqrt(max(m.models.P[coulomb, coulomb], 0.0))
     further = 0.0
     for position in range(k.terms.shape[0]):
-        term = int(k.first_term) + position * m.filters.r.shape[1] + joint
+        term = int(k.first_offset) + (2 + position) * joints + joint
         if k.terms[position] == further_friction.STRIBECK:
             open_Nm = min(np.sqrt(max(m.models.P[term, term], 0.0)), STATIC_SHARE * total)
             further += max(m.models.theta[term], 0.0) + open_Nm
@@ -357,8 +350,8 @@ def _threshold(k: Constants, m: Memory, channel: int, joint: int, momentum: floa
 
 
 @compiled
-def fill_wide(k: Constants, m: Memory, c: int) -> None:
-    """Fill `wide_sigma` and `wide_threshold` (n,), Nm: deviation and threshold of the torque with filter c undone.
+def fill_wide(k: Constants, m: Memory) -> None:
+    """Fill `wide_sigma` and `wide_threshold` (n,), Nm: deviation and threshold of the torque with filter WIDE undone.
 
     The undone filter is a mean over five samples of its input: its noise is white torque noise over five, and the
     velocity's change over five samples. The slow filters detect a slow push first: the threshold is the least of all
@@ -371,7 +364,7 @@ def fill_wide(k: Constants, m: Memory, c: int) -> None:
         momentum = momentum_noise(m, i)
         noise = k.torque_noise_Nm**2 * own.roughness[i] / samples
         velocity = 2.0 * (k.noise.velocity_std_rad_s / span_s) ** 2 * momentum
-        doubt = own.doubt[c, i] / k.model_sigmas
+        doubt = own.doubt[filter_bank.WIDE, i] / k.model_sigmas
         own.wide_sigma[i] = np.sqrt(noise + velocity + doubt * doubt)
         own.wide_threshold[i] = np.min(own.h[:, i])
 

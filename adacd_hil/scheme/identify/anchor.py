@@ -36,6 +36,7 @@ from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify import evidence
 from adacd_hil.scheme.identify.evidence import OFFSETS
 from adacd_hil.scheme.memory import AnchorConstants, Constants, Memory
+from adacd_hil.scheme.model.regressor import F_C1
 from adacd_hil.settings.configuration import Settings
 
 REST, TARE, ACCEPTED, LAST = range(4)
@@ -154,10 +155,10 @@ def is_within(k: Constants, m: Memory, theta: Vector, P: Vector) -> bool:
     Store the comparison as evidence. theta (p,), P (p, p): the model. A missing anchor bounds nothing. The last
     certificate is used only for a joint without a bound of `beta_Nm`.
     """
-    first_coulomb, is_within = int(k.first_coulomb), True
+    is_within = True
     evidence.fit(k, m, theta, P, min(np.max(m.sensitivity.unit), 1.0))
     for i in range(m.anchor.anchor_Nm.shape[1]):
-        q, friction = OFFSETS + i, ASYMMETRY * max(theta[first_coulomb + i], 0.0)
+        q, friction = OFFSETS + i, ASYMMETRY * max(theta[F_C1 + i], 0.0)
         for kind in range(KINDS):
             variance = _variance(k, m, kind, i) + friction**2 + MODEL_STD_NM**2
             if kind == LAST and np.min(m.evidence.limit[:LAST, q]) <= k.beta_Nm:
@@ -183,19 +184,22 @@ def is_excluded(m: Memory, joint: int, offset_Nm: float) -> bool:
 
 
 @compiled
-def innovation(k: Constants, m: Memory, joint: int, offset_Nm: float, variance_Nm2: float) -> float:
+def _innovation(k: Constants, m: Memory, joint: int) -> float:
     """Return (o - a) / (P_oo + sigma_a² + b² t) for the joint's best known anchor, 1/Nm; 0 without an anchor.
 
-    o, P_oo: the fit's offset_Nm and variance_Nm2. theta less the offset's column of P times the result is the model
+    o, P_oo: the fit's offset and its variance. theta less the offset's column of P times the result is the model
     corrected by the anchor as by a measurement of the offset. joint: from 0.
     """
+    offset = int(k.first_offset) + joint
     kind = int(np.argmin(m.anchor.anchor_std[:, joint]))
     known = _variance(k, m, kind, joint)
     if known == np.inf:
         return 0.0
     if kind == REST:
         known += k.anchor.holding_Nm[joint] ** 2
-    return float((offset_Nm - m.anchor.anchor_Nm[kind, joint]) / (variance_Nm2 + known))
+    return float(
+        (m.models.belief[offset] - m.anchor.anchor_Nm[kind, joint]) / (m.models.P_belief[offset, offset] + known)
+    )
 
 
 def accept(m: Memory, offset_Nm: Vector, std_Nm: Vector) -> None:
@@ -230,12 +234,7 @@ def tightest(k: Constants, m: Memory, joint: int) -> int | None:
 
 def open_joints(k: Constants, m: Memory) -> list[int]:
     """Return the joints, from 0, whose last judged torque offset no anchor bounds to `beta_Nm`."""
-    return [i for i in range(JOINTS) if tightest(k, m, i) is None]
-
-
-def is_anchored(k: Constants, m: Memory) -> bool:
-    """Return whether an anchor bounds the last judged torque offset of each joint to `beta_Nm`."""
-    return not open_joints(k, m)
+    return [i for i in range(JOINTS) if is_open(k, m, i)]
 
 
 def judged_Nm(m: Memory) -> Vector:
@@ -264,7 +263,7 @@ def describe_refused(m: Memory, is_reading: bool) -> list[str]:
     lines = []
     for i, value in enumerate(judged_Nm(m).tolist()):
         for kind in range(KINDS):
-            expected, limit = float(m.anchor.anchor_Nm[kind, i]), float(m.evidence.limit[kind, OFFSETS + i])
+            expected, limit = m.anchor.anchor_Nm[kind, i], m.evidence.limit[kind, OFFSETS + i]
             if not abs(value - expected) <= limit:
                 what = (
                     f"reads {value:.3f} Nm at rest" if is_reading else f"has a fitted torque offset of {value:.3f} Nm"
@@ -286,7 +285,7 @@ def is_place_bounded(k: Constants, m: Memory) -> bool:
 
     Torque by place: it depends on the joint's position. True, without filling, for a model without such a torque.
     """
-    if k.position_torque_Nm == 0.0:
+    if not k.position_torque_Nm:
         return True
     is_place_bounded = True
     for i in range(m.anchor.by_place_Nm.shape[0]):
@@ -301,7 +300,7 @@ def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
     joints, first = m.anchor.by_place_Nm.shape[0], int(k.first_position)
     offset, largest = int(k.first_offset) + joint, 0.0
     P, theta = m.models.P_belief, m.models.belief
-    off = innovation(k, m, joint, theta[offset], P[offset, offset])
+    off = _innovation(k, m, joint)
     for s in range(int(m.fit_check.samples_kept)):
         torque = 0.0
         for term in range(m.regressor.X.shape[1]):
@@ -313,7 +312,7 @@ def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
 
 def describe_place(k: Constants, m: Memory) -> str:
     """Return each joint's last checked torque by place, and its bound, as text; "" if the model has no such torque."""
-    if k.position_torque_Nm == 0.0:
+    if not k.position_torque_Nm:
         return ""
     return (
         f"; torque by place up to {_by_joint(m.anchor.by_place_Nm)}, believed up to {float(k.position_torque_Nm):g} Nm"

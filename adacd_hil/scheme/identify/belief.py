@@ -24,7 +24,7 @@ Shapes: theta, prior (p,); P (p, p); ring_W (h, n, p), ring_tau, ring_R, ring_st
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.records import Vector
 from adacd_hil.scheme.detect import sensitivity
 from adacd_hil.scheme.identify import estimator, fit_check, missing_torque
 from adacd_hil.scheme.memory import Constants, Memory
@@ -51,18 +51,17 @@ def begin_fit(k: Constants, m: Memory, is_payload: bool) -> None:
         add_payload(k.payload_direction, k.payload_std_kg, k.payload_rest_std, own.P_belief)
     else:
         begin(k.prior, k.prior_std, own.belief, own.P_belief)
-    _use(m)
+    use(m)
     discard(m)
     own.are_lags_held = 0.0
     own.recovering_cycles = 0.0
 
 
 @compiled
-def freeze(k: Constants, m: Memory) -> None:
+def freeze(m: Memory) -> None:
     """Move negative friction in the belief to 0, use the belief as the model, and empty the ring of waiting samples."""
-    first_coulomb = int(k.first_coulomb)
-    keep_non_negative(first_coulomb - JOINTS, first_coulomb + JOINTS, m.models.belief, m.models.P_belief)
-    _use(m)
+    keep_non_negative(regressor.F_V1, regressor.F_C2 + 1, m.models.belief, m.models.P_belief)
+    use(m)
     discard(m)
 
 
@@ -92,7 +91,7 @@ def _certify(m: Memory) -> None:
 
 
 @compiled
-def _use(m: Memory) -> None:
+def use(m: Memory) -> None:
     """Copy the belief to the model in use."""
     own = m.models
     own.theta[:] = own.belief
@@ -119,21 +118,10 @@ def is_free(k: Constants, m: Memory, is_touched: bool) -> bool:
 
 
 @compiled
-def learn_and_use(k: Constants, m: Memory) -> bool:
-    """Learn from a sample as `learn` does, and return its result; if it is True, use the belief as the model."""
-    has_learnt = learn(k, m)
-    if has_learnt:
-        _use(m)
-    return has_learnt
-
-
-@compiled
 def begin(prior: Vector, prior_std: Vector, theta: Vector, P: Vector) -> None:
     """Set theta (p,) to the prior, and P (p, p) to the diagonal of prior_std² (p,), in place."""
     theta[:] = prior
-    P[:] = 0.0
-    for j in range(theta.shape[0]):
-        P[j, j] = prior_std[j] ** 2
+    P[:] = np.diag(prior_std**2)
 
 
 @compiled
@@ -143,10 +131,8 @@ def add_payload(direction: Vector, payload_std_kg: float, rest_std: Vector, P: V
     direction (p,): parameters of a point mass of 1 kg at the tip. rest_std (p,): deviation by which a payload differs
     from a point mass.
     """
-    for j in range(direction.shape[0]):
-        for k in range(direction.shape[0]):
-            P[j, k] += payload_std_kg**2 * direction[j] * direction[k]
-        P[j, j] += rest_std[j] ** 2
+    P += np.outer(payload_std_kg**2 * direction, direction)
+    P += np.diag(rest_std**2)
 
 
 @compiled
@@ -158,10 +144,7 @@ def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
     friction by load from a load that hardly varies, and would be far off where it counts.
     """
     for j in range(drift_std.shape[0]):
-        shown = 0.0
-        for i in range(W_f.shape[0]):
-            shown = max(shown, abs(W_f[i, j]))
-        P[j, j] += (drift_std[j] * min(shown, 1.0)) ** 2 * elapsed_s
+        P[j, j] += (drift_std[j] * min(np.max(np.abs(W_f[:, j])), 1.0)) ** 2 * elapsed_s
 
 
 @compiled

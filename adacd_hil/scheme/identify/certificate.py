@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import FRICTION_SPEEDS_RAD_S, JOINTS, Vector
+from adacd_hil.records import FRICTION_SPEEDS_RAD_S, JOINTS
 from adacd_hil.scheme.identify import anchor, earlier, evidence, fit_check, missing_torque
 from adacd_hil.scheme.identify.evidence import FRICTIONS, INERTIAS, LAST, OFFSETS, VISCOUS
 from adacd_hil.scheme.memory import Constants, Memory
@@ -54,8 +54,8 @@ class Certificate(NamedTuple):
         return f"<Certificate{' with a payload' if self.is_payload else ''}: a1, a2, a3 = {inertia} kg m²>"
 
 
-def last_of(settings: Settings) -> tuple[Vector, Vector, Vector]:
-    """Return value, variance and slack (Q,) of the last certificate per quantity of `evidence`.
+def begin(settings: Settings, m: Memory) -> None:
+    """Load the last certificate as a source of evidence: value, variance and slack (Q,) of each quantity.
 
     slack: size up to which a difference is ignored. The variance is inf for the torque offsets, and for all quantities
     without a last certificate. A viscous friction is computed from two frictions. Their deviations count as
@@ -75,12 +75,7 @@ def last_of(settings: Settings) -> tuple[Vector, Vector, Vector]:
         variance = quantities**2 @ np.square((*history.friction_std_Nm, *history.inertia_std_kgm2))
         variance += np.square(share * last)
         variance[OFFSETS:VISCOUS] = np.inf
-    return last, variance, np.repeat((FLOOR_NM, FLOOR_KGM2, 0.0, FLOOR_NM_S), counts)
-
-
-def begin(settings: Settings, m: Memory) -> None:
-    """Load the last certificate as a source of evidence, if there is one."""
-    evidence.set_source(m, LAST, *last_of(settings))
+    evidence.set_source(m, LAST, last, variance, np.repeat((FLOOR_NM, FLOOR_KGM2, 0.0, FLOOR_NM_S), counts))
 
 
 def forget(m: Memory) -> None:
@@ -96,7 +91,7 @@ def is_compared(m: Memory) -> bool:
 @compiled
 def withhold(m: Memory, cause: int) -> None:
     """Set `withheld_by` to the contradiction that withholds or revokes the certificate; NOTHING: there is none."""
-    m.certificate.withheld_by = cause
+    m.withheld_by = cause
 
 
 @compiled
@@ -112,9 +107,7 @@ def contradicted_by(k: Constants, m: Memory) -> int:
     if last_step != fit_check.NONE:
         earlier.keep_steps(k, m, last_step)
         return BY_PLACE if missing_torque.is_found(k, m) else CHANGED
-    evidence.fit(
-        k, m, m.models.belief, m.models.P_belief, fit_check.unit_of(m.fit_check.fit_square, m.fit_check.fit_rows)
-    )
+    evidence.fit(k, m, m.models.belief, m.models.P_belief, fit_check.fit_unit(m))
     if not earlier.is_no_more(k, m):
         return MORE
     if not anchor.is_place_bounded(k, m):
@@ -139,8 +132,7 @@ def describe_more(m: Memory, date_utc: str) -> list[str]:
     """Return a line for each quantity of which the fit has more than the last certificate allows, with its bound."""
     difference, limit = m.evidence.difference[LAST], m.evidence.limit[LAST]
     return [
-        f"{what} is {float(difference[q]):.3f} {unit} more than in the certificate of {date_utc}, "
-        f"bound {float(limit[q]):.3f} {unit}"
+        f"{what} is {difference[q]:.3f} {unit} more than in the certificate of {date_utc}, bound {limit[q]:.3f} {unit}"
         for q, what, unit in evidence.named(difference / limit)
     ]
 

@@ -38,7 +38,7 @@ import numpy as np
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.detect import sensitivity
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
@@ -90,9 +90,8 @@ def causes_of(settings: Settings, count: int) -> Vector:
     h: a payload of 1 kg, then Coulomb and viscous friction of joint 1, of joint 2. count: number p of parameters.
     """
     unit = np.eye(count)
-    first = PARAMETER_NAMES.index("F_c1"), PARAMETER_NAMES.index("F_v1")
     rows = [regressor.payload_direction(settings.arm.link_length_m, count, settings.gravity_m_s2)]
-    rows += [unit[place + i] for i in range(JOINTS) for place in first]
+    rows += [unit[place + i] for i in range(JOINTS) for place in (regressor.F_C1, regressor.F_V1)]
     return np.array(rows)
 
 

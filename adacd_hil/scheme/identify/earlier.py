@@ -88,14 +88,7 @@ def keep_fit(k: Constants, m: Memory) -> None:
     changed = fit_check.last_step_before_contradiction(k, m)
     keep_steps(k, m, int(m.fit_check.steps_used) - 1 if changed == fit_check.NONE else changed)
     if changed == fit_check.NONE:
-        keep_belief(
-            k,
-            m,
-            m.models.belief,
-            m.models.P_belief,
-            fit_check.unit_of(m.fit_check.fit_square, m.fit_check.fit_rows),
-            0.0,
-        )
+        keep_belief(k, m, m.models.belief, m.models.P_belief, fit_check.fit_unit(m), 0.0)
 
 
 @compiled
@@ -207,14 +200,7 @@ def _lapses(k: Constants, m: Memory) -> bool:
         else:
             else_Nm += change_Nm
         is_same = is_same and (own.refused_fits == 0.0 or abs(evidence.weigh(k, m, REFUSED, q)) <= 1.0)
-    _fill_source(
-        k,
-        m,
-        REFUSED,
-        m.models.belief,
-        m.models.P_belief,
-        fit_check.unit_of(m.fit_check.fit_square, m.fit_check.fit_rows),
-    )
+    _fill_source(k, m, REFUSED, m.models.belief, m.models.P_belief, fit_check.fit_unit(m))
     own.refused_fits = own.refused_fits + 1.0 if is_same else 1.0
     if is_little and friction_Nm + else_Nm <= LITTLE_NM:
         return bool(own.refused_fits >= LITTLE_FITS)
@@ -236,11 +222,8 @@ def _changed(m: Memory, s: int, q: int, what: str, unit: str) -> str:
 
     what, unit: name and unit of the quantity.
     """
-    change, limit, age_s = (
-        float(m.evidence.difference[s, q]),
-        float(m.evidence.limit[s, q]),
-        float(m.evidence.age_s[s]),
-    )
+    own = m.evidence
+    change, limit, age_s = own.difference[s, q], own.limit[s, q], own.age_s[s]
     is_helped = q < FRICTIONS and change < 0.0
     why = "a hand helps the motion, or one that dragged has let go"
     if not is_helped:

@@ -60,11 +60,3 @@ def correct(
                 P[j, k] += s * K[j] * K[k] - (K[j] * v[k] + v[j] * K[k])
                 P[k, j] = P[j, k]
     return epsilon, s
-
-
-@compiled
-def reset_gain(P0: Vector, P: Vector) -> None:
-    """Set P (p, p) in place to a diagonal matrix with P0 (p,) on its diagonal."""
-    P[:] = 0.0
-    for j in range(P0.shape[0]):
-        P[j, j] = P0[j]

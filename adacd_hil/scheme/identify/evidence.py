@@ -24,8 +24,9 @@ import numpy as np
 
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
-from adacd_hil.records import FRICTION_SPEEDS_RAD_S, JOINTS, PARAMETER_NAMES, QUINTIC_PEAK_ACCELERATION, Vector
+from adacd_hil.records import FRICTION_SPEEDS_RAD_S, JOINTS, QUINTIC_PEAK_ACCELERATION, Vector
 from adacd_hil.scheme.memory import Constants, EvidenceConstants, Memory
+from adacd_hil.scheme.model.regressor import F_C1, F_V1
 from adacd_hil.settings.configuration import Settings
 
 _INERTIAS = ("a1", "a2", "a3")
@@ -55,11 +56,10 @@ def constants_of(settings: Settings, prior_std: Vector) -> EvidenceConstants:
     """
     unit = np.eye(prior_std.size)
     base = len(settings.estimator.parameter_names)
-    viscous, coulomb = PARAMETER_NAMES.index("F_v1"), PARAMETER_NAMES.index("F_c1")
-    friction = [v * unit[viscous + i] + unit[coulomb + i] for i in range(JOINTS) for v in FRICTION_SPEEDS_RAD_S]
-    inertia = [unit[PARAMETER_NAMES.index(name)] for name in _INERTIAS]
+    friction = [v * unit[F_V1 + i] + unit[F_C1 + i] for i in range(JOINTS) for v in FRICTION_SPEEDS_RAD_S]
+    inertia = unit[:INERTIAS]
     offset = [unit[base + i] for i in range(JOINTS)]
-    columns = np.array([*friction, *inertia, *offset, *(unit[viscous + i] for i in range(JOINTS))])
+    columns = np.array([*friction, *inertia, *offset, *(unit[F_V1 + i] for i in range(JOINTS))])
     less_counts = np.ones((SOURCES, QUANTITIES))
     less_counts[LAST] = 0.0
     less_counts[KEPT:, FRICTIONS:OFFSETS] = 0.0
@@ -93,8 +93,7 @@ def set_source(m: Memory, s: int, value: Vector, variance: Vector, slack: Vector
 @compiled
 def follow(m: Memory, period_s: float) -> None:
     """Add one period to the age of each source."""
-    for s in range(m.evidence.age_s.shape[0]):
-        m.evidence.age_s[s] += period_s
+    m.evidence.age_s[:] += period_s
 
 
 @compiled
@@ -174,7 +173,7 @@ def weigh(k: Constants, m: Memory, s: int, q: int) -> float:
     """
     own = m.evidence
     difference = own.fitted[q] - own.value[s, q]
-    if own.variance[s, q] == np.inf or (difference < 0.0 and k.evidence.less_counts[s, q] == 0.0):
+    if own.variance[s, q] == np.inf or (difference < 0.0 and not k.evidence.less_counts[s, q]):
         difference = 0.0 if np.isfinite(difference) else difference
     std = np.sqrt(own.variance[s, q] + own.fitted_variance[q])
     own.difference[s, q] = difference

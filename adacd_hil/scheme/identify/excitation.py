@@ -54,12 +54,9 @@ def widen(value: Vector, low: Vector, high: Vector) -> None:
 @compiled
 def has_moved(motion: Motion, travel_rad: float, velocity_rad_s: float) -> bool:
     """Return whether each joint has covered at least `travel_rad`, and reached `velocity_rad_s` in both directions."""
-    for i in range(motion.q_low.shape[0]):
-        if not (motion.q_high[i] - motion.q_low[i] >= travel_rad):
-            return False
-        if not (motion.dq_high[i] >= velocity_rad_s and motion.dq_low[i] <= -velocity_rad_s):
-            return False
-    return True
+    has_travelled = np.all(motion.q_high - motion.q_low >= travel_rad)
+    is_fast = np.all(motion.dq_high >= velocity_rad_s) and np.all(motion.dq_low <= -velocity_rad_s)
+    return bool(has_travelled and is_fast)
 
 
 @compiled
@@ -108,12 +105,8 @@ def eigenvalue_range(information: Vector, scale: Vector, scratch: Vector) -> tup
         for j in range(count):
             for k in range(j):
                 _rotate(scratch, j, k)
-    smallest: float = scratch[0, 0]
-    largest: float = scratch[0, 0]
-    for j in range(1, count):
-        smallest = min(smallest, scratch[j, j])
-        largest = max(largest, scratch[j, j])
-    return max(smallest, 0.0), max(largest, 0.0)
+    values = np.diag(scratch)[:count]
+    return max(np.min(values), 0.0), max(np.max(values), 0.0)
 
 
 @compiled

@@ -141,6 +141,12 @@ def unit_of(square: float, rows: float) -> float:
 
 
 @compiled
+def fit_unit(m: Memory) -> float:
+    """Return u of the whole fit so far, see `unit_of`."""
+    return unit_of(m.fit_check.fit_square, m.fit_check.fit_rows)
+
+
+@compiled
 def late_square(m: Memory) -> float:
     """Return the mean square of the residuals over their variances in the fit's later half; 1 before the second step.
 
@@ -178,7 +184,7 @@ def last_step_before_change(k: Constants, m: Memory) -> int:
     own = m.fit_check
     used, oldest = int(own.steps_used), max(int(own.steps_used) - own.steps_rows.shape[0], 0)
     changed = last_step_before_contradiction(k, m)
-    if changed != NONE or m.models.is_payload != 0.0:
+    if changed != NONE or m.models.is_payload:
         return changed
     for number in range(oldest, used):
         if not later_share(k, m, number % own.steps_rows.shape[0]) <= 1.0:
@@ -206,7 +212,7 @@ def first_unexplained(m: Memory) -> int:
     samples before it are not kept, so not examined.
     """
     kept, first = int(m.fit_check.samples_kept), -1
-    if m.models.is_payload != 0.0 or kept < 2:
+    if m.models.is_payload or kept < 2:
         return first
     limit = limit_Nm(m)
     for s in range(kept - 1, -1, -1):
@@ -259,7 +265,7 @@ def later_share(k: Constants, m: Memory, s: int) -> float:
         return np.inf
     limit_Nm = LATER_NM + RMS_SHARE * better_rms(m)
     limit_Nm += LEARNT_SHARE * k.residual_Nm * np.sqrt(_better_square(m, s))
-    has_gravity, unit, largest = int(k.first_offset) > A5, unit_of(own.fit_square, own.fit_rows), 0.0
+    has_gravity, unit, largest = int(k.first_offset) > A5, fit_unit(m), 0.0
     for sample in range(int(own.samples_kept)):
         for i in range(own.samples_tau.shape[1]):
             w, allowed_Nm = own.samples_W[sample, i], limit_Nm
@@ -312,8 +318,7 @@ def find_later(m: Memory, s: int) -> bool:
         return False
     x, P_0 = own.apart, own.steps_P[s]
     linalg.solve_upper(own.factor, x)
-    for j in range(x.shape[0]):
-        x[j] /= np.sqrt(P_0[j, j])
+    x /= np.sqrt(np.diag(P_0))
     for j in range(x.shape[0]):
         own.later[j] = linalg.dot(m.models.P_belief[j], x)
     return True

@@ -33,6 +33,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.memory import Constants, Memory, TermConstants
 from adacd_hil.scheme.model import filter_bank
+from adacd_hil.scheme.model.regressor import F_C1
 from adacd_hil.scheme.model.torque_by_place import PLACE_TERMS
 from adacd_hil.settings.configuration import Settings
 
@@ -78,20 +79,17 @@ def rest(m: Memory) -> None:
 
 
 @compiled
-def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
+def follow(k: Constants, m: Memory, is_seen: bool) -> None:
     """Advance the filtered columns X (n, PLACE_TERMS) over one period, by the filter `LEARNT` and the pole behind it.
 
-    is_seen: False after a gap, when that filter keeps its values. rates (3,): its coefficients for one period, see
-    `torque_filter.FirstOrderHold`; smoothing: share of the pole's old output that stays after one period.
+    is_seen: False after a gap, when that filter keeps its values. k.smoothing: share of the pole's old output that
+    stays after one period.
     """
-    decay, weight_old, weight_new = rates[0], rates[1], rates[2]
-    X, X_old, X_f, X_learnt = m.regressor.X, m.missing_torque.X_old, m.missing_torque.X_f, m.missing_torque.X_learnt
-    for i in range(X.shape[0]):
-        for term in range(PLACE_TERMS):
-            if is_seen:
-                X_f[i, term] = decay * X_f[i, term] + (weight_old * X_old[i, term] + weight_new * X[i, term])
-            X_old[i, term] = X[i, term]
-            X_learnt[i, term] = X_f[i, term] + smoothing * (X_learnt[i, term] - X_f[i, term])
+    X, rates, own = m.regressor.X, m.filters.rates[:, filter_bank.LEARNT], m.missing_torque
+    if is_seen:
+        own.X_f[:] = rates[0] * own.X_f + (rates[1] * own.X_old + rates[2] * X)
+    own.X_old[:] = X
+    own.X_learnt[:] = own.X_f + k.smoothing * (own.X_learnt - own.X_f)
 
 
 @compiled
@@ -142,7 +140,7 @@ def add(k: Constants, m: Memory, slot: int, joint: int) -> None:
     v[count + PLACE_TERMS * joint : count + PLACE_TERMS * (joint + 1)] = own.ring_X[slot, joint]
     r = -linalg.misfit(v, k.prior, m.ring.tau[slot, joint])
     linalg.add_row(v, r, R, own.L[joint], own.b)
-    own.ways[joint, 1 if v[int(k.first_coulomb) + joint] > 0.0 else 0] += 1.0
+    own.ways[joint, 1 if v[F_C1 + joint] > 0.0 else 0] += 1.0
     own.yy += r * r / R
     own.weight[joint] += 1.0 / R
 
@@ -189,7 +187,7 @@ def is_found(k: Constants, m: Memory) -> bool:
     """
     own = m.missing_torque
     own.rms_Nm[:] = 0.0
-    if k.position_torque_Nm != 0.0:
+    if k.position_torque_Nm:
         return False
     basic, full = own.basic, own.full
     without = log_evidence(m, own.b, scale_of(k, m, False), basic)
@@ -229,7 +227,7 @@ def _is_found_again(k: Constants, m: Memory) -> bool:
     own = m.missing_torque
     own.rms_Nm[:] = 0.0
     last_found, count, basic, full = own.last_found, m.models.belief.shape[0], own.basic, own.full
-    if k.position_torque_Nm != 0.0 or not np.any(last_found != 0.0):
+    if k.position_torque_Nm or not np.any(last_found):
         return False
     b = own.row
     b[:] = own.b
@@ -261,10 +259,8 @@ def _rms_Nm(m: Memory, joint: int) -> float:
     `full`: with a torque that depends on the position; `basic`: without. Overwrites `row`.
     """
     own = m.missing_torque
-    apart = own.row
-    for j in range(apart.shape[0]):
-        apart[j] = own.full[j] - own.basic[j]
-    square = linalg.quadratic(own.L[joint], apart)
+    own.row[:] = own.full - own.basic
+    square = linalg.quadratic(own.L[joint], own.row)
     return float(np.sqrt(square / max(own.weight[joint], 1e-12)))
 
 
@@ -288,8 +284,7 @@ def log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
     linalg.solve_lower(M, x)
     square = linalg.dot(x, x)
     linalg.solve_upper(M, x)
-    for j in range(count):
-        x[j] *= s[j]
+    x *= s
     return float(0.5 * (square - log_det))
 
 

@@ -23,7 +23,7 @@ Then the model is frozen, friction coefficients below zero put to zero, and test
 import numpy as np
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import Vector
+from adacd_hil.records import JOINTS, Vector
 from adacd_hil.scheme.identify.excitation import begin, begin_speeds, eigenvalue_range, gather, has_moved, widen
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model.regressor import is_positive_definite
@@ -31,11 +31,8 @@ from adacd_hil.scheme.model.regressor import is_positive_definite
 
 @compiled
 def is_quiet(tau_ext_hat: Vector, beta_Nm: float) -> bool:
-    """Return whether |tau_ext_hat| is at most beta_Nm in each joint, eq. (15); False if a value is not a number."""
-    is_within = True
-    for i in range(tau_ext_hat.shape[0]):
-        is_within = is_within and abs(tau_ext_hat[i]) <= beta_Nm
-    return is_within
+    """Return whether |tau_ext_hat| is at most beta_Nm in each joint, as in eq. (15); False with a NaN among them."""
+    return bool(np.all(np.abs(tau_ext_hat) <= beta_Nm))
 
 
 @compiled
@@ -77,14 +74,11 @@ def test(k: Constants, m: Memory, dq: Vector, tau_ext_hat: Vector) -> int:
     own = m.motion
     m.fit.tested += 1.0
     widen(dq, own.dq_low, own.dq_high)
-    has_moved = True
-    for i in range(dq.shape[0]):
-        if not (abs(tau_ext_hat[i]) <= m.fit.test_limit_Nm):
-            return -1
-        fastest = max(own.dq_high[i], -own.dq_low[i])
-        has_moved = has_moved and fastest >= k.velocity_rad_s
+    if not is_quiet(tau_ext_hat, m.fit.test_limit_Nm):
+        return -1
+    is_fast = np.all(np.maximum(own.dq_high, -own.dq_low) >= k.velocity_rad_s)
     is_long = m.fit.tested >= k.test_cycles[int(m.models.is_payload)]
-    return 1 if is_long and has_moved else 0
+    return 1 if is_long and is_fast else 0
 
 
 TEST_NM = 0.03
@@ -101,17 +95,14 @@ def is_complete(k: Constants, m: Memory) -> bool:
     joint.
     """
     own = m.motion
-    is_payload = m.models.is_payload != 0.0
-    if own.samples < k.fit_cycles[1 if is_payload else 0] or not is_positive_definite(m.models.belief):
+    if own.samples < k.fit_cycles[int(m.models.is_payload)] or not is_positive_definite(m.models.belief):
         return False
-    for j in range(m.models.belief.shape[0]):
-        if not (m.models.P_belief[j, j] <= k.enough_std[j] ** 2):
-            return False
-    if is_payload:
+    if not np.all(np.diag(m.models.P_belief) <= k.enough_std**2):
+        return False
+    if m.models.is_payload:
         return True
-    if not (m.fit.excitation >= k.excitation_Nm2s and m.fit.condition <= k.condition):
-        return False
-    return has_moved(own, k.travel_rad, k.velocity_rad_s)
+    is_excited = m.fit.excitation >= k.excitation_Nm2s and m.fit.condition <= k.condition
+    return is_excited and has_moved(own, k.travel_rad, k.velocity_rad_s)
 
 
 @compiled
@@ -131,12 +122,11 @@ def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dic
     """
     own = m.motion
     lines = []
-    joints = own.q_low.shape[0]
-    travel, speed = float(np.degrees(k.travel_rad)), float(np.degrees(k.velocity_rad_s))
+    travel, speed = np.degrees(k.travel_rad), np.degrees(k.velocity_rad_s)
     enough_samples = k.fit_cycles[int(m.models.is_payload)]
     if own.samples < enough_samples:
         lines.append(f"{own.samples:.0f} samples in a row are undisturbed, {enough_samples:.0f} needed")
-    if m.models.is_payload == 0.0:
+    if not m.models.is_payload:
         if not m.fit.excitation >= k.excitation_Nm2s:
             lines.append(
                 f"the motion excites the parameters by {m.fit.excitation:.2g} Nm² s, certified.excitation_Nm2s = "
@@ -148,11 +138,11 @@ def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dic
                 f"{k.condition:.2g} allowed: a motion that shows each of them, or a model with fewer "
                 "(estimator.gravity of an arm that hardly feels it)"
             )
-        for i in range(joints):
-            travelled = max(float(np.degrees(own.q_high[i] - own.q_low[i])), 0.0)
+        for i in range(JOINTS):
+            travelled = max(np.degrees(own.q_high[i] - own.q_low[i]), 0.0)
             if not travelled >= travel:
                 lines.append(f"joint {i + 1} has travelled {travelled:.1f} deg of {travel:g}: move it further")
-            fastest, slowest = float(np.degrees(own.dq_high[i])), float(np.degrees(own.dq_low[i]))
+            fastest, slowest = np.degrees(own.dq_high[i]), np.degrees(own.dq_low[i])
             if not (fastest >= speed and slowest <= -speed):
                 lines.append(
                     f"joint {i + 1} has moved at {min(slowest, 0.0):.1f} to {max(fastest, 0.0):.1f} deg/s, "
@@ -161,7 +151,7 @@ def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dic
     if not is_positive_definite(m.models.belief):
         lines.append("the estimated mass matrix is not positive definite: accelerate both joints harder")
     for j, name in enumerate(names):
-        std, enough = float(np.sqrt(m.models.P_belief[j, j])), float(k.enough_std[j])
+        std, enough = np.sqrt(m.models.P_belief[j, j]), k.enough_std[j]
         if not std <= enough:
             unit = units.get(name, "")
             lines.append(f"{name} is known to {std:.3g} {unit}, {enough:.3g} needed: {_motion_for(name)}")

@@ -32,12 +32,7 @@ from adacd_hil.scheme.identify import (
     refinement,
     termination,
 )
-from adacd_hil.scheme.kernel.kernel_samples import (
-    is_filled,
-    keep_sample,
-    observe,
-    put_between,
-)
+from adacd_hil.scheme.kernel.kernel_samples import is_filled, keep_sample, observe, put_between
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.scheme.supervisor.transitions import (
@@ -79,7 +74,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
     m.gaps.has_gap = 1.0
     filter_bank.forget(m)
     missing_torque.forget(m)
-    external_torque.forget(m.wide)
+    m.wide_history[:] = 0.0
     belief.begin_fit(k, m, is_payload)
     if is_payload and int(k.first_offset) > regressor.A5:
         filter_bank.rest(m)
@@ -94,7 +89,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
 def begin_test(constants: Structured, memory: Structured) -> None:
     """Use the belief, without negative friction, as the model, and begin its test, with all counts at 0."""
     k, m = constants[0], memory[0]
-    belief.freeze(k, m)
+    belief.freeze(m)
     margin.begin_sight(m)
     termination.begin_test(k, m, fit_check.late_square(m))
 
@@ -130,7 +125,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
             observation &= ~UNSEEN
         if not (np.all(np.isfinite(m.filters.r)) and np.all(np.isfinite(m.models.theta))):
             observation |= NOT_A_NUMBER
-    elif is_complete != 0:
+    elif is_complete:
         m.gaps.has_gap = 1.0
     if mode & MEASURE and anchor.is_rest_refused(k, m):
         certificate.withhold(m, certificate.READING)
@@ -158,7 +153,7 @@ def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
     """
     nominal_s: float = k.period_s
     period_s: float = out.period_s
-    is_seen = m.gaps.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, sensitivity.MOST_FILLED)
+    is_seen = not m.gaps.has_gap and is_filled(steps, period_s, nominal_s, sensitivity.MOST_FILLED)
     each_s = period_s / steps if is_seen else period_s
     if is_seen:
         filter_bank.choose_rates(k, m, each_s)
@@ -178,10 +173,9 @@ def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
     keep_sample(out.q, out.dq, out.tau_J, m.gaps.last)
     out.tau_f[:] = m.filters.tau_f[filter_bank.SLOW]
     external_torque.predict(m.filters.W_f[filter_bank.SLOW], k.theta_cad, out.tau_f_cad)
-    for i in range(out.q.shape[0]):
-        out.tau_ext_hat[i] = m.filters.r[filter_bank.SLOW, i]
-        out.tau_f_hat[i] = m.filters.r[filter_bank.SLOW, i] + out.tau_f[i]
-        out.tau_ext_hat_cad[i] = out.tau_f_cad[i] - out.tau_f[i]
+    out.tau_ext_hat[:] = m.filters.r[filter_bank.SLOW]
+    out.tau_f_hat[:] = out.tau_ext_hat + out.tau_f
+    out.tau_ext_hat_cad[:] = out.tau_f_cad - out.tau_f
     return bool(is_seen)
 
 
@@ -201,21 +195,19 @@ def _take_sample(
     is_seen: False after a gap: the filters resume from the sample. Fill tau_ext_wide_hat (2,), and the residuals,
     channels, standstill, velocity noise and friction at rest of `m`.
     """
-    cutoff = k.cutoff
     regressor.fill(k, m, q, dq, tau_J, period_s)
     filter_bank.take_sample(k, m, tau_J, is_seen)
-    missing_torque.follow(m, m.filters.rates[:, filter_bank.LEARNT], k.smoothing, is_seen)
-    filter_bank.fill_lag(cutoff, tau_J, m.filters.tau_f, int(k.first_offset) + q.shape[0], m.filters.W_f)
-    if k.has_cross_talk != 0.0:
-        filter_bank.fill_cross_talk(m.filters.tau_f, int(k.first_cross_talk), m.filters.W_f)
-    filter_bank.smooth_learnt(k.smoothing, m.filters.W_f, m.filters.tau_f, m.filters.W_learnt, m.filters.tau_learnt)
-    filter_bank.estimate_external(m.filters.tau_f, m.filters.W_f, m.models.theta, m.filters.r)
-    filter_bank.smooth(k.smoothing, m.filters.r, m.filters.y)
+    missing_torque.follow(k, m, is_seen)
+    filter_bank.fill_lag(k, m, tau_J)
+    filter_bank.fill_cross_talk(k, m)
+    filter_bank.smooth_learnt(k, m)
+    filter_bank.estimate_external(m)
+    filter_bank.smooth(k, m)
     sensitivity.follow_standstill(k, m, dq)
     sensitivity.follow_velocity_noise(k, m, dq, m.gaps.is_steady != 0.0)
     sensitivity.follow_friction(k, m, tau_J)
     external_torque.undo_filter(
-        m.filters.r[filter_bank.WIDE], k.decay[filter_bank.WIDE], m.wide.history, tau_ext_wide_hat
+        m.filters.r[filter_bank.WIDE], k.decay[filter_bank.WIDE], m.wide_history, tau_ext_wide_hat
     )
 
 
@@ -227,9 +219,9 @@ def _watch(k: Constants, m: Memory, out: CertifiedBlock, is_fresh: bool) -> int:
     `collision_Nm`, too. is_fresh: False keeps the thresholds of the sample before.
     """
     if is_fresh:
-        sensitivity.fill_thresholds(k, m, m.sensitivity.h)
+        sensitivity.fill_thresholds(k, m)
         out.threshold[:] = m.sensitivity.h[filter_bank.SLOW]
-        sensitivity.fill_wide(k, m, filter_bank.WIDE)
+        sensitivity.fill_wide(k, m)
     joints = sensitivity.joints_over(m.filters.y, m.sensitivity.h)
     if not joints:
         return 0
@@ -260,13 +252,14 @@ def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode
     if mode & REFINE:
         return _refine(k, m) if is_free else 0
     W_f, tau_f = m.filters.W_f[filter_bank.SLOW], m.filters.tau_f[filter_bank.SLOW]
-    if is_free and belief.learn_and_use(k, m):
+    if is_free and belief.learn(k, m):
+        belief.use(m)
         fit_check.follow(k, m, W_f, tau_f)
     is_complete = is_free and termination.follow(k, m, out.q, out.dq, W_f)
     if not is_complete:
         return 0
     certificate.withhold(m, certificate.contradicted_by(k, m))
-    return FITTED if m.certificate.withheld_by == certificate.NOTHING else WITHHELD
+    return FITTED if m.withheld_by == certificate.NOTHING else WITHHELD
 
 
 @compiled
@@ -291,12 +284,12 @@ def _test(k: Constants, m: Memory, dq: Vector) -> int:
     0 while the test goes on. WITHHELD: the model lacks a torque that depends on the position. Set `withheld_by` if
     refuted.
     """
-    sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_test_share, False)
+    sensitivity.follow_unit(k, m, False)
     margin.follow_test(k, m)
     result = termination.test(k, m, dq, m.filters.r[filter_bank.SLOW])
     if result >= 0:
         return CERTIFIED if result > 0 else 0
-    if m.models.is_payload == 0.0:  # a new payload: hands have been on the arm, and friction may depend on it
+    if not m.models.is_payload:  # a new payload: hands have been on the arm, and friction may depend on it
         earlier.keep_fit(k, m)
     is_by_place = missing_torque.is_found(k, m)
     certificate.withhold(m, certificate.BY_PLACE if is_by_place else certificate.NOTHING)
@@ -310,7 +303,7 @@ def _refine(k: Constants, m: Memory) -> int:
     Return WITHHELD if later evidence contradicts the certificate, else 0; set `withheld_by` to the contradiction, or
     NOTHING.
     """
-    sensitivity.follow_unit(k, m, filter_bank.SLOW, k.noise.unit_share, True)
+    sensitivity.follow_unit(k, m, True)
     sensitivity.decay_strain(k, m)
     cause = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
     if belief.learn(k, m):
@@ -330,15 +323,13 @@ def _fill_model(k: Constants, m: Memory, out: CertifiedBlock) -> None:
     The channels' thresholds only while thresholds are in force.
     """
     base, joints = int(k.first_offset), m.filters.y.shape[1]
+    out.theta_hat[:] = m.models.theta[:base]
+    out.theta_further[:] = m.models.theta[base:]
     for j in range(m.models.theta.shape[0]):
-        if j < base:
-            out.theta_hat[j] = m.models.theta[j]
-        else:
-            out.theta_further[j - base] = m.models.theta[j]
         out.theta_std[j] = np.sqrt(max(m.models.P[j, j], 0.0))
+    out.tau_ext_bank[:] = m.filters.y.ravel()
     for c in range(m.filters.y.shape[0]):
         for i in range(joints):
-            out.tau_ext_bank[c * joints + i] = m.filters.y[c, i]
             if out.threshold[i] != np.inf:
                 out.threshold_bank[c * joints + i] = m.sensitivity.h[c, i]
     out.excitation = m.fit.excitation

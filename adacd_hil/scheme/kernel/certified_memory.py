@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from adacd_hil.records import JOINTS, PARAMETER_NAMES, POSITION_TERMS, CertifiedBlock, Vector, block_sizes
+from adacd_hil.records import JOINTS, POSITION_TERMS, CertifiedBlock, Vector, block_sizes
 from adacd_hil.scheme.detect import external_torque, margin, sensitivity
 from adacd_hil.scheme.identify import (
     anchor,
@@ -120,8 +120,8 @@ def constants_of(settings: Settings) -> Structured:
     certified, names = settings.certified, parameter_names(settings)
     period_s = settings.bus.period_s
     cutoff = np.array(certified.cutoffs_rad_s)
-    decay, weight_old, weight_new = np.zeros_like(cutoff), np.zeros_like(cutoff), np.zeros_like(cutoff)
-    filter_bank.discretise(cutoff, period_s, decay, weight_old, weight_new)
+    decay, weight_old, weight_new = rates = np.zeros((3, cutoff.size))
+    filter_bank.discretise(cutoff, period_s, *rates)
     base = len(settings.estimator.parameter_names)
     theta_cad = np.zeros(len(names))
     theta_cad[: len(settings.arm.cad_theta)] = settings.arm.cad_theta
@@ -138,9 +138,6 @@ def constants_of(settings: Settings) -> Structured:
             weight_old=weight_old,
             weight_new=weight_new,
             first_offset=base,
-            first_coulomb=PARAMETER_NAMES.index("F_c1"),
-            first_term=base + 2 * JOINTS,
-            has_cross_talk=certified.cross_talk_std > 0.0,
             first_cross_talk=_first_of(CROSS_TALK, names),
             first_position=_first_of(POSITION_TERMS[0], names),
             position_torque_Nm=settings.arm.position_torque_Nm,

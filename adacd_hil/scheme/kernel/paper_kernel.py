@@ -33,7 +33,7 @@ from adacd_hil.scheme.kernel.kernel_samples import (
     put_between,
     put_sample,
 )
-from adacd_hil.scheme.memory import Limits, Motion, Sample, Wide
+from adacd_hil.scheme.memory import Limits, Motion, Sample
 from adacd_hil.scheme.model import regressor, torque_filter
 from adacd_hil.scheme.supervisor.transitions import (
     ADAPTED,
@@ -60,8 +60,8 @@ line is within 2.1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
 class PaperMemory:
     """The memory of the paper's scheme. mode: LEARN, then ARMED, of a step beside another scheme.
 
-    motion: evidence of the excitation. quiet_cycles: cycles in a row within beta, eq. (15). standstill, integral, peak:
-    see `external_torque`. last, between: q, dq, tau_J of the sample before, and of an interpolated one.
+    motion: evidence of the excitation. quiet_cycles: cycles in a row within beta, eq. (15). standstill, integral, peak,
+    wide_history: see `external_torque`. last, between: q, dq, tau_J of the sample before, and of an interpolated one.
     """
 
     has_gap: float
@@ -82,7 +82,7 @@ class PaperMemory:
     standstill: PerJoint
     integral: PerJoint
     peak: PerJoint
-    wide: Wide
+    wide_history: Annotated[Vector, "wide n"]
 
 
 @dataclass(frozen=True)
@@ -179,9 +179,9 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
     m.has_gap = 1.0
     m.W_f[:] = 0.0
     out.tau_f[:] = 0.0
-    external_torque.forget(m.wide)
+    m.wide_history[:] = 0.0
     m.mode = LEARN  # used by a step beside; in charge, the mode follows from the state
-    estimator.reset_gain(c.P0, m.P)
+    m.P[:] = np.diag(c.P0)
     excitation.begin(m.motion)
     m.quiet_cycles = 0.0
     out.quiet_s = 0.0
@@ -206,7 +206,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
             observation |= _learn(c, m, out, period_s)
         if not (np.all(np.isfinite(out.tau_ext_hat)) and np.all(np.isfinite(out.theta_hat))):
             observation |= NOT_A_NUMBER
-    elif is_complete != 0:
+    elif is_complete:
         m.has_gap = 1.0
     if mode & ARMED:
         return observation | _watch(c, m, out, period_s, is_fresh, mode & REPORTING != 0)
@@ -227,7 +227,7 @@ def _filter(c: PaperConstants, m: PaperMemory, out: SchemeBlock, steps: int) -> 
     nominal_s: float = c.period_s
     period_s: float = out.period_s
     q, dq, tau_J = out.q[:], out.dq[:], out.tau_J[:]  # arrays like those of `between`: all is compiled once
-    is_seen = m.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, MOST_FILLED)
+    is_seen = not m.has_gap and is_filled(steps, period_s, nominal_s, MOST_FILLED)
     if is_seen:
         step_s = period_s / steps
         hold = torque_filter.FirstOrderHold(c.decay, c.weight_old, c.weight_new)
@@ -235,10 +235,8 @@ def _filter(c: PaperConstants, m: PaperMemory, out: SchemeBlock, steps: int) -> 
             hold = torque_filter.first_order_hold(a, b, step_s)
         for k in range(1, steps):
             put_between(m.last, out.q, out.dq, out.tau_J, k / steps, m.between)
-            _advance(c, m, m.between[0], m.between[1], m.between[2], hold, out.tau_f)
-            _compare(c, m, m.between[1], hold.decay, out)
-        _advance(c, m, q, dq, tau_J, hold, out.tau_f)
-        _compare(c, m, dq, hold.decay, out)
+            _advance(c, m, m.between[0], m.between[1], m.between[2], hold, out)
+        _advance(c, m, q, dq, tau_J, hold, out)
     else:
         period_s = nominal_s
         regressor.fill_momentum(q, dq, m.Y_p)
@@ -258,14 +256,15 @@ def _advance(
     dq: Vector,
     tau_J: Vector,
     hold: torque_filter.FirstOrderHold,
-    tau_f: Vector,
+    out: SchemeBlock,
 ) -> None:
-    """Advance the filters of torque and regressor by one period to a sample; fill tau_f (2,), and W_f of `m`."""
+    """Advance the filters of torque and regressor, tau_f and W_f, by one period to a sample; then `_compare`."""
     a, b = c.a_rad_s, c.b_rad_s
     regressor.fill_momentum(q, dq, m.Y_p)
     regressor.fill_remainder(q, dq, c.level_rad, m.Y_h)
-    torque_filter.advance_torque(hold, m.tau_old, tau_J, tau_f)
+    torque_filter.advance_torque(hold, m.tau_old, tau_J, out.tau_f)
     torque_filter.advance_regressor(hold, a, b, m.Y_p, m.Y_h, m.input_old, m.S, m.W_f)
+    _compare(c, m, dq, hold.decay, out)
 
 
 @compiled
@@ -279,7 +278,7 @@ def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: S
     external_torque.predict(m.W_f, c.theta_cad, out.tau_f_cad)
     external_torque.estimate_external(out.tau_f, out.tau_f_hat, c.dc_gain, out.tau_ext_hat)
     external_torque.estimate_external(out.tau_f, out.tau_f_cad, c.dc_gain, out.tau_ext_hat_cad)
-    external_torque.undo_filter(out.tau_ext_hat, c.decay, m.wide.history, out.tau_ext_wide_hat)
+    external_torque.undo_filter(out.tau_ext_hat, c.decay, m.wide_history, out.tau_ext_wide_hat)
 
 
 @compiled
@@ -343,8 +342,6 @@ def step_beside(
     if observation & ADAPTED:
         m.mode = ARMED
     main.paper_is_armed = 1.0 if m.mode == ARMED else 0.0
-    for i in range(JOINTS):
-        main.paper_tau_ext_hat[i] = own.tau_ext_hat[i]
-        main.paper_threshold[i] = own.threshold[i]
-    for j in range(own.theta_hat.size):
-        main.paper_theta_hat[j] = own.theta_hat[j]
+    main.paper_tau_ext_hat[:] = own.tau_ext_hat
+    main.paper_threshold[:] = own.threshold
+    main.paper_theta_hat[:] = own.theta_hat

@@ -117,17 +117,17 @@ def fill(k: Constants, m: Memory, q: Vector, dq: Vector, tau_J: Vector, period_s
     Fill M (n, n), the mass matrix of the model in use. Advance the friction's bristles by period_s.
     """
     own = m.regressor
-    base, first_coulomb, count = int(k.first_offset), int(k.first_coulomb), q.shape[0]
+    base, count = int(k.first_offset), q.shape[0]
     bend_bristles(dq, period_s, k.still_rad_s, k.dahl_rad, own.bent)
     fill_momentum(q, dq, own.Y_p[:, :base])
     fill_remainder(q, dq, k.level_rad, own.Y_h[:, :base])
     for i in range(count):
-        own.Y_h[i, first_coulomb + i] = smooth_sign(dq[i], k.still_rad_s, k.width_rad_s)
+        own.Y_h[i, F_C1 + i] = smooth_sign(dq[i], k.still_rad_s, k.width_rad_s)
         own.Y_h[i, base + i] = 1.0
     speeds = k.still_rad_s, k.width_rad_s, k.stribeck_rad_s
     fill_terms(dq, tau_J, k.terms, speeds, own.bent, base + 2 * count, own.Y_h)
     fill_position(q, own.X)
-    if k.position_torque_Nm != 0.0:
+    if k.position_torque_Nm:
         put_position_columns(own.X, int(k.first_position), own.Y_h)
     fill_mass_matrix(q, m.models.theta, own.M)
 

@@ -103,7 +103,7 @@ class CertificateWatch:
         self._refusal = None
         known_by, self._vouched_against = self._known_by(), ""
         k, m = self._k, self._m
-        level = "info" if anchor.is_anchored(k, m) else "warning"
+        level = "warning" if anchor.open_joints(k, m) else "info"
         by_place = anchor.describe_place(k, m)
         text = f"{anchor.describe(k, m)}; {margin.describe_sight(m)}; {known_by}{by_place}"
         self._is_standing = True
@@ -136,7 +136,7 @@ class CertificateWatch:
         None if the refusal before had the same cause; but each REPORT_EACH-th refused fit in a row is reported again.
         Call it before the kernel forgets the fit.
         """
-        before, m, cause = self._refusal, self._m, int(self._m.certificate.withheld_by)
+        before, m, cause = self._refusal, self._m, int(self._m.withheld_by)
         offsets = slice(int(self._k.first_offset), int(self._k.first_offset) + JOINTS)
         std_Nm = np.sqrt(np.diag(m.models.P_belief)[offsets])
         times = 1 if before is None else before.times + 1
@@ -189,7 +189,7 @@ class CertificateWatch:
 
         It is an offset, a torque that depends on the position, or a smallest push that has grown.
         """
-        return CommonCause("; ".join(self._describe(int(self._m.certificate.withheld_by))), is_payload=False)
+        return CommonCause("; ".join(self._describe(int(self._m.withheld_by))), is_payload=False)
 
     def _describe(self, cause: int) -> list[str]:
         """Return the lines of a contradiction: the quantities that contradict each other, with their bounds.

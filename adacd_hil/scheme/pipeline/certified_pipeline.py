@@ -207,17 +207,18 @@ class CertifiedPipeline(Pipeline):
     def _begin_adaptation(self, previous: SchemeState) -> None:
         """Begin an adaptation: of a payload if the arm is certified, of the whole arm if not, or after a failed test.
 
-        If the user has taken the certificate back, revoke it first.
+        If the user has taken the certificate back, revoke it first. The paper's scheme beside begins one with a first
+        attempt, too.
         """
         cause = self._course.supervisor.cause
+        is_first = cause in (SchemeEvent.REVOKED, SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED)
         if cause == SchemeEvent.REVOKED:
             self._revoke()
-        elif cause in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED):
+        if is_first:
             self._is_payload = bool(self._course.is_model_valid)
             paper_kernel.begin_adaptation(*self._paper)
         elif previous is SchemeState.CERTIFY:
             self._is_payload = False
-        is_first = cause in (SchemeEvent.REVOKED, SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED)
         self._learn_anew(is_first)
 
     def _learn_anew(self, is_first: bool) -> None:
@@ -230,15 +231,11 @@ class CertifiedPipeline(Pipeline):
         certified_kernel.begin_adaptation(*self.numbers[:2], self._is_payload, is_first)
 
     def _revoke(self) -> None:
-        """Take back the certificate for the user, drop the kept beliefs, and set the feedforward's model to 0.
-
-        The paper's scheme beside begins an adaptation, too.
-        """
-        self._is_payload = self._course.is_model_valid = False
+        """Take back the certificate for the user, drop the kept beliefs, and set the feedforward's model to 0."""
+        self._course.is_model_valid = False
         self.theta_ff = np.zeros(self.theta_ff.size)
         self._events.append(self._watch.revoke())
         earlier.forget(self._m)
-        paper_kernel.begin_adaptation(*self._paper)
 
     def _feed_forward(self) -> None:
         """Copy the parameters of the model in use to `theta_ff`, the feedforward's model."""

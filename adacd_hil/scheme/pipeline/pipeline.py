@@ -63,10 +63,6 @@ class SchemeBatch(NamedTuple):
     contact_places: NDArray[np.int64]
 
 
-_STATES, _FAULTS, _REACTIONS = tuple(SchemeState), tuple(FaultReason), tuple(Reaction)
-"""Members of each enumeration, by number."""
-
-
 def layout_of(settings: Settings) -> Layout:
     """Return the layout of the values that the selected scheme writes per cycle, its block."""
     count = len(settings.estimator.parameter_names)
@@ -171,9 +167,9 @@ class Pipeline(ABC):
         block = self._block[0].copy()
         return SchemeOutput(
             cycle=arm.cycle,
-            state=_STATES[state],
-            previous_state=_STATES[previous_state],
-            fault=_FAULTS[fault],
+            state=SchemeState(state),
+            previous_state=SchemeState(previous_state),
+            fault=FaultReason(fault),
             contact_joints=contact_joints,
             is_model_valid=bool(is_model_valid),
             theta_hat=block[self._theta_hat],
@@ -181,7 +177,7 @@ class Pipeline(ABC):
             tau_ext_hat=self.tau_ext_hat.copy(),
             contact=contact,
             block=block,
-            reaction=_REACTIONS[reaction],
+            reaction=Reaction(reaction),
         )
 
     def run(self, arms: ArmBatch, requests: NDArray[np.uint8]) -> SchemeBatch:

@@ -55,21 +55,10 @@ with 700 °/s² it stays below 0.05 rad/s for 8 ms: a margin of 6."""
 UNREST_S = 0.02
 """How long an arm may move while its drives enable: an arm whose brakes have opened sags until the drives hold it."""
 
-_REST_UNLOADED = AT_REST | UNLOADED
-
-POWERED = frozenset(
-    (
-        SchemeState.ADAPT,
-        SchemeState.CERTIFY,
-        SchemeState.MONITOR,
-        SchemeState.REACT,
-        SchemeState.STOPPED,
-        SchemeState.PAYLOAD,
-    )
-)
-"""States in which the drives are enabled and may have torque."""
 LEARNING = frozenset((SchemeState.ADAPT, SchemeState.CERTIFY))
 REACTING = frozenset((SchemeState.REACT, SchemeState.STOPPED))
+POWERED = LEARNING | REACTING | {SchemeState.MONITOR, SchemeState.PAYLOAD}
+"""States in which the drives are enabled and may have torque."""
 
 KEPT_IN = MappingProxyType(
     {
@@ -197,7 +186,7 @@ def supervise(
     _count(m, arm, observation)
     if arm.request != Request.NONE:
         _take(m, arm.request)
-    if m.state == SchemeState.REACT and m.is_latched == 0 and _has_grown(k, m, arm, observation):
+    if m.state == SchemeState.REACT and not m.is_latched and _has_grown(k, m, arm, observation):
         m.is_latched = 1
     event = _event(k, m, arm, observation, is_reporting, goes_on)
     if event != SchemeEvent.NONE:
@@ -248,7 +237,7 @@ def _keeps(m: SupervisorMemory, request: int, state: int) -> bool:
     who changes it may touch the arm.
     """
     if request == Request.PAYLOAD_CHANGED and IS_REACTING[state]:
-        return bool(m.is_doubted != 0 or m.origin == SchemeState.PAYLOAD)
+        return bool(m.is_doubted or m.origin == SchemeState.PAYLOAD)
     return bool(_IS_KEPT[request, state])
 
 
@@ -263,7 +252,7 @@ def _has_grown(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observa
 
     It must after a collision, a late host, or `patience_cycles`, or if the user has attributed it to a changed payload.
     """
-    is_over = observation & COLLISION != 0 or arm.is_late != 0 or m.phase_periods >= k.patience_cycles
+    is_over = observation & COLLISION or arm.is_late or m.phase_periods >= k.patience_cycles
     return bool(is_over or _is_payload_announced(k, m))
 
 
@@ -271,7 +260,7 @@ def _has_grown(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observa
 def _is_announced(m: SupervisorMemory) -> bool:
     """Return whether an announced change of payload ends the state; STOPPED only if it was announced in STOPPED."""
     is_awaited = _is_pending(m, Request.PAYLOAD) and m.state == SchemeState.MONITOR
-    return bool(m.is_announced_here != 0 or is_awaited)
+    return bool(m.is_announced_here or is_awaited)
 
 
 @compiled
@@ -281,8 +270,8 @@ def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
     It is if the model is in doubt; with gravity also if the payload was being changed, and the user announced its
     weight since the contact began: an earlier announcement cannot exclude a person's touch.
     """
-    is_weight = k.has_gravity != 0 and m.origin == SchemeState.PAYLOAD and m.is_weight_announced != 0
-    return bool((m.is_doubted != 0 or is_weight) and _is_pending(m, Request.PAYLOAD_CHANGED))
+    is_weight = k.has_gravity and m.origin == SchemeState.PAYLOAD and m.is_weight_announced
+    return bool((m.is_doubted or is_weight) and _is_pending(m, Request.PAYLOAD_CHANGED))
 
 
 @compiled
@@ -344,7 +333,7 @@ def _touch(m: SupervisorMemory, arm: Sample, observation: int) -> int:
     COLLISION goes before CONTACT, also where the state reacts to CONTACT alone. NONE also while the drives aren't
     enabled: an arm without torque can't react. observation: bits of the findings.
     """
-    if observation & ANY_CONTACT == 0 or arm.is_enabled == 0:
+    if not (observation & ANY_CONTACT and arm.is_enabled):
         return SchemeEvent.NONE
     event = SchemeEvent.COLLISION if observation & COLLISION else SchemeEvent.CONTACT
     return event if leads_on(m.state, event) else SchemeEvent.NONE
@@ -361,7 +350,7 @@ def _progress(
     state = m.state
     event: int = SchemeEvent.NONE
     is_still = m.still_cycles >= k.rest_cycles
-    if state == SchemeState.MONITOR and arm.is_late != 0:
+    if state == SchemeState.MONITOR and arm.is_late:
         event = SchemeEvent.LATE
     elif state == SchemeState.MONITOR and observation & WITHHELD:
         event = SchemeEvent.CONTRADICTED
@@ -388,15 +377,16 @@ def _released(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observat
     acknowledgement joints below their thresholds.
     """
     event: int = SchemeEvent.NONE
-    is_late = arm.is_late != 0
+    if arm.is_late:
+        return event
     if _is_payload_announced(k, m):
-        if is_still and not is_late:
+        if is_still:
             event = SchemeEvent.PAYLOAD_CHANGED
     elif _is_pending(m, Request.RELEARN):
-        if is_still and not is_late:
+        if is_still:
             event = SchemeEvent.REVOKED
-    elif _is_pending(m, Request.ACKNOWLEDGE) and observation & ANY_CONTACT == 0 and not is_late:
-        event = SchemeEvent.REVOKED if m.is_doubted != 0 else SchemeEvent.ACKNOWLEDGED
+    elif _is_pending(m, Request.ACKNOWLEDGE) and not observation & ANY_CONTACT:
+        event = SchemeEvent.REVOKED if m.is_doubted else SchemeEvent.ACKNOWLEDGED
     return event
 
 
@@ -420,11 +410,11 @@ def _begun(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
     """Return the event that ends INIT, COMMISSION or ENABLE in this cycle, or NONE."""
     state = m.state
     event: int = SchemeEvent.NONE
-    if state == SchemeState.INIT and arm.is_complete != 0:
+    if state == SchemeState.INIT and arm.is_complete:
         event = SchemeEvent.COMPLETE
     elif state == SchemeState.COMMISSION and _is_commissioned(k, m, arm, observation):
         event = SchemeEvent.COMMISSIONED
-    elif state == SchemeState.ENABLE and arm.is_enabled != 0:
+    elif state == SchemeState.ENABLE and arm.is_enabled:
         event = SchemeEvent.ENABLED
     elif state == SchemeState.ENABLE and m.moving_cycles >= k.unrest_cycles:
         event = SchemeEvent.MOVED
@@ -439,7 +429,7 @@ def _settled(k: SupervisorConstants, m: SupervisorMemory, is_still: bool, goes_o
     row were without contact, and the arm is at rest or its reaction lets it go on (goes_on).
     """
     event: int = SchemeEvent.NONE
-    if m.is_latched != 0:
+    if m.is_latched:
         if is_still:
             event = SchemeEvent.AT_REST
     elif m.cleared_cycles >= k.clear_cycles and (is_still or goes_on):
@@ -454,7 +444,7 @@ def _is_commissioned(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, o
     The checks: at rest, unloaded, no reading refused, no fault. A cycle with incomplete data doesn't count but doesn't
     break the row: `_check` limits how many may be missing.
     """
-    is_resting = observation & (_REST_UNLOADED | WITHHELD) == _REST_UNLOADED
+    is_resting = observation & AT_REST and observation & UNLOADED and not observation & WITHHELD
     is_good = is_resting and _check(k, m, arm, observation) == FaultReason.NONE
     m.commissioned_cycles = m.commissioned_cycles + arm.is_complete if is_good else 0
     return bool(m.commissioned_cycles >= k.commission_cycles)
@@ -485,7 +475,7 @@ def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
         fault = arm.fault
     elif observation & NOT_A_NUMBER:
         fault = FaultReason.NOT_A_NUMBER
-    elif arm.is_late != 0 and not _IS_HELD_FROM[state]:
+    elif arm.is_late and not _IS_HELD_FROM[state]:
         fault = FaultReason.DEADLINE  # outranks its effects: old data, drives that drop out
     elif arm.age > k.max_age_cycles or m.stale_cycles > k.blind_limit:
         fault = FaultReason.DATA_AGE
@@ -493,7 +483,7 @@ def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
         fault = FaultReason.BLIND
     elif observation & OVER_LIMIT or (observation & OVER_SPEED and not is_thrown):
         fault = FaultReason.LIMIT
-    elif _IS_POWERED[state] and arm.is_enabled == 0:
+    elif _IS_POWERED[state] and not arm.is_enabled:
         fault = FaultReason.DRIVE
     return fault
 

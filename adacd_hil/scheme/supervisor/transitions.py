@@ -49,49 +49,42 @@ STAYS = -1
 TO_ORIGIN = -2
 """Next state: the state from which REACT was entered."""
 
+_TOUCHED = {SchemeEvent.COLLISION: SchemeState.REACT, SchemeEvent.CONTACT: SchemeState.REACT}
+
+# Beside these, FAULT leads from each state to the state FAULT.
 TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, int]] = MappingProxyType(
     {
         # Gathers no data yet. Out: the first complete cycle; too late is a fault.
         SchemeState.INIT: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COMPLETE: SchemeState.COMMISSION,
         },
         # Drives off, arm must lie still. Out: enough complete cycles at rest; too late is a fault.
         SchemeState.COMMISSION: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.COMMISSIONED: SchemeState.ENABLE,
         },
         # The host enables the drives. Out: both are enabled; an arm that moves meanwhile must lie still again; too late
         # is a fault; a contact once they are enabled.
         SchemeState.ENABLE: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COLLISION: SchemeState.REACT,
-            SchemeEvent.CONTACT: SchemeState.REACT,
+            **_TOUCHED,
             SchemeEvent.ENABLED: SchemeState.ADAPT,
             SchemeEvent.MOVED: SchemeState.COMMISSION,
         },
         # Moves and learns. Out: eq. (15) with evidence; a fit to be tested; a contact; too late is a fault.
         SchemeState.ADAPT: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COLLISION: SchemeState.REACT,
-            SchemeEvent.CONTACT: SchemeState.REACT,
+            **_TOUCHED,
             SchemeEvent.ADAPTED: SchemeState.MONITOR,
             SchemeEvent.FITTED: SchemeState.CERTIFY,
         },
         # Moves on, the model frozen and tested. Out: the test's result; a contact; too late is a fault.
         SchemeState.CERTIFY: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COLLISION: SchemeState.REACT,
-            SchemeEvent.CONTACT: SchemeState.REACT,
+            **_TOUCHED,
             SchemeEvent.CERTIFIED: SchemeState.MONITOR,
             SchemeEvent.REFUTED: SchemeState.ADAPT,
         },
         # Moves, detection armed. Out: a contact; a late host; later evidence against the certificate; the announcement
         # of a payload change; back from these, the doubt of the model.
         SchemeState.MONITOR: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COLLISION: SchemeState.REACT,
-            SchemeEvent.CONTACT: SchemeState.REACT,
+            **_TOUCHED,
             SchemeEvent.LATE: SchemeState.REACT,
             SchemeEvent.CONTRADICTED: SchemeState.REACT,
             SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
@@ -99,7 +92,6 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, int]] = MappingProx
         },
         # Reacts. Out, once the report is final: at rest, if it is to be acknowledged; else cleared.
         SchemeState.REACT: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.AT_REST: SchemeState.STOPPED,
             SchemeEvent.CLEARED: TO_ORIGIN,
         },
@@ -107,7 +99,6 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, int]] = MappingProx
         # that looked like contacts, or whose weight looks like one; the certificate taken back, even while a push seems
         # to last.
         SchemeState.STOPPED: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
             SchemeEvent.ACKNOWLEDGED: TO_ORIGIN,
             SchemeEvent.PAYLOAD_ANNOUNCED: SchemeState.PAYLOAD,
             SchemeEvent.PAYLOAD_CHANGED: SchemeState.ADAPT,
@@ -115,9 +106,7 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, int]] = MappingProx
         },
         # Parks. Out: the payload has been changed and the arm is at rest; a contact.
         SchemeState.PAYLOAD: {
-            SchemeEvent.FAULT: SchemeState.FAULT,
-            SchemeEvent.COLLISION: SchemeState.REACT,
-            SchemeEvent.CONTACT: SchemeState.REACT,
+            **_TOUCHED,
             SchemeEvent.PAYLOAD_CHANGED: SchemeState.ADAPT,
         },
         # Latched. No way out: a recovery begins the next attempt in INIT.
@@ -129,6 +118,7 @@ TRANSITIONS: MappingProxyType[SchemeState, dict[SchemeEvent, int]] = MappingProx
 def _numbered() -> NDArray[np.int64]:
     """Return `TRANSITIONS` as numbers (states, events): the next state, STAYS or TO_ORIGIN."""
     table = np.full((len(SchemeState), len(SchemeEvent)), STAYS)
+    table[:, SchemeEvent.FAULT] = SchemeState.FAULT
     for state, row in TRANSITIONS.items():
         for event, following in row.items():
             table[state, event] = following
