@@ -250,8 +250,8 @@ def _pack_numbers(scenario: Scenario) -> Vector:
 class Body:
     """One emulated arm, from power-on. After construction it compiles no code and allocates no large array."""
 
-    def __init__(self, scenario: Scenario, seed: int | None = None) -> None:
-        """Put the arm at the scenario's start pose, at rest. `seed` outweighs the scenario's."""
+    def __init__(self, scenario: Scenario) -> None:
+        """Put the arm at the scenario's start pose, at rest."""
         self.scenario = scenario
         self._contacts = contact_table(scenario.contacts)
         self._payloads = payload_table(scenario.payloads)
@@ -270,8 +270,7 @@ class Body:
             motor["peak_Nm"], scenario.arm.rated_torque_Nm
         )
         """Whether no motor ever has less torque than its drive wants, or calls for a fault."""
-        seed = scenario.seed if seed is None else seed
-        quiet = (0.0, 0.0)
+        seed, quiet = scenario.seed, (0.0, 0.0)
         self._noise = TorqueNoise(seed, scenario.sensors.torque_noise_Nm if scenario.noise else quiet)
         self._walk = TorqueNoise(
             np.random.SeedSequence(seed, spawn_key=_WALK_STREAM), scenario.sensors.offset_walk_Nm_rs

@@ -7,7 +7,7 @@ from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_text import to_short_toml, to_toml
 from adacd_hil.wire.codec import Codec
-from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS, FaultPlan
+from firmware_sim.bench.fault_plan import FaultPlan
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario, read_table
 
 
@@ -64,7 +64,7 @@ def check(file: str, codec: Codec) -> ScenarioFinding:
         return ScenarioFinding(file, (str(error).removeprefix(f"scenario {file}").removeprefix(":").strip(),))
     try:
         scenario = parse(Scenario, table)
-        FaultPlan(scenario.faults, scenario.seed, PLANNED_PERIOD_NS, codec)
+        FaultPlan(scenario.faults, scenario.seed, codec)
     except ConfigError as error:
         return ScenarioFinding(file, error.problems)
     return ScenarioFinding(file, (), _checked(scenario, codec))
