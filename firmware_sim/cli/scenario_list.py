@@ -1,11 +1,10 @@
-"""The command line's output about scenarios: their list, the content of one, and the errors of a file."""
+"""The command line's output about scenarios: their list, and the errors of a file."""
 
 from dataclasses import dataclass
 from typing import Any
 
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_text import to_short_toml, to_toml
 from adacd_hil.wire.codec import Codec
 from firmware_sim.bench.fault_plan import FaultPlan
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario, read_table
@@ -44,11 +43,6 @@ def describe_all() -> list[dict[str, Any]]:
         }
         for one in scenarios
     ]
-
-
-def show(scenario: Scenario, is_whole: bool) -> str:
-    """Return a scenario as TOML that loads to the same; `is_whole`: with defaults, else only differences from them."""
-    return to_toml(scenario) if is_whole else to_short_toml(scenario)
 
 
 def check(file: str, codec: Codec) -> ScenarioFinding:
