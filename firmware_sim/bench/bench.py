@@ -22,11 +22,12 @@ from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import HOST_MARK
 from firmware_sim.bench.bench_nodes import BenchNodes
 from firmware_sim.bench.bench_time import BenchTime, OnTruth, TruthFeed
+from firmware_sim.bench.fault_rows import EVERYBODY
 from firmware_sim.bench.injector import Handler, Injector, OnEvent, Outbox
-from firmware_sim.body.body import Body, MovableArm
+from firmware_sim.body.body import Body
 from firmware_sim.canopen.error_control import SyncKind, SyncOrder
 from firmware_sim.canopen.object_dictionary import EmulatedContract, contract_of
-from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE
+from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE, MovableArm
 from firmware_sim.scenario.scenario import Scenario
 
 ClockMode = Literal["sync", "wall"]
@@ -165,7 +166,7 @@ class Bench:
                 time.advance_faults(t_ns, self._time_to_sync_ns(data))
             if self._plan.is_quiet:
                 self._on_sync(data, t_ns)
-            elif not self.injector.receive_by_all(can_id, data, self._on_sync, t_ns) and not self._is_wall:
+            elif not self.injector.receive(EVERYBODY, can_id, data, self._on_sync, t_ns) and not self._is_wall:
                 self._miss_sync(data, t_ns)
         elif can_id in self._nodes.commands:
             for place, take in self._nodes.commands[can_id]:
@@ -200,7 +201,7 @@ class Bench:
             for device in self.devices:
                 device.on_heartbeat(self._host_id, t_ns)
 
-        self.injector.receive_by_all(0x700 + self._host_id, data, take, t_ns)
+        self.injector.receive(EVERYBODY, 0x700 + self._host_id, data, take, t_ns)
 
     def _sdo_handler(self, can_id: int) -> Handler:
         """Return a handler that passes SDO requests with this identifier to every device that receives it."""

@@ -20,7 +20,6 @@ from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import DEVICE_MARK, NEVER_NS, MarkKind, pack_mark
 from firmware_sim.arm.sensing import Measurement
 from firmware_sim.bench.fault_plan import ActionKind, FaultPlan, NodeAction
-from firmware_sim.bench.fault_rows import EVERYBODY
 from firmware_sim.body.sensors import count_Nm
 from firmware_sim.canopen.object_dictionary import Send
 from firmware_sim.nodes.device import EmulatedDevice
@@ -135,7 +134,7 @@ class Injector:
 
         on_event: called with t_ns, level, name and text when a fault begins or ends; None: it isn't.
         """
-        first, second = (count_Nm(scenario.sensors, joint) for joint in scenario.wiring.sensor_joint)
+        first, second = (count_Nm(scenario.sensors, joint) for joint in scenario.arm.wiring.sensor_joint)
         self.plan = FaultPlan(scenario.faults, scenario.seed, codec, (first, second))
         self._rows = scenario.faults
         self.has_faults = bool(scenario.faults)
@@ -209,13 +208,6 @@ class Injector:
                 due_ns = t_ns + delay_ns
                 self._outbox.hold(due_ns, lambda received=received, due_ns=due_ns: take(received, due_ns))  # type: ignore[misc]
         return bool(frames)
-
-    def receive_by_all(self, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
-        """Call `take` with a host's frame to all nodes, as faults change, repeat or delay it.
-
-        Return False if it is lost.
-        """
-        return self.receive(EVERYBODY, can_id, data, take, t_ns)
 
     def advance(self, now_ns: int, stamp_ns: int) -> None:
         """Begin and end the faults that are due by `now_ns`: report events stamped `stamp_ns`, and act on nodes.

@@ -8,7 +8,7 @@ hands and walls are a table for compiled code, with the rates at which they make
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,50 +80,52 @@ def _largest_mobility(arm: EmulatedArm, link: int, points_m: Vector) -> float:
     return float(largest.max())
 
 
-def _row(kind: int, arm: EmulatedArm, thing: BodySettings | HandSettings | WallSettings) -> np.void:
-    """Return a row of THING for a body, hand or wall with kind, times and link lengths; the other fields are NaN."""
+def _row(
+    kind: int,
+    arm: EmulatedArm,
+    thing: BodySettings | HandSettings | WallSettings,
+    angle_deg: float | None,
+    stiffness: float,
+    damping: float,
+    mobility: float,
+) -> np.void:
+    """Return a row of THING for a body, hand or wall, with its equally named settings; fields that it lacks are NaN.
+
+    mobility: the largest 1/mass, 1/kg, that spring and damper meet.
+    """
     row: np.void = np.full(THING.itemsize // 8, np.nan).view(THING)[0]
+    for name in THING.names or ():
+        if getattr(thing, name, None) is not None:
+            row[name] = getattr(thing, name)
     row["kind"] = kind
     row["onset_s"] = ticks(thing.at_s) * TICK_S
     row["end_s"] = math.inf if thing.duration_s is None else (ticks(thing.at_s) + ticks(thing.duration_s)) * TICK_S
     row["length1_m"], row["length2_m"] = arm.link_length_m
+    row["angle_rad"] = math.nan if angle_deg is None else math.radians(angle_deg)
+    row["stiffness"], row["damping"] = stiffness, damping
+    row["stiff_rate_rad_s"], row["damped_rate_1_s"] = math.sqrt(stiffness * mobility), damping * mobility
     return row
 
 
 def _body_row(arm: EmulatedArm, body: BodySettings) -> np.void:
-    row = _row(BODY, arm, body)
-    row["link"], row["x_m"], row["y_m"] = body.link, body.x_m, body.y_m
-    row["stiffness"], row["damping"], row["mass_kg"] = body.stiffness, body.damping_N_s_m, body.mass
-    row["radius_m"], row["room_m"] = body.radius_m, body.room_m
-    row["angle_rad"] = math.nan if body.free_deg is None else math.radians(body.free_deg)
     points_m = np.linspace(0.0, arm.link_length_m[body.link - 1], _POINTS)
     mobility = _largest_mobility(arm, body.link, points_m) + 1.0 / body.mass
-    row["stiff_rate_rad_s"] = math.sqrt(body.stiffness * mobility)
-    row["damped_rate_1_s"] = body.damping_N_s_m * mobility
+    row = _row(BODY, arm, body, body.free_deg, body.stiffness, body.damping_N_s_m, mobility)
+    row["mass_kg"] = body.mass
     return row
 
 
 def _hand_row(arm: EmulatedArm, hand: HandSettings) -> np.void:
-    row = _row(HAND, arm, hand)
-    row["link"], row["point_m"] = hand.link, hand.point_m
-    row["force_limit_N"], row["speed_m_s"] = hand.force_limit_N, hand.speed_m_s
-    row["stiffness"], row["damping"] = hand.stiffness_N_m, hand.damping_N_s_m
+    mobility = _largest_mobility(arm, hand.link, np.array([hand.point_m]))
+    row = _row(HAND, arm, hand, hand.direction_deg, hand.stiffness_N_m, hand.damping_N_s_m, mobility)
     if hand.move_to_m is not None:
         row["x_m"], row["y_m"] = hand.move_to_m
-    if hand.direction_deg is not None:
-        row["angle_rad"] = math.radians(hand.direction_deg)
-    mobility = _largest_mobility(arm, hand.link, np.array([hand.point_m]))
-    row["stiff_rate_rad_s"] = math.sqrt(hand.stiffness_N_m * mobility)
-    row["damped_rate_1_s"] = hand.damping_N_s_m * mobility
     return row
 
 
 def _wall_row(arm: EmulatedArm, wall: WallSettings) -> np.void:
-    row = _row(WALL, arm, wall)
-    row["x_m"], row["y_m"], row["angle_rad"] = wall.x_m, wall.y_m, math.radians(wall.normal_deg)
-    row["stiffness"], row["damping"] = wall.stiffness_N_m, wall.damping_s_m
     mobility = max(_largest_mobility(arm, link, np.array([arm.link_length_m[link - 1]])) for link in (1, 2))
-    row["stiff_rate_rad_s"] = math.sqrt(wall.stiffness_N_m * mobility)
+    row = _row(WALL, arm, wall, wall.normal_deg, wall.stiffness_N_m, wall.damping_s_m, mobility)
     # ∂F/∂δ̇ = K χ δ is largest at the deepest point of a blow with v, about v/√(K/μ).
     row["damped_rate_1_s"] = row["stiff_rate_rad_s"] * wall.damping_s_m * _FASTEST_BLOW_M_S
     return row
@@ -184,38 +186,6 @@ def payload_table(payloads: tuple[PayloadSettings, ...]) -> Structured:
     """Return payload changes as a table (n,) of dtype PAYLOAD_CHANGE, in the same order, for compiled functions."""
     rows = [(change.tick, change.mass_kg, *change.center_m, change.inertia_kg_m2) for change in payloads]
     return np.array(rows, dtype=PAYLOAD_CHANGE)
-
-
-class MovableArm(Protocol):
-    """An arm as its devices use it; the members mean the same as those of `Body`."""
-
-    @property
-    def has_ideal_motors(self) -> bool: ...  # noqa: D102
-
-    @property
-    def is_torque_limited(self) -> tuple[bool, bool]: ...  # noqa: D102
-
-    @property
-    def motor_error_code(self) -> tuple[int, int]: ...  # noqa: D102
-
-    @property
-    def motor_torque_Nm(self) -> tuple[float, float]: ...  # noqa: D102
-
-    @property
-    def joint_temperature_C(self) -> tuple[float, float]: ...  # noqa: D102
-
-    @property
-    def drive_velocity_rad_s(self) -> tuple[float, float]: ...  # noqa: D102
-
-    def start_scenario(self) -> None: ...  # noqa: D102
-
-    def advance(  # noqa: D102
-        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int
-    ) -> None: ...
-
-    def sample(self) -> Measurement: ...  # noqa: D102
-
-    def truth(self, out: Vector) -> None: ...  # noqa: D102
 
 
 class BodyParts(NamedTuple):

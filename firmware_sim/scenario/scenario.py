@@ -35,7 +35,7 @@ from adacd_hil.records import FaultReason, Vector
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
-from firmware_sim.arm.arms import ARMS, STRAIGHT, EmulatedArm, Wiring
+from firmware_sim.arm.arms import ARMS, EmulatedArm
 from firmware_sim.arm.hardware_settings import (
     DriveSettings,
     HabitSettings,
@@ -291,11 +291,6 @@ class Scenario:
         return ARMS[self.profile] if self.own_arm is None else self.own_arm
 
     @property
-    def wiring(self) -> Wiring:
-        """Joint, directions and zero of the device at each place; straight for an arm of a profile."""
-        return STRAIGHT if self.own_arm is None else self.own_arm.wiring
-
-    @property
     def payload_bodies(self) -> tuple[PayloadBody, ...]:
         """All payloads, as (mass kg, centre of mass m, inertia kg m²): none, that at power-on, then the changes."""
         changes = ((change.mass_kg, change.center_m, change.inertia_kg_m2) for change in self.payloads)
@@ -304,7 +299,7 @@ class Scenario:
     @property
     def start_rad(self) -> Vector:
         """Pose at power-on, rad, (2,)."""
-        return np.array([math.radians(angle_deg) for angle_deg in self.start_deg])
+        return np.radians(self.start_deg)
 
 
 def builtin_scenarios() -> list[str]:
