@@ -356,6 +356,7 @@ def named_profile(name_or_file: str) -> str | None:
     return None if profile is None else str(profile)
 
 
+_SAME: Final = (1.0, 1.0)
 SCENARIO_SECTIONS = ("sensors", "drives", "mechanics")
 
 
@@ -394,15 +395,15 @@ class TruthArmSettings:
 class FactorSettings:
     """Factors on values of the host's configuration, by joint."""
 
-    link_length: Pair = setting((1.0, 1.0), low=0.1, high=10.0, meaning="of the lengths; masses keep their shares")
-    mass: Pair = setting((1.0, 1.0), low=0.01, high=100.0, meaning="of the masses, and with them the inertia")
-    rated_torque: Pair = setting((1.0, 1.0), low=0.01, high=100.0, meaning="of the rated torque of each joint's drive")
+    link_length: Pair = setting(_SAME, low=0.1, high=10.0, meaning="of the lengths; masses keep their shares")
+    mass: Pair = setting(_SAME, low=0.01, high=100.0, meaning="of the masses, and with them the inertia")
+    rated_torque: Pair = setting(_SAME, low=0.01, high=100.0, meaning="of the rated torque of each joint's drive")
     gear: Pair = setting(
-        (1.0, 1.0), low=1e-3, high=1e3, meaning="of the gear ratio of each joint's drive: its torque and its counts"
+        _SAME, low=1e-3, high=1e3, meaning="of the gear ratio of each joint's drive: its torque and its counts"
     )
-    torque_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the torque sensors' counts")
-    position_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the drives' counts of position")
-    velocity_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the drives' counts of velocity")
+    torque_counts: Pair = setting(_SAME, low=1e-3, high=1e3, meaning="of the torque sensors' counts")
+    position_counts: Pair = setting(_SAME, low=1e-3, high=1e3, meaning="of the drives' counts of position")
+    velocity_counts: Pair = setting(_SAME, low=1e-3, high=1e3, meaning="of the drives' counts of velocity")
 
 
 SWAPS = ("nothing", "drives", "sensors", "joints")
