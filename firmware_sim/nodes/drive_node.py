@@ -25,14 +25,16 @@ from firmware_sim.nodes.device import Application, EmulatedDevice, MovableArm
 from firmware_sim.nodes.drive_profile import (
     DISABLE,
     FAULT_REACTIONS,
+    LONGEST_BRAKING_NS,
     QUICK_STOPS,
     RAMPS,
+    REST_NS,
+    REST_RAD_S,
     STATE_BITS,
     TRANSITIONS,
     DriveEvent,
     DriveState,
     Patience,
-    Standstill,
     Stop,
     TorqueLimits,
     decode_command,
@@ -107,7 +109,7 @@ class DriveNode(Application):
         self._ramp_end: DriveEvent | None = None
         self._is_braking = False
         self._is_motor_limited = self._is_limiting = False
-        self._standstill = Standstill()
+        self._braking_ns = self._moving_ns = 0  # when it began to brake, and when it last moved
         self._mode = self._wanted_mode = device.default_or(0, 0x6060)
         self._habits = habits
         self._has_habits = habits != HabitSettings()
@@ -449,7 +451,7 @@ class DriveNode(Application):
         self.motor_mode = stop.mode
         self._is_braking = True
         self.has_news = True
-        self._standstill.begin_braking(t_ns)
+        self._braking_ns = self._moving_ns = t_ns
 
     def _reset_fault(self, t_ns: int) -> None:
         """Leave the state Fault for Switch on disabled, with an EMCY.
@@ -556,11 +558,13 @@ class DriveNode(Application):
         return self._patience.is_command_missing or self._pdos.find_late(t_ns)
 
     def _watch_standstill(self, t_ns: int) -> None:
-        """End the braking once the motor stands still, or after the longest time, see `Standstill.is_reached`.
+        """End the braking once the motor has stood still for `REST_NS`, or has braked for `LONGEST_BRAKING_NS`.
 
-        The state then changes, except in a quick stop that stays.
+        The state then changes, except in a quick stop that stays. Call it often while the drive brakes.
         """
-        if not self._standstill.is_reached(self._speed_rad_s, t_ns):
+        if abs(self._speed_rad_s) > REST_RAD_S:
+            self._moving_ns = t_ns
+        if t_ns - self._moving_ns < REST_NS and t_ns - self._braking_ns < LONGEST_BRAKING_NS:
             return
         if self.state is DriveState.FAULT_REACTION_ACTIVE:
             self._apply(DriveEvent.FAULT_REACTION_DONE, t_ns)

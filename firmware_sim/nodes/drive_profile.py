@@ -124,8 +124,8 @@ def decode_command(controlword: int, previous: int) -> DriveEvent | None:
 
 
 REST_RAD_S = 0.02  # standstill: a hundredth of the slowest motion that the arm makes
-_REST_NS = 10_000_000  # standstill lasts; passing through zero does not
-_LONGEST_BRAKING_NS = 1_000_000_000  # an arm that someone keeps pushing never stands still
+REST_NS = 10_000_000  # standstill lasts; passing through zero does not
+LONGEST_BRAKING_NS = 1_000_000_000  # an arm that someone keeps pushing never stands still
 
 
 class Stop(NamedTuple):
@@ -155,26 +155,7 @@ FAULT_REACTIONS = {code: QUICK_STOPS[code] for code in (0, 1, 2, 3)}
 """0x605E."""
 
 
-class Standstill:
-    """Finds whether a braking motor has stood still for `_REST_NS`, or has braked for `_LONGEST_BRAKING_NS`."""
-
-    def __init__(self) -> None:
-        self._since_ns = self._moving_ns = 0
-
-    def begin_braking(self, t_ns: int) -> None:
-        """Begin at `t_ns` to measure how long the motor stands still, and how long it brakes."""
-        self._since_ns = self._moving_ns = t_ns
-
-    def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:
-        """Return whether the motor has stood still for `_REST_NS`, or has braked for `_LONGEST_BRAKING_NS`.
-
-        Up to `REST_RAD_S` it stands still. Call it often while it brakes.
-        """
-        if abs(velocity_rad_s) > REST_RAD_S:
-            self._moving_ns = t_ns
-        return t_ns - self._moving_ns >= _REST_NS or t_ns - self._since_ns >= _LONGEST_BRAKING_NS
-
-
+_SYNCS, _TOLERANCE = 0x2200, 0x2201
 _NO_COMMAND_YET = 256  # SYNCs without a command: more than the longest patience, 0x2200
 _NO_PATIENCE = 1 << 30  # a drive without 0x2200 doesn't count SYNCs
 _TENTH_PERIODS = 15  # a drive without 0x2201: SYNC is missing after 1.5 periods
@@ -225,17 +206,19 @@ class Patience:
         """SYNCs since the last command."""
         self.sync_ns = 0
         """When the last SYNC came, by the device's clock."""
-        self._syncs = dictionary.value_or(_NO_PATIENCE, 0x2200)
         self._factory_period_us = self._period_us = dictionary.value(0x1006)
-        self._tenth_periods = dictionary.value_or(_TENTH_PERIODS, 0x2201)
         dictionary.watch(0x1006, 0, self._set_period)
-        dictionary.watch(0x2200, 0, self._set_syncs)
-        dictionary.watch(0x2201, 0, self._set_tolerance)
+        self._values = {
+            _SYNCS: dictionary.value_or(_NO_PATIENCE, _SYNCS),
+            _TOLERANCE: dictionary.value_or(_TENTH_PERIODS, _TOLERANCE),
+        }
+        for index in self._values:
+            dictionary.watch(index, 0, functools.partial(self._values.__setitem__, index))
 
     @property
     def is_command_missing(self) -> bool:
         """Whether 0x2200 SYNCs or more have come since the last command; True before the first command."""
-        return self.silent_syncs >= self._syncs
+        return self.silent_syncs >= self._values[_SYNCS]
 
     @property
     def sync_due_ns(self) -> int:
@@ -245,22 +228,16 @@ class Patience:
         """
         if not self._period_us:
             return NEVER_NS
-        return self.sync_ns + self._period_us * self._tenth_periods * 100
+        return self.sync_ns + self._period_us * self._values[_TOLERANCE] * 100
 
     def forget_command(self) -> None:
         """Forget the last command: commands count as missing until the next one."""
         self.silent_syncs = _NO_COMMAND_YET
 
-    def _set_syncs(self, syncs: int) -> None:
-        self._syncs = syncs
-
     def _set_period(self, period_us: int) -> None:
         # 0 is written to change 0x1019; a drive that has a period from its factory watches SYNC all the same.
         if period_us or not self._factory_period_us:
             self._period_us = period_us
-
-    def _set_tolerance(self, tenth_periods: int) -> None:
-        self._tenth_periods = tenth_periods
 
 
 def velocity_lsb(codec: Codec, number: int, factor: float) -> float | None:
@@ -268,6 +245,6 @@ def velocity_lsb(codec: Codec, number: int, factor: float) -> float | None:
 
     Then the body's counts fit as they are. number: of the drive, 1 or 2.
     """
-    signals = codec.message(f"Drive{number}Feedback").signals
-    scale = next(signal.scale for signal in signals if signal.name == "velocity") / factor
+    message = codec.message(f"Drive{number}Feedback")
+    scale = message.values[message.place("velocity")].scale / factor
     return None if scale == VELOCITY_LSB_RAD_S else scale
