@@ -150,10 +150,10 @@ def bench_in_process() -> None:
     time_calls("scheme: one step", lambda: pipeline.step(arm))
 
     scenario = load_scenario("paper", "P")
-    body = Body(scenario, 1)
+    body = Body(scenario)
     torques, modes = (0.1, 0.05), (DriveMode.TORQUE, DriveMode.TORQUE)
     time_calls("plant: 1 ms of arm, drives and sensors", lambda: (body.advance(torques, modes), body.sample()))
-    rich = Body(dataclasses.replace(scenario, mechanics=EVERYTHING), 1)
+    rich = Body(dataclasses.replace(scenario, mechanics=EVERYTHING))
     time_calls(
         "plant: the same with every option of [mechanics]", lambda: (rich.advance(torques, modes), rich.sample())
     )

@@ -39,6 +39,7 @@ LARGEST_RATE: Final = 1.0
 """Largest |λ| h with the most substeps: 160 000 rad/s. Beyond it a scenario is refused."""
 
 Pair = tuple[float, float]
+_ZERO: Final = (0.0, 0.0)
 PayloadBody = tuple[float, Pair, float]
 """Mass kg, centre of mass from the tip m, inertia about it kg m²."""
 
@@ -48,31 +49,29 @@ class MechanicsSettings:
     """Properties of the arm beyond rigid links, viscous and Coulomb friction."""
 
     static_Nm: Pair = setting(
-        (0.0, 0.0), unit="Nm", low=0.0, high=1000.0, meaning="F_s, friction at standstill; 0: the profile's Coulomb"
+        _ZERO, unit="Nm", low=0.0, high=1000.0, meaning="F_s, friction at standstill; 0: the profile's Coulomb"
     )
     stribeck_velocity_rad_s: Pair = setting(
         (0.05, 0.05), unit="rad/s", low=1e-4, high=100.0, meaning="v_s: how fast static falls to Coulomb friction"
     )
     sigma0_Nm_rad: Pair = setting(
-        (0.0, 0.0), unit="Nm/rad", low=0.0, high=1e7, meaning="LuGre: stiffness of the bristles; 0: no bristles"
+        _ZERO, unit="Nm/rad", low=0.0, high=1e7, meaning="LuGre: stiffness of the bristles; 0: no bristles"
     )
-    sigma1_Nm_s: Pair = setting(
-        (0.0, 0.0), unit="Nm s/rad", low=0.0, high=1e4, meaning="LuGre: damping of the bristles"
-    )
+    sigma1_Nm_s: Pair = setting(_ZERO, unit="Nm s/rad", low=0.0, high=1e4, meaning="LuGre: damping of the bristles")
     sigma2_Nm_s: Pair | None = setting(
         None, unit="Nm s/rad", low=0.0, high=1e4, meaning="LuGre: viscous friction; absent: the profile's"
     )
     load_friction: Pair = setting(
-        (0.0, 0.0), low=0.0, high=0.9, meaning="growth of Coulomb friction per torque through the joint"
+        _ZERO, low=0.0, high=0.9, meaning="growth of Coulomb friction per torque through the joint"
     )
     viscous_drop_per_K: Pair = setting(
-        (0.0, 0.0), unit="1/K", low=0.0, high=0.5, meaning="viscous friction falls by this share per kelvin above 25 °C"
+        _ZERO, unit="1/K", low=0.0, high=0.5, meaning="viscous friction falls by this share per kelvin above 25 °C"
     )
     coulomb_drop_per_K: Pair = setting(
-        (0.0, 0.0), unit="1/K", low=0.0, high=0.5, meaning="Coulomb and static friction likewise"
+        _ZERO, unit="1/K", low=0.0, high=0.5, meaning="Coulomb and static friction likewise"
     )
     heat_capacity_J_K: Pair = setting(
-        (0.0, 0.0), unit="J/K", low=0.0, high=1e9, meaning="of the joint that its friction warms; 0: no warming"
+        _ZERO, unit="J/K", low=0.0, high=1e9, meaning="of the joint that its friction warms; 0: no warming"
     )
     cooling_s: Pair = setting(
         (600.0, 600.0), unit="s", low=0.01, high=1e6, meaning="time constant of the joint's way back to ambient"
@@ -81,25 +80,25 @@ class MechanicsSettings:
         REFERENCE_C, unit="°C", low=-40.0, high=80.0, meaning="temperature around, and of the joints at power-on"
     )
     stiffness_Nm_rad: Pair = setting(
-        (0.0, 0.0), unit="Nm/rad", low=0.0, high=1e7, meaning="of the joint, motor to sensor; 0: stiff"
+        _ZERO, unit="Nm/rad", low=0.0, high=1e7, meaning="of the joint, motor to sensor; 0: stiff"
     )
-    damping_Nm_s: Pair = setting((0.0, 0.0), unit="Nm s/rad", low=0.0, high=1e4, meaning="beside that stiffness")
+    damping_Nm_s: Pair = setting(_ZERO, unit="Nm s/rad", low=0.0, high=1e4, meaning="beside that stiffness")
     rotor_inertia_kg_m2: Pair = setting(
-        (0.0, 0.0), unit="kg m²", low=0.0, high=100.0, meaning="of motor and gear, seen from the joint (times N²)"
+        _ZERO, unit="kg m²", low=0.0, high=100.0, meaning="of motor and gear, seen from the joint (times N²)"
     )
-    backlash_rad: Pair = setting((0.0, 0.0), unit="rad", low=0.0, high=0.5, meaning="whole width of the dead zone")
-    ripple_Nm: Pair = setting((0.0, 0.0), unit="Nm", low=0.0, high=100.0, meaning="amplitude of the torque ripple")
-    ripple_share: Pair = setting((0.0, 0.0), low=0.0, high=1.0, meaning="amplitude per motor torque, added to it")
+    backlash_rad: Pair = setting(_ZERO, unit="rad", low=0.0, high=0.5, meaning="whole width of the dead zone")
+    ripple_Nm: Pair = setting(_ZERO, unit="Nm", low=0.0, high=100.0, meaning="amplitude of the torque ripple")
+    ripple_share: Pair = setting(_ZERO, low=0.0, high=1.0, meaning="amplitude per motor torque, added to it")
     ripple_periods: Pair = setting(
         (100.0, 100.0), low=1.0, high=1e5, meaning="periods of the ripple per revolution of the joint"
     )
-    ripple_phase_deg: Pair = setting((0.0, 0.0), unit="deg", low=-360.0, high=360.0, meaning="of the ripple at q = 0")
+    ripple_phase_deg: Pair = setting(_ZERO, unit="deg", low=-360.0, high=360.0, meaning="of the ripple at q = 0")
     motor_viscous_Nm_s: Pair = setting(
-        (0.0, 0.0), unit="Nm s/rad", low=0.0, high=1e4, meaning="friction before the sensor, which does not see it"
+        _ZERO, unit="Nm s/rad", low=0.0, high=1e4, meaning="friction before the sensor, which does not see it"
     )
-    motor_coulomb_Nm: Pair = setting((0.0, 0.0), unit="Nm", low=0.0, high=1000.0, meaning="likewise, Coulomb")
+    motor_coulomb_Nm: Pair = setting(_ZERO, unit="Nm", low=0.0, high=1000.0, meaning="likewise, Coulomb")
     holding_brake_Nm: Pair = setting(
-        (0.0, 0.0), unit="Nm", low=0.0, high=1000.0, meaning="what the motor's brake holds while the drive is off"
+        _ZERO, unit="Nm", low=0.0, high=1000.0, meaning="what the motor's brake holds while the drive is off"
     )
     encoder_side: str = setting("motor", choices=ENCODER_SIDES, meaning="which side of the spring the encoder reads")
     stop_low_deg: Pair | None = setting(
@@ -305,20 +304,20 @@ class DriveSettings:
         meaning="natural frequency of the tracking loop",
     )
     torque_constant_error: Pair = setting(
-        (0.0, 0.0), low=-0.5, high=0.5, meaning="delivered torque over the one that the drive believes, less one"
+        _ZERO, low=-0.5, high=0.5, meaning="delivered torque over the one that the drive believes, less one"
     )
     torque_offset_Nm: Pair = setting(
-        (0.0, 0.0),
+        _ZERO,
         unit="Nm",
         low=-10.0,
         high=10.0,
         meaning="zero error of the current sensor while the motor is powered",
     )
     peak_torque_Nm: Pair = setting(
-        (0.0, 0.0), unit="Nm", low=0.0, high=1000.0, meaning="peak current; 0, or more than rated torque: rated torque"
+        _ZERO, unit="Nm", low=0.0, high=1000.0, meaning="peak current; 0, or more than rated torque: rated torque"
     )
     continuous_torque_Nm: Pair = setting(
-        (0.0, 0.0), unit="Nm", low=0.0, high=1000.0, meaning="current that I²t allows for ever; 0: no I²t"
+        _ZERO, unit="Nm", low=0.0, high=1000.0, meaning="current that I²t allows for ever; 0: no I²t"
     )
     peak_time_s: Pair = setting(
         (1.0, 1.0), unit="s", low=1e-3, high=1e4, meaning="how long I²t allows the peak current from rest"
@@ -327,15 +326,15 @@ class DriveSettings:
         "limit", choices=("limit", "fault"), meaning="down to the continuous current, or 0x2310"
     )
     winding_rise_K: Pair = setting(
-        (0.0, 0.0), unit="K", low=0.0, high=1000.0, meaning="winding over housing at rated torque, for ever; 0: none"
+        _ZERO, unit="K", low=0.0, high=1000.0, meaning="winding over housing at rated torque, for ever; 0: none"
     )
     winding_time_s: Pair = setting((30.0, 30.0), unit="s", low=1e-2, high=1e5, meaning="its time constant")
     housing_rise_K: Pair = setting(
-        (0.0, 0.0), unit="K", low=0.0, high=1000.0, meaning="housing over ambient at rated torque, for ever; 0: none"
+        _ZERO, unit="K", low=0.0, high=1000.0, meaning="housing over ambient at rated torque, for ever; 0: none"
     )
     housing_time_s: Pair = setting((900.0, 900.0), unit="s", low=1e-2, high=1e5, meaning="its time constant")
     ambient_C: Pair = setting((25.0, 25.0), unit="°C", low=-40.0, high=100.0, meaning="temperature around the motor")
-    preheat_K: Pair = setting((0.0, 0.0), unit="K", low=0.0, high=300.0, meaning="housing over ambient at power-on")
+    preheat_K: Pair = setting(_ZERO, unit="K", low=0.0, high=300.0, meaning="housing over ambient at power-on")
     derating_start_C: Pair = setting(
         (110.0, 110.0), unit="°C", low=0.0, high=300.0, meaning="winding from which the torque falls; a fault's reset"
     )
@@ -370,31 +369,29 @@ class SensorSettings:
     """Errors of the torque sensors and the encoders."""
 
     offset_drift_Nm_s: Pair = setting(
-        (0.0, 0.0), unit="Nm/s", low=-10.0, high=10.0, meaning="steady drift of the torque zero since power-on"
+        _ZERO, unit="Nm/s", low=-10.0, high=10.0, meaning="steady drift of the torque zero since power-on"
     )
     offset_walk_Nm_rs: Pair = setting(
-        (0.0, 0.0), unit="Nm/√s", low=0.0, high=10.0, meaning="random walk of the torque zero, rms after one second"
+        _ZERO, unit="Nm/√s", low=0.0, high=10.0, meaning="random walk of the torque zero, rms after one second"
     )
     offset_drift_Nm_K: Pair = setting(
-        (0.0, 0.0), unit="Nm/K", low=-1.0, high=1.0, meaning="drift of the torque zero with the joint's temperature"
+        _ZERO, unit="Nm/K", low=-1.0, high=1.0, meaning="drift of the torque zero with the joint's temperature"
     )
-    gain_error: Pair = setting(
-        (0.0, 0.0), low=-0.9, high=1.0, meaning="relative error of the torque sensor's sensitivity"
-    )
+    gain_error: Pair = setting(_ZERO, low=-0.9, high=1.0, meaning="relative error of the torque sensor's sensitivity")
     gain_drift_1_K: Pair = setting(
-        (0.0, 0.0), unit="1/K", low=-0.01, high=0.01, meaning="its drift with the joint's temperature, from 25 °C"
+        _ZERO, unit="1/K", low=-0.01, high=0.01, meaning="its drift with the joint's temperature, from 25 °C"
     )
     cross_talk: Pair = setting(
-        (0.0, 0.0), low=-0.5, high=0.5, meaning="share of the other joint's torque that this joint's sensor sees"
+        _ZERO, low=-0.5, high=0.5, meaning="share of the other joint's torque that this joint's sensor sees"
     )
     hysteresis_Nm: Pair = setting(
-        (0.0, 0.0), unit="Nm", low=0.0, high=10.0, meaning="between the falling and the rising branch; 0: none"
+        _ZERO, unit="Nm", low=0.0, high=10.0, meaning="between the falling and the rising branch; 0: none"
     )
     hysteresis_reach_Nm: Pair = setting(
         (10.0, 10.0), unit="Nm", low=0.01, high=100.0, meaning="way from one branch to the other after a reversal"
     )
     torque_bandwidth_Hz: Pair = setting(
-        (0.0, 0.0), unit="Hz", low=0.0, high=1e5, meaning="-3 dB of the amplifier's first-order low-pass; 0: none"
+        _ZERO, unit="Hz", low=0.0, high=1e5, meaning="-3 dB of the amplifier's first-order low-pass; 0: none"
     )
     torque_noise_Nm: Pair = setting(
         (TORQUE_NOISE_NM, TORQUE_NOISE_NM), unit="Nm", low=0.0, high=10.0, meaning="white noise of a sample, rms"
@@ -408,33 +405,29 @@ class SensorSettings:
     )
     torque_bits: tuple[int, int] = setting((16, 16), low=4, high=24, meaning="of the converter, over its whole range")
     sample_rate_Hz: Pair = setting(
-        (0.0, 0.0), unit="Hz", low=0.0, high=1e5, meaning="of the torque sensor's own clock; 0: it samples at SYNC"
+        _ZERO, unit="Hz", low=0.0, high=1e5, meaning="of the torque sensor's own clock; 0: it samples at SYNC"
     )
     clock_error_ppm: Pair = setting(
-        (0.0, 0.0), unit="ppm", low=-1e4, high=1e4, meaning="how much the sensor's own clock is fast"
+        _ZERO, unit="ppm", low=-1e4, high=1e4, meaning="how much the sensor's own clock is fast"
     )
     clock_phase: Pair = setting(
-        (0.0, 0.0), low=0.0, high=1.0, meaning="when it first samples after power-on, in sample periods"
+        _ZERO, low=0.0, high=1.0, meaning="when it first samples after power-on, in sample periods"
     )
     encoder_bits: tuple[int, int] = setting((20, 20), low=8, high=24, meaning="encoder counts per revolution, log2")
     encoder_noise_counts: Pair = setting(
-        (0.0, 0.0), low=0.0, high=1000.0, meaning="white noise of the angle, rms, in the encoder's own counts"
+        _ZERO, low=0.0, high=1000.0, meaning="white noise of the angle, rms, in the encoder's own counts"
     )
     index_error_rad: Pair = setting(
-        (0.0, 0.0), unit="rad", low=-4.0, high=4.0, meaning="error of the encoder's zero since power-on"
+        _ZERO, unit="rad", low=-4.0, high=4.0, meaning="error of the encoder's zero since power-on"
     )
     eccentricity_rad: Pair = setting(
-        (0.0, 0.0), unit="rad", low=0.0, high=0.1, meaning="amplitude of the error once per revolution"
+        _ZERO, unit="rad", low=0.0, high=0.1, meaning="amplitude of the error once per revolution"
     )
-    eccentricity_phase_rad: Pair = setting(
-        (0.0, 0.0), unit="rad", low=-7.0, high=7.0, meaning="its phase at the true zero"
-    )
+    eccentricity_phase_rad: Pair = setting(_ZERO, unit="rad", low=-7.0, high=7.0, meaning="its phase at the true zero")
     ellipticity_rad: Pair = setting(
-        (0.0, 0.0), unit="rad", low=0.0, high=0.1, meaning="amplitude of the error twice per revolution"
+        _ZERO, unit="rad", low=0.0, high=0.1, meaning="amplitude of the error twice per revolution"
     )
-    ellipticity_phase_rad: Pair = setting(
-        (0.0, 0.0), unit="rad", low=-7.0, high=7.0, meaning="its phase at the true zero"
-    )
+    ellipticity_phase_rad: Pair = setting(_ZERO, unit="rad", low=-7.0, high=7.0, meaning="its phase at the true zero")
 
     def __post_init__(self) -> None:
         for joint in range(2):

@@ -110,7 +110,7 @@ def _fill_rates(row: int, rates: int, around: Surroundings, slips: Slips, work: 
     ddq1, ddq2, _, _ = accelerate_links(now, around, slips, forces)
     rate["dq"][0], rate["dq"][1] = ddq1, ddq2
     for joint in range(2):
-        motor_slip = slips[2] if joint == 0 else slips[3]
+        motor_slip = slips[2 + joint]
         rate["q"][joint] = now["dq"][joint]
         if mechanics["stiffness_Nm_rad"][joint] == 0.0:
             rate["q_m"][joint] = rate["q"][joint]
@@ -211,16 +211,16 @@ def _margin(around: Surroundings, slips: Slips, work: _StepWork) -> float:
     """
     now, forces, mechanics = work.rows[_END], work.forces, around.mechanics
     margin = np.inf
-    friction1, friction2 = 0.0, 0.0
+    links = (0.0, 0.0, 0.0, 0.0)
     if slips[0] == 0 or slips[1] == 0:
-        _, _, friction1, friction2 = accelerate_links(now, around, slips, forces)
-    if not is_free(0, around.state, mechanics):
-        margin = min(margin, now["dq"][0] * slips[0] if slips[0] != 0 else forces["coulomb_Nm"][0] - abs(friction1))
-    if not is_free(1, around.state, mechanics):
-        margin = min(margin, now["dq"][1] * slips[1] if slips[1] != 0 else forces["coulomb_Nm"][1] - abs(friction2))
+        links = accelerate_links(now, around, slips, forces)
     for joint in range(2):
+        slip = slips[joint]
+        if not is_free(joint, around.state, mechanics):
+            reserve_Nm = forces["coulomb_Nm"][joint] - abs(links[2 + joint])
+            margin = min(margin, now["dq"][joint] * slip if slip != 0 else reserve_Nm)
         if mechanics["stiffness_Nm_rad"][joint] != 0.0 and forces["motor_level_Nm"][joint] != 0.0:
-            slip = slips[2] if joint == 0 else slips[3]
+            slip = slips[2 + joint]
             if slip != 0:
                 margin = min(margin, now["dq_m"][joint] * slip)
             else:
@@ -239,16 +239,13 @@ def _take_end(around: Surroundings, slips: Slips, work: _StepWork) -> None:
         work.touch[_START, index] = work.touch[_END, index]
     start, mechanics = work.rows[_START], around.mechanics
     for joint in range(2):
-        slip = slips[0] if joint == 0 else slips[1]
-        if not is_free(joint, around.state, mechanics) and not start["dq"][joint] * slip > 0.0:
+        if not is_free(joint, around.state, mechanics) and not start["dq"][joint] * slips[joint] > 0.0:
             start["dq"][joint] = 0.0
         if mechanics["stiffness_Nm_rad"][joint] == 0.0:
             start["q_m"][joint] = start["q"][joint]
             start["dq_m"][joint] = start["dq"][joint]
-        elif work.forces["motor_level_Nm"][joint] != 0.0:
-            motor_slip = slips[2] if joint == 0 else slips[3]
-            if not start["dq_m"][joint] * motor_slip > 0.0:
-                start["dq_m"][joint] = 0.0
+        elif work.forces["motor_level_Nm"][joint] != 0.0 and not start["dq_m"][joint] * slips[2 + joint] > 0.0:
+            start["dq_m"][joint] = 0.0
 
 
 @compiled

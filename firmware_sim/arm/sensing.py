@@ -30,8 +30,6 @@ TORQUE_LSB_NM: Final = 2.0 * TORQUE_RANGE_NM / (1 << 16)
 TORQUE_COUNTS: Final = (-(1 << 15), (1 << 15) - 1)
 """Ends of the converter's range; a value at either end is saturated."""
 
-_LOWEST_COUNT: Final = TORQUE_COUNTS[0]
-_HIGHEST_COUNT: Final = TORQUE_COUNTS[1]
 # Samples drawn at once: large enough for a negligible cost per sample, small enough to draw within 10 µs.
 _SAMPLES_AT_ONCE: Final = 256
 
@@ -55,7 +53,7 @@ def to_counts(value: float, lsb: float) -> int:
 @compiled
 def torque_counts(torque_Nm: float, count_Nm: float = TORQUE_LSB_NM) -> int:
     """Return a torque in counts of `count_Nm`, rounded to the nearest, limited to TORQUE_COUNTS."""
-    return min(max(to_counts(torque_Nm, count_Nm), _LOWEST_COUNT), _HIGHEST_COUNT)
+    return min(max(to_counts(torque_Nm, count_Nm), TORQUE_COUNTS[0]), TORQUE_COUNTS[1])
 
 
 @compiled

@@ -68,24 +68,15 @@ THING_STATE: Final = float_fields(
         "presence": (),  # one of the three below
         "shift_m": (),  # body: s
         "shift_rate_m_s": (),  # body: ṡ
-        "free_x": (),  # body: u; wall: normal
+        "free_x": (),  # body: u; wall: normal; hand: direction of its way, 0, 0 without one
         "free_y": (),
         "side": (),  # body: +1 on the side of +q of its link, else −1
-    }
-)
-"""A body's or a wall's part of the touch state."""
-
-HAND_STATE: Final = float_fields(
-    {
-        "presence": (),  # one of the three below
-        "start_x_m": (),  # where it grasped, m
+        "start_x_m": (),  # hand: where it grasped, m
         "start_y_m": (),
-        "path_x": (),  # direction of its way; 0, 0 without one
-        "path_y": (),
-        "path_length_m": (),  # inf for no end
+        "path_length_m": (),  # hand: of its way, inf for no end
     }
 )
-"""A hand's part, of the same size."""
+"""A thing's part of the touch state."""
 THING_PLACES: Final = THING_STATE.itemsize // 8
 
 Pose = tuple[float, float, float, float]
@@ -110,20 +101,12 @@ TOUCH_TRUTH: Final = float_fields(
 
 @compiled
 def _own(state: Vector, row: int) -> np.void:
-    """Return the values of a body or wall in the touch state, or in its rates, as a writable view.
+    """Return the values of a thing in the touch state, or in its rates, as a writable view.
 
     row: its row in the touch table.
     """
     place = TOUCH_HEADER + row * THING_PLACES
     part: np.void = state[place : place + THING_PLACES].view(THING_STATE)[0]
-    return part
-
-
-@compiled
-def _hand(state: Vector, row: int) -> np.void:
-    """Return a hand's values in the touch state as a writable view; row: its row in the touch table."""
-    place = TOUCH_HEADER + row * THING_PLACES
-    part: np.void = state[place : place + THING_PLACES].view(HAND_STATE)[0]
     return part
 
 
@@ -238,11 +221,11 @@ def _hand_force(thing: np.void, own: np.void, time_s: float, pose: Pose, dq1: fl
     speed = thing["speed_m_s"]
     if way_m >= own["path_length_m"]:
         way_m, speed = own["path_length_m"], 0.0
-    force_x = thing["stiffness"] * (own["start_x_m"] + way_m * own["path_x"] - x) + thing["damping"] * (
-        speed * own["path_x"] - dx
+    force_x = thing["stiffness"] * (own["start_x_m"] + way_m * own["free_x"] - x) + thing["damping"] * (
+        speed * own["free_x"] - dx
     )
-    force_y = thing["stiffness"] * (own["start_y_m"] + way_m * own["path_y"] - y) + thing["damping"] * (
-        speed * own["path_y"] - dy
+    force_y = thing["stiffness"] * (own["start_y_m"] + way_m * own["free_y"] - y) + thing["damping"] * (
+        speed * own["free_y"] - dy
     )
     size = math.sqrt(force_x * force_x + force_y * force_y)
     if size > thing["force_limit_N"]:
@@ -304,7 +287,7 @@ def touch(
             rates["shift_m"] = _recede_rate(thing, own)
             rates["shift_rate_m_s"] = -(force_x * own["free_x"] + force_y * own["free_y"]) / thing["mass_kg"]
         elif thing["kind"] == HAND:
-            force_x, force_y = _hand_force(thing, _hand(state, row), time_s, pose, dq1, dq2)
+            force_x, force_y = _hand_force(thing, own, time_s, pose, dq1, dq2)
             gain1, gain2 = _joint_torque(thing["link"], thing["point_m"], force_x, force_y, length1_m, pose)
         else:
             force_x, force_y, point_m, _ = _wall_force(thing, own, 1.0, pose, dq1, dq2)
@@ -319,25 +302,25 @@ def touch(
 
 
 @compiled
-def _appear(thing: np.void, own: np.void, hand: np.void, pose: Pose) -> None:
+def _appear(thing: np.void, own: np.void, pose: Pose) -> None:
     """Set a body, hand or wall as present, a body or wall only if the arm isn't in its place.
 
     Store where a hand grasps and the way that it guides, a body's side and given free direction, or a wall's normal,
-    in its part of the touch state. own, hand: two views of that part.
+    in its part of the touch state, `own`.
     """
     if thing["kind"] == HAND:
-        hand["start_x_m"], hand["start_y_m"], _, _ = _moved_point(
+        own["start_x_m"], own["start_y_m"], _, _ = _moved_point(
             thing["link"], thing["point_m"], thing["length1_m"], pose, 0.0, 0.0
         )
-        hand["path_x"], hand["path_y"], hand["path_length_m"] = 0.0, 0.0, np.inf
+        own["free_x"], own["free_y"], own["path_length_m"] = 0.0, 0.0, np.inf
         if not math.isnan(thing["angle_rad"]):
-            hand["path_x"], hand["path_y"] = math.cos(thing["angle_rad"]), math.sin(thing["angle_rad"])
+            own["free_x"], own["free_y"] = math.cos(thing["angle_rad"]), math.sin(thing["angle_rad"])
         elif not math.isnan(thing["x_m"]):
-            way_x, way_y = thing["x_m"] - hand["start_x_m"], thing["y_m"] - hand["start_y_m"]
-            hand["path_length_m"] = math.sqrt(way_x * way_x + way_y * way_y)
-            if hand["path_length_m"] > 0.0:
-                hand["path_x"], hand["path_y"] = way_x / hand["path_length_m"], way_y / hand["path_length_m"]
-        hand["presence"] = _PRESENT
+            way_x, way_y = thing["x_m"] - own["start_x_m"], thing["y_m"] - own["start_y_m"]
+            own["path_length_m"] = math.sqrt(way_x * way_x + way_y * way_y)
+            if own["path_length_m"] > 0.0:
+                own["free_x"], own["free_y"] = way_x / own["path_length_m"], way_y / own["path_length_m"]
+        own["presence"] = _PRESENT
     elif thing["kind"] == WALL:
         own["free_x"], own["free_y"] = math.cos(thing["angle_rad"]), math.sin(thing["angle_rad"])
         _, _, _, depth1_m = _wall_force(thing, own, 1.0, pose, 0.0, 0.0)
@@ -392,7 +375,7 @@ def change_touch(things: Structured, time_s: float, q1: float, q2: float, state:
             own["presence"] = _GONE
             continue
         if own["presence"] == _WAITING and time_s > thing["onset_s"] - _HALF_TICK_S:
-            _appear(thing, own, _hand(state, row), pose)
+            _appear(thing, own, pose)
         if own["presence"] != _PRESENT:
             continue
         if thing["kind"] == HAND:
@@ -458,7 +441,7 @@ def describe_touch(
             elif thing["kind"] == BODY:
                 force_x, force_y, point_m, depth_m = _body_force(thing, own, pose, dq1, dq2)
             else:
-                force_x, force_y = _hand_force(thing, _hand(state, row), time_s, pose, dq1, dq2)
+                force_x, force_y = _hand_force(thing, own, time_s, pose, dq1, dq2)
             if depth_m <= 0.0:
                 continue
             gain1, gain2 = _joint_torque(link, point_m, force_x, force_y, length1_m, pose)

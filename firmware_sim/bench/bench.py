@@ -22,12 +22,12 @@ from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import HOST_MARK
 from firmware_sim.bench.bench_nodes import BenchNodes
 from firmware_sim.bench.bench_time import BenchTime, OnTruth, TruthFeed
-from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS
+from firmware_sim.bench.fault_rows import EVERYBODY
 from firmware_sim.bench.injector import Handler, Injector, OnEvent, Outbox
-from firmware_sim.body.body import Body, MovableArm
+from firmware_sim.body.body import Body
 from firmware_sim.canopen.error_control import SyncKind, SyncOrder
 from firmware_sim.canopen.object_dictionary import EmulatedContract, contract_of
-from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE
+from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE, MovableArm
 from firmware_sim.scenario.scenario import Scenario
 
 ClockMode = Literal["sync", "wall"]
@@ -44,7 +44,6 @@ class Bench:
         send: Callable[[int, bytes], None],
         *,
         clock_mode: ClockMode = "sync",
-        seed: int | None = None,
         on_truth: OnTruth | None = None,
         contract: EmulatedContract | None = None,
         on_event: OnEvent | None = None,
@@ -55,7 +54,7 @@ class Bench:
 
         send: called with (identifier, data). clock_mode: the arm's time goes by SYNC ("sync"), or by the clock of
         `advance_to` and frames ("wall"). on_answer: called after each SYNC that devices answer, when all frames are
-        sent. seed: outweighs the scenario's. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
+        sent. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
         TRUTH_LAYOUT), the block being valid until the next call. contract: which EDS files the devices have; default:
         those that go with the codec's DBC. on_event: called with t_ns, level, name and text when a fault begins or
         ends. arm: None: a body of the scenario's.
@@ -73,10 +72,9 @@ class Bench:
         self._lost_syncs = 0  # before the last one
         self.is_scenario_started = False
         """Whether both drives have been in Operation enabled at once."""
-        scenario_seed = scenario.seed if seed is None else seed
-        self.injector = Injector(scenario, scenario_seed, PLANNED_PERIOD_NS, codec, self._outbox, on_event)
+        self.injector = Injector(scenario, codec, self._outbox, on_event)
         self._plan = self.injector.plan
-        self._body = arm or Body(scenario, seed=scenario_seed)
+        self._body = arm or Body(scenario)
         self.rows = TruthFeed(self._fill_truth, on_truth)
         self._nodes = BenchNodes(scenario, codec, self.contract, self.injector, self._body, self._is_wall)
         self.devices, self.drives, self.sensors = self._nodes.devices, self._nodes.drives, self._nodes.sensors
@@ -168,7 +166,7 @@ class Bench:
                 time.advance_faults(t_ns, self._time_to_sync_ns(data))
             if self._plan.is_quiet:
                 self._on_sync(data, t_ns)
-            elif not self.injector.receive_by_all(can_id, data, self._on_sync, t_ns) and not self._is_wall:
+            elif not self.injector.receive(EVERYBODY, can_id, data, self._on_sync, t_ns) and not self._is_wall:
                 self._miss_sync(data, t_ns)
         elif can_id in self._nodes.commands:
             for place, take in self._nodes.commands[can_id]:
@@ -203,7 +201,7 @@ class Bench:
             for device in self.devices:
                 device.on_heartbeat(self._host_id, t_ns)
 
-        self.injector.receive_by_all(0x700 + self._host_id, data, take, t_ns)
+        self.injector.receive(EVERYBODY, 0x700 + self._host_id, data, take, t_ns)
 
     def _sdo_handler(self, can_id: int) -> Handler:
         """Return a handler that passes SDO requests with this identifier to every device that receives it."""
@@ -257,8 +255,8 @@ class Bench:
 
         takers: 1 for each device that takes SYNCs of this length, else 0.
         """
-        listeners, is_quiet = self._nodes.listeners, self.injector.is_quiet
-        heard = listeners.everybody if is_quiet else self.injector.count_heard(self._sync_id, data)
+        listeners = self._nodes.listeners
+        heard = listeners.everybody if self._plan.is_quiet else self.injector.count_heard(self._sync_id, data)
         listeners.ignore(heard, takers, self._order.kind, self.time.now_ns)
         self.time.poll(self.time.now_ns)
 

@@ -5,17 +5,15 @@ from collections.abc import Callable, Sequence
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
-from firmware_sim.arm.arms import STRAIGHT, EmulatedArm
+from firmware_sim.arm.arms import STRAIGHT
 from firmware_sim.arm.hardware_settings import HabitSettings
-from firmware_sim.arm.sensing import ENCODER_COUNTS, Measurement
+from firmware_sim.arm.sensing import Measurement
 from firmware_sim.arm.touch_settings import TICK_S
 from firmware_sim.bench.injector import Handler, Injector
-from firmware_sim.body.body import MovableArm
 from firmware_sim.body.sensors import converter_ends, count_Nm
 from firmware_sim.canopen.object_dictionary import Abort, EmulatedContract, longest_pdo, refuse
-from firmware_sim.nodes.device import EmulatedDevice, SyncListeners
+from firmware_sim.nodes.device import EmulatedDevice, MovableArm, SyncListeners
 from firmware_sim.nodes.drive_node import DriveNode
-from firmware_sim.nodes.drive_profile import DriveScale, Motor
 from firmware_sim.nodes.sensor_node import SensorNode
 from firmware_sim.scenario.faults import device_ids, own_messages
 from firmware_sim.scenario.scenario import Scenario
@@ -51,8 +49,8 @@ class BenchNodes:
         """Whether all cyclic frames of the contract, and no others, answer SYNC."""
         self.answers = answers_to_sync(codec)
         self._arm = arm
-        self.wiring = wiring = scenario.wiring
-        self.is_crossed = wiring != STRAIGHT
+        self.wiring = scenario.arm.wiring
+        self.is_crossed = self.wiring != STRAIGHT
         """Whether some device isn't at its own joint or counts the other way."""
         described = [contract.describe_device(place) for place in range(len(_NODES))]
         right_ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
@@ -68,16 +66,14 @@ class BenchNodes:
             )
             for i in range(len(_NODES))
         )
-        rated_Nm = scenario.arm.rated_torque_Nm
         self.drives = tuple(
             DriveNode(
                 self.devices[i],
                 codec,
-                i + 1,
-                self._motor(i),
-                rated_Nm[wiring.drive_joint[i]],
+                i,
+                arm,
+                scenario.arm,
                 is_free_running,
-                _scale_of(scenario.own_arm, i),
                 scenario.habits[i] if scenario.habits else HabitSettings(),
             )
             for i in range(JOINTS)
@@ -146,17 +142,6 @@ class BenchNodes:
         measured = self._arm.sample()
         return self.wiring.read(measured) if self.is_crossed else measured
 
-    def _motor(self, place: int) -> Motor:
-        wiring = self.wiring
-        joint, sign, torque_sign = wiring.drive_joint[place], wiring.drive_sign[place], wiring.torque_sign[place]
-        return Motor(
-            velocity_rad_s=lambda: sign * self._arm.drive_velocity_rad_s[joint],
-            torque_Nm=lambda: torque_sign * self._arm.motor_torque_Nm[joint],
-            is_limited=lambda: self._arm.is_torque_limited[joint],
-            error_code=lambda: self._arm.motor_error_code[joint],
-            is_ideal=self._arm.has_ideal_motors,
-        )
-
     def _make_sensor(self, place: int, codec: Codec, scenario: Scenario) -> SensorNode:
         joint = self.wiring.sensor_joint[place]
         low, high = converter_ends(scenario.sensors, joint)
@@ -174,13 +159,6 @@ class BenchNodes:
         self.told_period_ns = period_us * 1000
         if period_us:  # 0 is written to change 0x1019; the time of a SYNC stays
             self.period_ns = self.told_period_ns
-
-
-def _scale_of(own: EmulatedArm | None, place: int) -> DriveScale:
-    if own is None:
-        return DriveScale()
-    increments = own.increments_per_joint_rev[place] or ENCODER_COUNTS
-    return DriveScale(increments / ENCODER_COUNTS, own.velocity_factor[place], own.rated_count_Nm[place])
 
 
 def _scaled(read: Callable[[], int], ratio: float, low: int, high: int) -> Callable[[], int]:

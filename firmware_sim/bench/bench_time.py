@@ -31,7 +31,7 @@ from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.time_marks import NEVER_NS, MarkKind, unpack_mark
 from firmware_sim.bench.bench_nodes import TICK_NS, BenchNodes
 from firmware_sim.bench.injector import Injector, Outbox
-from firmware_sim.body.body import MovableArm
+from firmware_sim.nodes.device import MovableArm
 from firmware_sim.nodes.drive_profile import REST_RAD_S
 from firmware_sim.scenario.scenario import Scenario
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from enum import Enum
 from typing import NamedTuple
 
+from adacd_hil.records import Event
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import TORQUE_LSB_NM
@@ -20,12 +21,10 @@ from firmware_sim.bench.fault_rows import (
     Sent,
     distort_value,
     find_frames,
-    name_streams,
+    stream_seeds,
 )
 from firmware_sim.scenario.faults import NODES, FaultSettings
 
-PLANNED_PERIOD_NS = 1_000_000
-"""How long a fault without length, such as a reboot, is active."""
 _BEFORE_NS = -1  # scenario time before the drives are enabled
 _NOT_VALID = 0x01  # of 0x6150
 _FRAME_KINDS = ("lose", "duplicate", "delay", "reorder", "corrupt", "freeze_counter")
@@ -34,14 +33,6 @@ _NODES_OWN = ("wrong_node_id", "duplicate_node_id", "drive_fault", "sensor_error
 """Kinds whose effect the node keeps by itself, from power-on or since a `NodeAction`."""
 
 Pair = tuple[int, int]
-
-
-class FaultEdge(NamedTuple):
-    """A fault of the scenario that begins or ends now. row: its index in the scenario; text: for a log."""
-
-    row: int
-    begins: bool
-    text: str
 
 
 class ActionKind(Enum):
@@ -79,11 +70,10 @@ class FaultPlan:
         self,
         rows: Sequence[FaultSettings],
         seed: int,
-        period_ns: int,
         codec: Codec,
         torque_count_Nm: tuple[float, float] = (TORQUE_LSB_NM, TORQUE_LSB_NM),
     ) -> None:
-        """Begin before power-on. `period_ns`: SYNC's. `torque_count_Nm`: torque of one count of each sensor.
+        """Begin before power-on. `torque_count_Nm`: torque of one count of each sensor.
 
         Raises ConfigError for a fault on a frame that the contract hasn't.
         """
@@ -92,15 +82,13 @@ class FaultPlan:
         """Bit i: row i is active."""
         self.is_quiet = True
         """Whether no fault acts on frames or values and no action is left; then a call of `advance` is enough."""
-        self._period_ns = period_ns
         self._rows = tuple(
-            FaultRow(index, row, seed_text, period_ns)
-            for index, (row, seed_text) in enumerate(name_streams(rows, seed))
+            FaultRow(index, row, seed_text)
+            for index, (row, seed_text) in enumerate(zip(rows, stream_seeds(rows, seed), strict=True))
         )
         self._places = tuple(find_frames(codec, index, row) for index, row in enumerate(rows))
         self._messages = codec.by_id
         self._scenario_ns, self._power_ns = _BEFORE_NS, _BEFORE_NS
-        self._next_scenario_ns = self._next_power_ns = NEVER_NS
         self._sending: dict[Place, tuple[FaultRow, ...]] = {}
         self._receiving: dict[Place, tuple[FaultRow, ...]] = {}
         self._silent: frozenset[int] = frozenset()
@@ -113,7 +101,6 @@ class FaultPlan:
         self._bits: dict[int, int] = {}
         self._drifts: dict[int, float] = {}
         self._replaced: dict[tuple[int, tuple[int, int]], int] = {}
-        self._plan_next()
 
     @property
     def wait_ns(self) -> int:
@@ -121,14 +108,12 @@ class FaultPlan:
 
         NEVER_NS if none will.
         """
-        wait_ns = NEVER_NS
-        for now_ns, next_ns in (
-            (self._scenario_ns, self._next_scenario_ns),
-            (self._power_ns, self._next_power_ns),
-        ):
-            if now_ns >= 0 and next_ns < NEVER_NS:
-                wait_ns = min(wait_ns, max(0, next_ns - now_ns))
-        return wait_ns
+        waits_ns = (
+            max(0, row.due_ns - now_ns)
+            for row in self._rows
+            if (now_ns := self._now_ns(row)) >= 0 and row.due_ns < NEVER_NS
+        )
+        return min(waits_ns, default=NEVER_NS)
 
     @property
     def is_acknowledged(self) -> bool:
@@ -140,24 +125,22 @@ class FaultPlan:
         """Whether a fault of kind `babble` is active."""
         return bool(self._babbling)
 
-    def advance(self, scenario_ns: int, since_power_on_ns: int = _BEFORE_NS) -> list[FaultEdge]:
+    def advance(self, scenario_ns: int, since_power_on_ns: int = _BEFORE_NS) -> list[Event]:
         """Set the time, begin and end the faults that are due, queue their actions.
 
-        Return the beginnings and ends, fault by fault in the order of the plan; empty if none is due.
+        Return an event for each beginning and end, fault by fault in the order of the plan; empty if none is due.
 
         scenario_ns: since both drives were enabled, negative before. since_power_on_ns: negative if no time counts from
         there. Neither may go back; this is not checked.
         """
         self._scenario_ns, self._power_ns = scenario_ns, since_power_on_ns
-        is_due = scenario_ns >= self._next_scenario_ns or since_power_on_ns >= self._next_power_ns
-        if not is_due and self.is_quiet:
+        if self.wait_ns and self.is_quiet:
             return []
-        edges = [edge for row in self._rows for edge in self._move(row)]
-        if edges:
+        events = [event for row in self._rows for event in self._move(row)]
+        if events:
             self._take_over()
-        self._plan_next()
         self._find_quiet()
-        return edges
+        return events
 
     def actions(self) -> list[NodeAction]:
         """Return and remove the actions on nodes that are due now, in the order in which they were queued."""
@@ -235,20 +218,20 @@ class FaultPlan:
     def _now_ns(self, row: FaultRow) -> int:
         return self._power_ns if row.settings.is_from_power_on else self._scenario_ns
 
-    def _move(self, row: FaultRow) -> list[FaultEdge]:
-        """Begin or end a row if it is due, and return these edges. Queue the EMCYs of its storm that are due."""
-        edges: list[FaultEdge] = []
+    def _move(self, row: FaultRow) -> list[Event]:
+        """Begin or end a row if it is due, and return these events. Queue the EMCYs of its storm that are due."""
+        events: list[Event] = []
         now_ns = self._now_ns(row)
         if not row.is_active and not row.is_over and row.begin_ns <= now_ns:
             row.is_active = True
             self._begin(row)
-            edges.append(FaultEdge(row.index, True, f"begins: {row.settings.text}"))
+            events.append(Event("warning", f"fault {row.index}", f"begins: {row.settings.text}"))
         if row.is_active and row.settings.kind == "emcy_storm":
             self._storm(row)
         if row.is_active and (now_ns >= row.end_ns or row.hits_left <= 0):
             row.is_active, row.is_over = False, True
-            edges.append(FaultEdge(row.index, False, f"ends: {row.settings.text}"))
-        return edges
+            events.append(Event("info", f"fault {row.index}", f"ends: {row.settings.text}"))
+        return events
 
     def _begin(self, row: FaultRow) -> None:
         """Queue both actions of a reboot or drive fault without duration at once: off and on, or failure and repair."""
@@ -380,16 +363,6 @@ class FaultPlan:
             return frames
         row.held[can_id] = frames
         return []
-
-    def _plan_next(self) -> None:
-        """Set the next times at which a row begins, ends or sends, in scenario time and since power-on.
-
-        A time is NEVER_NS if no row will.
-        """
-        by_scenario = [row for row in self._rows if not row.settings.is_from_power_on]
-        by_power = [row for row in self._rows if row.settings.is_from_power_on]
-        self._next_scenario_ns = min((row.due_ns for row in by_scenario), default=NEVER_NS)
-        self._next_power_ns = min((row.due_ns for row in by_power), default=NEVER_NS)
 
     def _find_quiet(self) -> None:
         is_acting = any(row.is_active and row.settings.kind not in _NODES_OWN for row in self._rows)

@@ -13,21 +13,11 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, VELOCITY_LSB_RAD_S
-from firmware_sim.scenario.faults import NODES, FaultSettings
+from firmware_sim.scenario.faults import BROADCAST, HOST, NODES, FaultSettings
 
 EVERYBODY = -1
 """For `receive`: a frame that comes to all devices at once."""
 ANY_FRAME = -1  # in place of an identifier
-_DBC_NAMES = {
-    "feedback": "Feedback",
-    "torque": "Torque",
-    "status": "Status",
-    "command": "Command",
-    "heartbeat": "Heartbeat",
-    "emcy": "Emcy",
-    "sdo_request": "SdoRequest",
-    "sdo_response": "SdoResponse",
-}
 SIGNALS: dict[str, tuple[int, float | None]] = {
     "position": (0, POSITION_LSB_RAD),
     "velocity": (1, VELOCITY_LSB_RAD_S),
@@ -35,6 +25,8 @@ SIGNALS: dict[str, tuple[int, float | None]] = {
 }
 """Place of each signal among the measured values, and its count; a torque's is the sensor's."""
 _INSTANT_KINDS = ("reboot", "drive_fault")
+_INSTANT_NS = 1_000_000
+"""How long a fault without length, such as a reboot, is active."""
 
 Sent = list[tuple[int, bytes]]
 Place = tuple[int, int]
@@ -48,14 +40,14 @@ class FaultRow:
     be overtaken. kept: stuck counts by node, or frozen counters by identifier.
     """
 
-    def __init__(self, index: int, settings: FaultSettings, seed: str, period_ns: int) -> None:
+    def __init__(self, index: int, settings: FaultSettings, seed: str) -> None:
         self.index = index
         self.settings = settings
         self.draws = random.Random(seed)
         self.begin_ns = settings.onset_ns
         duration_ns = settings.duration_ns
         if settings.kind in _INSTANT_KINDS and not duration_ns:
-            duration_ns = period_ns
+            duration_ns = _INSTANT_NS
         self.end_ns = NEVER_NS if duration_ns is None else self.begin_ns + duration_ns
         self.is_active = self.is_over = False
         self.hits_left = NEVER_NS if settings.count is None else settings.count
@@ -168,18 +160,13 @@ FRAME_CHANGES: dict[str, Callable[[FaultRow, MessageCodec | None, Sent], Sent]] 
 }
 
 
-def name_streams(rows: Sequence[FaultSettings], seed: int) -> list[tuple[FaultSettings, str]]:
-    """Return each fault with the seed text of its random numbers.
+def stream_seeds(rows: Sequence[FaultSettings], seed: int) -> list[str]:
+    """Return the seed text of each fault's random numbers.
 
     Faults of the same kind, node, frame and signal get different seeds, by their order.
     """
-    counts: dict[str, int] = {}
-    named = []
-    for row in rows:
-        name = f"{row.kind} {row.node} {row.frame} {row.signal}"
-        counts[name] = counts.get(name, 0) + 1
-        named.append((row, f"{seed} {name} {counts[name]}"))
-    return named
+    names = [f"{row.kind} {row.node} {row.frame} {row.signal}" for row in rows]
+    return [f"{seed} {name} {names[: place + 1].count(name)}" for place, name in enumerate(names)]
 
 
 def find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Place]:
@@ -194,9 +181,8 @@ def find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Place
     if row.frame == "any":
         return frozenset((node, ANY_FRAME) for node in row.nodes)
     try:
-        if row.is_broadcast:
-            return frozenset([(EVERYBODY, codec.message(_broadcast_name(row)).can_id)])
-        found = [(node, _message(codec, row, node)) for node in row.nodes]
+        nodes = (EVERYBODY,) if row.is_broadcast else row.nodes
+        found = [(node, codec.message(_message_name(row, node))) for node in nodes]
     except CodecError as error:
         raise ConfigError(f"faults[{index}]: frame {row.frame!r} is not in {codec.path.name}: {error}") from None
     for _, message in found:
@@ -205,12 +191,8 @@ def find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Place
     return frozenset((node, message.can_id) for node, message in found)
 
 
-def _broadcast_name(row: FaultSettings) -> str:
-    return "HostHeartbeat" if row.frame == "heartbeat" else (row.frame or "").capitalize()
-
-
-def _message(codec: Codec, row: FaultSettings, node: int) -> MessageCodec:
-    frame = row.frame or ""
-    if frame in ("sync", "nmt"):
-        return codec.message(frame.capitalize())
-    return codec.message(f"{NODES[node].capitalize()}{_DBC_NAMES[frame]}")
+def _message_name(row: FaultSettings, node: int) -> str:
+    """Return the DBC's name of a fault's frame: from `sdo_request` of drive 1, for example, `Drive1SdoRequest`."""
+    sender = HOST if row.node == HOST else NODES[node]
+    name = (row.frame or "").title().replace("_", "")
+    return name if row.frame in BROADCAST else f"{sender.capitalize()}{name}"

@@ -10,8 +10,8 @@ no mark.
 """
 
 import heapq
+import itertools
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.schema import ConfigError
@@ -20,21 +20,12 @@ from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import DEVICE_MARK, NEVER_NS, MarkKind, pack_mark
 from firmware_sim.arm.sensing import Measurement
 from firmware_sim.bench.fault_plan import ActionKind, FaultPlan, NodeAction
-from firmware_sim.bench.fault_rows import EVERYBODY
 from firmware_sim.body.sensors import count_Nm
 from firmware_sim.canopen.object_dictionary import Send
 from firmware_sim.nodes.device import EmulatedDevice
 from firmware_sim.nodes.drive_node import DriveNode
 from firmware_sim.nodes.sensor_node import SensorNode
 from firmware_sim.scenario.scenario import Scenario
-
-
-class Held(NamedTuple):
-    """A function to be called at `due_ns`; of several due at one time, the one held first."""
-
-    due_ns: int
-    order: int
-    act: Callable[[], None]
 
 
 class Outbox:
@@ -46,23 +37,21 @@ class Outbox:
         self.is_paced = False
         """Whether a host in lockstep hears marks."""
         self._send = send
-        self._held: list[Held] = []
-        self._order = 0
-        self._now_ns = 0
-        self._is_open = False
+        self._held: list[tuple[int, int, Callable[[], None]]] = []  # due, order of holding, function
+        self._order = itertools.count()
+        self._collected_ns: int | None = None
 
     @property
     def due_ns(self) -> int:
         """Time at which the next held frame or function is due, ns; NEVER_NS without one."""
-        return self._held[0].due_ns if self._held else NEVER_NS
+        return self._held[0][0] if self._held else NEVER_NS
 
     def put(self, can_id: int, data: bytes) -> None:
         """Send a frame at once; between `collect` and `send_released`, hold it until the latter."""
-        if self._is_open:
-            self.put_later(self._now_ns, can_id, data)
+        if self._collected_ns is None:
+            self._put(can_id, data)
         else:
-            self.sent += 1
-            self._send(can_id, data)
+            self.put_later(self._collected_ns, can_id, data)
 
     def _put(self, can_id: int, data: bytes) -> None:
         self.sent += 1
@@ -74,34 +63,35 @@ class Outbox:
 
     def hold(self, due_ns: int, act: Callable[[], None]) -> None:
         """Hold a function until `due_ns`; `release` or `send_released` then calls it."""
-        self._order += 1
-        heapq.heappush(self._held, Held(due_ns, self._order, act))
+        heapq.heappush(self._held, (due_ns, next(self._order), act))
 
     def release(self, now_ns: int) -> None:
         """Send the held frames and call the held functions that are due by `now_ns`, the earliest first."""
-        while self._held and self._held[0].due_ns <= now_ns:
-            heapq.heappop(self._held).act()
+        while self.due_ns <= now_ns:
+            self._release_next()
+
+    def _release_next(self) -> None:
+        _, _, act = heapq.heappop(self._held)
+        act()
 
     def collect(self, now_ns: int) -> None:
         """From now on, hold frames that are `put`, due at `now_ns`, until `send_released` sends them."""
-        self._now_ns = now_ns
-        self._is_open = True
+        self._collected_ns = now_ns
 
     def send_released(self, sync_ns: int, until_ns: int) -> None:
         """End `collect`, send the held frames and call the held functions that are due before `until_ns`.
 
         In lockstep, RELEASE marks give the host their times after `sync_ns`, and an END mark follows the last.
         """
-        self._is_open = False
+        self._collected_ns = None
         if self.is_paced:
             self.mark(MarkKind.RELEASE)
         released_ns = sync_ns
-        while self._held and self._held[0].due_ns < until_ns:
-            held = heapq.heappop(self._held)
-            if self.is_paced and held.due_ns > released_ns:
-                released_ns = held.due_ns
+        while self.due_ns < until_ns:
+            if self.is_paced and self.due_ns > released_ns:
+                released_ns = self.due_ns
                 self.mark(MarkKind.RELEASE, released_ns - sync_ns)
-            held.act()
+            self._release_next()
         if self.is_paced:
             self.mark(MarkKind.END)
 
@@ -136,18 +126,16 @@ OnEvent = Callable[[int, str, str, str], None]
 class Injector:
     """Applies the faults of one bench to frames, measured values and nodes.
 
-    Without faults it costs one look at `is_quiet` per SYNC.
+    Without faults it costs one look at the plan's `is_quiet` per SYNC.
     """
 
-    def __init__(
-        self, scenario: Scenario, seed: int, period_ns: int, codec: Codec, outbox: Outbox, on_event: OnEvent | None
-    ) -> None:
+    def __init__(self, scenario: Scenario, codec: Codec, outbox: Outbox, on_event: OnEvent | None) -> None:
         """Begin before power-on. Raises ConfigError for a fault on a frame that the contract hasn't.
 
-        period_ns: SYNC's. on_event: called with t_ns, level, name and text when a fault begins or ends; None: it isn't.
+        on_event: called with t_ns, level, name and text when a fault begins or ends; None: it isn't.
         """
-        first, second = (count_Nm(scenario.sensors, joint) for joint in scenario.wiring.sensor_joint)
-        self.plan = FaultPlan(scenario.faults, seed, period_ns, codec, (first, second))
+        first, second = (count_Nm(scenario.sensors, joint) for joint in scenario.arm.wiring.sensor_joint)
+        self.plan = FaultPlan(scenario.faults, scenario.seed, codec, (first, second))
         self._rows = scenario.faults
         self.has_faults = bool(scenario.faults)
         self.now_ns = 0
@@ -182,11 +170,6 @@ class Injector:
     def start(self, t_ns: int) -> None:
         """Set `t_ns` as scenario time 0, from which most faults count."""
         self._started_ns = t_ns
-
-    @property
-    def is_quiet(self) -> bool:
-        """Whether no fault acts on frames or values, and no action on a node is queued."""
-        return self.plan.is_quiet
 
     @property
     def due_ns(self) -> int:
@@ -226,13 +209,6 @@ class Injector:
                 self._outbox.hold(due_ns, lambda received=received, due_ns=due_ns: take(received, due_ns))  # type: ignore[misc]
         return bool(frames)
 
-    def receive_by_all(self, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
-        """Call `take` with a host's frame to all nodes, as faults change, repeat or delay it.
-
-        Return False if it is lost.
-        """
-        return self.receive(EVERYBODY, can_id, data, take, t_ns)
-
     def advance(self, now_ns: int, stamp_ns: int) -> None:
         """Begin and end the faults that are due by `now_ns`: report events stamped `stamp_ns`, and act on nodes.
 
@@ -240,9 +216,9 @@ class Injector:
         """
         self.now_ns = now_ns
         scenario_ns = -1 if self._started_ns is None else now_ns - self._started_ns
-        for edge in self.plan.advance(scenario_ns, now_ns - self._power_on_ns):
+        for event in self.plan.advance(scenario_ns, now_ns - self._power_on_ns):
             if self.on_event is not None:
-                self.on_event(stamp_ns, "warning" if edge.begins else "info", f"fault {edge.row}", edge.text)
+                self.on_event(stamp_ns, *event)
         for action in self.plan.actions():
             self._do(action, now_ns)
         if self._is_acknowledged != self.plan.is_acknowledged:

@@ -10,7 +10,7 @@ SYNC by the SYNC counter, as the bench counts them; SYNCs that were lost leave a
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -22,24 +22,18 @@ from adacd_hil.wire.time_marks import ANSWERS, answers_to_sync
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_LSB_NM, VELOCITY_LSB_RAD_S, DriveMode, Measurement
 from firmware_sim.bench.bench import Bench, ClockMode
 from firmware_sim.canopen.object_dictionary import EmulatedContract
+from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE
 from firmware_sim.nodes.sensor_node import ROOM_TEMPERATURE_C
 from firmware_sim.scenario.scenario import Scenario
 
-RESETS: Final = (129, 130)
-"""NMT commands that begin an attempt: reset node, reset communication."""
+RESETS: Final = (bytes([RESET_NODE]), bytes([RESET_COMMUNICATION]))
+"""First bytes of the NMT commands that begin an attempt."""
 Answer = tuple[int, bytes]
 """Identifier and data."""
 
 
-class RecordedCycle(NamedTuple):
-    """The recorded answers to one SYNC.
-
-    attempt counts NMT resets, cycle the SYNCs since the attempt's first; both from 0.
-    """
-
-    attempt: int
-    cycle: int
-    answers: tuple[Answer, ...]
+RecordedCycle = tuple[tuple[int, int], tuple[Answer, ...]]
+"""Attempt and cycle of one SYNC, and its recorded answers; cycles count the SYNCs of the attempt, both from 0."""
 
 
 class RecordedCycles:
@@ -74,11 +68,11 @@ class RecordedCycles:
         Earlier cycles are skipped for good. Raises LogError if the recording can't be read on.
         """
         wanted = (self.attempt, cycle)
-        while self._next is not None and (self._next.attempt, self._next.cycle) < wanted:
+        while self._next is not None and self._next[0] < wanted:
             self._next = self._fetch()
-        if self._next is None or (self._next.attempt, self._next.cycle) != wanted:
+        if self._next is None or self._next[0] != wanted:
             return ()
-        answers = self._next.answers
+        _, answers = self._next
         self._next = self._fetch()
         self.answered += bool(answers)
         return answers
@@ -94,12 +88,12 @@ class RecordedCycles:
         is_reset = True
         for can_id, data in self._frames():
             if can_id == self._nmt_id:
-                is_reset = is_reset or data[:1] in (bytes([command]) for command in RESETS)
+                is_reset = is_reset or data[:1] in RESETS
             elif can_id != self._sync_id:
                 answers.append((can_id, data))
             else:
                 if attempt >= 0:
-                    yield RecordedCycle(attempt, cycle, tuple(answers))
+                    yield (attempt, cycle), tuple(answers)
                 answers = []
                 now = data[0] if data else 0
                 if is_reset:
@@ -108,7 +102,7 @@ class RecordedCycles:
                     cycle += (now - counter) % SYNC_OVERFLOW if now and counter else 1
                 counter = now
         if attempt >= 0:
-            yield RecordedCycle(attempt, cycle, tuple(answers))
+            yield (attempt, cycle), tuple(answers)
 
     def _frames(self) -> Iterator[Answer]:
         """Yield identifier and data of SYNC, NMT and the answers, in the order of the bus.
@@ -125,7 +119,6 @@ class RecordedCycles:
                 yield can_id, data[:length].tobytes()
 
 
-_FEEDBACKS, _TORQUES = ANSWERS[:JOINTS], ANSWERS[JOINTS:]
 _TORQUE = DriveMode.TORQUE
 
 
@@ -140,15 +133,15 @@ class RecordedBody:
     def __init__(self, codec: Codec) -> None:
         self.motor_torque_Nm = (0.0, 0.0)
         """Torque of motors that follow at once."""
-        self._feedbacks = {codec.message(name).can_id: (place, name) for place, name in enumerate(_FEEDBACKS)}
-        self._torques = {codec.message(name).can_id: (place, name) for place, name in enumerate(_TORQUES)}
-        self._codec = codec
-        self._q_rad, self._dq_rad_s, self._torque_Nm = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
+        messages = [codec.message(name) for name in ANSWERS]
+        self._sources = {message.can_id: (place % JOINTS, message) for place, message in enumerate(messages)}
+        self._values = {name: [0.0, 0.0] for name in ("position", "velocity", "torque")}
 
     @property
     def drive_velocity_rad_s(self) -> tuple[float, float]:
         """Velocity in the latest recorded feedback of each drive, rad/s; 0 before the first."""
-        return self._dq_rad_s[0], self._dq_rad_s[1]
+        first, second = self._values["velocity"]
+        return first, second
 
     def show(self, answers: Sequence[Answer]) -> None:
         """Store position, velocity and torque from recorded answers (identifier, data).
@@ -156,16 +149,11 @@ class RecordedBody:
         Answers of wrong length are skipped.
         """
         for can_id, data in answers:
-            for table in (self._feedbacks, self._torques):
-                if can_id in table:
-                    place, name = table[can_id]
-                    message = self._codec.message(name)
-                    if len(data) != message.length:
-                        continue
-                    values = dict(zip((s.name for s in message.signals), message.decode(data), strict=True))
-                    self._q_rad[place] = values.get("position", self._q_rad[place])
-                    self._dq_rad_s[place] = values.get("velocity", self._dq_rad_s[place])
-                    self._torque_Nm[place] = values.get("torque", self._torque_Nm[place])
+            place, message = self._sources[can_id]
+            if len(data) == message.length:
+                for signal, value in zip(message.signals, message.decode(data), strict=True):
+                    if signal.name in self._values:
+                        self._values[signal.name][place] = value
 
     def start_scenario(self) -> None:
         """Ignore the start: the recording already has all faults and contacts."""
@@ -186,9 +174,9 @@ class RecordedBody:
     def sample(self) -> Measurement:
         """Return the latest recorded values in the default counts of position, velocity and torque."""
         return Measurement(
-            _counts(self._q_rad, POSITION_LSB_RAD),
-            _counts(self._dq_rad_s, VELOCITY_LSB_RAD_S),
-            _counts(self._torque_Nm, TORQUE_LSB_NM),
+            _counts(self._values["position"], POSITION_LSB_RAD),
+            _counts(self._values["velocity"], VELOCITY_LSB_RAD_S),
+            _counts(self._values["torque"], TORQUE_LSB_NM),
         )
 
     def truth(self, out: Vector) -> None:
@@ -228,7 +216,7 @@ class RecordedBench(Bench):
 
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
         super()._on_nmt(data, t_ns)
-        self._is_reset = self._is_reset or data[:1] in (bytes([command]) for command in RESETS)
+        self._is_reset = self._is_reset or data[:1] in RESETS
 
     def _answer(self, data: bytes, t_ns: int, late_ns: int) -> None:
         if self._cycles is not None:

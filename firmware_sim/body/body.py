@@ -8,7 +8,7 @@ hands and walls are a table for compiled code, with the rates at which they make
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,50 +80,52 @@ def _largest_mobility(arm: EmulatedArm, link: int, points_m: Vector) -> float:
     return float(largest.max())
 
 
-def _row(kind: int, arm: EmulatedArm, thing: BodySettings | HandSettings | WallSettings) -> np.void:
-    """Return a row of THING for a body, hand or wall with kind, times and link lengths; the other fields are NaN."""
+def _row(
+    kind: int,
+    arm: EmulatedArm,
+    thing: BodySettings | HandSettings | WallSettings,
+    angle_deg: float | None,
+    stiffness: float,
+    damping: float,
+    mobility: float,
+) -> np.void:
+    """Return a row of THING for a body, hand or wall, with its equally named settings; fields that it lacks are NaN.
+
+    mobility: the largest 1/mass, 1/kg, that spring and damper meet.
+    """
     row: np.void = np.full(THING.itemsize // 8, np.nan).view(THING)[0]
+    for name in THING.names or ():
+        if getattr(thing, name, None) is not None:
+            row[name] = getattr(thing, name)
     row["kind"] = kind
     row["onset_s"] = ticks(thing.at_s) * TICK_S
     row["end_s"] = math.inf if thing.duration_s is None else (ticks(thing.at_s) + ticks(thing.duration_s)) * TICK_S
     row["length1_m"], row["length2_m"] = arm.link_length_m
+    row["angle_rad"] = math.nan if angle_deg is None else math.radians(angle_deg)
+    row["stiffness"], row["damping"] = stiffness, damping
+    row["stiff_rate_rad_s"], row["damped_rate_1_s"] = math.sqrt(stiffness * mobility), damping * mobility
     return row
 
 
 def _body_row(arm: EmulatedArm, body: BodySettings) -> np.void:
-    row = _row(BODY, arm, body)
-    row["link"], row["x_m"], row["y_m"] = body.link, body.x_m, body.y_m
-    row["stiffness"], row["damping"], row["mass_kg"] = body.stiffness, body.damping_N_s_m, body.mass
-    row["radius_m"], row["room_m"] = body.radius_m, body.room_m
-    row["angle_rad"] = math.nan if body.free_deg is None else math.radians(body.free_deg)
     points_m = np.linspace(0.0, arm.link_length_m[body.link - 1], _POINTS)
     mobility = _largest_mobility(arm, body.link, points_m) + 1.0 / body.mass
-    row["stiff_rate_rad_s"] = math.sqrt(body.stiffness * mobility)
-    row["damped_rate_1_s"] = body.damping_N_s_m * mobility
+    row = _row(BODY, arm, body, body.free_deg, body.stiffness, body.damping_N_s_m, mobility)
+    row["mass_kg"] = body.mass
     return row
 
 
 def _hand_row(arm: EmulatedArm, hand: HandSettings) -> np.void:
-    row = _row(HAND, arm, hand)
-    row["link"], row["point_m"] = hand.link, hand.point_m
-    row["force_limit_N"], row["speed_m_s"] = hand.force_limit_N, hand.speed_m_s
-    row["stiffness"], row["damping"] = hand.stiffness_N_m, hand.damping_N_s_m
+    mobility = _largest_mobility(arm, hand.link, np.array([hand.point_m]))
+    row = _row(HAND, arm, hand, hand.direction_deg, hand.stiffness_N_m, hand.damping_N_s_m, mobility)
     if hand.move_to_m is not None:
         row["x_m"], row["y_m"] = hand.move_to_m
-    if hand.direction_deg is not None:
-        row["angle_rad"] = math.radians(hand.direction_deg)
-    mobility = _largest_mobility(arm, hand.link, np.array([hand.point_m]))
-    row["stiff_rate_rad_s"] = math.sqrt(hand.stiffness_N_m * mobility)
-    row["damped_rate_1_s"] = hand.damping_N_s_m * mobility
     return row
 
 
 def _wall_row(arm: EmulatedArm, wall: WallSettings) -> np.void:
-    row = _row(WALL, arm, wall)
-    row["x_m"], row["y_m"], row["angle_rad"] = wall.x_m, wall.y_m, math.radians(wall.normal_deg)
-    row["stiffness"], row["damping"] = wall.stiffness_N_m, wall.damping_s_m
     mobility = max(_largest_mobility(arm, link, np.array([arm.link_length_m[link - 1]])) for link in (1, 2))
-    row["stiff_rate_rad_s"] = math.sqrt(wall.stiffness_N_m * mobility)
+    row = _row(WALL, arm, wall, wall.normal_deg, wall.stiffness_N_m, wall.damping_s_m, mobility)
     # ∂F/∂δ̇ = K χ δ is largest at the deepest point of a blow with v, about v/√(K/μ).
     row["damped_rate_1_s"] = row["stiff_rate_rad_s"] * wall.damping_s_m * _FASTEST_BLOW_M_S
     return row
@@ -186,42 +188,10 @@ def payload_table(payloads: tuple[PayloadSettings, ...]) -> Structured:
     return np.array(rows, dtype=PAYLOAD_CHANGE)
 
 
-class MovableArm(Protocol):
-    """An arm as its devices use it; the members mean the same as those of `Body`."""
-
-    @property
-    def has_ideal_motors(self) -> bool: ...  # noqa: D102
-
-    @property
-    def is_torque_limited(self) -> tuple[bool, bool]: ...  # noqa: D102
-
-    @property
-    def motor_error_code(self) -> tuple[int, int]: ...  # noqa: D102
-
-    @property
-    def motor_torque_Nm(self) -> tuple[float, float]: ...  # noqa: D102
-
-    @property
-    def joint_temperature_C(self) -> tuple[float, float]: ...  # noqa: D102
-
-    @property
-    def drive_velocity_rad_s(self) -> tuple[float, float]: ...  # noqa: D102
-
-    def start_scenario(self) -> None: ...  # noqa: D102
-
-    def advance(  # noqa: D102
-        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int
-    ) -> None: ...
-
-    def sample(self) -> Measurement: ...  # noqa: D102
-
-    def truth(self, out: Vector) -> None: ...  # noqa: D102
-
-
 class BodyParts(NamedTuple):
-    """Arguments of `body_ticks.advance_body` beside set-points, modes and ticks.
+    """Arguments of `body_ticks.advance_body` before set-points, modes and ticks; the first seven are `fill_truth`'s.
 
-    Its arrays are the body's own, not copies.
+    The arrays are the body's own, not copies.
     """
 
     state: Vector
@@ -230,9 +200,9 @@ class BodyParts(NamedTuple):
     things: Structured
     touch_state: Vector
     payloads: Structured
+    work: Vector
     encoder_noise: NDArray[np.float64]
     substeps: int
-    work: Vector
 
 
 def _pack_numbers(scenario: Scenario) -> Vector:
@@ -250,28 +220,13 @@ def _pack_numbers(scenario: Scenario) -> Vector:
 class Body:
     """One emulated arm, from power-on. After construction it compiles no code and allocates no large array."""
 
-    def __init__(self, scenario: Scenario, seed: int | None = None) -> None:
-        """Put the arm at the scenario's start pose, at rest. `seed` outweighs the scenario's."""
+    def __init__(self, scenario: Scenario) -> None:
+        """Put the arm at the scenario's start pose, at rest."""
         self.scenario = scenario
-        self._contacts = contact_table(scenario.contacts)
-        self._payloads = payload_table(scenario.payloads)
-        self._things = touch_table(scenario)
-        self._touch_state = initial_touch_state(self._things)
-        self._touch_truth = np.zeros(TOUCH_TRUTH.itemsize // 8)
-        touch_rad_s = largest_rate_rad_s(self._things) + fade_rate_rad_s(scenario)
-        self._substeps = scenario.mechanics.substeps(scenario.arm, scenario.payload_bodies, touch_rad_s)
-        self._work = work_space(self._touch_state.size)
-        self._number_vector = _pack_numbers(scenario)
-        self._numbers: np.void = self._number_vector.view(BODY_NUMBERS)[0]
-        motor = self._numbers["motor"]
-        self._gain, self._offset_Nm = motor["gain"].tolist(), motor["torque_offset_Nm"].tolist()
-        self._can_overload = float(motor["can_overload"])
-        self.has_ideal_motors = not motor["has_limits"] and np.array_equal(
-            motor["peak_Nm"], scenario.arm.rated_torque_Nm
-        )
-        """Whether no motor ever has less torque than its drive wants, or calls for a fault."""
-        seed = scenario.seed if seed is None else seed
-        quiet = (0.0, 0.0)
+        things = touch_table(scenario)
+        touch_state = initial_touch_state(things)
+        touch_rad_s = largest_rate_rad_s(things) + fade_rate_rad_s(scenario)
+        seed, quiet = scenario.seed, (0.0, 0.0)
         self._noise = TorqueNoise(seed, scenario.sensors.torque_noise_Nm if scenario.noise else quiet)
         self._walk = TorqueNoise(
             np.random.SeedSequence(seed, spawn_key=_WALK_STREAM), scenario.sensors.offset_walk_Nm_rs
@@ -280,62 +235,62 @@ class Body:
             np.random.SeedSequence(seed, spawn_key=_ENCODER_STREAM),
             scenario.sensors.encoder_noise_counts if scenario.noise else quiet,
         )
+        self.parts = BodyParts(
+            state=np.zeros(BODY_STATE.itemsize // 8),
+            numbers=_pack_numbers(scenario),
+            contacts=contact_table(scenario.contacts),
+            things=things,
+            touch_state=touch_state,
+            payloads=payload_table(scenario.payloads),
+            work=work_space(touch_state.size),
+            encoder_noise=self._encoder_noise.table,
+            substeps=scenario.mechanics.substeps(scenario.arm, scenario.payload_bodies, touch_rad_s),
+        )
+        """Arguments of the compiled functions, also for a caller that plays many cycles at once."""
+        self._touch_truth = np.zeros(TOUCH_TRUTH.itemsize // 8)
         self._counts = np.zeros(6, dtype=np.int64)
-        self._state_vector = np.zeros(BODY_STATE.itemsize // 8)
-        state: np.void = self._state_vector.view(BODY_STATE)[0]
+        numbers: np.void = self.parts.numbers.view(BODY_NUMBERS)[0]
+        motor = numbers["motor"]
+        self._gain: Vector = motor["gain"]
+        self._offset_Nm: Vector = motor["torque_offset_Nm"]
+        self._can_overload = float(motor["can_overload"])
+        self.has_ideal_motors = not motor["has_limits"] and np.array_equal(
+            motor["peak_Nm"], scenario.arm.rated_torque_Nm
+        )
+        """Whether no motor ever has less torque than its drive wants, or calls for a fault."""
+        state: np.void = self.parts.state.view(BODY_STATE)[0]
         self._arm: np.void = state["arm"]
         self._course: np.void = state["course"]
-        self._motors: np.void = state["motor"]
-        self._is_limited: Vector = self._motors["is_limited"]
-        self._is_overheated: Vector = self._motors["is_overheated"]
-        self._is_spent: Vector = self._motors["is_spent"]
+        self._is_limited: Vector = state["motor"]["is_limited"]
+        self._is_overheated: Vector = state["motor"]["is_overheated"]
+        self._is_spent: Vector = state["motor"]["is_spent"]
         self._tau_m: Vector = self._arm["tau_m"]
         self._temperature_C: Vector = self._arm["temperature_C"]
         self._velocity_rad_s: Vector = self._course["velocity_rad_s"]
-        self._put_at_start()
+        self._put_at_start(state, numbers)
         self._compile()
 
-    def _put_at_start(self) -> None:
+    def _put_at_start(self, state: np.void, numbers: np.void) -> None:
         """Set the state at power-on: the start pose at rest, the payload, motors at their preheat, settled sensors."""
-        state: np.void = self._state_vector.view(BODY_STATE)[0]
         for name in ("q", "q_m", "q_encoder"):
             self._arm[name] = self.scenario.start_rad
         state["motor"] = motor_state(self.scenario.drives)
         self._course["start_tick"] = -1.0
         self._arm["temperature_C"] = self.scenario.mechanics.ambient_C
-        fit_payload(self._arm, self._numbers["arm"], self.scenario.payload_kg)
-        encoder_rad = [read_angle(self._numbers["encoder"], i, self._arm["q_encoder"][i], 0.0) for i in range(2)]
+        fit_payload(self._arm, numbers["arm"], self.scenario.payload_kg)
+        encoder_rad = [read_angle(numbers["encoder"], i, self._arm["q_encoder"][i], 0.0) for i in range(2)]
         self._course["encoder_rad"] = self._course["estimate_rad"] = encoder_rad
-        settle_transducer(
-            self._numbers["transducer"], state["transducer"], *self._arm["tau_J"], *self._arm["temperature_C"]
-        )
-
-    @property
-    def parts(self) -> BodyParts:
-        """Arguments of the compiled functions, for a caller that plays many cycles at once.
-
-        They share the body's memory.
-        """
-        return BodyParts(
-            self._state_vector, self._number_vector, self._contacts, self._things, self._touch_state,
-            self._payloads, self._encoder_noise.table, self._substeps, self._work,
-        )  # fmt: skip
+        settle_transducer(numbers["transducer"], state["transducer"], *self._arm["tau_J"], *self._arm["temperature_C"])
 
     compiled_functions = (advance_body, sample_body, fill_truth)
     """The largest that are compiled with the first body."""
 
     def _compile(self) -> None:
         """Call every compiled function once, on a copy of the state, so that none is compiled during a run."""
-        state = self._state_vector.copy()
-        advance_body(
-            state, self._number_vector, self._contacts, self._things, self._touch_state.copy(),
-            self._payloads, self._encoder_noise.table, 0.0, 0.0, 0, 0, 1, self._substeps, self._work,
-        )  # fmt: skip
-        sample_body(state, self._number_vector, np.zeros(2), np.zeros(2), self._counts)
-        fill_truth(
-            state, self._number_vector, self._contacts, self._things, self._touch_state.copy(),
-            self._payloads, self._work, self._touch_truth, np.zeros(TRUTH_LAYOUT.size),
-        )  # fmt: skip
+        parts = self.parts._replace(state=self.parts.state.copy(), touch_state=self.parts.touch_state.copy())
+        advance_body(*parts, 0.0, 0.0, 0, 0, 1)
+        sample_body(parts.state, parts.numbers, np.zeros(2), np.zeros(2), self._counts)
+        fill_truth(*parts[:7], self._touch_truth, np.zeros(TRUTH_LAYOUT.size))
 
     def start_scenario(self) -> None:
         """Set scenario time 0 to now; call it once both drives are enabled. Later calls have no effect."""
@@ -345,9 +300,8 @@ class Body:
     @property
     def motor_torque_Nm(self) -> tuple[float, float]:
         """Torque that the drives believe, by joint, Nm: from their motor currents, with their zero error; 0x6077."""
-        (gain1, gain2), (offset1_Nm, offset2_Nm) = self._gain, self._offset_Nm
-        tau1_Nm, tau2_Nm = self._tau_m.tolist()
-        return tau1_Nm / gain1 - offset1_Nm, tau2_Nm / gain2 - offset2_Nm
+        first_Nm, second_Nm = (self._tau_m / self._gain - self._offset_Nm).tolist()
+        return first_Nm, second_Nm
 
     @property
     def is_torque_limited(self) -> tuple[bool, bool]:
@@ -394,42 +348,18 @@ class Body:
                 count = min(tick_count, NOISE_TICKS)
                 self._encoder_noise.draw(int(self._course["tick"]) + count - 1)
             tick_count -= count
-            advance_body(
-                self._state_vector,
-                self._number_vector,
-                self._contacts,
-                self._things,
-                self._touch_state,
-                self._payloads,
-                self._encoder_noise.table,
-                float(torque_setpoint_Nm[0]),
-                float(torque_setpoint_Nm[1]),
-                int(drive_mode[0]),
-                int(drive_mode[1]),
-                count,
-                self._substeps,
-                self._work,
-            )
+            (first_Nm, second_Nm), (mode1, mode2) = torque_setpoint_Nm, drive_mode
+            advance_body(*self.parts, float(first_Nm), float(second_Nm), int(mode1), int(mode2), count)
 
     def sample(self) -> Measurement:
         """Return the values that the devices measure now, in counts, by joint.
 
         Call it once per SYNC: each call draws new noise, and moves the torque sensors' wandering zeros.
         """
-        sample_body(self._state_vector, self._number_vector, self._noise.draw(), self._walk.draw(), self._counts)
+        sample_body(self.parts.state, self.parts.numbers, self._noise.draw(), self._walk.draw(), self._counts)
         q1, q2, dq1, dq2, tau1, tau2 = self._counts.tolist()
         return Measurement((q1, q2), (dq1, dq2), (tau1, tau2))
 
     def truth(self, out: Vector) -> None:
         """Fill a block laid out by TRUTH_LAYOUT with the present true values. Measurements stay the same."""
-        fill_truth(
-            self._state_vector,
-            self._number_vector,
-            self._contacts,
-            self._things,
-            self._touch_state,
-            self._payloads,
-            self._work,
-            self._touch_truth,
-            out,
-        )
+        fill_truth(*self.parts[:7], self._touch_truth, out)

@@ -73,11 +73,6 @@ PAYLOAD_CHANGE: Final = float_fields(
 )
 _TRUTH: Final = float_fields({field.name: (field.size,) for field in TRUTH_LAYOUT.fields})
 
-_OFF: Final = int(DriveMode.OFF)
-_TORQUE: Final = int(DriveMode.TORQUE)
-_BRAKE: Final = int(DriveMode.BRAKE)
-_BRAKE_SLOWLY: Final = int(DriveMode.BRAKE_SLOWLY)
-_BRAKE_HARD: Final = int(DriveMode.BRAKE_HARD)
 _SLOW_SHARE: Final = 0.5
 _HARD_SHARE: Final = 1.5
 """Of the brake's damping. The shortest time constant, 10 ms / 1.5, is four lags of the drive's velocity: no
@@ -142,14 +137,14 @@ def _torque_target(arm: np.void, joint: int, mode: int, setpoint_Nm: float, velo
     0 while it is off.
     """
     limit_Nm = arm["rated_torque_Nm"][joint]
-    if mode == _TORQUE:
+    if mode == DriveMode.TORQUE:
         return float(min(max(setpoint_Nm, -limit_Nm), limit_Nm))
     damping = arm["brake_damping_Nm_s"][joint]
-    if mode == _BRAKE_SLOWLY:
+    if mode == DriveMode.BRAKE_SLOWLY:
         damping *= _SLOW_SHARE
-    elif mode == _BRAKE_HARD:
+    elif mode == DriveMode.BRAKE_HARD:
         damping *= _HARD_SHARE
-    elif mode != _BRAKE:
+    elif mode != DriveMode.BRAKE:
         return 0.0
     return float(min(max(-damping * velocity_rad_s, -limit_Nm), limit_Nm))
 
@@ -201,20 +196,20 @@ def advance_body(
     things: Structured,
     touch_state: Vector,
     payloads: Structured,
+    work: Vector,
     encoder_noise: NDArray[np.float64],
+    substeps: int,
     setpoint1_Nm: float,
     setpoint2_Nm: float,
     mode1: int,
     mode2: int,
     tick_count: int,
-    substeps: int,
-    work: Vector,
 ) -> None:
     """Advance the body's state, touch state included, by `tick_count` ticks of 100 µs, in place.
 
     State and numbers: laid out by BODY_STATE and BODY_NUMBERS. contacts, things, payloads: tables of CONTACT, THING and
-    PAYLOAD_CHANGE. encoder_noise: table of `EncoderNoise`. mode1, mode2: `DriveMode`. substeps: integration steps per
-    tick. work: from `work_space`, overwritten.
+    PAYLOAD_CHANGE. work: from `work_space`, overwritten. encoder_noise: table of `EncoderNoise`. substeps: integration
+    steps per tick. mode1, mode2: `DriveMode`.
     """
     state, numbers = state_vector.view(BODY_STATE)[0], number_vector.view(BODY_NUMBERS)[0]
     now, course, motors = state["arm"], state["course"], state["motor"]
@@ -227,10 +222,10 @@ def advance_body(
         change_touch(things, _scenario_s(course), before1, before2, touch_state, contact.size != 0)
         wanted1 = _torque_target(arm, 0, mode1, setpoint1_Nm, course["velocity_rad_s"][0])
         wanted2 = _torque_target(arm, 1, mode2, setpoint2_Nm, course["velocity_rad_s"][1])
-        target1 = command_torque(motor, motors, 0, wanted1, now["tau_m"][0], mode1 != _OFF)
-        target2 = command_torque(motor, motors, 1, wanted2, now["tau_m"][1], mode2 != _OFF)
-        now["brake_Nm"][0] = mechanics["holding_brake_Nm"][0] if mode1 == _OFF else 0.0
-        now["brake_Nm"][1] = mechanics["holding_brake_Nm"][1] if mode2 == _OFF else 0.0
+        target1 = command_torque(motor, motors, 0, wanted1, now["tau_m"][0], mode1 != DriveMode.OFF)
+        target2 = command_torque(motor, motors, 1, wanted2, now["tau_m"][1], mode2 != DriveMode.OFF)
+        now["brake_Nm"][0] = mechanics["holding_brake_Nm"][0] if mode1 == DriveMode.OFF else 0.0
+        now["brake_Nm"][1] = mechanics["holding_brake_Nm"][1] if mode2 == DriveMode.OFF else 0.0
         integrate_mechanics(
             now, arm, mechanics, contact, things, touch_state,
             _scenario_s(course), elapsed_s, target1, target2, TICK_S, substeps, work,

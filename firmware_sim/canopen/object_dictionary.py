@@ -307,7 +307,7 @@ class ObjectDictionary:
     def has(self, index: int, subindex: int = 0) -> bool:
         """Return whether the device has this object: the EDS lists it, or the description adds it."""
         try:
-            self._node._find_object(index, subindex)
+            self.find(index, subindex)
         except canopen.SdoAbortedError:
             return False
         return True
@@ -393,7 +393,7 @@ class ObjectDictionary:
 
     def value(self, index: int, subindex: int = 0) -> int:
         """Return the present value of a numeric object; raise `Refusal` if the device lacks it."""
-        variable = self._node._find_object(index, subindex)
+        variable = self.find(index, subindex)
         return int(variable.decode_raw(self._node.get_data(index, subindex)))
 
     def value_or(self, default: int, index: int, subindex: int = 0) -> int:
@@ -404,7 +404,7 @@ class ObjectDictionary:
         """Return the EDS's default of a numeric object; `default` if it lacks the object or gives it no default."""
         if not self.has(index, subindex):
             return default
-        value = self._node._find_object(index, subindex).default
+        value = self.find(index, subindex).default
         return default if value is None else int(value)
 
     def take_over(self, index: int, subindex: int, value: int) -> bool:
@@ -413,7 +413,7 @@ class ObjectDictionary:
         Return False, with the object unchanged, if a check refuses it or the device lacks it.
         """
         try:
-            data = self._node._find_object(index, subindex).encode_raw(value)
+            data = self.find(index, subindex).encode_raw(value)
             self._node.set_data(index, subindex, data, check_writable=True)
         except canopen.SdoAbortedError:
             return False

@@ -85,28 +85,10 @@ class TransmitPdo(PdoRecord):
             data = pdos.header = sender.protect(frame)  # type: ignore[union-attr]
             send(can_id, data)
 
-        def send_protected_value() -> None:
-            frame = bytearray(length)
-            pack_into(frame, header_bytes, only())
-            frame[status_byte] = pdos.header_status() << status_shift & 0xFF
-            data = pdos.header = sender.protect(frame)  # type: ignore[union-attr]
-            send(can_id, data)
-
         def send_plain() -> None:
             send(can_id, pack(*[read() for read in reads]))
 
-        def send_pair() -> None:
-            send(can_id, pack(first(), second()))
-
-        if header_bytes and len(reads) == 1:
-            (only,) = reads
-            return send_protected_value
-        if header_bytes:
-            return send_protected
-        if len(reads) != 2:
-            return send_plain
-        first, second = reads
-        return send_pair
+        return send_protected if header_bytes else send_plain
 
     def on_sync(self) -> None:
         """Send a frame if this SYNC is the n-th of transmission type n.

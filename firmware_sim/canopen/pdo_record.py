@@ -8,6 +8,7 @@ instead of objects) leave gaps in frames that are received. Source: CiA 301 (4.2
 
 import struct
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 from adacd_hil.wire.codec import MessageCodec
@@ -27,11 +28,18 @@ LISTENED_IDS = frozenset(base + node for base in (0x200, 0x300, 0x400, 0x500) fo
 most as wide, and the emulator's kernel filter is this one."""
 
 
+_RESTRICTED = (
+    (0x000, 0x180),
+    (0x581, 0x5FF),
+    (0x601, 0x67F),
+    (0x6E0, 0x6FF),
+    (0x701, 0x7FF),
+)
+
+
 def _is_restricted(can_id: int) -> bool:
     """Return whether CiA 301, table 34, or SYNC and EMCY forbid an identifier to PDOs."""
-    lowest = (0x000, 0x080, 0x101, 0x581, 0x601, 0x6E0, 0x701)
-    highest = (0x07F, 0x100, 0x180, 0x5FF, 0x67F, 0x6FF, 0x7FF)
-    return any(low <= can_id <= high for low, high in zip(lowest, highest, strict=True))
+    return any(low <= can_id <= high for low, high in _RESTRICTED)
 
 
 class PdoRecord:
@@ -77,7 +85,8 @@ class PdoRecord:
         dictionary.watch(index, 5, self._set_timer)
         # Entries before their number: a reset restores them in this order.
         for place in range(len(self._entries)):
-            dictionary.watch(mapping, place + 1, self._setter(place), self._entry_check(place))
+            set_entry, check = partial(self._entries.__setitem__, place), partial(self._check_entry, place)
+            dictionary.watch(mapping, place + 1, set_entry, check)
         dictionary.watch(mapping, 0, self._map, self._check_count)
 
     @property
@@ -124,22 +133,13 @@ class PdoRecord:
         self.timer_ns = period_ms * 1_000_000
         self._refresh()
 
-    def _entry_check(self, place: int) -> Callable[[int], None]:
-        def check(value: int) -> None:
-            if value == self._entries[place]:
-                return
-            if self._is_held or self._count != 0:
-                refuse(Abort.DEVICE_STATE)
-            if value != 0:
-                check_entry(self._dictionary, value, self.is_received)
-
-        return check
-
-    def _setter(self, place: int) -> Callable[[int], None]:
-        def set_entry(value: int) -> None:
-            self._entries[place] = value
-
-        return set_entry
+    def _check_entry(self, place: int, value: int) -> None:
+        if value == self._entries[place]:
+            return
+        if self._is_held or self._count != 0:
+            refuse(Abort.DEVICE_STATE)
+        if value != 0:
+            check_entry(self._dictionary, value, self.is_received)
 
     def _check_count(self, value: int) -> None:
         if value == self._count:

@@ -25,6 +25,7 @@ from adacd_hil.progress_lines import Progress
 from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.arm_settings import BusSettings
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.toml_text import to_short_toml, to_toml
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import open_terminals, terminal_columns, write_result
 from adacd_hil.wire.bus import BusError, BusMissingError
@@ -40,7 +41,7 @@ from firmware_sim.body.body import Body
 from firmware_sim.canopen.object_dictionary import CONTRACTS, EmulatedContract
 from firmware_sim.canopen.pdo_record import LAST_NODE
 from firmware_sim.cli.own_devices import rehearse
-from firmware_sim.cli.scenario_list import check, describe_all, show
+from firmware_sim.cli.scenario_list import check, describe_all
 from firmware_sim.cli.service import Service, open_devices_end, stop_by_signal
 from firmware_sim.scenario.scenario import Scenario, load_scenario, load_truth, truth_names
 
@@ -60,18 +61,8 @@ EPILOG = (
     "missing."
 )
 
-_CODES: tuple[tuple[type[Exception], EmulatorExit], ...] = (
-    (click.ClickException, EmulatorExit.USAGE),
-    (ConfigError, EmulatorExit.USAGE),
-    (CodecError, EmulatorExit.USAGE),
-    (BusMissingError, EmulatorExit.BUS_MISSING),
-    (BusError, EmulatorExit.FAILURE),
-    (LogExistsError, EmulatorExit.USAGE),
-    (LogError, EmulatorExit.FAILURE),
-    (OSError, EmulatorExit.FAILURE),
-)
-
-
+_USAGE_ERRORS = (click.ClickException, ConfigError, CodecError, LogExistsError)
+_FAILURES = (BusError, LogError, OSError)
 _CONTEXT = {"auto_envvar_prefix": "FIRMWARE_SIM", "help_option_names": ["-h", "--help"]}
 
 
@@ -294,10 +285,11 @@ def list_truths(as_json: bool) -> int:
 def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int | None, as_json: bool) -> int:
     """Print a scenario, resolved, as TOML that loads to the same: all differences from the defaults."""
     resolved = load_scenario(scenario, profile, seed)
+    text = to_toml(resolved) if is_whole else to_short_toml(resolved)
     if as_json:
-        print(json.dumps(tomllib.loads(show(resolved, is_whole)), indent=2, ensure_ascii=False))
+        print(json.dumps(tomllib.loads(text), indent=2, ensure_ascii=False))
     else:
-        print(show(resolved, is_whole), end="")
+        print(text, end="")
     return EmulatorExit.OK
 
 
@@ -442,9 +434,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         code = EmulatorExit.USAGE
     except (click.Abort, KeyboardInterrupt):
         code = EmulatorExit.OK
-    except tuple(kind for kind, _ in _CODES) as error:
+    except (*_USAGE_ERRORS, *_FAILURES) as error:
         _complain(error.format_message() if isinstance(error, click.ClickException) else error_text(error))
-        code = next(code for kind, code in _CODES if isinstance(error, kind))
+        code = EmulatorExit.USAGE if isinstance(error, _USAGE_ERRORS) else EmulatorExit.FAILURE
+        if isinstance(error, BusMissingError):
+            code = EmulatorExit.BUS_MISSING
     sys.exit(code)
 
 

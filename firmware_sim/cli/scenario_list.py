@@ -1,13 +1,12 @@
-"""The command line's output about scenarios: their list, the content of one, and the errors of a file."""
+"""The command line's output about scenarios: their list, and the errors of a file."""
 
 from dataclasses import dataclass
 from typing import Any
 
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
-from adacd_hil.settings.toml_text import to_short_toml, to_toml
 from adacd_hil.wire.codec import Codec
-from firmware_sim.bench.fault_plan import PLANNED_PERIOD_NS, FaultPlan
+from firmware_sim.bench.fault_plan import FaultPlan
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario, read_table
 
 
@@ -46,11 +45,6 @@ def describe_all() -> list[dict[str, Any]]:
     ]
 
 
-def show(scenario: Scenario, is_whole: bool) -> str:
-    """Return a scenario as TOML that loads to the same; `is_whole`: with defaults, else only differences from them."""
-    return to_toml(scenario) if is_whole else to_short_toml(scenario)
-
-
 def check(file: str, codec: Codec) -> ScenarioFinding:
     """Check a scenario file and its faults' frames against a contract.
 
@@ -64,7 +58,7 @@ def check(file: str, codec: Codec) -> ScenarioFinding:
         return ScenarioFinding(file, (str(error).removeprefix(f"scenario {file}").removeprefix(":").strip(),))
     try:
         scenario = parse(Scenario, table)
-        FaultPlan(scenario.faults, scenario.seed, PLANNED_PERIOD_NS, codec)
+        FaultPlan(scenario.faults, scenario.seed, codec)
     except ConfigError as error:
         return ScenarioFinding(file, error.problems)
     return ScenarioFinding(file, (), _checked(scenario, codec))

@@ -7,10 +7,13 @@ the bench's time; a device and its application exchange times of the device's ow
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
+from typing import Protocol
 
+from adacd_hil.records import Vector
 from adacd_hil.wire.codec import MessageCodec
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
 from adacd_hil.wire.time_marks import NEVER_NS
+from firmware_sim.arm.sensing import Measurement
 from firmware_sim.canopen.error_control import (
     ErrorReporter,
     HeartbeatConsumer,
@@ -81,6 +84,38 @@ class Application:
         """Do nothing; subclasses reset their state. `is_node_reset`: False at a reset of the communication only."""
 
 
+class MovableArm(Protocol):
+    """An arm as its devices use it; the members mean the same as those of `firmware_sim.body.body.Body`."""
+
+    @property
+    def has_ideal_motors(self) -> bool: ...  # noqa: D102
+
+    @property
+    def is_torque_limited(self) -> tuple[bool, bool]: ...  # noqa: D102
+
+    @property
+    def motor_error_code(self) -> tuple[int, int]: ...  # noqa: D102
+
+    @property
+    def motor_torque_Nm(self) -> tuple[float, float]: ...  # noqa: D102
+
+    @property
+    def joint_temperature_C(self) -> tuple[float, float]: ...  # noqa: D102
+
+    @property
+    def drive_velocity_rad_s(self) -> tuple[float, float]: ...  # noqa: D102
+
+    def start_scenario(self) -> None: ...  # noqa: D102
+
+    def advance(  # noqa: D102
+        self, torque_setpoint_Nm: Sequence[float], drive_mode: Sequence[int], tick_count: int
+    ) -> None: ...
+
+    def sample(self) -> Measurement: ...  # noqa: D102
+
+    def truth(self, out: Vector) -> None: ...  # noqa: D102
+
+
 class EmulatedDevice(ObjectDictionary):
     """A CANopen device: its communication; `attach` gives it an application."""
 
@@ -99,8 +134,6 @@ class EmulatedDevice(ObjectDictionary):
         super().__init__(node_id, description, self._send)
         self.clock = NodeClock()
         self.is_powered = True
-        self.is_on_bus = True
-        """Whether it has power and its controller takes part in the bus."""
         self._is_bus_off = False
         self.state = NmtState.INITIALISING
         self.is_operational = False
@@ -132,6 +165,11 @@ class EmulatedDevice(ObjectDictionary):
         """Objects that SDO may write while the device is at work."""
         self.pdos = Pdos(self, send, messages, longest_pdo)
         self.pdos.own_ns = self.clock.own_ns
+
+    @property
+    def is_on_bus(self) -> bool:
+        """Whether it has power and its controller takes part in the bus."""
+        return self.is_powered and not self._is_bus_off
 
     @property
     def error_register(self) -> int:
@@ -166,7 +204,6 @@ class EmulatedDevice(ObjectDictionary):
         In bus-off the device stays silent.
         """
         self.is_powered = True
-        self.is_on_bus = not self._is_bus_off
         self.power_on_ns = self.clock.own_ns(t_ns)
         self._boot(self.power_on_ns)
 
@@ -175,7 +212,7 @@ class EmulatedDevice(ObjectDictionary):
 
         Written values, errors and application state are lost.
         """
-        self.is_powered = self.is_on_bus = False
+        self.is_powered = False
         self._errors.forget_messages()
         self.is_operational = False
         self.state = NmtState.INITIALISING
@@ -188,14 +225,12 @@ class EmulatedDevice(ObjectDictionary):
         An operational device goes to Pre-operational, the default of 0x1029.
         """
         self._is_bus_off = True
-        self.is_on_bus = False
         if self.is_operational:
             self._enter(NmtState.PRE_OPERATIONAL, self.clock.own_ns(t_ns))
 
     def return_to_bus(self, t_ns: int) -> None:
         """End `leave_bus`: a device with power takes part in the bus again, and sends an EMCY (0x8140)."""
         self._is_bus_off = False
-        self.is_on_bus = self.is_powered
         if self.is_on_bus:
             self._errors.report_error(_RECOVERED_FROM_BUS_OFF, self.clock.own_ns(t_ns))
 

@@ -16,27 +16,28 @@ Source: CiA 402-2 (IEC 61800-7-201), state machine, controlword 0x6040, statuswo
 
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import NEVER_NS
+from firmware_sim.arm.arms import EmulatedArm
 from firmware_sim.arm.hardware_settings import HabitSettings
-from firmware_sim.arm.sensing import VELOCITY_LSB_RAD_S, DriveMode
+from firmware_sim.arm.sensing import ENCODER_COUNTS, VELOCITY_LSB_RAD_S, DriveMode
 from firmware_sim.canopen.error_control import ERROR_CODES, WARNINGS, Watchdog
 from firmware_sim.canopen.object_dictionary import Abort, one_of, refuse
-from firmware_sim.nodes.device import Application, EmulatedDevice
+from firmware_sim.nodes.device import Application, EmulatedDevice, MovableArm
 from firmware_sim.nodes.drive_profile import (
     DISABLE,
     FAULT_REACTIONS,
+    LONGEST_BRAKING_NS,
     QUICK_STOPS,
     RAMPS,
+    REST_NS,
+    REST_RAD_S,
     STATE_BITS,
+    TRANSITIONS,
     DriveEvent,
-    DriveScale,
     DriveState,
-    Motor,
     Patience,
-    Standstill,
     Stop,
     TorqueLimits,
     decode_command,
-    find_transition,
     velocity_lsb,
 )
 
@@ -63,16 +64,16 @@ class DriveNode(Application):
         self,
         device: EmulatedDevice,
         codec: Codec,
-        number: int,
-        motor: Motor,
-        rated_torque_Nm: float,
+        place: int,
+        arm: MovableArm,
+        described: EmulatedArm,
         is_free_running: bool,
-        scale: DriveScale,
         habits: HabitSettings,
     ) -> None:
         """Connect the node to its device, whose application it becomes.
 
-        `number`: 1 or 2, as in the DBC's names. `is_free_running`: time passes without SYNC, so SYNC is watched.
+        `place`: 0 for Drive1, 1 for Drive2. `described`: the arm, with the wiring and the counts of its drives.
+        `is_free_running`: time passes without SYNC, so SYNC is watched.
         """
         self.device = device
         self.motor_mode = DriveMode.OFF
@@ -83,14 +84,17 @@ class DriveNode(Application):
         self._pdos = device.pdos
         self._clock = device.clock
         self._tripped = device.tripped
-        self._motor = motor
+        self._arm = arm
+        wiring = described.wiring
+        self._joint = wiring.drive_joint[place]
+        self._sign, self._torque_sign = wiring.drive_sign[place], wiring.torque_sign[place]
         self.is_free_running = is_free_running
         """Whether time passes without SYNC, so that SYNC is watched."""
-        self._rated_counts = round(rated_torque_Nm / scale.rated_count_Nm)
-        is_plain = scale.rated_count_Nm == 1e-3
-        self._rated_mNm = self._rated_counts if is_plain else self._rated_counts * scale.rated_count_Nm * 1e3
-        self._position_scale = scale.position
-        self._velocity_lsb_rad_s = velocity_lsb(codec, number, scale.velocity)
+        count_Nm = described.rated_count_Nm[place]
+        self._rated_counts = round(described.rated_torque_Nm[self._joint] / count_Nm)
+        self._rated_mNm = self._rated_counts if count_Nm == 1e-3 else self._rated_counts * count_Nm * 1e3
+        self._position_scale = (described.increments_per_joint_rev[place] or ENCODER_COUNTS) / ENCODER_COUNTS
+        self._velocity_lsb_rad_s = velocity_lsb(codec, place + 1, described.velocity_factor[place])
         self._position = self._velocity = 0
         self._limits = TorqueLimits(device, self._pdos)
         self._demand = self._acted_commands = 0
@@ -105,7 +109,7 @@ class DriveNode(Application):
         self._ramp_end: DriveEvent | None = None
         self._is_braking = False
         self._is_motor_limited = self._is_limiting = False
-        self._standstill = Standstill()
+        self._braking_ns = self._moving_ns = 0  # when it began to brake, and when it last moved
         self._mode = self._wanted_mode = device.default_or(0, 0x6060)
         self._habits = habits
         self._has_habits = habits != HabitSettings()
@@ -117,9 +121,7 @@ class DriveNode(Application):
         device.pause_ns = round(habits.pause_ms * 1e6)
         self._patience = Patience(device)
         self._serve(codec)
-        self._configure()
-        if not codec.message(f"Drive{number}Command").is_protected:
-            device.open_at_work |= {(0x6071, 0)}
+        self._configure(is_protected=codec.message(f"Drive{place + 1}Command").is_protected)
         device.attach(self)
         self.restart_node(is_node_reset=True)
 
@@ -140,10 +142,13 @@ class DriveNode(Application):
         serve(0x6076, 0, lambda: self._rated_counts)
         serve(0x6077, 0, lambda: self._torque_permille)
 
-    def _configure(self) -> None:
-        """Register checks of writes by SDO or PDO of the drive's objects, and the functions that take the values."""
+    def _configure(self, is_protected: bool) -> None:
+        """Register checks of writes by SDO or PDO of the drive's objects, and the functions that take the values.
+
+        `is_protected`: the command frame is, so SDO doesn't write the target torque while the drive is at work.
+        """
         device = self.device
-        device.open_at_work |= {_CONTROLWORD}
+        device.open_at_work |= {_CONTROLWORD} if is_protected else {_CONTROLWORD, (0x6071, 0)}
         self._pdos.events = _EVENTS
         self._pdos.accept_values(*_CONTROLWORD, self._receive_word)
         device.watch(*_CONTROLWORD, check=self._obey_by_sdo)
@@ -216,7 +221,7 @@ class DriveNode(Application):
         if lsb_rad_s is None:
             self._velocity = velocity
         else:
-            speed_rad_s = velocity * VELOCITY_LSB_RAD_S if is_distorted else self._motor.velocity_rad_s()
+            speed_rad_s = velocity * VELOCITY_LSB_RAD_S if is_distorted else self._speed_rad_s
             self._velocity = round(speed_rad_s / lsb_rad_s)
         if self._pdos.act_on_sync(t_ns):
             self._patience.silent_syncs = 0
@@ -225,8 +230,7 @@ class DriveNode(Application):
             self._miss_command(t_ns)
         if self._tripped:
             self._clear_watchdogs(t_ns)
-        if self._received_word is not None:
-            self._obey_received(t_ns)
+        self._obey_received(t_ns)
         if self._mode != self._wanted_mode:
             self._change_mode()
         if self._has_habits:
@@ -240,8 +244,7 @@ class DriveNode(Application):
 
     def act(self, t_ns: int) -> None:
         """Carry out the command of an RPDO that doesn't wait for SYNC, and command the motor."""
-        if self._received_word is not None:
-            self._obey_received(t_ns)
+        self._obey_received(t_ns)
         self._drive_motor()
 
     def mind_length(self, is_right: bool, t_ns: int) -> None:
@@ -348,7 +351,7 @@ class DriveNode(Application):
         self._controlword = _HALT if self._habits.is_halted else 0
         self._acted_commands = 0
         self._enabling_ns = None
-        self._limits.target = 0
+        self._limits.forget_target()
         self._mode = self._wanted_mode
         self._ramp_end = None
         self._patience.forget_command()
@@ -423,10 +426,10 @@ class DriveNode(Application):
 
         Quick stop and fault reaction begin to brake by their option codes.
         """
-        transition = find_transition(self.state, event)
-        if transition is None:
+        state = TRANSITIONS.get((self.state, event))
+        if state is None:
             return
-        self.state = transition.target
+        self.state = state
         self._ramp_end = None
         self._is_braking = False
         self.motor_mode = DriveMode.TORQUE if self.is_enabled else DriveMode.OFF
@@ -448,7 +451,7 @@ class DriveNode(Application):
         self.motor_mode = stop.mode
         self._is_braking = True
         self.has_news = True
-        self._standstill.begin_braking(t_ns)
+        self._braking_ns = self._moving_ns = t_ns
 
     def _reset_fault(self, t_ns: int) -> None:
         """Leave the state Fault for Switch on disabled, with an EMCY.
@@ -483,7 +486,7 @@ class DriveNode(Application):
         self._is_found_by_time = is_found_by_time
         self.device.is_faulty = True
         self.device.fault_bits = _KIND_BITS.get(code >> 12, 0)
-        self._limits.target = 0
+        self._limits.forget_target()
         self._apply(DriveEvent.FAULT_DETECTED, t_ns)
         self._drive_motor()
         if cause is None:
@@ -496,10 +499,10 @@ class DriveNode(Application):
 
         Set `has_news` if a torque limit begins or ceases to act.
         """
-        motor = self._motor
-        if not motor.is_ideal and (code := motor.error_code()):
+        arm, joint = self._arm, self._joint
+        if not arm.has_ideal_motors and (code := arm.motor_error_code[joint]):
             self._latch(code, None, t_ns)
-        is_limited = not motor.is_ideal and motor.is_limited()
+        is_limited = not arm.has_ideal_motors and arm.is_torque_limited[joint]
         is_limiting = self._limits.is_limiting and self._follows_target
         if is_limited != self._is_motor_limited or is_limiting != self._is_limiting:
             self._is_motor_limited, self._is_limiting = is_limited, is_limiting
@@ -510,7 +513,7 @@ class DriveNode(Application):
 
         Watchdogs that only warn don't count.
         """
-        if self._failure or self._tripped - WARNINGS or self._motor.error_code():
+        if self._failure or self._tripped - WARNINGS or self._arm.motor_error_code[self._joint]:
             return True
         return self._cause is Watchdog.COMMAND and self._is_command_missing(t_ns)
 
@@ -555,11 +558,13 @@ class DriveNode(Application):
         return self._patience.is_command_missing or self._pdos.find_late(t_ns)
 
     def _watch_standstill(self, t_ns: int) -> None:
-        """End the braking once the motor stands still, or after the longest time, see `Standstill.is_reached`.
+        """End the braking once the motor has stood still for `REST_NS`, or has braked for `LONGEST_BRAKING_NS`.
 
-        The state then changes, except in a quick stop that stays.
+        The state then changes, except in a quick stop that stays. Call it often while the drive brakes.
         """
-        if not self._standstill.is_reached(self._motor.velocity_rad_s(), t_ns):
+        if abs(self._speed_rad_s) > REST_RAD_S:
+            self._moving_ns = t_ns
+        if t_ns - self._moving_ns < REST_NS and t_ns - self._braking_ns < LONGEST_BRAKING_NS:
             return
         if self.state is DriveState.FAULT_REACTION_ACTIVE:
             self._apply(DriveEvent.FAULT_REACTION_DONE, t_ns)
@@ -570,12 +575,16 @@ class DriveNode(Application):
 
     def _drive_motor(self) -> None:
         """Set torque demand and set-point: 0 outside Operation enabled, in another mode than 10, in a ramp down."""
-        self._demand = self._limits.demand() if self._follows_target else 0
+        self._demand = self._limits.demand if self._follows_target else 0
         self.torque_Nm = self._demand * self._rated_mNm * 1e-6
 
     @property
+    def _speed_rad_s(self) -> float:
+        return self._sign * self._arm.drive_velocity_rad_s[self._joint]
+
+    @property
     def _torque_permille(self) -> int:
-        permille = round(self._motor.torque_Nm() * 1e6 / self._rated_mNm)
+        permille = round(self._torque_sign * self._arm.motor_torque_Nm[self._joint] * 1e6 / self._rated_mNm)
         return max(-0x8000, min(0x7FFF, permille))
 
     def _keep_habits(self, t_ns: int) -> None:

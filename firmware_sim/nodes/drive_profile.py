@@ -13,7 +13,6 @@ objects 0x605A to 0x605E, cyclic synchronous torque mode.
 """
 
 import functools
-from collections.abc import Callable
 from enum import Enum
 from typing import NamedTuple
 
@@ -60,48 +59,38 @@ class DriveEvent(Enum):
     FAULT_REACTION_DONE = "fault reaction completed"
 
 
-class StateTransition(NamedTuple):
-    """One arrow of the state machine with the standard's number."""
-
-    number: int
-    source: DriveState
-    event: DriveEvent
-    target: DriveState
-
-
 _S, _E = DriveState, DriveEvent
-TRANSITIONS = (
-    StateTransition(0, _S.START, _E.POWER_ON, _S.NOT_READY_TO_SWITCH_ON),
-    StateTransition(1, _S.NOT_READY_TO_SWITCH_ON, _E.INITIALISED, _S.SWITCH_ON_DISABLED),
-    StateTransition(2, _S.SWITCH_ON_DISABLED, _E.SHUTDOWN, _S.READY_TO_SWITCH_ON),
-    StateTransition(3, _S.READY_TO_SWITCH_ON, _E.SWITCH_ON, _S.SWITCHED_ON),
+TRANSITIONS: dict[tuple[DriveState, DriveEvent], DriveState] = {
+    (_S.START, _E.POWER_ON): _S.NOT_READY_TO_SWITCH_ON,  # 0
+    (_S.NOT_READY_TO_SWITCH_ON, _E.INITIALISED): _S.SWITCH_ON_DISABLED,  # 1
+    (_S.SWITCH_ON_DISABLED, _E.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 2
+    (_S.READY_TO_SWITCH_ON, _E.SWITCH_ON): _S.SWITCHED_ON,  # 3
     # "Switch on and enable operation" in one word: 3 now, 4 with the next command.
-    StateTransition(3, _S.READY_TO_SWITCH_ON, _E.ENABLE_OPERATION, _S.SWITCHED_ON),
-    StateTransition(4, _S.SWITCHED_ON, _E.ENABLE_OPERATION, _S.OPERATION_ENABLED),
-    StateTransition(5, _S.OPERATION_ENABLED, _E.SWITCH_ON, _S.SWITCHED_ON),
-    StateTransition(6, _S.SWITCHED_ON, _E.SHUTDOWN, _S.READY_TO_SWITCH_ON),
-    StateTransition(7, _S.READY_TO_SWITCH_ON, _E.QUICK_STOP, _S.SWITCH_ON_DISABLED),
-    StateTransition(7, _S.READY_TO_SWITCH_ON, _E.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    StateTransition(8, _S.OPERATION_ENABLED, _E.SHUTDOWN, _S.READY_TO_SWITCH_ON),
-    StateTransition(9, _S.OPERATION_ENABLED, _E.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    StateTransition(10, _S.SWITCHED_ON, _E.QUICK_STOP, _S.SWITCH_ON_DISABLED),
-    StateTransition(10, _S.SWITCHED_ON, _E.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    StateTransition(11, _S.OPERATION_ENABLED, _E.QUICK_STOP, _S.QUICK_STOP_ACTIVE),
-    StateTransition(12, _S.QUICK_STOP_ACTIVE, _E.QUICK_STOP_DONE, _S.SWITCH_ON_DISABLED),
-    StateTransition(12, _S.QUICK_STOP_ACTIVE, _E.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
-    *(
-        StateTransition(13, state, _E.FAULT_DETECTED, _S.FAULT_REACTION_ACTIVE)
+    (_S.READY_TO_SWITCH_ON, _E.ENABLE_OPERATION): _S.SWITCHED_ON,  # 3
+    (_S.SWITCHED_ON, _E.ENABLE_OPERATION): _S.OPERATION_ENABLED,  # 4
+    (_S.OPERATION_ENABLED, _E.SWITCH_ON): _S.SWITCHED_ON,  # 5
+    (_S.SWITCHED_ON, _E.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 6
+    (_S.READY_TO_SWITCH_ON, _E.QUICK_STOP): _S.SWITCH_ON_DISABLED,  # 7
+    (_S.READY_TO_SWITCH_ON, _E.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,  # 7
+    (_S.OPERATION_ENABLED, _E.SHUTDOWN): _S.READY_TO_SWITCH_ON,  # 8
+    (_S.OPERATION_ENABLED, _E.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,  # 9
+    (_S.SWITCHED_ON, _E.QUICK_STOP): _S.SWITCH_ON_DISABLED,  # 10
+    (_S.SWITCHED_ON, _E.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,  # 10
+    (_S.OPERATION_ENABLED, _E.QUICK_STOP): _S.QUICK_STOP_ACTIVE,  # 11
+    (_S.QUICK_STOP_ACTIVE, _E.QUICK_STOP_DONE): _S.SWITCH_ON_DISABLED,  # 12
+    (_S.QUICK_STOP_ACTIVE, _E.DISABLE_VOLTAGE): _S.SWITCH_ON_DISABLED,  # 12
+    **{
+        (state, _E.FAULT_DETECTED): _S.FAULT_REACTION_ACTIVE  # 13
         for state in DriveState
         if state not in (_S.START, _S.FAULT_REACTION_ACTIVE, _S.FAULT)
-    ),
-    StateTransition(14, _S.FAULT_REACTION_ACTIVE, _E.FAULT_REACTION_DONE, _S.FAULT),
-    StateTransition(15, _S.FAULT, _E.FAULT_RESET, _S.SWITCH_ON_DISABLED),
+    },
+    (_S.FAULT_REACTION_ACTIVE, _E.FAULT_REACTION_DONE): _S.FAULT,  # 14
+    (_S.FAULT, _E.FAULT_RESET): _S.SWITCH_ON_DISABLED,  # 15
     # Only where 0x605A lets the drive stay in Quick stop active.
-    StateTransition(16, _S.QUICK_STOP_ACTIVE, _E.ENABLE_OPERATION, _S.OPERATION_ENABLED),
-)
-"""CiA 402-2, figure "power drive system finite state automaton" and its table of transitions."""
-
-_BY_SOURCE = {(row.source, row.event): row for row in TRANSITIONS}
+    (_S.QUICK_STOP_ACTIVE, _E.ENABLE_OPERATION): _S.OPERATION_ENABLED,  # 16
+}
+"""State after an event in a state that it changes; a comment has the standard's number. CiA 402-2, figure "power drive
+system finite state automaton" and its table of transitions."""
 
 STATE_BITS = {
     DriveState.START: 0x00,
@@ -115,11 +104,6 @@ STATE_BITS = {
     DriveState.FAULT: 0x08 | _VOLTAGE_ENABLED,
 }
 """Bits 0 to 6 of the statusword; quick stop (bit 5) is 0 where the standard leaves it open."""
-
-
-def find_transition(state: DriveState, event: DriveEvent) -> StateTransition | None:
-    """Return the transition that `event` causes in `state`; None if it causes none there."""
-    return _BY_SOURCE.get((state, event))
 
 
 def decode_command(controlword: int, previous: int) -> DriveEvent | None:
@@ -140,8 +124,8 @@ def decode_command(controlword: int, previous: int) -> DriveEvent | None:
 
 
 REST_RAD_S = 0.02  # standstill: a hundredth of the slowest motion that the arm makes
-_REST_NS = 10_000_000  # standstill lasts; passing through zero does not
-_LONGEST_BRAKING_NS = 1_000_000_000  # an arm that someone keeps pushing never stands still
+REST_NS = 10_000_000  # standstill lasts; passing through zero does not
+LONGEST_BRAKING_NS = 1_000_000_000  # an arm that someone keeps pushing never stands still
 
 
 class Stop(NamedTuple):
@@ -171,31 +155,13 @@ FAULT_REACTIONS = {code: QUICK_STOPS[code] for code in (0, 1, 2, 3)}
 """0x605E."""
 
 
-class Standstill:
-    """Finds whether a braking motor has stood still for `_REST_NS`, or has braked for `_LONGEST_BRAKING_NS`."""
-
-    def __init__(self) -> None:
-        self._since_ns = self._moving_ns = 0
-
-    def begin_braking(self, t_ns: int) -> None:
-        """Begin at `t_ns` to measure how long the motor stands still, and how long it brakes."""
-        self._since_ns = self._moving_ns = t_ns
-
-    def is_reached(self, velocity_rad_s: float, t_ns: int) -> bool:
-        """Return whether the motor has stood still for `_REST_NS`, or has braked for `_LONGEST_BRAKING_NS`.
-
-        Up to `REST_RAD_S` it stands still. Call it often while it brakes.
-        """
-        if abs(velocity_rad_s) > REST_RAD_S:
-            self._moving_ns = t_ns
-        return t_ns - self._moving_ns >= _REST_NS or t_ns - self._since_ns >= _LONGEST_BRAKING_NS
-
-
+_SYNCS, _TOLERANCE = 0x2200, 0x2201
 _NO_COMMAND_YET = 256  # SYNCs without a command: more than the longest patience, 0x2200
 _NO_PATIENCE = 1 << 30  # a drive without 0x2200 doesn't count SYNCs
 _TENTH_PERIODS = 15  # a drive without 0x2201: SYNC is missing after 1.5 periods
-_LIMITS = (0x6072, 0x60E0, 0x60E1)  # of torque: both ways, positive, negative
-_UNLIMITED = 0xFFFF  # where the EDS lacks a limit
+_UNLIMITED = 0xFFFF  # torque where the EDS lacks a limit
+_TARGET, _OFFSET = 0x6071, 0x60B2
+_MOST, _MOST_POSITIVE, _MOST_NEGATIVE = 0x6072, 0x60E0, 0x60E1
 
 
 class TorqueLimits:
@@ -205,72 +171,31 @@ class TorqueLimits:
     """
 
     def __init__(self, dictionary: ObjectDictionary, pdos: Pdos) -> None:
-        self.target = self._offset = 0
-        self._limits = {index: dictionary.default_or(_UNLIMITED, index) for index in _LIMITS}
-        dictionary.serve(0x6071, 0, lambda: self.target)
-        dictionary.serve(0x60B2, 0, lambda: self._offset)
-        for index in _LIMITS:
-            dictionary.serve(index, 0, functools.partial(self._limits.__getitem__, index))
-        takers: dict[int, Callable[[int], None]] = {0x6071: self._set_target, 0x60B2: self._set_offset}
-        takers |= {index: functools.partial(self._limit, index) for index in _LIMITS}
-        for index, take in takers.items():
-            pdos.accept_values(index, 0, take)
-            dictionary.watch(index, 0, take)
-        self.target, self._offset = dictionary.default_or(0, 0x6071), dictionary.default_or(0, 0x60B2)
-        self._combine()
-
-    def demand(self) -> int:
-        """Return the torque demand 0x6074, per mille: target plus offset, within the limits."""
-        wanted = self.target + self._offset
-        if self._low <= wanted <= self._high:
-            return wanted
-        return self._high if wanted > self._high else self._low
-
-    @property
-    def is_limiting(self) -> bool:
+        self.demand = 0
+        """Torque demand 0x6074, per mille: target plus offset, within the limits."""
+        self.is_limiting = False
         """Whether target plus offset lies beyond a torque limit, one cause of statusword bit 11."""
-        return not self._low <= self.target + self._offset <= self._high
+        self._values = {index: dictionary.default_or(0, index) for index in (_TARGET, _OFFSET)}
+        for index in (_MOST, _MOST_POSITIVE, _MOST_NEGATIVE):
+            self._values[index] = dictionary.default_or(_UNLIMITED, index)
+        for index, permille in self._values.items():
+            take = functools.partial(self._take, index)
+            dictionary.serve(index, 0, functools.partial(self._values.__getitem__, index))
+            dictionary.watch(index, 0, take)
+            pdos.accept_values(index, 0, take)
+            take(permille)
 
-    def _set_target(self, permille: int) -> None:
-        self.target = permille
+    def forget_target(self) -> None:
+        """Set the target torque to 0."""
+        self._take(_TARGET, 0)
 
-    def _set_offset(self, permille: int) -> None:
-        self._offset = permille
-
-    def _limit(self, index: int, permille: int) -> None:
-        self._limits[index] = permille
-        self._combine()
-
-    def _combine(self) -> None:
-        """Set the lowest and the highest torque: in each direction the smaller of its own limit and of 0x6072."""
-        most, positive, negative = self._limits.values()
-        self._low, self._high = -min(most, negative), min(most, positive)
-
-
-class Motor(NamedTuple):
-    """Functions that read the motor's state: velocity in rad/s, torque in Nm.
-
-    is_limited: whether current limit, I²t or temperature leave less torque than the drive asks for. error_code: the
-    fault that the motor's state calls for now, 0 without a fault. is_ideal: neither ever occurs, so both need no
-    check.
-    """
-
-    velocity_rad_s: Callable[[], float]
-    torque_Nm: Callable[[], float]
-    is_limited: Callable[[], bool]
-    error_code: Callable[[], int]
-    is_ideal: bool
-
-
-class DriveScale(NamedTuple):
-    """Counts of a drive, as factors: position counts per count of the body, velocity counts per count of the contract.
-
-    rated_count_Nm: torque of one count of 0x6076, behind the gear.
-    """
-
-    position: float = 1.0
-    velocity: float = 1.0
-    rated_count_Nm: float = 1e-3
+    def _take(self, index: int, permille: int) -> None:
+        """Store a value, and set the demand; in each direction the smaller of its own limit and of 0x6072 counts."""
+        values = self._values
+        values[index] = permille
+        wanted, most = values[_TARGET] + values[_OFFSET], values[_MOST]
+        self.demand = max(-min(most, values[_MOST_NEGATIVE]), min(wanted, most, values[_MOST_POSITIVE]))
+        self.is_limiting = self.demand != wanted
 
 
 class Patience:
@@ -281,17 +206,19 @@ class Patience:
         """SYNCs since the last command."""
         self.sync_ns = 0
         """When the last SYNC came, by the device's clock."""
-        self._syncs = dictionary.value_or(_NO_PATIENCE, 0x2200)
         self._factory_period_us = self._period_us = dictionary.value(0x1006)
-        self._tenth_periods = dictionary.value_or(_TENTH_PERIODS, 0x2201)
         dictionary.watch(0x1006, 0, self._set_period)
-        dictionary.watch(0x2200, 0, self._set_syncs)
-        dictionary.watch(0x2201, 0, self._set_tolerance)
+        self._values = {
+            _SYNCS: dictionary.value_or(_NO_PATIENCE, _SYNCS),
+            _TOLERANCE: dictionary.value_or(_TENTH_PERIODS, _TOLERANCE),
+        }
+        for index in self._values:
+            dictionary.watch(index, 0, functools.partial(self._values.__setitem__, index))
 
     @property
     def is_command_missing(self) -> bool:
         """Whether 0x2200 SYNCs or more have come since the last command; True before the first command."""
-        return self.silent_syncs >= self._syncs
+        return self.silent_syncs >= self._values[_SYNCS]
 
     @property
     def sync_due_ns(self) -> int:
@@ -301,22 +228,16 @@ class Patience:
         """
         if not self._period_us:
             return NEVER_NS
-        return self.sync_ns + self._period_us * self._tenth_periods * 100
+        return self.sync_ns + self._period_us * self._values[_TOLERANCE] * 100
 
     def forget_command(self) -> None:
         """Forget the last command: commands count as missing until the next one."""
         self.silent_syncs = _NO_COMMAND_YET
 
-    def _set_syncs(self, syncs: int) -> None:
-        self._syncs = syncs
-
     def _set_period(self, period_us: int) -> None:
         # 0 is written to change 0x1019; a drive that has a period from its factory watches SYNC all the same.
         if period_us or not self._factory_period_us:
             self._period_us = period_us
-
-    def _set_tolerance(self, tenth_periods: int) -> None:
-        self._tenth_periods = tenth_periods
 
 
 def velocity_lsb(codec: Codec, number: int, factor: float) -> float | None:
@@ -324,6 +245,6 @@ def velocity_lsb(codec: Codec, number: int, factor: float) -> float | None:
 
     Then the body's counts fit as they are. number: of the drive, 1 or 2.
     """
-    signals = codec.message(f"Drive{number}Feedback").signals
-    scale = next(signal.scale for signal in signals if signal.name == "velocity") / factor
+    message = codec.message(f"Drive{number}Feedback")
+    scale = message.values[message.place("velocity")].scale / factor
     return None if scale == VELOCITY_LSB_RAD_S else scale

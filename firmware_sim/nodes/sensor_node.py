@@ -53,8 +53,8 @@ class SensorNode(Application):
         """Whether a status change has not been sent yet."""
         self._pdos = device.pdos
         self._lowest_count, self._highest_count = converter_ends
-        signals = codec.message(f"Sensor{number}Torque").signals
-        signal = next(signal for signal in signals if signal.name == "torque")
+        message = codec.message(f"Sensor{number}Torque")
+        signal = message.values[message.place("torque")]
         if count_Nm is None:
             self._lsbs_per_count = TORQUE_LSB_NM * round(1.0 / signal.scale)  # exact: contracts have decimal fractions
         else:

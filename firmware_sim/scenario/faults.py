@@ -8,10 +8,11 @@ Nodes are named drive1, drive2, sensor1, sensor2; frames by their content, as in
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.schema import ConfigError, setting
+from adacd_hil.wire.codec import MessageCodec
 
 DRIVES = ("drive1", "drive2")
 SENSORS = ("sensor1", "sensor2")
@@ -44,6 +45,7 @@ SINCE = ("enabled", "power_on")
 _FRAMES = tuple(FRAME_NODES)
 _TIMED = ("kind", "at_s", "since")
 _END = ("duration_s", "count")
+_LONGEST = 64  # bytes of a mask or of a flood's frame
 _COUNTED = ("feedback", "torque", "command")
 
 
@@ -140,8 +142,8 @@ class FaultSettings:
             raise ValueError("`duration_s` and `count` can't both end it")
         if self.bits is not None and self.mask is not None:
             raise ValueError("`bits` and `mask` can't both be flipped")
-        for key, longest in (("mask", 64), ("data", 64)):
-            _check_hex(key, getattr(self, key), longest)
+        _check_hex("mask", self.mask)
+        _check_hex("data", self.data)
         if self.kind == "saturate" and self.value is None and self.signal != "torque":
             raise ValueError(f"saturate of {self.signal} lacks the key `value`: it has no end of range")
         if self.kind == "duplicate_node_id" and self.same_as == self.node:
@@ -189,12 +191,10 @@ class FaultSettings:
     @property
     def nodes(self) -> tuple[int, ...]:
         """Places in `NODES` of the devices that the fault affects; () for the host."""
-        if self.node == HOST:
-            return ()
-        names = FRAME_NODES[self.frame] if self.frame is not None else NODES
+        names: tuple[str | None, ...] = (self.node,)
         if self.node in (None, ALL):
-            return tuple(place for place, name in enumerate(NODES) if name in names)
-        return tuple(place for place, name in enumerate(NODES) if name == self.node)
+            names = FRAME_NODES[self.frame] if self.frame is not None else NODES
+        return tuple(place for place, name in enumerate(NODES) if name in names)
 
     @property
     def is_broadcast(self) -> bool:
@@ -210,7 +210,7 @@ class FaultSettings:
     def text(self) -> str:
         """One line: kind, frame or signal, node, then the other keys but for onset."""
         whom = self.node or ALL
-        what = next((part for part in (self.frame, self.signal) if part is not None), None)
+        what = self.frame or self.signal
         details = [
             f"{field.name} {_show(getattr(self, field.name), field.metadata['is_hex'])}"
             for field in fields(self)
@@ -253,15 +253,15 @@ def _refusal(key: str, value: str, allowed: Sequence[str], what: str) -> str:
     return f"{key} = {value!r} can't be with {what}, which takes {', '.join(allowed)}{hint}"
 
 
-def _check_hex(key: str, text: str | None, longest: int) -> None:
+def _check_hex(key: str, text: str | None) -> None:
     if text is None:
         return
     try:
         size = len(bytes.fromhex(text))
     except ValueError:
         raise ValueError(f"{key} = {text!r} is not a row of hex bytes") from None
-    if not 1 <= size <= longest:
-        raise ValueError(f"{key} has {size} bytes, 1 to {longest} expected")
+    if not 1 <= size <= _LONGEST:
+        raise ValueError(f"{key} has {size} bytes, 1 to {_LONGEST} expected")
 
 
 def check_rows(rows: Sequence[FaultSettings]) -> None:
@@ -290,10 +290,7 @@ def device_ids(rows: Iterable[FaultSettings], right_ids: Sequence[int]) -> tuple
     return tuple(ids)
 
 
-Message = TypeVar("Message")
-
-
-def own_messages(messages: Mapping[int, Message], right_id: int, node_id: int) -> Mapping[int, Message]:
+def own_messages(messages: Mapping[int, MessageCodec], right_id: int, node_id: int) -> Mapping[int, MessageCodec]:
     """Return the messages, by identifier, as a device with a wrong node id expects them.
 
     Its own frames are at the identifiers that follow from the wrong id, but keep their data ids; other messages

@@ -67,8 +67,8 @@ class DeviceCounts(NamedTuple):
 
     increments_per_joint_rev: Pair
     torque_range_Nm: Pair
-    rated_count_Nm: Pair = (1e-3, 1e-3)
-    rated_torque_Nm: Pair = (0.0, 0.0)
+    rated_count_Nm: Pair
+    rated_torque_Nm: Pair
 
 
 @dataclass(frozen=True)
@@ -315,26 +315,27 @@ def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -
     known = theta[3:7] if any(theta[3:7]) else ()
     found: list[Pair] = []
     arm = told.settings.arm
-    for key, given, places, share, unit in (
-        ("viscous", truth.arm.viscous_Nm_s or arm.viscous_Nm_s, slice(0, 2), _VISCOUS_SHARE_S, "Nm s/rad"),
-        ("Coulomb", truth.arm.coulomb_Nm or arm.coulomb_Nm, slice(2, 4), _COULOMB_SHARE, "Nm"),
-    ):
+    model = ARMS[arm.profile]
+    for key, given, places, typical, share, unit in (
+        (
+            "viscous", truth.arm.viscous_Nm_s or arm.viscous_Nm_s, slice(0, 2), model.viscous_Nm_s,
+            _VISCOUS_SHARE_S, "Nm s/rad",
+        ),
+        ("Coulomb", truth.arm.coulomb_Nm or arm.coulomb_Nm, slice(2, 4), model.coulomb_Nm, _COULOMB_SHARE, "Nm"),
+    ):  # fmt: skip
         if given is not None:
-            found.append(given)
+            first, second = given
         elif known:
             first, second = known[places]
-            found.append((first, second))
         elif not told.has_geometry:
-            model = ARMS[told.settings.arm.profile]
-            first, second = model.viscous_Nm_s if key == "viscous" else model.coulomb_Nm
-            found.append((first, second))
+            first, second = typical
         else:
             first, second = _times(rated, (share, share))
-            found.append((first, second))
             assumed.append(
                 f"{key} friction {first:.3g} and {second:.3g} {unit}, since the file has none: {100 * share:g} % of "
                 "rated torque"
             )
+        found.append((first, second))
     viscous, coulomb = found
     return viscous, coulomb
 
@@ -345,9 +346,10 @@ def _wire(sign: tuple[int, int], truth: ArmTruth) -> dict[str, Any]:
     drive_joint, sensor_joint = (
         (2, 1) if wiring.swapped in (what, "joints") else (1, 2) for what in ("drives", "sensors")
     )
-    turned = [-1 if is_reversed else 1 for is_reversed in wiring.reversed_joint]
-    driven = [-1 if is_reversed else 1 for is_reversed in wiring.reversed_motor]
-    sensed = [-1 if is_reversed else 1 for is_reversed in wiring.reversed_sensor]
+    turned, driven, sensed = (
+        [-1 if is_reversed else 1 for is_reversed in joints]
+        for joints in (wiring.reversed_joint, wiring.reversed_motor, wiring.reversed_sensor)
+    )
     return {
         "drive_joint": list(drive_joint),
         "sensor_joint": list(sensor_joint),
@@ -421,7 +423,7 @@ def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list
     return mechanics
 
 
-_LENGTHS: Final = ("x_m", "y_m", "radius_m", "room_m")
+_LENGTHS: Final = ("x_m", "y_m", "radius_m")
 
 
 def _fit(table: dict[str, Any], settings: Settings, links: _Links, rated: Pair, assumed: list[str]) -> None:
@@ -447,7 +449,7 @@ def _fit(table: dict[str, Any], settings: Settings, links: _Links, rated: Pair, 
         table["payloads"] = [_heavier(row, heavier, longer[1]) for row in table["payloads"]]
     for key in ("contacts", "hands"):
         if key in table:
-            table[key] = [_stronger(row, longer, stronger, reach) for row in table[key]]
+            table[key] = [_stronger(row, longer, stronger) for row in table[key]]
     for key in ("bodies", "walls"):
         if key in table:
             table[key] = [
@@ -462,8 +464,7 @@ def _fit(table: dict[str, Any], settings: Settings, links: _Links, rated: Pair, 
 
 
 def _heavier(row: dict[str, Any], heavier: float, longer: float) -> dict[str, Any]:
-    fitted = dict(row)
-    fitted["mass_kg"] = row["mass_kg"] * heavier
+    fitted = {**row, "mass_kg": row["mass_kg"] * heavier}
     if "center_m" in row:
         fitted["center_m"] = [value * longer for value in row["center_m"]]
     if "inertia_kg_m2" in row:
@@ -471,10 +472,9 @@ def _heavier(row: dict[str, Any], heavier: float, longer: float) -> dict[str, An
     return fitted
 
 
-def _stronger(row: dict[str, Any], longer: Pair, stronger: Pair, reach: float) -> dict[str, Any]:
+def _stronger(row: dict[str, Any], longer: Pair, stronger: Pair) -> dict[str, Any]:
     link = row["link"] - 1
-    fitted = {name: value * reach if name in _LENGTHS else value for name, value in row.items()}
-    fitted["point_m"] = row["point_m"] * longer[link]
+    fitted = {**row, "point_m": row["point_m"] * longer[link]}
     for key in ("force_N", "force_limit_N"):
         if key in row:
             fitted[key] = row[key] * stronger[link] / longer[link]

@@ -35,7 +35,7 @@ from adacd_hil.records import FaultReason, Vector
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError, setting
 from adacd_hil.settings.toml_files import find_toml, read_toml, toml_names
-from firmware_sim.arm.arms import ARMS, STRAIGHT, EmulatedArm, Wiring
+from firmware_sim.arm.arms import ARMS, EmulatedArm
 from firmware_sim.arm.hardware_settings import (
     DriveSettings,
     HabitSettings,
@@ -291,11 +291,6 @@ class Scenario:
         return ARMS[self.profile] if self.own_arm is None else self.own_arm
 
     @property
-    def wiring(self) -> Wiring:
-        """Joint, directions and zero of the device at each place; straight for an arm of a profile."""
-        return STRAIGHT if self.own_arm is None else self.own_arm.wiring
-
-    @property
     def payload_bodies(self) -> tuple[PayloadBody, ...]:
         """All payloads, as (mass kg, centre of mass m, inertia kg m²): none, that at power-on, then the changes."""
         changes = ((change.mass_kg, change.center_m, change.inertia_kg_m2) for change in self.payloads)
@@ -304,7 +299,7 @@ class Scenario:
     @property
     def start_rad(self) -> Vector:
         """Pose at power-on, rad, (2,)."""
-        return np.array([math.radians(angle_deg) for angle_deg in self.start_deg])
+        return np.radians(self.start_deg)
 
 
 def builtin_scenarios() -> list[str]:
@@ -361,6 +356,7 @@ def named_profile(name_or_file: str) -> str | None:
     return None if profile is None else str(profile)
 
 
+_SAME: Final = (1.0, 1.0)
 SCENARIO_SECTIONS = ("sensors", "drives", "mechanics")
 
 
@@ -399,15 +395,15 @@ class TruthArmSettings:
 class FactorSettings:
     """Factors on values of the host's configuration, by joint."""
 
-    link_length: Pair = setting((1.0, 1.0), low=0.1, high=10.0, meaning="of the lengths; masses keep their shares")
-    mass: Pair = setting((1.0, 1.0), low=0.01, high=100.0, meaning="of the masses, and with them the inertia")
-    rated_torque: Pair = setting((1.0, 1.0), low=0.01, high=100.0, meaning="of the rated torque of each joint's drive")
+    link_length: Pair = setting(_SAME, low=0.1, high=10.0, meaning="of the lengths; masses keep their shares")
+    mass: Pair = setting(_SAME, low=0.01, high=100.0, meaning="of the masses, and with them the inertia")
+    rated_torque: Pair = setting(_SAME, low=0.01, high=100.0, meaning="of the rated torque of each joint's drive")
     gear: Pair = setting(
-        (1.0, 1.0), low=1e-3, high=1e3, meaning="of the gear ratio of each joint's drive: its torque and its counts"
+        _SAME, low=1e-3, high=1e3, meaning="of the gear ratio of each joint's drive: its torque and its counts"
     )
-    torque_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the torque sensors' counts")
-    position_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the drives' counts of position")
-    velocity_counts: Pair = setting((1.0, 1.0), low=1e-3, high=1e3, meaning="of the drives' counts of velocity")
+    torque_counts: Pair = setting(_SAME, low=1e-3, high=1e3, meaning="of the torque sensors' counts")
+    position_counts: Pair = setting(_SAME, low=1e-3, high=1e3, meaning="of the drives' counts of position")
+    velocity_counts: Pair = setting(_SAME, low=1e-3, high=1e3, meaning="of the drives' counts of velocity")
 
 
 SWAPS = ("nothing", "drives", "sensors", "joints")

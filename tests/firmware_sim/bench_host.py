@@ -80,7 +80,6 @@ class BenchHost:
         self,
         scenario: Scenario | None = None,
         clock_mode: str = "sync",
-        seed: int | None = None,
         contract: str = "arm",
     ) -> None:
         codec = CODEC if contract == "arm" else load_codec(CONTRACTS[contract].path)
@@ -92,7 +91,6 @@ class BenchHost:
             codec,
             lambda can_id, data: self.frames.append((can_id, data)),
             clock_mode=clock_mode,
-            seed=seed,
             on_truth=lambda cycle, t_ns, block: self.truths.append((cycle, t_ns, block.copy())),
         )
         self.t_ns = 0

@@ -20,8 +20,8 @@ def errors_over_a_turn(joint: int, count: int = 4096, **settings) -> np.ndarray:
     return np.array([read_angle(numbers, joint, angle, 0.0) - angle for angle in angles])
 
 
-def arm(seed: int = 1, noise: bool = True, **sensors) -> Body:
-    return Body(parse(Scenario, {"profile": "S", "noise": noise, "sensors": sensors}), seed=seed)
+def arm(noise: bool = True, **sensors) -> Body:
+    return Body(parse(Scenario, {"profile": "S", "noise": noise, "sensors": sensors}))
 
 
 @pytest.mark.parametrize(("error", "joint", "times"), [("eccentricity", 0, 1), ("ellipticity", 1, 2)])

@@ -28,7 +28,7 @@ FEEDBACK = bytes(range(8))
 
 def plan_of(*rows: dict[str, object], seed: int = 1, contract: str = "arm") -> FaultPlan:
     codec = CODEC if contract == "arm" else load_codec(CONTRACTS[contract].path)
-    return FaultPlan([parse(FaultSettings, row) for row in rows], seed, PERIOD_NS, codec)
+    return FaultPlan([parse(FaultSettings, row) for row in rows], seed, codec)
 
 
 def active(*rows: dict[str, object], seed: int = 1) -> FaultPlan:
@@ -49,10 +49,12 @@ def test_a_row_begins_and_ends_at_its_times_and_says_so():
     plan = plan_of(example("silence", node="sensor2", at_s=1.0, duration_s=0.5))
     assert plan.advance(-1, 5 * S) == []
     assert (plan.mask, plan.is_quiet, plan.wait_ns) == (0, True, NEVER_NS)
-    edges = {ms: plan.advance(ms * MS) for ms in (-1, 0, 999, 1000, 1001, 1499, 1500, 1501)}
-    said = {ms: [(edge.row, edge.begins, edge.text) for edge in found] for ms, found in edges.items() if found}
+    events = {ms: plan.advance(ms * MS) for ms in (-1, 0, 999, 1000, 1001, 1499, 1500, 1501)}
     text = "silence of sensor2, duration_s 0.5"
-    assert said == {1000: [(0, True, f"begins: {text}")], 1500: [(0, False, f"ends: {text}")]}
+    assert {ms: found for ms, found in events.items() if found} == {
+        1000: [("warning", "fault 0", f"begins: {text}")],
+        1500: [("info", "fault 0", f"ends: {text}")],
+    }
 
 
 def test_the_mask_has_a_bit_for_each_row_that_is_active():
@@ -352,7 +354,7 @@ def test_a_value_jumps_by_its_step_or_saturates_at_its_bound_and_no_other_does(r
 def test_a_torque_of_a_sensor_with_a_wide_range_changes_by_its_own_counts(row, counts, seen):
     sensors = {"torque_range_Nm": [100.0, 50.0], "torque_bits": [16, 16]}
     scenario = quiet_scenario(sensors=sensors, faults=[row | {"at_s": 0.0}])
-    plan = Injector(scenario, 1, PERIOD_NS, CODEC, None, None).plan
+    plan = Injector(scenario, CODEC, None, None).plan
     plan.advance(0)
     assert plan.distort((0, 0), (0, 0), (counts, counts))[2] == (seen, counts)
 

@@ -4,7 +4,7 @@ import configparser
 import struct
 
 import pytest
-from bench_host import CODEC, EDS, BenchHost, Nmt
+from bench_host import CODEC, EDS, Nmt
 
 from adacd_hil.wire.dbc_contract import contract_folder
 from firmware_sim.canopen.error_control import Watchdog
@@ -46,11 +46,6 @@ def default_of(text: str, node: int) -> int | str:
         return int(text, 0)
     except ValueError:
         return text
-
-
-@pytest.fixture
-def host() -> BenchHost:
-    return BenchHost()
 
 
 @pytest.mark.parametrize("node", [1, 3])

@@ -10,11 +10,6 @@ INCOMPATIBLE, VALUE_RANGE, DEVICE_STATE, READ_ONLY = 0x06040043, 0x06090030, 0x0
 COMMAND = (0x60400010, 0x60710010)
 
 
-@pytest.fixture
-def host() -> BenchHost:
-    return BenchHost()
-
-
 def entry(index: int, bits: int, sub: int = 0) -> int:
     return index << 16 | sub << 8 | bits
 

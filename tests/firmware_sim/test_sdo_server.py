@@ -12,11 +12,6 @@ VALUE, HIGH, LOW, STATE = 0x06090030, 0x06090031, 0x06090032, 0x08000022
 CANNOT_STORE = 0x08000020
 
 
-@pytest.fixture
-def host() -> BenchHost:
-    return BenchHost()
-
-
 def ask(host: BenchHost, request: bytes, node: int = 1) -> bytes:
     """Send one request frame; return the one answer."""
     host.take()

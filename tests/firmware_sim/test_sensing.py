@@ -1,4 +1,4 @@
-"""What the devices measure: lag, quantisation, noise, saturation."""
+"""What the devices measure: the lag of a drive's velocity, and the noise of the torque sensors."""
 
 import itertools
 import math
@@ -7,13 +7,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from firmware_sim.arm.sensing import (
-    POSITION_LSB_RAD,
-    TorqueNoise,
-    to_counts,
-    torque_counts,
-    track,
-)
+from firmware_sim.arm.sensing import TorqueNoise, track
 from firmware_sim.arm.touch_settings import TICK_S
 
 
@@ -36,31 +30,6 @@ def test_the_tracking_loop_is_the_critically_damped_200_hz_one():
     system = signal.lti([omega**2, 0.0], [1.0, 2.0 * omega, omega**2])
     _, expected, _ = signal.lsim(system, positions, times_s, interp=True)
     assert np.allclose(tracked(positions), expected[1:], rtol=1e-9, atol=1e-9)
-
-
-def test_the_encoder_is_never_off_by_more_than_half_a_count():
-    for angle_rad in np.random.default_rng(4).uniform(-7, 7, 500):
-        error_rad = to_counts(angle_rad, POSITION_LSB_RAD) * POSITION_LSB_RAD - angle_rad
-        assert abs(error_rad) <= 0.5 * POSITION_LSB_RAD * (1 + 1e-9)
-    assert to_counts(2.0 * math.pi, POSITION_LSB_RAD) == 1 << 20
-    assert to_counts(-math.pi, POSITION_LSB_RAD) == -(1 << 19)
-
-
-@pytest.mark.parametrize(
-    ("torque_Nm", "counts"),
-    [
-        (0.0007, 0),
-        (0.0008, 1),
-        (-0.0008, -1),
-        (-12.0, -7864),
-        (50.0, 32767),
-        (75.0, 32767),
-        (-50.0, -32768),
-        (-75.0, -32768),
-    ],
-)
-def test_the_torque_converter_counts_and_saturates(torque_Nm, counts):
-    assert torque_counts(torque_Nm) == counts
 
 
 def test_torque_noise_has_its_rms_on_both_joints_independently():

@@ -71,7 +71,7 @@ def test_the_counter_goes_on_over_a_pause_and_begins_anew_after_a_reset(command)
 
 
 def test_autozero_takes_the_mean_of_64_samples_for_zero():
-    host = BenchHost(quiet_scenario(noise=True, torque_offset_Nm=[3.0, 0.0]), seed=5)
+    host = BenchHost(quiet_scenario(noise=True, torque_offset_Nm=[3.0, 0.0], seed=5))
     host.nmt(Nmt.START)
     before = torque_frames(host, 200)
     assert np.mean([torque_uNm(frame) for frame in before]) == pytest.approx(3e6, abs=10e3)

@@ -110,9 +110,9 @@ def play_loop(
     things: Structured,
     touch_state: Vector,
     payloads: Structured,
+    work: Vector,
     encoder_noise: NDArray[np.float64],
     substeps: int,
-    work: Vector,
     pushes: NDArray[np.float64],
     drift: NDArray[np.float64],
     asymmetry: float,
@@ -172,9 +172,8 @@ def play_loop(
             now["tau_m"][0] += push1
             now["tau_m"][1] += push2
             advance_body(
-                state_vector, number_vector, contacts, things, touch_state, payloads,
-                encoder_noise, latched[0] + push1, latched[1] + push2, _POWERED, _POWERED, 1 if is_fine else TICKS,
-                substeps, work,
+                state_vector, number_vector, contacts, things, touch_state, payloads, work, encoder_noise, substeps,
+                latched[0] + push1, latched[1] + push2, _POWERED, _POWERED, 1 if is_fine else TICKS,
             )  # fmt: skip
             now["tau_m"][0] -= push1
             now["tau_m"][1] -= push2

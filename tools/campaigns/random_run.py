@@ -116,7 +116,7 @@ def draw_run(seed: int) -> Drawn:
         "start_deg": start_deg,
         "payloads": payloads,
     }
-    faults = _draw_faults(draws, settings, _codec(contract), seed, armed_s, finish_s)
+    faults = _draw_faults(draws, _codec(contract), seed, armed_s, finish_s)
     scenario = _build(table | {"faults": faults}, touches)
     return Drawn(seed, contract, settings, scenario, _draw_user(draws, armed_s, finish_s), armed_s, finish_s)
 
@@ -280,7 +280,7 @@ def _codec(contract: str) -> Codec:
 
 
 def _draw_faults(
-    draws: random.Random, settings: Settings, codec: Codec, seed: int, armed_s: float, finish_s: float
+    draws: random.Random, codec: Codec, seed: int, armed_s: float, finish_s: float
 ) -> list[dict[str, Any]]:
     """Draw faults that this contract can have."""
     rows: list[dict[str, Any]] = []
@@ -294,7 +294,7 @@ def _draw_faults(
         for _ in range(ATTEMPTS):
             row = _draw_fault(draws, armed_s, finish_s)
             try:
-                FaultPlan([parse(FaultSettings, row)], seed, settings.bus.period_ns, codec)
+                FaultPlan([parse(FaultSettings, row)], seed, codec)
             except ConfigError:
                 continue
             rows.append(row)
