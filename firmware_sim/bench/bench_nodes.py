@@ -146,13 +146,14 @@ class BenchNodes:
         joint = self.wiring.sensor_joint[place]
         low, high = converter_ends(scenario.sensors, joint)
         own = scenario.own_arm
+        factor = 1.0 if own is None else own.torque_factor[place]
         return SensorNode(
             self.devices[JOINTS + place],
             codec,
             place + 1,
             (low, high) if self.wiring.sensor_sign[place] > 0 else (-high, -low),
             lambda: self._arm.joint_temperature_C[joint],
-            None if own is None else own.torque_factor[place] * count_Nm(scenario.sensors, joint),
+            factor * count_Nm(scenario.sensors, joint),
         )
 
     def _set_period(self, period_us: int) -> None:

@@ -9,10 +9,10 @@ Pre-operational; the sensor takes its samples at the following SYNCs, in any sta
 Source: CiA 404, objects 0x6125, 0x6150, 0x9130.
 """
 
+import math
 from collections.abc import Callable
 
 from adacd_hil.wire.codec import Codec
-from firmware_sim.arm.sensing import TORQUE_LSB_NM
 from firmware_sim.canopen.error_control import Watchdog
 from firmware_sim.canopen.object_dictionary import Abort, refuse
 from firmware_sim.nodes.device import Application, EmulatedDevice
@@ -40,13 +40,12 @@ class SensorNode(Application):
         number: int,
         converter_ends: tuple[int, int],
         temperature_C: Callable[[], float],
-        count_Nm: float | None,
+        count_Nm: float,
     ) -> None:
         """Connect the node to its device, whose application it becomes.
 
         `number`: 1 or 2, as in the DBC's names. `converter_ends`: lowest and highest counts that the converter gives,
-        which mean overload. `temperature_C`: of the joint, 0x2111. `count_Nm`: torque sent for a converter's count;
-        None: the true one, and then no value is beyond the signal.
+        which mean overload. `temperature_C`: of the joint, 0x2111. `count_Nm`: torque sent for a converter's count.
         """
         self.device = device
         self.has_news = False
@@ -55,10 +54,9 @@ class SensorNode(Application):
         self._lowest_count, self._highest_count = converter_ends
         message = codec.message(f"Sensor{number}Torque")
         signal = message.values[message.place("torque")]
-        if count_Nm is None:
-            self._lsbs_per_count = TORQUE_LSB_NM * round(1.0 / signal.scale)  # exact: contracts have decimal fractions
-        else:
-            self._lsbs_per_count = count_Nm / signal.scale
+        per_Nm = round(1.0 / signal.scale)
+        is_exact = math.isclose(per_Nm * signal.scale, 1.0, rel_tol=1e-12)  # most contracts have decimal fractions
+        self._lsbs_per_count = count_Nm * per_Nm if is_exact else count_Nm / signal.scale
         self._ends = signal.raw_low, signal.raw_high
         self._status = STATUS_NOT_VALID  # not measured yet
         self._torque = self._counts = 0

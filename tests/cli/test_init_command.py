@@ -25,6 +25,7 @@ from adacd_hil.lab.commission.profile_draft import DeviceRatings, draft_profile
 from adacd_hil.lab.serial_arm.urdf import UrdfError
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
+from adacd_hil.wire.bus import BusError
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec
 from firmware_sim.cli.own_devices import rehearse
 
@@ -449,7 +450,7 @@ def on_bus(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Rig]:
 
     def attach(**parts: object) -> Rig:
         rig = Rig(is_wall=True, **parts)  # type: ignore[arg-type]
-        monkeypatch.setattr("adacd_hil.lab.cli.arm_drafting.open_bus", lambda *_: rig.bus)
+        monkeypatch.setattr("adacd_hil.cli.connection.open_bus", lambda *_: rig.bus)
         monkeypatch.setattr("adacd_hil.lab.cli.arm_drafting.MonotonicClock", lambda: rig.clock)
         return rig
 
@@ -473,6 +474,16 @@ def test_devices_are_recognised_with_their_ratings_and_no_drive_is_enabled(out, 
     # SDO uploads only: no NMT command, no SYNC, no command, no download.
     assert {frame.can_id & 0x780 for frame in rig.sent} == {0x600}
     assert {frame.data[0] & 0xE0 for frame in rig.sent} <= {0x40, 0x60, 0x80}
+
+
+def test_a_bus_that_fails_has_the_status_of_a_missing_one(out, on_bus):
+    def fail(*_: object) -> None:
+        raise BusError("lab is gone")
+
+    on_bus().bus.receive = fail
+    result = init(out, *BUS)
+    assert (result.exit_code, out.exists()) == (BUS_MISSING, False)
+    assert result.stderr.splitlines()[-1].endswith("lab is gone")
 
 
 @pytest.mark.parametrize(

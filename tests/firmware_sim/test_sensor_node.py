@@ -28,6 +28,12 @@ def test_the_value_is_the_converters_count_in_micronewtonmetres():
     assert host.read(3, 0x9130, 1) == pytest.approx(1e6, abs=lsb_uNm)
 
 
+def test_a_sensor_of_a_larger_range_sends_the_torque_in_coarser_steps():
+    host = BenchHost(quiet_scenario(torque_offset_Nm=[10.0, 0.0], sensors={"torque_range_Nm": [100.0, 50.0]}))
+    host.nmt(Nmt.START)
+    assert torque_uNm(torque_frames(host, 1, 3)[0]) == pytest.approx(10e6, abs=200e6 / 65536)
+
+
 @pytest.mark.parametrize(("range_Nm", "bits"), [(50.0, 16), (20.0, 12)])
 @pytest.mark.parametrize("beyond_Nm", [-0.1, 0.0, 15.0])
 @pytest.mark.parametrize(("way", "overload"), [(1.0, 0x03), (-1.0, 0x05)])

@@ -4,7 +4,7 @@ import math
 import os
 import tempfile
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -58,7 +58,6 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.setting_keys import known_keys
 from adacd_hil.settings.toml_text import toml_value
 from adacd_hil.wire.can_interface import can_interfaces, read_link
-from adacd_hil.wire.open_bus import open_bus
 
 Pair = tuple[float, float]
 _PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
@@ -161,9 +160,9 @@ class Drafting:
         """Scan the bus, ask the user, derive the other values; return the text of a configuration, and a summary.
 
         The summary is for JSON, but for the `Connection` under "bus". Writes no file; adds device profiles to
-        `writing`. Raises CommandError without an answer, for options that exclude each other, or if the configuration
-        would have errors; ConfigError for a URDF, EDS or value that can't be used, BusMissingError if the bus can't be
-        opened, BusError if it fails.
+        `writing`. Raises CommandError without an answer, for options that exclude each other, if the configuration
+        would have errors, or if the bus fails; ConfigError for a URDF, EDS or value that can't be used, BusMissingError
+        if the bus can't be opened.
         """
         facts = self._gather()
         title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]}"
@@ -290,20 +289,21 @@ class Drafting:
     def _find_devices(self) -> dict[str, list[RecognisedDevice]]:
         """Scan the bus, if there is one; return the devices of joint 1 and 2 by kind, [] without a bus.
 
-        Sets `bus` and `bitrate`. Raises CommandError if fewer than two of a kind answer, BusMissingError if the bus
-        can't be opened, BusError if it fails.
+        Sets `bus` and `bitrate`. Raises CommandError if fewer than two of a kind answer or the bus fails,
+        BusMissingError if it can't be opened.
         """
         channel = self._ask_channel()
         if channel is None:
             return {DRIVE: [], SENSOR: []}
         interface = self.options.interface or "socketcan"
         clock = MonotonicClock()
-        with closing(open_bus(interface, channel, clock, None, self.options.bitrate, False)) as bus:
+        connection = Connection(interface, channel, self.options.bitrate, str(self.writing.out), None, None)
+        with connection.bus(clock, is_fd=False) as bus:
             found = survey(bus, clock, progress=tell)
             kinds = dict.fromkeys(self.options.drive_node or (), DRIVE)
             kinds |= dict.fromkeys(self.options.sensor_node or (), SENSOR)
             devices = recognise(bus, clock, found.nodes, kinds)
-        self.bus = Connection(interface, channel, self.options.bitrate, str(self.writing.out), None, None)
+        self.bus = connection
         link = read_link(channel) if interface == "socketcan" else None
         self.bitrate = (None if link is None else link.bitrate) or self.bitrate
         for device in devices:
