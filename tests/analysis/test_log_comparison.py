@@ -82,6 +82,14 @@ def test_what_differs_is_named_with_its_first_cycle_and_by_how_much(paths):
     assert (found.cycles, found.only) == (25, (15, 0))
 
 
+def test_no_cycle_is_paired_with_one_of_another_period(tmp_path):
+    slow = apply_settings(SETTINGS, {"bus.period_us": "2000"})
+    found = compare_logs(write(tmp_path / "fast"), write(tmp_path / "slow", settings=slow))
+    assert (found.cycles, found.only, found.fields) == (0, (40, 40), ())
+    assert not found.is_same_where_whole
+    assert "cycles of 1000 µs in 1, of 2000 µs in 2: none is paired with another" in found.notes
+
+
 def test_a_contact_that_one_log_reports_otherwise_or_not_at_all_is_a_difference(tmp_path):
     def other_link(run) -> None:
         for cycle in run.cycles:

@@ -249,6 +249,7 @@ def test_runs_are_chosen_by_verdict_date_and_arm(many):
     [
         (("--since", "2026-11-25", "--until", "2026-11-24"), "is after --until"),
         (("--arm", "lab"), "no run of arm 'lab'"),
+        (("--scenario", "papers"), "did you mean 'paper'?"),
     ],
 )
 def test_a_choice_that_makes_no_sense_is_one_line(many, options, line):

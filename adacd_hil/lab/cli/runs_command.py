@@ -2,8 +2,9 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import datetime, timedelta
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,7 @@ from adacd_hil.log.log_files import LOG_NAME, LogError
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 from adacd_hil.remedies import nearest_name
+from adacd_hil.settings.toml_files import toml_names
 
 if TYPE_CHECKING:
     from adacd_hil.lab.runs.run_summary import RunSummary
@@ -188,7 +190,7 @@ def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progre
     """Return the runs of a folder that meet the conditions `asked`, oldest first; [] if none does.
 
     is_judging: judge runs without a report by their logs. Raises LogError for a folder without a run, CommandError if
-    no run is of an arm in `asked`.
+    no run is of an arm in `asked`, or of a scenario there that isn't built in either.
     """
     from adacd_hil.lab.runs import run_table
     from adacd_hil.lab.runs.run_summary import NOT_JUDGED, find_runs, judged, summarise
@@ -203,10 +205,11 @@ def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progre
         raise LogError(f"{folder} has no {LOG_NAME}, nor has any folder in it")
     for arm in asked.arms:
         if not any(run_table.is_arm(run, arm) for run in found):
-            known = sorted({run.arm for run in found if run.arm})
-            near = nearest_name(arm, [*known, *sorted({run.config for run in found if run.config})])
-            hint = f"did you mean {near!r}?" if near else f"there are {', '.join(known) or 'none that is named'}"
-            raise CommandError(f"no run of arm {arm!r} in {folder}; {hint}", ExitCode.USAGE)
+            raise _no_run_of("arm", arm, folder, {run.arm for run in found}, {run.config for run in found})
+    for scenario in asked.scenarios:
+        known, builtin = {run.scenario for run in found}, toml_names(resources.files("firmware_sim") / "scenarios")
+        if scenario not in (*known, *builtin):
+            raise _no_run_of("scenario", scenario, folder, known, builtin)
     if is_judging:  # which may change the verdict: it is filtered afterwards
         with_any_verdict = dataclasses.replace(asked, statuses=())
         found = [run for run in found if with_any_verdict.takes(run)]
@@ -214,6 +217,14 @@ def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progre
             progress(f"reading {counted(waiting, 'log')} without a report; `adacd-hil report` keeps the figures")
         found = [judged(run) for run in found]
     return [run for run in run_table.in_order(found) if asked.takes(run)]
+
+
+def _no_run_of(what: str, name: str, folder: Path, named: Iterable[str], others: Iterable[str] = ()) -> CommandError:
+    """Return the error for a name that no run has: with the nearest of `named` and `others`, else all of `named`."""
+    known = sorted(filter(None, named))
+    near = nearest_name(name, [*known, *sorted(filter(None, others))])
+    hint = f"did you mean {near!r}?" if near else f"there are {', '.join(known) or 'none that is named'}"
+    return CommandError(f"no run of {what} {name!r} in {folder}; {hint}", ExitCode.USAGE)
 
 
 def _page(found: list["RunSummary"], path: Path) -> str:
