@@ -151,8 +151,10 @@ def on_bus(command: Callable[..., ExitCode], is_required: bool = True) -> Callab
         from adacd_hil.cli.connection import Connection
 
         if url is not None:
-            if given := [name for name, value in (("--interface", interface), ("--channel", channel)) if value]:
-                raise CommandError(f"--url watches a run, {given[0]} a bus: choose one", ExitCode.USAGE)
+            source = click.get_current_context().get_parameter_source
+            for name in ("interface", "channel", "bitrate", "config", "profile", "dbc"):
+                if source(name) is not click.core.ParameterSource.DEFAULT:
+                    raise CommandError(f"--url watches a run, --{name} is of a bus: choose one", ExitCode.USAGE)
             return command(url, **own)
         if interface is None or channel is None:
             raise CommandError("give --interface and --channel, or --url", ExitCode.USAGE)

@@ -137,7 +137,8 @@ WRONG = {
 
 OPTIONS = {
     "fit_s = (105, 101) s ends before it begins": {"fit_s": (105.0, 101.0)},
-    "too little free motion to fit from 200 to 300 s: 100 samples in a row are the least": {"fit_s": (200.0, 300.0)},
+    "fit_s ends at 300 s, t at 112 s": {"fit_s": (100.0, 300.0)},
+    "too little free motion to fit from 100 to 100.1 s: 100 samples in a row are the least": {"fit_s": (100.0, 100.1)},
     "noise_Nm has 2 values, the arm 1 joints": {"noise_Nm": (0.1, 0.1)},
     "`deviations` = 0.0 is below 1": {"deviations": 0.0},
     "unknown key `deviation`; did you mean `deviations`?": {"deviation": 5.0},

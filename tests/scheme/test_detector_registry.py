@@ -115,6 +115,8 @@ CAUSES = {
 
 @pytest.mark.parametrize("way", CAUSES)
 def test_a_detector_that_breaks_the_contract_is_refused(way):
+    with pytest.raises(ValueError, match="needs a name that can be printed, not ''"):
+        register("", lambda _: Broken(way))
     with pytest.raises(ValueError, match=f"^detector its name {CAUSES[way]}"):
         detector_registry.check_contract("its name", lambda _: Broken(way))
 

@@ -129,8 +129,10 @@ def forget_loaded() -> None:
 def register(name: str, make: Maker) -> None:
     """Register a detector under a name, for this process. make: begins one on a stream of a period, s.
 
-    Raises ValueError for a name that is taken, and for a detector that breaks the contract.
+    Raises ValueError for a name that is taken, empty or can't be printed, and for a detector that breaks the contract.
     """
+    if not name.strip() or not name.isprintable():
+        raise ValueError(f"a detector needs a name that can be printed, not {name!r}")
     if name in (*_REGISTERED, *OWN_CHANNELS, *_OWN_DETECTORS):
         where = f", of {_ORIGINS[name]}" if name in _ORIGINS else ""
         raise ValueError(f"there is a detector or channel {name} already{where}")

@@ -373,11 +373,12 @@ def _numbers(name: str, given: ArrayLike) -> Vector:
 def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tuple[float, float]:
     """Return the span of free motion, s since the recording's first row; by default the first `FIT_SHARE` of it.
 
-    Raises ArrayError if `fit_s` is no pair of times, or ends before it begins.
+    Raises ArrayError if `fit_s` is no pair of times, ends before it begins, or ends after the last sample.
     """
+    last = recording.stretches[-1]
+    length_s = last.start_s + len(last.record.q) * recording.period_s
     if fit_s is None:
-        last = recording.stretches[-1]
-        return 0.0, FIT_SHARE * (last.start_s + len(last.record.q) * recording.period_s)
+        return 0.0, FIT_SHARE * length_s
     try:
         start_s, end_s = (float(bound) - recording.columns.begin_s for bound in fit_s)
     except (TypeError, ValueError):
@@ -386,6 +387,8 @@ def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tup
         raise ArrayError(f"fit_s = {fit_s!r} is no pair of times in s")
     if not start_s < end_s:
         raise ArrayError(f"fit_s = ({float(fit_s[0]):g}, {float(fit_s[1]):g}) s ends before it begins")
+    if end_s > length_s + recording.period_s:
+        raise ArrayError(f"fit_s ends at {float(fit_s[1]):g} s, t at {recording.columns.begin_s + length_s:g} s")
     return start_s, end_s
 
 
