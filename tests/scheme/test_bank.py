@@ -62,39 +62,36 @@ def test_the_lag_column_is_the_filtered_derivative_of_its_joint_s_torque():
     _, _, tau_J = signals()
     tau_J -= tau_J[0]
     filtered, got = Bank(), []
-    none, first = np.zeros((2, COLUMNS)), NAMES.index("lag1")
+    none = np.zeros((2, COLUMNS))
     for k, torque in enumerate(tau_J):
         filtered.take(none, none, torque, is_seen=k > 0)
-        filter_bank.fill_lag(filtered.k, filtered.m, torque)
-        got.append(filtered.W_f.copy())
+        W_f = np.zeros((3, 2, COLUMNS))
+        filter_bank.fill_lag(CUTOFF, torque, filtered.tau_f, 3, W_f)
+        got.append(W_f)
     rate = np.concatenate([np.zeros((1, 2)), np.diff(tau_J, axis=0) / T])
     for c, a in enumerate(CUTOFF):
         decay = np.exp(-a * T)
         expected = scipy.signal.lfilter([1.0 - decay], [1.0, -decay], rate, axis=0)
         columns = np.array(got)[:, c]
         for joint in range(2):
-            np.testing.assert_allclose(columns[:, joint, first + joint], expected[:, joint], rtol=1e-9, atol=1e-9)
-            assert np.count_nonzero(np.delete(columns[:, joint], first + joint, axis=1)) == 0
+            np.testing.assert_allclose(columns[:, joint, 3 + joint], expected[:, joint], rtol=1e-9, atol=1e-9)
+            assert np.count_nonzero(np.delete(columns[:, joint], 3 + joint, axis=1)) == 0
 
 
 def test_the_cross_talk_column_is_the_other_joint_s_filtered_torque():
-    k, m = kernel_of()
-    W_f, tau_f, first = m.filters.W_f, m.filters.tau_f, NAMES.index("cross_talk1")
-    tau_f[:] = [[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]
-    filter_bank.fill_cross_talk(k, m)
-    np.testing.assert_array_equal(W_f[:, 0, first], tau_f[:, 1])
-    np.testing.assert_array_equal(W_f[:, 1, first + 1], tau_f[:, 0])
+    tau_f, W_f = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), np.zeros((3, 2, COLUMNS))
+    filter_bank.fill_cross_talk(tau_f, 1, W_f)
+    np.testing.assert_array_equal(W_f[:, 0, 1], tau_f[:, 1])
+    np.testing.assert_array_equal(W_f[:, 1, 2], tau_f[:, 0])
     assert np.count_nonzero(W_f) == 6
 
 
 def test_smoothed_channels_come_first_and_all_but_the_slowest_are_there_bare_too():
     r = np.random.default_rng(3).standard_normal((100, 3, 2))
-    (k, m), got = kernel_of(), []
+    y, got, smoothing = np.zeros((5, 2)), [], np.exp(-0.2)
     for row in r:
-        m.filters.r = row
-        filter_bank.smooth(k, m)
-        got.append(m.filters.y.copy())
-    smoothing = np.exp(-0.2)
+        filter_bank.smooth(smoothing, row, y)
+        got.append(y.copy())
     smoothed = scipy.signal.lfilter([1.0 - smoothing], [1.0, -smoothing], r, axis=0)
     np.testing.assert_allclose(np.array(got)[:, :3], smoothed, rtol=1e-9, atol=1e-12)
     np.testing.assert_array_equal(np.array(got)[:, 3:], r[:, 1:])

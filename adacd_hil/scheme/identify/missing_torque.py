@@ -79,17 +79,20 @@ def rest(m: Memory) -> None:
 
 
 @compiled
-def follow(k: Constants, m: Memory, is_seen: bool) -> None:
+def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
     """Advance the filtered columns X (n, PLACE_TERMS) over one period, by the filter `LEARNT` and the pole behind it.
 
-    is_seen: False after a gap, when that filter keeps its values. k.smoothing: share of the pole's old output that
-    stays after one period.
+    is_seen: False after a gap, when that filter keeps its values. rates (3,): its coefficients for one period, see
+    `torque_filter.FirstOrderHold`; smoothing: share of the pole's old output that stays after one period.
     """
-    X, rates, own = m.regressor.X, m.filters.rates[:, filter_bank.LEARNT], m.missing_torque
-    if is_seen:
-        own.X_f[:] = rates[0] * own.X_f + (rates[1] * own.X_old + rates[2] * X)
-    own.X_old[:] = X
-    own.X_learnt[:] = own.X_f + k.smoothing * (own.X_learnt - own.X_f)
+    decay, weight_old, weight_new = rates[0], rates[1], rates[2]
+    X, X_old, X_f, X_learnt = m.regressor.X, m.missing_torque.X_old, m.missing_torque.X_f, m.missing_torque.X_learnt
+    for i in range(X.shape[0]):
+        for term in range(PLACE_TERMS):
+            if is_seen:
+                X_f[i, term] = decay * X_f[i, term] + (weight_old * X_old[i, term] + weight_new * X[i, term])
+            X_old[i, term] = X[i, term]
+            X_learnt[i, term] = X_f[i, term] + smoothing * (X_learnt[i, term] - X_f[i, term])
 
 
 @compiled

@@ -195,14 +195,16 @@ def _take_sample(
     is_seen: False after a gap: the filters resume from the sample. Fill tau_ext_wide_hat (2,), and the residuals,
     channels, standstill, velocity noise and friction at rest of `m`.
     """
+    cutoff = k.cutoff
     regressor.fill(k, m, q, dq, tau_J, period_s)
     filter_bank.take_sample(k, m, tau_J, is_seen)
-    missing_torque.follow(k, m, is_seen)
-    filter_bank.fill_lag(k, m, tau_J)
-    filter_bank.fill_cross_talk(k, m)
-    filter_bank.smooth_learnt(k, m)
-    filter_bank.estimate_external(m)
-    filter_bank.smooth(k, m)
+    missing_torque.follow(m, m.filters.rates[:, filter_bank.LEARNT], k.smoothing, is_seen)
+    filter_bank.fill_lag(cutoff, tau_J, m.filters.tau_f, int(k.first_offset) + q.shape[0], m.filters.W_f)
+    if k.first_cross_talk < m.models.theta.shape[0]:
+        filter_bank.fill_cross_talk(m.filters.tau_f, int(k.first_cross_talk), m.filters.W_f)
+    filter_bank.smooth_learnt(k.smoothing, m.filters.W_f, m.filters.tau_f, m.filters.W_learnt, m.filters.tau_learnt)
+    filter_bank.estimate_external(m.filters.tau_f, m.filters.W_f, m.models.theta, m.filters.r)
+    filter_bank.smooth(k.smoothing, m.filters.r, m.filters.y)
     sensitivity.follow_standstill(k, m, dq)
     sensitivity.follow_velocity_noise(k, m, dq, m.gaps.is_steady != 0.0)
     sensitivity.follow_friction(k, m, tau_J)

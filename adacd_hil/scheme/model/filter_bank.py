@@ -125,7 +125,13 @@ def take_sample(k: Constants, m: Memory, tau_J: Vector, is_seen: bool) -> None:
     own = m.filters
     rates = own.rates
     for c in range(k.cutoff.shape[0]):
-        a, tau_old, input_old, S, W_f = k.cutoff[c], own.tau_old[c], own.input_old[c], own.S[c], own.W_f[c]
+        a, tau_old, input_old, S, W_f = (
+            k.cutoff[c],
+            own.tau_old[c],
+            own.input_old[c],
+            own.S[c],
+            own.W_f[c],
+        )
         if is_seen:
             hold = FirstOrderHold(rates[0, c], rates[1, c], rates[2, c])
             advance_torque(hold, tau_old, tau_J, own.tau_f[c])
@@ -135,61 +141,60 @@ def take_sample(k: Constants, m: Memory, tau_J: Vector, is_seen: bool) -> None:
 
 
 @compiled
-def fill_lag(k: Constants, m: Memory, tau_J: Vector) -> None:
-    """Write the columns of the lag into W_f (C, n, p): the filtered derivative of each tau_J.
+def fill_lag(cutoff_rad_s: Vector, tau_J: Vector, tau_f: Vector, first_column: int, W_f: Vector) -> None:
+    """Write the columns of the lag into W_f (C, n, p), from `first_column` on: the filtered derivative of each tau_J.
 
     Only the cells of a joint's own lag are written.
     """
-    own, joints = m.filters, tau_J.shape[0]
-    first = int(k.first_offset) + joints
-    for c in range(k.cutoff.shape[0]):
-        for i in range(joints):
-            own.W_f[c, i, first + i] = k.cutoff[c] * (tau_J[i] - own.tau_f[c, i])
+    for c in range(cutoff_rad_s.shape[0]):
+        for i in range(tau_J.shape[0]):
+            W_f[c, i, first_column + i] = cutoff_rad_s[c] * (tau_J[i] - tau_f[c, i])
 
 
 @compiled
-def fill_cross_talk(k: Constants, m: Memory) -> None:
-    """Write the other joint's filtered torque into W_f (C, 2, p), if the model has columns of cross-talk.
+def fill_cross_talk(tau_f: Vector, first_column: int, W_f: Vector) -> None:
+    """Write the other joint's filtered torque into W_f (C filters, 2, p).
 
-    Joint 1's row at `first_cross_talk`, joint 2's at the next. All other cells stay as they are. The other joint's
-    torque is itself distorted by cross-talk, but that error is of second order.
+    Joint 1's row at `first_column`, joint 2's at the next. All other cells stay as they are. The other joint's torque
+    is itself distorted by cross-talk, but that error is of second order.
     """
-    own, first = m.filters, int(k.first_cross_talk)
-    if first < own.W_f.shape[2]:
-        own.W_f[:, 0, first] = own.tau_f[:, 1]
-        own.W_f[:, 1, first + 1] = own.tau_f[:, 0]
+    for c in range(W_f.shape[0]):
+        W_f[c, 0, first_column] = tau_f[c, 1]
+        W_f[c, 1, first_column + 1] = tau_f[c, 0]
 
 
 @compiled
-def smooth_learnt(k: Constants, m: Memory) -> None:
+def smooth_learnt(smoothing: float, W_f: Vector, tau_f: Vector, W_learnt: Vector, tau_learnt: Vector) -> None:
     """Advance the learnt signals, W_learnt (n, p) and tau_learnt (n,), over one period behind the filter `LEARNT`.
 
-    k.smoothing: share of the old value that stays; 0 passes W_f and tau_f of that filter unchanged.
+    smoothing: share of the old value that stays; 0 passes W_f and tau_f of that filter unchanged.
     """
-    own = m.filters
-    W_f, tau_f = own.W_f[LEARNT], own.tau_f[LEARNT]
-    own.W_learnt[:] = W_f + k.smoothing * (own.W_learnt - W_f)
-    own.tau_learnt[:] = tau_f + k.smoothing * (own.tau_learnt - tau_f)
+    for i in range(tau_learnt.shape[0]):
+        tau_learnt[i] = tau_f[LEARNT, i] + smoothing * (tau_learnt[i] - tau_f[LEARNT, i])
+        for j in range(W_learnt.shape[1]):
+            W_learnt[i, j] = W_f[LEARNT, i, j] + smoothing * (W_learnt[i, j] - W_f[LEARNT, i, j])
 
 
 @compiled
-def estimate_external(m: Memory) -> None:
-    """Fill r (C, n), the external torque that each filter sees, Nm: eq. (13) with our sign, as their DC gain is 1."""
-    own = m.filters
-    for c in range(own.W_f.shape[0]):
-        for i in range(own.W_f.shape[1]):
-            own.r[c, i] = linalg.misfit(own.W_f[c, i], m.models.theta, own.tau_f[c, i])
+def estimate_external(tau_f: Vector, W_f: Vector, theta: Vector, tau_ext_hat: Vector) -> None:
+    """Fill the external torque (C, n) that each filter sees, Nm: eq. (13) with our sign, for filters with DC gain 1."""
+    for c in range(W_f.shape[0]):
+        for i in range(W_f.shape[1]):
+            tau_ext_hat[c, i] = linalg.misfit(W_f[c, i], theta, tau_f[c, i])
 
 
 @compiled
-def smooth(k: Constants, m: Memory) -> None:
+def smooth(smoothing: float, r: Vector, y: Vector) -> None:
     """Advance the channels y (2 C - 1, n) by one period: r (C, n) through a second low-pass, then copies of r[1:].
 
-    k.smoothing: share of the old value that stays after one period; 0 passes r unchanged. The drive's velocity noise
+    smoothing: share of the old value that stays after one period; 0 passes r unchanged. The drive's velocity noise
     rises with frequency up to the bandwidth of its tracking loop. A first-order filter passes it on through the
     momentum undiminished; a second pole takes it away, for a few milliseconds of a small step's detection. A large step
     is detected in the bare residual first.
     """
-    r, y, filters = m.filters.r, m.filters.y, m.filters.r.shape[0]
-    y[:filters] = r + k.smoothing * (y[:filters] - r)
-    y[filters:] = r[1:]
+    count = r.shape[0]
+    for c in range(count):
+        for i in range(r.shape[1]):
+            y[c, i] = r[c, i] + smoothing * (y[c, i] - r[c, i])
+            if c > 0:
+                y[count + c - 1, i] = r[c, i]

@@ -127,7 +127,7 @@ def fill(k: Constants, m: Memory, q: Vector, dq: Vector, tau_J: Vector, period_s
     speeds = k.still_rad_s, k.width_rad_s, k.stribeck_rad_s
     fill_terms(dq, tau_J, k.terms, speeds, own.bent, base + 2 * count, own.Y_h)
     fill_position(q, own.X)
-    if k.position_torque_Nm:
+    if k.position_torque_Nm != 0.0:
         put_position_columns(own.X, int(k.first_position), own.Y_h)
     fill_mass_matrix(q, m.models.theta, own.M)
 

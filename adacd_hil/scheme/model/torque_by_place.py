@@ -16,10 +16,12 @@ PLACE_TERMS = len(POSITION_TERMS)
 def fill_position(q: Vector, X: Vector) -> None:
     """Fill X (n, PLACE_TERMS) with the columns of torque by position at q (n,), in the order of `POSITION_TERMS`."""
     total = np.sum(q)
-    s, c = np.sin(q), np.cos(q)
-    X[:, 0], X[:, 1] = s, c
-    X[:, 2], X[:, 3] = 2.0 * s * c, c * c - s * s
-    X[:, 4], X[:, 5] = np.sin(total), np.cos(total)
+    sin_sum, cos_sum = np.sin(total), np.cos(total)
+    for i in range(q.shape[0]):
+        s, c = np.sin(q[i]), np.cos(q[i])
+        X[i, 0], X[i, 1] = s, c
+        X[i, 2], X[i, 3] = 2.0 * s * c, c * c - s * s
+        X[i, 4], X[i, 5] = sin_sum, cos_sum
 
 
 @compiled

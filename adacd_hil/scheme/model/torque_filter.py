@@ -56,8 +56,9 @@ def first_order_hold(a_rad_s: float, b_rad_s: float, period_s: float) -> FirstOr
 @compiled
 def advance_torque(hold: FirstOrderHold, tau_old: Vector, tau_new: Vector, tau_f: Vector) -> None:
     """Advance tau_f (2,) over one period in place; copy tau_new to tau_old."""
-    tau_f[:] = hold.decay * tau_f + (hold.weight_old * tau_old + hold.weight_new * tau_new)
-    tau_old[:] = tau_new
+    for i in range(tau_f.shape[0]):
+        tau_f[i] = hold.decay * tau_f[i] + (hold.weight_old * tau_old[i] + hold.weight_new * tau_new[i])
+        tau_old[i] = tau_new[i]
 
 
 @compiled
@@ -68,10 +69,12 @@ def advance_regressor(
 
     a, b: of F(s), rad/s.
     """
-    input_new = Y_h - a * Y_p
-    S[:] = hold.decay * S + (hold.weight_old * input_old + hold.weight_new * input_new)
-    W_f[:] = b * Y_p + S
-    input_old[:] = input_new
+    for i in range(W_f.shape[0]):
+        for j in range(W_f.shape[1]):
+            input_new = Y_h[i, j] - a * Y_p[i, j]
+            S[i, j] = hold.decay * S[i, j] + (hold.weight_old * input_old[i, j] + hold.weight_new * input_new)
+            W_f[i, j] = b * Y_p[i, j] + S[i, j]
+            input_old[i, j] = input_new
 
 
 @compiled
@@ -90,6 +93,8 @@ def resume(
 
     W_f (2, p) and the filtered torque stay as they were. a, b: of F(s), rad/s.
     """
-    tau_old[:] = tau_new
-    S[:] = W_f - b * Y_p
-    input_old[:] = Y_h - a * Y_p
+    for i in range(W_f.shape[0]):
+        tau_old[i] = tau_new[i]
+        for j in range(W_f.shape[1]):
+            S[i, j] = W_f[i, j] - b * Y_p[i, j]
+            input_old[i, j] = Y_h[i, j] - a * Y_p[i, j]
