@@ -32,7 +32,12 @@ from adacd_hil.scheme.identify import (
     refinement,
     termination,
 )
-from adacd_hil.scheme.kernel.kernel_samples import is_filled, keep_sample, observe, put_between
+from adacd_hil.scheme.kernel.kernel_samples import (
+    is_filled,
+    keep_sample,
+    observe,
+    put_between,
+)
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
 from adacd_hil.scheme.supervisor.transitions import (
@@ -125,7 +130,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
             observation &= ~UNSEEN
         if not (np.all(np.isfinite(m.filters.r)) and np.all(np.isfinite(m.models.theta))):
             observation |= NOT_A_NUMBER
-    elif is_complete:
+    elif is_complete != 0:
         m.gaps.has_gap = 1.0
     if mode & MEASURE and anchor.is_rest_refused(k, m):
         certificate.withhold(m, certificate.READING)
@@ -153,7 +158,7 @@ def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
     """
     nominal_s: float = k.period_s
     period_s: float = out.period_s
-    is_seen = not m.gaps.has_gap and is_filled(steps, period_s, nominal_s, sensitivity.MOST_FILLED)
+    is_seen = m.gaps.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, sensitivity.MOST_FILLED)
     each_s = period_s / steps if is_seen else period_s
     if is_seen:
         filter_bank.choose_rates(k, m, each_s)
@@ -173,9 +178,10 @@ def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
     keep_sample(out.q, out.dq, out.tau_J, m.gaps.last)
     out.tau_f[:] = m.filters.tau_f[filter_bank.SLOW]
     external_torque.predict(m.filters.W_f[filter_bank.SLOW], k.theta_cad, out.tau_f_cad)
-    out.tau_ext_hat[:] = m.filters.r[filter_bank.SLOW]
-    out.tau_f_hat[:] = out.tau_ext_hat + out.tau_f
-    out.tau_ext_hat_cad[:] = out.tau_f_cad - out.tau_f
+    for i in range(out.q.shape[0]):
+        out.tau_ext_hat[i] = m.filters.r[filter_bank.SLOW, i]
+        out.tau_f_hat[i] = m.filters.r[filter_bank.SLOW, i] + out.tau_f[i]
+        out.tau_ext_hat_cad[i] = out.tau_f_cad[i] - out.tau_f[i]
     return bool(is_seen)
 
 
@@ -291,7 +297,7 @@ def _test(k: Constants, m: Memory, dq: Vector) -> int:
     result = termination.test(k, m, dq, m.filters.r[filter_bank.SLOW])
     if result >= 0:
         return CERTIFIED if result > 0 else 0
-    if not m.models.is_payload:  # a new payload: hands have been on the arm, and friction may depend on it
+    if m.models.is_payload == 0.0:  # a new payload: hands have been on the arm, and friction may depend on it
         earlier.keep_fit(k, m)
     is_by_place = missing_torque.is_found(k, m)
     certificate.withhold(m, certificate.BY_PLACE if is_by_place else certificate.NOTHING)
@@ -325,13 +331,15 @@ def _fill_model(k: Constants, m: Memory, out: CertifiedBlock) -> None:
     The channels' thresholds only while thresholds are in force.
     """
     base, joints = int(k.first_offset), m.filters.y.shape[1]
-    out.theta_hat[:] = m.models.theta[:base]
-    out.theta_further[:] = m.models.theta[base:]
     for j in range(m.models.theta.shape[0]):
+        if j < base:
+            out.theta_hat[j] = m.models.theta[j]
+        else:
+            out.theta_further[j - base] = m.models.theta[j]
         out.theta_std[j] = np.sqrt(max(m.models.P[j, j], 0.0))
-    out.tau_ext_bank[:] = m.filters.y.ravel()
     for c in range(m.filters.y.shape[0]):
         for i in range(joints):
+            out.tau_ext_bank[c * joints + i] = m.filters.y[c, i]
             if out.threshold[i] != np.inf:
                 out.threshold_bank[c * joints + i] = m.sensitivity.h[c, i]
     out.excitation = m.fit.excitation

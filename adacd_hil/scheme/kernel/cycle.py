@@ -82,12 +82,18 @@ class RunMemory:
 
 
 _SIZES = {"n": JOINTS, "states": len(SchemeState), "levels": len(ContactLevel)}
-_CERTIFIED_MODE = np.full(len(SchemeState), certified_kernel.WATCH)
-_CERTIFIED_MODE[[SchemeState.INIT, SchemeState.FAULT]] = 0
-_CERTIFIED_MODE[SchemeState.COMMISSION] = certified_kernel.MEASURE
-_CERTIFIED_MODE[SchemeState.ADAPT] |= certified_kernel.LEARN
-_CERTIFIED_MODE[SchemeState.CERTIFY] |= certified_kernel.TEST
-_CERTIFIED_MODE[SchemeState.MONITOR] |= certified_kernel.REFINE
+_CERTIFIED_MODE = np.zeros(len(SchemeState), np.int64)
+for _state, _mode in (
+    (SchemeState.COMMISSION, certified_kernel.MEASURE),
+    (SchemeState.ENABLE, certified_kernel.WATCH),
+    (SchemeState.ADAPT, certified_kernel.WATCH | certified_kernel.LEARN),
+    (SchemeState.CERTIFY, certified_kernel.WATCH | certified_kernel.TEST),
+    (SchemeState.MONITOR, certified_kernel.WATCH | certified_kernel.REFINE),
+    (SchemeState.REACT, certified_kernel.WATCH),
+    (SchemeState.STOPPED, certified_kernel.WATCH),
+    (SchemeState.PAYLOAD, certified_kernel.WATCH),
+):
+    _CERTIFIED_MODE[_state] = _mode
 _PAPER_MODE = np.zeros(len(SchemeState), np.int64)
 _PAPER_MODE[SchemeState.ADAPT] = paper_kernel.LEARN
 _PAPER_MODE[[SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED]] = paper_kernel.ARMED
@@ -113,9 +119,9 @@ def interval_s(m: RunMemory, sample: Sample) -> float:
     For an incomplete sample, or in a run that doesn't measure intervals (`m.is_measured` = 0), return 0 and store no
     time. 0 also for the first sample.
     """
-    if not (m.is_measured and sample.is_complete):
+    if m.is_measured == 0 or sample.is_complete == 0:
         return 0.0
-    period_s = (sample.sampled_ns - m.sampled_ns) * 1e-9 if m.is_sampled else 0.0
+    period_s = (sample.sampled_ns - m.sampled_ns) * 1e-9 if m.is_sampled != 0 else 0.0
     m.is_sampled, m.sampled_ns = 1, sample.sampled_ns
     return period_s
 
@@ -153,7 +159,8 @@ def certified_cycle(
     promotions = memory[0].models.promotions
     observation = certified_kernel.step(constants, memory, block, sample.is_complete, sample.steps, mode)
     paper_kernel.step_beside(paper_constants, paper_memory, paper_block, sample, period_s, block[0])
-    blocks[place] = values
+    for j in range(values.size):
+        blocks[place, j] = values[j]
     asked = decide(course_constants[0], run, sample, observation, decision)
     if memory[0].models.promotions != promotions:
         asked |= TOOK_OVER
@@ -193,8 +200,8 @@ def end_certified(
         course_constants[0], run, samples[place], decision, m.filters.y[filter_bank.WIDE], out.tau_ext_wide_hat
     )
     is_disturbed = IS_REACTING[state] and IS_LEARNING[run.supervisor.origin]
-    is_reported = is_disturbed and not contact.is_open
-    if is_reported and not m.watch.has_forgotten:
+    is_reported = is_disturbed and contact.is_open == 0
+    if is_reported and m.watch.has_forgotten == 0.0:
         asked |= FORGET
     m.watch.has_forgotten = 1.0 if is_reported else 0.0
     if state == SchemeState.MONITOR:
@@ -204,7 +211,7 @@ def end_certified(
             asked |= SECOND
     if m.watch.until_push_cycles > 0.0:
         m.watch.until_push_cycles = m.watch.until_push_cycles - 1.0 if state == SchemeState.STOPPED else 0.0
-        if m.watch.until_push_cycles == 0.0 and decision.contact_joints and state == SchemeState.STOPPED:
+        if m.watch.until_push_cycles == 0.0 and decision.contact_joints != 0 and state == SchemeState.STOPPED:
             asked |= PUSHED
     return asked
 
@@ -226,11 +233,12 @@ def paper_cycle(
     sample, decision, run = samples[place], decisions[place], course_memory[0]
     period_s = interval_s(run, sample)
     mode = _PAPER_MODE[run.supervisor.state]
-    if run.contact.is_open:
+    if run.contact.is_open != 0:
         mode |= paper_kernel.REPORTING
     put_sample(block, sample, period_s)
     observation = paper_kernel.step(constants, memory, block, sample.is_complete, sample.steps, mode)
-    blocks[place] = values
+    for j in range(values.size):
+        blocks[place, j] = values[j]
     asked = decide(course_constants[0], run, sample, observation, decision)
     if asked:
         return asked
@@ -266,7 +274,7 @@ def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, deci
     asked, previous = 0, m.supervisor.state
     if sample.request == Request.ACCEPT:
         asked |= ACCEPTED
-        if m.is_refusing:  # this cycle doesn't withhold a certificate
+        if m.is_refusing != 0:  # this cycle doesn't withhold a certificate
             observation &= ~WITHHELD
     is_reporting = m.contact.is_open != 0
     supervisor.supervise(k.supervisor, m.supervisor, sample, observation, is_reporting, course.goes_on(m.contact))

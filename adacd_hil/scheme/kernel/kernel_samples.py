@@ -49,10 +49,12 @@ def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
 def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
     """Return the arm states and requests of n cycles as an array of type SAMPLE (n,)."""
     samples = np.zeros(arms.cycle.size, SAMPLE)
+    for name in ("cycle", "periods", "steps", "sampled_ns", "fault", "is_complete", "is_enabled", "is_late"):
+        samples[name] = getattr(arms, name)
+    for name in ("q", "dq", "tau_J"):
+        samples[name] = getattr(arms, name)
     samples["age"] = np.maximum(arms.age_q.max(axis=1, initial=0), arms.age_tau_J.max(axis=1, initial=0))
     samples["request"] = requests
-    for name in set(SAMPLE.names or ()) - {"age", "request"}:
-        samples[name] = getattr(arms, name)
     return samples
 
 
@@ -63,7 +65,10 @@ def put_sample(block: Structured, sample: Sample, period_s: float) -> None:
     period_s: 0: not measured.
     """
     out: SchemeBlock = block[0]
-    out.q[:], out.dq[:], out.tau_J[:] = sample.q, sample.dq, sample.tau_J
+    for i in range(out.q.shape[0]):
+        out.q[i] = sample.q[i]
+        out.dq[i] = sample.dq[i]
+        out.tau_J[i] = sample.tau_J[i]
     out.period_s = period_s
 
 
@@ -87,17 +92,19 @@ def observe(limits: Limits, nominal_s: float, block: Structured, steps: int, too
     out: SchemeBlock = block[0]
     if out.period_s == 0.0:
         out.period_s = max(steps, 1) * nominal_s
-    observation, speed = UNSEEN, np.abs(out.dq)
-    if not (np.all(np.isfinite(out.q)) and np.all(np.isfinite(out.dq)) and np.all(np.isfinite(out.tau_J))):
-        observation |= NOT_A_NUMBER
-    if not np.all(np.abs(out.q) <= limits.position_limit_rad):
-        observation |= OVER_LIMIT
-    if not np.all(speed <= limits.velocity_limit_rad_s):
-        observation |= too_fast
-    if np.all(speed < limits.rest_velocity_rad_s):
-        observation |= AT_REST
-    if np.all(np.abs(out.tau_J) < limits.rest_torque_Nm):
-        observation |= UNLOADED
+    observation = AT_REST | UNLOADED | UNSEEN
+    for i in range(out.q.shape[0]):
+        q, dq, tau_J = out.q[i], out.dq[i], out.tau_J[i]
+        if not (np.isfinite(q) and np.isfinite(dq) and np.isfinite(tau_J)):
+            observation |= NOT_A_NUMBER
+        if not (abs(q) <= limits.position_limit_rad[i]):
+            observation |= OVER_LIMIT
+        if not (abs(dq) <= limits.velocity_limit_rad_s[i]):
+            observation |= too_fast
+        if not (abs(dq) < limits.rest_velocity_rad_s):
+            observation &= ~AT_REST
+        if not (abs(tau_J) < limits.rest_torque_Nm):
+            observation &= ~UNLOADED
     return observation
 
 
@@ -116,12 +123,14 @@ def is_filled(steps: int, period_s: float, nominal_s: float, most: int) -> bool:
 @compiled
 def put_between(last: Vector, q: Vector, dq: Vector, tau_J: Vector, share: float, between: Vector) -> None:
     """Fill `between` (3, n) with the sample at a share, 0 to 1, of the way from `last` (3, n) to q, dq, tau_J (n,)."""
-    between[0] = last[0] + share * (q - last[0])
-    between[1] = last[1] + share * (dq - last[1])
-    between[2] = last[2] + share * (tau_J - last[2])
+    for i in range(between.shape[1]):
+        between[0, i] = last[0, i] + share * (q[i] - last[0, i])
+        between[1, i] = last[1, i] + share * (dq[i] - last[1, i])
+        between[2, i] = last[2, i] + share * (tau_J[i] - last[2, i])
 
 
 @compiled
 def keep_sample(q: Vector, dq: Vector, tau_J: Vector, last: Vector) -> None:
     """Keep q, dq, tau_J (n,) in `last` (3, n)."""
-    last[0], last[1], last[2] = q, dq, tau_J
+    for i in range(last.shape[1]):
+        last[0, i], last[1, i], last[2, i] = q[i], dq[i], tau_J[i]

@@ -206,7 +206,7 @@ def step(constants: Structured, memory: Structured, block: Structured, is_comple
             observation |= _learn(c, m, out, period_s)
         if not (np.all(np.isfinite(out.tau_ext_hat)) and np.all(np.isfinite(out.theta_hat))):
             observation |= NOT_A_NUMBER
-    elif is_complete:
+    elif is_complete != 0:
         m.has_gap = 1.0
     if mode & ARMED:
         return observation | _watch(c, m, out, period_s, is_fresh, mode & REPORTING != 0)
@@ -227,7 +227,7 @@ def _filter(c: PaperConstants, m: PaperMemory, out: SchemeBlock, steps: int) -> 
     nominal_s: float = c.period_s
     period_s: float = out.period_s
     q, dq, tau_J = out.q[:], out.dq[:], out.tau_J[:]  # arrays like those of `between`: all is compiled once
-    is_seen = not m.has_gap and is_filled(steps, period_s, nominal_s, MOST_FILLED)
+    is_seen = m.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, MOST_FILLED)
     if is_seen:
         step_s = period_s / steps
         hold = torque_filter.FirstOrderHold(c.decay, c.weight_old, c.weight_new)
@@ -235,8 +235,10 @@ def _filter(c: PaperConstants, m: PaperMemory, out: SchemeBlock, steps: int) -> 
             hold = torque_filter.first_order_hold(a, b, step_s)
         for k in range(1, steps):
             put_between(m.last, out.q, out.dq, out.tau_J, k / steps, m.between)
-            _advance(c, m, m.between[0], m.between[1], m.between[2], hold, out)
-        _advance(c, m, q, dq, tau_J, hold, out)
+            _advance(c, m, m.between[0], m.between[1], m.between[2], hold, out.tau_f)
+            _compare(c, m, m.between[1], hold.decay, out)
+        _advance(c, m, q, dq, tau_J, hold, out.tau_f)
+        _compare(c, m, dq, hold.decay, out)
     else:
         period_s = nominal_s
         regressor.fill_momentum(q, dq, m.Y_p)
@@ -256,15 +258,14 @@ def _advance(
     dq: Vector,
     tau_J: Vector,
     hold: torque_filter.FirstOrderHold,
-    out: SchemeBlock,
+    tau_f: Vector,
 ) -> None:
-    """Advance the filters of torque and regressor, tau_f and W_f, by one period to a sample; then `_compare`."""
+    """Advance the filters of torque and regressor by one period to a sample; fill tau_f (2,), and W_f of `m`."""
     a, b = c.a_rad_s, c.b_rad_s
     regressor.fill_momentum(q, dq, m.Y_p)
     regressor.fill_remainder(q, dq, c.level_rad, m.Y_h)
-    torque_filter.advance_torque(hold, m.tau_old, tau_J, out.tau_f)
+    torque_filter.advance_torque(hold, m.tau_old, tau_J, tau_f)
     torque_filter.advance_regressor(hold, a, b, m.Y_p, m.Y_h, m.input_old, m.S, m.W_f)
-    _compare(c, m, dq, hold.decay, out)
 
 
 @compiled
@@ -342,6 +343,8 @@ def step_beside(
     if observation & ADAPTED:
         m.mode = ARMED
     main.paper_is_armed = 1.0 if m.mode == ARMED else 0.0
-    main.paper_tau_ext_hat[:] = own.tau_ext_hat
-    main.paper_threshold[:] = own.threshold
-    main.paper_theta_hat[:] = own.theta_hat
+    for i in range(JOINTS):
+        main.paper_tau_ext_hat[i] = own.tau_ext_hat[i]
+        main.paper_threshold[i] = own.threshold[i]
+    for j in range(own.theta_hat.size):
+        main.paper_theta_hat[j] = own.theta_hat[j]
