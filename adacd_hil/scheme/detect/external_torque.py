@@ -22,8 +22,6 @@ begins where |y| was last below half of its threshold, which is before it is det
 Shapes: joint vectors (2,); history (WIDE_SAMPLES + 1, 2), newest first.
 """
 
-import numpy as np
-
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
@@ -46,7 +44,8 @@ def estimate_external(tau_f: Vector, tau_f_hat: Vector, dc_gain: float, tau_ext_
 
     tau_f, tau_f_hat (2,): filtered torque, measured and predicted. dc_gain: b / a of the filter.
     """
-    tau_ext_hat[:] = -(tau_f - tau_f_hat) / dc_gain
+    for i in range(tau_f.shape[0]):
+        tau_ext_hat[i] = -(tau_f[i] - tau_f_hat[i]) / dc_gain
 
 
 @compiled
@@ -55,8 +54,9 @@ def follow_standstill(dq: Vector, standstill_rad_s: float, decay: float, standst
 
     A joint slower than standstill_rad_s stands still. decay: share of the old value that stays after one period.
     """
-    target = np.where(np.abs(dq) < standstill_rad_s, 1.0, 0.0)
-    standstill[:] = target + decay * (standstill - target)
+    for i in range(dq.shape[0]):
+        target = 1.0 if abs(dq[i]) < standstill_rad_s else 0.0
+        standstill[i] = target + decay * (standstill[i] - target)
 
 
 @compiled

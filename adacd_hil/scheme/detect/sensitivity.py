@@ -213,8 +213,10 @@ def raise_strain(m: Memory, largest: float) -> None:
     """
     own = m.sensitivity
     for i in range(own.strain.shape[0]):
-        if not np.all(np.abs(m.filters.y[:, i]) <= own.h[:, i]):
-            own.strain[i] = min(STRAIN * own.strain[i], max(largest, own.strain[i]))
+        for c in range(m.filters.y.shape[0]):
+            if not (abs(m.filters.y[c, i]) <= own.h[c, i]):
+                own.strain[i] = min(STRAIN * own.strain[i], max(largest, own.strain[i]))
+                break
 
 
 @compiled

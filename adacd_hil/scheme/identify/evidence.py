@@ -93,7 +93,8 @@ def set_source(m: Memory, s: int, value: Vector, variance: Vector, slack: Vector
 @compiled
 def follow(m: Memory, period_s: float) -> None:
     """Add one period to the age of each source."""
-    m.evidence.age_s[:] += period_s
+    for s in range(m.evidence.age_s.shape[0]):
+        m.evidence.age_s[s] += period_s
 
 
 @compiled

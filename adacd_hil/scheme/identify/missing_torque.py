@@ -262,8 +262,10 @@ def _rms_Nm(m: Memory, joint: int) -> float:
     `full`: with a torque that depends on the position; `basic`: without. Overwrites `row`.
     """
     own = m.missing_torque
-    own.row[:] = own.full - own.basic
-    square = linalg.quadratic(own.L[joint], own.row)
+    apart = own.row
+    for j in range(apart.shape[0]):
+        apart[j] = own.full[j] - own.basic[j]
+    square = linalg.quadratic(own.L[joint], apart)
     return float(np.sqrt(square / max(own.weight[joint], 1e-12)))
 
 

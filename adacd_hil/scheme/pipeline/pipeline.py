@@ -63,6 +63,10 @@ class SchemeBatch(NamedTuple):
     contact_places: NDArray[np.int64]
 
 
+_STATES, _FAULTS, _REACTIONS = tuple(SchemeState), tuple(FaultReason), tuple(Reaction)
+"""Members of each enumeration, by number."""
+
+
 def layout_of(settings: Settings) -> Layout:
     """Return the layout of the values that the selected scheme writes per cycle, its block."""
     count = len(settings.estimator.parameter_names)
@@ -167,9 +171,9 @@ class Pipeline(ABC):
         block = self._block[0].copy()
         return SchemeOutput(
             cycle=arm.cycle,
-            state=SchemeState(state),
-            previous_state=SchemeState(previous_state),
-            fault=FaultReason(fault),
+            state=_STATES[state],
+            previous_state=_STATES[previous_state],
+            fault=_FAULTS[fault],
             contact_joints=contact_joints,
             is_model_valid=bool(is_model_valid),
             theta_hat=block[self._theta_hat],
@@ -177,7 +181,7 @@ class Pipeline(ABC):
             tau_ext_hat=self.tau_ext_hat.copy(),
             contact=contact,
             block=block,
-            reaction=Reaction(reaction),
+            reaction=_REACTIONS[reaction],
         )
 
     def run(self, arms: ArmBatch, requests: NDArray[np.uint8]) -> SchemeBatch:
