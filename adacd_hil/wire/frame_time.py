@@ -123,7 +123,14 @@ def exact_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
     That function raises ValueError for a length that no frame has. Frames of more than 8 bytes are CAN FD with rate
     switch, and need `data_bitrate`.
     """
-    return lambda can_id, data: exact_frame(can_id, data).duration_ns(bitrate, data_bitrate)
+
+    def time_ns(can_id: int, data: bytes) -> int:
+        length = len(data)
+        if length > CLASSIC_BYTES:
+            return exact_frame(can_id, data).duration_ns(bitrate, data_bitrate)
+        return -(-_classic_bits(can_id, int.from_bytes(data, "big", signed=True), length) * 1_000_000_000 // bitrate)
+
+    return time_ns
 
 
 def worst_time(bitrate: int, data_bitrate: int = 0) -> FrameTime:
