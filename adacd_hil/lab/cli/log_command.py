@@ -111,7 +111,7 @@ def recover(log: Path, out: Path | None, as_json: bool) -> ExitCode:
 
 @log.command(epilog=explain_statuses(OK="done", FAILURE="no data there, or the log is damaged", USAGE="wrong usage"))
 @log_argument
-@click.option("--contact", type=click.IntRange(min=1), help="Cut around this contact, numbered from 1.")
+@click.option("--contact", type=click.IntRange(min=1), help="Cut around this detected contact, from 1.")
 @click.option(
     "--around",
     "around_s",
