@@ -5,8 +5,8 @@ Each run is two files in `runs/`: NAME.config.toml and NAME.scenario.toml. What 
 - decisions: every transition with its cycle, every final contact report, the fault, the model at the end. Compared on
   every machine, within `CYCLES` cycles and `SHARE` of a value.
 - bits: for each field of /scheme, /control and /contact, and for each identifier on the bus both ways, one digest per
-  `BLOCK_CYCLES` cycles. Compared where `arithmetic` is that of the machine on which they were stored: another processor
-  or another numpy may round the last bit differently.
+  `BLOCK_CYCLES` cycles. Compared where `arithmetic` is that of the machine on which they were stored: another numpy, or
+  a processor without fused multiply-add, may round the last bit differently.
 
 Renew what is stored with `python tests/reference/renew.py`; it prints every difference. A renewal is a commit of its
 own with that print in its body.
@@ -44,6 +44,8 @@ CYCLES = 2
 """Cycles by which a decision may shift on a machine whose arithmetic is another."""
 SHARE = 0.01
 """Share by which a value may differ there."""
+_ROUNDING = ("avx2", "fma")
+"""Instructions that change how numpy's products and the C library's sines round; Zen 3 and 5 gave equal bits."""
 _TOPICS = ("/scheme", "/control", "/contact")
 _DIGEST_BYTES = 4
 
@@ -54,10 +56,11 @@ def names() -> list[str]:
 
 
 def arithmetic() -> dict[str, str]:
-    """Say what decides the last bits: processor, libraries, C library."""
+    """Say what decides the last bits: instructions, libraries, C library."""
+    features = llvmlite.binding.get_host_cpu_features()
     return {
         "machine": platform.machine(),
-        "processor": llvmlite.binding.get_host_cpu_name(),
+        "instructions": " ".join(name for name in _ROUNDING if features.get(name)),
         "libc": " ".join(platform.libc_ver()),
         **{name: version(name) for name in ("numpy", "scipy", "numba", "llvmlite")},
     }
