@@ -103,7 +103,10 @@ def has_other_head(path: Path, head: bytes) -> bool:
 
 
 def _check_replaceable(path: Path, is_log: bool) -> None:
-    """Raise OSError if the path is a folder, a FIFO, a socket, a device or (unless is_log) a log."""
+    """Raise OSError if the path is a folder, a FIFO, a socket, a device or a log, which begins as MCAP.
+
+    is_log: a log passes. A missing path passes. A link passes: the link itself is replaced, whatever its target.
+    """
     try:
         mode = path.lstat().st_mode
     except FileNotFoundError:

@@ -34,9 +34,10 @@ def make_clock(name: str) -> Clock:
 
 
 def check_clock(name: str, interface: str, channel: str) -> None:
-    """Raise CommandError for lockstep on a channel that may be hardware, since hardware can't wait for the host.
+    """Raise CommandError for the lockstep clock on a channel that may be hardware, which can't wait for the host.
 
-    A missing interface passes; opening it raises the error.
+    name: of the clock, as in `--clock`. A channel that doesn't exist passes, and so does an interface that can't be
+    used: opening them raises the error.
     """
     if name == "lockstep" and may_be_hardware(interface, channel):
         raise CommandError(

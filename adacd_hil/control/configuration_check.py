@@ -184,7 +184,10 @@ def _unknown_assumptions(settings: Settings) -> Iterator[str]:
 
 
 def _ignored(settings: Settings) -> Iterator[str]:
-    """Yield a warning for each changed reaction that the paper's scheme, which always withdraws, doesn't know."""
+    """Yield a warning for each reaction to a contact or a collision that scheme `paper` ignores: it always withdraws.
+
+    Yield none for a reaction at its default, and none with another scheme.
+    """
     usual = ReactionSettings()
     for key in ("contact", "collision") if settings.scheme == "paper" else ():
         if (wanted := getattr(settings.reaction, key)) != getattr(usual, key):

@@ -224,7 +224,10 @@ def describe_disabled(arm: Arm) -> list[str]:
 
 
 def describe_excess(arm: Arm) -> list[str]:
-    """Return a line per position or velocity limit that a joint exceeds, with its value; empty without an excess."""
+    """Return a line per position or velocity limit that a joint exceeds, with value and limit, deg or deg/s.
+
+    Beyond a revolution the line names settings that may be wrong. Return [] without an excess.
+    """
     lines = []
     for joint, (drive, sign) in enumerate(zip(arm.drives, arm.sign, strict=True)):
         position, velocity = drive.values

@@ -160,7 +160,11 @@ class HeartbeatWatch:
         self._is_watching = False
 
     def accept(self, frame: Frame) -> None:
-        """Store the state and time of a watched node's heartbeat; ignore other frames."""
+        """Store the state and time of a watched node's heartbeat.
+
+        If the node left OPERATIONAL, remember that until the next `judge_nodes`, even if it returns before. Ignore
+        other frames, error frames, and frames of another length than one byte.
+        """
         node = self._nodes.get(frame.can_id)
         if node is None or frame.is_error or len(frame.data) != 1:
             return
@@ -172,9 +176,10 @@ class HeartbeatWatch:
             node.left_to = node.state
 
     def judge_nodes(self, t_ns: int) -> list[str]:
-        """Return a line per node that fails now; empty if all are well or the watch is stopped.
+        """Return a line per node that is silent, or was in another state than OPERATIONAL since the last call.
 
-        Report an event for each node whose failure is new, another than at the last call, or over.
+        Return [] if the watch is stopped. For the allowed silence after `start` a node that hasn't been OPERATIONAL yet
+        passes. Report an event when a failure begins, changes or ends.
         """
         if not self._is_watching:
             return []

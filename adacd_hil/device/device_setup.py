@@ -478,9 +478,9 @@ _RECORDS = (*range(0x1400, 0x1600), *range(0x1800, 0x1A00))
 def set_up_pdos(slave: Slave, command_deadline_ms: int) -> None:
     """Write the PDOs of a device that differ from its profile, or all if the profile's `mapping` is `rewritten`.
 
-    PDOs that the profile doesn't name are switched off. `command_deadline_ms`: event timer of the command PDO if the
-    profile's `command_watchdog` is `0x1400:5`. Raises DeviceError if a PDO still differs, or the device refuses or
-    doesn't answer; BusError if the bus fails.
+    Before that switch off the PDOs that the profile doesn't name; one whose identifier can't be written stays on.
+    `command_deadline_ms`: event timer of the command PDO if the profile's `command_watchdog` is `0x1400:5`. Raises
+    DeviceError if a PDO still differs, or the device refuses or doesn't answer; BusError if the bus fails.
     """
     profile = slave.device.settings
     timers = {pdo.message: _event_timer(slave, pdo, command_deadline_ms) for pdo in profile.pdo}
@@ -573,9 +573,9 @@ def pdo_differences(slave: Slave, command_deadline_ms: int) -> list[str]:
 
 
 def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
-    """Read a PDO; return its first difference from the profile in words, "" without one.
+    """Read a PDO up to its first difference from the profile; return that in words, "" without one.
 
-    Store the expected values in the device's `known`.
+    Store the expected values of what was read in the device's `known`.
     """
     index = pdo.communication_index
     identifier = slave.read(index, _COB_ID)
@@ -595,7 +595,10 @@ def _difference(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> str:
 
 
 def _mapping_difference(slave: Slave, pdo: PdoSettings) -> str:
-    """Read the mapping of a PDO; return its first difference from the profile in words, "" without one."""
+    """Read the mapping of a PDO up to its first difference from the profile; return that in words, "" without one.
+
+    Store the expected values of what was read in the device's `known`.
+    """
     mapping_index, entries = pdo.mapping_index, slave.device.mapping(pdo)
     text = slave.compare(mapping_index, 0, len(entries), "number of mapped objects")
     for sub, entry in enumerate(entries, 1):

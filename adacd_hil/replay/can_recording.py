@@ -268,7 +268,11 @@ class RecordingAlone:
         return place_devices(settings)
 
     def parts(self, with_frames: bool) -> Iterator[Part]:  # noqa: ARG002 (there are only frames)
-        """Yield the whole recording as one part; with_frames has no effect, since it has only frames."""
+        """Yield one part, with a stretch of cycles per attempt.
+
+        The last cycles of an attempt, in which the host disables the drives, are left out. with_frames has no effect:
+        the recording has only frames.
+        """
         yield Part(list(self._stretches()), {}, (), frozenset())
 
     def _stretches(self) -> Iterator[CycleStretch]:

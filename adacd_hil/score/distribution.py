@@ -109,7 +109,10 @@ class Distribution:
         return dict(zip(LOW_PERCENTILE_NAMES, map(self._at, ranks), strict=True))
 
     def median(self) -> float:
-        """Return the median, of an even number the mean of the middle two; NaN without a value."""
+        """Return the median, of an even number the mean of the middle two.
+
+        Beyond `exact` values each of these is the end of its bin that is nearer to 0. NaN without a value.
+        """
         if self.count == 0:
             return float("nan")
         if self._bins is None:

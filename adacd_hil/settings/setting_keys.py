@@ -154,7 +154,11 @@ def refuse_log_settings(changes: Mapping[str, str]) -> None:
 
 
 def _read_value(key: str, text: str) -> Any:
-    """Return the value of a TOML text; a word without quotes is a text. Raises ConfigError, which names the key."""
+    """Parse a text as a TOML value.
+
+    Return a text that is no TOML as a string, for words without quotes. Raises ConfigError, which names the key, for
+    such a text if it is empty or holds a quote, bracket, brace, `=`, `#` or newline.
+    """
     try:
         return parse_toml(f"value = {text}")["value"]
     except ConfigError:

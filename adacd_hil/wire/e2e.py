@@ -292,7 +292,10 @@ class ProtectedReceiver(E2eReceiver):
         return self._accept(delta) if is_in_sequence else self._lose_sequence()
 
     def _begin(self, counter: int) -> E2eStatus:
-        """Begin the sequence with the first frame, the standard's INITIAL, and return OK; ignore silence before it."""
+        """Begin the sequence with the counter of the first right frame, and return OK; the standard returns INITIAL.
+
+        Cycles without a frame before it don't count as missing.
+        """
         self._last, self._max_delta = counter, self._tolerance.max_delta
         self._missing = 0
         return E2eStatus.OK

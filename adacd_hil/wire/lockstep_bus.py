@@ -289,7 +289,11 @@ class LockstepBus(Bus):
         return self._ask(limit_ns) or self._granted_ns < limit_ns
 
     def _ask(self, until_ns: int) -> bool:
-        """Let the devices run until `until_ns` or their first frame; return whether they sent a frame."""
+        """Let the devices run until `until_ns` or their first frame, and return whether a frame came.
+
+        Queue their frames and store the time that they grant. False also means that no device answered within the
+        patience.
+        """
         self._bus.send(HOST_MARK, pack_mark(MarkKind.ADVANCE, until_ns))
         return self._await_grant()
 

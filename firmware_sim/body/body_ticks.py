@@ -169,9 +169,10 @@ def _read_encoder(course: np.void, numbers: np.void, joint: int, angle_rad: floa
 
 @compiled
 def _measure_tick(state: np.void, numbers: np.void, encoder_noise: NDArray[np.float64]) -> None:
-    """Update encoders, motor temperatures and torque sensors by the arm's state at the end of a tick.
+    """Update the encoders by the arm's state at the end of a tick.
 
-    encoder_noise: table of `EncoderNoise`, counts.
+    Update motor temperatures if the motors have limits, and the torque sensors if they have memory. encoder_noise:
+    `EncoderNoise.table`, counts, filled for this tick.
     """
     arm, course, motor = state["arm"], state["course"], numbers["motor"]
     tick = course["tick"]

@@ -326,9 +326,10 @@ class ObjectDictionary:
         return self._node._find_object(index, subindex)
 
     def serve(self, index: int, subindex: int, read: Callable[[], int]) -> None:
-        """Set `read` as the source of an object's value for all later reads.
+        """Read an object's value by `read()` from now on.
 
-        An object that the device lacks stays absent.
+        A value set by `replace_value` has priority. Functions that `reader` returned earlier keep their source. An
+        object that the device lacks stays absent.
         """
         self._readers[index, subindex] = read
 

@@ -243,12 +243,18 @@ class DriveNode(Application):
             self.has_news = True
 
     def act(self, t_ns: int) -> None:
-        """Carry out the command of an RPDO that doesn't wait for SYNC, and command the motor."""
+        """Carry out the command of an RPDO that doesn't wait for SYNC, and command the motor.
+
+        t_ns: the device's own time.
+        """
         self._obey_received(t_ns)
         self._drive_motor()
 
     def mind_length(self, is_right: bool, t_ns: int) -> None:
-        """Trip the length watchdog at a command frame of wrong length; clear it at the first right one."""
+        """Trip the length watchdog if a command frame has a wrong length, else clear it.
+
+        t_ns: the device's own time.
+        """
         if not is_right:
             self.device.trip(Watchdog.LENGTH, t_ns)
         else:

@@ -635,10 +635,11 @@ class _DriveWriter(_ProfileWriter):
         return lambda index, sub: None if index == 0x6091 and not is_set else self.number(index, sub)
 
     def _velocity(self, gear: float, increments: float) -> list[str]:
-        """Return the profile's lines on one count of velocity, in rad/s of the joint.
+        """Return the profile's lines on `velocity_rad_s`, the joint's velocity per count, rad/s.
 
-        It follows from the unit of the user's answer, else of 0x60A9, else it is the maker's, else one increment per
-        second, stored as a guess. gear: ratio of motor to joint. increments: per revolution of the joint.
+        The unit is the user's answer, or without one 0x60A9. If that unit is unknown, the value is that of the maker's
+        profile. Without one it is a stored guess: one increment per second. gear: motor revolutions per joint
+        revolution. increments: per revolution of the joint.
         """
         unit = self.answers.get("velocity_unit")
         code = int(unit) if unit is not None else self.number(0x60A9, 0)

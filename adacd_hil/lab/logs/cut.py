@@ -26,9 +26,10 @@ def default_out(path: Path) -> Path:
 
 
 def find_contact(path: Path, contact: int, around_s: float) -> TimeWindow:
-    """Return the time window from `around_s` before a contact's detection to as long after it.
+    """Return the time window around a contact's detection, s since the log's begin.
 
-    contact: its number, from 1. Raises LogError if the log can't be read or has no such contact.
+    It reaches `around_s` to both sides, even beyond the log. contact: its number, from 1. Raises LogError if the log
+    can't be read or has no such contact.
     """
     log = read_log(path, (CONTACT.name,))
     begun = each_once(log.contacts)

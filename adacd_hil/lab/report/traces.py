@@ -267,10 +267,11 @@ def step_of(values: Vector, finest: float, is_next: NDArray[np.bool_] | None = N
 
 
 def pack(values: Vector, step: float) -> tuple[str, dict[str, Any]]:
-    """Return a series (n,) as base64 text, rounded to `step`, or coarser if its range has over `_LARGEST_CODE` steps.
+    """Return a series (n,) as base64 text of zlib data, and the table by which the page's script decodes it.
 
-    Return with it a table for the page's script: low and step in the series' unit; order: how often it was differenced;
-    planes: bytes per number.
+    Values are rounded to `step`, or to a larger step if their range has over `_LARGEST_CODE` steps. Code 0 is a value
+    that isn't finite, code 1 is `low`. The codes are differenced, zigzag coded and split into byte planes. Table: low
+    and step in the series' unit; order: number of differences, 1 or 2; planes: bytes per number.
     """
     is_finite = np.isfinite(values)
     finite = values[is_finite]

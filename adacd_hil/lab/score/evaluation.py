@@ -66,7 +66,10 @@ class RunGatherer:
         self._state = int(SchemeState.INIT)  # of the last cycle so far
 
     def add_times(self, timing: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
-        """Add the times of the next cycles; cycle, state: those of /scheme for the same cycles (k,)."""
+        """Add the times and the cyclic data of the next cycles, in the order of the run: the last state is kept.
+
+        timing: columns of /cycle. cycle, state: of /scheme (k,), for the same cycles.
+        """
         self.timing.add_columns(timing, find_reactions(timing, cycle, state, self._state))
         self.data.add_columns(timing, cycle, state)
         if state.size:

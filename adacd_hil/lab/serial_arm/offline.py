@@ -308,7 +308,8 @@ def filtered_noise_Nm(settings: OfflineSettings) -> Vector:
 def certify(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> OfflineCertificate:
     """Test an estimate on a record of free motion that `identify` has not seen; return residuals and margins.
 
-    Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
+    A joint's margin is the smallest ratio of threshold to residual; below 1 there was a false alarm. The caller judges
+    it. Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
     """
     trace = _trace(model, record, estimate, settings)
     residual = np.abs(trace.tau_ext_hat)

@@ -40,9 +40,9 @@ def _table(frame_count: int, message_count: int) -> struct.Struct:
 def pack_cycle(
     t_ns: int, dropped: int, messages: Sequence[tuple[int, bytes]], frames: Sequence[tuple[bool, Frame]]
 ) -> bytes:
-    """Return the packet of a cycle: its messages (channel, body), and its frames, each with True if it was sent.
+    """Return the packet of a cycle: the head, then its frames, then its messages, laid out as the module says.
 
-    dropped: number of packets lost so far.
+    messages: channel and body. frames: True if the host sent it, and the frame. dropped: number of packets lost so far.
     """
     values: list[int | bytes] = [CYCLE, len(messages), len(frames), dropped, t_ns]
     rests = []

@@ -329,10 +329,11 @@ class Doubt:
         return -SPREAD * abs(size) <= total <= PLAUSIBLE * float(cause @ self._k.prior_std)
 
     def _common(self, contacts: list[_Weighed], h: int, spread: float) -> float | None:
-        """Return the size of cause h over all contacts, in its unit.
+        """Return the size of cause h that fits all contacts best by least squares, in its unit.
 
-        None if it doesn't explain each of them with that size. A contact's own size may differ by `spread` of the
-        common one, and 2 sigma.
+        None if the cause explains less than `SHARE` of a contact's squared residual. None, too, if a contact's own size
+        differs from the common one by more than `spread` times that plus 2 sigma, or if a contact tells nothing of the
+        cause.
         """
         ww = sum(contact.ww[h] for contact in contacts)
         if not ww > 0.0:

@@ -113,10 +113,12 @@ class CertifiedPipeline(Pipeline):
         return events
 
     def _follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:
-        """Report acceptance and refusal, weigh a contact, and run the first actions of a new state.
+        """Carry out the tasks that a cycle's result asks for.
 
-        asked: bits of the tasks, see `kernel.cycle`. previous: state before this cycle. observation: the cycle's
-        findings, see `transitions`.
+        Report an acceptance or a refusal. At a new state weigh the contact, which may stop the arm, and run the state's
+        first actions. After a refusal that stays in ADAPT learn anew. At TOOK_OVER update the feedforward. asked: bits
+        of the tasks, see `kernel.cycle`. previous: state before this cycle. observation: the cycle's findings, see
+        `transitions`.
         """
         state = self.state
         if asked & ACCEPTED:
