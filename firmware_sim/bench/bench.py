@@ -25,7 +25,7 @@ from firmware_sim.bench.bench_time import BenchTime, OnTruth, TruthFeed
 from firmware_sim.bench.fault_rows import EVERYBODY
 from firmware_sim.bench.injector import Handler, Injector, OnEvent, Outbox
 from firmware_sim.body.body import Body
-from firmware_sim.canopen.error_control import SyncKind, SyncOrder
+from firmware_sim.canopen.error_control import SyncOrder
 from firmware_sim.canopen.object_dictionary import EmulatedContract, contract_of
 from firmware_sim.nodes.device import RESET_COMMUNICATION, RESET_NODE, MovableArm
 from firmware_sim.scenario.scenario import Scenario
@@ -162,18 +162,12 @@ class Bench:
         if self._is_wall:
             time.reach(t_ns)
         if can_id == self._sync_id:
-            if self.injector.has_faults:
-                time.advance_faults(t_ns, self._time_to_sync_ns(data))
-            if self._plan.is_quiet:
-                self._on_sync(data, t_ns)
-            elif not self.injector.receive(EVERYBODY, can_id, data, self._on_sync, t_ns) and not self._is_wall:
+            time.advance_faults(t_ns, self._time_to_sync_ns(data))
+            if not self.injector.receive(EVERYBODY, can_id, data, self._on_sync, t_ns) and not self._is_wall:
                 self._miss_sync(data, t_ns)
         elif can_id in self._nodes.commands:
             for place, take in self._nodes.commands[can_id]:
-                if self._plan.is_quiet:
-                    take(data, time.now_ns)
-                else:
-                    self.injector.receive(place, can_id, data, take, time.now_ns)
+                self.injector.receive(place, can_id, data, take, time.now_ns)
         elif can_id in self._services:
             self._services[can_id](data, time.now_ns)
             time.poll(time.now_ns)
@@ -255,9 +249,8 @@ class Bench:
 
         takers: 1 for each device that takes SYNCs of this length, else 0.
         """
-        listeners = self._nodes.listeners
-        heard = listeners.everybody if self._plan.is_quiet else self.injector.count_heard(self._sync_id, data)
-        listeners.ignore(heard, takers, self._order.kind, self.time.now_ns)
+        heard = self.injector.count_heard(self._sync_id, data)
+        self._nodes.listeners.ignore(heard, takers, self._order.kind, self.time.now_ns)
         self.time.poll(self.time.now_ns)
 
     def _answer(self, data: bytes, t_ns: int, late_ns: int) -> None:
@@ -316,29 +309,15 @@ class Bench:
         SYNC, else 0.
         """
         now_ns = self.time.now_ns
-        drive1, drive2 = self.drives
-        sensor1, sensor2 = self.sensors
-        measured = self._nodes.sample()
-        listeners, order, lost = self._nodes.listeners, self._order, self._lost_syncs
-        heard: Sequence[int] = listeners.everybody
-        if self._plan.is_quiet and takers == heard:
-            if listeners.is_remembering or lost or order.kind is not SyncKind.RIGHT:
-                listeners.report_sync(heard, takers, order.kind, lost, now_ns)
-            (position1, position2), (velocity1, velocity2), (torque1, torque2) = measured
-            drive1.on_sync(position1, velocity1, now_ns)
-            drive2.on_sync(position2, velocity2, now_ns)
-            sensor1.on_sync(torque1)
-            sensor2.on_sync(torque2)
-        else:
-            heard = self.injector.count_heard(self._sync_id, data)
-            listeners.report_sync(heard, takers, order.kind, lost, now_ns)
-            heard = [times * is_taken for times, is_taken in zip(heard, takers, strict=True)]
-            self.injector.sync(heard, measured, now_ns)
-            if not self._is_wall:  # by the clock, a drive that hears no SYNC has no period to count
-                self._nodes.lose_sync(heard, now_ns)
-        if now_ns >= self.time.due_ns or drive1.has_news or drive2.has_news or sensor1.has_news or sensor2.has_news:
+        heard = self.injector.count_heard(self._sync_id, data)
+        self._nodes.listeners.report_sync(heard, takers, self._order.kind, self._lost_syncs, now_ns)
+        heard = tuple(times * is_taken for times, is_taken in zip(heard, takers, strict=True))
+        self.injector.sync(heard, self._nodes.sample(), now_ns)
+        if not self._is_wall:  # by the clock, a drive that hears no SYNC has no period to count
+            self._nodes.lose_sync(heard, now_ns)
+        if now_ns >= self.time.due_ns or self._nodes.has_news:
             self.time.poll(now_ns)
-        if not self.is_scenario_started and drive1.is_ready and drive2.is_ready:
+        if not self.is_scenario_started and all(drive.is_ready for drive in self.drives):
             self.is_scenario_started = True
             self.injector.start(now_ns)
             self._body.start_scenario()

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from adacd_hil.records import JOINTS
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import answers_to_sync
-from firmware_sim.arm.arms import STRAIGHT
 from firmware_sim.arm.hardware_settings import HabitSettings
 from firmware_sim.arm.sensing import Measurement
 from firmware_sim.arm.touch_settings import TICK_S
@@ -50,8 +49,6 @@ class BenchNodes:
         self.answers = answers_to_sync(codec)
         self._arm = arm
         self.wiring = scenario.arm.wiring
-        self.is_crossed = self.wiring != STRAIGHT
-        """Whether some device isn't at its own joint or counts the other way."""
         described = [contract.describe_device(place) for place in range(len(_NODES))]
         right_ids = [codec.node_id(f"{name}Heartbeat") for name in _NODES]
         ids = device_ids(scenario.faults, right_ids)
@@ -79,6 +76,7 @@ class BenchNodes:
             for i in range(JOINTS)
         )
         self.sensors = tuple(self._make_sensor(i, codec, scenario) for i in range(JOINTS))
+        self._nodes: tuple[DriveNode | SensorNode, ...] = (*self.drives, *self.sensors)
         for device, description in zip(self.devices, described, strict=True):
             for alias, (key, ratio) in description.aliases.items():
                 if alias != key:
@@ -108,20 +106,21 @@ class BenchNodes:
 
     def poll(self, t_ns: int) -> int:
         """Let all nodes act on their timers that are due at `t_ns`, and return the time, ns, of the next timer."""
-        drive1, drive2 = self.drives
-        sensor1, sensor2 = self.sensors
-        return min(drive1.poll(t_ns), drive2.poll(t_ns), sensor1.poll(t_ns), sensor2.poll(t_ns))
+        return min(node.poll(t_ns) for node in self._nodes)
+
+    @property
+    def has_news(self) -> bool:
+        """Whether a node has a frame to send, or a timer to set, before its next timer is due: call `poll`."""
+        return any(node.has_news for node in self._nodes)
 
     def latch_motors(self) -> None:
         """Store the drives' present set-points, Nm, and modes, by joint; `move_arm` uses them until the next call."""
-        drive1, drive2 = self.drives
-        torque_Nm = (drive1.torque_Nm, drive2.torque_Nm)
-        modes = (drive1.motor_mode, drive2.motor_mode)
-        if self.is_crossed:
-            up1, up2 = self.wiring.torque_sign
-            torque_Nm = (up1 * torque_Nm[0], up2 * torque_Nm[1])
-            if self.wiring.drive_joint == (1, 0):
-                torque_Nm, modes = torque_Nm[::-1], modes[::-1]
+        signs = self.wiring.torque_sign
+        torque_Nm = [sign * drive.torque_Nm for sign, drive in zip(signs, self.drives, strict=True)]
+        modes = [drive.motor_mode for drive in self.drives]
+        if self.wiring.drive_joint == (1, 0):
+            torque_Nm.reverse()
+            modes.reverse()
         self._motor_Nm, self._motor_modes = torque_Nm, modes
 
     def move_arm(self, tick_count: int) -> None:
@@ -139,8 +138,7 @@ class BenchNodes:
 
     def sample(self) -> Measurement:
         """Return the arm's measured values in counts, with pairs by device (Drive1, Drive2 or Sensor1, Sensor2)."""
-        measured = self._arm.sample()
-        return self.wiring.read(measured) if self.is_crossed else measured
+        return self.wiring.read(self._arm.sample())
 
     def _make_sensor(self, place: int, codec: Codec, scenario: Scenario) -> SensorNode:
         joint = self.wiring.sensor_joint[place]

@@ -231,19 +231,16 @@ class BenchTime:
 
     def poll(self, t_ns: int) -> None:
         """Let the nodes act on timers that are due at `t_ns`; set `due_ns` to the next timer, fault or held frame."""
-        self.due_ns = self._nodes.poll(t_ns)
-        if self._injector.has_faults:
-            self.due_ns = min(self.due_ns, self._injector.due_ns, self._outbox.due_ns)
+        self.due_ns = min(self._nodes.poll(t_ns), self._injector.due_ns, self._outbox.due_ns)
 
     def advance_faults(self, stamp_ns: int, ahead_ns: int = 0) -> None:
         """Begin and end the faults that are due within `ahead_ns` of now, and let babbling nodes send.
 
         stamp_ns: time of their events, unused in lockstep.
         """
-        if self._injector.has_faults:
-            is_paced = self._outbox.is_paced
-            self._injector.advance(self.now_ns + ahead_ns, self.host_ns + ahead_ns if is_paced else stamp_ns)
-            self._injector.flood(self._nodes.period_ns)
+        is_paced = self._outbox.is_paced
+        self._injector.advance(self.now_ns + ahead_ns, self.host_ns + ahead_ns if is_paced else stamp_ns)
+        self._injector.flood(self._nodes.period_ns)
 
     def take_mark(self, data: bytes, _t_ns: int) -> None:
         """On an ADVANCE mark, let time pass to the mark's time or until a frame is sent; then send a GRANT mark.

@@ -80,8 +80,6 @@ class FaultPlan:
         self._torque_count_Nm = torque_count_Nm
         self.mask = 0
         """Bit i: row i is active."""
-        self.is_quiet = True
-        """Whether no fault acts on frames or values and no action is left; then a call of `advance` is enough."""
         self._rows = tuple(
             FaultRow(index, row, seed_text)
             for index, (row, seed_text) in enumerate(zip(rows, stream_seeds(rows, seed), strict=True))
@@ -121,6 +119,12 @@ class FaultPlan:
         return len(self._off | self._off_bus) < len(NODES)
 
     @property
+    def is_quiet(self) -> bool:
+        """Whether no fault acts on frames or values, no frame is held back, and no action on a node is left."""
+        is_acting = any(row.is_active and row.settings.kind not in _NODES_OWN for row in self._rows)
+        return not (is_acting or self._actions or any(row.held for row in self._rows))
+
+    @property
     def is_flooding(self) -> bool:
         """Whether a fault of kind `babble` is active."""
         return bool(self._babbling)
@@ -134,18 +138,14 @@ class FaultPlan:
         there. Neither may go back; this is not checked.
         """
         self._scenario_ns, self._power_ns = scenario_ns, since_power_on_ns
-        if self.wait_ns and self.is_quiet:
-            return []
         events = [event for row in self._rows for event in self._move(row)]
         if events:
             self._take_over()
-        self._find_quiet()
         return events
 
     def actions(self) -> list[NodeAction]:
         """Return and remove the actions on nodes that are due now, in the order in which they were queued."""
         taken, self._actions = self._actions, []
-        self._find_quiet()
         return taken
 
     def transmit(self, node: int, can_id: int, data: bytes) -> list[tuple[int, int, bytes]]:
@@ -357,16 +357,11 @@ class FaultPlan:
             overtaken = row.held.pop(can_id)
             if not row.is_active:
                 self._sort_frames()
-                self._find_quiet()
             return frames + overtaken
         if not (row.hit() and frames):
             return frames
         row.held[can_id] = frames
         return []
-
-    def _find_quiet(self) -> None:
-        is_acting = any(row.is_active and row.settings.kind not in _NODES_OWN for row in self._rows)
-        self.is_quiet = not (is_acting or self._actions or any(row.held for row in self._rows))
 
 
 def _of(rows: Sequence[FaultRow], *kinds: str) -> tuple[FaultRow, ...]:

@@ -124,10 +124,7 @@ OnEvent = Callable[[int, str, str, str], None]
 
 
 class Injector:
-    """Applies the faults of one bench to frames, measured values and nodes.
-
-    Without faults it costs one look at the plan's `is_quiet` per SYNC.
-    """
+    """Applies the faults of one bench to frames, measured values and nodes."""
 
     def __init__(self, scenario: Scenario, codec: Codec, outbox: Outbox, on_event: OnEvent | None) -> None:
         """Begin before power-on. Raises ConfigError for a fault on a frame that the contract hasn't.
@@ -137,7 +134,6 @@ class Injector:
         first, second = (count_Nm(scenario.sensors, joint) for joint in scenario.arm.wiring.sensor_joint)
         self.plan = FaultPlan(scenario.faults, scenario.seed, codec, (first, second))
         self._rows = scenario.faults
-        self.has_faults = bool(scenario.faults)
         self.now_ns = 0
         self.on_event = on_event
         self._outbox = outbox
@@ -181,25 +177,19 @@ class Injector:
         outbox, plan = self._outbox, self.plan
 
         def put(can_id: int, data: bytes) -> None:
-            if plan.is_quiet:
-                outbox.put(can_id, data)
-                return
             for delay_ns, identifier, changed in plan.transmit(place, can_id, data):
                 if delay_ns:
                     outbox.put_later(self.now_ns + delay_ns, identifier, changed)
                 else:
                     outbox.put(identifier, changed)
 
-        return put if self.has_faults else outbox.put
+        return put
 
     def receive(self, place: int, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
         """Call `take` with a frame of the host, as faults change, repeat or delay it; return False if it is lost.
 
         A delayed frame is taken when the outbox releases it. place: index in NODES of the receiver, or EVERYBODY.
         """
-        if self.plan.is_quiet:
-            take(data, t_ns)
-            return True
         frames = self.plan.receive(place, can_id, data)
         for delay_ns, received in frames:
             if delay_ns == 0:
@@ -228,7 +218,7 @@ class Injector:
 
     def late_ns(self, period_ns: int) -> int:
         """Return how late this SYNC reaches the devices, ns: random, 0 without such a fault, less than a period."""
-        return 0 if self.plan.is_quiet else min(self.plan.sync_delay_ns(), period_ns - 1)
+        return min(self.plan.sync_delay_ns(), period_ns - 1)
 
     def flood(self, period_ns: int) -> None:
         """Queue the frames that babbling nodes send in the period from now on, each until its time."""

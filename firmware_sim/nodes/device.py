@@ -42,7 +42,6 @@ class NmtState(IntEnum):
 _COMMANDED_STATES = {1: NmtState.OPERATIONAL, 2: NmtState.STOPPED, 128: NmtState.PRE_OPERATIONAL}
 _EMCY_STATES = (NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL)
 RESET_NODE, RESET_COMMUNICATION = 129, 130
-_OF_SYNC = {Watchdog.SYNC_ORDER, Watchdog.SYNC_LENGTH}
 
 
 class Application:
@@ -179,11 +178,6 @@ class EmulatedDevice(ObjectDictionary):
         """
         register = _GENERIC | _COMMUNICATION if self.tripped else 0
         return register | (_GENERIC | self.fault_bits if self.is_faulty else 0)
-
-    @property
-    def is_sync_odd(self) -> bool:
-        """Whether the watchdog of SYNC's order or length is tripped. Then right SYNCs must be counted, too."""
-        return bool(_OF_SYNC & self.tripped)
 
     def attach(self, application: Application) -> None:
         """Set the application, which then gets received values and state changes."""
@@ -433,10 +427,7 @@ class NodeClock:
 
 
 class SyncListeners:
-    """Reports each SYNC to the devices of a bench, with the number lost before.
-
-    A right SYNC needs no report unless `is_remembering`.
-    """
+    """Reports each SYNC to the devices of a bench, with the number lost before."""
 
     def __init__(self, devices: Sequence[EmulatedDevice]) -> None:
         self._devices = devices
@@ -447,8 +438,6 @@ class SyncListeners:
         self._takers: dict[int, tuple[int, ...]] = {}
         self.overflow = SYNC_OVERFLOW
         """The last SYNC counter before 1."""
-        self.is_remembering = False
-        """Whether a device remembers a SYNC that was odd or lost, and counts right ones, too."""
         for device in devices:
             device.watch(0x1019, 0, lambda _: self._sort())
         self._sort()
@@ -479,7 +468,6 @@ class SyncListeners:
             self._unheard[place] = 0
             for _ in range(heard[place] - 1):
                 device.note_sync(SyncKind.REPEATED, 0, t_ns)
-        self._remember()
 
     def ignore(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, t_ns: int) -> None:
         """Report the kind of a SYNC that no device answers, without lost ones before it.
@@ -489,15 +477,10 @@ class SyncListeners:
         for place, device in enumerate(self._devices):
             for _ in range(heard[place]):
                 device.note_sync(kind if takers[place] else SyncKind.WRONG_LENGTH, 0, t_ns)
-        self._remember()
 
     def miss(self, count: int) -> None:
         """Add `count` lost SYNCs for every device; the next `report_sync` reports them."""
         self._unheard = [unheard + count for unheard in self._unheard]
-        self._remember()
-
-    def _remember(self) -> None:
-        self.is_remembering = any(self._unheard) or any(device.is_sync_odd for device in self._devices)
 
     def _sort(self) -> None:
         """Update the devices that take SYNCs with and without counter, and `overflow`, by their 0x1019."""

@@ -5,7 +5,7 @@ import struct
 import pytest
 from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, moving_host
 
-from firmware_sim.canopen.error_control import SyncKind, SyncOrder
+from firmware_sim.canopen.error_control import SyncKind, SyncOrder, Watchdog
 
 NODES = (1, 2, 3, 4)
 TOLERATED, CLEAN_SYNCS = 3, 100  # as docs/protocol.md says
@@ -76,7 +76,7 @@ def test_a_warning_about_sync_does_not_keep_another_fault_from_being_reset():
     host.bench.drives[0].fail(0x2310, host.bench.now_ns)
     host.bench.drives[0].mend()
     host.step(Word.ENABLE, times=CLEAN_SYNCS - 10)
-    assert (host.state_bits(1), host.bench.devices[0].is_sync_odd) == (State.FAULT, True)
+    assert (host.state_bits(1), host.bench.devices[0].tripped) == (State.FAULT, {Watchdog.SYNC_ORDER})
     host.step(0x80)
     assert host.state_bits(1) == 0x40
 
