@@ -263,8 +263,8 @@ class ArmState(NamedTuple):
     q: Vector
     dq: Vector
     tau_J: Vector
-    age_q: tuple[int, int]
-    age_tau_J: tuple[int, int]
+    age_q: tuple[int, ...]
+    age_tau_J: tuple[int, ...]
     is_enabled: bool
     is_complete: bool
     fault: FaultReason

@@ -52,9 +52,9 @@ class Arm:
         self._is_pipelined = settings.bus.is_pipelined
         self._pending: _Command | None = None
         self.sign = settings.arm.sign
-        zero1, zero2 = settings.arm.zero_rad.tolist()
-        self.zero_rad = zero1, zero2
-        self._offset_Nm = settings.arm.torque_offset_Nm
+        self.zero_rad: tuple[float, ...] = tuple(settings.arm.zero_rad.tolist())
+        self._signs = np.array(self.sign * 3)  # of positions, velocities, torques
+        self._zeros = np.array((*self.zero_rad, *(0.0,) * JOINTS, *settings.arm.torque_offset_Nm))
         self.limits = settings.arm
         self._permille_per_Nm = tuple(
             sign * 1000.0 / rated for sign, rated in zip(settings.arm.sign, settings.arm.rated_torque_Nm, strict=True)
@@ -268,7 +268,7 @@ class Arm:
         sample = newest_sample(self._clocks, self._ordinal, self._sampled_ordinal)
         if sample is not None:
             ordinal, values = sample
-            return self._state_of(ordinal, values, (self._sync_cycles[ordinal % KEPT],) * 4)
+            return self._state_of(ordinal, values, (self._sync_cycles[ordinal % KEPT],) * len(self.devices))
         return self._state_of(
             None, [device.values for device in self.devices], [device.sample_cycle for device in self.devices]
         )
@@ -279,33 +279,25 @@ class Arm:
         `ordinal`: of the SYNC that all devices have answered, whose sample now counts as used; None: the sample is
         incomplete.
         """
-        (q1, dq1), (q2, dq2), (tau1,), (tau2,) = values
-        sign1, sign2 = self.sign
-        zero1, zero2 = self.zero_rad
-        offset1, offset2 = self._offset_Nm
         cycle = self._cycle
+        ages = tuple(cycle - own for own in sampled)
         steps, sampled_ns = 0, self._t_ns
         if ordinal is not None:
             steps = sampled[0] - self._sampled_cycle if self._sampled_ordinal >= 0 else 1
             sampled_ns = self._sync_ns[ordinal % KEPT]
             self._sampled_ordinal, self._sampled_cycle = ordinal, sampled[0]
-        is_enabled = self.drives[0].is_enabled and self.drives[1].is_enabled
-        motion = np.array(
-            (
-                *(sign1 * q1 - zero1, sign2 * q2 - zero2),
-                *(sign1 * dq1, sign2 * dq2),
-                *(sign1 * tau1 - offset1, sign2 * tau2 - offset2),
-            )
-        )
+        is_enabled = all(drive.is_enabled for drive in self.drives)
+        (q, dq), (tau_J,) = zip(*values[:JOINTS], strict=True), zip(*values[JOINTS:], strict=True)
+        measured = self._signs * np.array(q + dq + tau_J) - self._zeros
         return ArmState(
             cycle=cycle,
             t_ns=self._t_ns,
             periods=self._periods,
-            q=motion[:2],
-            dq=motion[2:4],
-            tau_J=motion[4:],
-            age_q=(cycle - sampled[0], cycle - sampled[1]),
-            age_tau_J=(cycle - sampled[2], cycle - sampled[3]),
+            q=measured[:JOINTS],
+            dq=measured[JOINTS : 2 * JOINTS],
+            tau_J=measured[2 * JOINTS :],
+            age_q=ages[:JOINTS],
+            age_tau_J=ages[JOINTS:],
             is_enabled=is_enabled,
             is_complete=ordinal is not None,
             fault=self._device_fault(is_enabled),
@@ -345,15 +337,14 @@ class Arm:
             self._bus.send_all(self._encode(*values))
 
     def _encode(self, tau_c: list[float], enable: bool, quick_stop: bool) -> tuple[tuple[int, bytes], ...]:
-        """Return (identifier, data) of both drives' commands; each call advances the alive counters.
+        """Return (identifier, data) of each drive's command; each call advances the alive counters.
 
         tau_c: of each joint, Nm. enable: go one state nearer to Operation enabled, else disable voltage. quick_stop:
         has precedence over enable.
         """
-        (drive1, drive2), (ratio1, ratio2), (tau1, tau2) = self.drives, self._permille_per_Nm, tau_c
-        return (
-            (drive1.command_id, drive1.command(round(tau1 * ratio1), enable, quick_stop)),
-            (drive2.command_id, drive2.command(round(tau2 * ratio2), enable, quick_stop)),
+        return tuple(
+            (drive.command_id, drive.command(round(tau * ratio), enable, quick_stop))
+            for drive, ratio, tau in zip(self.drives, self._permille_per_Nm, tau_c, strict=True)
         )
 
     def frame_checks(self) -> FrameChecks:

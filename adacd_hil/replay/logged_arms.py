@@ -56,7 +56,6 @@ def logged_arms(scheme: NDArray[Any], arm: NDArray[Any], ticks: Ticks) -> ArmBat
 
 def arm_at(arms: ArmBatch, row: int) -> ArmState:
     """Return the arm's state in one cycle of a batch, by the cycle's index `row`; its vectors are views."""
-    age_q, age_tau_J = arms.age_q[row].tolist(), arms.age_tau_J[row].tolist()
     return ArmState(
         cycle=int(arms.cycle[row]),
         t_ns=int(arms.t_ns[row]),
@@ -64,8 +63,8 @@ def arm_at(arms: ArmBatch, row: int) -> ArmState:
         q=arms.q[row],
         dq=arms.dq[row],
         tau_J=arms.tau_J[row],
-        age_q=(age_q[0], age_q[1]),
-        age_tau_J=(age_tau_J[0], age_tau_J[1]),
+        age_q=tuple(arms.age_q[row].tolist()),
+        age_tau_J=tuple(arms.age_tau_J[row].tolist()),
         is_enabled=bool(arms.is_enabled[row]),
         is_complete=bool(arms.is_complete[row]),
         fault=FaultReason(arms.fault[row]),
