@@ -135,7 +135,9 @@ def find_contract(name: str) -> Path:
 def _move(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
     """Return the contract with the host at its configured node id, and the devices if all move by the same number.
 
-    Otherwise the devices keep the DBC's node ids. A DBC without the host's heartbeat is returned unchanged.
+    Otherwise the devices keep the DBC's node ids. A DBC without the host's heartbeat is returned unchanged. Raises
+    CodecError for a device's 29-bit identifier, or its node id outside 1 to 126 or equal to the host's, unless no id
+    changes.
     """
     offsets = {
         device.node_id - (codec.messages[name].can_id & NODE_MASK)
@@ -249,10 +251,11 @@ def _mapped(device: PlacedDevice, pdo: PdoSettings, name: ObjectName) -> EdsVari
 
 
 def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
-    """Return the message of a PDO.
+    """Return the message of a PDO: its signals are the end-to-end header, if it has data ids, then the mapped objects.
 
-    Raises ConfigError if the EDS lacks the PDO or an object, the header has the wrong number of bits, a bound is
-    outside its value's range, or no CAN frame has the length.
+    A received PDO is a command of the host; others are sent on SYNC or on events. Raises ConfigError if the EDS lacks
+    the PDO or an object, the header has the wrong number of bits, a bound is outside its value's range, or no CAN frame
+    has the length.
     """
     profile, name = device.settings, device.name.upper()
     for place in (ObjectName(pdo.communication_index, 1), ObjectName(pdo.mapping_index)):

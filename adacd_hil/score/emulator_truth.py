@@ -123,7 +123,10 @@ class _TruthRows:
         self._last = rows[-1:]
 
     def _rows(self, truth: Series) -> NDArray[Any]:
-        """Return the records as rows of type _ROW; a cycle number that falls begins the next attempt."""
+        """Return the records as rows of type _ROW; a cycle number that falls begins the next attempt.
+
+        Fields that the log lacks are 0.
+        """
         records, rows = truth.records, np.zeros(len(truth), _ROW)
         for name in _ROW.names or ():
             if name in truth.fields:
@@ -274,10 +277,10 @@ class HostCycles(NamedTuple):
 
 
 def placed_contacts(contacts: Sequence[TrueContact], host: HostCycles, settings: Settings) -> list[TrueContact]:
-    """Return the contacts that begin within the host's cycles, with their times on the host's clock.
+    """Return the contacts that begin up to the last of the host's cycles, with their times on the host's clock.
 
-    contacts: their cycles are counted by the host. host: its cycles before and after each onset and end, others may be
-    left out.
+    An onset or end outside these cycles gets the time of the nearest one. contacts: their cycles are counted by the
+    host. host: its cycles before and after each onset and end, others may be left out.
     """
     contacts = [contact for contact in contacts if len(host.cycle) and contact.onset <= host.cycle[-1]]
     if not contacts:
