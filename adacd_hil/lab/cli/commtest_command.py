@@ -139,7 +139,8 @@ def _exit_code(test: CommunicationTest, fault: FaultReason, is_interrupted: bool
 def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection, achieved: dict[str, str]) -> Recorder:
     """Create the log of a test in the folder `out`, and the folder; attach contract and settings; return its recorder.
 
-    achieved: metadata on the host. Raises LogError if it can't be created.
+    achieved: metadata on the host. Raises LogExistsError if a log is there, LogError if it can't be created, OSError if
+    the folder can't be.
     """
     out.mkdir(parents=True, exist_ok=True)
     return Recorder(
