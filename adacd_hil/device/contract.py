@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from adacd_hil.device.canopen_bus import EdsVariable
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, ObjectName, PdoSettings, PlacedDevice
+from adacd_hil.file_access import exists
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
@@ -121,10 +122,10 @@ def find_contract(name: str) -> Path:
     Raises ConfigError for any other text, with the nearest name if there is one.
     """
     folder = contract_folder()
-    if (folder / f"{name}.dbc").is_file():
+    if exists(folder / f"{name}.dbc"):
         return folder / f"{name}.dbc"
     path = Path(name)
-    if name and (path.suffix or path.exists()):
+    if name and (path.suffix or exists(path)):
         return path
     known = sorted(path.stem for path in folder.glob("*.dbc"))
     nearest = nearest_name(name, known)
