@@ -171,10 +171,13 @@ class LockstepBus(Bus):
     def close(self) -> None:
         """Send the queued frames, then close the bus behind it; frames that no node acknowledges are not sent.
 
-        Raises SilenceError if no device answers a queued SYNC, BusError if the bus behind fails; then it stays open.
+        Raises SilenceError if no device answers a queued SYNC, BusError if the bus behind fails. The bus behind is
+        closed in any case.
         """
-        self._transmit_before(NEVER_NS)
-        self._bus.close()
+        try:
+            self._transmit_before(NEVER_NS)
+        finally:
+            self._bus.close()
 
     def _transmit_before(self, limit_ns: int) -> None:
         """Transmit in turn all waiting frames, of host and devices, that start before `limit_ns`."""
