@@ -34,9 +34,9 @@ def listening(listener: Listener) -> Iterator[None]:
 def functions_below(functions: Sequence[Any], is_all: bool = False) -> dict[str, Any]:
     """Return these compiled functions and all that they call, by full name.
 
-    Calls are found by the names in the code: of functions, and of functions in modules. Left out are functions that
-    numba doesn't compile (all of them if NUMBA_DISABLE_JIT is set) and, unless `is_all`, functions that this process
-    has compiled or loaded already.
+    Calls are found by the names in the code: of functions, and of functions in modules. Left out, with the calls in
+    them, are functions that numba doesn't compile (all of them if NUMBA_DISABLE_JIT is set) and, unless `is_all`,
+    functions that this process has compiled or loaded already.
     """
     found: dict[str, Any] = {}
     waiting = list(functions)

@@ -19,7 +19,10 @@ class GivenPath(click.Path):
         super().__init__(path_type=Path, file_okay=file_okay, dir_okay=dir_okay)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return a path as `click.Path` does; refuse an empty name."""
+        """Return a path as `click.Path` does; refuse an empty name, too.
+
+        Raises click.BadParameter for a refused path.
+        """
         if value == "":
             self.fail("the name is empty", param, ctx)
         return super().convert(value, param, ctx)
@@ -34,7 +37,8 @@ class WrittenPath(GivenPath):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return a path as `GivenPath` does; refuse a link without a target among the folders above it.
 
-        A path that may be a folder is refused, too, if it is such a link itself; a file would replace the link.
+        A path that may be a folder is refused, too, if it is such a link itself; a file would replace the link. Raises
+        click.BadParameter for a refused path.
         """
         path = Path(super().convert(value, param, ctx))
         link = dangling_link(path if self.dir_okay else path.parent)  # a file would replace the link

@@ -127,8 +127,9 @@ class _SchedulingAttributes(ctypes.Structure):
 def request_realtime(request: RealtimeRequest | None = None) -> RealtimeGrant:
     """Request real-time scheduling, a processor, locked memory and shallow idle states (None: the default request).
 
-    Call it after compiling. Return the grant, which lists the refusals; none is raised. Children inherit neither
-    scheduler nor locked memory; see `RealtimeGrant.unpinned` for the processor.
+    Under SCHED_OTHER also make sleeps exact, to 1 ns of timer slack. Call it after compiling. Return the grant, which
+    lists the refusals; none is raised. Children inherit neither scheduler nor locked memory; see
+    `RealtimeGrant.unpinned` for the processor.
     """
     request = request or RealtimeRequest()
     libc = ctypes.CDLL(None, use_errno=True)
@@ -259,7 +260,10 @@ def isolated_cpus(folder: Path = _SYSTEM_CPUS) -> tuple[int, ...]:
 
 
 def freeze_garbage() -> None:
-    """Collect garbage once, then disable the collection: the cycle makes no cycles of references."""
+    """Collect garbage once, exempt the objects that are left from later collections, and disable automatic collection.
+
+    The cycle makes no cycles of references.
+    """
     gc.collect()
     gc.freeze()
     gc.disable()

@@ -177,8 +177,8 @@ class Terminal(io.TextIOBase):
     def write(self, text: str) -> int:
         """Write a text with control characters escaped; return its length.
 
-        Unless the stream is needed, `for_people` folds and colours the text. Raises OSError if a needed stream can't be
-        written, unless its reader has gone.
+        Unless the stream is needed, `for_people` folds and colours the text. Raises TypeError for anything but text;
+        OSError if a needed stream can't be written, unless its reader has gone.
         """
         if not isinstance(text, str):
             raise TypeError(f"{self.name} takes text, not {type(text).__name__}")
@@ -186,7 +186,7 @@ class Terminal(io.TextIOBase):
         return len(text)
 
     def write_raw(self, text: str) -> None:
-        """Write a text without escaping, for our own cursor movements.
+        """Write a text without escaping, for our own cursor movements; drop it once the reader has gone.
 
         Raises OSError if the stream is needed and can't be written, unless its reader has gone.
         """

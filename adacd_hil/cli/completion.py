@@ -95,7 +95,10 @@ def _starting(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
 
 
 def _toml_files(incomplete: str) -> list[CompletionItem]:
-    """Return the TOML files and folders whose paths begin with `incomplete`; hidden ones only if that isn't empty."""
+    """Return the TOML files and folders whose paths begin with `incomplete`; hidden ones only if that isn't empty.
+
+    Folders end with a slash. [] for a folder that can't be listed.
+    """
     folder, slash, _ = incomplete.rpartition("/")
     found = []
     try:
@@ -127,7 +130,10 @@ class BashWithEquals(BashComplete):
     """The part of the word before `=` that bash keeps."""
 
     def get_completion_args(self) -> tuple[list[str], str]:
-        """Return the words before the cursor, and the word under it; join KEY, `=` and VALUE, which bash has split."""
+        """Return the words before the cursor, and the word under it; behind --set and --vary join KEY, `=` and VALUE.
+
+        Bash has split these three. The `KEY=` of a joined word under the cursor is kept for `format_completion`.
+        """
         args, incomplete = super().get_completion_args()
         words: list[str] = []
         for word in [*args, incomplete]:

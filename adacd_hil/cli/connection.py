@@ -62,7 +62,8 @@ def check_rehearsal(scenario: str, interface: str, channel: str) -> None:
 def may_be_hardware(interface: str, channel: str) -> bool:
     """Return whether an arm may be on a channel: the channel exists, and isn't virtual.
 
-    Virtual: vcan, vxcan, and python-can's own virtual bus.
+    Virtual: vcan, vxcan, and python-can's own virtual bus. Of other interfaces than SocketCAN every channel counts as
+    existing if python-can knows the interface and it doesn't echo own frames.
     """
     from adacd_hil.wire.python_can import is_usable
 

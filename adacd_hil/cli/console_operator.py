@@ -98,7 +98,8 @@ class ConsoleOperator:
     def _enter(self, state: SchemeState) -> None:
         """Store a new state, and print which word it waits for.
 
-        In FAULT drop all requests typed before except FINISH: they can't acknowledge it.
+        Only STOPPED and PAYLOAD wait for one, and it isn't printed if a request is queued already. In FAULT drop all
+        requests typed before except FINISH: they can't acknowledge it.
         """
         self._state = state
         if state is SchemeState.FAULT:

@@ -106,7 +106,8 @@ def _misused(error: click.ClickException) -> str:
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line (default: this process's) and exit with a documented status.
 
-    `adacd_hil.cli.start_host` calls this.
+    Without `arguments`, first replace the standard streams by terminals of ours, unless a shell asks for completions.
+    Errors of click and of missing packages are printed on standard error in one line.
     """
     if is_completing():  # click writes completions in raw form
         prepare_completion()

@@ -242,8 +242,8 @@ def live_options(command: Callable[..., ExitCode]) -> Callable[..., ExitCode]:
 def _live_view(host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int) -> "LiveView":
     """Return the live view that an installed package makes, to listen on host and port.
 
-    origins, names, most_viewers: as of --live-origin, --live-name and --live-viewers.
-    Raises CommandError if no or more than one package serves one, an origin is wrong, or the port can't be listened on.
+    origins, names, most_viewers: as of --live-origin, --live-name and --live-viewers. Raises CommandError if the extra
+    `live` is missing, no or more than one package serves a view, an origin is wrong, or the port can't be listened on.
     """
     require_live("--live")
     try:

@@ -295,7 +295,7 @@ def writable_folder(out: Path | None) -> Iterator[None]:
 
 
 def print_and_write(text: str, out: Path | None, content: str, has_all: bool) -> None:
-    """Print a result's text, and write `content` to the file `out`, unless that is None.
+    """Print a result's text, and write `content` to the file `out`, unless that is None; make its folder if missing.
 
     has_all: the text contains `content`. If the file can't be written, print `content` too, unless has_all, and raise
     CommandError.
@@ -328,7 +328,10 @@ class RunFolder:
     links: tuple[Path, ...] = ()
 
     def link(self, progress: Callable[[str], None] = lambda _: None) -> None:
-        """Set the links; skip one whose name is taken by a file or folder, and report it to `progress`."""
+        """Set the links; report each that can't be set to `progress`, and go on.
+
+        A link isn't set if a file or folder has its name.
+        """
         for link in self.links:
             try:
                 _lead(link, self.path)

@@ -125,7 +125,7 @@ def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
     """Return a line that names up to _MOST_NAMED guessed values of a configuration, and the command to confirm them.
 
     "" if there are none. Guessed: listed in `assumed`, of the settings or of a device profile. measured: keys of the
-    settings that are guesses no longer.
+    settings that are guesses no longer. Raises ConfigError as `profile_guesses`.
     """
     guesses = [f"`{key}`" for key in (*profile_guesses(settings), *settings.assumed) if key not in measured]
     more = f" and {len(guesses) - _MOST_NAMED} more" if len(guesses) > _MOST_NAMED else ""
@@ -228,9 +228,10 @@ def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
 
 
 def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
-    """Yield a warning for each frame whose range of values is less than the rated torque or the largest position.
+    """Yield a warning for each position frame below the largest position, and each torque frame below rated torque.
 
-    The latter is `arm.position_limit_deg` plus the size of `arm.zero_deg`.
+    The largest position is `arm.position_limit_deg` plus the size of `arm.zero_deg`. A frame's range is that of its raw
+    values, scaled.
     """
     limits_deg, zeros_deg = settings.arm.position_limit_deg, settings.arm.zero_deg
     for joint, (limit_deg, zero_deg) in enumerate(zip(limits_deg, zeros_deg, strict=True)):
@@ -289,7 +290,10 @@ def _gears(devices: Sequence[PlacedDevice]) -> Iterator[str]:
 
 
 def _unused(codec: Codec, settings: Settings) -> Iterator[str]:
-    """Yield a warning if `devices.bitrate` is set beside a DBC, which has its own bit rate."""
+    """Yield a warning if `devices.bitrate` is set beside a DBC, `devices.contract`, which has another bit rate.
+
+    None for the default bit rate, which counts as not set.
+    """
     bitrate, _ = read_bitrates(codec)
     if settings.devices.contract and settings.devices.bitrate not in (bitrate, DEFAULT_BITRATE):
         yield (

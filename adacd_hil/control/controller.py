@@ -114,10 +114,11 @@ class Floating:
         self._is_braking = [True] * JOINTS
 
     def torque(self, q: Vector, dq: Vector, tau_ext_hat: Vector, theta: Vector, tau_d: Vector) -> None:
-        """Fill the desired torque `tau_d` (2,), Nm, of the floating law.
+        """Fill the desired torque `tau_d` (2,), Nm: gravity and a share of the friction by theta, less damping.
 
-        tau_ext_hat (2,): a joint that it pushes along its motion is no longer braked. theta (p,): model of friction and
-        gravity, zeros for none.
+        A joint that still moves from before `begin` is only braked, until it stands or tau_ext_hat (2,) pushes it along
+        its motion. Over the speed limit, and near a position limit, the controller's gains act against the motion.
+        theta (p,): zeros for no model.
         """
         tau_d[:] = regressor.inverse_dynamics(q, np.zeros(JOINTS), np.zeros(JOINTS), theta, self._level_rad)
         friction = theta[regressor.F_V1 : regressor.F_C2 + 1]

@@ -113,10 +113,10 @@ class SelfChecks:
         )
 
     def _judge_torque(self, cycle: int) -> str:
-        """Return a line for a drive whose torque has been outside its recent commands' range for too long, else "".
+        """Return a line for the first drive whose torque was outside its recent commands' range for too long, else "".
 
-        Outside: by more than `arm.torque_error_share` of its rated torque. Only statuses of this cycle are judged. Too
-        long: TORQUE_STATUSES in a row, and TORQUE_S.
+        Outside: by more than `arm.torque_error_share` of its rated torque. Too long: TORQUE_STATUSES in a row, and
+        TORQUE_S. Only statuses of this cycle are judged, and only of drives that report their torque.
         """
         for drive, rated_Nm in zip(self._arm.drives, self._arm.limits.rated_torque_Nm, strict=True):
             if drive.status_cycle != cycle or not drive.shows_torque:

@@ -166,9 +166,10 @@ class FirstMotion(EventSource):
                 self.line = readings.name_causes(self._left()) or NO_CAUSE
 
     def check_lengths(self, certificates: tuple[Certificate, ...]) -> None:
-        """Compare the first certificate of the run, if any, with the configured lengths; add an event if they differ.
+        """Compare the run's first certificate, if any, with the configured lengths; add the event of `geometry_event`.
 
-        It is the event of `geometry_event`. Set `is_certified` to True, also without a certificate.
+        It is a warning of a contradiction, or an info if a smaller tilt explains that or torques can't check a length;
+        there is none if the lengths agree. Set `is_certified` to True, also without a certificate.
         """
         self.is_certified = True
         event = geometry_event(self._settings, certificates[0]) if certificates else None
@@ -232,9 +233,10 @@ class FirstMotion(EventSource):
         )
 
     def _take_block(self, block: "_Block") -> None:
-        """Add a long block to the sums by which positions are judged, and of a moving joint also torques.
+        """Add a long block to the sums by which positions are judged, and for a moving joint also torques.
 
-        Judge the joints at each fifth block.
+        Moving: in one direction throughout, at _MOVING_RAD_S or more on average. Judge the joints at each fifth block,
+        while any is still to be judged.
         """
         self._path += block.travel * block.way, block.way * block.way, block.travel * block.travel
         self._way_rad += np.abs(block.way)

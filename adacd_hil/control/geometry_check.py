@@ -52,7 +52,11 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
 
 
 def _by_direction(settings: Settings, theta: tuple[float, ...]) -> Event | None:
-    """Return a warning if gravity acts against the configured mounting, by the sign of a5; else None."""
+    """Return a warning if gravity acts against the configured mounting, by the sign of a5; else None.
+
+    theta (p,): of the certificate, with gravity. A negative a5 counts from a share of `_SEEN` of the size that a2 and
+    the lengths predict. None also if they predict no positive a5.
+    """
     expected_Nm = settings.gravity_m_s2 * theta[A2] / settings.arm.link_length_m[0]
     if theta[A5] >= -_SEEN * abs(expected_Nm) or expected_Nm <= 0.0:
         return None

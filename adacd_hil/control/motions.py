@@ -81,7 +81,7 @@ class Pace:
         self.begin_path()
 
     def begin_path(self) -> None:
-        """Restart at full speed, for a new path."""
+        """Set the share of the planned speed to 1, its change and the lag to 0, for a new path."""
         self.share, self.change = 1.0, 0.0
         """Present share, and its rate of change, 1/s."""
         self.lag_s = 0.0

@@ -146,7 +146,10 @@ class RunNarration:
         return _STATES.get(output.state, output.state.name.lower())
 
     def _touch(self, t_ns: int, output: SchemeOutput) -> str:
-        """Return the text of a detected touch: its level, the delay of the detection if known, the reaction."""
+        """Return the text of a detected touch: its level, the delay of the detection if known, the reaction.
+
+        A delay below 0, or of more than _LATEST_MS, is left out: the detected touch is then another one.
+        """
         contact = output.contact
         assert contact is not None
         what = "light touch" if contact.level is ContactLevel.CONTACT else "touch"

@@ -144,7 +144,8 @@ class GridPacer:
     def next(self) -> Tick:
         """Sleep until the next grid point and return the tick; if whole periods were missed, skip and count them.
 
-        The first call sets the grid.
+        The first call sets the grid, at the clock's next whole period. For the last `spin_ns` read the clock in place
+        of sleep.
         """
         if self._start_ns is None:
             self._start_ns = -(-self._clock.now_ns() // self._period_ns) * self._period_ns
@@ -164,13 +165,13 @@ class GridPacer:
         return Tick(self._cycle, now_ns, self._cycle - previous, now_ns - due_ns)
 
     def command_time(self, feedback_ns: int) -> int:
-        """Move a virtual clock to feedback_ns plus the modelled latency; return the clock's time."""
+        """Return the clock's time, ns; with a modelled latency, first move the clock to feedback_ns plus that."""
         if self._latency is not None:
             self._clock.sleep_until_ns(feedback_ns + self._latency.draw_ns())
         return self._clock.now_ns()
 
     def resume(self) -> None:
-        """Skip the periods of a pause, without counting them as overruns."""
+        """Skip the periods of a pause, without counting them as overruns; do nothing before the first cycle."""
         if self._start_ns is not None:
             self._cycle = max(self._cycle, (self._clock.now_ns() - self._start_ns) // self._period_ns)
 
@@ -256,7 +257,8 @@ class FollowingPacer:
     def _count(self, sync: Frame) -> int:
         """Return the periods since the SYNC before, at least 1; 0 for the first.
 
-        Raises BusError if the first `_JUDGED_SYNCS` come at another period than configured.
+        By the counters of both SYNCs, and the bus's times for whole rounds of the counter; by the times alone without
+        counters. Raises BusError if the first `_JUDGED_SYNCS` with counters come at another period than configured.
         """
         last = self._last
         if last is None:

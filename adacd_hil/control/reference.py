@@ -104,7 +104,7 @@ class Reference(EventSource):
         """Joints that brake beyond their position limit in this state; reported once."""
 
     def compile_motion(self) -> None:
-        """Compile every kind of motion by evaluating it once, so that it doesn't compile in the cycle."""
+        """Evaluate trajectory, excitation if there is one, and a withdrawal once, so that they don't compile later."""
         zeros, scratch = np.zeros(JOINTS), np.zeros((3, JOINTS))
         self._follow(0.0, *scratch)
         if self._excitation.is_on:
@@ -117,7 +117,10 @@ class Reference(EventSource):
         return self._state in REACTING and self._reaction is Reaction.FLOAT
 
     def park(self) -> None:
-        """Begin the way to the start corner, where the arm stays; while it reacts or is stopped, leave it in place."""
+        """Begin the way to the start corner, where the arm stays.
+
+        While it reacts or is stopped, leave it in place; the way begins when it goes on afterwards.
+        """
         self._is_parking = True
         if self._state not in REACTING:
             self._approach()
@@ -182,7 +185,8 @@ class Reference(EventSource):
     def _is_yielding(self, arm: ArmState, output: SchemeOutput) -> bool:
         """Fill the desired motion of FLOAT or ADMITTANCE and return True; return False for reactions along a path.
 
-        If a blow has just thrown the arm, restart the reaction, of any kind but FLOAT, from the measured motion.
+        If a blow has just thrown the arm, and `reaction.start` is `measured`, restart the reaction from the measured
+        motion; not in FLOAT.
         """
         if self._reaction is Reaction.FLOAT:
             self._stay(arm)
@@ -269,7 +273,8 @@ class Reference(EventSource):
     def _react(self, output: SchemeOutput, arm: ArmState) -> None:
         """Begin the reaction to a contact: STOP brakes, WITHDRAW takes a new path, FLOAT and ADMITTANCE have none.
 
-        NONE and SLOW_DOWN keep the path. Store contact and external torque, by which `_is_thrown` judges.
+        NONE and SLOW_DOWN keep the path. Store the cycle; for the others also place and external torque, by which
+        `_is_thrown` judges. Report joints that can't stop within their limit, except in FLOAT.
         """
         self._reaction = output.reaction
         self._contact_cycle = arm.cycle
@@ -332,7 +337,7 @@ class Reference(EventSource):
         return Withdrawal(self._settings, q, dq, np.zeros(JOINTS))
 
     def _brake(self, cycle: int) -> None:
-        """Make the soonest stop from the present desired motion the path."""
+        """Make the soonest stop from the present desired motion the path; report joints that exceed their limit."""
         self._withdraw(self._stop_from(self._q_d, self._dq_d), cycle)
 
     def _approach(self) -> None:

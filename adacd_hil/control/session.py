@@ -221,7 +221,8 @@ class Session:
     def _attempt(self, attempt: Attempt, recorder: Recorder, tap: Tap) -> Ending:
         """Boot the devices, run until the run is finished, interrupted or faulted, and return how the attempt ended.
 
-        Log and print an error of bus or devices instead of raising it.
+        In real time first refuse a bus on which another host runs the arm. Log and print an error of bus or devices
+        instead of raising it. At the end log the counts of the frame checks, and each certificate.
         """
         arm, master, cycle = attempt
         ending = Ending(None, "", is_bus_failed=False)
@@ -263,7 +264,8 @@ class Session:
     def _run(self, cycle: Cycle, master: Master, recorder: Recorder, tap: Tap) -> RunResult:
         """Set the devices to Operational, run the cycles, and stop the devices in any case; return the result.
 
-        Raises BusError if sending or receiving fails, in lockstep if no device answers.
+        Before the first attempt call `on_started`. Raises BusError if sending or receiving fails, in lockstep if no
+        device answers.
         """
         if not self._has_started:
             self._has_started = True

@@ -202,10 +202,12 @@ class UsedTare:
 
 
 def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
-    """Read a tare for a run with these settings, with warnings about its age and a zero set by the sensors themselves.
+    """Read a tare for a run with these settings.
 
-    now_ns: wall clock. Raises ConfigError if the tare is missing, too old, or measured with another sign, without
-    gravity where the configuration has it or the other way round, or in gravity with another mounting or zero.
+    Its warnings are on its age, a date in the future, and a zero that the sensors have set themselves. now_ns: wall
+    clock. Raises ConfigError if the tare is missing, invalid, or older than `tare.max_age_h`, 0 for no limit. Also if
+    it was measured with another sign, without gravity where the configuration has it or the other way round, or in
+    gravity with another mounting or zero.
     """
     tare = read_tare(path)
     if tare.sign != settings.arm.sign:

@@ -60,9 +60,12 @@ class AnswerClock:
         position_error: Callable[[int], float] | None = None,
         soonest_ns: int | None = None,
     ) -> int | None:
-        """Return the ordinal of the SYNC that a frame answers; None when every SYNC has its answer already.
+        """Return the ordinal of the SYNC that a frame answers; None if all SYNCs up to `newest` are answered already.
 
-        If the last answer was a guess that the frame corrects, `newest` is returned again.
+        Before the first answer it is `newest`. With a counter it is `step` SYNCs after the last answered one, at least
+        one and at most up to `newest`. Without a counter it is the oldest unanswered SYNC, or `newest` if arrival time
+        and position show that answers were lost. If the last answer was a guess that the frame corrects, `newest` is
+        returned again.
 
         newest: ordinal of the last SYNC before the frame, which came `offset_ns` after it. step: advance of its alive
         counter since the last frame; None without a counter, and at the beginning. position_error: returns, for a
@@ -85,7 +88,8 @@ class AnswerClock:
     def _is_newer(self, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
         """Return whether a second frame after one SYNC, without counter, answers it, so that the first one was late.
 
-        By its time after SYNC, offset_ns, and, if given, the position: position_error, as of `find`.
+        False if it comes later after SYNC (`offset_ns`) than usual. If position_error, as of `find`, is given, the
+        frame must also fit one period after the first frame about as well as one period before it.
         """
         if not self._is_usual(offset_ns):
             return False
@@ -98,7 +102,9 @@ class AnswerClock:
     def _follows_lost_ones(self, owed: int, offset_ns: int, position_error: Callable[[int], float] | None) -> bool:
         """Return whether a frame without counter answers the last SYNC, so that answers to earlier SYNCs were lost.
 
-        `owed`: number of SYNCs since the last answered one. By the position if that decides, else by the time.
+        `owed`: number of SYNCs since the last answered one. The position decides if its errors over one and over `owed`
+        periods differ by more than CLEAR_RAD. Else the time does: True if the frame comes no later after SYNC than
+        usual.
         """
         advantage_rad = 0.0 if position_error is None else position_error(1) - position_error(owed)
         if abs(advantage_rad) > CLEAR_RAD:
@@ -108,7 +114,8 @@ class AnswerClock:
     def take_straggler(self, behind: int) -> bool:
         """Return whether a frame that answers no new SYNC is a delayed answer; note it, so that a second call is False.
 
-        `behind`: how far its counter is behind the last answer's, 0 without a counter.
+        `behind`: how far its counter is behind the last answer's; the answer with that counter must be missing. 0: no
+        counter; then the frame is a delayed answer if the last answer was a guess.
         """
         if behind == 0:
             was_guess, self._is_guess = self._is_guess, False
@@ -127,10 +134,11 @@ class AnswerClock:
         return values if answered == ordinal else None
 
     def set_answered(self, ordinal: int, newest: int, offset_ns: int, is_counted: bool) -> None:
-        """Set `ordinal` as the last answered SYNC; learn the device's usual time to an answer from one that is in time.
+        """Set `ordinal` as the last answered SYNC, and note the SYNCs skipped before it as unanswered.
 
-        newest: ordinal of the last SYNC before the answer, which came offset_ns after it. is_counted: whether the frame
-        has a counter.
+        The first USUAL_ANSWERS answers in time, without the very first, also set the device's usual time to an answer;
+        an answer without a counter after skipped SYNCs is a guess, which doesn't. newest: ordinal of the last SYNC
+        before the answer, which came offset_ns after it. is_counted: whether the frame has a counter.
         """
         before, self.answered = self.answered, ordinal
         if before is not None and ordinal > before:

@@ -98,7 +98,8 @@ class Arm:
     def synchronise(self, cycle: int, t_ns: int, periods: int) -> None:
         """Begin a cycle: send SYNC, unless another host sends it, then the pipelined commands of `send_command`.
 
-        First, count a miss of each device whose frame the ending cycle lacks. `cycle`, `t_ns`: number and time of this
+        First, count a miss of each device whose frame the ending cycle lacks, and shift `gaps`. Pipelined commands are
+        sent without torque if `periods` exceeds `bus.max_age_cycles`. `cycle`, `t_ns`: number and host time of this
         SYNC. `periods`: since the previous SYNC. Raises BusError if the bus refuses a frame.
         """
         if self._cycle >= 0:
@@ -126,7 +127,10 @@ class Arm:
         self._bus.send_all(frames)
 
     def _miss(self) -> None:
-        """Count a miss of each device whose frame did not come in the cycle that ends now."""
+        """Count a miss of each device whose frame did not come in the cycle that ends now.
+
+        A frame of the right length has come, even if it failed its check.
+        """
         for bit, device in enumerate(self.devices):
             if not self._seen & (1 << bit):
                 device.miss()
@@ -140,9 +144,10 @@ class Arm:
     def accept(self, frame: Frame, is_late: bool = False) -> bool:
         """Take a frame; return True for a cyclic or status frame of the arm, and for one that only this host may send.
 
-        A cyclic or status frame that fails a check is True, too, but its values are not used. All others are False:
-        EMCY, whose code is kept, heartbeats, SDO answers, error frames. `is_late`: the frame arrived before SYNC, so it
-        answers an earlier one.
+        A cyclic or status frame that fails a check is True, too, but its values are not used. A frame that only this
+        host may send is judged by `strangers`, which reports other senders. All others are False: EMCY, whose code is
+        kept, heartbeats, SDO answers, error frames. `is_late`: the frame arrived before SYNC, so it answers an earlier
+        one.
         """
         if frame.is_error:
             return False
@@ -160,7 +165,9 @@ class Arm:
     def _answer(self, frame: Frame, place: int, newest: int) -> None:
         """Take a cyclic frame of device `place` as the answer to a SYNC, or refuse it if it answers none.
 
-        `newest`: ordinal of the last SYNC before the frame; -1: none was sent, and the frame is ignored.
+        Its values are used only if its check passes. After a restart of the device's counter, each SYNC up to `newest`
+        counts as answered. `newest`: ordinal of the last SYNC before the frame; -1: none was sent, and the frame is
+        ignored.
         """
         if newest < 0:
             return  # no SYNC was sent yet
@@ -228,9 +235,10 @@ class Arm:
                 self.strangers.report_second_frame(frame, device.name, self._cycle)
 
     def _hear_emergency(self, frame: Frame) -> None:
-        """Keep the error code of a device's EMCY, unless `safety.tolerated_emergencies` has it; ignore other frames.
+        """Keep the error code of a device's EMCY, unless `safety.tolerated_emergencies` has it.
 
-        An EMCY with code 0x00xx, error reset, deletes the device's code. Source: CiA 301, clause 7.2.7.
+        An EMCY with code 0x00xx, error reset, deletes the device's code. Ignore other frames, and an EMCY of another
+        length than 8 bytes. Source: CiA 301, clause 7.2.7.
         """
         device = self._emergency_ids.get(frame.can_id)
         if device is None or len(frame.data) != _EMERGENCY_BYTES:
@@ -276,8 +284,8 @@ class Arm:
     def _state_of(self, ordinal: int | None, values: Sequence[tuple[float, ...]], sampled: Sequence[int]) -> ArmState:
         """Return the state from each device's values and the cycle of their sample, both in the order of `devices`.
 
-        `ordinal`: of the SYNC that all devices have answered, whose sample now counts as used; None: the sample is
-        incomplete.
+        The values are the devices' own, in rad, rad/s and Nm. Sign, zero and torque offset are applied. `ordinal`: of
+        the SYNC that all devices have answered, whose sample now counts as used; None: the sample is incomplete.
         """
         cycle = self._cycle
         ages = tuple(cycle - own for own in sampled)

@@ -71,9 +71,11 @@ class DataWatch(EventSource):
         self._has_rows = False
 
     def count_cycle(self, state: ArmState) -> None:
-        """Count a cycle and its missing frames and sample; after each second, compare the shares with their limits.
+        """Count a cycle and its missing frames and sample; compare the shares with their limits after each second.
 
-        Call it once per cycle, after the cycle's last frame. A cycle without enabled drives is not counted.
+        Add a warning when MOST_IN_A_ROW cycles in a row have no sample. After each second of counted cycles, also add
+        an event for each share that now exceeds its limit, or no longer does. Call it once per cycle, after the cycle's
+        last frame. A cycle without enabled drives is not counted.
         """
         if not state.is_enabled:
             return
@@ -106,7 +108,8 @@ class DataWatch(EventSource):
     def _end_window(self) -> None:
         """Add an event for each share of the window that now exceeds its limit, or no longer does.
 
-        Add the window's counts to the totals, and begin the next window.
+        Add one, too, if rows of cycles without a sample were reported and the window had none. Add the window's counts
+        to the totals, and begin the next window.
         """
         repeats = [now - before for now, before in zip(self._arm.repeats, self._repeats_before, strict=True)]
         for name, count in zip(self._limits, [self._incomplete, *self._missing, *repeats], strict=True):

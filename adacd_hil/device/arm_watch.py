@@ -31,7 +31,11 @@ class Recurrence:
         self._due_cycle = 0
 
     def take_turn(self, cycle: int) -> bool:
-        """Return whether it is due in this cycle; if so, set the next due cycle: a second call returns False."""
+        """Return whether it is due in this cycle; if so, set the next due cycle: a second call returns False.
+
+        It is due in cycle 0 and in multiples of the interval; if one of these is skipped, in the next cycle with a
+        call.
+        """
         if cycle < self._due_cycle:
             return False
         self._due_cycle = cycle - cycle % self._cycles + self._cycles
@@ -156,7 +160,7 @@ class HeartbeatWatch:
             node.complaint = ""
 
     def stop(self) -> None:
-        """Stop watching."""
+        """Stop watching: `judge_nodes` returns [] and reports nothing until `start`."""
         self._is_watching = False
 
     def accept(self, frame: Frame) -> None:

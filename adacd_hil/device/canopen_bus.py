@@ -86,7 +86,10 @@ class EdsVariable(NamedTuple):
 
 
 def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
-    """Return an object of canopen's object dictionary `objects`; None if index or sub-index isn't listed."""
+    """Return an object of canopen's object dictionary `objects`; None if index or sub-index isn't listed.
+
+    None, too, for a sub-index other than 0 of an object without sub-indices.
+    """
     entry = objects.get(index)
     if entry is None:
         return None
@@ -267,7 +270,8 @@ def name_error(code: int) -> str:
 def describe_emergency(code: int, manufacturer: bytes, has_watchdog: bool) -> str:
     """Return an EMCY message in words, in one line. `code`: its error code; `manufacturer`: its bytes 3 to 7.
 
-    `has_watchdog`: these bytes are the watchdog's number and the device's time.
+    If these bytes are all 0 they are left out. `has_watchdog`: they are the watchdog's number and the device's time; an
+    unknown number is shown as bytes.
     """
     text = f"EMCY 0x{code:04X}: {name_error(code) if code else 'error reset'}"
     if not any(manufacturer):

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from adacd_hil.device.canopen_bus import EdsVariable
 from adacd_hil.device.profile import EMCY_INHIBIT_100US, ObjectName, PdoSettings, PlacedDevice
+from adacd_hil.file_access import exists
 from adacd_hil.remedies import nearest_name
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
@@ -121,10 +122,10 @@ def find_contract(name: str) -> Path:
     Raises ConfigError for any other text, with the nearest name if there is one.
     """
     folder = contract_folder()
-    if (folder / f"{name}.dbc").is_file():
+    if exists(folder / f"{name}.dbc"):
         return folder / f"{name}.dbc"
     path = Path(name)
-    if name and (path.suffix or path.exists()):
+    if name and (path.suffix or exists(path)):
         return path
     known = sorted(path.stem for path in folder.glob("*.dbc"))
     nearest = nearest_name(name, known)
@@ -135,7 +136,9 @@ def find_contract(name: str) -> Path:
 def _move(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> Codec:
     """Return the contract with the host at its configured node id, and the devices if all move by the same number.
 
-    Otherwise the devices keep the DBC's node ids. A DBC without the host's heartbeat is returned unchanged.
+    Otherwise the devices keep the DBC's node ids. A DBC without the host's heartbeat is returned unchanged. Raises
+    CodecError for a device's 29-bit identifier, or its node id outside 1 to 126 or equal to the host's, unless no id
+    changes.
     """
     offsets = {
         device.node_id - (codec.messages[name].can_id & NODE_MASK)
@@ -249,10 +252,11 @@ def _mapped(device: PlacedDevice, pdo: PdoSettings, name: ObjectName) -> EdsVari
 
 
 def _pdo_message(device: PlacedDevice, pdo: PdoSettings) -> _DbcMessage:
-    """Return the message of a PDO.
+    """Return the message of a PDO: its signals are the end-to-end header, if it has data ids, then the mapped objects.
 
-    Raises ConfigError if the EDS lacks the PDO or an object, the header has the wrong number of bits, a bound is
-    outside its value's range, or no CAN frame has the length.
+    A received PDO is a command of the host; others are sent on SYNC or on events. Raises ConfigError if the EDS lacks
+    the PDO or an object, the header has the wrong number of bits, a bound is outside its value's range, or no CAN frame
+    has the length.
     """
     profile, name = device.settings, device.name.upper()
     for place in (ObjectName(pdo.communication_index, 1), ObjectName(pdo.mapping_index)):

@@ -53,7 +53,8 @@ class CyclicDevice(ABC):
     def set_bounds(self, placed: PlacedDevice) -> None:
         """Take over the bounds of values and the period of the status from the device's profile.
 
-        The status may be 2.5 periods old. Raises CodecError when a frame lacks a bounded signal.
+        The status may be 2.5 periods old, rounded up to whole cycles; any age without a period. Raises CodecError when
+        a frame lacks a bounded signal.
         """
         status, cyclic = placed.pdo("Status"), self._message.name.removeprefix(self.name)
         if status is not None and status.event_timer_ms:
@@ -65,7 +66,9 @@ class CyclicDevice(ABC):
     def accept_cyclic(self, data: bytes, cycle: int) -> bool:
         """Take one cyclic frame of `cycle`; return False for a wrong length or header, or no plausible main value.
 
-        Then the values in use stay. An unprotected frame is compared with the last one that came, usable or not.
+        Then the values in use stay. A protected frame is checked by its header alone, whose status is counted in
+        `end_to_end`. An unprotected frame is compared with the last one that came, usable or not; the first one passes.
+        A wrong length or an implausible value is counted in `implausible_frames`.
         """
         if len(data) != self.cyclic_length:
             self.implausible_frames += 1

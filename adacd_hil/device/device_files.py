@@ -33,8 +33,9 @@ def profile_names() -> list[str]:
 def load_profile(name_or_file: str, kind: str) -> DeviceProfile:
     """Load a device profile by built-in name or file; `kind`: the required kind, drive or sensor.
 
-    Raises ConfigError for an unknown name or key, a value outside its bounds, an EDS that can't be
-    read, another kind.
+    Its EDS is looked for beside it, beside the profiles that it extends, then in dbc/. Raises ConfigError for an
+    unknown name or key, a value outside its bounds, an EDS that is missing or can't be read, another kind. The EDS is
+    not parsed.
     """
     path = find_toml("device profile", name_or_file, _builtin_folder())
     try:
@@ -55,8 +56,10 @@ def load_profile(name_or_file: str, kind: str) -> DeviceProfile:
 def _read_profile(path: Path, depth: int = 0) -> tuple[dict[str, Any], list[Path]]:
     """Return the table of a profile merged over those that it extends, and the folders of all these, its own first.
 
-    `depth`: number of profiles that extend this one. Raises ConfigError for a file that can't be read, and for
-    `extends` that is no name or goes deeper than _MOST_EXTENDED.
+    Sections of MERGED are merged key by key, `pdo` by message; of other keys the extending profile's value counts. Its
+    own keys are no longer in `assumed`, unless it has that itself. `depth`: number of profiles that extend this one.
+    Raises ConfigError for a file that can't be read, and for `extends` that is no name or goes deeper than
+    _MOST_EXTENDED.
     """
     table = read_toml(path, "device profile")
     extended = table.pop("extends", None)
@@ -97,8 +100,8 @@ def place_devices(settings: Settings) -> list[PlacedDevice]:
 def logged_devices(settings: Settings, attachments: Mapping[str, bytes]) -> list[PlacedDevice] | None:
     """Return the devices of a run by the profiles and EDS files attached to its log, in the order of `place_devices`.
 
-    None if an attachment is missing, or a profile has keys of another version. Raises ConfigError for an EDS that can't
-    be parsed.
+    None if an attachment is missing, or a profile can't be parsed, such as one with keys of another version. Raises
+    ConfigError for an EDS that can't be parsed.
     """
     try:
         return _placed(settings, lambda kind, joint: _logged_profile(device_name(kind, joint), attachments))

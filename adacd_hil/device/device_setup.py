@@ -145,7 +145,7 @@ _MODE_READS = 20
 
 
 def command_deadline_ms(settings: Settings) -> int:
-    """Return the longest time without a new command until a drive faults, ms, rounded up.
+    """Return the longest time without a new command until a drive faults, ms, rounded up, at least 1.
 
     It is `bus.command_patience_cycles` periods, for drives that count time instead of SYNCs.
     """
@@ -158,10 +158,12 @@ _TORQUE_UNITS = {1.0: "Nm", 1e-3: "mNm", 1e-6: "µNm"}
 
 
 def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequence[PlacedDevice]) -> list[str]:
-    """Check the drive, write limits, option codes and mode; return values that could not be checked, a line each.
+    """Check the drive, write its limits, option codes and mode; return values that nothing confirms, a line each.
 
-    `drives`: of all joints. Raises DeviceError for a drive without cyclic synchronous torque, another rated torque,
-    gear or unit than configured, or a value that it doesn't take; BusError if the bus fails.
+    Option codes, limits and watchdogs are written only if its profile names them. Objects that its EDS lacks are left
+    out, but a watchdog that is missing there is a DeviceError. `drives`: of all joints. Raises DeviceError for a drive
+    without cyclic synchronous torque, another rated torque, gear or unit than configured, or a value that it doesn't
+    take; BusError if the bus fails.
     """
     joint, profile = slave.device.joint, slave.device.settings
     if slave.has(0x6502):
@@ -194,8 +196,9 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequenc
 def _check_rated_torque(slave: Slave, settings: Settings, drives: Sequence[PlacedDevice]) -> None:
     """Raise DeviceError if 0x6076, brought to the joint, differs from the configured rated torque.
 
-    It differs if it is away by a share of over `_ROUNDED_SHARE`.
-    `drives`: of all joints, so that the error can name exchanged drives.
+    It differs if it is away by a share of over `_ROUNDED_SHARE`. Store the value read in `known`. `drives`: of all
+    joints, so that the error can name exchanged drives. Raises DeviceError also if it can't be read, BusError if the
+    bus fails.
     """
     found = slave.read(0x6076)
     slave.known[0x6076, 0] = found
@@ -329,7 +332,7 @@ def check_sensor(slave: Slave, codec: Codec) -> str:
     """Compare unit and decimal digits with the contract; return the status as text, empty for 0 and without 0x6150.
 
     Objects that the EDS doesn't list are not compared. Raises DeviceError for a unit other than Nm, with any power of
-    ten, or other decimal digits.
+    ten, for other decimal digits, and if an object can't be read; BusError if the bus fails.
     """
     torque = codec.message(f"{slave.name}Torque")
     scale = torque.values[torque.place("torque")].scale
@@ -444,7 +447,8 @@ class ParameterWatch(RateLimitedEvents):
     def accept(self, frame: Frame) -> bool:
         """Take the answer to the open request and compare it; return False for any other frame.
 
-        After an abort, warn, and don't read that object again.
+        The first difference goes into `first_difference`. An answer that isn't expedited is not compared. After an
+        abort, warn, and don't read that object again.
         """
         asked, data = self._asked, frame.data
         if asked is None or frame.can_id != SDO_RESPONSE_ID + asked.slave.node_id or len(data) != 8:

@@ -56,9 +56,10 @@ class DriveUnits(NamedTuple):
         return (self.increments_per_joint_rev or 0.0) >= LEAST_INCREMENTS
 
     def is_other_gear(self, ratio: float) -> bool:
-        """Return whether 0x6091 contradicts a profile's `scale.gear_ratio`.
+        """Return whether 0x6091 contradicts a profile's `scale.gear_ratio`; False if the drive has no 0x6091.
 
-        1 in the profile doesn't: 0x6076 is then the joint's. Nor does 1 : 1 in the drive, the factory's value.
+        1 in the profile doesn't contradict: 0x6076 is then the joint's. Nor does 1 : 1 in the drive, the factory's
+        value.
         """
         return self.gear_ratio not in (None, 1.0) and ratio not in (1.0, self.gear_ratio)
 
@@ -66,7 +67,9 @@ class DriveUnits(NamedTuple):
 def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
     """Return the units of a drive's position and velocity by its objects; `number` returns an object's value or None.
 
-    `gear_ratio`: motor revolutions per revolution of the joint, used if 0x6091 is missing or 0.
+    Increments come from 0x6092 if it has at least LEAST_INCREMENTS per revolution. Without that they come from 0x60A8
+    if its unit is an angle, and from 0x608F times the gear if it is none. `gear_ratio`: motor revolutions per
+    revolution of the joint, used if 0x6091 is missing or 0.
     """
     encoder, motor_revs = number(0x608F, 1), number(0x608F, 2)
     gear_in, gear_out = number(0x6091, 1), number(0x6091, 2)

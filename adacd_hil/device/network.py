@@ -265,7 +265,8 @@ class Master(EventSource):
     def _set_up_heartbeats(self, slave: Slave) -> None:
         """Write the period of the device's heartbeat; if the EDS doesn't allow that, warn that it isn't watched.
 
-        Write the device's patience with the host's heartbeat, if it has one; 0, never, if `watch_host` is False.
+        Write the device's patience with the host's heartbeat, if it has one; 0, never, if `watch_host` is False. Raises
+        DeviceError if the device doesn't take a value, BusError if the bus fails.
         """
         period_ms = self._settings.bus.heartbeat_ms
         if slave.device.is_heartbeat_known:

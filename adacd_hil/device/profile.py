@@ -165,7 +165,7 @@ class PdoSettings:
 
     @property
     def is_synchronous(self) -> bool:
-        """Whether the PDO is exchanged on SYNC."""
+        """Whether the PDO is exchanged on SYNC: its transmission type is 240 or less."""
         return self.transmission <= 240
 
     @property
@@ -301,7 +301,8 @@ class ProfileSettings:
     def _check_frames(self) -> None:
         """Raise ValueError unless all needed frames and signals are there once, in the right frame.
 
-        Each PDO has its own number. Signals of one sample or command share a frame, and feedback comes on every SYNC.
+        The frame Status may be missing. Each PDO has its own number. Signals of one sample or command share a frame,
+        and Feedback and Torque have transmission 1, on every SYNC.
         """
         wanted = {"drive": ("Feedback", "Command"), "sensor": ("Torque",)}[self.kind]
         found = [pdo.message for pdo in self.pdo]
@@ -378,7 +379,11 @@ class ProfileSettings:
                 raise ValueError(f"pdo {pdo.message}: signal {taken[0]!r} has the name of a part of the header")
 
     def _check_scale(self) -> None:
-        """Raise ValueError for a missing scale, too few increments, and unless there are 0 or 2 serial numbers."""
+        """Raise ValueError for a missing scale, too few increments, and unless there are 0 or 2 serial numbers.
+
+        A drive needs `increments_per_joint_rev`, at least LEAST_INCREMENTS, and `velocity_rad_s`; a sensor needs
+        `torque_Nm`.
+        """
         if self.kind == "drive" and not (self.scale.increments_per_joint_rev and self.scale.velocity_rad_s):
             raise ValueError("scale: a drive needs increments_per_joint_rev and velocity_rad_s")
         if self.kind == "drive" and self.scale.increments_per_joint_rev < LEAST_INCREMENTS:
@@ -411,7 +416,10 @@ class ProfileSettings:
                 raise ValueError(f"assumed: {key!r} is no key of a profile{hint}")
 
     def unit_of(self, signal: SignalSettings) -> tuple[float, str]:
-        """Return (value of one count, unit) of a signal: by `scale` for position, velocity and torque, else its own."""
+        """Return (value of one count, unit) of a signal, by `scale` or else by the signal's own settings.
+
+        By `scale`: position and velocity of a drive, in rad and rad/s; torque and gross_torque of a sensor, in Nm.
+        """
         if self.kind == "drive" and signal.signal == "position":
             return 2.0 * math.pi / self.scale.increments_per_joint_rev, "rad"
         if self.kind == "drive" and signal.signal == "velocity":

@@ -60,7 +60,8 @@ def refuse_company(bus: Bus, clock: Clock, settings: Settings, codec: Codec, dev
     """Listen for HOSTS_LISTEN_S; raise DeviceError if another host runs the arm, which a reset would take from it.
 
     Not for lockstep, where time passes only by this host's own frames. Requests that only read objects, and NMT
-    commands to nodes of other arms, are ignored. Raises BusError if the bus fails.
+    commands to nodes of other arms, are ignored. Frames that arrive meanwhile are dropped. Raises BusError if the bus
+    fails.
     """
     strangers = Strangers(settings, codec, devices)
     end_ns = clock.now_ns() + round(HOSTS_LISTEN_S * 1e9)

@@ -40,7 +40,8 @@ class ValueBound(NamedTuple):
 def value_bounds(pdo: PdoSettings | None, message: MessageCodec | None) -> tuple[ValueBound, ...]:
     """Return the bounds that a profile sets to values of a frame; empty if `pdo` or `message` is None.
 
-    Raises CodecError when the message lacks a bounded signal.
+    Signals without bounds are left out; a bound that is not set is infinite. Raises CodecError when the message lacks a
+    bounded signal.
     """
     if pdo is None or message is None:
         return ()

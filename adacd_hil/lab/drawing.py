@@ -54,9 +54,9 @@ def _style() -> dict[Any, Any]:
 
 
 def style(more: dict[Any, Any] | None = None) -> AbstractContextManager[None]:
-    """Return a context manager that applies the figures' style. The user's matplotlib configuration has no effect.
+    """Return a context manager that applies the figures' style in place of the user's matplotlib configuration.
 
-    more: rcParams that override the style's.
+    The backend stays. more: rcParams that override the style's; a backend in it has no effect.
     """
     return mpl.rc_context({**_style(), **(more or {}), "backend": mpl.rcParams["backend"]})
 
@@ -71,7 +71,7 @@ class Drawing:
     figure: Figure
 
     def png(self) -> bytes:
-        """Return the figure as PNG, on white, with `_DOTS_PER_INCH`."""
+        """Return the figure as PNG, on white, with `_DOTS_PER_INCH`; the figure keeps that resolution."""
         out = io.BytesIO()
         with style():
             canvas: Any = FigureCanvasAgg(self.figure)
@@ -81,7 +81,10 @@ class Drawing:
 
 
 def paper_svg(drawing: Drawing) -> str:
-    """Return a drawing as the text of an SVG file, on white, without a date."""
+    """Return a drawing as the text of an SVG file, on white, without a date.
+
+    Its ids come from the drawing's name, so the same drawing gives the same text.
+    """
     out = io.StringIO()
     with style({"svg.hashsalt": drawing.name}):
         canvas: Any = FigureCanvasSVG(drawing.figure)
@@ -142,7 +145,10 @@ HistoryPanel = tuple[str, tuple[str, ...], Vector, Vector]
 
 
 def history_figure(dates: Sequence[str], panels: Sequence[HistoryPanel]) -> Drawing:
-    """Return a drawing of panels below each other: values over n dates (ISO 8601), with bars of two deviations."""
+    """Return a drawing of panels below each other: values over n dates (ISO 8601), with bars of two deviations.
+
+    A panel has at most three curves. A "Z" at the end of a date is left out.
+    """
     at = np.array([date.removesuffix("Z") for date in dates], dtype="datetime64[s]")
     with style():
         figure = Figure(figsize=(7.2, 2.0 * len(panels)), layout="constrained")

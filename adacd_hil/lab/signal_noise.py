@@ -27,9 +27,10 @@ def white_noise(*parts: Vector) -> Vector:
 
 
 def resolution(values: Vector) -> float:
-    """Return the step of a quantised series (k,): the smallest difference between two of its values.
+    """Return the step of a quantised series (k,), k > 0: the smallest difference between two of its values.
 
-    0 if all are equal.
+    Differences of up to 1e-9 of the series' range are rounding and don't count. 0 if all values are equal, or one is
+    NaN.
     """
     levels = np.unique(values)
     steps = np.diff(levels)

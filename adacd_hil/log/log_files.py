@@ -17,7 +17,10 @@ class LogExistsError(LogError):
 
 @contextmanager
 def failing_as(what: str) -> Iterator[None]:
-    """Turn an OSError in the block into a LogError with one line: `what`, the failed operation, and the reason."""
+    """Turn an OSError in the block into a LogError of one line.
+
+    what: the failed operation, with which the line begins.
+    """
     try:
         yield
     except OSError as error:

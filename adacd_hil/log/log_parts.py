@@ -44,8 +44,8 @@ def parts_of(path: Path) -> dict[int, Path]:
 def missing_parts(path: Path, parts: Collection[int], ending: str = "") -> list[Path]:
     """Return the paths of missing parts of the log `path`, [] if it is whole.
 
-    Those before its last part; also the next one if `ending` is CONTINUED. parts: the numbers of those that exist.
-    ending: of the last one, from its summary.
+    These are the parts before the last existing one, and if `ending` is CONTINUED also the next. parts: the numbers of
+    those that exist, at least one. ending: of the last one, from its summary.
     """
     last = max(parts)
     missing = [number for number in range(last) if number not in parts]

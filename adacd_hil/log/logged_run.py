@@ -64,7 +64,8 @@ class Span(NamedTuple):
 def host_cycles(cycle: Cycles, attempt: Cycles, begins: Cycles) -> Cycles:
     """Return the host's numbers (m,) of the emulator's cycles (m,).
 
-    attempt: of each cycle (m,), from 0. begins: the host's number of the first cycle of each attempt (k,).
+    attempt: of each cycle (m,), from 0; one that `begins` lacks is counted as the last of them. begins: the host's
+    number of the first cycle of each attempt (k,).
     """
     return np.asarray(cycle + cycle_offsets(begins)[np.minimum(attempt, len(begins) - 1)])
 

@@ -203,7 +203,7 @@ _STATES: Final = {"state": SchemeState, "previous_state": SchemeState, "fault": 
 
 
 def check_states(scheme: Series) -> None:
-    """Raise LogError for a record of /scheme with an unknown state or fault."""
+    """Raise LogError for a record of /scheme with an unknown state or fault; a field that the log lacks passes."""
     for name, kind in _STATES.items():
         if name in scheme.fields:
             odd = np.flatnonzero(~np.isin(scheme.records[name], [int(member) for member in kind]))

@@ -48,8 +48,9 @@ def bodies_of(
 ) -> tuple[LinkBody, LinkBody]:
     """Return two rigid links with the parameters `theta` (p,), p = 7 or with gravity 9.
 
-    Raises ValueError if no rigid links have them. theta: in the order of `records.PARAMETER_NAMES`. gravity_m_s2: in
-    the plane of motion.
+    Without gravity link 1 is a uniform rod. Raises ValueError if no rigid links have them, or if a5 differs by more
+    than 1 % from the value that a2 gives. theta: in the order of `records.PARAMETER_NAMES`. gravity_m_s2: in the plane
+    of motion.
     """
     alpha, beta, gamma = theta[_A1] - theta[_A3], theta[_A2], theta[_A3]
     if not (gamma > 0.0 and alpha * gamma > beta * beta):

@@ -83,8 +83,10 @@ def _time_of(wanted: Places, number: Places, t_ns: Places) -> Places:
 def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording:
     """Read a recording, and put its frames in the order in which the host would have read them.
 
-    Of several CAN channels, only the one with the most SYNCs counts. Raises LogError if it can't be read, or has no
-    SYNC with a counter.
+    Frames after all cyclic ones of a cycle, and in real time those after the host's wait, go to the next cycle. Of
+    several CAN channels, only the one with the most SYNCs counts; frames that a `Bus` doesn't receive are dropped. By
+    the DBC's senders the host's frames count as sent. Raises LogError if it can't be read, or has no SYNC with a
+    counter; CodecError if the DBC lacks Sync or a device's cyclic frame.
     """
     found = read_frames(path)
     sync_id = codec.message("Sync").can_id
@@ -316,9 +318,9 @@ class RecordingAlone:
 
 
 def _count_disabling_cycles(frames: NDArray[Any], t_ns: Places, codec: Codec) -> int:
-    """Return how many cycles at the end of an attempt command both drives off; at most as many as a host sends.
+    """Return how many cycles at the end of an attempt command no drive on, at most DISABLE_CYCLES.
 
-    t_ns: of the attempt's cycles (n,).
+    Cycles without a command frame count, too. t_ns: of the attempt's cycles (n,).
     """
     commands = [codec.message(name) for name in ("Drive1Command", "Drive2Command")]
     for count, cycle_ns in enumerate(t_ns[: -DISABLE_CYCLES - 1 : -1].tolist()):

@@ -83,7 +83,8 @@ class AttemptSplitter:
     def split(self, piece: Piece) -> Iterator[CycleStretch]:
         """Yield the stretches of the log's next piece: cycles of one attempt, without a gap.
 
-        Cycles of an attempt that began before the log are left out and counted.
+        Cycles of an attempt that began before the log are left out and counted. Frames of an attempt whose first cycle
+        comes with the next piece are kept for the next call.
         """
         scheme, other = self._pair(piece)
         frames = piece.frames

@@ -74,9 +74,9 @@ def replay_many(
 ) -> list[Replay]:
     """Replay a log, or a stretch of it, once for each of the settings; the log is read and decoded once.
 
-    progress: prints a line about the work. watch: called with the decisions of each variant. Raises LogError,
-    ConfigError or CodecError if the log, its attachments or a device can't be read; LogError also if no cycle of the
-    stretch can be replayed.
+    Only settings equal to the log's are compared with it. progress: prints a line about the work. watch: called with
+    the decisions of each variant. Raises LogError, ConfigError or CodecError if the log, its attachments or a device
+    can't be read; LogError also if no cycle of the stretch can be replayed.
     """
     source, remarks = LogSource(path), list[str]()
     truth = contacts_beside(path, remarks.append)
@@ -235,12 +235,12 @@ def replay_source(
 ) -> list[Replay]:
     """Replay a source, once for each of the settings; shown: mismatches that are kept.
 
-    truth: the true contacts, None if unknown; remarks: on it, for the notes of each replay. progress: prints a line
-    about the work. tolerance: of the comparison; None: exact, or `TOLERANCE` where the log's numbers were computed on
-    another kind of machine. script_of: as for `replay`. stretch: the part that is compared and reported; watch sees all
-    from the beginning of the log on. by_frames: decode the frames and compare each state with the log's. Raises
-    LogError if the source can't be read, or no cycle of the stretch can be replayed; ConfigError if a device can't be
-    loaded.
+    Only settings equal to the source's are compared with the log. truth: the true contacts, None if unknown; remarks:
+    on it, for the notes of each replay. progress: prints a line about the work. tolerance: of the comparison; None:
+    exact, or `TOLERANCE` where the log's numbers were computed on another kind of machine. script_of: as for `replay`.
+    stretch: the part that is compared and reported; watch sees all from the beginning of the log on. by_frames: decode
+    the frames and compare each state with the log's. Raises LogError if the source can't be read, or no cycle of the
+    stretch can be replayed; ConfigError if a device can't be loaded.
     """
     bounds_ns = EVER_NS if stretch.is_whole else stretch.bounds_ns(source.start_ns)
     if tolerance is None:
@@ -304,7 +304,8 @@ def _replay_part(
 ) -> int:
     """Replay the cycles of a piece of the log with each player; return their number.
 
-    bounds_ns: time of the reported cycles. watch: called with each player's decisions.
+    bounds_ns: begin and end of the reported time, on the run's clock; cycles from the end on are not replayed, but
+    count in the number. watch: called with each player's decisions.
     """
     exact: list[tuple[int, int]] = []
     cycles, (part, arms_of_part) = 0, decoded
@@ -336,7 +337,8 @@ def _arms_of(arms: ArmBatch, rows: slice) -> ArmBatch:
 def _split(stretch: CycleStretch, bounds_ns: tuple[int, int]) -> Iterator[tuple[CycleStretch, slice, bool]]:
     """Split a stretch at the beginning of the reported time; yield each part, its slice, and whether it is reported.
 
-    Cycles after the end of the reported time are left out. Each part keeps all frames of the stretch.
+    bounds_ns: begin and end of that time, on the run's clock. Cycles from its end on are left out, and so is an empty
+    part. Each part keeps all frames of the stretch.
     """
     first, end = np.searchsorted(stretch.ticks.t_ns, bounds_ns).tolist()
     for rows, is_told in ((slice(0, first), False), (slice(first, end), True)):
@@ -415,9 +417,10 @@ def _decoding_key(settings: Settings) -> Any:
 def _result(
     player: _Player, source: ReplaySource, source_notes: Sequence[str], tolerance: float, first_ns: int
 ) -> Replay:
-    """Return a player's outcome, after the end of its last attempt, with notes on all that was not compared or judged.
+    """Return a player's outcome, with notes on all that was not compared or judged; end its last attempt first.
 
-    first_ns: contacts, changes of state and adaptations before this time are left out.
+    Requests that the script doesn't explain are counted as mismatches. first_ns: contacts, changes of state and
+    adaptations before this time are left out.
     """
     gatherer, comparison, notes = player.gatherer, player.comparison, list(source_notes)
     gatherer.end_attempt()

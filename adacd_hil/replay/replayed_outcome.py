@@ -143,7 +143,10 @@ class OutcomeGatherer:
         return threshold, push
 
     def _enter(self, transition: StateChange) -> None:
-        """Record a change of state, and the beginning or end of an adaptation by it."""
+        """Record a change of state, and the beginning or end of an adaptation by it.
+
+        An adaptation begins with ADAPT and ends in MONITOR; FAULT or PAYLOAD end it as one that never reached MONITOR.
+        """
         self.transitions.append(transition)
         state = transition.state
         if state is SchemeState.ADAPT and self._began_ns is None:
@@ -274,7 +277,11 @@ Row = tuple[str, ...]
 
 
 def side_by_side(replays: Sequence[Replay]) -> list[Row]:
-    """Return a table of the replays, a row per quantity: its name, then its value in each replay, as texts."""
+    """Return a table of the replays, a row per quantity: its name, then its value in each replay, as texts.
+
+    Rows: time watched, contacts, delays, thresholds, adaptations, parameters, the last state. "–" stands for a value
+    that is unknown or missing.
+    """
     rows = [("watched, s", *(f"{each.monitored_s:.2f}" for each in replays))]
     rows.append(("contacts detected", *map(_detected, replays)))
     if any(each.score is None for each in replays):
@@ -372,7 +379,8 @@ def _end(found: Replay) -> str:
 def as_json(found: Replay) -> dict[str, Any]:
     """Return a replay's outcome in plain values for JSON; times in s since the first ADAPT, see `Replay.time_s`.
 
-    Contacts, false alarms and missed contacts are None if the truth is not known.
+    Contacts, false alarms and missed contacts are None if the truth is not known. Thresholds that aren't finite are
+    left out.
     """
     return {
         "cycles": found.cycles,

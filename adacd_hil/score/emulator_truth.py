@@ -23,7 +23,7 @@ from adacd_hil.log.log_walk import attachment, run_metadata
 from adacd_hil.log.logged_run import Cycles, EmulatorSpan, Progress, Truth, is_armed_in, is_interrupted
 from adacd_hil.log.reader import LogStream, Series
 from adacd_hil.log.types.truth_topic import TRUTH
-from adacd_hil.records import PARAMETER_NAMES, Vector
+from adacd_hil.records import PARAMETER_NAMES, SchemeState, Vector
 from adacd_hil.score.judge import TrueContact, forgotten_after_s, true_contacts
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
@@ -123,7 +123,10 @@ class _TruthRows:
         self._last = rows[-1:]
 
     def _rows(self, truth: Series) -> NDArray[Any]:
-        """Return the records as rows of type _ROW; a cycle number that falls begins the next attempt."""
+        """Return the records as rows of type _ROW; a cycle number that falls begins the next attempt.
+
+        Fields that the log lacks are 0.
+        """
         records, rows = truth.records, np.zeros(len(truth), _ROW)
         for name in _ROW.names or ():
             if name in truth.fields:
@@ -274,10 +277,11 @@ class HostCycles(NamedTuple):
 
 
 def placed_contacts(contacts: Sequence[TrueContact], host: HostCycles, settings: Settings) -> list[TrueContact]:
-    """Return the contacts that begin within the host's cycles, with their times on the host's clock.
+    """Return the contacts that begin up to the last of the host's cycles, with their times on the host's clock.
 
-    contacts: their cycles are counted by the host. host: its cycles before and after each onset and end, others may be
-    left out.
+    An onset or end outside these cycles gets the time of the nearest one. A contact from the first cycle or before it
+    is not armed. contacts: their cycles are counted by the host. host: its cycles before and after each onset and end,
+    others may be left out.
     """
     contacts = [contact for contact in contacts if len(host.cycle) and contact.onset <= host.cycle[-1]]
     if not contacts:
@@ -288,6 +292,7 @@ def placed_contacts(contacts: Sequence[TrueContact], host: HostCycles, settings:
     is_certified = settings.scheme == "certified"
     a_rad_s = settings.certified.cutoffs_rad_s[0] if is_certified else settings.filter.a_rad_s
     times_ns = (since_ns + host.t_ns[0]).tolist()
+    host = host._replace(before=np.concatenate(([SchemeState.INIT], host.before[1:])))
     return [
         placed_contact(contact, (onset_ns, end_ns), host, row, settings, a_rad_s)
         for contact, row, (onset_ns, end_ns) in zip(contacts, rows, times_ns, strict=True)

@@ -136,7 +136,7 @@ class Score:
 
     @property
     def delays_ms(self) -> tuple[float, ...]:
-        """Delays of all contacts that were found, armed or not."""
+        """Delays from onset to detection, ms, of all contacts that were found, armed or not."""
         return tuple(contact.delay_ms for contact in self.contacts if contact.delay_ms is not None)
 
     def since(self, first_ns: int) -> "Score":
@@ -282,7 +282,8 @@ def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: f
 def true_contacts(truth: Truth | None, first_number: int = 1) -> tuple[TrueContact, ...]:
     """Return the true contacts in a truth, numbered from `first_number`; () without a truth.
 
-    Their cycles are the emulator's; their times on a run's clock are still 0.
+    Each has its own rows of the truth, and the one after them if that is of the same attempt. Their cycles are the
+    emulator's; their times on a run's clock are still 0.
     """
     if truth is None:
         return ()

@@ -18,8 +18,9 @@ _LONGEST_CHAIN = 8
 def with_todays_keys(table: dict[str, Any]) -> dict[str, Any]:
     """Return a log's configuration table with some old keys changed to today's; `parse` refuses other removed keys.
 
-    `safety.commission_cycles` becomes `safety.commission_s`. Withdrawn keys of `detector` are dropped. If
-    `certified.cross_talk_std` is missing, the version that wrote the log had no such term, so that it becomes 0.
+    An integer `safety.commission_cycles` becomes `safety.commission_s`. Withdrawn keys of `detector` are dropped. If
+    the section `certified` lacks `cross_talk_std`, the version that wrote the log had no such term, so that it becomes
+    0. The given table stays as it is.
     """
     certified = table.get("certified")
     if isinstance(certified, dict) and "cross_talk_std" not in certified:
@@ -75,8 +76,9 @@ def resolved_table(layers: Sequence[ConfigurationLayer]) -> dict[str, Any]:
 def configuration_layers(name_or_file: str, profile: str | None = None) -> list[ConfigurationLayer]:
     """Return the layers of a configuration and of all that it extends, the base first.
 
-    `profile` picks the `[profiles.X]` tables; None: `arm.profile` does. Their layers precede those of the files, whose
-    keys override them. Raises ConfigError for a file that can't be read, wrong `extends`, and an unknown profile.
+    `profile` picks the `[profiles.X]` tables, and is itself the last layer, as `arm.profile`; None: `arm.profile` of
+    the files picks them. The layers of these tables precede those of the files, whose keys override them. Raises
+    ConfigError for a file that can't be read, wrong `extends`, and an unknown profile.
     """
     files = _load_chain(name_or_file)
     table = resolved_table(files)

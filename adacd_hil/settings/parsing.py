@@ -24,7 +24,10 @@ WITHDRAWN = {"detector.live": _OFFLINE, "detector.live_lag_s": _OFFLINE}
 
 
 def bounds_of(section: type, name: str) -> tuple[float, float]:
-    """Return the lowest and the highest value that a setting of a section may have; infinite without a bound."""
+    """Return the lowest and the highest value that a setting of a section may have; infinite without a bound.
+
+    Raises ValueError if the section has no such setting.
+    """
     (metadata,) = (field.metadata for field in dataclasses.fields(section) if field.name == name)
     return metadata["low"], metadata["high"]
 
@@ -156,7 +159,10 @@ def _element_hints(hint: Any, value: Any, key: str) -> tuple[Any, ...]:
 
 
 def _check_bounds(value: float, key: str, metadata: Any) -> None:
-    """Raise ConfigError for a number that is not finite or is outside its bounds."""
+    """Raise ConfigError for a number that is not finite or is outside its bounds, which are inclusive.
+
+    The error names another unit in which the number would be within them, if there is one.
+    """
     unit = f" {metadata['unit']}" if metadata["unit"] else ""
     if not math.isfinite(value):
         raise ConfigError(f"`{key}` = {value} is not finite")

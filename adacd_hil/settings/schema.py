@@ -33,10 +33,12 @@ def setting(
     is_hex: bool = False,
     meaning: str,
 ) -> Any:
-    """Return the dataclass field of one setting, required if it has no default; a section's class as default is called.
+    """Return the dataclass field of one setting; it is required if `default` is missing.
 
-    low, high: bounds, inclusive, also of each number of a tuple. choices: permitted texts; (): any. meaning: for the
-    user. is_hex: an integer that everybody writes in hexadecimal, such as an index; messages do, too.
+    If `default` is a class, such as a section, the default value is a new instance of it. The rest is stored for
+    `parse`, which checks it. low, high: bounds, inclusive, also of each number of a tuple. choices: permitted texts;
+    (): any. meaning: for the user. is_hex: an integer that everybody writes in hexadecimal, such as an index; messages
+    do, too.
     """
     metadata = {"unit": unit, "low": low, "high": high, "choices": choices, "is_hex": is_hex, "meaning": meaning}
     if isinstance(default, type):

@@ -64,7 +64,7 @@ def keys_of(section: type[Any], prefix: str) -> Iterator[KnownKey]:
 
 
 def known_keys() -> dict[str, KnownKey]:
-    """Return every setting by its key, in the order of the declarations."""
+    """Return every setting by its key, those in the rows of lists included, in the order of the declarations."""
     tables = ((f"{name}." if name else "", section) for name, section, _ in sections())
     return {known.key: known for prefix, section in tables for known in keys_of(section, prefix)}
 
@@ -146,7 +146,11 @@ def apply_settings(settings: Settings, changes: Mapping[str, str]) -> Settings:
 
 
 def refuse_log_settings(changes: Mapping[str, str]) -> None:
-    """Raise ConfigError if one of the changed keys determined the numbers of a log, such as a sign or a device."""
+    """Raise ConfigError if one of the changed keys determined the numbers of a log; values are not looked at.
+
+    These are all keys of `devices`, `bus.period_us`, `realtime.sample_period`, and of `arm` profile, signs, torque
+    offsets and rated torques.
+    """
     facts = {f"arm.{name}" for name in _FACTS} | {"bus.period_us", "realtime.sample_period"}
     for key in changes:
         if key in facts or key.startswith("devices."):

@@ -180,7 +180,7 @@ class FrameBudget:
 
     @property
     def is_emergency(self) -> bool:
-        """Whether it is a CiA 301 EMCY."""
+        """Whether it is an EMCY: an event frame whose identifier is 0x080 plus a node id."""
         is_emcy_id = _function(self.can_id, self.is_extended) == EMERGENCY_ID and self.can_id != SYNC_ID
         return is_emcy_id and self.trigger is Trigger.EVENT
 
@@ -248,7 +248,10 @@ class Budget:
 
     @property
     def longest_event_ns(self) -> int:
-        """Duration of the longest event frame other than EMCY, which can delay SYNC, feedback and commands."""
+        """Duration of the longest event frame other than EMCY, ns; 0 without one.
+
+        It can delay SYNC, feedback and commands.
+        """
         events = [e.duration_ns for e in self.frames if e.trigger is Trigger.EVENT and not e.is_emergency]
         return max(events, default=0)
 
@@ -295,7 +298,7 @@ class Budget:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks on event frames, requests and EMCY, one line each."""
+        """Remarks on event frames, requests and EMCY, one line each; () if the contract has none of them."""
         notes = []
         if self.longest_event_ns:
             notes.append(
@@ -387,6 +390,7 @@ def _given(codec: Codec, attribute: str, chosen: int | None) -> int:
 def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, data_bitrate: int) -> FrameBudget:
     """Return the budget of a message, still without response times.
 
+    Interval: the period; of an event frame the first of inhibit time, cycle time and ASSUMED_INTERVAL_MS that isn't 0.
     Deadline: the period for cyclic frames, the cycle time, if any, for event frames, none for requests. contract: name
     of the DBC, for the error. Raises CodecError for an unknown Trigger.
     """

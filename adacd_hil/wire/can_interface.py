@@ -187,8 +187,8 @@ def can_interfaces() -> list[str]:
 def is_virtual(interface: str, channel: str) -> bool:
     """Return whether a channel certainly has no wire: vcan, vxcan, python-can's own virtual bus.
 
-    False for a serial adapter (slcan), although it has no device of its own. Without iproute2, the interface's name
-    decides.
+    False for a missing SocketCAN interface, and for a serial adapter (slcan), although it has no device of its own.
+    Without iproute2, the interface's name decides.
     """
     if interface != "socketcan":
         return interface == "virtual"

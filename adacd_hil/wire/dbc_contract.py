@@ -36,7 +36,10 @@ def _message_codec(message: Message) -> MessageCodec:
 
 
 def _check_length(message: Message) -> None:
-    """Raise CodecError for a length that no frame has, or a frame format that doesn't fit the length."""
+    """Raise CodecError for a length that no frame has, or a frame format that doesn't fit the length.
+
+    A frame of up to 8 bytes must be classic, a longer one CAN FD.
+    """
     if message.length > CLASSIC_BYTES and message.length not in FD_LENGTHS:
         lengths = ", ".join(map(str, FD_LENGTHS))
         raise CodecError(f"{message.name}: no CAN frame has {message.length} bytes; beyond 8 there are {lengths}")

@@ -273,7 +273,8 @@ class ProtectedReceiver(E2eReceiver):
     def _judge(self, frame: bytes) -> E2eStatus:
         """Return the status of a frame by its length, CRC and counter, and advance the sequence.
 
-        A wrong length is WRONG_CRC, too.
+        A wrong length is WRONG_CRC, too. A frame with a wrong CRC doesn't advance the sequence. A frame whose counter
+        stands still is REPEATED, and counts as a cycle without a new frame. The first right frame begins the sequence.
         """
         is_growing = self._profile.is_growing
         self._max_delta += is_growing
@@ -309,7 +310,9 @@ class ProtectedReceiver(E2eReceiver):
     def _accept(self, delta: int) -> E2eStatus:
         """Return the status of a frame whose counter advanced by `delta`, a tolerated step, and update the sequence.
 
-        SYNC after a silence or a wrong sequence; else OK for a step of 1, OK_SOME_LOST for a larger one.
+        SYNC for the first frame after more than `max_missing` cycles without a new one, and for the `sync_frames`
+        frames after that frame or after a wrong sequence. Other frames: OK for a step of 1, OK_SOME_LOST for a larger
+        one.
         """
         missing, self._missing = self._missing, 0
         if missing > self._tolerance.max_missing:

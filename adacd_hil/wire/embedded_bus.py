@@ -42,5 +42,5 @@ class EmbeddedBus(Bus):
         self._received.clear()
 
     def close(self) -> None:
-        """Disconnect the device; later frames are dropped."""
+        """Disconnect the device; later frames of the host are dropped."""
         self._device = None

@@ -96,7 +96,8 @@ def is_bus_off(frame: Frame) -> bool:
 def decode_error(frame: Frame) -> tuple[TroubleKind, str]:
     """Return the gravest kind in an error frame, and a text with all; missing data bytes count as zero.
 
-    Raises ValueError for other frames.
+    The error counters follow in the text if the frame has them. A frame without a known error is of kind OTHER. Raises
+    ValueError for other frames.
     """
     if not frame.is_error:
         raise ValueError(f"frame 0x{frame.can_id:X} is not an error frame")
@@ -138,7 +139,7 @@ def _of_controller(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
 def _of_bus(classes: int, data: bytes) -> list[tuple[TroubleKind, str]]:
     """Return (kind, text) of each bus error in an error frame: acknowledgement, protocol, arbitration; [] without any.
 
-    classes, data: as of `_of_controller`.
+    A bus error of none of these kinds counts as a protocol error. classes, data: as of `_of_controller`.
     """
     found = []
     is_slot_empty = bool(classes & _PROTOCOL) and data[3] == _ACKNOWLEDGE_SLOT

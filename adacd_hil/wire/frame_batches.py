@@ -172,7 +172,10 @@ class FrameReceiver:
         return frames
 
     def _to_clock(self, wall_ns: int) -> int:
-        """Return a kernel stamp in CLOCK_MONOTONIC; if the frames have another clock, that clock's present time."""
+        """Return a kernel stamp in CLOCK_MONOTONIC; if the frames have another clock, that clock's present time.
+
+        After 1 s, a longer silence than 20 ms or a step of the wall clock, the two clocks are compared again.
+        """
         if self._clock is not None:
             return self._clock.now_ns()
         if not (wall_ns < self._trusted_ns and 0 <= wall_ns - self._last_ns < _STEP_NS):

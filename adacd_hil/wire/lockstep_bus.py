@@ -109,8 +109,9 @@ class LockstepBus(Bus):
     def send(self, can_id: int, data: bytes) -> None:
         """Queue a frame at the clock's present time.
 
-        Frames that start before now are transmitted first if the queue is full. Raises TransmitQueueError if it stays
-        full as no node acknowledges, SilenceError if no device answers a SYNC, BusError if the bus behind fails.
+        The first call of `send` or `receive` drops frames from before, and gives the devices the clock's time. Frames
+        that start before now are transmitted first if the queue is full. Raises TransmitQueueError if it stays full as
+        no node acknowledges, SilenceError if no device answers a SYNC, BusError if the bus behind fails.
         """
         now_ns = self._clock.now_ns()
         if not self._is_attached:
@@ -168,9 +169,15 @@ class LockstepBus(Bus):
         self._received.clear()
 
     def close(self) -> None:
-        """Send the queued frames, then close the bus behind it."""
-        self._transmit_before(NEVER_NS)
-        self._bus.close()
+        """Send the queued frames, then close the bus behind it; frames that no node acknowledges are not sent.
+
+        Raises SilenceError if no device answers a queued SYNC, BusError if the bus behind fails. The bus behind is
+        closed in any case.
+        """
+        try:
+            self._transmit_before(NEVER_NS)
+        finally:
+            self._bus.close()
 
     def _transmit_before(self, limit_ns: int) -> None:
         """Transmit in turn all waiting frames, of host and devices, that start before `limit_ns`."""
@@ -180,7 +187,8 @@ class LockstepBus(Bus):
     def _transmit_next(self, limit_ns: int) -> bool:
         """Transmit the next waiting frame of host or devices that starts before `limit_ns`; return False without one.
 
-        If the devices' time is not yet at its start, they are first asked for frames up to then.
+        While no node acknowledges, the host's frames stay in the queue. If the devices' time is not yet at the start,
+        they are first asked for frames up to then.
         """
         queue = self._queue
         while True:

@@ -139,7 +139,11 @@ def _in_words(error: Exception) -> str:
 
 
 def _remedy(interface: str, error: Exception) -> str:
-    """Return remedies for an interface that can't be opened, each behind a semicolon; "" without one."""
+    """Return remedies for an interface that can't be opened, each behind a semicolon; "" without one.
+
+    They are python-can's extra, if the interface has one and a library is missing; and on Linux, for an adapter,
+    socketcan.
+    """
     remedies = []
     extra = _EXTRAS.get(interface, interface.replace("_", "-"))
     is_here = isinstance(error, ImportError | can.CanInterfaceNotImplementedError) and "Windows" not in str(error)

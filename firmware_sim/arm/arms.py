@@ -131,9 +131,10 @@ class EmulatedArm:
 
     @property
     def wiring(self) -> "Wiring":
-        """Joint (0, 1), signs and zero of Drive1 and Drive2, Sensor1 and Sensor2.
+        """Joints (0, 1), signs and zeros of Drive1 and Drive2, Sensor1 and Sensor2.
 
-        The unit of the zeros is 2^-20 revolutions.
+        The sign of a drive's torque is `drive_sign` times `motor_sign`. The zeros are rounded to 2^-20 revolutions,
+        their unit.
         """
         drive, sensor = (tuple(joint - 1 for joint in places) for places in (self.drive_joint, self.sensor_joint))
         torque = tuple(turn * up for turn, up in zip(self.drive_sign, self.motor_sign, strict=True))

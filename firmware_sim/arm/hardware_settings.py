@@ -138,15 +138,18 @@ class MechanicsSettings:
 
     @property
     def holding_torque_Nm(self) -> Pair:
-        """Torque that each motor holds without power: motor-side Coulomb friction, holding brake and ripple, summed."""
+        """Torque that each motor holds without power: motor-side Coulomb friction, holding brake and ripple, summed.
+
+        The ripple counts by its constant amplitude, `ripple_Nm`.
+        """
         first, second = zip(self.motor_coulomb_Nm, self.holding_brake_Nm, self.ripple_Nm, strict=True)
         return sum(first), sum(second)
 
     def check(self, arm: EmulatedArm, start_deg: Pair, payloads: Sequence[PayloadBody]) -> None:
         """Raise ConfigError when these mechanics do not go with the arm, its start pose or its payloads.
 
-        Causes: static below Coulomb friction, bristles without dry friction, a start pose beyond the joint stops, or an
-        eigenfrequency too fast to integrate.
+        Causes: static friction above 0 but below Coulomb friction; bristles in a joint without static and Coulomb
+        friction; a start pose beyond the joint stops; an eigenvalue too fast to integrate with LARGEST_SUBSTEPS.
         """
         for joint in range(2):
             static_Nm, coulomb_Nm = self.static_Nm[joint], arm.coulomb_Nm[joint]
@@ -189,7 +192,11 @@ class MechanicsSettings:
         return self.stop_low_deg, self.stop_high_deg
 
     def numbers(self, arm: EmulatedArm) -> np.void:
-        """Return friction, gear, gravity and brakes of an arm as one record of dtype MECHANICS_NUMBERS."""
+        """Return friction, gear, gravity and brakes of an arm as one record of dtype MECHANICS_NUMBERS.
+
+        Static friction is given as its surplus over the arm's Coulomb friction, 0 if it is less. LuGre's viscous
+        friction that is absent here is the arm's.
+        """
         numbers = pack_fields(self, MECHANICS_NUMBERS)
         surplus = [max(0.0, self.static_Nm[joint] - arm.coulomb_Nm[joint]) for joint in range(2)]
         numbers["surplus_Nm"] = surplus
@@ -213,7 +220,7 @@ class MechanicsSettings:
         """Return the largest |Im λ| and the largest |λ|, rad/s, of the arm linearised about rest.
 
         It is linearised with stuck bristles and touched stops. Each is the maximum over elbow angles from 0 to 180
-        degrees in steps of 45, and over the payloads.
+        degrees in steps of 45, and over the payloads; 0 without payloads, so a list for the empty arm has one of 0 kg.
         """
         elastic = [joint for joint in range(2) if self.stiffness_Nm_rad[joint] > 0.0]
         size = 2 + len(elastic)
@@ -255,7 +262,8 @@ class MechanicsSettings:
     def substeps(self, arm: EmulatedArm, payloads: Sequence[PayloadBody], touch_rad_s: float = 0.0) -> int:
         """Return the integration steps per 100 µs tick that the fastest rates need, 1 to LARGEST_SUBSTEPS.
 
-        payloads: all that the arm carries in turn. touch_rad_s: fastest rate of bodies, hands and walls.
+        payloads: all that the arm carries in turn. touch_rad_s: fastest rate of bodies, hands and walls, counted as an
+        oscillation.
         """
         oscillation, largest = self.eigenvalues(arm, payloads)
         oscillation = max(oscillation, touch_rad_s)

@@ -122,7 +122,8 @@ def advance_bristle(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, l
 def warm(mechanics: np.void, joint: int, temperature_C: float, power_W: float, step_s: float) -> float:
     """Return the lubricant's temperature, °C, after a step of constant friction power.
 
-    It stays if the heat capacity is 0.
+    It decays with the time constant `cooling_s` toward ambient plus the power's steady rise. A heat capacity of 0 keeps
+    it.
     """
     capacity_J_K = mechanics["heat_capacity_J_K"][joint]
     if capacity_J_K == 0.0:
@@ -134,9 +135,10 @@ def warm(mechanics: np.void, joint: int, temperature_C: float, power_W: float, s
 
 @compiled
 def spring_torque(mechanics: np.void, joint: int, twist_rad: float, twist_rad_s: float) -> float:
-    """Return the torque τ_s in an elastic joint's spring, Nm; 0 inside the backlash, and never a pull across it.
+    """Return the torque τ_s in an elastic joint's spring with its damper, Nm.
 
-    twist: motor side minus link side.
+    With backlash it is 0 within the dead zone, and beyond it a flank only pushes. Without backlash it is linear. twist:
+    motor side minus link side.
     """
     stiffness = mechanics["stiffness_Nm_rad"][joint]
     damping = mechanics["damping_Nm_s"][joint]
@@ -152,7 +154,10 @@ def spring_torque(mechanics: np.void, joint: int, twist_rad: float, twist_rad_s:
 
 @compiled
 def ripple_torque(mechanics: np.void, joint: int, shaft_rad: float, motor_Nm: float) -> float:
-    """Return the torque ripple that adds to the motor torque, Nm; shaft_rad: angle q_m of the motor side."""
+    """Return the torque ripple that adds to the motor torque, Nm: a sine of the motor side's angle q_m, `shaft_rad`.
+
+    Its amplitude is `ripple_Nm` plus `ripple_share` of |motor_Nm|.
+    """
     amplitude = mechanics["ripple_Nm"][joint] + mechanics["ripple_share"][joint] * abs(motor_Nm)
     if amplitude == 0.0:
         return 0.0
@@ -235,10 +240,11 @@ def collect_forces(
     elapsed_s: float,
     forces: np.void,
 ) -> None:
-    """Fill all fields of `forces` but the two drifts, and `touch_rates` if bodies, hands or walls exist.
+    """Fill `forces` except its two drifts, and `touch_rates` if bodies, hands or walls exist.
 
-    Call `set_drift` first: the friction levels use its factors. now: integrated state, an element of ROW. time_s:
-    scenario time. elapsed_s: time since the contact's onset.
+    Of a stiff joint `motor_Nm` stays, of a joint without bristles `bristle_level_Nm`. Call `set_drift` first: the
+    friction levels use its factors. now: integrated state, an element of ROW. time_s: scenario time. elapsed_s: time
+    since the contact's onset.
     """
     state, arm, mechanics = around.state, around.arm, around.mechanics
     q1, q2, dq1, dq2 = now["q"][0], now["q"][1], now["dq"][0], now["dq"][1]
@@ -310,7 +316,10 @@ def decide(now: np.void, around: Surroundings, forces: np.void) -> Slips:
 
 @compiled
 def _motor_slip(joint: int, now: np.void, mechanics: np.void, forces: np.void) -> int:
-    """Return the slip of one motor, 0 if it sticks; 1 unless the joint is elastic with dry motor-side friction."""
+    """Return the slip of one motor: 1 or -1 by its velocity, at standstill by its torque, 0 if it sticks.
+
+    It is 1 for a stiff joint, and for a motor side without dry friction or closed brake.
+    """
     if mechanics["stiffness_Nm_rad"][joint] == 0.0 or forces["motor_level_Nm"][joint] == 0.0:
         return 1
     velocity = now["dq_m"][joint]

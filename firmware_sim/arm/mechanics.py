@@ -96,7 +96,7 @@ def _matrix(space: Vector) -> NDArray[np.float64]:
 
 @compiled
 def _collect(row: int, around: Surroundings, time_s: float, elapsed_s: float, work: _StepWork) -> None:
-    """Fill the work space's forces, friction levels included, and its touch rates for the state in row number `row`."""
+    """Fill the work space's forces and touch rates for the state in row number `row`, as `collect_forces` does."""
     collect_forces(around, work.rows[row], work.touch[row], work.touch[_TOUCH_RATES], time_s, elapsed_s, work.forces)
 
 
@@ -104,7 +104,8 @@ def _collect(row: int, around: Surroundings, time_s: float, elapsed_s: float, wo
 def _fill_rates(row: int, rates: int, around: Surroundings, slips: Slips, work: _StepWork) -> None:
     """Fill row number `rates` of the work space with the derivative of the state in row number `row`.
 
-    Needs the forces of the same state in the work space. Leaves the rates of bristles and motor torques out.
+    Needs the forces and touch rates of the same state in the work space. Leaves the rates of bristles and motor torques
+    out.
     """
     now, rate, forces, mechanics = work.rows[row], work.rows[rates], work.forces, around.mechanics
     ddq1, ddq2, _, _ = accelerate_links(now, around, slips, forces)
@@ -130,7 +131,7 @@ def _fill_rates(row: int, rates: int, around: Surroundings, slips: Slips, work: 
 def _set_stage(rates: int, length_s: float, mechanics: np.void, work: _StepWork) -> None:
     """Fill the row `_STAGE` with the start row plus `length_s` times the rates in row number `rates`.
 
-    The bristles of LuGre friction advance by the mean velocity over `length_s`.
+    The bristles of LuGre friction advance by the mean velocity over `length_s`. The motor torques of the row stay.
     """
     values = work.values
     for place in range(_INTEGRATED):
@@ -144,7 +145,7 @@ def _set_stage(rates: int, length_s: float, mechanics: np.void, work: _StepWork)
 def _set_bristles(row: int, length_s: float, mechanics: np.void, work: _StepWork) -> None:
     """Set the bristle deflections of row number `row` by the mean velocity since the start row, `length_s` before.
 
-    Joints without bristles stay as they are.
+    Joints without bristles stay as they are, and all do if `length_s` is 0.
     """
     start, now = work.rows[_START], work.rows[row]
     for joint in range(2):
@@ -207,7 +208,7 @@ def _margin(around: Surroundings, slips: Slips, work: _StepWork) -> float:
     """Return by how much the slips still fit at the end row; negative: a link or motor has stopped or broken away.
 
     It is the smallest of all velocities along their slips, rad/s, and all reserves of holding torque, Nm; inf if no
-    link or motor can stick.
+    link or motor can stick. Needs the forces of the end row in the work space.
     """
     now, forces, mechanics = work.rows[_END], work.forces, around.mechanics
     margin = np.inf
@@ -232,7 +233,8 @@ def _margin(around: Surroundings, slips: Slips, work: _StepWork) -> float:
 def _take_end(around: Surroundings, slips: Slips, work: _StepWork) -> None:
     """Copy the end row to the start row.
 
-    A velocity of a link or motor that can stick is set to 0 if it has passed zero.
+    The velocity of a link or motor that can stick is set to 0 if it sticks or has passed zero. The motor side of a
+    stiff joint gets position and velocity of its link side.
     """
     work.rows[_START] = work.rows[_END]
     for index in range(work.touch.shape[1]):
@@ -260,7 +262,8 @@ def _step(
 ) -> None:
     """Advance the start row by `step_s`, in parts that end where a link or motor stops or breaks away.
 
-    Needs the forces of the start row in the work space, and leaves those of the new start there.
+    After `_LARGEST_CUTS` - 1 such parts the last part is the whole rest. Needs the forces of the start row in the work
+    space, and leaves those of the new start there.
     """
     left_s = step_s
     for cut in range(_LARGEST_CUTS):
@@ -330,11 +333,12 @@ def integrate_mechanics(
     substeps: int,
     space: Vector,
 ) -> None:
-    """Advance the mechanical state and the touch state by `step_s` in `substeps` substeps.
+    """Advance the mechanical state and the touch state by `step_s` in `substeps` substeps, in place.
 
-    contact: one row of the contact table, or empty; elapsed_s: since its onset. things, touch_state: table and state of
-    bodies, hands and walls for `firmware_sim.arm.touch_forces.touch`; time_s: scenario time, negative before the
-    scenario starts. target: set-points of the drives' torque loops, Nm. space: from `work_space`, overwritten.
+    Temperatures change once, at the end. contact: one row of the contact table, or empty; elapsed_s: since its onset.
+    things, touch_state: table and state of bodies, hands and walls for `firmware_sim.arm.touch_forces.touch`; time_s:
+    scenario time, negative before the scenario starts. target: set-points of the drives' torque loops, Nm. space: from
+    `work_space`, overwritten.
     """
     around = Surroundings(state, arm, mechanics, contact, things)
     rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]
@@ -388,7 +392,7 @@ def _set_joint_torque(around: Surroundings, work: _StepWork) -> None:
 def _warm(around: Surroundings, step_s: float, work: _StepWork) -> None:
     """Set the joints' temperatures after `step_s` of the friction power at the start row.
 
-    Friction on the motor side counts, too.
+    Friction on the motor side counts, too. A joint with heat capacity 0 keeps its temperature.
     """
     now, state, mechanics, forces = work.rows[_START], around.state, around.mechanics, work.forces
     _, _, friction1, friction2, motor1, motor2 = find_friction(now, around, forces)
@@ -417,8 +421,9 @@ def observe(
 ) -> tuple[float, float, float, float, float, float]:
     """Return the present true values, Nm: external torque, friction along +dq, gravity torque, two joints each.
 
-    The friction is on the link side of the sensor. Position, velocity and touch state stay; `space` is overwritten.
-    Arguments are as of `integrate_mechanics`.
+    The friction is on the link side of the sensor; the external torque includes joint stops. Position, velocity and
+    touch state stay; `rotor_kg_m2` of the state is set, `space` is overwritten. Arguments are as of
+    `integrate_mechanics`.
     """
     around = Surroundings(state, arm, mechanics, contact, things)
     rows, forces = space[:_ROWS_END], space[_ROWS_END:_FORCES_END].view(FORCES)[0]

@@ -88,12 +88,12 @@ def fit_payload(
     beside_m: float = 0.0,
     inertia_kg_m2: float = 0.0,
 ) -> None:
-    """Set the payload in `state`: a body with its centre of mass at (along, beside) from the tip, along link 2.
+    """Replace the payload in `state` by a body with its centre of mass at (along, beside) from the tip.
 
-    Updates inertia, and velocities of a moving arm. inertia_kg_m2: about the payload's centre of mass.
+    Updates the inertia. along, beside: in the frame of link 2. inertia_kg_m2: about the payload's centre of mass.
 
-    An added mass was at rest: it shares the momentum of the moving arm, M q̇ stays. A mass that is taken off leaves with
-    its speed: q̇ stays. At rest both change only the inertia.
+    A mass that is added was at rest: it shares the momentum of the moving arm, M q̇ stays and q̇ changes. A mass that
+    is taken off leaves with its speed: q̇ stays. At rest both change only the inertia.
     """
     added_kg = payload_kg - state["payload_kg"]
     m11, m12, m22 = mass_matrix(state, state["q"][1])
@@ -208,7 +208,10 @@ def decide_slips(
 
 @compiled
 def _stop_torque(arm: np.void, joint: int, q: float, dq: float) -> float:
-    """Return the torque, Nm, with which a stop pushes back a joint (0 or 1) that is beyond it; 0 between the stops."""
+    """Return the torque, Nm, with which a stop pushes back a joint (0 or 1) that is beyond it; 0 between the stops.
+
+    A stop never pulls: damping may lower the push to 0.
+    """
     if q > arm["stop_high_rad"][joint]:
         push = (
             -arm["stop_stiffness_Nm_rad"][joint] * (q - arm["stop_high_rad"][joint])

@@ -46,7 +46,7 @@ class DriveMode(IntEnum):
 
 @compiled
 def to_counts(value: float, lsb: float) -> int:
-    """Return a value in counts of `lsb`, rounded to the nearest."""
+    """Return a value in counts of `lsb`, rounded to the nearest, halves up."""
     return math.floor(value / lsb + 0.5)
 
 

@@ -156,9 +156,9 @@ def _joint_torque(
 def _meet(thing: np.void, own: np.void, pose: Pose) -> tuple[float, float, float, float, float]:
     """Return how a body meets its link: penetration and point along the link, m; normal x, y; distance across, m.
 
-    The penetration is negative while they are apart. The normal points from the link to the body; the last is the
-    signed distance of the body's centre from the link's line. thing, own: the body's row of the touch table, and its
-    part of the touch state.
+    The penetration is negative while they are apart. The normal points from the link to the body, between the ends of
+    the link on the stored side; a body beyond an end meets that end. The last is the signed distance of the body's
+    centre from the link's line. thing, own: the body's row of the touch table, and its part of the touch state.
     """
     along_x, along_y, link2_x, link2_y = pose
     length_m = thing["length1_m"]
@@ -265,10 +265,10 @@ def touch(
     state: Vector,
     rates_out: Vector,
 ) -> tuple[float, float]:
-    """Return the external torque of all bodies, hands and walls, Nm, and fill the rates of the touch state `state`.
+    """Return the external torque of the bodies, hands and walls that are present, Nm, and fill the touch state's rates.
 
-    things: their table. time_s: scenario time. Writes only rates_out, and leaves even that unchanged for an empty
-    table: an integrator may call it at any stage of a step.
+    things: table of all. state: touch state. time_s: scenario time. Writes only rates_out, and leaves even that
+    unchanged for an empty table: an integrator may call it at any stage of a step.
     """
     torque1, torque2 = 0.0, 0.0
     if things.shape[0] == 0:
@@ -361,9 +361,10 @@ def _settle_body(thing: np.void, own: np.void, pose: Pose) -> bool:
 def change_touch(things: Structured, time_s: float, q1: float, q2: float, state: Vector, is_prescribed: bool) -> None:
     """Apply the changes between ticks to the touch state: bodies, hands, walls come and go, a body stops at its wall.
 
-    The energy is set to 0 while nothing touches the arm. Call it at the start of each tick and before `describe_touch`;
-    a second call at the same instant changes nothing. is_prescribed: whether a scripted contact acts. The free
-    direction of a body that has not moved turns with the normal.
+    A body or wall whose place the arm occupies comes as soon as the place is free. The energy is set to 0 while nothing
+    touches the arm. Call it at the start of each tick and before `describe_touch`; a second call at the same instant
+    changes nothing. is_prescribed: whether a scripted contact acts. The free direction of a body that has not moved
+    turns with the normal, unless its row gives one.
     """
     is_touched = is_prescribed
     pose = _cosines(q1, q2)
@@ -392,7 +393,7 @@ def change_touch(things: Structured, time_s: float, q1: float, q2: float, state:
 
 @compiled
 def _note(out: np.void, force_x: float, force_y: float, link: float, index: float) -> None:
-    """Store size of force, N, link and index of a contact in `out`, of TOUCH_TRUTH, if no stronger one is stored."""
+    """Store force, N, link and index of a contact in `out`, of TOUCH_TRUTH, if none or a weaker one is stored."""
     size = math.sqrt(force_x * force_x + force_y * force_y)
     if out["index"] < 0.0 or size > out["force_N"]:
         out["force_N"], out["link"], out["index"] = size, link, index
@@ -415,9 +416,9 @@ def describe_touch(
 ) -> tuple[float, float]:
     """Fill `out`, a record of TOUCH_TRUTH, and return the external torque of all contacts on both joints, Nm.
 
-    Contacts are the scripted one, bodies, hands and walls; link and index of `out` are those of the strongest force.
-    contact, contact_index, elapsed_s: the scripted contact that acts, its index and the time since its onset; an empty
-    array without one.
+    Contacts are the scripted one, bodies, hands and walls, not joint stops. `out` has link, index and force of the
+    strongest, or 0, -1 and 0 without a contact. contact, contact_index, elapsed_s: the scripted contact that acts, its
+    index and the time since its onset; an empty array without one. time_s: scenario time.
     """
     out["force_N"], out["link"], out["index"] = 0.0, 0.0, -1.0
     torque1, torque2 = 0.0, 0.0

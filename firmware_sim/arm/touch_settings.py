@@ -119,7 +119,10 @@ class ContactSettings:
         return self.force_N * self.duration_s
 
     def row(self) -> tuple[float, ...]:
-        """Return the contact's values for compiled functions, in the order of CONTACT's fields."""
+        """Return the contact's values for compiled functions, in the order of CONTACT's fields.
+
+        The duration is in whole ticks of 100 µs; the ramp is half of it at most.
+        """
         duration_s = (self.end_tick - self.onset_tick) * TICK_S
         return (
             self.onset_tick,
@@ -184,8 +187,8 @@ def contact_torque(
 ) -> tuple[float, float]:
     """Return the external torque of the two joints, J(q)ᵀ F, Nm: moments of the force about the two joint axes.
 
-    force_N: as `contact_force` gives it. A force at the angle ψ has the moment p F sin(ψ − φ) about the joint at the
-    other end of the lever p, which itself points along φ.
+    force_N: as `contact_force` gives it; `aim` reduces it in frame "motion". A force at the angle ψ has the moment p F
+    sin(ψ − φ) about the joint at the other end of the lever p, which itself points along φ.
     """
     link2 = contact["link"] == 2.0
     phi = q1 + q2 if link2 else q1

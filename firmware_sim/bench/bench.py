@@ -54,13 +54,14 @@ class Bench:
 
         send: called with (identifier, data). clock_mode: the arm's time goes by SYNC ("sync"), or by the clock of
         `advance_to` and frames ("wall"). on_answer: called after each SYNC that devices answer, when all frames are
-        sent. on_truth: called each cycle with (cycle, t_ns of the SYNC frame, block by
-        TRUTH_LAYOUT), the block being valid until the next call. contract: which EDS files the devices have; default:
-        those that go with the codec's DBC. on_event: called with t_ns, level, name and text when a fault begins or
-        ends. arm: None: a body of the scenario's.
+        sent. on_truth: called with (cycle, t_ns, block by TRUTH_LAYOUT) for each SYNC that is answered or lost by a
+        fault, and for periods that pass without SYNC until the arm rests; t_ns is the time of the SYNC frame, in
+        lockstep the host's, and the block is valid until the next call. contract: which EDS files the devices have;
+        default: those that go with the codec's DBC. on_event: called with t_ns, level, name and text when a fault
+        begins or ends. arm: None: a body of the scenario's.
 
-        Raises ConfigError when a fault is about a frame that the contract hasn't, CodecError when the DBC lacks a
-        message, OSError when an EDS can't be read.
+        Raises ConfigError when a fault is about a frame that the contract hasn't, or about an object or value that its
+        device can't have; CodecError when the DBC lacks a message; OSError when an EDS can't be read.
         """
         self.cycle = -1
         """Number of the last SYNC, -1 before the first."""
@@ -107,19 +108,26 @@ class Bench:
 
     @property
     def now_ns(self) -> int:
-        """The bench's time, ns: by mode `sync` that of `boot` plus the periods since then, by `wall` the clock's."""
+        """The bench's time, ns: by mode `wall` the clock's.
+
+        By mode `sync` it is that of `boot` plus the periods since then, and goes on to the time of `advance_to` or of a
+        host's mark where that is later.
+        """
         return self.time.now_ns
 
     @property
     def due_ns(self) -> int:
-        """Time, ns, at which a timer, a fault or a held frame is due next; call `advance_to` then."""
+        """Bench time, ns, at which a timer, a fault or a held frame is due next; call `advance_to` then.
+
+        NEVER_NS if none is.
+        """
         return self.time.due_ns
 
     @property
     def is_at_rest(self) -> bool:
-        """Whether, for a while, the arm has stood still by the drives' velocities and no drive has powered its motor.
+        """Whether, for 50 ms, the arm has stood still by the drives' velocities and no drive has powered its motor.
 
-        Motion between two calls is missed.
+        A call while the arm moves or a motor has power restarts that time. Motion between two calls is missed.
         """
         return self.time.is_at_rest
 
@@ -138,12 +146,16 @@ class Bench:
     def advance_to(self, t_ns: int) -> None:
         """Advance the time to `t_ns` without frames: heartbeats, event timers and watchdogs act when they are due.
 
-        In clock mode `wall` the arm moves, too.
+        Faults and held frames do, too. An earlier time changes nothing. The arm moves in clock mode `wall`; in `sync`
+        only while a drive brakes as it has lost its host.
         """
         self.time.advance_to(t_ns)
 
     def outlive_host(self) -> None:
-        """In clock mode `sync`, advance the time without a host until the arm rests, at most LONGEST_ORPHANAGE_NS."""
+        """In clock mode `sync`, advance the time without a host until the arm rests, at most LONGEST_ORPHANAGE_NS.
+
+        Do nothing in `wall`, before the first SYNC, and in later calls until the next SYNC.
+        """
         self.time.outlive_host()
 
     def release(self) -> None:
@@ -153,7 +165,8 @@ class Bench:
     def on_frame(self, frame: Frame) -> None:
         """Take one frame from the bus: run a cycle on SYNC, and pass the others to the devices that receive them.
 
-        Error frames, and frames that no device takes, have no effect.
+        Error frames have no effect. In clock mode `wall` every other frame first takes time and arm to the frame's
+        time; in `sync` a host's mark does so in lockstep. Devices ignore frames that they don't take.
         """
         can_id, data, t_ns, is_error = frame
         if is_error:
@@ -275,9 +288,10 @@ class Bench:
         self.time.end_sync(self.cycle, t_ns)
 
     def _miss_sync(self, data: bytes, t_ns: int) -> None:
-        """Advance by the period of a SYNC that a fault keeps from all devices, and send their other frames.
+        """Advance to a SYNC that a fault keeps from all devices, send their other frames, and add a row of truth.
 
-        Only in clock mode `sync`.
+        Only in clock mode `sync`. Time stays if no device would take the SYNC, and before the first one that devices
+        took.
         """
         is_counted = self._order.counter != 0 and any(self._nodes.listeners.takers(data)) and self._judge(data, t_ns)
         if is_counted and self.time.has_begun:

@@ -36,9 +36,11 @@ class BenchNodes:
         arm: MovableArm,
         is_free_running: bool,
     ) -> None:
-        """Build the nodes around an arm. `is_free_running`: time passes without SYNC, so drives watch for it.
+        """Build the nodes around an arm, and make them those of `injector`.
 
-        Raises CodecError when the DBC lacks a message, OSError when an EDS can't be read.
+        `is_free_running`: time passes without SYNC, so drives watch for it. Raises CodecError when the DBC lacks a
+        message, OSError when an EDS can't be read, ConfigError when a fault replaces an object that its device lacks,
+        or by a value that the object can't have.
         """
         self.senders: tuple[tuple[int, Callable[[], None]], ...] = ()
         """Senders of the answers to SYNC: place of a node, and its function."""
@@ -105,7 +107,10 @@ class BenchNodes:
         self.commands = commands
 
     def poll(self, t_ns: int) -> int:
-        """Let all nodes act on their timers that are due at `t_ns`, and return the time, ns, of the next timer."""
+        """Let all nodes act on their timers that are due at `t_ns`, and return the time, ns, of the next timer.
+
+        Event-driven frames go out, too. NEVER_NS if no timer runs. Both are times of the bench.
+        """
         return min(node.poll(t_ns) for node in self._nodes)
 
     @property
@@ -137,7 +142,10 @@ class BenchNodes:
                 drive.on_lost_sync(t_ns)
 
     def sample(self) -> Measurement:
-        """Return the arm's measured values in counts, with pairs by device (Drive1, Drive2 or Sensor1, Sensor2)."""
+        """Return the arm's measured values in counts, with pairs by device (Drive1, Drive2 or Sensor1, Sensor2).
+
+        Call it once per SYNC: each call draws new noise. The values are without the scenario's faults.
+        """
         return self.wiring.read(self._arm.sample())
 
     def _make_sensor(self, place: int, codec: Codec, scenario: Scenario) -> SensorNode:

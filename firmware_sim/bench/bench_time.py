@@ -56,17 +56,17 @@ class TruthFeed:
         self._sync_stamp_ns = self._sync_cycle = 0
 
     def add_sync_row(self, cycle: int, stamp_ns: int) -> None:
-        """Call `on_truth` with the present truth as that of SYNC `cycle` at `stamp_ns`.
+        """Add the row of truth of SYNC number `cycle`, stamped `stamp_ns`: call `on_truth` with the present truth.
 
-        Later rows count from this SYNC.
+        Later rows count from this SYNC. Without `on_truth` only the numbers are stored.
         """
         self._sync_stamp_ns, self._sync_cycle = stamp_ns, cycle
         self.add_later_row(0, 0)
 
     def add_later_row(self, periods: int, period_ns: int) -> None:
-        """Call `on_truth` with the present truth as that of `periods` periods after the last SYNC's row.
+        """Add the row of truth `periods` periods after the last SYNC's row: call `on_truth` with the present truth.
 
-        Without `on_truth` only `cycle` changes.
+        Its stamp is that SYNC's plus `periods` times `period_ns`. Without `on_truth` only `cycle` changes.
         """
         self.cycle = self._sync_cycle + periods
         if self.on_truth is not None:
@@ -104,15 +104,22 @@ class TruthLog(Recorder):
         )
 
     def write(self, cycle: int, t_ns: int, block: Vector) -> None:
-        """Log the truth of one cycle; `block` is laid out by TRUTH_LAYOUT."""
+        """Log the truth of one cycle; `block` is laid out by TRUTH_LAYOUT.
+
+        t_ns: without the log's epoch. With a full ring it waits if the log is `blocking`, else it drops and counts the
+        cycle.
+        """
         self.cycle(t_ns, ((ChannelId.TRUTH, pack_truth(cycle, block)),))
 
     def write_event(self, t_ns: int, level: str, name: str, text: str) -> None:
-        """Log the beginning or end of a fault as an event. `level`: info, warning or error."""
+        """Log the beginning or end of a fault as an event. `level`: info, warning or error.
+
+        t_ns: without the log's epoch. With a full ring it waits or drops the event as `write` does.
+        """
         self.event(t_ns, Event(level, name, text))
 
     def discard(self) -> None:
-        """Close the log and delete its files. Raises OSError if one can't be deleted."""
+        """Close the log and delete all its parts. Raises OSError if one can't be deleted."""
         self.close()
         for part in find_parts(self.path).values():
             part.unlink()
@@ -156,14 +163,14 @@ class BenchTime:
 
     @property
     def host_ns(self) -> int:
-        """The bench's time, ns, on the clock of a host in lockstep."""
+        """The bench's time, ns, on the clock of a host in lockstep; the bench's own before lockstep began."""
         return self.now_ns - self._ahead_ns
 
     @property
     def is_at_rest(self) -> bool:
         """Whether the arm has stood still by the drives' velocities, and no drive has had power, for `_REST_NS`.
 
-        Motion between two calls is missed.
+        A call while the arm moves or a drive has power restarts that time. Motion between two calls is missed.
         """
         return self._has_rested(self.now_ns)
 
@@ -209,7 +216,7 @@ class BenchTime:
             self.advance(self._nodes.period_ns)
 
     def pass_lost_syncs(self, count: int) -> None:
-        """Advance by `count` periods; the drives count a lost SYNC at the end of each."""
+        """Advance by `count` periods; at the end of each the drives count a lost SYNC, then set-points are latched."""
         for _ in range(count):
             self.advance(self._nodes.period_ns)
             for drive in self._nodes.drives:
@@ -234,9 +241,10 @@ class BenchTime:
         self.due_ns = min(self._nodes.poll(t_ns), self._injector.due_ns, self._outbox.due_ns)
 
     def advance_faults(self, stamp_ns: int, ahead_ns: int = 0) -> None:
-        """Begin and end the faults that are due within `ahead_ns` of now, and let babbling nodes send.
+        """Begin and end the faults that are due within `ahead_ns` of now, and queue the frames of babbling nodes.
 
-        stamp_ns: time of their events, unused in lockstep.
+        Those frames are of the period from now on. Do nothing without faults in the scenario. stamp_ns: time of the
+        faults' events, unused in lockstep, where the host's time counts.
         """
         is_paced = self._outbox.is_paced
         self._injector.advance(self.now_ns + ahead_ns, self.host_ns + ahead_ns if is_paced else stamp_ns)
@@ -294,10 +302,10 @@ class BenchTime:
         self.poll(self.now_ns)
 
     def _advance_without_sync(self, dt_ns: int) -> None:
-        """Advance arm and time by `dt_ns` without a SYNC.
+        """Latch the drives' set-points, and advance arm and time by `dt_ns` without a SYNC.
 
         Add a row of truth per period until the arm rests, in clock mode `wall` from period number `_FIRST_OVERDUE`
-        after the last SYNC on.
+        after the last SYNC on; none before the first row of a SYNC.
         """
         end_ns, period_ns = self.now_ns + dt_ns, self._nodes.period_ns
         first = _FIRST_OVERDUE if self._is_wall else 1

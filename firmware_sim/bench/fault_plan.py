@@ -104,7 +104,7 @@ class FaultPlan:
     def wait_ns(self) -> int:
         """Longest time from the last `advance` to the next one, ns: until a row begins, ends or sends an EMCY.
 
-        NEVER_NS if none will.
+        NEVER_NS if none will. Rows whose clock has not begun don't count.
         """
         waits_ns = (
             max(0, row.due_ns - now_ns)
@@ -151,7 +151,8 @@ class FaultPlan:
     def transmit(self, node: int, can_id: int, data: bytes) -> list[tuple[int, int, bytes]]:
         """Return the frames that faults make of a node's frame: delay in ns, identifier, data; [] if it is not sent.
 
-        node: index in NODES.
+        It isn't sent if the node is silent, or if the frame is lost or waits until the next one overtakes it, which
+        then brings both. Each call uses up hits and random draws. node: index in NODES.
         """
         if node in self._silent:
             return []
@@ -163,8 +164,9 @@ class FaultPlan:
     def receive(self, node: int, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
         """Return the frames that faults make of a host's frame to a node: delay in ns and data; [] if it is lost.
 
-        node: index in NODES. For a frame to all devices call it with `EVERYBODY` first, then with each of the returned
-        frames for each node.
+        It is [] also while the frame waits to be overtaken by the next one, which then brings both. Each call uses up
+        hits and random draws. node: index in NODES. For a frame to all devices call it with `EVERYBODY` first, then
+        with each of the returned frames for each node.
         """
         rows = self._receiving.get((node, can_id))
         return self._change(rows, can_id, data) if rows else [(0, data)]
@@ -234,7 +236,10 @@ class FaultPlan:
         return events
 
     def _begin(self, row: FaultRow) -> None:
-        """Queue both actions of a reboot or drive fault without duration at once: off and on, or failure and repair."""
+        """Queue both actions of a reboot or drive fault without duration: off and on, or failure and repair.
+
+        Rows of other kinds, or with a duration, queue nothing here.
+        """
         settings = row.settings
         for node in settings.nodes:
             if settings.kind == "reboot" and not settings.duration_ns:
@@ -304,7 +309,10 @@ class FaultPlan:
         self._replaced = replaced
 
     def _switch_failures(self, failing: tuple[FaultRow, ...]) -> None:
-        """Queue the failure of a drive whose fault begins, and its repair once no fault is left on it."""
+        """Queue the failure of a drive whose fault begins, and its repair once no fault is left on it.
+
+        Only faults with a duration count.
+        """
         for row in self._rows:
             if row.settings.kind != "drive_fault" or not row.settings.duration_ns:
                 continue
@@ -349,9 +357,9 @@ class FaultPlan:
         return frames
 
     def _swap(self, row: FaultRow, can_id: int, frames: Sent) -> Sent:
-        """Hold a frame back until the next with its identifier has overtaken it; return the frames to send now.
+        """Hold a frame that is hit until the next with its identifier has overtaken it; return the frames to send now.
 
-        While one is held back, that is [].
+        That is [] for the frame held back, both for the next one, and the frames as they are without a hit.
         """
         if can_id in row.held:
             overtaken = row.held.pop(can_id)

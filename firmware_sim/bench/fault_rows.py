@@ -62,13 +62,16 @@ class FaultRow:
 
     @property
     def flood_ns(self) -> int:
-        """Time at which the next frame of a flood (`babble`, `emcy_storm`) is due, ns; NEVER_NS if none is."""
+        """Time at which the next frame of a flood (`babble`, `emcy_storm`) is due, ns on the clock of `begin_ns`.
+
+        NEVER_NS for other kinds, and once the fault has used up its count. It doesn't depend on `is_active`.
+        """
         rate_Hz = self.settings.rate_Hz or 0.0
         return self.begin_ns + round(self.sent * 1e9 / rate_Hz) if rate_Hz and self.hits_left > 0 else NEVER_NS
 
     @property
     def due_ns(self) -> int:
-        """Time at which the fault next begins, ends or, in a storm of EMCYs, sends one, ns.
+        """Time at which the fault next begins, ends or, in a storm of EMCYs, sends one, ns on the clock of `begin_ns`.
 
         NEVER_NS once it is over.
         """
@@ -89,7 +92,7 @@ class FaultRow:
         return True
 
     def late_ns(self) -> int:
-        """Return by how much the fault delays a frame, ns: its delay plus random jitter, drawn anew at each call."""
+        """Return by how much the fault delays a frame, ns: its delay plus a uniform jitter, drawn anew at each call."""
         settings = self.settings
         jitter_us = settings.jitter_us * self.draws.random() if settings.jitter_us else 0.0
         return round(((settings.delay_us or 0.0) + jitter_us) * 1e3)
@@ -98,8 +101,10 @@ class FaultRow:
 def distort_value(row: FaultRow, node: int, counts: int, lsb: float) -> int:
     """Return a measured value in counts as a fault of kind stick, jump or saturate changes it, or as it is if not hit.
 
-    A torque that jumps or saturates stays within TORQUE_COUNTS. node: index in NODES; a stuck value is kept for each.
-    lsb: one count in the unit of the signal.
+    stick: the first value hit of each node is kept, and each later hit returns it. jump: the step is added. saturate:
+    the value is limited to ± the bound; without a bound a torque goes to the end of TORQUE_COUNTS on its side. A torque
+    that jumps stays within TORQUE_COUNTS. A hit uses up one of the fault's count. node: index in NODES. lsb: one count
+    in the unit of the signal.
     """
     settings = row.settings
     if not row.hit():
@@ -122,7 +127,10 @@ def _delay(row: FaultRow, _message: MessageCodec | None, frames: Sent) -> Sent:
 
 
 def _flip(row: FaultRow, data: bytes) -> bytes:
-    """Return data with the bits of the fault's mask flipped; without a mask, with its number of random bits flipped."""
+    """Return data with the bits of the fault's mask flipped, as far as the mask and the data reach.
+
+    Without a mask, flip its number of random bits, 1 if it has none and all at most.
+    """
     settings = row.settings
     bits = int.from_bytes(data, "little")
     if settings.mask is not None:

@@ -96,7 +96,10 @@ class Outbox:
             self.mark(MarkKind.END)
 
     def mark(self, kind: MarkKind, t_ns: int = 0) -> None:
-        """Send a mark to a host in lockstep. `t_ns`: as `MarkKind` defines it for the kind."""
+        """Send a mark to a host in lockstep at once, also during `collect`; `sent` doesn't count it.
+
+        `t_ns`: as `MarkKind` defines it for the kind.
+        """
         self._send(DEVICE_MARK, pack_mark(kind, t_ns))
 
 
@@ -188,7 +191,8 @@ class Injector:
     def receive(self, place: int, can_id: int, data: bytes, take: Handler, t_ns: int) -> bool:
         """Call `take` with a frame of the host, as faults change, repeat or delay it; return False if it is lost.
 
-        A delayed frame is taken when the outbox releases it. place: index in NODES of the receiver, or EVERYBODY.
+        False also while a frame waits for the next one to overtake it. A delayed frame is taken when the outbox
+        releases it. place: index in NODES of the receiver, or EVERYBODY.
         """
         frames = self.plan.receive(place, can_id, data)
         for delay_ns, received in frames:
@@ -217,18 +221,27 @@ class Injector:
                 self._outbox.mark(MarkKind.LIT if self._is_acknowledged else MarkKind.DARK)
 
     def late_ns(self, period_ns: int) -> int:
-        """Return how late this SYNC reaches the devices, ns: random, 0 without such a fault, less than a period."""
+        """Return how late this SYNC reaches the devices, ns: 0 without such a fault, less than a period.
+
+        It is random: call it once per SYNC.
+        """
         return min(self.plan.sync_delay_ns(), period_ns - 1)
 
     def flood(self, period_ns: int) -> None:
-        """Queue the frames that babbling nodes send in the period from now on, each until its time."""
+        """Queue the frames that babbling nodes send in the period from now on, each until its time.
+
+        Do nothing while no fault of kind `babble` is active.
+        """
         if self.plan.is_flooding:
             self._flooded_ns = self.now_ns + period_ns
             for offset_ns, can_id, data in self.plan.babble(period_ns):
                 self._outbox.put_later(self.now_ns + offset_ns, can_id, data)
 
     def count_heard(self, sync_id: int, data: bytes) -> tuple[int, ...]:
-        """Return how often each device hears one SYNC: 0 off the bus or if it is lost, 2 if it is doubled, else 1."""
+        """Return how often each device hears one SYNC: 0 off the bus or if it is lost, 2 if it is doubled, else 1.
+
+        Call it once per SYNC: it uses up hits of the faults. Faults of a SYNC to all devices at once don't count here.
+        """
         plan = self.plan
         return tuple(
             len(plan.receive(place, sync_id, data)) * device.is_on_bus for place, device in enumerate(self._devices)

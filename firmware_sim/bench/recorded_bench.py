@@ -40,7 +40,10 @@ class RecordedCycles:
     """The cycles of a recording, read forwards only."""
 
     def __init__(self, path: Path, codec: Codec) -> None:
-        """Open the recording. Raises LogError if it can't be read, CodecError if the DBC lacks Sync or Nmt."""
+        """Open the recording and read its first cycle.
+
+        Raises LogError if it can't be read, CodecError if the DBC lacks Sync or Nmt.
+        """
         self.attempt = -1
         """Number of the attempt in progress, -1 before the first."""
         self.answered = 0
@@ -55,7 +58,10 @@ class RecordedCycles:
 
     @property
     def problem(self) -> str:
-        """One line on the part of the recording that is damaged or missing; empty if it is whole."""
+        """One line on the part of the recording that is damaged or missing; empty if it is whole.
+
+        It is complete once the recording is over.
+        """
         return self._source.problem
 
     def begin(self) -> None:
@@ -65,7 +71,8 @@ class RecordedCycles:
     def take(self, cycle: int) -> tuple[Answer, ...]:
         """Return the answers to a cycle of this attempt, () if the recording lacks them.
 
-        Earlier cycles are skipped for good. Raises LogError if the recording can't be read on.
+        Each cycle is returned once, and earlier ones are skipped for good. Counts cycles with answers in `answered`.
+        Raises LogError if the recording can't be read on.
         """
         wanted = (self.attempt, cycle)
         while self._next is not None and self._next[0] < wanted:
@@ -107,7 +114,7 @@ class RecordedCycles:
     def _frames(self) -> Iterator[Answer]:
         """Yield identifier and data of SYNC, NMT and the answers, in the order of the bus.
 
-        Error and remote frames are left out.
+        Error frames, remote frames and those with extended identifiers are left out.
         """
         wanted = [self._sync_id, self._nmt_id, *self._answer_ids]
         for frames in self._source:
@@ -172,7 +179,7 @@ class RecordedBody:
         self.motor_torque_Nm = first_Nm * (drive_mode[0] == _TORQUE), second_Nm * (drive_mode[1] == _TORQUE)
 
     def sample(self) -> Measurement:
-        """Return the latest recorded values in the default counts of position, velocity and torque."""
+        """Return the latest recorded values in the default counts of position, velocity and torque, 0 before any."""
         return Measurement(
             _counts(self._values["position"], POSITION_LSB_RAD),
             _counts(self._values["velocity"], VELOCITY_LSB_RAD_S),

@@ -299,13 +299,20 @@ class Body:
 
     @property
     def motor_torque_Nm(self) -> tuple[float, float]:
-        """Torque that the drives believe, by joint, Nm: from their motor currents, with their zero error; 0x6077."""
+        """Torque that the drives believe, by joint, Nm: the present motor torque, with the errors of the drive; 0x6077.
+
+        It is the torque over the torque constant's factor, less the zero error of the current sensor; a motor without
+        torque shows minus that error.
+        """
         first_Nm, second_Nm = (self._tau_m / self._gain - self._offset_Nm).tolist()
         return first_Nm, second_Nm
 
     @property
     def is_torque_limited(self) -> tuple[bool, bool]:
-        """Whether each drive wants more torque than its peak current, I²t or temperature allow; statusword bit 11."""
+        """Whether each drive wanted more torque in the last tick than peak current, I²t or temperature allow.
+
+        By joint; a cause of statusword bit 11.
+        """
         if self.has_ideal_motors:
             return False, False
         first, second = self._is_limited.tolist()
@@ -331,9 +338,9 @@ class Body:
 
     @property
     def drive_velocity_rad_s(self) -> tuple[float, float]:
-        """Velocity that each drive estimates from its encoder, rad/s, before rounding to counts.
+        """Velocity by joint that each drive estimates from its encoder, rad/s along +q, before rounding to counts.
 
-        By it drives see standstill.
+        By it drives see standstill. It is that of the last tick, without the scenario's faults of values.
         """
         first, second = self._velocity_rad_s.tolist()
         return first, second
@@ -341,7 +348,10 @@ class Body:
     def advance(
         self, torque_setpoint_Nm: Sequence[float] | Vector, drive_mode: Sequence[int], tick_count: int = PERIOD_TICKS
     ) -> None:
-        """Advance the arm by `tick_count` ticks of 100 µs with constant set-points (2,), Nm, and `DriveMode`s (2,)."""
+        """Advance the arm by `tick_count` ticks of 100 µs with constant set-points (2,), Nm, and `DriveMode`s (2,).
+
+        Both are by joint. Also applies the scenario's changes of payload and touches that are due in each tick.
+        """
         while tick_count > 0:
             count = tick_count
             if self._encoder_noise.is_on:
@@ -361,5 +371,9 @@ class Body:
         return Measurement((q1, q2), (dq1, dq2), (tau1, tau2))
 
     def truth(self, out: Vector) -> None:
-        """Fill a block laid out by TRUTH_LAYOUT with the present true values. Measurements stay the same."""
+        """Fill a block laid out by TRUTH_LAYOUT with the present true values.
+
+        First applies the payload and touch changes that are due. Measurements stay the same. The field `faults` is 0:
+        the bench fills it.
+        """
         fill_truth(*self.parts[:7], self._touch_truth, out)

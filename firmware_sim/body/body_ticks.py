@@ -86,12 +86,14 @@ def find_contact(course: np.void, contacts: Structured) -> Structured:
     Sets `course["contact"]` to the index of that contact or of the next one. Contacts that have ended are skipped for
     good. course: that part of the body's state.
     """
+    if course["start_tick"] < 0.0:
+        return contacts[:0]
     tick = course["tick"] - course["start_tick"]
     index = int(course["contact"])
     while index < contacts.size and contacts[index]["end_tick"] <= tick:
         index += 1
     course["contact"] = index
-    if course["start_tick"] >= 0.0 and index < contacts.size and contacts[index]["onset_tick"] <= tick:
+    if index < contacts.size and contacts[index]["onset_tick"] <= tick:
         return contacts[index : index + 1]
     return contacts[:0]
 

@@ -133,10 +133,10 @@ def command_torque(
 ) -> float:
     """Return the target, Nm, with which the plant's 1 kHz torque loop gives the motor's torque after this tick.
 
-    Sets `is_limited` in the state if the drive wants more than it may. wanted: the drive's set-point, within rated
-    torque. tau: the motor's torque now. is_powered: errors of torque constant and current sensor act only then. The
-    result is exact at the ends of the ticks. Within a tick a loop slower than 1 kHz is off by a hundredth of the way to
-    the target at most, one of 2 kHz by a twentieth, one of 5 kHz by a quarter.
+    Sets `is_limited` in the state to 1 if the drive wants more than it may, else to 0. wanted: the drive's set-point,
+    within rated torque. tau: the motor's torque now. is_powered: errors of torque constant and current sensor act only
+    then. The result is exact at the ends of the ticks. Within a tick a loop slower than 1 kHz is off by a hundredth of
+    the way to the target at most, one of 2 kHz by a twentieth, one of 5 kHz by a quarter.
     """
     limit_Nm = available_torque(numbers, state, joint)
     target_Nm = min(max(wanted_Nm, -limit_Nm), limit_Nm)

@@ -287,10 +287,12 @@ def sample_torque(
     temperature_C: float,
     noise_Nm: float,
 ) -> int:
-    """Return the counts that the sensor of a joint sends at the SYNC at `tick`.
+    """Return the counts that the sensor of a joint sends at the SYNC at `tick`, and store them.
 
-    A sensor with its own clock repeats the last counts until that clock has a new sample. tau, other: torque in the
-    spring of this joint and of the other one, now.
+    To the sensed torque it adds zero error, drift, walk and `noise_Nm`; the sum is rounded to the converter's bits and
+    limited to its range. A sensor with its own clock repeats the last counts until that clock has a new sample. tau,
+    other: torque in the spring of this joint and of the other one, now; a sensor with memory uses those of
+    `sense_torque`.
     """
     if numbers["has_memory"] == 0.0:
         torque_Nm = _bridge(numbers, joint, tau_Nm, other_Nm, temperature_C)

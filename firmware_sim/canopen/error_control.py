@@ -109,9 +109,9 @@ class ErrorReporter:
             dictionary.serve(0x2210, _COUNT_SUB + watchdog, lambda w=watchdog: self._counts[w] & 0xFFFF)  # type: ignore[misc]
 
     def report_error(self, code: int, t_ns: int, number: int = 0, time_ms: int = 0) -> None:
-        """Add a code other than 0 to the history, and send an EMCY after the inhibit time.
+        """Add a code other than 0 to the history, and send an EMCY, at once or after the inhibit time.
 
-        It sends none if 0x1014 or the NMT state forbids it. number: of the watchdog, 0 for none. time_ms: on the
+        It sends none if 0x1014 or the NMT state forbids it. number: of the watchdog, 0 for none. t_ns, time_ms: on the
         device's clock.
         """
         if code != 0:
@@ -123,7 +123,7 @@ class ErrorReporter:
     def report_at_once(self, code: int, t_ns: int) -> None:
         """Add a code to the history, and send an EMCY now, before those that wait for the inhibit time.
 
-        It sends none if 0x1014 or the NMT state forbids it.
+        That time begins anew. It sends none if 0x1014 or the NMT state forbids it. t_ns: on the device's clock.
         """
         self._history.appendleft(code)
         if self._is_valid and self._is_allowed():
@@ -148,7 +148,10 @@ class ErrorReporter:
         self.report_error(0, t_ns, watchdog, time_ms)
 
     def forget_messages(self) -> None:
-        """Drop the waiting EMCYs, the history and the running inhibit time, as a loss of power does."""
+        """Drop the waiting EMCYs, the history and the running inhibit time, as a loss of power does.
+
+        Tripped watchdogs and their counts stay.
+        """
         self._waiting.clear()
         self._history.clear()
         self._allowed_ns = 0
@@ -204,7 +207,10 @@ class HeartbeatProducer:
         self._due_ns = t_ns + self._period_ns if self._period_ns else NEVER_NS
 
     def send_due(self, t_ns: int) -> int:
-        """Send a heartbeat if it is due; return when the next one is due, ns, NEVER_NS without heartbeats."""
+        """Send a heartbeat if it is due, one for several missed periods; return when the next is due, ns.
+
+        NEVER_NS without heartbeats. Both times are on the device's clock.
+        """
         if t_ns >= self._due_ns:
             self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
             self._send(self._can_id, bytes([self._state()]))
@@ -253,7 +259,7 @@ class HeartbeatConsumer:
     def find_silence(self, t_ns: int) -> int:
         """Report the heartbeat as lost if its timeout is over; return when to call again, ns.
 
-        NEVER_NS before the first heartbeat and while it is lost.
+        NEVER_NS before the first heartbeat and while it is lost. Both times are on the device's clock.
         """
         if t_ns >= self._due_ns:
             self._due_ns = NEVER_NS
@@ -329,8 +335,9 @@ class SyncOrder:
     def judge(self, counter: int, overflow: int, t_ns: int, period_ns: int) -> None:
         """Set `kind`, `is_taken`, `counter` and `periods` by a SYNC of the right length.
 
-        A SYNC that isn't taken leaves `counter`. `counter`: 0 without one. `overflow`: 0x1019. `period_ns`: 0x1006; 0:
-        not set, so no SYNC is early.
+        A SYNC that isn't taken leaves `counter`. `counter`: 0 without one. `overflow`: 0x1019, 0 for SYNCs without
+        counter. `t_ns`: when it came, used and kept only if SYNC is judged by time. `period_ns`: 0x1006; 0: not set, so
+        no SYNC is early.
         """
         last = self.counter
         self.kind, self.is_taken, self.periods = SyncKind.RIGHT, True, 1
@@ -391,7 +398,7 @@ class SyncCounts:
         """Count a SYNC by its kind, and `lost` SYNCs before it.
 
         One that is repeated, early or out of sequence adds to `odd`; `CLEAN_SYNCS` right ones in a row set `odd` to 0.
-        The counts of 0x2211 stay.
+        The counts of 0x2211 stay. Lost SYNCs and those of wrong length change neither `odd` nor the row.
         """
         self._counts[_LOST_SUB] += lost
         if kind is not SyncKind.RIGHT:

@@ -191,9 +191,10 @@ def _compare_lengths(length: int, expected: int) -> None:
 
 
 def read_eds(path: Path, node_id: int) -> canopen.ObjectDictionary:
-    """Return the objects of an EDS or DCF file of any encoding; `node_id` replaces $NODEID.
+    """Return the objects of an EDS or DCF file; `node_id` replaces $NODEID.
 
-    The result is cached: don't change it. Raises OSError if the file can't be read.
+    Bytes that aren't UTF-8 are replaced. The result is cached by content and node id: don't change it. Raises OSError
+    if the file can't be read.
     """
     return _parse_eds(path.read_bytes().decode("utf-8", "replace").removeprefix("\ufeff"), node_id)
 
@@ -336,7 +337,8 @@ class ObjectDictionary:
     def reader(self, index: int, subindex: int) -> Callable[[], int]:
         """Return a function that reads a numeric object: its replaced value, its live value by `serve`, or as written.
 
-        It keeps the source of now: a later `serve` or `replace_value` doesn't reach it.
+        It keeps the source of now: a later `serve` or `replace_value` doesn't reach it. It raises `Refusal` when it
+        reads an object that the device lacks.
         """
         key = index, subindex
         return self._replaced.get(key) or self._readers.get(key) or (lambda: self.value(index, subindex))
@@ -344,7 +346,8 @@ class ObjectDictionary:
     def replace_value(self, index: int, subindex: int, value: int | None) -> None:
         """Give a numeric object a value in place of its own; None: its own again.
 
-        Reads by SDO and by `value` return it from now on; functions that `reader` returned before don't.
+        Reads by SDO and by `value` return it from now on; functions that `reader` returned before don't. Writes go to
+        the object's own value. An object that the device lacks stays absent.
         """
         if value is None:
             self._replaced.pop((index, subindex), None)
@@ -393,25 +396,35 @@ class ObjectDictionary:
             self._appliers.setdefault((index, subindex), []).append(apply)
 
     def value(self, index: int, subindex: int = 0) -> int:
-        """Return the present value of a numeric object; raise `Refusal` if the device lacks it."""
+        """Return the present value of a numeric object: replaced, live, as written, or the EDS's.
+
+        Raise `Refusal` if the device lacks the object, or if it has none of these.
+        """
         variable = self.find(index, subindex)
         return int(variable.decode_raw(self._node.get_data(index, subindex)))
 
     def value_or(self, default: int, index: int, subindex: int = 0) -> int:
-        """Return the present value of a numeric object; `default` if the device lacks the object."""
+        """Return the present value of a numeric object; `default` if the device lacks the object.
+
+        Raise `Refusal` if the object has no value.
+        """
         return self.value(index, subindex) if self.has(index, subindex) else default
 
     def default_or(self, default: int, index: int, subindex: int = 0) -> int:
-        """Return the EDS's default of a numeric object; `default` if it lacks the object or gives it no default."""
+        """Return the default of a numeric object by EDS and description, whatever has been written since.
+
+        It is `default` if the device lacks the object, or if neither gives it one.
+        """
         if not self.has(index, subindex):
             return default
         value = self.find(index, subindex).default
         return default if value is None else int(value)
 
     def take_over(self, index: int, subindex: int, value: int) -> bool:
-        """Write an object with the checks of an SDO request except `is_locked`.
+        """Write an object with the checks of an SDO request except `is_locked`, and call the functions that watch it.
 
-        Return False, with the object unchanged, if a check refuses it or the device lacks it.
+        Return False, with the object unchanged, if a check refuses it, or if it is read-only or absent. Raises
+        ValueError for a value outside the object's type.
         """
         try:
             data = self.find(index, subindex).encode_raw(value)
@@ -431,7 +444,8 @@ class ObjectDictionary:
     def restore(self, last: int) -> None:
         """Restore the defaults of all objects up to index `last`.
 
-        Functions that watch them get the defaults, 0 without one.
+        Functions that watch them get the defaults, 0 without one; checks and `is_locked` don't count. Values of `serve`
+        and `replace_value` stay.
         """
         for index in [index for index in self._node.data_store if index <= last]:
             del self._node.data_store[index]

@@ -46,7 +46,7 @@ class TransmitPdo(PdoRecord):
         """Whether its events are the changes of its content."""
 
     def restart_sequence(self) -> None:
-        """Restart the counter of protected frames; a plain PDO stays as it is."""
+        """Restart the counter of protected frames; a plain PDO stays as it is. It takes effect with the next `bind`."""
         if self.message is not None and self.message.is_protected:
             self._sender = self.message.sender()
 
@@ -107,7 +107,10 @@ class TransmitPdo(PdoRecord):
             self.send()
 
     def compare(self) -> None:
-        """Set `is_due` if the content has changed since the last call, in a PDO whose events are such changes."""
+        """Set `is_due` if the content has changed since the last call, or at the first one; keep the content.
+
+        Only in a PDO whose events are such changes.
+        """
         if self.is_compared:
             content = self.layout.packing.pack(*[read() for read in self._reads])
             if content != self._sent:
@@ -117,7 +120,8 @@ class TransmitPdo(PdoRecord):
     def poll(self, t_ns: int) -> int:
         """Send a frame for an event, after the inhibit time, or by the event timer; return when to call again, ns.
 
-        It returns NEVER_NS without an event and a timer.
+        It returns NEVER_NS without an event and a timer, which begins with the first frame. Both times are on the
+        device's clock.
         """
         if (self.is_due and t_ns >= self._allowed_ns) or t_ns >= self._timer_due_ns:
             self.is_due = False
@@ -166,7 +170,9 @@ class ReceivePdo(PdoRecord):
     def on_frame(self, data: bytes, t_ns: int) -> None:
         """Check a frame; keep its values until SYNC, or write them at once for an event-driven type.
 
-        A frame of wrong length, or one that fails the end-to-end check, changes no object. t_ns: the bench's time.
+        A frame of wrong length, or one that fails the end-to-end check, changes no object. `Pdos.mind_length` is called
+        for each frame of wrong length, and for the first good one after it. A later frame replaces the values that
+        wait. t_ns: the bench's time.
         """
         layout = self.layout
         if len(data) != layout.length:
@@ -185,7 +191,7 @@ class ReceivePdo(PdoRecord):
             self._pdos.act_at_once(self, self._pdos.own_ns(t_ns))
 
     def is_late(self, t_ns: int) -> bool:
-        """Return whether the last frame acted longer ago than the event timer.
+        """Return whether the last frame acted at least an event timer ago; t_ns: on the device's clock.
 
         False without a timer, or before the first frame.
         """
@@ -204,7 +210,8 @@ class Pdos:
     ) -> None:
         """Make a PDO for each of COUNT communication records each way that the dictionary has.
 
-        `messages`: the contract's, by identifier. `longest`: the longest frame, bytes.
+        Serve the objects of the end-to-end header, 0x2100 and 0x2101. `messages`: the contract's, by identifier.
+        `longest`: the longest frame, bytes.
         """
         self.dictionary = dictionary
         self.send = send
@@ -260,7 +267,7 @@ class Pdos:
     def accept_values(self, index: int, subindex: int, write: Callable[[int], object]) -> None:
         """Register `write` for an object's values that come by RPDO.
 
-        It then replaces the checked write of the object.
+        It replaces the checked write of the object in PDOs that are bound from now on.
         """
         self._writers[index, subindex] = write
 
@@ -350,7 +357,10 @@ class Pdos:
         return is_commanded
 
     def find_late(self, t_ns: int) -> bool:
-        """Return whether the last frame of some RPDO acted longer ago than its event timer."""
+        """Return whether the last frame of some active RPDO acted at least its event timer ago.
+
+        t_ns: on the device's clock.
+        """
         return any(pdo.is_late(t_ns) for pdo in self._receiving)
 
     @property

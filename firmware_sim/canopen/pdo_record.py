@@ -58,8 +58,9 @@ class PdoRecord:
     ) -> None:
         """Read the defaults, and watch the record's objects.
 
-        `longest`: the longest frame, bytes. `message_ids`: identifiers of the contract. `refresh`: called after each
-        change of the configuration. `message`: the contract's with the PDO's default COB-ID, None without one.
+        A default mapping that no master could write counts as empty. `longest`: the longest frame, bytes.
+        `message_ids`: identifiers of the contract. `refresh`: called after each change of the configuration except the
+        inhibit time. `message`: the contract's with the PDO's default COB-ID, None without one.
         """
         self._dictionary, self._longest, self._message_ids, self._refresh = dictionary, longest, message_ids, refresh
         self.layout = NOTHING
@@ -192,8 +193,9 @@ NOTHING = PdoLayout((), struct.Struct("<"), 0, 0)
 def check_entry(dictionary: ObjectDictionary, value: int, is_received: bool) -> str:
     """Return the `struct` format of a mapping entry; raise `Refusal` if it can't be mapped in this direction.
 
-    An entry is index << 16 | sub-index << 8 | bits. is_received: it is of an RPDO, so the object must be writable; else
-    readable. Causes: the object is missing, not mappable, without that access, or of another size.
+    An entry is index << 16 | sub-index << 8 | bits; the format of a dummy, for RPDOs only, is padding. is_received: it
+    is of an RPDO, so the object must be writable; else readable. Causes: the object is missing, not mappable, without
+    that access, of another size, or of a type that FORMATS lacks.
     """
     index, subindex, bits = value >> 16, value >> 8 & 0xFF, value & 0xFF
     dummy_bits = dictionary.dummy_bits(index)

@@ -172,7 +172,7 @@ def _habits_by_vendor() -> dict[int, HabitSettings]:
 def _maker_habits(device: PlacedDevice) -> HabitSettings:
     """Return the habits of the maker's drives, by the vendor id in the device's EDS.
 
-    Other makers have default habits.
+    Makers that `maker_habits.toml` lacks have default habits.
     """
     vendor = _default(device, 0x1018, 1) or device.objects.device_information.vendor_number
     return _habits_by_vendor().get(vendor, HabitSettings())
@@ -269,7 +269,8 @@ def _check_objects(device: PlacedDevice) -> None:
 def _describe(device: PlacedDevice, settings: Settings) -> DeviceDescription:
     """Return a device's description: its EDS, and the values at power-on that its device profile adds or replaces.
 
-    Raises ConfigError for an EDS with a wrong type or an unsigned signal.
+    An EDS of the package keeps its values except the serial number. Raises ConfigError for an EDS with a wrong type or
+    an unsigned signal.
     """
     _check_objects(device)
     kind, scale = device.settings.kind, device.settings.scale

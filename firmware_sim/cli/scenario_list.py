@@ -48,9 +48,8 @@ def describe_all() -> list[dict[str, Any]]:
 def check(file: str, codec: Codec) -> ScenarioFinding:
     """Check a scenario file and its faults' frames against a contract.
 
-    Return its problems, or a summary if it has none.
-
-    A file that can't be read is a problem, too.
+    Return its problems, or a summary if it has none. A file that can't be read is a problem, too. Objects whose values
+    faults replace aren't looked up in the EDS.
     """
     try:
         table = read_table(file)

@@ -47,7 +47,7 @@ RESET_NODE, RESET_COMMUNICATION = 129, 130
 class Application:
     """The application of a device: everything besides communication.
 
-    `EmulatedDevice` calls the methods; here they are empty.
+    `EmulatedDevice` calls the methods; here they are empty. Times `t_ns` are of the device's own clock.
     """
 
     @property
@@ -193,9 +193,9 @@ class EmulatedDevice(ObjectDictionary):
         self.pdos.refresh()
 
     def power_on(self, t_ns: int) -> None:
-        """Switch the power on: send the boot-up message, and enter Pre-operational.
+        """Switch the power on: send the boot-up message, begin the heartbeats, and enter Pre-operational.
 
-        In bus-off the device stays silent.
+        In bus-off the device stays silent. t_ns: the bench's time.
         """
         self.is_powered = True
         self.power_on_ns = self.clock.own_ns(t_ns)
@@ -204,7 +204,8 @@ class EmulatedDevice(ObjectDictionary):
     def power_off(self, _t_ns: int) -> None:
         """Switch the power off: the device neither sends nor hears.
 
-        Written values, errors and application state are lost.
+        Written values, errors and application state are lost; values of `replace_value` and the clock's drift stay. The
+        argument has no effect.
         """
         self.is_powered = False
         self._errors.forget_messages()
@@ -216,14 +217,18 @@ class EmulatedDevice(ObjectDictionary):
     def leave_bus(self, t_ns: int) -> None:
         """Put the controller into bus-off: the device neither sends nor hears.
 
-        An operational device goes to Pre-operational, the default of 0x1029.
+        An operational device goes to Pre-operational, the default of 0x1029. t_ns: the bench's time.
         """
         self._is_bus_off = True
         if self.is_operational:
             self._enter(NmtState.PRE_OPERATIONAL, self.clock.own_ns(t_ns))
 
     def return_to_bus(self, t_ns: int) -> None:
-        """End `leave_bus`: a device with power takes part in the bus again, and sends an EMCY (0x8140)."""
+        """End `leave_bus`: a device with power takes part in the bus again, and sends an EMCY (0x8140).
+
+        The EMCY waits for the inhibit time, and is not sent if the NMT state or 0x1014 forbids it. t_ns: the bench's
+        time.
+        """
         self._is_bus_off = False
         if self.is_on_bus:
             self._errors.report_error(_RECOVERED_FROM_BUS_OFF, self.clock.own_ns(t_ns))
@@ -231,7 +236,7 @@ class EmulatedDevice(ObjectDictionary):
     def send_emergency(self, code: int, t_ns: int) -> None:
         """Add an error code to the history and send its EMCY at once, whatever the inhibit time.
 
-        No EMCY is sent if the NMT state or 0x1014 forbids it.
+        No EMCY is sent off the bus, or if the NMT state or 0x1014 forbids it. t_ns: the bench's time.
         """
         self._errors.report_at_once(code, self.clock.own_ns(t_ns))
 
@@ -244,7 +249,8 @@ class EmulatedDevice(ObjectDictionary):
     def on_nmt(self, data: bytes, t_ns: int) -> None:
         """Change the NMT state or reset the device by an NMT command.
 
-        Commands to other devices or off the bus have no effect.
+        Commands of another length than 2, unknown ones, those to other devices and all off the bus have no effect. A
+        reset sends the boot-up message. t_ns: the bench's time.
         """
         if len(data) != 2 or data[1] not in (0, self.node_id) or not self.is_on_bus:
             return
@@ -258,7 +264,10 @@ class EmulatedDevice(ObjectDictionary):
             self._boot(t_ns)
 
     def on_sdo(self, data: bytes, t_ns: int) -> None:
-        """Answer an SDO request of 8 bytes; ignore it off the bus, in Stopped and within `pause_ns` of an answer."""
+        """Answer an SDO request of 8 bytes; ignore it off the bus, in Stopped and within `pause_ns` of an answer.
+
+        Requests of another length are ignored. t_ns: the bench's time.
+        """
         if not self.is_on_bus:
             return
         self.now_ns = t_ns = self.clock.own_ns(t_ns)
@@ -269,25 +278,28 @@ class EmulatedDevice(ObjectDictionary):
             self.on_request(data, t_ns)
 
     def on_heartbeat(self, node_id: int, t_ns: int) -> None:
-        """Note another node's heartbeat, if it is the monitored one; ignore it off the bus."""
+        """Note another node's heartbeat, if it is the monitored one; ignore it off the bus. t_ns: the bench's time."""
         if self.is_on_bus:
             self._consumer.on_heartbeat(node_id, self.clock.own_ns(t_ns))
 
     def lose_heartbeat(self, t_ns: int) -> None:
-        """React to the master's silence: call the application, then leave Operational (CiA 301, default of 0x1029)."""
+        """React to the master's silence: call the application, then leave Operational (CiA 301, default of 0x1029).
+
+        t_ns: the device's own time.
+        """
         self._application.lose_heartbeat(t_ns)
         if self.is_operational:
             self._enter(NmtState.PRE_OPERATIONAL, t_ns)
 
     def find_heartbeat(self, t_ns: int) -> None:
-        """Report the return of the master's heartbeat to the application."""
+        """Report the return of the master's heartbeat to the application. t_ns: the device's own time."""
         self._application.find_heartbeat(t_ns)
 
     def note_sync(self, kind: SyncKind, lost: int, t_ns: int) -> None:
-        """Count a SYNC and the `lost` ones before it; trip or clear the watchdogs of SYNC.
+        """Count a SYNC and the `lost` ones before it; trip or clear the watchdogs of SYNC. t_ns: the bench's time.
 
-        Outside Operational do nothing. If too many were repeated, early or out of sequence, call the
-        application's `distrust_sync`.
+        Outside Operational and off the bus do nothing. If more than TOLERATED were repeated, early or out of sequence,
+        call the application's `distrust_sync`.
         """
         if not (self.is_operational and self.is_on_bus):
             return
@@ -308,23 +320,29 @@ class EmulatedDevice(ObjectDictionary):
     def trip(self, watchdog: Watchdog, t_ns: int) -> None:
         """Trip a watchdog and send its EMCY, unless it is tripped already.
 
-        Call the application's `note_error` in any case.
+        Call the application's `note_error` in any case. t_ns: the device's own time.
         """
         self._errors.trip(watchdog, t_ns, self._time_ms(t_ns))
         self._application.note_error()
 
     def clear(self, watchdog: Watchdog, t_ns: int) -> None:
-        """Clear a watchdog whose cause has gone, with an EMCY of code 0; do nothing if it isn't tripped."""
+        """Clear a watchdog whose cause has gone, with an EMCY of code 0; do nothing if it isn't tripped.
+
+        Then call the application's `note_error`. t_ns: the device's own time.
+        """
         if watchdog in self.tripped:
             self._errors.clear(watchdog, t_ns, self._time_ms(t_ns))
             self._application.note_error()
 
     def report_fault(self, code: int, t_ns: int) -> None:
-        """Send the EMCY of a fault that no watchdog has found, and add its code to the history."""
+        """Send the EMCY of a fault that no watchdog has found, and add its code to the history.
+
+        The EMCY waits for the inhibit time. t_ns: the device's own time.
+        """
         self._errors.report_error(code, t_ns, time_ms=self._time_ms(t_ns))
 
     def report_no_error(self, t_ns: int) -> None:
-        """Report the reset of a fault by an EMCY with code 0."""
+        """Report the reset of a fault by an EMCY with code 0, after the inhibit time. t_ns: the device's own time."""
         self._errors.report_error(0, t_ns)
 
     def poll(self, t_ns: int) -> int:
@@ -365,7 +383,10 @@ class EmulatedDevice(ObjectDictionary):
         return (t_ns - self.power_on_ns) // 1_000_000
 
     def _enter(self, state: NmtState, t_ns: int) -> None:
-        """Change the NMT state; begin or end PDOs, and report leaving and entering Operational to the application."""
+        """Change the NMT state; begin or end PDOs, and report leaving and entering Operational to the application.
+
+        Leaving is reported before the change, entering after it. t_ns: the device's own time.
+        """
         was_operational, self.is_operational = self.is_operational, state == NmtState.OPERATIONAL
         if was_operational and not self.is_operational:
             self._application.leave_operational(t_ns)
@@ -456,8 +477,9 @@ class SyncListeners:
     def report_sync(self, heard: Sequence[int], takers: Sequence[int], kind: SyncKind, lost: int, t_ns: int) -> None:
         """Report the kind of a SYNC to the devices that hear it, each with the number of SYNCs that it missed before.
 
-        heard: how often each device hears it; the second time counts as repeated. takers: 1 for each device that takes
-        its length, else 0: to that one it is of wrong length. lost: SYNCs that the counter skipped, missed by all.
+        heard: how often each device hears it; the second time counts as repeated. A SYNC that a device doesn't hear is
+        kept as missed for its next report. takers: 1 for each device that takes its length, else 0: to that one it is
+        of wrong length. lost: SYNCs that the counter skipped, missed by all. t_ns: the bench's time.
         """
         for place, device in enumerate(self._devices):
             self._unheard[place] += lost

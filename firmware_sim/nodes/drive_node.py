@@ -73,7 +73,8 @@ class DriveNode(Application):
         """Connect the node to its device, whose application it becomes.
 
         `place`: 0 for Drive1, 1 for Drive2. `described`: the arm, with the wiring and the counts of its drives.
-        `is_free_running`: time passes without SYNC, so SYNC is watched.
+        `is_free_running`: time passes without SYNC, so SYNC is watched. Raises CodecError when the DBC lacks the
+        drive's command or feedback.
         """
         self.device = device
         self.motor_mode = DriveMode.OFF
@@ -210,9 +211,9 @@ class DriveNode(Application):
     def on_sync(self, position: int, velocity: int, t_ns: int, *, is_distorted: bool = False) -> None:
         """Take the measured values, carry out the waiting command, check the watchdogs, and command the motor.
 
-        `position`, `velocity`: sampled at this SYNC, in counts of POSITION_LSB_RAD and VELOCITY_LSB_RAD_S.
-        `is_distorted`: a fault changed the velocity, so it is used in place of the motor's own where the contract has
-        another LSB.
+        `position`, `velocity`: sampled at this SYNC, in counts of POSITION_LSB_RAD and VELOCITY_LSB_RAD_S. t_ns: the
+        bench's time. `is_distorted`: a fault changed the velocity, so it is used in place of the motor's own where the
+        contract has another LSB.
         """
         t_ns = self._clock.own_ns(t_ns)
         self._patience.sync_ns = t_ns
@@ -251,9 +252,9 @@ class DriveNode(Application):
         self._drive_motor()
 
     def mind_length(self, is_right: bool, t_ns: int) -> None:
-        """Trip the length watchdog if a command frame has a wrong length, else clear it.
+        """Trip the length watchdog if an RPDO's frame has a wrong length, else clear it.
 
-        t_ns: the device's own time.
+        It is a warning: the drive doesn't fault. t_ns: the device's own time.
         """
         if not is_right:
             self.device.trip(Watchdog.LENGTH, t_ns)
@@ -263,7 +264,8 @@ class DriveNode(Application):
     def on_lost_sync(self, t_ns: int) -> None:
         """Count a SYNC that this drive has not heard as one without a command.
 
-        Check motor and standstill, and command the motor. Benches that count lost SYNCs by the SYNC counter call it.
+        Too many latch a fault of an enabled drive. Check motor and standstill, and command the motor. Benches that
+        count lost SYNCs by the SYNC counter call it. t_ns: the bench's time.
         """
         t_ns = self._clock.own_ns(t_ns)
         self._miss_command(t_ns)
@@ -298,7 +300,8 @@ class DriveNode(Application):
     def fail(self, code: int, t_ns: int) -> None:
         """Latch a fault with this error code, 0x603F, now or once the drive has power.
 
-        It returns after each reset until `mend`.
+        Until `mend` a fault reset has no effect, and the fault returns after a reset of the node. A fault that is
+        latched already keeps its code. t_ns: the bench's time.
         """
         self._failure = code
         self._feel_failure(self._clock.own_ns(t_ns))
@@ -388,7 +391,9 @@ class DriveNode(Application):
     def _obey(self, controlword: int, t_ns: int) -> None:
         """Carry out the command of a controlword, if it has one that this state allows.
 
-        Enable operation without a PDO that brings commands trips a watchdog in place of it.
+        Enable operation in Switched on trips a watchdog instead if no PDO brings commands, and waits for `enable_s` of
+        the habits; in a quick stop it acts only if that stays. Any other command clears that watchdog. Shutdown and
+        disable operation of an enabled drive may brake first; further ones during that do nothing.
         """
         event = decode_command(controlword, self._controlword)
         if event is None:
@@ -543,7 +548,11 @@ class DriveNode(Application):
             self._fault(Watchdog.COMMAND, t_ns)
 
     def _watch_bus(self, t_ns: int) -> int:
-        """Latch a fault if SYNC is missing or an RPDO is late; return when to check again, ns of the device."""
+        """Latch a fault if SYNC is missing or an RPDO is late; return when to check again, ns.
+
+        SYNC counts only if `is_free_running`. Both times are of the device's own clock; the result is `t_ns` after a
+        fault.
+        """
         due_ns = NEVER_NS
         if self.is_free_running:
             due_ns = self._patience.sync_due_ns

@@ -217,14 +217,18 @@ class Patience:
 
     @property
     def is_command_missing(self) -> bool:
-        """Whether 0x2200 SYNCs or more have come since the last command; True before the first command."""
+        """Whether 0x2200 SYNCs or more have come since the last command; True before the first command.
+
+        Always False for a drive that lacks 0x2200.
+        """
         return self.silent_syncs >= self._values[_SYNCS]
 
     @property
     def sync_due_ns(self) -> int:
         """Time on the device's clock from which SYNC counts as missing, ns: 0x2201 tenths of a period after the last.
 
-        NEVER_NS while 0x1006 is 0.
+        A drive that lacks 0x2201 waits for 1.5 periods. NEVER_NS while 0x1006 is 0; a drive whose EDS gives a period
+        keeps its last period then.
         """
         if not self._period_us:
             return NEVER_NS
@@ -241,9 +245,10 @@ class Patience:
 
 
 def velocity_lsb(codec: Codec, number: int, factor: float) -> float | None:
-    """Return a drive's LSB of velocity, rad/s: the contract's divided by `factor`; None if it is VELOCITY_LSB_RAD_S.
+    """Return a drive's LSB of velocity, rad/s: the contract's divided by `factor`; None if that is VELOCITY_LSB_RAD_S.
 
-    Then the body's counts fit as they are. number: of the drive, 1 or 2.
+    With None the counts of the emulated arm are sent as they are. number: of the drive, 1 or 2. Raises CodecError if
+    the DBC lacks its feedback.
     """
     message = codec.message(f"Drive{number}Feedback")
     scale = message.values[message.place("velocity")].scale / factor

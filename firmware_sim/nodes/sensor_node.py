@@ -46,6 +46,7 @@ class SensorNode(Application):
 
         `number`: 1 or 2, as in the DBC's names. `converter_ends`: lowest and highest counts that the converter gives,
         which mean overload. `temperature_C`: of the joint, 0x2111. `count_Nm`: torque sent for a converter's count.
+        Raises CodecError when the DBC lacks the sensor's torque.
         """
         self.device = device
         self.has_news = False
@@ -79,7 +80,8 @@ class SensorNode(Application):
     def on_sync(self, counts: int) -> None:
         """Take the torque sampled at this SYNC, in the converter's counts; update status and a running autozero.
 
-        A torque beyond the signal's range is limited to it.
+        The mean of `AUTOZERO_SAMPLES` samples becomes the zero of the torque that is sent, from the last of them on. A
+        torque beyond the signal's range is limited to it.
         """
         status = self._error_bits
         if counts >= self._highest_count:

@@ -170,7 +170,7 @@ class FaultSettings:
 
     @property
     def onset_ns(self) -> int:
-        """Onset, ns since power-on or since the drives were enabled (`is_from_power_on`)."""
+        """Onset, ns since power-on or since the drives were enabled (`is_from_power_on`); 0 without `at_s`."""
         return round((self.at_s or 0.0) * 1e9)
 
     @property
@@ -190,7 +190,11 @@ class FaultSettings:
 
     @property
     def nodes(self) -> tuple[int, ...]:
-        """Places in `NODES` of the devices that the fault affects; () for the host."""
+        """Places in `NODES` of the devices that the fault affects; () for the host.
+
+        Without a node, or with `all`, they are all devices that can have the fault's frame, or all devices without a
+        frame.
+        """
         names: tuple[str | None, ...] = (self.node,)
         if self.node in (None, ALL):
             names = FRAME_NODES[self.frame] if self.frame is not None else NODES
@@ -279,7 +283,10 @@ def check_rows(rows: Sequence[FaultSettings]) -> None:
 
 
 def device_ids(rows: Iterable[FaultSettings], right_ids: Sequence[int]) -> tuple[int, ...]:
-    """Return the node ids of the devices, in the order of `NODES`: `right_ids`, changed by faults of node ids."""
+    """Return the node ids of the devices, in the order of `NODES`: `right_ids`, changed by faults of node ids.
+
+    A fault `same_as` takes the other node's right id, even if another fault changes that.
+    """
     ids = list(right_ids)
     for row in rows:
         place = NODES.index(row.node) if row.node in NODES else -1

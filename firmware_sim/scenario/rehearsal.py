@@ -264,7 +264,10 @@ def _rods(length_m: Pair, mass_kg: Pair) -> _Links:
 
 
 def _heavy_enough(length_m: Pair, rated_Nm: Pair) -> Pair:
-    """Return the masses of uniform rods, kg, that their rated torque accelerates about as it does profile P's."""
+    """Return the masses of uniform rods, kg, that their rated torque accelerates about as it does profile P's.
+
+    Link 1 has at least half the mass of link 2.
+    """
     (l1, l2), (r1, r2) = length_m, rated_Nm
     alpha, _, gamma = _MODEL.inertia()
     m2 = 3.0 * gamma * r2 / _MODEL.rated_torque_Nm[1] / l2**2
@@ -427,9 +430,10 @@ _LENGTHS: Final = ("x_m", "y_m", "radius_m")
 
 
 def _fit(table: dict[str, Any], settings: Settings, links: _Links, rated: Pair, assumed: list[str]) -> None:
-    """Scale a scenario's table, made for profile P, to the arm, in place: start pose, places, forces, payloads.
+    """Fit a scenario's table, made for profile P, to the arm, in place: scale places, forces and payloads.
 
-    Appends a line to `assumed` if a factor isn't 1.
+    A start pose is replaced by the corner where the trajectory begins. Keys that the table lacks stay absent. Appends a
+    line to `assumed` if a factor of places or torques isn't 1.
     """
     length_m = links.length_m
     longer = length_m[0] / _MODEL.link_length_m[0], length_m[1] / _MODEL.link_length_m[1]

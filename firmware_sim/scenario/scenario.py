@@ -95,7 +95,10 @@ class ExpectSettings:
 
     @property
     def text(self) -> str:
-        """The expectation in a few words: adaptations, detections, false alarms and misses if any, fault, end."""
+        """The expectation in a few words: adaptations, detections, false alarms and misses if any, fault, end.
+
+        The end is left out if it is `finished` or `fault`.
+        """
         words = [f"{self._count('adaptations')} adapted", f"{self._count('contacts')} detected"]
         words += [f"{self._count(key)} {word}" for key, word in _TROUBLES if self._count(key) != "0"]
         if self.fault is not None:
@@ -147,7 +150,8 @@ class ScenarioOutcome(NamedTuple):
 def deviations(expect: ExpectSettings, outcome: ScenarioOutcome) -> tuple[str, ...]:
     """Return the differences of an outcome from an expectation, a line each; () if it is as expected.
 
-    A bound on delay or force is not checked where the outcome is None.
+    A time that is expected within bounds but is None is a difference. A bound on delay or force is not checked where
+    the outcome is None.
     """
     found = []
     for key in ("end", "fault"):

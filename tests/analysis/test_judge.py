@@ -7,6 +7,7 @@ import pytest
 
 from adacd_hil.log.logged_run import begins_alarm, enters_react
 from adacd_hil.records import SchemeState
+from adacd_hil.score.emulator_truth import HostCycles, placed_contacts
 from adacd_hil.score.judge import (
     Detection,
     Score,
@@ -16,6 +17,7 @@ from adacd_hil.score.judge import (
     explained_until,
     judge,
 )
+from adacd_hil.settings.configuration_files import load_settings
 
 MS = 1_000_000
 
@@ -139,3 +141,12 @@ def test_windows_of_contacts_do_not_overlap():
 def test_a_reaction_is_an_alarm_if_something_touches(previous, is_over, is_reported, is_alarm):
     states = (np.array([state], np.uint8) for state in (previous, SchemeState.REACT))
     assert begins_alarm(*states, np.array([is_over]), np.array([is_reported])).tolist() == [is_alarm]
+
+
+def test_a_contact_from_before_the_first_cycle_is_not_armed():
+    cycle, monitor = np.arange(1000, 1010), SchemeState.MONITOR
+    host = HostCycles(cycle, cycle * MS, np.full(10, monitor, np.uint8), np.full((10, 2), 0.1))
+    onsets = (900, 1000, 1001)
+    contacts = [TrueContact(1, 1, cycle=np.arange(onset, 1005), tau_ext=np.ones((1005 - onset, 2))) for onset in onsets]
+    placed = placed_contacts(contacts, host, load_settings("paper"))
+    assert [contact.is_armed for contact in placed] == [False, False, True]

@@ -118,6 +118,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("budget --dbc identifiers.dbc", USAGE, ("Drive1Emcy and Drive2Emcy have the same identifier",)),
     ("budget --dbc many.dbc", USAGE, ("1029 messages are more than 1000",)),
     ("budget --dbc arm_fdd", USAGE, ("contract 'arm_fdd' is neither in dbc/ nor a file", "did you mean 'arm_fd'?")),
+    (f"budget --dbc {'a' * 300}", USAGE, ("is neither in dbc/ nor a file",)),
     (f"{INIT} --urdf arm.urdf", USAGE, ("3 joints move (joint1, joint2, joint3), an arm has 2 here", "with --lock")),
     (f"{INIT} --length-m 350 300", USAGE, ("350.0 m is above 5 m", "350 mm are 0.35 m")),
     ("init my-arm.toml --no-bus --yes", USAGE, ("my-arm.toml exists", "--force to replace it")),

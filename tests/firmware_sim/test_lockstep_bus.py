@@ -72,7 +72,7 @@ class Devices(Bus):
         self.queue.clear()
 
     def close(self) -> None:
-        self.queue.clear()
+        self.is_closed = True
 
 
 class Rig:
@@ -219,6 +219,10 @@ def test_devices_that_say_nothing_to_sync_have_gone() -> None:
     rig.bus.send(SYNC, b"\x01")
     with pytest.raises(SilenceError, match="silence on devices for 0 s"):
         rig.bus.receive(0.0007)
+    rig.bus.send(SYNC, b"\x02")
+    with pytest.raises(SilenceError):
+        rig.bus.close()
+    assert rig.devices.is_closed
 
 
 def test_without_sync_devices_live_with_the_hosts_clock() -> None:

@@ -64,8 +64,9 @@ def show_settings(
 def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tuple[str, ...]) -> list[dict[str, str]]:
     """Return a row per setting, all as text by name: key, effective value, default, and origin of the value.
 
-    given: changes as KEY=VALUE, which override the configuration. keys: keys or groups of the settings to return; ():
-    all. Raises ConfigError for an invalid configuration or change, CommandError for an unknown key or group.
+    Settings in the rows of a list have no row. given: changes as KEY=VALUE, which override the configuration. keys:
+    keys or groups of the settings to return; (): all. Raises ConfigError for an invalid configuration or change,
+    CommandError for an unknown key or group.
     """
     from adacd_hil.control.configuration_check import origins_of
     from adacd_hil.settings.configuration import Settings

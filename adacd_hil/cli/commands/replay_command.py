@@ -185,9 +185,9 @@ def _open(
 ) -> "tuple[ReplaySource, bool]":
     """Return a log or a recording, and whether it is a recording without a log.
 
-    against: log of the run that a recording is of. Raises CommandError for
-    a recording without a log and without --config, and for --profile or --dbc where a log has its own; LogError,
-    ConfigError or CodecError if one can't be read or used.
+    A missing file counts as a log. against: log of the run that a recording is of. Raises CommandError for a recording
+    without a log and without --config, and for --profile or --dbc where a log has its own; LogError, ConfigError or
+    CodecError if one can't be read or used.
     """
     from adacd_hil.device.contract import load_contract
     from adacd_hil.device.device_files import place_devices

@@ -80,9 +80,10 @@ def run_on_bus(
     """Run the scheme on a bus until its end; return the result, see `summarise`, and the exit status.
 
     clock: "lockstep" or "realtime". out: folder of the log; None: a new one by date. tare, history: files with the
-    offsets of a tare, and with the arm's certificates; this run's are added. live: serves the log to viewers. scenario:
-    name of an emulated arm's scenario, whose user makes the requests. without_anchor: the user accepts that no anchor
-    bounds the torque offsets.
+    offsets of a tare, and with the arm's certificates, to which those of this run are added at its end. If that fails,
+    the error is printed and in the result, and OK becomes PARTIAL. live: serves the log to viewers. scenario: name of
+    an emulated arm's scenario, whose user makes the requests. without_anchor: the user accepts that no anchor bounds
+    the torque offsets.
 
     Raises CommandError for options that don't fit the bus, or if the user declines; ConfigError or CodecError for
     settings or files that can't be used, BusMissingError for the bus, LogError or OSError for the folder and log.
@@ -197,7 +198,11 @@ def ask_without_anchor(joints: list[int], arguments: str) -> None:
 
 
 def summarise(summary: SessionSummary) -> dict[str, Any]:
-    """Return the result of a session by name, for JSON and `as_text`; print its error, if any, on standard error."""
+    """Return the result of a session by name, for JSON and `as_text`; print its error, if any, on standard error.
+
+    A run that broke off has `broke_off` in place of cycles, state, fault and data; one that didn't start has none of
+    these.
+    """
     described: dict[str, Any] = {"log": str(summary.log.path), "scheduler": summary.grant.scheduler}
     if summary.error:
         described["error"] = summary.error

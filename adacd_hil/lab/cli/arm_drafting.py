@@ -727,8 +727,8 @@ class Drafting:
     def _limit(self, key: str, proposal: Fact) -> Fact:
         """Return the two values of `arm.KEY`, within its bounds, by option or user, with their source.
 
-        proposal: for the user, or taken with `--yes`; an answer above a known one is added to the warnings. Raises
-        ConfigError for a wrong option, CommandError without an answer.
+        proposal: for the user, or taken with `--yes`. An answer above a proposal that is no guess, and not just the
+        rated torque, is added to the warnings. Raises ConfigError for a wrong option, CommandError without an answer.
         """
         given = getattr(self.options, key.lower())
         option = f"--{key.lower().replace('_', '-')}"

@@ -33,9 +33,10 @@ def judge(
 ) -> tuple[Codec, Budget, list[str]]:
     """Compute whether the frames of a contract meet their deadlines; return its codec, the budget, and remarks.
 
-    dbc: name or file; None: the contract of the configuration's devices, loaded or composed. A value that is None comes
-    from the DBC, else from the configuration. arms: number of arms on the bus. Raises CodecError, ConfigError if
-    contract or configuration can't be used.
+    dbc: name or file; None: the contract of the configuration's devices, loaded or composed. period_us: None: the
+    DBC's, else the configuration's. bitrate, data_bitrate: bit/s; None: the DBC's. arms: number of arms on the bus;
+    None: the configuration's. A remark names a period or bit rate of the configuration that isn't used. Raises
+    CodecError, ConfigError if contract or configuration can't be used.
     """
     settings = load_settings(config)
     codec = load_contract(settings, place_devices(settings)) if dbc is None else load_codec(find_contract(dbc))

@@ -1,5 +1,6 @@
 """Communication test: cycles at zero torque for a while, and a verdict on the connection."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +123,8 @@ def _run(
         except BusError as error:
             raise CommandError(str(error), ExitCode.SAFETY_STOP) from None
         finally:
-            master.stop()
+            with suppress(BusError):  # the first error is the cause
+                master.stop()
 
 
 def _exit_code(test: CommunicationTest, fault: FaultReason, is_interrupted: bool, has_lost_log: bool) -> ExitCode:
@@ -139,7 +141,8 @@ def _exit_code(test: CommunicationTest, fault: FaultReason, is_interrupted: bool
 def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection, achieved: dict[str, str]) -> Recorder:
     """Create the log of a test in the folder `out`, and the folder; attach contract and settings; return its recorder.
 
-    achieved: metadata on the host. Raises LogError if it can't be created.
+    achieved: metadata on the host. Raises LogExistsError if a log is there, LogError if it can't be created, OSError if
+    the folder can't be.
     """
     out.mkdir(parents=True, exist_ok=True)
     return Recorder(

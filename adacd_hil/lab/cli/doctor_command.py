@@ -27,11 +27,12 @@ _MARKS = {Status.OK: "ok", Status.WARNING: "WARNING", Status.FAILED: "FAILED", S
 
 
 def examine(connection: Connection, is_moving: bool) -> tuple[list[Finding], ExitCode]:
-    """Run all checks of configuration, host and arm; return their findings and the exit status.
+    """Run the checks of configuration, host and arm; return their findings and the exit status.
 
-    The status is FAILURE if a check failed, else OK. The drives stay disabled, the nodes end pre-operational.
-    is_moving: ask the user, on a terminal, to move joints by hand. Raises ConfigError, CodecError if configuration or
-    contract can't be used.
+    A check is skipped if one that it needs has failed. The status is FAILURE if a check failed, else OK. The drives
+    stay disabled; nodes that were reset end pre-operational. Prints a line per finding meanwhile. is_moving: ask the
+    user to move joints by hand; without a terminal those checks are skipped. Raises ConfigError, CodecError if
+    configuration or contract can't be used, KeyboardInterrupt if the user interrupts.
     """
     settings, codec, devices = connection.load()
     bitrate, data_bitrate = read_bitrates(codec)

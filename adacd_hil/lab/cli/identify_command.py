@@ -97,8 +97,9 @@ def identify(
 def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
     """Write the map of a recording by a URDF, and print its guesses; return OK. given: recording and URDF.
 
-    map_path: file to write; None: map.toml beside the recording. Raises CommandError for other files, or if another map
-    is in the way; ConfigError, LogError if recording and URDF don't give a map.
+    map_path: file to write; None: map.toml beside the recording. An equal map may be there already. Raises CommandError
+    for other files, or if another map is in the way; ConfigError, LogError if recording and URDF don't give a map;
+    OSError if it can't be written.
     """
     from adacd_hil.lab.offline.map_draft import draft_map, map_text
     from adacd_hil.lab.offline.recording_map import parse_map

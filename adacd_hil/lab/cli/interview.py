@@ -78,7 +78,10 @@ class Interview:
                 tell(str(error))
 
     def confirm(self, answer: bool | None, question: str) -> bool:
-        """Return the option's answer, unless None; else ask yes or no on a terminal; False elsewhere."""
+        """Return the option's answer, unless None; else ask yes or no on a terminal, Enter for no; False elsewhere.
+
+        With `--yes` the user isn't asked: False, too.
+        """
         if answer is not None:
             return answer
         return self.is_asking and click.confirm(in_line(question), default=False, err=True)

@@ -86,9 +86,10 @@ class LiveMonitor:
             self._cycle = self._client.decode(message)
 
     def describe(self) -> dict[str, Any]:
-        """Return the latest values as a dictionary for JSON; times are s since the first message.
+        """Return the latest values as a dictionary for JSON; times are s of the log's clock since the first message.
 
-        The keys of /scheme, and "timing", are missing until a message of /scheme, or of /cycle, has come.
+        Of contacts and events it has the last few. The keys of /scheme, and "timing", are missing until a message of
+        /scheme, or of /cycle, has come.
         """
         begin_ns = self._log_ns if self._begin_ns is None else self._begin_ns
         described: dict[str, Any] = {"messages": self.messages, "t_s": round((self._log_ns - begin_ns) * 1e-9, 3)}

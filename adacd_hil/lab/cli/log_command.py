@@ -162,7 +162,10 @@ def merge(logs: tuple[str, ...]) -> ExitCode:  # noqa: ARG001
 
 
 def info_as_text(info: "LogInfo") -> str:
-    """Return the contents of a log as text: main facts, errors and problems, then tables of topics and metadata."""
+    """Return the contents of a log as text: main facts, errors and problems, then attachments, topics and metadata.
+
+    Of the errors it has the first `_TOLD_FAULTS`, and the number of the others. Topics without messages are left out.
+    """
     from adacd_hil.log.types.topics import CONTACT, EVENTS
 
     ending = f", {info.ending}" if info.ending else ", without an end" if info.problems else ""
@@ -331,7 +334,8 @@ def export(
 def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
     """Return text and path of a recording's DBC: of `dbc` if given, else from an MCAP log, else the package's.
 
-    Raises CodecError if the DBC can't be read, LogError for an MCAP file that can't be.
+    An MCAP file, by its suffix, that lacks a DBC or can't be read gives the package's. Raises CodecError if a DBC file
+    can't be read.
     """
     from adacd_hil.log.log_files import DBC_NAME
     from adacd_hil.log.log_walk import attachment

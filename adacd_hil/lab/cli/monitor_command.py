@@ -101,8 +101,9 @@ class Monitor:
     def describe(self) -> dict[str, Any]:
         """Return the traffic so far as a dictionary for JSON; its load is of the time since the previous call.
 
-        It has the keys of `BusView.describe`; bus_state, of the controller, "" for other than SocketCAN; and
-        not_processed: frames that the interface carried and this process has not read, None if unknown.
+        It has the keys of `BusView.describe`; bus_state, of the controller, read once per `_LINK_S`, "" for other than
+        SocketCAN, "gone" without the interface; and not_processed: frames that the interface carried and this process
+        has not read, None if unknown.
         """
         now_ns = self._clock.now_ns()
         if self._link_name is not None and now_ns - self._state_ns >= _LINK_S * 1e9:
@@ -132,8 +133,8 @@ def show_tables(
 ) -> None:
     """Listen for so many seconds, then print a table, or JSON; None: print tables until the listening ends.
 
-    listen: for a duration, s; False: it has ended. describe: returns what was heard, as_text: that as a table. The last
-    table is printed even if the bus fails.
+    Of as_json, only the last table is JSON. listen: for a duration, s; False: it has ended. describe: returns what was
+    heard, as_text: that as a table. The last table is printed even if the bus fails; then BusError is raised.
     """
     screen = Screen(seconds is None and moves_cursor(sys.stdout), write_screen)
     clock = MonotonicClock()

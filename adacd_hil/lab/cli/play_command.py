@@ -185,9 +185,10 @@ def _run(
 ) -> tuple[dict[str, Any], ExitCode]:
     """Play a recording onto a bus, `times` times (0: until interrupted), and close the bus.
 
-    speed: factor on the recording's. longest_pause_s: to which pauses are cut; None: they stay. Return counts and
-    lateness of the frames for JSON, and the exit status: INTERRUPTED, PARTIAL for a damaged recording, FAILURE if no
-    frame was sent, else OK. Raises LogError if the recording can't be read, CommandError if the bus fails.
+    Requests real-time scheduling for this process, and prints refusals. speed: factor on the recording's.
+    longest_pause_s: to which pauses are cut; None: they stay. Return counts and lateness of the frames for JSON, and
+    the exit status: INTERRUPTED, PARTIAL for a damaged recording, FAILURE if no frame was sent, else OK. Raises
+    LogError if the recording can't be read, CommandError if the bus fails.
     """
     from adacd_hil.cli.connection import on_interrupt
     from adacd_hil.lab.logs.playback import play as play_frames

@@ -189,8 +189,9 @@ def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "R
 def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progress) -> list["RunSummary"]:
     """Return the runs of a folder that meet the conditions `asked`, oldest first; [] if none does.
 
-    is_judging: judge runs without a report by their logs. Raises LogError for a folder without a run, CommandError if
-    no run is of an arm in `asked`, or of a scenario there that isn't built in either.
+    is_judging: judge runs without a report by their logs, before the verdict is looked at; nothing is stored. Raises
+    LogError for a folder that is missing or has no run, CommandError if no run is of an arm in `asked`, or of a
+    scenario there that isn't built in either.
     """
     from adacd_hil.lab.runs import run_table
     from adacd_hil.lab.runs.run_summary import NOT_JUDGED, find_runs, judged, summarise

@@ -174,7 +174,7 @@ def _plan(
 def _files(logs: Sequence[Path]) -> list[Path]:
     """Return the logs; a folder stands for every run.mcap below it.
 
-    Raises CommandError if a log or all of them are missing.
+    Raises CommandError for a log that doesn't exist, or a folder without one.
     """
     found: list[Path] = []
     for given in logs:
@@ -203,7 +203,8 @@ def _seeds(text: str) -> range:
 def simulate_task(task: "Task") -> "list[Values]":
     """Play a task's scenario with the settings of each row; return a row of results or of an error for each, in order.
 
-    The results are those of a replay of the run's log, which is then deleted.
+    The results are those of a replay of the run's log, which is then deleted. A run that didn't start, and errors of
+    configuration, contract or log, become rows; other errors are raised.
     """
     return [_simulate(task, row) for row in task.rows]
 

@@ -62,9 +62,10 @@ def tare_on_bus(
     """Tare the sensors of an arm on a bus, and write file `out`; return the tare, and the copy of an older file.
 
     The copy is None without one. poses, seconds: number of poses, and time per pose; None: those of the configuration.
-    clock: "lockstep" or "realtime". auto_zero: the sensors set their own zero first. Raises CommandError if
-    the tare is refused or the arm not found; ConfigError, CodecError if configuration, contract or an older file can't
-    be used; BusError if the bus fails; OSError if the file can't be written.
+    clock: "lockstep" or "realtime". auto_zero: the sensors set their own zero first. Raises CommandError if the tare is
+    refused, the arm not found, another host runs it, or the clock doesn't fit the bus; ConfigError, CodecError if
+    configuration, contract or an older file can't be used; BusError if the bus fails; KeyboardInterrupt if the user
+    interrupts or suspends it; OSError if the file can't be written.
     """
     interface, channel = connection.interface, connection.channel
     check_clock(clock, interface, channel)

@@ -124,7 +124,7 @@ class ArmExamination:
     def joint_values(self, name: str) -> NDArray[np.float64]:
         """Return a quantity of the stored cycles with complete data (n, 2), n = 0 if there are none.
 
-        name: "q", "dq" or "tau_J".
+        name: "q", rad, "dq", rad/s, or "tau_J", Nm.
         """
         return _joint_values([cycle.state for cycle in self.cycles if cycle.state.is_complete], name)
 
@@ -140,7 +140,10 @@ def open_arm_bus(patient: ArmExamination) -> Finding:
 
 
 def check_other_masters(patient: ArmExamination) -> Finding:
-    """Listen for `LISTEN_S`, and fail if a frame comes that only a host sends. NMT is allowed on a shared bus."""
+    """Listen for `LISTEN_S`, and fail if a frame comes that only a host sends. NMT is allowed on a shared bus.
+
+    The frames heard are then removed from the tap. Raises BusError if the bus fails.
+    """
     traffic = Traffic()
     listen(patient.tap, patient.clock, LISTEN_S, traffic)
     patient.tap.take_passed()
@@ -154,7 +157,10 @@ def check_other_masters(patient: ArmExamination) -> Finding:
 
 
 def check_nodes(patient: ArmExamination) -> Finding:
-    """Fail if an expected node is missing or has another identity; warn of nodes that the configuration lacks."""
+    """Fail if an expected node is missing, doesn't answer SDO or has another identity; warn of nodes not configured.
+
+    The wire version and layout digest aren't compared here. Raises BusError if the bus fails.
+    """
     slaves = patient.master.slaves
     verdicts = compare(survey(patient.tap, patient.clock, 0.0), slaves)
     wrong = [f"node {node}: {text}" for node, text in verdicts.items() if text not in ("", "unexpected")]
@@ -236,9 +242,10 @@ def check_torque_scale(patient: ArmExamination) -> Finding:
 
 
 def check_position_scale(patient: ArmExamination) -> Finding:
-    """Describe each drive's increments per revolution of the joint; warn if no object tells them, or of its polarity.
+    """Describe each drive's increments per revolution of the joint; warn if no object tells them.
 
-    The set-up has compared the increments that an object tells. Raises DeviceError.
+    Also warn of a polarity, 0x607E, that reverses some of position, velocity and torque, and not all. The set-up has
+    compared the increments that an object tells. Raises DeviceError if a drive refuses a read or doesn't answer.
     """
     drives = patient.master.slaves[:JOINTS]
     return _together([*map(_increments, drives), *(_polarity(slave) for slave in drives if slave.has(0x607E))])
@@ -252,7 +259,10 @@ def _together(findings: Sequence[Finding]) -> Finding:
 
 
 def _rated_torque(slave: Slave, rated_Nm: float) -> Finding:
-    """Return the finding on a motor's rated torque, 0x6076, and that of its joint, `rated_Nm`. Raises DeviceError."""
+    """Return the finding on a motor's rated torque, 0x6076, and that of its joint, `rated_Nm`.
+
+    A warning if the EDS has no 0x6076. Raises DeviceError if the drive refuses the read or doesn't answer.
+    """
     if not slave.has(0x6076):
         return warning(
             f"{slave.name}: its EDS has no 0x6076, so nothing confirms {rated_Nm:g} Nm at the joint",
@@ -268,7 +278,10 @@ def _rated_torque(slave: Slave, rated_Nm: float) -> Finding:
 
 
 def _torque_of_count(slave: Slave) -> Finding:
-    """Return the finding on the torque of one count of a sensor; the set-up needs 0x6131 and 0x6132 to compare it."""
+    """Return the finding on the torque of one count of a sensor: a warning if the EDS lacks 0x6131 or 0x6132.
+
+    With both, the set-up has compared it. Reads nothing.
+    """
     count, channel = f"{slave.device.settings.scale.torque_Nm:g} Nm a count", sensor_channel(slave)
     lacking = [str(ObjectName(index, channel)) for index in (0x6131, 0x6132) if not slave.has(index, channel)]
     if lacking:
@@ -280,7 +293,10 @@ def _torque_of_count(slave: Slave) -> Finding:
 
 
 def _increments(slave: Slave) -> Finding:
-    """Return the finding on a drive's increments per revolution of the joint. Raises DeviceError."""
+    """Return the finding on a drive's increments per revolution of the joint: a warning if no object tells them.
+
+    Raises DeviceError if the drive refuses a read or doesn't answer.
+    """
     scale = slave.device.settings.scale
     units = read_drive_units(lambda *place: slave.read(*place) if slave.has(*place) else None, scale.gear_ratio)
     count = f"{scale.increments_per_joint_rev:.10g} increments per revolution of the joint"
@@ -327,7 +343,7 @@ def check_protection(patient: ArmExamination) -> Finding:
 def play_cycles(patient: ArmExamination) -> Finding:
     """Start the nodes, run cycles for `cycle_s` with disabled drives; store cycles and received traffic for the checks.
 
-    Raises BusError if the bus fails.
+    Frames that passed the tap before are dropped. Raises BusError if the bus fails.
     """
     patient.tap.take_passed()
     patient.master.start()
@@ -371,9 +387,10 @@ def check_load(patient: ArmExamination) -> Finding:
 
 
 def check_heartbeats(patient: ArmExamination) -> Finding:
-    """Fail if a node sent no heartbeat in the stored cycles, or was not Operational; warn if it came too rarely.
+    """Fail if a node sent no heartbeat in the stored cycles, or its last one is not Operational.
 
-    A node whose heartbeat can't be set by its EDS isn't watched: warn of it.
+    Warn if heartbeats came at less than two thirds of their rate. A node whose heartbeat can't be set by its EDS isn't
+    watched: warn of it. Only the worst of these is reported.
     """
     expected_Hz = 1e3 / patient.settings.bus.heartbeat_ms
     silent, odd, slow, unwatched = [], [], [], []
@@ -404,9 +421,10 @@ def check_heartbeats(patient: ArmExamination) -> Finding:
 
 
 def check_devices(patient: ArmExamination) -> Finding:
-    """Fail if a value is outside `low` and `high` of its device's profile, or missing; warn of other faults.
+    """Fail if a value is outside `low` and `high` of its device's profile, or its status is missing or old.
 
-    Others are faults of the drives, and EMCYs and other events of the devices.
+    Warn of other faults of the drives, values that are too old, other senders, and EMCYs and other events of the
+    devices, which are taken from the master. A sensor's status isn't looked at here.
     """
     lines = [line for line in describe_faults(patient.arm) if ": status" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
@@ -529,7 +547,8 @@ _WANTED_DEG = 10.0
 def _check_joint(joint: int) -> Callable[[ArmExamination], Finding]:
     """Return the check of a joint's signs, for which the user moves the joint by hand. joint: from 0.
 
-    The check is skipped if no user can be asked, or there are no complete cycles.
+    It runs cycles for `move_s`, or until a joint has moved by `_WANTED_DEG`. The check is skipped if no user can be
+    asked, or there are no complete cycles.
     """
 
     def check(patient: ArmExamination) -> Finding:
@@ -565,8 +584,9 @@ def _has_moved(way: Vector) -> bool:
 def _judge_motion(joint: int, way: Vector, work_J: float) -> Finding:
     """Return the finding on a motion by hand toward +q: whether the right joint moved, with the right signs.
 
-    joint: from 0. way (2,): travel of both joints, rad. work_J: of the joint, as of `_judge_work`. A warning if it
-    moved too little, with the other joint, or with too little torque to tell the sign.
+    joint: from 0. way (2,): travel of both joints, rad. work_J: of the joint, as of `_judge_work`. A failure if the
+    other joint moved further, or q decreased. A warning if it moved too little, the other joint moved along, or too
+    little torque tells the sign.
     """
     number, moved = joint + 1, int(np.argmax(np.abs(way)))
     text = "moved {:+.1f} and {:+.1f} deg, work {:+.4f} J".format(*np.degrees(way), work_J)

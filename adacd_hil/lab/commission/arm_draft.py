@@ -91,8 +91,8 @@ def uniform_rods(link_length_m: Pair, mass_kg: Pair, mounting_deg: Pair) -> Plan
 def _theta(inertia: Pair, moment_kg_m: Pair, outer_kg: float, l1: float, mounting_deg: Pair) -> tuple[float, ...]:
     """Return a1, a2, a3, four times 0 for friction and, unless the axes are vertical, a4 and a5 of two links.
 
-    inertia: of each about its joint, kg m². moment_kg_m: mass times centre of mass, along the line of the link.
-    outer_kg: mass of link 2. l1: length of link 1, m. mounting_deg: as `arm.mounting_deg`.
+    a4 is at least 0. inertia: of each about its joint, kg m². moment_kg_m: mass times centre of mass, along the line of
+    the link. outer_kg: mass of link 2. l1: length of link 1, m. mounting_deg: as `arm.mounting_deg`.
     """
     first, second = inertia
     theta = [first + outer_kg * l1**2 + second, l1 * moment_kg_m[1], second, 0.0, 0.0, 0.0, 0.0]
@@ -541,8 +541,8 @@ def _fast_damping(Kd: Vector, cad_theta: Sequence[float]) -> Iterator[str]:
 def _rest_torque(facts: ArmFacts) -> Entry:
     """Return `safety.rest_torque_Nm` for an arm with gravity, whose load may rest on the sensors.
 
-    It is the default plus gravity's largest torque on joint 1 and a fifth; if the masses are not known, the default
-    plus the larger torque limit, as a guess.
+    It is the default plus gravity's largest torque on joint 1 and a fifth, at most `_MOST_REST_NM`. If the masses are
+    not known, it is the default plus the larger torque limit, as a guess.
     """
     free = load_settings("certified").safety.rest_torque_Nm
     gravity = _gravity(facts, facts.position_limit_deg.value)[0]

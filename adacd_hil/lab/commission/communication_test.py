@@ -74,8 +74,9 @@ class ZeroTorqueLoop:
     ) -> FaultReason:
         """Run cycles for a duration, then disable the drives; return the fault that ended the cycles, NONE without one.
 
-        observe: called with each cycle but those that disable. is_over: ends the cycles earlier when it returns True. A
-        fault counts only if the loop enables the drives. Raises BusError if the bus fails.
+        observe: called with each cycle but those that disable. is_over: ends the cycles earlier when it returns True.
+        After `interrupt` only the cycles that disable are run. A fault counts only if the loop enables the drives.
+        Stores `device_faults`. Raises BusError if the bus fails; the drives are then not disabled.
         """
         last_ns = self._clock.now_ns() + round(duration_s * 1e9) - self._period_ns
         fault = FaultReason.NONE
@@ -89,9 +90,9 @@ class ZeroTorqueLoop:
         return fault
 
     def _fault(self, state: ArmState) -> FaultReason:
-        """Return the fault of a cycle: the arm's, or DATA_AGE if it is enabled and a value is too old.
+        """Return the fault of a cycle: DATA_AGE if the arm is enabled and a value is too old, else the arm's.
 
-        NONE without a fault, and always if the loop doesn't enable the drives.
+        Too old: more than `bus.max_age_cycles`. NONE without a fault, and always if the loop doesn't enable the drives.
         """
         if not self._is_enabling:
             return FaultReason.NONE
@@ -235,7 +236,11 @@ class CommunicationTest:
         }
 
     def load_percent(self) -> float:
-        """Return the bus load, percent, over the last `_LOAD_CYCLES`, sent and received; 0 without cycles."""
+        """Return the bus load, percent, over the last `_LOAD_CYCLES`, sent and received; 0 without cycles.
+
+        Skipped periods count as time. Error frames, and frames of a length that the contract's bus can't have, are left
+        out.
+        """
         meter = LoadMeter(self.bitrate, self.data_bitrate, 0)
         for cycle in self._recent:
             for _, frame in cycle.frames:

@@ -53,8 +53,8 @@ class RecognisedDevice(NamedTuple):
 def recognise(bus: Bus, clock: Clock, nodes: Sequence[Node], kinds: Mapping[int, str]) -> list[RecognisedDevice]:
     """Return the drives and sensors among a survey's nodes that answer, with ratings read from them.
 
-    `kinds`: "drive" or "sensor" by node id, for nodes whose 0x1000 names neither. Sets `layout_digest` of a node if a
-    profile of its vendor and product has 0x2000. Raises BusError if the bus fails.
+    `kinds`: "drive" or "sensor" by node id, for nodes whose 0x1000 names neither. Reads `layout_digest` into a node if
+    a profile of its vendor and product has 0x2000. Raises BusError if the bus fails.
     """
     canopen = CanopenBus(Tap(bus, clock))
     found = []
@@ -101,9 +101,9 @@ _RATINGS = {
 
 
 def _number(remote: Any, index: int, sub: int = 0, is_signed: bool = False) -> int | None:
-    """Read an object of a node as a number; None if it is missing, refused, empty or longer than 8 bytes.
+    """Read an object of a node as a number; None if it is missing, refused, not answered, empty or longer than 8 bytes.
 
-    is_signed: it is in two's complement.
+    is_signed: it is in two's complement. Raises BusError if the bus fails.
     """
     try:
         data = read_object(remote, index, sub)
@@ -120,10 +120,11 @@ def _read_ratings(remote: Any, kind: str) -> DeviceRatings:
 def choose_family(
     drives: Sequence[RecognisedDevice], sensors: Sequence[RecognisedDevice]
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the profiles of two drives and of two sensors: those whose contract has the layout digest that all report.
+    """Return the profiles of two drives and of two sensors, by the layout digest that the devices report.
 
-    If the devices report no digest, several, or that of no profiles: the first profile of each device; "" if it has
-    none.
+    Both drives get one profile, and both sensors: those that all of them may have, and whose contract has this digest.
+    Devices without a digest don't count. If the devices report no digest, several, or that of no profiles: the first
+    profile of each device; "" if it has none.
     """
     digests = {device.node.layout_digest for device in (*drives, *sensors)} - {None}
     combinations = itertools.product(drives[0].profiles or ("",), sensors[0].profiles or ("",))

@@ -85,8 +85,8 @@ def diagnose(
 ) -> list[Finding]:
     """Run the checks in order; call `report` with each finding, and return all findings, with their names.
 
-    A DeviceError or BusError fails its check. A check is skipped if a check that it needs has failed, or was skipped
-    for that reason, here or in `earlier`, the findings of another table.
+    A DeviceError or BusError fails its check; other errors are raised. A check is skipped if a check that it needs has
+    failed, or was skipped for that reason, here or in `earlier`, the findings of another table.
     """
     findings: list[Finding] = []
     # failed or skipped check → the failed check that caused it
@@ -124,7 +124,8 @@ def summarise(findings: Sequence[Finding]) -> str:
 def configuration_checks(settings: Settings, layers: Sequence[ConfigurationLayer] = ()) -> list[Check[Settings]]:
     """Return doctor's checks of a configuration: one of its errors and likely mistakes, and one for each guessed value.
 
-    Guessed are keys in `assumed` of the configuration, and of its device profiles. layers: as of `examine_settings`.
+    The latter always warn. Guessed are keys in `assumed` of the configuration, and of its device profiles; unknown keys
+    of the configuration have no check. layers: as of `examine_settings`.
     """
     known, guesses = known_keys(), dict[str, Finding]()
     for key in settings.assumed:
@@ -296,7 +297,7 @@ def check_controller(_host: Host, link: InterfaceState) -> Finding:
 def check_queue(host: Host) -> Finding:
     """Warn if the transmit queue holds `LONG_QUEUE_FRAMES` or more, outdated commands after a dead bus.
 
-    The check is skipped without SocketCAN.
+    An interface without a queue passes. The check is skipped without SocketCAN.
     """
     if host.link is None:
         return skipped("no SocketCAN interface")
@@ -352,7 +353,10 @@ def request_scheduler(host: Host) -> Finding:
 
 
 def check_throttling(host: Host) -> Finding:
-    """Warn if the kernel lets real-time processes work for less than `_RT_SHARE` of the time; skipped if unknown."""
+    """Warn if the kernel lets real-time processes work for less than `_RT_SHARE` of the time; skipped if unknown.
+
+    It passes if the kernel doesn't limit them.
+    """
     folder = host.root / "proc/sys/kernel"
     try:
         runtime_us = int(_read(folder / "sched_rt_runtime_us"))
@@ -390,7 +394,10 @@ def check_processor(host: Host) -> Finding:
 
 
 def check_isolation(host: Host) -> Finding:
-    """Warn if the processor of the control cycle, `realtime.cpu`, isn't isolated, or isolated ones aren't used."""
+    """Warn if the processor that `realtime.cpu` names isn't isolated, or if it names none and there are isolated ones.
+
+    It passes if `realtime.cpu` names none and none is isolated.
+    """
     isolated = isolated_cpus(host.root / "sys/devices/system/cpu")
     names = ", ".join(map(str, isolated)) or "none"
     isolate = "isolcpus={0} nohz_full={0} rcu_nocbs={0} on the kernel's command line, and no interrupts there"

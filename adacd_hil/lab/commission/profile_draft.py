@@ -183,9 +183,10 @@ def draft_profile(
 ) -> ProfileDraft:
     """Draft the profile of the device that an EDS describes; write no file.
 
-    `ratings`: values read from the device. `kind`: "drive" or "sensor", if 0x1000 names neither. `answers`: given
-    values of `scale`, by key; `velocity_unit` is a code of 0x60A9. Raises ConfigError if the EDS can't be read, its
-    kind is unknown, or it lacks an object or a PDO that a cycle needs.
+    `ratings`: values read from the device. `kind`: "drive" or "sensor", whatever 0x1000 says; "": of `kind_of`.
+    `answers`: given values of `scale`, by key; `velocity_unit` is a code of 0x60A9. Raises ConfigError if the EDS can't
+    be read, its kind is unknown, it lacks an object or a PDO that a cycle needs, or a value isn't one that a profile
+    may have.
     """
     kind = kind or kind_of(eds)
     if not kind:
@@ -203,9 +204,10 @@ def draft_profile(
 
 
 def maker_facts(eds: Path, kind: str) -> ProfileSettings | None:
-    """Return the settings of the shipped profile of the EDS's maker that has `assumed` keys; None if there is none.
+    """Return the settings of the first shipped profile of the EDS's maker that has `assumed` keys; None without one.
 
-    Its values that are not `assumed` hold for all devices of this maker. Raises ConfigError if the EDS can't be read.
+    kind: "drive" or "sensor". Its values that are not `assumed` hold for all devices of this maker. Raises ConfigError
+    if the EDS can't be read.
     """
     vendor, _ = identity_of(eds)
     for _, profile in shipped_profiles(kind):
@@ -345,7 +347,10 @@ class _ProfileWriter(ABC):
         return not any(record.room for is_received in (False, True) for record in self.records(is_received))
 
     def records(self, is_received: bool) -> list[_Record]:
-        """Return the device's PDOs with a usable identifier and a mapping: RPDOs if is_received, else TPDOs."""
+        """Return the device's PDOs with a usable identifier and a mapping, ascending: RPDOs if is_received, else TPDOs.
+
+        Those after the `_MOST_RECORDS`th parameter record are not read.
+        """
         base = _RECEIVED if is_received else _SENT
         found = []
         for number in range(1, _MOST_RECORDS + 1):
@@ -564,8 +569,9 @@ class _DriveWriter(_ProfileWriter):
     def _gear(self, motor_Nm: float) -> tuple[float, list[str]]:
         """Return the gear ratio, and the profile's lines on it and its efficiency; store guesses.
 
-        motor_Nm: rated torque of the motor, 0 if unknown. The ratio is the user's answer, else the drive's own 0x6091,
-        else a guess.
+        motor_Nm: rated torque of the motor, 0 if unknown. The ratio is the user's answer, else the drive's own 0x6091
+        unless that is 1 : 1, else a guess. A factory value of 0x6091 is stored as a guess, too, and so is an efficiency
+        without an answer. There is no efficiency without a gear.
         """
         by_drive = read_drive_units(self.number).gear_ratio
         lines: list[str] = []
@@ -588,8 +594,9 @@ class _DriveWriter(_ProfileWriter):
     def _likely_gear(self, motor_Nm: float) -> float:
         """Return a guess of the gear ratio, rather too large, so that too little torque is commanded.
 
-        It is the maker's, if known. A motor_Nm in a joint's range means no gear, a weaker motor, or a velocity in rpm,
-        means one. motor_Nm: 0 if unknown.
+        It is that of the maker's profile, if there is one. Else it raises a motor_Nm below `_LEAST_JOINT_NM` to
+        `_JOINT_NM`, by `_MOST_GEAR` at most. For an unknown motor with a velocity in rpm it is `_LIKELY_GEAR`; in other
+        cases it is 1. motor_Nm: 0 if unknown.
         """
         if self.facts is not None:
             return self.facts.scale.gear_ratio
@@ -600,7 +607,9 @@ class _DriveWriter(_ProfileWriter):
     def _increments(self, gear: float) -> tuple[float, list[str]]:
         """Return the increments per revolution of the joint, and the profile's lines on them; store a guess.
 
-        They are the user's answer, else the maker's, else the drive's own, else a guess.
+        They are the user's answer, else the maker's, else the drive's own, else a guess. The drive's own are a guess,
+        too, if they are a factory value or coarser than `CREDIBLE_INCREMENTS`. gear: motor revolutions per joint
+        revolution.
         """
         units = read_drive_units(self._numbers_with_gear(), gear)
         found, text = units.increments_per_joint_rev, units.increments_text

@@ -101,9 +101,9 @@ class Node:
 
     @property
     def state_text(self) -> str:
-        """The NMT state as text, by the last heartbeat or boot-up, else by PDOs, which only an operational node sends.
+        """The NMT state as text, by the last heartbeat; without one by PDOs, which only an operational node sends.
 
-        "? (no heartbeat)" if neither came.
+        PDOs count more than a boot-up, a boot-up more than nothing. "? (no heartbeat)" if none of these came.
         """
         if self.has_pdos and self.nmt_state in (None, 0):
             return "operational (sends PDOs)"
@@ -132,11 +132,11 @@ def survey(
     progress: Callable[[str], None] = lambda _: None,
     contract_ids: Container[int] = (),
 ) -> Survey:
-    """Ask all 127 node ids for 0x1000, listen for `duration_s`, and read the identity of each node that answers.
+    """Ask all 127 node ids for 0x1000, listen, and read the identity of each node that answers.
 
+    duration_s: from the first request to the end of the listening, which lasts at least `_ANSWER_S` after the last one.
     contract_ids: ids of the nodes of which 0x2000, wire version and layout digest, is read, too. progress: called with
-    a line before each step. Silent nodes are found by heartbeat or EMCY. It listens for at least `_ANSWER_S` after its
-    requests, even if `duration_s` is 0. Raises BusError if the bus fails.
+    a line before each step. Nodes that don't answer are found by heartbeat or EMCY. Raises BusError if the bus fails.
     """
     tap = Tap(bus, clock)
     traffic = Traffic()
@@ -212,7 +212,7 @@ def read_number(remote: Any, index: int, sub: int = 0) -> int | None:
 def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
     """Add each identifier to `produces` of its node by the predefined connection set; return those of no node.
 
-    SDO responses, which are answers to us, are in neither.
+    SDO responses of these nodes, which are answers to us, are in neither.
     """
     others = []
     for talk in traffic.sorted():
@@ -229,7 +229,7 @@ def compare(found: Survey, slaves: Iterable[Slave], codec: Codec | None = None) 
     """Return, by node id, how each node differs from the arm's slaves, or "" if it fits.
 
     Texts are such as "unexpected" or "missing: NAME expected". codec: nodes whose profile has the object 0x2000 must
-    have its wire version and layout digest.
+    have its wire version and layout digest; None: these aren't compared.
     """
     wanted = {slave.node_id: slave for slave in slaves}
     present = {node.node_id: node for node in found.nodes}
@@ -247,8 +247,8 @@ def compare(found: Survey, slaves: Iterable[Slave], codec: Codec | None = None) 
 def _difference(node: Node, slave: Slave, codec: Codec | None) -> str:
     """Return the first difference of a node from its slave as text, "" without one. codec: as of `compare`.
 
-    Vendor, product and profile number must be the EDS's, the serial number the profile's; those that these lack are not
-    compared.
+    A node that doesn't answer SDO differs. The serial number must be the profile's. Vendor, product and profile number
+    must be the EDS's if the profile's `identity` is "eds". Those that profile or EDS lack are not compared.
     """
     if not node.answers:
         return f"{slave.name} expected; does not answer SDO"
@@ -296,9 +296,9 @@ class BusView:
     """Counts, checks and decodes the frames of a bus for a listener; `describe` returns the results."""
 
     def __init__(self, codec: Codec | DbcDecoder, bitrate: int, data_bitrate: int, t_ns: int) -> None:
-        """Begin at `t_ns` without frames; the bit rates, in bit/s, are for the load.
+        """Begin at `t_ns` without frames; the bit rates, in bit/s, are for the load, data_bitrate 0 without CAN FD.
 
-        Raises ValueError for a bit rate of 0.
+        Raises ValueError if `bitrate` is 0 or less.
         """
         from adacd_hil.lab.commission.load_meter import LoadMeter
 

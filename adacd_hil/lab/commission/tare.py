@@ -76,7 +76,10 @@ class TareSolution:
 
 
 def check_plan(settings: Settings) -> None:
-    """Raise ConfigError if these settings allow no tare: gravity needs a CAD model that is missing, or more poses."""
+    """Raise ConfigError if these settings allow no tare: gravity needs a CAD model that is missing, or more poses.
+
+    Without `estimator.gravity` all settings pass.
+    """
     tare = settings.tare
     if not settings.estimator.gravity:
         return
@@ -177,8 +180,9 @@ def gravity_columns(q: Vector, level_rad: float) -> Vector:
 def solve_tare(poses: Sequence[Pose], settings: Settings) -> TareSolution:
     """Return the least-squares solution of the poses: offsets, gravity, residuals.
 
-    Raises TareRefusedError if an offset, or the disagreement of the poses, exceeds its limit, or the poses don't
-    determine gravity.
+    Raises TareRefusedError if an offset exceeds `tare.offset_limit_Nm`, the poses disagree by more than
+    `tare.pose_limit_Nm`, or they don't determine gravity. Their disagreement is each residual with gravity, else the
+    spread of the residuals.
     """
     solution = _solve(poses, settings)
     tare = settings.tare

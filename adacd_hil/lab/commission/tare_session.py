@@ -85,9 +85,9 @@ class TareSession:
     def run(self) -> Tare:
         """Boot the devices, measure the poses, solve for the offsets; return the tare. Writes no file.
 
-        Stops the nodes again, also after an error. Raises TareRefusedError for data or motion that allow no tare,
-        DeviceError if a device is missing or refuses its set-up, BusError if the bus fails, KeyboardInterrupt after
-        `interrupt`.
+        Once the devices are set up, stops the nodes at the end, also after an error. Raises TareRefusedError for data
+        or motion that allow no tare, DeviceError if a device is missing or refuses its set-up, BusError if the bus
+        fails, KeyboardInterrupt after `interrupt`.
         """
         self.progress(f"looking for the arm on {self.bus.channel}")
         self._master.reset()
@@ -245,10 +245,10 @@ class TareSession:
                 raise TareRefusedError(f"{name} has sent nothing usable for {age} cycles, bus.max_age_cycles = {bound}")
 
     def _auto_zero(self, nodes: list[Any], sensors: tuple[Identity, ...]) -> None:
-        """Let the sensors set their own zero at rest, and measure before and after it.
+        """Let the sensors set their own zero at rest, in pre-operational, and measure before and after it.
 
-        Raises TareRefusedError if the arm isn't at rest and unloaded before, or torque is left after; DeviceError if a
-        sensor refuses.
+        Raises TareRefusedError if the arm isn't at rest and unloaded before, or more torque than
+        `tare.auto_zero_limit_Nm` is left after; DeviceError if a sensor refuses or doesn't answer.
         """
         before = self._measure()
         solve_tare([before], self.settings)  # refuse if the arm is pushed

@@ -64,11 +64,12 @@ class OfflineArm:
         locked: tuple[str, ...] = (),
         has_rotors: bool = False,
     ) -> Self:
-        """Return the arm that a URDF describes; urdf: a file, or its text. Inertias in it are not needed.
+        """Return the arm that a URDF describes. Inertias in it are not needed.
 
-        gravity_m_s2: in the axes of the root link. locked: joints that do not move, as of a gripper. has_rotors: the
-        torques are those of geared motors, which turn their rotors too. Raises UrdfError, a ValueError, if it is no
-        usable URDF; ConfigError, a ValueError, for another argument; OSError if the file can't be read.
+        urdf: a file, or its text, which has a "<". gravity_m_s2: in the axes of the root link. locked: joints that do
+        not move, as of a gripper. has_rotors: the torques are those of geared motors, which turn their rotors too.
+        Raises UrdfError, a ValueError, if it is no usable URDF; ConfigError, a ValueError, for another argument;
+        OSError if the file can't be read.
         """
         given = {"gravity_m_s2": gravity_m_s2, "locked": locked, "has_rotors": has_rotors}
         parse(ArmSection, {"urdf": ""} | {key: _plain(value) for key, value in given.items()}, "")
@@ -77,9 +78,10 @@ class OfflineArm:
 
     @classmethod
     def from_config(cls, config: str | Path, profile: str | None = None) -> Self:
-        """Return the two-joint arm of a configuration; config: a name or a TOML file, profile: of an emulated arm.
+        """Return the two-joint arm of a configuration, without rotors.
 
-        Raises ConfigError, a ValueError, if it can't be used.
+        config: a name or a TOML file. profile: of an emulated arm; None: the configuration's. Raises ConfigError, a
+        ValueError, if it can't be used.
         """
         return cls(read_urdf(robot_description(load_settings(str(config), profile))))
 
@@ -99,7 +101,10 @@ class OfflineArm:
 
 
 def _plain(value: Any) -> Any:
-    """Return a setting as TOML would give it: tuples and arrays as lists, numpy's numbers as Python's."""
+    """Return a setting as TOML would give it: tuples and arrays as lists, numpy's numbers as Python's.
+
+    The elements of a tuple, and other values, stay as they are.
+    """
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     return list(value) if isinstance(value, tuple) else value
@@ -173,10 +178,11 @@ def fit(
     velocity_lag_s: float = 0.0,
     **scheme: Any,
 ) -> FittedModel:
-    """Fit a model to the first part of the free motion in arrays, and test it on the last 40 % of that motion.
+    """Fit a model to the first 60 % of the free motion in arrays, and test it on the rest.
 
-    For the arguments and errors see `detect`. Look at the model's `verdict` first: it tells whether the model explains
-    the torque.
+    Free motion: the span `fit_s` of `t`, by default the first 40 %, without touched samples. Arguments: as of `detect`.
+    Raises ArrayError, a ValueError, for unusable input or too little motion. Look at the model's `verdict` first: it
+    tells whether the model explains the torque.
     """
     return _fitted(_taken(arrays, arm, velocity_lag_s), arm, fit_s, scheme)
 
@@ -184,10 +190,10 @@ def fit(
 def _fitted(
     recording: ForeignRecording, arm: OfflineArm, fit_s: tuple[float, float] | None, scheme: Mapping[str, Any]
 ) -> FittedModel:
-    """Fit a model to the free motion of a recording, and test it.
+    """Fit a model to the first 60 % of the free motion of a recording, and test it on the rest.
 
-    fit_s: its span in the arrays' time; None: the first `FIT_SHARE` of it. Raises ArrayError if that is too little
-    motion or no span, or `scheme` has an invalid setting.
+    fit_s: its span in the arrays' time; None: the first `FIT_SHARE` of the recording. Touched samples are left out.
+    Raises ArrayError if that is too little motion or no span, or `scheme` has an invalid setting.
     """
     start_s, end_s = _span(recording, fit_s)
     described = _described(arm, recording.columns.values.shape[1] > 2 * arm.joints, scheme)
@@ -219,18 +225,20 @@ def detect(
     velocity_lag_s: float = 0.0,
     **scheme: Any,
 ) -> ArrayDetection:
-    """Run the offline scheme over recorded arrays: fit, test, then detect contacts in all of them.
+    """Run the offline scheme over recorded arrays: fit, test, then detect contacts from the first sample to the last.
 
-    arrays: `t` (k,) s, increasing; `q` (k, n) rad; `tau_J` (k, n) Nm, positive along the joint's axis; optionally
-    `dq` (k, n) rad/s, else derived from q; `touched` (k,) bool, true while the arm is touched, left out of the fit.
-    `time`, `qd` and `tau` stand for `t`, `dq` and `tau_J`. All finite, below 1e6; gaps in time split them.
+    arrays: `t` (k,) s, increasing; `q` (k, n) rad; `tau_J` (k, n) Nm, positive along the joint's axis; optionally `dq`
+    (k, n) rad/s, else derived from q; `touched` (k,) bool, true while the arm is touched, left out of the fit. `time`,
+    `qd` and `tau` stand for `t`, `dq` and `tau_J`. All finite; except t, at most 1e6 in size. Gaps in time split them;
+    parts of fewer than `SHORTEST_SAMPLES` are left out.
 
-    model: of `fit`, instead of a fit here. fit_s: span of `t` in which the arm moves freely; default: the first 40 %. A
-    touch in it is learnt. velocity_lag_s: time by which dq is older than tau_J, as behind a tracking loop; 1.25e-3 for
-    the emulated drives. scheme: `OfflineSettings` by name, such as detection_cutoff_rad_s=20.0, deviations=6.0,
-    noise_Nm=(0.02, 0.02); the default noise is estimated from the arrays.
+    model: of `fit`, instead of a fit here; it excludes fit_s and scheme. fit_s: span of `t` in which the arm moves
+    freely; default: the first 40 %. A touch in it is learnt. velocity_lag_s: time by which dq is older than tau_J, as
+    behind a tracking loop; 1.25e-3 for the emulated drives. scheme: `OfflineSettings` by name, such as
+    detection_cutoff_rad_s=20.0, deviations=6.0, noise_Nm=(0.02, 0.02); the default noise is estimated from the arrays.
 
-    Raises ArrayError, a ValueError, for unusable input, in one line: quantity, value, bound.
+    Raises ArrayError, a ValueError, in one line with quantity, value and bound: for unusable input, too little free
+    motion, or a model of another arm or period.
     """
     recording = _taken(arrays, arm, velocity_lag_s)
     begin_s = recording.columns.begin_s
@@ -262,7 +270,7 @@ def detect(
 
 
 def _check_arm(model: FittedModel, arm: OfflineArm) -> None:
-    """Raise ArrayError if a model is of another arm than `arm`."""
+    """Raise ArrayError if a model is of an arm with another number of joints, geometry, gravity or `has_rotors`."""
     if model.arm.joints != arm.joints:
         raise ArrayError(f"model is of {model.arm.joints} joints, the arm has {arm.joints}")
     if model.arm.has_rotors != arm.has_rotors or not all(map(np.allclose, model.arm.serial.chain, arm.serial.chain)):
@@ -294,10 +302,12 @@ def _named(arrays: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
 
 
 def _taken(arrays: Mapping[str, ArrayLike], arm: OfflineArm, velocity_lag_s: float) -> ForeignRecording:
-    """Return arrays as a recording at a fixed period, velocities moved to the torques' times.
+    """Return arrays as a recording at a fixed period, the median one of `t`; move velocities to the torques' times.
 
-    velocity_lag_s: time by which velocities are older than torques. Raises ArrayError if an array has a wrong shape,
-    type or value, times don't grow, or the lag is out of its range.
+    velocity_lag_s: time by which velocities are older than torques; they are interpolated, and the last one is held.
+    Raises ArrayError if an array is unknown, missing or given twice, or has a wrong shape, type or value; if times
+    don't grow, their period is outside `SHORTEST_PERIOD_S` to `LONGEST_PERIOD_S`, gaps leave too few samples in a row,
+    the lag is out of its range, or `arm` is no OfflineArm.
     """
     named = _named(arrays)
     if not isinstance(arm, OfflineArm):
@@ -371,9 +381,10 @@ def _numbers(name: str, given: ArrayLike) -> Vector:
 
 
 def _span(recording: ForeignRecording, fit_s: tuple[float, float] | None) -> tuple[float, float]:
-    """Return the span of free motion, s since the recording's first row; by default the first `FIT_SHARE` of it.
+    """Return begin and end of the free motion, s since the first row; by default of the first `FIT_SHARE` of the time.
 
-    Raises ArrayError if `fit_s` is no pair of times, ends before it begins, or ends after the last sample.
+    fit_s: in the arrays' time. Raises ArrayError if it is no pair of times, doesn't end after it begins, or ends more
+    than two periods after the last sample. It may begin before the first.
     """
     last = recording.stretches[-1]
     length_s = last.start_s + len(last.record.q) * recording.period_s

@@ -94,7 +94,10 @@ class LoadedRun:
 
     @property
     def t_s(self) -> Vector:
-        """Times of the cycles (n,), s since motion start."""
+        """Times of the cycles (n,), s since motion start: the first cycle in ADAPT, else the first cycle.
+
+        Cycles before motion start have negative times.
+        """
         return self.arrays["t_s"]
 
     @property
@@ -104,14 +107,15 @@ class LoadedRun:
 
     @property
     def motion(self) -> dict[str, Vector]:
-        """Arrays for `detect`: `t` (n,), s since motion start, `q`, `dq`, `tau_J` (n, 2)."""
+        """Arrays for `detect`: `t` (n,), s since motion start, `q`, `dq`, `tau_J` (n, 2), rad, rad/s, Nm."""
         return {"t": self.t_s, **{name: self.arrays[name] for name in ("q", "dq", "tau_J")}}
 
     @cached_property
     def certificates(self) -> "tuple[Certificate, ...]":
-        """Certificates that were not taken back, oldest first.
+        """Certificates that were not taken back, oldest first, read from the events once and kept.
 
-        () if there is none, or the log is cut before its end.
+        Unreadable ones, such as those of another version, are left out. () if there is none, or the log is cut before
+        its end.
         """
         return tuple(certificates_in((event.name, event.message) for event in self.events))
 
@@ -148,7 +152,7 @@ class LoadedRun:
         return frame.set_index("t_s")
 
     def to_polars(self) -> "polars.DataFrame":
-        """Return `columns` as a data frame.
+        """Return `columns` as a data frame, `t_s` as one of its columns.
 
         Raises ImportError without polars; it names the command that installs it.
         """
@@ -167,8 +171,9 @@ def _extra(name: str) -> Any:
 def load(run: str | Path) -> LoadedRun:
     """Return the run in a log, all parts of the log as one. run: a folder with run.mcap, or the log's first part.
 
-    A cut or damaged log is read as far as it is intact, see `problem`. Raises LogError, in one line, if it can't be
-    read, has no cycle, or its times don't grow.
+    Cycles that lack a record of /scheme, /control or /cycle are left out; of a topic without any record, only its
+    fields. A cut or damaged log is read as far as it is intact. `problem` names the damage, else the cycles left out.
+    Raises LogError, in one line, if it can't be read, has no cycle, or its times don't grow.
     """
     path = log_in(run)
     log = read_log(path, _READ)
@@ -196,8 +201,8 @@ def load(run: str | Path) -> LoadedRun:
 def _arrays(log: RunLog) -> dict[str, NDArray[Any]]:
     """Return the fields of /scheme, /control and /cycle, and `t_ns`, for the cycles that all three have.
 
-    A topic without any record is left out, with its fields. Raises LogError if /scheme has none, no cycle is common, or
-    times don't grow.
+    `t_ns`: times of the records of /scheme. A field of several topics is that of the first. A topic without any record
+    is left out, with its fields. Raises LogError if /scheme has none, no cycle is common, or times don't grow.
     """
     if not len(log.scheme):
         raise LogError(f"log {log.path} has no cycle" + (f": {log.problem}" if log.problem else ""))

@@ -66,7 +66,8 @@ NOTICES = tuple(refusal.notice for refusal in (_ORIGIN, _HOST, _PROTOCOL, FULL))
 def normal_origin(origin: str) -> str:
     """Return an origin in lower case, without a slash at its end.
 
-    Raises ValueError if it isn't scheme, host and port.
+    Raises ValueError if it isn't scheme and "://", mostly with host and port after it, or has a path, a space or an
+    "@".
     """
     found = re.fullmatch(r"([a-z][a-z0-9+.-]*://[^/\s@]*)/?", origin.lower())
     if not found:
@@ -78,7 +79,10 @@ class Admission:
     """Decides by origins and host names which viewers the live view of a run admits."""
 
     def __init__(self, setup: LiveView) -> None:
-        """Allow the origins and names of `setup`, besides the viewers' own pages and this machine's own names."""
+        """Allow the origins and names of `setup`, besides the viewers' own pages and this machine's own names.
+
+        Raises ValueError for an invalid origin.
+        """
         self._origins = {*VIEWER_ORIGINS, *map(normal_origin, setup.origins)}
         own = socket.gethostname().lower()
         short = own.partition(".")[0]
@@ -89,8 +93,9 @@ class Admission:
     ) -> ViewerRefusal | None:
         """Return why a request is refused; None if it is admitted.
 
-        origins, hosts, subprotocols: all values of its headers Origin, Host and Sec-WebSocket-Protocol; subprotocols is
-        None for a browser that asks for a page. There may be no origin, but there must be one host.
+        It needs exactly one host, an IP address or an allowed name; no origin, or one that is allowed; and one of
+        `SUBPROTOCOLS`. origins, hosts, subprotocols: all values of its headers Origin, Host and Sec-WebSocket-Protocol;
+        subprotocols: None for a browser that asks for a page, which needs none.
         """
         if len(hosts) != 1 or not self._is_own_host(hosts[0]):
             return _HOST
@@ -105,7 +110,10 @@ class Admission:
         return origin.lower() in self._origins or _OWN_PAGE.fullmatch(origin.lower()) is not None
 
     def _is_own_host(self, host: str) -> bool:
-        """Return whether a Host header, `name:port` or `[::1]:port`, is an IP address or an allowed name."""
+        """Return whether a Host header, `name:port` or `[::1]:port`, has an IP address or an allowed name, in any case.
+
+        The port may be missing. False for a header of another form.
+        """
         found = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::\d{1,5})?", host)
         if not found:
             return False

@@ -39,8 +39,8 @@ class LiveClient:
     def __init__(self, connection: ClientConnection, topics: Collection[str] | None) -> None:
         """Subscribe to `topics`, None: to all, and wait until the server confirms it by the arm's description.
 
-        Raises LogError after OPEN_TIMEOUT_S, or for data that is no log of adacd-hil. The messages received so far are
-        returned by `receive`.
+        Raises LogError after OPEN_TIMEOUT_S, if the server ends before, or for data that is no log of adacd-hil. The
+        messages received so far are returned by `receive`.
         """
         self.topics: dict[str, tuple[str, str]] = {}
         """Name and text of the schema of each topic that the server offers."""
@@ -56,7 +56,7 @@ class LiveClient:
     def _wait(self) -> None:
         """Receive and store messages up to the arm's description: then the subscriptions are in force.
 
-        Raises LogError after OPEN_TIMEOUT_S.
+        Raises LogError after OPEN_TIMEOUT_S, if the connection ends before, or for data that is no log of adacd-hil.
         """
         clock = MonotonicClock()
         end_ns = clock.now_ns() + round(OPEN_TIMEOUT_S * 1e9)
@@ -76,7 +76,8 @@ class LiveClient:
     def _receive(self, timeout_s: float) -> LiveMessage | None:
         """Return the next message from the connection; None after the timeout or at the server's end.
 
-        The server's other messages are obeyed on the way. Raises LogError for data that is no log of adacd-hil.
+        At the end, set `is_open` to False. JSON from the server is obeyed on the way, its other binary data ignored.
+        Raises LogError for data that is no log of adacd-hil, as a message without a subscription.
         """
         clock = MonotonicClock()
         end_ns = clock.now_ns() + round(timeout_s * 1e9)
@@ -101,9 +102,10 @@ class LiveClient:
         return None
 
     def _obey(self, word: dict[str, Any]) -> None:
-        """Subscribe to the wanted channels that the server advertises, and last to the arm's description.
+        """Subscribe to the wanted channels that the server advertises, and last, always, to the arm's description.
 
-        The description ends `_wait`. word: a message of the server, decoded from JSON; other kinds have no effect.
+        The description ends `_wait`. Adds the channels to `topics`, wanted or not. word: a message of the server,
+        decoded from JSON; kinds other than "advertise" have no effect.
         """
         if word["op"] != "advertise":
             return
@@ -136,10 +138,10 @@ class LiveClient:
 
 @contextmanager
 def live_client(url: str, topics: Collection[str] | None = None) -> Iterator[LiveClient]:
-    """Connect to a live view while the block lasts; `topics`: to subscribe to, None: all.
+    """Connect to a live view while the block lasts, then disconnect; `topics`: to subscribe to, None: all.
 
-    Raises LogError if none answers at `url`, or for data that is no log of adacd-hil. OSError, ValueError and LogError
-    of the block become LogErrors with the URL.
+    Raises LogError if none answers at `url`, or for data that is no log of adacd-hil. OSError, ValueError, LogError and
+    errors of the WebSocket in the block become LogErrors with the URL.
     """
     try:
         connection = connect(

@@ -135,7 +135,7 @@ class LiveFeed:
     def _hear(self) -> dict[str, str]:
         """Return the first message of the view's process: its "url" with an empty "error", or an "error".
 
-        It is an "error" if none comes within `START_TIMEOUT_S`.
+        It is an "error" if the process ends, or none comes within `START_TIMEOUT_S`.
         """
         self._socket.settimeout(START_TIMEOUT_S)
         try:
@@ -147,7 +147,10 @@ class LiveFeed:
 
     @property
     def is_watched(self) -> bool:
-        """Whether a viewer has subscribed to a topic."""
+        """Whether a viewer has subscribed to a topic, by the latest word of the view's process, which is read here.
+
+        False once that process has closed its socket.
+        """
         with contextlib.suppress(BlockingIOError, ConnectionResetError):
             while word := self._socket.recv(processes.MOST_BYTES):
                 self._is_watched = word == processes.WATCHED
@@ -205,9 +208,10 @@ class Decimator:
         self._first_ns = -1  # the first cycle of the slot
 
     def takes(self, cycle_ns: int) -> bool:
-        """Return whether the next message is shown; at the rate EVERY_MESSAGE always.
+        """Return whether the next message is shown: if it is of the first cycle that came in its slot of 1 / rate.
 
-        cycle_ns: time of the message's cycle, which never runs backwards.
+        At the rate EVERY_MESSAGE always. Keeps the slot for the next call. cycle_ns: time of the message's cycle, which
+        never runs backwards.
         """
         if not self._slot_ns:
             return True
@@ -266,7 +270,9 @@ class LiveTopics:
     def choose(self, messages: Iterable[LoggedMessage], wanted: Collection[int]) -> Iterator[Shown]:
         """Yield the messages that are shown, in their order, each followed by those that are drawn from it.
 
-        wanted: channels to which viewers have subscribed; others yield nothing.
+        wanted: channels to which viewers have subscribed; others yield nothing. Drawn messages come without their
+        source if only they are wanted; a message that can't be decoded isn't drawn. Raises `latest_ns` to the latest
+        log time, also of messages that are not shown, and keeps the slots of the decimators.
         """
         sources = self._sources(wanted)
         for channel, log_ns, publish_ns, payload in messages:
@@ -289,7 +295,11 @@ class LiveTopics:
         return sources & self._decimators.keys()
 
     def _drawn_from(self, shown: Shown, wanted: Collection[int]) -> Iterator[Shown]:
-        """Yield the wanted messages that are drawn from a shown one, poses or shapes; none from most channels."""
+        """Yield the wanted messages that are drawn from a shown one, poses or shapes; none from most channels.
+
+        Shapes of /scheme keep the rate of the scene. Raises ValueError, IndexError or struct.error for a damaged
+        payload.
+        """
         channel, log_ns, payload = shown
         if channel == self._joint_states and self.transforms in wanted:
             q = np.frombuffer(payload, JOINT_STATE_DTYPE)[0]["q"]

@@ -48,7 +48,10 @@ class LiveView:
 
 
 def live_address(host: str, port: int, origins: tuple[str, ...], names: tuple[str, ...], most_viewers: int) -> LiveView:
-    """Return a live view on an address, without an arm. Raises ValueError for an invalid origin."""
+    """Return a live view on an address, without an arm, its origins in lower case and without a slash at the end.
+
+    Raises ValueError for an invalid origin.
+    """
     from adacd_hil.lab.live.admission import normal_origin
 
     return LiveView(host, port, tuple(map(normal_origin, origins)), names, most_viewers)

@@ -172,9 +172,9 @@ def transforms_of(shape: Shape, q: Vector) -> tuple[Transform, ...]:
 
 
 def threshold_shares(scheme: Any) -> Vector:
-    """Return each joint's largest |residual| / threshold (2,) over its channels, of a record of /scheme.
+    """Return each joint's largest |residual| / threshold (2,) over its channels that are on, of a record of /scheme.
 
-    NaN while detection is off: the thresholds are 0, infinite or NaN.
+    NaN for a joint whose detection is off: all its thresholds are 0, infinite or NaN.
     """
     has_bank = "tau_ext_bank" in scheme.dtype.names
     torque, threshold = ("tau_ext_bank", "threshold_bank") if has_bank else ("tau_ext_hat", "threshold")
@@ -187,7 +187,8 @@ def threshold_shares(scheme: Any) -> Vector:
 def draw_joints(state: SchemeState, tau_ext_hat: Vector, shares: Vector) -> tuple[Entity, ...]:
     """Return three entities: a sphere and text at each joint, and the state's name above the base.
 
-    Size and colour of a sphere show the joint's share. tau_ext_hat (2,), Nm; shares (2,): of `threshold_shares`.
+    Size and colour of a sphere show the joint's share: it grows up to a share of 1, and is smallest and grey for NaN.
+    tau_ext_hat (2,), Nm; shares (2,): of `threshold_shares`.
     """
     entities = []
     for index, link in enumerate(LINK_NAMES):
@@ -205,8 +206,8 @@ def draw_joints(state: SchemeState, tau_ext_hat: Vector, shares: Vector) -> tupl
 def draw_contact(shape: Shape, report: ContactReport) -> Entity:
     """Return an entity with the arrow and text of a report's force, which viewers show for `ARROW_LIFETIME_NS`.
 
-    It is at the touched place of link 2 if that is known, else at the link's end. "≥" stands before a force that is not
-    known.
+    It is at the touched place of link 2 if that is known, else at the link's end. The arrow's length is limited; it is
+    red for a collision, else yellow. "≥" stands before a force that is not known.
     """
     on_link_2 = report.link == 2
     length_m = shape.link_length_m[report.link - 1]

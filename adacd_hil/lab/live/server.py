@@ -205,7 +205,10 @@ class LiveServer:
             asyncio.get_running_loop().call_soon(self._show_some)
 
     def _show(self, batch: bytes) -> None:
-        """Queue the messages of a batch for the viewers that have subscribed to them."""
+        """Queue the messages of a batch for the viewers that have subscribed to them, and the log time for all viewers.
+
+        Messages that the decimators of the topics don't choose are left out.
+        """
         wanted = {channel for viewer in self._viewers for channel in viewer.by_channel}
         for shown in self._topics.choose(unpack_batch(batch), wanted):
             self._tell_time(shown.log_ns)
@@ -214,7 +217,7 @@ class LiveServer:
         self._tell_time(self._topics.latest_ns)
 
     def _tell_time(self, log_ns: int) -> None:
-        """Queue the log time for all viewers if `_TIME_STEP_NS` of it have passed since the last time."""
+        """Queue the log time for all viewers if `_TIME_STEP_NS` of it have passed since the time queued last."""
         if log_ns - self._time_ns >= _TIME_STEP_NS:
             self._time_ns = log_ns
             for viewer in self._viewers:
@@ -231,7 +234,7 @@ class LiveServer:
     # -- viewers --------------------------------------------------------------------------------------------------
 
     def _judge(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Return the answer to a refused request, or the page for a browser.
+        """Return the answer to a refused request, or the page for a browser; print a line on a refusal, once per kind.
 
         None: the connection is admitted, and counted as a viewer.
         """
@@ -257,7 +260,10 @@ class LiveServer:
                 os.write(self._notices, f"{refusal.notice}\n".encode())
 
     async def _attend(self, connection: ServerConnection) -> None:
-        """Serve one viewer until it disconnects. One that asks for too many subscriptions is disconnected."""
+        """Send a viewer the server's info, the channels and the log time; then serve it until it disconnects.
+
+        One that asks for too many subscriptions is disconnected. The writer learns if the last subscription has ended.
+        """
         viewer = Viewer(connection)
         viewer.put(self._info)
         viewer.put(json.dumps({"op": "advertise", "channels": list(self._topics.advertised.values())}))
@@ -278,9 +284,10 @@ class LiveServer:
                 await sending
 
     def _obey(self, viewer: Viewer, data: Data) -> bool:
-        """Carry out a viewer's request; return False if it asks for too many subscriptions.
+        """Carry out a viewer's request, JSON as text; return False if it asks for too many subscriptions.
 
-        A request that makes no sense or isn't supported is answered with an error or warning.
+        A request that makes no sense is answered with an error, one that isn't supported with a warning, the first time
+        only.
         """
         try:
             word = json.loads(data) if isinstance(data, str) else {}
@@ -400,7 +407,8 @@ def _no_logger() -> logging.Logger:
 def listen(setup: LiveView) -> socket.socket:
     """Return the open listening socket, on the first address of the host's name.
 
-    Raises OSError if it can't be opened.
+    Raises OSError if it can't be opened or the name has no address, OverflowError or UnicodeError for a wrong port or
+    name.
     """
     family, _, _, _, address = socket.getaddrinfo(setup.host, setup.port, type=socket.SOCK_STREAM)[0]
     return socket.create_server(address[:2], family=family, backlog=128)
@@ -413,9 +421,10 @@ def url_of(setup: LiveView, listening: socket.socket) -> str:
 
 
 def main(socket_descriptor: int, ring_descriptor: int, notices: int) -> None:
-    """Serve the live view: send the writer the address or an error, then serve until the writer ends.
+    """Serve the live view: send the writer the address, then serve until the writer ends or dies.
 
-    notices: descriptor of the run's terminal. The setup is read from stdin.
+    If the address can't be opened, send an error and return. Lowers the priority of this process. notices: descriptor
+    of the run's terminal. The setup is read from stdin.
     """
     writer = socket.socket(fileno=socket_descriptor)
     told: ServerSetup = read_setup()

@@ -48,9 +48,11 @@ def cut(
 ) -> int:
     """Copy a time window of the log whose first part is `path` to the new log `out`; return its number of messages.
 
-    Attachments and metadata are copied whole. stretch: its times are s since the first message. topics: those that are
-    copied; (): all. progress: called with a line per part. Raises LogError if the log is damaged, lacks a topic, has no
-    message in the window, or is `out` itself.
+    Messages count by publish_time in a log of ours, else by log_time, and those at the window's end are left out.
+    Attachments and metadata are copied whole. An earlier result of `cut` or `recover` at `out` is replaced, at the end.
+    stretch: its times are s since the first message. topics: those that are copied; (): all. progress: called with a
+    line per part. Raises LogError if the log is damaged, lacks a topic, or has no message in the window; also if `out`
+    is the log itself, another file, or named like a part of a log, or can't be written.
     """
     log = SalvagedLog(path, progress)
     known = set()

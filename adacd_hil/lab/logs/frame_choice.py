@@ -32,7 +32,11 @@ class FrameChoice:
     end_ns: int | None
 
     def pieces(self, source: Iterable[NDArray[Any]]) -> Iterator[NDArray[Any]]:
-        """Yield the chosen frames of each array of a recording's frames, in turn; arrays without any are skipped."""
+        """Yield the chosen frames of each array of a recording's frames, in turn; arrays without any are skipped.
+
+        Times count from the first frame of the first array that isn't empty. A frame at `start_ns` is in, one at
+        `end_ns` out.
+        """
         first_ns = None
         for frames in source:
             if first_ns is None and len(frames):
@@ -56,7 +60,10 @@ class FrameChoice:
         return is_chosen
 
     def _is_hosts(self, frames: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which frames (n,) are the host's: by the identifier, else those that the recorder sent."""
+        """Return which frames (n,) are the host's: by the identifier, else those that the recorder sent.
+
+        Error and remote frames go by the latter alone.
+        """
         is_known = ~frames["is_error"] & ~frames["is_remote"]
         is_host = is_known & np.isin(frames["can_id"], list(self.host_ids))
         is_device = is_known & np.isin(frames["can_id"], list(self.device_ids))

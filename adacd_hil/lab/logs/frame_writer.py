@@ -39,7 +39,11 @@ class FrameWriter:
         self._flushed_ns: int | None = None
 
     def write_frame(self, frame: RecordedFrame) -> None:
-        """Write a frame. Raises ValueError for a time below 0 or beyond the range of ROS stamps."""
+        """Write a frame to the stream, or keep it for its chunk, which spans at most `FLUSH_PERIOD_NS`.
+
+        Its publish time is its own; its log time is at least that of the frame before on its topic. Raises ValueError
+        for a time below 0 or beyond the range of ROS stamps.
+        """
         if not 0 <= frame.t_ns < END_OF_TIME_NS:
             raise ValueError(f"t_ns = {frame.t_ns} is not within 0 and {END_OF_TIME_NS} ns")
         if self._flushed_ns is None or not 0 <= frame.t_ns - self._flushed_ns < FLUSH_PERIOD_NS:

@@ -47,8 +47,8 @@ class LogCopy:
     def __init__(self, path: Path, log: SalvagedLog, topics: Collection[str] | None = None) -> None:
         """Begin a log at `path` that is copied from `log`; topics: those that are copied, None: all.
 
-        Raises LogError if `path` is the log itself, is no result of these commands, has the name of another log's part,
-        or can't be created.
+        An empty file, a link, and a result of `recover` or `cut` at `path` may be replaced. Raises LogError if any
+        other file is there, `path` is the log itself or has the name of another log's part, or it can't be created.
         """
         if path.exists() and any(part.exists() and path.samefile(part) for part in log.parts.values()):
             raise LogError(f"{path} is the log itself; --out names another file")
@@ -81,7 +81,8 @@ class LogCopy:
     def add_messages(self, contents: Contents, is_chosen: NDArray[np.bool_] | None = None) -> None:
         """Copy messages of a chunk, those where `is_chosen` (n,) is True; None: all.
 
-        Messages of topics that aren't copied, or without a definition, are left out.
+        Metadata and channels that the source has read since the last call are copied first. Messages of topics that
+        aren't copied, or without a definition, are left out. Raises LogError if the copy can't be written.
         """
         self._follow()
         numbers = self._numbers[contents.channels]
@@ -97,7 +98,10 @@ class LogCopy:
             self._file.end_packet()
 
     def _follow(self) -> None:
-        """Copy the metadata, and define the channels, that the source has read since the last call."""
+        """Copy the metadata, and define the channels of copied topics, that the source has read since the last call.
+
+        The number of the part is left out of the metadata.
+        """
         for name in [name for name in self._log.metadata if name not in self._metadata]:
             self._metadata.add(name)
             table = self._log.metadata[name]

@@ -230,7 +230,10 @@ class _InfoView:
             info.ending = item.metadata.get(ENDING_KEY, "")
 
     def _read(self, contents: Contents, definitions: Definitions) -> None:
-        """Add the events and contacts of a chunk to the info; skip those that can't be decoded."""
+        """Add the events and contacts of a chunk, and the bytes of both topics, to the info.
+
+        Messages that can't be decoded count with their bytes only.
+        """
         for channel in definitions.channels.values():
             if channel.topic not in _READ:
                 continue

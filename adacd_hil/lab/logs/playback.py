@@ -41,7 +41,10 @@ class Lateness:
         self._counts[lateness_ns // _BUCKET_NS] += 1
 
     def quantile_us(self, share: float) -> int:
-        """Return the lateness, µs, rounded up, that a share (0…1) of the frames did not exceed; 0 without frames."""
+        """Return a lateness, whole µs, that at least a share (0…1) of the frames did not reach; 0 without frames.
+
+        It is the upper end of the 1 µs bin in which the share is reached.
+        """
         needed = share * self.frames
         for bucket, count in sorted(self._counts.items()):
             needed -= count
@@ -61,9 +64,11 @@ def play(
 ) -> Lateness:
     """Send frames at their times until they end or `is_stopped` returns True; return how late they were sent.
 
-    frames: their times are by any clock, only differences matter. speed: 2 plays twice as fast. longest_pause_ns:
-    longer pauses of the recording are shortened to this; None: none is. A frame with an earlier time than the one
-    before is sent with it. Raises BusError if the bus fails.
+    The first frame is due `LEAD_NS` after the call, on `clock`. Only identifier and data of a frame are sent. Frames
+    due at the same time are sent together, up to `_MOST_AT_ONCE`, and count as late as the first of them. frames: their
+    times are by any clock, only differences matter. speed: 2 plays twice as fast. longest_pause_ns: longer pauses of
+    the recording are shortened to this; None: none is. A frame with an earlier time than the one before is sent with
+    it. is_stopped: called at least every `_STOP_NS`. Raises BusError if the bus fails.
     """
     lateness = Lateness()
     for due_ns, group in _grouped(_scheduled(frames, clock, speed, longest_pause_ns)):
@@ -101,7 +106,11 @@ def repeat(frames: Callable[[], Iterable[Frame]], times: int) -> Iterator[Frame]
 def _scheduled(
     frames: Iterable[Frame], clock: Clock, speed: float, longest_pause_ns: int | None
 ) -> Iterator[tuple[int, Frame]]:
-    """Yield each frame with the time at which it is due, ns of `clock`; the times never decrease."""
+    """Yield each frame with the time at which it is due, ns of `clock`; the times never decrease.
+
+    The first is due `LEAD_NS` after it was asked for. A pause above `longest_pause_ns` is shortened to it before
+    `speed` divides the time.
+    """
     begin_ns, first_ns, cut_ns, latest_ns = 0, None, 0, 0
     for frame in frames:
         if first_ns is None:

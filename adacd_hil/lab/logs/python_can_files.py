@@ -68,7 +68,7 @@ class McapWriter(BinaryIOMessageWriter):
         self._is_stopped = False
 
     def on_message_received(self, msg: can.Message) -> None:
-        """Write a message. Raises ValueError for a message that no CAN frame can have."""
+        """Write a message. Raises ValueError for a message that no CAN frame can have, and for a time out of range."""
         self._writer.write_frame(to_frame(msg))
 
     def stop(self) -> None:

@@ -31,8 +31,9 @@ class LogRecovery(NamedTuple):
 def recover(path: Path, out: Path | None = None, progress: Callable[[str], None] = lambda _: None) -> LogRecovery:
     """Save the trusted records of all parts of a log to the new log `out`. path: the log's first part.
 
-    out: None: such as run.recovered.mcap. progress: called with a line per part. Raises LogError if no record can be
-    trusted, a file can't be read or written, or `out` is the log itself.
+    An earlier result of `recover` or `cut` at `out` is replaced, at the end. out: None: such as run.recovered.mcap.
+    progress: called with a line per part. Raises LogError if no record can be trusted, a file can't be read or written,
+    or `out` is the log itself, another file, or named like a part of a log.
     """
     out = out or path.with_name(f"{path.stem}.{RECOVERED}{path.suffix}")
     log = SalvagedLog(path, progress)

@@ -91,7 +91,10 @@ class Losses:
             self.notes.append(text)
 
     def add_losses(self, other: "Losses") -> None:
-        """Add the losses of another file to these."""
+        """Add the losses of another file to these, except `missing_parts`, and notes beyond `_NOTES`.
+
+        The number of messages becomes None if it is unknown in one of them.
+        """
         self.chunks += other.chunks
         self.bytes += other.bytes
         is_known = self.messages is not None and other.messages is not None
@@ -113,7 +116,10 @@ class Salvage:
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the summary of a file, and find which CRCs it has. Raises LogError if it can't be read."""
+        """Read the summary of a file, and find which CRCs it has; this may read all of the file.
+
+        Raises LogError if it can't be read.
+        """
         self.losses = Losses()
         self.definitions = Definitions()
         self.is_vouched = False
@@ -135,7 +141,10 @@ class Salvage:
             self._look_at_end(file)
 
     def _look_at_end(self, file: IO[bytes]) -> None:
-        """Keep definitions and statistics of a sound summary; set `is_vouched` by the CRC of the data section."""
+        """Keep definitions and statistics of a sound summary; set `is_vouched` by the CRC of the data section.
+
+        Store, too, whether the file has no CRC at all in its data section and chunks.
+        """
         end = read_end(file)
         has_data_crc = end is not None and end.data_crc != 0
         chunks = (item for item in scan(file) if isinstance(item, RawRecord) and item.opcode == Opcode.CHUNK)
@@ -165,7 +174,8 @@ class Salvage:
     def _take(self, record: RawRecord) -> Iterator[Attachment | Metadata | Contents]:
         """Yield the content of a record if it can be trusted; else add it to the losses.
 
-        Definitions are kept, not yielded.
+        Definitions are kept, not yielded; untrusted ones are passed over. Metadata are trusted without a CRC. A message
+        outside of chunks that can't be trusted is counted as left out.
         """
         opcode = record.opcode
         is_trusted = self.is_vouched or (self._is_unchecked and not self.losses.bytes)
@@ -200,9 +210,10 @@ class Salvage:
             self._lose(record.offset, len(record.body), str(error))
 
     def _take_chunk(self, record: RawRecord) -> Iterator[Contents]:
-        """Yield the content of a chunk. Raises ChunkError if no CRC vouches for it, except in a file without CRCs.
+        """Yield the content of a chunk, and keep its definitions.
 
-        Raises ChunkError also if it can't be opened or fails its CRC.
+        Raises ChunkError if it can't be opened or fails its CRC. Raises ChunkError, too, if no CRC vouches for it. In a
+        file without CRCs it does so only if the chunk holds other bytes than whole messages and definitions.
         """
         self._chunk = None
         chunk: Chunk = parse(record.opcode, record.body)

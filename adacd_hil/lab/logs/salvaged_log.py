@@ -62,10 +62,10 @@ class SalvagedLog:
         self.losses.missing_parts = [*(part.name for part in missing), *foreign]
 
     def _is_foreign(self, item: Metadata, is_vouched: bool) -> bool:
-        """Return whether a part's metadata show that it is of another run.
+        """Return whether a part's metadata show that it is of another run than the parts before.
 
-        item: the metadata; is_vouched: a CRC vouches for them. A single entry that differs counts only if CRCs vouch
-        for both, since it may be damaged.
+        False for other metadata than the run's. item: the metadata; is_vouched: a CRC vouches for them. The part's
+        number may differ. A single entry that differs counts only if CRCs vouch for both, since it may be damaged.
         """
         if item.name != RUN_METADATA:
             return False

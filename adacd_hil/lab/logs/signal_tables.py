@@ -70,7 +70,9 @@ def event_columns(events: Iterable[LoggedEvent]) -> dict[str, Any]:
 def frame_columns(frames: NDArray[Any], decoder: DbcDecoder) -> Iterator[tuple[str, dict[str, Any]]]:
     """Decode frames of RECORDED_FRAME_DTYPE by a DBC; yield name and columns of each message that occurs.
 
-    A signal that a frame lacks, because it is short or multiplexed, is NaN. Error and remote frames are left out.
+    A signal that a frame lacks, because it is short or multiplexed, is NaN. Error and remote frames are left out, and
+    so are frames without a message in the DBC. If the DBC is a contract, frames of another length than their message
+    are left out, too. A signal that is named like `t_ns` or `cycle_t_ns` gets a "_" at its end.
     """
     frames = frames[~frames["is_error"] & ~frames["is_remote"]]
     there = set(frames["can_id"].tolist())

@@ -18,10 +18,13 @@ from adacd_hil.settings.schema import ConfigError
 
 
 def read_bag(path: Path, described: RecordingMap, span: TimeWindow | None) -> RecordedColumns:
-    """Read positions, efforts and, if all messages have them, velocities of the map's joints from a bag.
+    """Read the positions, efforts and velocities of the map's joints from the messages of a bag that name all of them.
 
-    span: as of `RecordedRows`. Raises LogError if the bag can't be read or has no efforts, ConfigError if it lacks a
-    topic or a joint, or the wanted stamps are all 0.
+    Velocities are left out unless all read messages have them. Messages whose arrays don't fit their names are dropped
+    and counted. Times count from the first read message. span: as of `RecordedRows`; reading ends behind it. Raises
+    LogError if the bag can't be read, the joints are never in one message, a joint has no effort in any message, or as
+    `RecordedRows.columns`. Raises ConfigError if the bag lacks a topic or a joint, or all stamps are 0 although
+    `bag.time` is "header".
     """
     wanted = described.columns.q or described.urdf.joint_names
     places: dict[tuple[str, ...], list[int] | None] = {}
@@ -87,8 +90,9 @@ def _topic(path: Path, topics: Mapping[str, str], wanted: str) -> str:
 def _check_names(where: str, wanted: tuple[str, ...], places: Mapping[tuple[str, ...], list[int] | None]) -> None:
     """Raise LogError or ConfigError if no message has all wanted joints.
 
-    LogError if there are no messages, or the joints are never together; ConfigError if no message names a joint. where:
-    recording and topic. places: by the names of each kind of message, None if one of the joints is missing.
+    LogError if there are no messages, or all joints are named, but never in one message. ConfigError if one of the
+    joints is named in no message. where: recording and topic. places: by the names of each kind of message, None if one
+    of the joints is missing.
     """
     if not places:
         raise LogError(f"{where} has no messages")

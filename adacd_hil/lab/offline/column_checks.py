@@ -144,9 +144,10 @@ def column_name(described: RecordingMap, key: str, joint: int) -> str:
 
 
 def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
-    """Report the first column whose rows, as recorded, alternate between two series of values.
+    """Report the first column whose rows in the file, not resampled, alternate between two series of values.
 
-    The torques of a recording are looked at before its positions. At most one finding.
+    The torques of a recording are looked at before its positions, velocities not at all. Recordings with fewer than
+    three whole rows are passed over. At most one finding.
     """
     n = described.joints
     for recording in recordings:
@@ -167,7 +168,10 @@ def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording])
 
 
 def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report torques that are constant, stuck, clipped, or over `BEYOND_EFFORT` times the URDF's effort."""
+    """Report torques that are constant, stuck, clipped, or over `BEYOND_EFFORT` times the URDF's effort.
+
+    Constant torques aren't checked for being stuck or clipped. Currents aren't compared with the effort.
+    """
     n = described.joints
     constant = [joint for joint in range(n) if np.ptp(columns.tau_J[:, joint]) == 0.0]
     if constant:
@@ -206,7 +210,10 @@ def torques_and_limits(tau_J: Vector, arm: SerialArm) -> tuple[Vector, Vector]:
 
 
 def _against_effort(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report the torque that is farthest beyond `BEYOND_EFFORT` times the URDF's effort, if one is; no current."""
+    """Report the torque that is farthest beyond `BEYOND_EFFORT` times the URDF's effort, if one is beyond.
+
+    Report nothing if the torques are currents. The finding has `is_dead` if the URDF has no masses.
+    """
     largest, effort = torques_and_limits(columns.tau_J, described.urdf)
     is_over = largest > BEYOND_EFFORT * effort
     if "A" in described.units.tau_J or not is_over.any():
@@ -233,9 +240,10 @@ def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, 
 
 
 def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report joints at rest or with dead encoders, noise, and one joint far beyond the URDF's limits.
+    """Report joints at rest or with dead encoders, noise, and the first turning joint far beyond the URDF's limits.
 
-    Far is over `_BEYOND_LIMITS` times a limit of position or speed.
+    Far is over `_BEYOND_LIMITS` times a limit of position or speed. A joint without limits of position may go two turns
+    to each side; noise isn't compared with limits. If no joint moves, report that in place of each joint at rest.
     """
     n, urdf = described.joints, described.urdf
     travel = np.ptp(columns.q, axis=0)
@@ -308,7 +316,7 @@ def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[Recording
 
 
 def _of_jumps(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
-    """Report the first joint whose position jumps and does not return, as of an encoder that is set to zero anew.
+    """Report the first turning joint whose position jumps and does not return, as of an encoder set to zero anew.
 
     A joint with more than `_MOST_JUMPS` is passed over: other checks report such a column.
     """
@@ -436,8 +444,9 @@ def _runs(column: Vector) -> NDArray[np.int64]:
 def _stuck_run(torque: Vector, q: Vector, period_s: float) -> tuple[int, int] | None:
     """Return the first and the end index of the longest run of equal torques (k,) if the sensor is stuck, else None.
 
-    The sensor is stuck if the run lasts `_STUCK_S`, some joint of q (k, n) moves in it, and the other runs are
-    `_STUCK_TIMES` shorter: a coarse sensor has many long runs. Runs at the extreme readings are left out.
+    The sensor is stuck if the run has at least `_STUCK_S` and 20 samples, some joint of q (k, n) moves in it, and the
+    other runs are `_STUCK_TIMES` shorter, by their 99 % quantile: a coarse sensor has many long runs. Runs at the
+    extreme readings are left out.
     """
     runs = _runs(torque)
     lengths = runs[:, 1] - runs[:, 0]
@@ -454,8 +463,9 @@ def clipped_torque(torque: Vector) -> tuple[float, float] | None:
     """Return the torque at which readings (k,) stop, as if clipped, and the share of readings there; None if none.
 
     Readings stop there if the band next to the extreme reading, as wide as the noise, holds far more of them than the
-    band beside it. A joint that overcomes only friction looks like this, too. Extreme readings that repeat exactly are
-    those of `_clipped_at`, and give None.
+    band beside it. The largest reading is tried before the smallest. A joint that overcomes only friction looks like
+    this, too. Extreme readings that repeat exactly are those of `_clipped_at`, and give None. None, too, without noise,
+    or if the band would be wider than `_PLATEAU_WIDTH` of the span.
     """
     width, span = 2.0 * _PLATEAU_SIGMAS * float(white_noise(torque)), float(np.ptp(torque))
     if not 0.0 < width < _PLATEAU_WIDTH * span:

@@ -55,10 +55,12 @@ class _Column(NamedTuple):
 
 
 def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> RecordedColumns:
-    """Read the columns that a map names from a CSV file. span: as of `RecordedRows`.
+    """Read the columns that a map names from a CSV file; rows that can't be read are dropped and counted.
 
-    Raises ConfigError if the map doesn't name positions or torques, or the file lacks a named column; LogError if the
-    file can't be read, or as `RecordedRows.columns`.
+    span: as of `RecordedRows`; reading ends behind it. Raises ConfigError if the map doesn't name positions or torques,
+    or gives neither times nor a period. Raises ConfigError, too, if the file lacks a named column, seems to have
+    another delimiter, or has a row of other units. Raises LogError if the file can't be read, or as
+    `RecordedRows.columns`.
     """
     for key in ("q", "tau_J"):
         if not getattr(described.columns, key):
@@ -81,9 +83,9 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
 
 
 def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
-    """Return the stripped cells of the first row, without empty ones at its end and a "#" at its begin.
+    """Return the stripped cells of the first row, without empty ones at its end and without a "#" at its begin.
 
-    Raises ConfigError if the map's delimiter gives a head of one column, and another one gives more than two.
+    Raises ConfigError if the map says that there is a header, its delimiter gives one column, and another one over two.
     """
     while first and not first[-1].strip():  # a delimiter at the end of every row
         first = first[:-1]
@@ -100,7 +102,8 @@ def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
 def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
     """Yield each row's number in the file, from 1, and its cells.
 
-    Empty rows, and comments below the first row, are skipped.
+    The first `csv.skip_rows` lines are skipped, but counted in the numbers. Empty rows, and comments ("#") below the
+    first row, are skipped, too. Raises LogError as `opened_text` and `split_rows`.
     """
     form = described.csv
     with opened_text(path) as file:
@@ -114,10 +117,10 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
 
 @contextmanager
 def opened_text(path: Path) -> Iterator[TextIO]:
-    """Open a text file for the block.
+    """Open a text file for the block, without its byte-order mark if it has one.
 
-    Raises LogError if the file can't be read or its first bytes are those of another format, and, from the block, if it
-    is no text in UTF-8, with or without a byte-order mark.
+    Raises LogError if the file can't be read or its first bytes are those of another format. Text that isn't UTF-8
+    raises LogError in the block. Any OSError of the block becomes a LogError, too.
     """
     try:
         with open_input(path) as file:
@@ -201,8 +204,10 @@ def _numbers(
 ) -> Iterator[tuple[int, list[float]]]:
     """Yield each row's number in the file and its values, the time first; an empty cell is nan.
 
-    Rows without a time column get one by their count. Bad rows are counted in `into`, a row of units is noted there.
-    width: number of cells of a row. Raises ConfigError if a row of units differs from the map.
+    Without a time column a row's time is its count, dropped rows included, times the map's period. Rows with too few
+    cells, more filled ones than `width`, or a cell that isn't a number are dropped and counted in `into`. A first row
+    of units is skipped with a note in `into`. width: number of cells of a row. Raises ConfigError if the row of units
+    differs from the map.
     """
     has_time = bool(columns[0].name)
     wanted = columns if has_time else columns[1:]
@@ -267,7 +272,10 @@ def _remedy(text: str, column: _Column, described: RecordingMap) -> str:
 
 
 def read_number(text: str, decimal: str) -> float:
-    """Parse a number with this decimal sign, "." or ",". Raises ValueError if the text is none."""
+    """Parse a number as `float` does, nan and inf included; `decimal` "," means that commas are read as points.
+
+    Raises ValueError if the text is none.
+    """
     return float(text.replace(",", ".") if decimal == "," else text)
 
 
@@ -293,7 +301,10 @@ def _time_reader(read: Callable[[str], Decimal], decimal: str) -> Callable[[str]
 
 
 def _iso_seconds(text: str) -> Decimal:
-    """Parse a date and time of ISO 8601, UTC unless it has an offset, as s since 1970."""
+    """Parse a date and time of ISO 8601, UTC unless it has an offset, as s since 1970, to the µs.
+
+    Raises ValueError if the text is none.
+    """
     moment = datetime.fromisoformat(text)
     since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - _EPOCH
     return since // timedelta(microseconds=1) * Decimal("1e-6")

@@ -86,10 +86,10 @@ def _read_arm(urdf: Path) -> tuple[SerialArm, tuple[str, ...]]:
 
 
 def _of_table(recording: Path, arm: SerialArm) -> list[DraftedKey]:
-    """Draft the keys of a CSV file.
+    """Draft the keys of a CSV file: the form that differs from the defaults, the columns, the units.
 
-    Raises ConfigError if no columns look like positions, or like torques or currents; LogError if the file can't be
-    read.
+    Without times, draft `sampling.period_s` = 0 for the user to fill in. Raises ConfigError if no columns look like
+    positions, or like torques or currents; LogError if the file can't be read.
     """
     guess = guess_table(recording, arm.joint_names)
     n, form = len(arm.joint_names), guess.form
@@ -160,9 +160,9 @@ def _angle_unit(q: Vector, arm: SerialArm) -> tuple[str, str]:
 
 
 def _speed_unit(guess: TableGuess, angle: str, step_s: float) -> str:
-    """Return the unit in which velocities are within 10 % of the positions' slope; "rad/s" if there is none.
+    """Return the unit in which velocities are within 10 % of the positions' slope, whatever their sign.
 
-    angle: unit of the positions. step_s: interval of the rows.
+    "rad/s" if there is none, or no position changes. angle: unit of the positions. step_s: interval of the rows.
     """
     slope = np.gradient(guess.of("q"), axis=0) / step_s * (np.pi / 180.0 if angle == "deg" else 1.0)
     square = np.nansum(slope**2)
@@ -184,10 +184,11 @@ def _torque_unit(tau: Vector, arm: SerialArm) -> tuple[str, str]:
 
 
 def _of_bag(recording: Path, arm: SerialArm) -> list[DraftedKey]:
-    """Draft the keys of a bag that differ from the defaults: topic, stamp, names of joints, units.
+    """Draft the keys of a bag that differ from the defaults: stamp, names of joints, units.
 
-    Only its first `_SEEN_MESSAGES` messages are read. Raises LogError if it can't be read or has no joint states,
-    ConfigError if its joints don't fit the arm's.
+    With several topics of joint states, draft `bag.topic`, too: /joint_states, or else the first. Only the first
+    `_SEEN_MESSAGES` messages are read. Raises LogError if the bag can't be read or has no joint states, ConfigError if
+    its joints don't fit the arm's.
     """
     keys = []
     with opened_bag(recording) as (topics, read_messages):

@@ -109,9 +109,10 @@ def find_readings(
 ) -> list[Reading]:
     """Return the interpretations that explain the test's torque far better than the map does, best first.
 
-    They explain `EXPLAINED` of it, and leave at most `_BETTER` of the share that the map leaves unexplained, unless no
-    arm can have the map's parameters. Of nearly equal ones only those with the fewest differences from the map are
-    returned. [] if there is none, or the map's own can't be computed.
+    An arm can have their parameters, and they explain at least `EXPLAINED` of the torque. They leave at most `_BETTER`
+    of the share that the map leaves unexplained, unless no arm can have the map's parameters. Of nearly equal ones only
+    those with the fewest differences from the map are returned. At most `_MOST_S` of fit and of test are used. [] if
+    there is none, or the map's own can't be computed.
     """
     fitted, tested = _thinned(fitted, settings), _thinned(tested, settings)
     step = _step(settings)
@@ -137,9 +138,10 @@ def find_readings(
 
 
 def is_possible(model: ArmModel, theta: Vector, q: Vector, dq: Vector) -> bool:
-    """Return whether an arm can have these parameters: positive inertias in about 8 poses of q, and braking friction.
+    """Return whether an arm can have these parameters: positive inertias in about 8 poses of q, braking friction.
 
-    q, dq: (k, n).
+    By its mean power in the motion, each joint's friction may drive it on a little: up to `_IDLE_FRICTION` of the
+    largest friction. q, dq: (k, n).
     """
     F_v, F_c = theta[model.place_of("F_v")], theta[model.place_of("F_c")]
     speed, square = np.abs(dq).mean(axis=0), (dq**2).mean(axis=0)
@@ -167,7 +169,7 @@ def _step(settings: OfflineSettings) -> int:
 def _thinned(records: list[Record], settings: OfflineSettings) -> list[Record]:
     """Return the first `_MOST_S` of the records in all, with only every `_step`-th sample.
 
-    A record left with one sample is dropped.
+    A record left with fewer than two samples is dropped.
     """
     step, room = _step(settings), round(_MOST_S / settings.period_s)
     kept = []
@@ -207,7 +209,11 @@ def _judge(
     torques: _Torques,
     fitted: list[Record],
 ) -> Reading:
-    """Fit the arm under an interpretation of motion and torques; return it with its unexplained share in the test."""
+    """Fit the arm to `fit` under an interpretation of motion and torques, and return the interpretation as a `Reading`.
+
+    Its unexplained share is that of the worst joint in `test`. Only the map's own reading, and readings that explain at
+    least `EXPLAINED`, are tested for parameters that an arm can have; the test is made on the motion of `fitted`.
+    """
     factors, places, joints = torques.factors, list(torques.places), range(motion.model.joints)
     weight = 1.0 / (factors**2 * fit.spread[places])
     A = np.tensordot(weight, fit.A, axes=1)
@@ -246,8 +252,9 @@ def _other_units(described: RecordingMap, tested: list[Record]) -> Iterator[tupl
 def _torques(described: RecordingMap, most_turned: int, units: list[tuple[int, float]]) -> Iterator[_Torques]:
     """Yield interpretations of the torques, the map's own first.
 
-    The others have some or all turned, one in another unit, two exchanged, all in reverse order. most_turned: most
-    torques that have the other sign, unless all have. units: joints and the factors to try on their torques.
+    The others: some turned, all turned, one in another unit, two exchanged, and, beyond three joints, all in reverse
+    order. Signs are tried on the first `_MOST_SIGNS` joints only. most_turned: most torques that have the other sign,
+    unless all have. units: joints and the factors to try on their torques.
     """
     n, names = described.joints, described.urdf.joint_names
     straight, ones = tuple(range(n)), np.ones(n)
@@ -276,8 +283,10 @@ def _torques(described: RecordingMap, most_turned: int, units: list[tuple[int, f
 def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
     """Yield interpretations of the motion, the map's own first, with texts "".
 
-    The others: positions in another unit, a joint turned, two exchanged, all in reverse order, sums or differences of
-    joints, torques with or without rotors, gravity along another axis or none.
+    The others: positions in another unit, a joint turned, two exchanged, sums or differences of neighbours, torques
+    with or without rotors, gravity along another axis or none. Beyond two joints also positions that count from the
+    base, and beyond three joints all columns in reverse order. Where the map names velocities, another unit of the
+    positions is tried with and without that of the velocities.
     """
     n, straight, names = model.joints, np.eye(model.joints), described.urdf.joint_names
     yield _Motion("", "", model, straight)

@@ -97,18 +97,19 @@ class RecordedRows:
 
     @property
     def is_past_span(self) -> bool:
-        """Whether all of the requested span has been read, so that no further row is needed.
+        """Whether the requested span and `_SPARE_S` more have been read, so that no further row is needed.
 
-        Always False without a span, and for a file with at most `MOST_ROWS` rows so far.
+        It changes only with each `BLOCK_ROWS` rows. Always False without a span, and for a file with at most
+        `MOST_ROWS` rows so far.
         """
         return self._is_long and self._span is not None and self._latest_s - self._begin_s > self._span.end_s + _SPARE_S
 
     def columns(self, described: RecordingMap, names: list[str], has_touches: bool = False) -> RecordedColumns:
-        """Return all kept rows as columns in SI units.
+        """Return all kept rows as columns in SI units; call it after the last row.
 
         names: of the value columns, for errors; more than 2 n include velocities. has_touches: the last number of a row
-        is not 0 while the arm is touched. Raises LogError for fewer than `SHORTEST_SAMPLES` rows, too many dropped
-        ones, rows of two sources, or a value above `LARGEST`.
+        is other than 0 while the arm is touched; NaN counts as touched. Raises LogError for fewer than
+        `SHORTEST_SAMPLES` rows, too many dropped ones, rows of two sources, or a size above `LARGEST`.
         """
         self._flush()
         table = np.concatenate(self._kept) if self._kept else np.empty((0, self._width))
@@ -211,9 +212,9 @@ class RecordedRows:
             )
 
     def _check_values(self, given: Vector, values: Vector, time_s: Vector, names: list[str]) -> None:
-        """Raise LogError if a finite recorded value is above `LARGEST` in SI units.
+        """Raise LogError if the size of a finite recorded value is above `LARGEST` in SI units.
 
-        given: values as recorded, values: in SI units, (k, c).
+        given: values as recorded, values: in SI units, (k, c). time_s (k,): since the first row, for errors.
         """
         too_large = np.argwhere(np.isfinite(given) & ~(np.abs(values) <= LARGEST))
         if len(too_large):

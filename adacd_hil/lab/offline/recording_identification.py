@@ -157,8 +157,9 @@ def identify(
     """Fit one model to all recordings, test it on another one, and detect contacts in further ones.
 
     tested: None: of the last recording the first `FIT_SHARE` of its time is fitted, and the rest tested. watched:
-    further recordings. Samples during a known touch are neither fitted nor tested. Raises LogError if there is too
-    little free motion to fit or to test, ConfigError if the map's settings of the scheme are invalid.
+    further recordings. Samples during a known touch are neither fitted nor tested. Period and noise are those of the
+    last fitted recording, except noise that the map gives. Raises LogError if a fitted recording has no stretch, or too
+    little free motion is left to fit or to test; ConfigError if the map's settings of the scheme are invalid.
     """
     for recording in fitted:
         if not recording.stretches:
@@ -244,8 +245,9 @@ def watch(
 ) -> Watched:
     """Detect contacts in a recording, and compare them with its touches if these are known.
 
-    lack_Nm: model error (n,), by which the thresholds are widened; 0: thresholds from noise and covariance only.
-    `faults` of the result is empty: columns aren't checked.
+    The first contact of a touch detects it; a contact of no touch is false. lack_Nm: model error (n,), by which the
+    thresholds are widened; 0: thresholds from noise and covariance only. `faults` of the result is empty: columns
+    aren't checked.
     """
     detections = [offline.detect(model, part.record, estimate, settings, lack_Nm) for part in recording.stretches]
     spells: list[Spell] = []
@@ -280,7 +282,7 @@ def _touch_indices(
     """Return the index of the touch to which each contact belongs, -1 without one.
 
     samples: index of each contact's first sample. A touch explains contacts from `blur_s` before it, for derived
-    velocities, to `isolation_s` after it.
+    velocities, to `isolation_s` after it. From `blur_s` before the next touch on, it explains no more.
     """
     firsts, ends = np.array(stretch.touches, np.int64).reshape(-1, 2).T
     onsets = firsts - round(recording.blur_s / recording.period_s)

@@ -90,7 +90,10 @@ class ForeignRecording:
 
     @property
     def span_s(self) -> tuple[float, float]:
-        """Begin of the first stretch and end of the last one, s since the recording's first row."""
+        """Begin of the first stretch and end of the last one, s since the recording's first row.
+
+        Raises IndexError without stretches.
+        """
         last = self.stretches[-1]
         return self.stretches[0].start_s, last.start_s + len(last.record.q) * self.period_s
 
@@ -109,8 +112,9 @@ class ForeignRecording:
     def between(self, start_s: float, end_s: float) -> "ForeignRecording":
         """Return the recording with its stretches cut to a span of time, s since the recording's first row.
 
-        Stretches left with fewer than `SHORTEST_SAMPLES` are dropped; there may be no stretch left. Noise,
-        columns and notes stay those of the whole recording.
+        A sample at `start_s` belongs to the span, a sample at `end_s` doesn't. Stretches left with fewer than
+        `SHORTEST_SAMPLES` are dropped; there may be no stretch left. Noise, columns and notes stay those of the whole
+        recording.
         """
         parts = [_cut(stretch, self.period_s, start_s, end_s) for stretch in self.stretches]
         kept = tuple(part for part in parts if len(part.record.q) >= SHORTEST_SAMPLES)
@@ -118,7 +122,11 @@ class ForeignRecording:
 
     @property
     def free(self) -> "ForeignRecording":
-        """The recording without touched samples; unchanged if touches are unknown. It may have no stretches."""
+        """The recording without touched samples; unchanged if touches are unknown.
+
+        Samples within `blur_s` of a touch are left out, too, and parts with fewer than `SHORTEST_SAMPLES`. It may have
+        no stretches.
+        """
         return replace(self, stretches=tuple(part for stretch in self.stretches for part in self._untouched(stretch)))
 
     def _untouched(self, stretch: RecordingStretch) -> list[RecordingStretch]:
@@ -151,11 +159,12 @@ def samples(recordings: Iterable[ForeignRecording], name: str) -> Vector:
 def read_recording(
     path: Path, described: RecordingMap, period_s: float = 0.0, span: TimeWindow | None = None
 ) -> ForeignRecording:
-    """Read a CSV file, an MCAP file or a rosbag into samples at a fixed period.
+    """Read a CSV file, an MCAP file or a rosbag, told apart by the first bytes, into samples at a fixed period.
 
     period_s: of the samples, if the map gives none; 0: the median interval of the file's rows. span: the part to read
     of a file with more than `MOST_ROWS` rows; any other is read whole. Raises LogError if the file can't be read, is
-    too long, or has no usable stretch; ConfigError if the map names a column, topic or joint that the file lacks.
+    too long, or has no usable stretch; ConfigError if the map names a column, topic or joint that the file lacks, or if
+    the map lacks a key.
     """
     read = read_bag if is_bag(path) else read_csv
     return recording_of(path, described, read(path, described, span), period_s)
@@ -166,9 +175,11 @@ def recording_of(
 ) -> ForeignRecording:
     """Make a recording from columns: drop rows that lack a value, resample at a fixed period, and split at gaps.
 
-    path: of the recording, named in errors. period_s: if the map gives none; 0: the median interval of the rows. Raises
-    LogError if no stretch without a gap has enough samples, the samples are more than `MOST_ROWS`, or the median
-    interval is outside `SHORTEST_PERIOD_S` to `LONGEST_PERIOD_S`.
+    Velocities of all joints are derived from the positions if they are missing, or a moving joint's is constant. Jumps
+    of a position by whole turns are removed. Stretches that are too short are dropped. path: of the recording, named in
+    errors. period_s: if the map gives none; 0: the median interval of the rows. Raises LogError if too few rows have
+    all values, no stretch without a gap has enough samples, or the samples are more than `MOST_ROWS`; also if the
+    median interval is used and is outside `SHORTEST_PERIOD_S` to `LONGEST_PERIOD_S`.
     """
     n = described.joints
     is_whole = np.isfinite(given.values).all(axis=1)
@@ -288,7 +299,10 @@ def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, lis
 
 
 def derivative_window(described: RecordingMap, period_s: float) -> int:
-    """Return the number of samples, odd and at least `_DEGREE` + 2, in the window over which a velocity is derived."""
+    """Return the number of samples in `sampling.smoothing_s`, the window over which a velocity is derived.
+
+    It is rounded, then made odd by adding 1, and at least `_DEGREE` + 2.
+    """
     return max(_DEGREE + 2, round(described.sampling.smoothing_s / period_s)) | 1
 
 

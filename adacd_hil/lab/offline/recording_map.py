@@ -35,7 +35,10 @@ _SPELLINGS = {
 
 
 def unit_of(text: str) -> str:
-    """Return the unit that a text names, such as "[degrees]" or "msec", as the map spells it; "" for any other text."""
+    """Return the unit that a text names, such as "[degrees]" or "msec", as the map spells it; "" for any other text.
+
+    Upper and lower case don't matter.
+    """
     return _SPELLINGS.get(text.strip(" []()").casefold(), "")
 
 
@@ -168,7 +171,10 @@ class RecordingMap:
         return TIME_S[self.units.time]
 
     def factors(self, key: str) -> tuple[float, ...]:
-        """Factor from each recorded value to rad, rad/s or Nm: unit times scale (n,). key: "q", "dq" or "tau_J"."""
+        """Factor from each recorded value to rad, rad/s or Nm: unit times scale (n,). key: "q", "dq" or "tau_J".
+
+        Velocities have the scale of the positions. The unit's factor of A is 1, of mA 0.001.
+        """
         unit = _UNITS[key][getattr(self.units, key)]
         return tuple(unit * factor for factor in self._scale("tau_J" if key == "tau_J" else "q"))
 
@@ -234,7 +240,8 @@ def parse_map(table: dict[str, Any], path: Path) -> RecordingMap:
 def checked_scheme(scheme: dict[str, Any], prefix: str) -> dict[str, Any]:
     """Return settings of the scheme, as given. prefix: of their keys in errors.
 
-    Raises ConfigError for a key or value that `OfflineSettings` doesn't allow, and for the period: the recording's.
+    Raises ConfigError for a key or value that `OfflineSettings` doesn't allow, and for `period_s`, which the recording
+    gives.
     """
     if "period_s" in scheme:
         raise ConfigError(f"`{prefix}period_s` is no setting: the recording's own period is taken")

@@ -120,7 +120,9 @@ class Fitted:
 def judge_fit(fit: Fitted) -> Verdict:
     """Return the verdict on a fit: whether the model explains the torque of the test, reasons if not, next step.
 
-    It isn't explained if a joint isn't, or a finding on columns, length, units or inertia is against it.
+    It isn't explained if a joint isn't, or a finding on columns, length, units or inertia is against it. With a dead
+    column or too short recordings, the model isn't judged further. Excitation and smallest contacts are remarked on
+    only if the test is explained.
     """
     joints = _shares(fit)
     columns = find_faults(fit.described, fit.fitted, fit.tested)
@@ -144,8 +146,9 @@ def judge_fit(fit: Fitted) -> Verdict:
 def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[RecordingFinding]) -> list[RecordingFinding]:
     """Return findings on columns, scale, other interpretations and fit; the first is the likeliest cause, if any.
 
-    columns: defects of columns as possible causes; remarks if the torque is explained, with a margin below 1 at least
-    `WHOLE` of it.
+    columns: defects of columns as possible causes. They are remarks beside a wrong scale, and beside a mistake of the
+    map. They are remarks, too, if all joints are explained, with no impossible inertia and no wrong column, and the
+    margin is at least 1 or the least share at least `WHOLE`.
     """
     remarks = [found._replace(is_against=False) for found in columns]
     scale = list(_of_scale(fit, joints))
@@ -197,7 +200,10 @@ def _shares(fit: Fitted) -> tuple[JointShare, ...]:
 
 
 def percent(share: float) -> str:
-    """Format a share 0…1 as a percentage, such as "97.3 %"; a negative one as "0.0 %", nan as "-"."""
+    """Format a share 0…1 as a percentage with one decimal, such as "97.3 %"; a negative one as "0.0 %", nan as "-".
+
+    From 0.9995 on with two decimals, and from 0.99995 on as "100.0 %".
+    """
     if math.isnan(share):
         return "-"
     digits = 1 if share < 0.9995 else 2
@@ -244,7 +250,12 @@ def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Ite
 
 
 def _of_noise(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
-    """Report unexplained torques: noise of a passive joint, noise, unrelated to the motion, or mostly noise."""
+    """Report unexplained joints whose torque is noise or unrelated to the motion, a finding per cause with its joints.
+
+    Causes: noise of a passive joint, noise unrelated to the motion, another torque unrelated to the motion, mostly
+    noise. Passive: the residual is within the threshold, and another joint is explained. Mostly noise: the residual is
+    within the threshold, without another of these causes.
+    """
     related, is_noise = _related_to_motion(fit), _is_noise(fit, joints)
     empty = [
         i for i, joint in enumerate(joints) if not joint.share >= NOTHING and (is_noise[i] or related[i] < NOTHING)
@@ -314,7 +325,8 @@ def _related_to_motion(fit: Fitted) -> Vector:
 def _predicted_share(fitted: Vector, tested: Vector) -> float:
     """Return the share of `tested`'s last column that its other columns explain with coefficients fitted to `fitted`.
 
-    Both (k, c), with torque as last column and the filtered constant as column 1. Negative if worse than a constant.
+    Both (k, c): the last column is the torque, the column with index 1 the filtered constant. Negative if worse than a
+    constant.
     """
     coefficients = np.linalg.lstsq(fitted[:, :-1], fitted[:, -1], rcond=1e-6)[0]
     unit, torque = tested[:, 1], tested[:, -1]
@@ -326,7 +338,9 @@ def _predicted_share(fitted: Vector, tested: Vector) -> float:
 def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
     """Report a unit of torques or angles by which the torques differ from the URDF's masses, or an impossible inertia.
 
-    A large ratio that no unit explains is a remark.
+    The ratio to the masses is judged if it is over `_SIGMAS` deviations and every joint's share over `_MOSTLY`; an
+    angle needs shares of `WHOLE`. A large ratio that no unit explains is a remark. The inertia about joint 1 is judged
+    if no unit was reported and every share is at least `HALF`.
     """
     scale, sigma = _scale_of_urdf(fit)
     mass_kg = _mass_at_reach(fit)
@@ -389,7 +403,8 @@ def _scale_of_urdf(fit: Fitted) -> tuple[float | None, float]:
 def _mass_at_reach(fit: Fitted) -> float | None:
     """Return the mass, kg, that has joint 1's largest inertia if it is at the outermost joint of the stretched arm.
 
-    None if the arm has no reach, a joint slides, or the inertia isn't positive.
+    The inertia is the largest of about 8 poses of the test's first stretch. None if the arm has no reach, a joint
+    slides, or the inertia isn't positive.
     """
     arm = fit.described.urdf.chain
     reach_m = float(np.sum(np.linalg.norm(arm.translation[1:], axis=1)))
@@ -400,7 +415,10 @@ def _mass_at_reach(fit: Fitted) -> float | None:
 
 
 def _of_inertia(fit: Fitted) -> Iterator[RecordingFinding]:
-    """Report the most negative inertia, if it is so by more than `_SIGMAS` deviations: no masses have it."""
+    """Report the most negative inertia, by its deviation, if it is below 0 by more than `_SIGMAS` deviations.
+
+    No masses have it. All joints are looked at, in about 16 poses of the test's first stretch.
+    """
     urdf, rows = fit.described.urdf, mass_rows(fit.model, fit.tested.records[0].q, 16)
     inertia = rows @ fit.estimate.theta
     sigma = np.maximum(np.linalg.norm(rows * fit.deviation, axis=-1), 1e-300)

@@ -93,8 +93,9 @@ class _Head(NamedTuple):
 def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
     """Guess the form of a CSV file and the role of its columns, by their heads, or by their values if it has no heads.
 
-    joint_names: of the arm, from the base; they also tell the number of joints. A role without fitting columns is
-    missing in the guess. Raises LogError if the file can't be read, or its first `_HEAD_ROWS` hold no rows of numbers.
+    Only the first `_SEEN_ROWS` rows are read. joint_names: of the arm, from the base; they also tell the number of
+    joints. A role without fitting columns is missing in the guess. Raises LogError if the file can't be read, or its
+    first `_HEAD_ROWS` hold no rows of numbers.
     """
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
@@ -126,8 +127,9 @@ _Form = tuple[CsvSection, tuple[str, ...], tuple[str, ...], int]
 def _form(path: Path, lines: list[str]) -> _Form:
     """Return form, heads, units below them and first data line, from 0, by the first lines of a CSV file.
 
-    Of all delimiters and decimal signs those are taken that give the data the most columns. Raises LogError unless
-    `_FULL_ROWS` successive rows of numbers lie in the first `_HEAD_ROWS`.
+    The delimiter and decimal sign are those that give the data the most columns; of equal ones the first in the order
+    of `DELIMITERS`, "." before ",". Raises LogError unless `_FULL_ROWS` successive rows of numbers lie in the first
+    `_HEAD_ROWS`.
     """
     best: _Form | None = None
     for delimiter in DELIMITERS:
@@ -196,7 +198,9 @@ def _number(cell: str, decimal: str) -> float:
 def _by_heads(guess: TableGuess, joint_names: Sequence[str]) -> None:
     """Set columns, units and reasons of a guess by the heads; a role without fitting columns stays unset.
 
-    Positions, velocities and torques need one column per joint. Currents are the torques if there are no torques.
+    Positions, velocities and torques need one numbered or named column per joint. If several groups fit a role, the
+    smallest number of words for values that aren't measured decides, then the number of words, then the order. Currents
+    are the torques if there are no torques.
     """
     groups: dict[tuple[tuple[str, ...], str], list[_Head]] = {}
     for place, (text, unit) in enumerate(zip(guess.heads, guess.units_below, strict=True)):

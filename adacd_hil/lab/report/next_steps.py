@@ -81,7 +81,7 @@ def _repairs(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]
 def _checked(run: Run, source: ReportSource, text: str) -> NextStep:
     """Return a next step: `text`, and the `doctor` command for host, bus and arm.
 
-    For an emulated arm the command is `demo`, to play the run again.
+    For an emulated arm, or a log that names no interface, the command is `demo`, to play the run again.
     """
     interface, channel = run.metadata.get("interface", ""), run.metadata.get("channel", "")
     if interface in ("", EMBEDDED):

@@ -115,7 +115,10 @@ def render_page(
 
 
 def render(template: str, **values: Any) -> str:
-    """Return the text of a template filled with values. Raises an error of Jinja2 if either is missing."""
+    """Return the text of a template filled with values, with a newline at its end.
+
+    Raises an error of Jinja2 if the template, or a value that it needs, is missing.
+    """
     return _environment().get_template(template).render(values) + "\n"
 
 

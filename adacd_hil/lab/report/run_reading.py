@@ -134,7 +134,8 @@ def read_run(
 def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
     """Return a run without a cycle, with metadata, settings and start of the log.
 
-    Metadata of the truth that the log lacks are there as "emulator_<key>".
+    Metadata of the truth that the log lacks are there as "emulator_<key>", except the digest of the host's
+    configuration. If the log has a DBC, its digest is there as "dbc_sha256".
     """
     metadata = dict(stream.metadata)
     if DBC_NAME in stream.attachments:
@@ -196,7 +197,7 @@ def _with_ending(
 ) -> ReadRun:
     """Return a run with `broken_off`, if the log ended unplanned, and the counts of the log's summary.
 
-    The source has the problems of log and truth, and unjudged alarms.
+    The run of a stretch has no counts. The source has the problems of log and truth, and unjudged alarms.
     """
     ending = stream.summary.get(ENDING_KEY, "")
     if ending and ending not in PLANNED_ENDINGS:
@@ -327,7 +328,8 @@ class RunReading:
     def _onset_rows(self, scheme: Series, cycle: Cycles) -> Rows:
         """Return the rows of a piece in which true contacts begin, and the rows before them; none without a truth.
 
-        Rows beyond the piece may be among them.
+        Rows beyond the piece may be among them. With a truth whose host cycles are still to be found, set the times of
+        its rows in this piece, and count the latest of them as busy.
         """
         if self._clock is not None:
             rows, cycles = self._clock.place_rows(scheme, self._attempts.begins)
@@ -418,7 +420,11 @@ class RunReading:
 
 
 def _around(run: Run) -> list[Bounds]:
-    """Return spans of time around the first contacts, detections and adaptations, whose cycles are all kept."""
+    """Return spans of time, ns of the run's clock, whose cycles are all kept.
+
+    These are `AROUND_S` around the first `TRACED_CONTACTS` contacts and as many detections, and the first
+    `ADAPTATION_S` of the first `ADAPTATIONS` adaptations.
+    """
     onsets_s = [float(each.time_s[0]) for each in timed_contacts(run) if each.time_s is not None]
     found_s = [(detection.t_ns - run.zero_ns) * 1e-9 for detection in find_detections(run)]
     around = [

@@ -74,7 +74,10 @@ class Mark(NamedTuple):
 
 
 def stays_of(run: Run) -> list[Stay]:
-    """Return the spans of a run in one state each, in order of time; [] for a run without cycles."""
+    """Return the spans of a run in one state each, in order of time; [] for a run without cycles.
+
+    A span ends at the first cycle of the next one, the last span at the last cycle.
+    """
     if run.state.size == 0:
         return []
     edges = np.flatnonzero(run.state[1:] != run.state[:-1]) + 1
@@ -90,7 +93,7 @@ def stays_of(run: Run) -> list[Stay]:
 def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
     """Return warnings, errors, faults and false alarms in order of time.
 
-    Of more than `_MOST_NOTICES`, warnings are left out first.
+    Of more than `_MOST_NOTICES`, warnings are left out first, then false alarms.
     """
     notices = [
         Notice((t_ns - run.zero_ns) * 1e-9, event.level == "error", f"{event.name}: {event.message}")
@@ -250,7 +253,7 @@ def _ticks(scale: _Scale) -> Iterator[tuple[float, str]]:
 def traces_of(run: Run, metrics: Metrics) -> Traces | None:
     """Return the curves of a run, packed for the page's script, with states, contacts, faults, errors and false alarms.
 
-    None with fewer than two cycles.
+    States without a colour are left out. None with fewer than two cycles.
     """
     if run.cycle.size < 2:
         return None

@@ -110,7 +110,11 @@ def _joint_traces(values: Vector, unit: str) -> tuple[Trace, ...]:
 
 
 def _residuals(run: Run) -> Iterator[TracePanel]:
-    """Yield a panel per joint: the residual of each model with its threshold, and the true external torque if known."""
+    """Yield a panel per joint: residuals and thresholds of the run's scheme and, if it ran beside, the paper's.
+
+    The CAD model's residual and the true external torque are added if known. Thresholds far above are cut by
+    `_in_view`.
+    """
     finest = FINEST["Nm"]
     ours = "identified" if run.certified is None else "certified"
     for joint in range(JOINTS):
@@ -198,7 +202,7 @@ def _parameters(run: Run) -> Iterator[TracePanel]:
 
 
 def _true_parameter(run: Run, name: str) -> Vector | None:
-    """Return a parameter's true value in each cycle (n,).
+    """Return a parameter's true value in each cycle (n,); before the truth's first value, that value.
 
     None without a truth, or if the truth hasn't the parameter.
     """
@@ -310,8 +314,8 @@ def pack_tracks(
 ) -> Traces | None:
     """Return the curves of a page, packed for its script; None if no track has two samples and a panel.
 
-    period_s: the script can't zoom in below eight periods. marks: bands, contacts and faults of the run. is_dated: the
-    abscissa is the time since 1970.
+    Tracks with fewer are left out. period_s: the script can't zoom in below eight periods. marks: bands, contacts and
+    faults of the run. is_dated: the abscissa is the time since 1970.
     """
     tracks = [track for track in tracks if track.at_s.size > 1 and track.panels]
     if not tracks:

@@ -107,7 +107,7 @@ class RunReader:
 
     @property
     def problem(self) -> str:
-        """One line on the missing parts of the log; "" if it is whole."""
+        """One line on damage or missing parts of the log; "" if it is whole. Known after the iteration."""
         return self._stream.problem
 
     @property
@@ -117,7 +117,10 @@ class RunReader:
 
     @property
     def timing_us(self) -> dict[str, dict[str, float]]:
-        """Percentiles, µs, of the cycles' times by name ("lateness", …); of slack the low ones."""
+        """Percentiles, µs, of the cycles' times read so far, by name ("lateness", …); of slack the low ones.
+
+        {} for a time that the log lacks.
+        """
         return {
             name.removesuffix("_ns"): times.low_percentiles() if name == "slack_ns" else times.percentiles()
             for name, times in self._times.items()
@@ -129,7 +132,7 @@ def _name_of(state: int) -> str:
 
 
 def _motion_start(path: Path) -> tuple[int, int]:
-    """Return cycle and time, ns, of the first cycle in ADAPT, else of the first cycle.
+    """Return cycle and time `t_ns` of the log, ns, of the first cycle in ADAPT, else of the first cycle.
 
     Raises LogError if the log has no /scheme or can't be read.
     """
@@ -194,7 +197,10 @@ class LogComparison:
 
     @property
     def is_same(self) -> bool:
-        """Whether no field, of contacts neither, differs and no cycle is in one log only."""
+        """Whether no field of /scheme or /contact differs, and no cycle is in one log only.
+
+        Settings, metadata and timing may differ.
+        """
         return not self.fields and self.only == (0, 0)
 
     @property
@@ -251,7 +257,10 @@ class _Differences:
         self._zero_cycle = zero_cycle
 
     def take(self, first: NDArray[Any], second: NDArray[Any], since: NDArray[np.int64]) -> None:
-        """Compare records of the same cycles and count the differences; since (n,): cycles since motion start."""
+        """Compare records of the same cycles, and count differences in `found`; since (n,): cycles since motion start.
+
+        Fields that one of both lacks are added to `missing`, not to `found`.
+        """
         names, others = _fields(first), _fields(second)
         self.missing |= set(names) ^ set(others)
         for name in names:
@@ -292,9 +301,9 @@ def compare_logs(
 ) -> LogComparison:
     """Compare two logs: settings, metadata, the fields of /scheme cycle by cycle, and contacts.
 
-    stretch: of the first log; the second is read over the same time after its own motion start. progress: called with a
-    line on the cycles compared. Raises LogError if a log can't be read or has no cycle in the stretch, ConfigError for
-    a log's configuration.
+    Cycles are paired by their number since motion start; none is if the logs' periods differ. stretch: of the first
+    log; the second is read over the same time after its own motion start. progress: called with a line on the cycles
+    compared. Raises LogError if a log can't be read, lacks /scheme or usable settings, or has no cycle in the stretch.
     """
     readers = RunReader(first), RunReader(second)
     one, two = readers
@@ -340,7 +349,8 @@ def _walk_together(
 ) -> tuple[int, tuple[int, int]]:
     """Compare the cycles that both logs have, by cycles since motion start; none if their periods differ.
 
-    Return their number, and the numbers of cycles that only the first, and only the second log has.
+    Counts into `differences`, and reads both logs to their ends, so that the readers' figures are complete. Return the
+    number of compared cycles, and the numbers of cycles that only the first, and only the second log has.
     """
     streams = iter(readers[0]), iter(readers[1])
     first, second = (_next_rows(stream) for stream in streams)
@@ -374,10 +384,10 @@ def _next_rows(stream: Iterator[NDArray[Any]]) -> NDArray[Any] | None:
 def _contact_differences(
     pairs: Sequence[ContactPair], fields: Collection[str], have_same_cycles: bool
 ) -> Iterator[FieldDifference]:
-    """Yield each of the `fields` of /contact that differs in the last reports of a contact.
+    """Yield each of the `fields` of /contact that differs in the last reports of a contact, but not `cycle`.
 
-    "report" stands for a contact that only one log has. Unless the logs have the same cycles, a missing or not yet
-    final report may be lost, and is no difference.
+    "report" stands for a contact that only one log has. Unless the logs have the same cycles, a missing report, or one
+    that is final in one log only, may be lost, and is no difference.
     """
     differs: dict[str, list[Contact]] = {}
     for pair in pairs:

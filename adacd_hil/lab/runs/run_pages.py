@@ -63,7 +63,10 @@ def _place(folder: Path, report: Path | None) -> str:
 
 
 def trend_page(found: Sequence[Trend]) -> str:
-    """Return the HTML of the trends, a section for each arm."""
+    """Return the HTML of the trends, a section for each arm.
+
+    Runs with a broken log are named at the top, and the page is then not marked as good.
+    """
     sections = [
         (trend, f"trend{number}", _changes_table(trend), _runs_table(trend)) for number, trend in enumerate(found)
     ]

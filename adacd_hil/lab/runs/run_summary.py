@@ -65,10 +65,11 @@ class RunSummary:
     """One run. None: not known, or not there.
 
     name: of its folder, from the folder that was looked through. started: local time, by `started_by`: "log" where the
-    log has the date, "folder" where its name has, else "file". status: of STATUSES; verdict: the reason in a sentence.
-    expected: contacts that there were while detection was armed, None on a real arm; found: the detected ones of those,
-    or all detections if the run isn't judged. margin: smallest threshold over residual. duration_s: from the log's
-    first message to its last. friction_Nm (at FRICTION_AT_RAD_S), offset_Nm: of the first certificate without payload.
+    log has the date, "folder" where its name has, else "file", the last change of the log. status: of STATUSES;
+    verdict: the reason in a sentence. expected: contacts that there were while detection was armed, None on a real arm;
+    found: the detected ones of those, or all detections if the run isn't judged. margin: smallest threshold over
+    residual. duration_s: from the log's first message to its last. friction_Nm (at FRICTION_AT_RAD_S), offset_Nm: of
+    the first certificate without payload.
     """
 
     name: str
@@ -111,12 +112,11 @@ class RunSummary:
 
 
 def find_runs(folder: Path) -> Iterator[Path]:
-    """Yield the folders of runs in a folder and up to DEEPEST levels below, by name.
+    """Yield the folders of runs in a folder and up to DEEPEST levels below, by name; only the folder if it is a run.
 
-    Only the folder itself if it is a run.
-
-    Links are ignored. A folder whose log lacks its first part is also a run. A folder that can't be read is yielded, so
-    that the list names it.
+    Links to folders below it are not followed. A folder whose log lacks its first part is also a run. A missing folder,
+    or one below that can't be read, is yielded at the end, so that the list names it. Raises OSError if the given
+    folder can't be listed.
     """
     if _has_run(folder, [entry.name for entry in folder.iterdir()] if folder.is_dir() else []):
         yield folder
@@ -142,8 +142,8 @@ def _has_run(folder: Path, names: Sequence[str]) -> bool:
 def summarise(folder: Path, name: str = "") -> RunSummary:
     """Return the summary of the run in a folder, by its report if there is one that fits, else by its log's events.
 
-    name: of the run in the list; "": the folder's. Does not raise: a log that can't be read gives the status BROKEN,
-    one that is being written RUNNING.
+    name: of the run in the list; "": the folder's. Does not raise: a log that is damaged or can't be read gives the
+    status BROKEN, one that is being written RUNNING, one without a fitting report NOT_JUDGED.
     """
     log = folder / LOG_NAME
     started, started_by = _started(log)
@@ -199,7 +199,8 @@ def judged(summary: RunSummary) -> RunSummary:
 def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:
     """Return the summary of the run in `folder` with the figures of a report, even one of a stretch.
 
-    BROKEN without a log. table: as in report.json. name: of the run in the list.
+    BROKEN if the log can't be read. table: as in report.json; a damaged one raises one of _DAMAGES. name: of the run in
+    the list.
     """
     log = folder / LOG_NAME
     empty = RunSummary(name, log, BROKEN, "")
@@ -241,7 +242,8 @@ def _headed(summary: RunSummary, info: LogInfo, settings: Settings | None) -> Ru
 def _started(log: Path, start_ns: int = 0) -> tuple[datetime | None, str]:
     """Return when a run began, local time, and the source: "log", "folder" (its name) or "file"; (None, "") if unknown.
 
-    start_ns: the log's first time, since 1970; 0 if it has no date, as in lockstep.
+    "file" is the time of the last change of the log's first part. start_ns: the log's first time, since 1970; 0 if it
+    has no date, as in lockstep.
     """
     try:
         if start_ns:
@@ -311,7 +313,10 @@ def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
 
 
 def _told_certificate(info: LogInfo) -> CertificateState:
-    """Return the state of the last certificate by the log's events; NO_CERTIFICATE without one."""
+    """Return the state of the last certificate by the log's events, and when that came; NO_CERTIFICATE without one.
+
+    IDENTIFIED if MONITOR was entered from ADAPT, as by the paper's scheme. TAKEN_BACK has the time at which it was.
+    """
     found = CertificateState(NO_CERTIFICATE, None)
     start_ns: int | None = None
     for t_ns, event in info.milestones:
@@ -327,9 +332,9 @@ def _told_certificate(info: LogInfo) -> CertificateState:
 
 
 def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
-    """Return the summary as GOOD or NOT_GOOD with the figures of a report.
+    """Return the summary as GOOD or NOT_GOOD with the figures of a report; a log that isn't whole is NOT_GOOD.
 
-    Raises one of _DAMAGES if the report is damaged.
+    Raises one of _DAMAGES if the report is damaged, LogError if the log is needed and can't be read.
     """
     log, certified = table["log"], table["certified"]
     is_good = _flag(table["is_clean"]) and _flag(log["is_complete"])
@@ -353,9 +358,9 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
 
 
 def _reported_certificate(summary: RunSummary, table: Mapping[str, Any]) -> CertificateState:
-    """Return the state of a run's last certificate by its report.
+    """Return the state of a run's last certificate by its report, and when that came, s since motion start.
 
-    By the log's events if a certificate was taken back.
+    By the log's events if a certificate was taken back; raises LogError if they can't be read.
     """
     certified = table["certified"]
     if certified is not None and certified["revoked"]:
@@ -376,9 +381,9 @@ def _first_adaptation(table: Mapping[str, Any]) -> str | None:
 
 
 def _threshold(table: Mapping[str, Any]) -> Pair | None:
-    """Return, by joint, the smallest of the channels' median thresholds in the first detection section, Nm.
+    """Return by joint the smallest of the channels' median thresholds in the first detection section with margins, Nm.
 
-    None if no section has margins.
+    None if no detection section has margins.
     """
     margins = table["certified"]["margins"]
     for section in _sections(table, "detection"):
@@ -391,7 +396,8 @@ def _threshold(table: Mapping[str, Any]) -> Pair | None:
 def _first_model(table: Mapping[str, Any]) -> dict[str, Any]:
     """Return friction and offsets, by field of RunSummary, of the first certificate without a payload.
 
-    A run of the paper's scheme has the friction of its first adaptation only; {} without such a certificate.
+    A run of the paper's scheme has the friction of its first complete adaptation only, None if unknown. {} for a
+    certified run without such a certificate.
     """
     certified, section = table["certified"], _first_adaptation(table)
     if certified is None:

@@ -73,7 +73,11 @@ class RunFilter:
     until: datetime | None = None
 
     def takes(self, run: RunSummary) -> bool:
-        """Return whether a run meets all conditions: on its arm, status, scenario and beginning."""
+        """Return whether a run meets all conditions: on its arm, status, scenario and beginning.
+
+        Of the names of one condition, one must fit. An empty condition is met, but a run without a date is outside any
+        bounds.
+        """
         if self.arms and not any(is_arm(run, arm) for arm in self.arms):
             return False
         if self.statuses and run.status not in self.statuses:
@@ -129,9 +133,10 @@ def row_texts(run: RunSummary) -> tuple[str, ...]:
 
 
 def certificate_text(run: RunSummary) -> str:
-    """Return the state of a run's last certificate, and when it got it, s since motion start; NONE if unknown.
+    """Return the state of a run's last certificate, and when that came, s since motion start; NONE if unknown.
 
-    A certified run with several certificates has their number, too.
+    "none" for a run without a certificate. The time is left out if unknown. A certified run with several certificates
+    has their number, too.
     """
     if run.certificate is None:
         return NONE
@@ -158,7 +163,7 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def as_csv(runs: Sequence[RunSummary]) -> str:
-    """Return the table of runs as CSV, with a head and a line per run."""
+    """Return the table of runs as CSV, with a head and a line per run; unknown values are empty."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(_flat(COLUMNS))
@@ -167,9 +172,9 @@ def as_csv(runs: Sequence[RunSummary]) -> str:
 
 
 def write_parquet(runs: Sequence[RunSummary], path: Path) -> None:
-    """Write the table of runs as Parquet; an earlier file is replaced once the new one is whole.
+    """Write the table of runs as Parquet, and make its folder; an earlier file is replaced once the new one is whole.
 
-    Raises LogError without pyarrow, or if the file can't be written.
+    Raises LogError without pyarrow, or if the file can't be written, as over a log or a folder.
     """
     arrow, parquet = import_pyarrow()
     rows = [_flat(values_of(run)) for run in runs]
@@ -184,6 +189,9 @@ def write_parquet(runs: Sequence[RunSummary], path: Path) -> None:
 
 
 def write_result(content: bytes | str, path: Path) -> None:
-    """Write a file; an earlier one is replaced once the new one is whole. Raises LogError if it can't be written."""
+    """Write a file, and make its folder; an earlier file is replaced once the new one is whole.
+
+    Raises LogError if it can't be written, as over a log or a folder.
+    """
     with failing_as(f"{path} can't be written"):
         replace_files(path.parent, {path.name: content})

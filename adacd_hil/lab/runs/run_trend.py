@@ -105,7 +105,8 @@ def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE)
     """Return the trend of each arm, sorted by name; runs that are not judged are left out of it, but listed.
 
     Runs of one name whose settings are of two arms are apart; the name of the later arm has the settings that differ.
-    threshold_share: share of a threshold from which a difference is a change.
+    threshold_share: share of a threshold; a larger difference is a change. If settings of the detection differ from the
+    run before, `MEANT_SHARE` of it counts.
     """
     by_arm: dict[str, list[RunSummary]] = {}
     for run in in_order(runs):
@@ -160,8 +161,9 @@ def _columns(pairs: Sequence[tuple[float, float] | None]) -> Vector:
 def _changes(runs: Sequence[RunSummary], values: Vector, std: Vector, share: float | None) -> tuple[TrendChange, ...]:
     """Return the runs whose value differs too much from the first one since the last change, joint by joint.
 
-    share: of that first value, times `MEANT_SHARE` if settings of the detection differ from the run before; None:
-    compare by standard deviations `std`, more than LAST_SIGMAS of both.
+    Runs without a value are passed over; the changes are sorted by run, then by joint. share: of that first value,
+    times `MEANT_SHARE` if settings of the detection differ from the run before; None: compare by standard deviations
+    `std`, more than LAST_SIGMAS of both; without any deviation there is no change.
     """
     found: list[TrendChange] = []
     for joint in range(JOINTS):
@@ -232,7 +234,7 @@ def _last_changes(quantity: TrendQuantity) -> tuple[RunSummary, str]:
 
 
 def _settings_text(runs: Sequence[RunSummary], run: RunSummary) -> str:
-    """Return a phrase with the settings that a run changed against the one before it.
+    """Return a phrase with the settings that a run changed against the one before it, `_TOLD_KEYS` of them by name.
 
     It may say that none changed, or that they are unknown.
     """

@@ -152,7 +152,7 @@ def list_contacts(
 def _reported(run: Run, detection: Detection | None) -> dict[str, Any]:
     """Return those fields of a `ReportedContact`, by name, that its detection and reports give.
 
-    {} without a detection.
+    {} without a detection; without a report of it, only `detected_s`.
     """
     if detection is None:
         return {}
@@ -332,7 +332,8 @@ class TimingGatherer:
     def add_columns(self, columns: CycleColumns, reactions: NDArray[np.bool_] | None = None) -> None:
         """Add times, queues, data ages and counts of the next cycles, of those columns that the log has.
 
-        reactions (n,): whether the state becomes REACT in a cycle; None without states.
+        Call it in the order of the run: the last values of running counts are kept. If the times are modelled, lateness
+        and queues are left out. reactions (n,): whether the state becomes REACT in a cycle; None without states.
         """
         self._cycles += len(columns)
         for quantity in QUANTITIES:

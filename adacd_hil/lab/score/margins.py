@@ -239,8 +239,9 @@ class UntouchedGatherer:
     def add_untouched(self, piece: Run, outline: Run) -> None:
         """Add the next piece of a run: of its cycles free of contact the residuals, margins and pushes, by section.
 
-        outline: the run, with all that has happened so far, and a second or more beyond the piece. Promotions and the
-        paper's scheme beside are gathered from all cycles.
+        Only sections of the kinds adaptation and detection count, and pushes only in MONITOR. Call it in the order of
+        time. outline: the run, with all that has happened so far, and a second or more beyond the piece. Promotions and
+        the paper's scheme beside are gathered from all cycles.
         """
         if piece.cycle.size == 0:
             return
@@ -267,9 +268,9 @@ class UntouchedGatherer:
     def _free(self, piece: Run, outline: Run) -> Mask:
         """Return for each cycle (n,) of a piece whether it is free of contact and, with a truth, covered by it.
 
-        Not free are contacts, or without the truth the settling time around detections, REACT, the settling time after
-        each, and all from the request to finish on.
-        Call it once per piece, in the order of time: it stores the piece's last cycle in REACT.
+        Cycles in a true contact, in REACT, or in the settling time after either are not free. Cycles from the request
+        to finish on are not free, either. Without a truth, the settling time before and after each detection stands for
+        the contact. Call it once per piece, in the order of time: it stores the piece's last cycle in REACT.
         """
         settling_ns = round(SETTLING_TIME_CONSTANTS / outline.a_rad_s * 1e9)
         t_ns, truth, finish = piece.t_ns, outline.truth, outline.finish_cycle

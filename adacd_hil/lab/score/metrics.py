@@ -66,7 +66,7 @@ class TimingEvidence:
     counts: Mapping[str, Count | None]
 
     def by_key(self) -> dict[str, Any]:
-        """Return the evidence by the keys of report.json, as "times_us"; a histogram is None where it is lacking."""
+        """Return the evidence by the keys of report.json, such as "times_us"; a missing histogram is None."""
         return {
             "is_modelled": self.is_modelled,
             "period_us": self.period_us,

@@ -14,7 +14,10 @@ CONFIDENCE_TEXT: Final = f"{100.0 * CONFIDENCE:g} %"
 
 
 def share_bounds(found: int, count: int) -> tuple[float, float]:
-    """Return the two-sided interval of a share that was seen in `found` of `count` cases; (0, 1) for no case."""
+    """Return the exact two-sided interval, at `CONFIDENCE`, of a share that was seen in `found` of `count` cases.
+
+    (0, 1) for no case; the low end is 0 if none was found, the high end 1 if all were.
+    """
     rest = 0.5 * (1.0 - CONFIDENCE)
     low = float(betaincinv(found, count - found + 1, rest)) if found > 0 else 0.0
     high = float(betaincinv(found + 1, count - found, 1.0 - rest)) if found < count else 1.0
@@ -22,7 +25,7 @@ def share_bounds(found: int, count: int) -> tuple[float, float]:
 
 
 def rate_bound_per_h(alarms: int, hours: float) -> float:
-    """Return the one-sided upper bound of a rate, 1/h, after `alarms` in `hours`; inf without time.
+    """Return the one-sided upper bound, at `CONFIDENCE`, of a rate, 1/h, after `alarms` in `hours`; inf without time.
 
     Without an alarm it is about 3 / hours.
     """
@@ -30,5 +33,8 @@ def rate_bound_per_h(alarms: int, hours: float) -> float:
 
 
 def least_rate_per_h(alarms: int, hours: float) -> float:
-    """Return the one-sided lower bound of a rate, 1/h, after `alarms` in `hours`; 0 without an alarm or time."""
+    """Return the one-sided lower bound, at `CONFIDENCE`, of a rate, 1/h, after `alarms` in `hours`.
+
+    0 without an alarm or time.
+    """
     return float(gammaincinv(alarms, 1.0 - CONFIDENCE)) / hours if alarms > 0 and hours > 0.0 else 0.0

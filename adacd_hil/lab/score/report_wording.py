@@ -135,7 +135,7 @@ def delays_phrase(delays_ms: Sequence[float]) -> str:
 
 
 def percent_text(share: float) -> str:
-    """Return a share (0…1) in percent as text with two significant digits.
+    """Return a share (0…1) in percent as text with two significant digits, from 99.5 % on without decimals.
 
     A share above 0 and below 0.005 % gives "less than 0.01 %".
     """

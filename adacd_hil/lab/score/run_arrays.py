@@ -263,7 +263,10 @@ class Run:
 
     @property
     def zero_ns(self) -> int:
-        """Motion start, ns: the first cycle in ADAPT, else the first cycle; 0 without a cycle."""
+        """Motion start, ns of the run's clock: `motion_start_ns` if that is set, else the first cycle in ADAPT.
+
+        Without one it is the first cycle; 0 for a run without cycles.
+        """
         if self.motion_start_ns is not None:
             return self.motion_start_ns
         if self.t_ns.size == 0:
@@ -279,7 +282,7 @@ class Run:
     def time_of_s(self, cycle: NDArray[Any]) -> Vector:
         """Return the time of any cycle numbers since motion start, s, interpolated between the run's cycles.
 
-        Zeros for a run without cycles.
+        A number before the first or after the last cycle has the time of that cycle. Zeros for a run without cycles.
         """
         if self.cycle.size == 0:
             return np.zeros(len(cycle))
@@ -337,7 +340,8 @@ def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def split_sections(run: Run) -> tuple[Section, ...]:
     """Return the lettered sections of a run, in the order of time; () for a run without cycles.
 
-    Cycles before the first ADAPT belong to no section.
+    Cycles in INIT, COMMISSION and ENABLE belong to no section. REACT and STOPPED belong to the section that they
+    interrupt.
     """
     if run.state.size == 0:
         return ()

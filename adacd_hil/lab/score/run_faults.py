@@ -96,9 +96,11 @@ class CyclicDataGatherer:
         self._present = np.empty((2, 0), np.int64)  # of the window under way: each cycle's number, and if incomplete
 
     def add_columns(self, columns: CycleColumns, cycle: Cycles, state: NDArray[np.uint8]) -> None:
-        """Count incomplete and aged data in the next cycles with powered drives.
+        """Count incomplete and aged data in the next cycles with powered drives, in the order of the run.
 
-        cycle, state: those of /scheme (k,).
+        The second under way is kept for the next call. If columns don't number their cycles, only cycles are counted. A
+        kind of data that some columns lack is no longer counted, and unknown in the end. cycle, state: those of /scheme
+        (k,).
         """
         is_powered = np.isin(state, _POWERED)
         self._cycles += int(np.count_nonzero(is_powered))
@@ -118,7 +120,7 @@ class CyclicDataGatherer:
     def _add_windows(self, cycles: Cycles) -> None:
         """Store the worst share so far of incomplete cycles in one second; a gap in the cycle numbers ends a second.
 
-        cycles (2, k): numbers, and whether incomplete.
+        The last second, which may go on, is kept for the next call. cycles (2, k): numbers, and whether incomplete.
         """
         cycles = np.concatenate((self._present, cycles), axis=1)
         begins = np.flatnonzero(np.diff(cycles[0], prepend=-2) != 1)
@@ -161,9 +163,10 @@ class CyclicDataGatherer:
 
 
 def _device_shares(checks: CheckCounts | None, run: Run) -> dict[str, DeviceShares]:
-    """Return each device's shares by its name.
+    """Return each device's shares by its name, over the times between two loggings of its counts.
 
-    {} without counts in the log, or with fewer than two loggings of them.
+    A time counts if the drives are powered at its end. Times in which a count went down are left out. {} without counts
+    in the log, or without such a time.
     """
     if checks is None or len(checks.cycle) < 2 or not run.cycle.size:
         return {}

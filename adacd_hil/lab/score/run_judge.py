@@ -108,7 +108,7 @@ def ideal_response(tau_ext: Vector, cycle: Cycles, period_s: float, a_rad_s: flo
 def row_at(run: Run, time_s: float) -> int:
     """Return the row of the first cycle at `time_s`, s since motion start, or after it.
 
-    The last row if there is none.
+    The last row if there is none; -1 for a run without cycles.
     """
     t_ns, zero_ns = run.t_ns, run.zero_ns
     row = bisect_left(range(len(t_ns)), time_s, key=lambda row: float((t_ns[row] - zero_ns) * 1e-9))
@@ -138,7 +138,8 @@ def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[De
 def is_payload_alarm(run: Run, row: int) -> bool:
     """Return whether an alarm in this row is about the weight of a payload that the scheme has not learnt yet.
 
-    False without the truth, without gravity, or if the row before isn't in PAYLOAD.
+    It is if the row before is in PAYLOAD, and the true payload differs from that in the last row in MONITOR before.
+    False without the truth, without gravity, or if no row before is in MONITOR.
     """
     truth, armed = run.truth, np.flatnonzero(is_armed_in(run.state[:row]))
     if truth is None or not run.settings.estimator.gravity or run.state[row - 1] != SchemeState.PAYLOAD:

@@ -99,7 +99,8 @@ def _judged_text(run: Run, found: str) -> str:
 def _blind_text(run: Run) -> str:
     """Return a text on the cycles of MONITOR in which no touch of some joint can be told, "" without.
 
-    Such as those with a threshold above the joint's rated torque, or a residual that is no number.
+    In such a cycle each channel of the joint has a threshold above the joint's rated torque, or a residual that isn't
+    finite. The first cycle of each stay in MONITOR isn't looked at.
     """
     by = run.certified
     values = (run.tau_ext_hat, run.threshold) if by is None else (by.tau_ext, by.threshold)
@@ -406,7 +407,7 @@ def _residual_text(frozen: list[tuple[float, float] | None], index: int) -> str:
 def data_text(data: CyclicData) -> str:
     """Return the verdict's clause on cyclic data that was late, lost or repeated; "" if the drives never had torque.
 
-    It names the worst device only.
+    Of the devices it names only the worst for missing data and the worst for repeated data.
     """
     if not data.cycles:
         return ""

@@ -104,7 +104,7 @@ def fill_friction(dq: Vector, first_column: int, Y: Vector) -> None:
 
 @compiled
 def regressor(chain: Chain, q: Vector, dq: Vector, ddq: Vector) -> Vector:
-    """Return W (n, 10 n) of tau = W theta_full, friction left out. q, dq, ddq (n,)."""
+    """Return W (n, 10 n) of tau = W theta_full: gravity is in, friction left out. q, dq, ddq (n,)."""
     n = q.shape[0]
     W = np.zeros((n, PER_LINK * n))
     E, r = _place_links(chain, q)
@@ -172,7 +172,10 @@ def _place_links(chain: Chain, q: Vector) -> tuple[Vector, Vector]:
 
 @compiled
 def _upward(chain: Chain) -> Vector:
-    """Return the upward acceleration (6,) of the base that stands for gravity."""
+    """Return the upward acceleration (6,) of the base that stands for gravity, m/s², in the base's frame.
+
+    The angular part comes first and is 0.
+    """
     upward = np.zeros(6)
     upward[3:] = -chain.gravity_m_s2
     return upward

@@ -121,7 +121,10 @@ class ArmModel:
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the p parameters in the order of theta: base, F_v, F_c, offset and rotor inertia of each joint."""
+        """Names of the p parameters in the order of theta: base, then F_v, F_c and offset of each joint.
+
+        With has_rotors the rotor inertia of each joint comes last.
+        """
         kinds = ("F_v", "F_c", "offset", *(("rotor",) if self.has_rotors else ()))
         per_joint = (f"{kind}{i + 1}" for kind in kinds for i in range(self.joints))
         return (*self.base.names, *per_joint)
@@ -129,7 +132,7 @@ class ArmModel:
     def place_of(self, kind: str) -> slice:
         """Return where in theta one kind of parameters is: "base", "F_v", "F_c", "offset" or "rotor".
 
-        "rotor" is valid only with has_rotors. Raises KeyError for another kind.
+        Without has_rotors, the slice of "rotor" is beyond the end of theta. Raises KeyError for another kind.
         """
         first, n = self.base.columns.size, self.joints
         starts = {"F_v": first, "F_c": first + n, "offset": first + 2 * n, "rotor": first + 3 * n}
@@ -245,6 +248,7 @@ def parameter_deviation(
     correlated); and, as such a residual may repeat with the motion, P of a fit in which the part of r beyond noise
     counts as if it came in p / 2 independent samples. On nine wrong models of the planar arm the true parameters were
     off by 0.9 to 5 of it (rms), and by 26 to 390 of P; only a torque that looks like another parameter was further off.
+    Raises ValueError if a record or `noise_Nm` and model differ in their number of joints.
     """
     count, kinds = sum(len(record.q) for record in records), [estimate.P]
     scores = np.zeros((_PARTS, estimate.theta.size))
@@ -270,7 +274,7 @@ def parameter_deviation(
 
 
 def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings: OfflineSettings) -> FilteredRecord:
-    """Return a record behind the filter of the fit, its external torque by the frozen estimate.
+    """Return a record behind the smoothed filter of the fit, its external torque and deviation by the frozen estimate.
 
     Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
     """
@@ -280,7 +284,8 @@ def filtered(model: ArmModel, record: Record, estimate: ModelEstimate, settings:
 def fit_rows(model: ArmModel, record: Record, settings: OfflineSettings) -> tuple[Vector, Vector]:
     """Return every `fit_every`-th sample behind the filter of the fit: regressor (m, n, p) and torque (m, n).
 
-    Raises ValueError if record or `noise_Nm` and model differ in their number of joints.
+    The first is the sample with index `fit_every` - 1; of a shorter record there is none. Raises ValueError if record
+    or `noise_Nm` and model differ in their number of joints.
     """
     count = len(record.q) // settings.fit_every
     shape = (count, model.joints, len(model.parameter_names))
@@ -555,7 +560,10 @@ def _squared_mass(arm: Chain, columns: Indices, has_rotors: bool, q: Vector, the
 
 @compiled
 def _fill_rotors(dq: Vector, Y_p: Vector) -> None:
-    """Write dq to the columns of the rotors' inertia in Y_p, the last ones, one per joint."""
+    """Write dq (n,) to the last n columns of Y_p (n, p), those of the rotors' inertia.
+
+    Only joint i's row is written in its column; all other cells stay as they are.
+    """
     n, p = Y_p.shape
     for i in range(n):
         Y_p[i, p - n + i] = dq[i]

@@ -107,8 +107,9 @@ def read_urdf(
     """Read a serial arm from the text of a URDF.
 
     gravity_m_s2: in the frame of the root link. locked: names of joints that count as fixed at their zero, with those
-    that mimic them. Raises UrdfError if the text is no URDF, a value is missing or impossible, no joint moves, or the
-    moving joints are no single chain.
+    that mimic them. Raises UrdfError if the text is no URDF, a locked joint does not exist, or a joint that isn't
+    locked mimics another. Raises UrdfError, too, if a value is missing or impossible, no joint moves, or the moving
+    joints are no single chain.
     """
     try:
         robot = ElementTree.fromstring(text)
@@ -139,7 +140,8 @@ def _assemble(
 ) -> SerialArm:
     """Return the arm: walk from the root outward, and merge the links that are fixed to each other.
 
-    Raises UrdfError if there isn't one root, the joints branch or are a loop, or none moves.
+    Other root links without joint and <inertial> are ignored. Raises UrdfError if there isn't one root, a link has two
+    parents, the joints branch or are a loop, or none moves.
     """
     children: dict[str, list[_Joint]] = {link: [] for link in (*links, *(joint.parent for joint in joints))}
     carried: set[str] = set()
@@ -265,8 +267,9 @@ def _read_inertial(link: Element, name: str) -> Vector:
 def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bool) -> _Joint:
     """Return one joint; of a fixed or, by `is_locked`, locked one only its place. links: names of all links.
 
-    Raises UrdfError for an unknown type or child link, a mimic that isn't locked, or a value that is no number or
-    impossible.
+    The axis is x without <axis>. A limit of speed or effort of 0 is none, and so are limits of position that are both
+    0, or of a continuous joint. Raises UrdfError for an unknown type or child link, a mimic that isn't locked, or a
+    value that is no number or impossible.
     """
     where = f'joint "{name}"'
     kind = "fixed" if is_locked else joint.get("type", "")

@@ -66,7 +66,8 @@ class Comparison:
     def ranking(self) -> tuple[str, ...]:
         """Names of the detectors, best first, by the geometric mean of their median delays over all steps and joints.
 
-        A step that is not found counts as ten times `HORIZON_S`.
+        A delay below 0.1 ms counts as 0.1 ms. A step that isn't found at over half of its onsets counts as ten times
+        `HORIZON_S`.
         """
         scores: dict[str, list[float]] = {}
         for row in self.rows:

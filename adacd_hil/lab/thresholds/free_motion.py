@@ -228,8 +228,9 @@ def check_together(logs: Sequence[LoggedMotion]) -> None:
 def sample_of(logs: Sequence[LoggedMotion]) -> Motion:
     """Return all motion of the logs, one after the other; of more than MOST_SAMPLES samples only windows.
 
-    The windows have free motion and are spread evenly. Raises LogError if a log can't be read, or the logs differ in
-    period or number of parameters.
+    The windows have free motion and are spread evenly. The first sample of each log, and of each window without the
+    window before, counts as after a gap and as not free. Raises LogError if a log can't be read, or as
+    `check_together`.
     """
     check_together(logs)
     chosen = _windows(logs)

@@ -58,7 +58,8 @@ _CHECKED_ALARMS: Final = 20.0  # alarms in the held-out half that are enough to 
 def find_lag(motion: Motion) -> tuple[float, Vector]:
     """Return by how much the velocity is older than the torque, s, for both joints together and for each (n,).
 
-    It is within 0 and `_LONGEST_LAG_S`. If the torque never changes, all are `VELOCITY_LAG_S`.
+    It is within 0 and `_LONGEST_LAG_S`. A joint whose torque never changes has the lag of both together. If no torque
+    changes, all are `VELOCITY_LAG_S`.
     """
     z, _ = make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
     moving = motion.is_free & (np.abs(motion.dq) > 0.02).all(axis=1)
@@ -105,8 +106,9 @@ class Statistics:
 def run_detectors(logs: Sequence[LoggedMotion], progress: Progress = lambda _: None) -> Statistics:
     """Run every detector over the motion of logs; return their statistics, and the lag and weights that they used.
 
-    progress: called with a line on the cycles read. Raises LogError if a log can't be read or the logs differ in period
-    or number of parameters, TooLittleMotionError if motion is too short for the likelihood weights.
+    progress: called with a line on the cycles read. Raises LogError if a log can't be read or the logs differ in
+    period, number of parameters or arm; TooLittleMotionError if motion is too short for the likelihood weights;
+    DetectorError if a registered detector can't be used.
     """
     motion = sample_of(logs)
     lag_s, lag_of_joint_s = find_lag(motion)
@@ -320,7 +322,7 @@ def thresholds_of_logs(
 
     stretch: part of each log. rate_per_h: wanted false alarms of each detector. progress: called with a line on the
     cycles read. Raises LogError for a log that can't be used or is of another arm than the first, TooLittleMotionError
-    if all together are too short.
+    if all together are too short, DetectorError if a registered detector can't be used.
     """
     logs = []
     for path in paths:

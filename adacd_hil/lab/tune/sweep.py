@@ -168,7 +168,7 @@ def failed(subject: Subject, row: SweepRow, error: str) -> Values:
 def replay_task(task: Task) -> list[Values]:
     """Replay a task's log with the settings of each row; return a row of results or an error for each, in their order.
 
-    Errors of `REFUSALS` become rows; others are raised.
+    ConfigError, CodecError and LogError become rows; other errors are raised.
     """
     subject = task.subject
     path = Path(subject.log)
@@ -193,7 +193,10 @@ def replay_task(task: Task) -> list[Values]:
 
 
 def _replay_all(path: Path, variants: list[Settings]) -> list[Replay | str]:
-    """Return the replay of a log with each of the settings; for one that is refused, the error's text."""
+    """Return the replay of a log with each of the settings; for one that is refused, the error's text.
+
+    If one of several is refused, each is replayed alone. Errors other than `REFUSALS` are raised.
+    """
     try:
         return list(replay_many(path, variants))
     except REFUSALS as refusal:
@@ -265,8 +268,10 @@ class SweepStore:
     def join(self, keys: Iterable[str], about: Mapping[str, str]) -> Path:
         """Write the table of the rows with these keys, in this order, and plan.json with `about`; return its path.
 
-        Of several results of a row, the last with status "ok" counts, else the last. Keys without one are left out.
-        Replaces an earlier table; the parts stay. Raises LogError if a part can't be read, or the table not be written.
+        The path is that of the table. Of several results of a row, the last with status "ok" counts, else the last.
+        Keys without one are left out. The table has `about` as metadata, too. Replaces an earlier table; the parts
+        stay. Raises LogError if a part can't be read, or the table not be written; OSError if plan.json can't be
+        written.
         """
         rows: dict[str, Values] = {}
         for path in self._paths():
@@ -445,7 +450,7 @@ class _Flights:
     def _land_broken(self) -> Iterator[list[Values]]:
         """Replace dead workers, and queue the tasks that ended with them to be tried again, each alone.
 
-        Yields the rows of a task that has failed too often.
+        If a single task ended with them, it counts as failed once more; yield its rows if it has failed too often.
         """
         self._progress("a worker process has died: killed, or out of memory")
         self._workers.replace_dead()

@@ -73,12 +73,11 @@ def tune(
 ) -> Tuning:
     """Find thresholds, filter and gain for a rate of false alarms from logs; write no file.
 
-    config: name or file of the settings to start from; None: the logs' own.
-
-    stretch: of each log; the replays begin with the log, and only their results in the stretch count.
-
-    Raises TooLittleMotionError if the half to choose on has no free motion with the settings to start from;
-    LogError, ConfigError or CodecError if a log, its settings or its contract can't be used.
+    If no log records the true contacts, filter and gain stay as they are. config: name or file of the settings to start
+    from; None: the logs' own. stretch: of each log; the replays begin with the log, and only their results in the
+    stretch count. Raises TooLittleMotionError if the half to choose on has no free motion with the settings to start
+    from; LogError, ConfigError or CodecError if a log, its settings or its contract can't be used; DetectorError if a
+    registered detector can't be used.
     """
     progress(f"reading {number_of(len(paths), 'log')}")
     logs = read_logs(paths, config, stretch, progress)

@@ -175,9 +175,8 @@ class ShownLog:
     def take_stretch(self, ticks: Ticks, batch: SchemeBatch) -> None:
         """Add a batch of replayed cycles to the largest statistics per block, and to those of the contacts in it.
 
-        Call it in the order of time. ticks, batch: times and results of the same cycles.
-
-        Cycles that the log lacks are skipped.
+        Blocks take armed cycles that are free of contact only. Cycles that the log lacks are skipped. Call it in the
+        order of time. ticks, batch: times and results of the same cycles.
         """
         rows = np.minimum(np.searchsorted(self._log.t_ns, ticks.t_ns), len(self._log.t_ns) - 1)
         known = np.flatnonzero(self._log.t_ns[rows] == ticks.t_ns)
@@ -245,8 +244,9 @@ class ShownLog:
 def observe_detectors(logs: Sequence[TunedLog], progress: Progress) -> list[Observed]:
     """Run all detectors over logs; return the statistics of each, in the order of `detectors`.
 
-    progress: called with a line on the cycles read. Raises LogError if a log can't be read or the logs differ in period
-    or number of parameters, TooLittleMotionError if motion is too short.
+    progress: called with a line on the cycles read. Raises LogError if a log can't be read or the logs differ in
+    period, number of parameters or arm; TooLittleMotionError if motion is too short; DetectorError if a registered
+    detector can't be used.
     """
     places_of = detectors()
     statistics = run_detectors([log.motion for log in logs], progress)

@@ -114,12 +114,12 @@ class Found(NamedTuple):
 
     @property
     def rate_bound_per_h(self) -> float:
-        """Upper bound of the rate of false alarms, by counting."""
+        """Upper bound, at `CONFIDENCE`, of the rate of false alarms, 1/h, by counting; inf without motion."""
         return rate_bound_per_h(self.alarms, self.hours)
 
     @property
     def share_bounds(self) -> tuple[float, float]:
-        """The interval, low and high, of the share of contacts that is found."""
+        """The interval, low and high, at `CONFIDENCE`, of the share of contacts found; (0, 1) without contacts."""
         return share_bounds(len(self.delays_ms), self.contacts or 0)
 
     def by_key(self) -> dict[str, Any]:
@@ -285,8 +285,8 @@ def read_logs(
     """Read logs, or a stretch of each, with contact-free motion and true contacts, for tuning.
 
     config: name or file of the settings to start from, in place of the logs' own. progress: called with a line on the
-    cycles read. Raises LogError if a log can't be read, has no free motion, or has other settings than the first;
-    ConfigError or CodecError if settings or contract can't be used.
+    cycles read. Raises LogError if a log can't be read, has no free motion, or has other settings of the scheme than
+    the first; ConfigError or CodecError if settings or contract can't be used.
     """
     logs = [_read(path, place, len(paths), config, stretch, progress) for place, path in enumerate(paths)]
     first = logs[0]

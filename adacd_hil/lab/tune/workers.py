@@ -116,7 +116,11 @@ class ProcessWorkers:
         self._pool = self._open()
 
     def end(self) -> None:
-        """End all processes, with or without a task, by force after `_PATIENCE_S`; cancel waiting tasks."""
+        """End all processes, with or without a task, by force after `_PATIENCE_S`; cancel waiting tasks.
+
+        Processes that this process has started otherwise by multiprocessing since the workers were opened are ended,
+        too.
+        """
         processes: set[BaseProcess] = set(multiprocessing.active_children()) - self._others
         self._pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:

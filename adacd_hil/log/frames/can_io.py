@@ -45,8 +45,8 @@ def time_ns(message: can.Message) -> int:
 def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
     """Convert a python-can message to a frame, and add `start_ns` to its time.
 
-    Raises ValueError for more data than its kind of frame has, an identifier of more than 29 bits, or a time beyond
-    `MOST_NS` or NaN.
+    Of remote and error frames, length and data are cut to the most that their kind of frame has. Raises ValueError for
+    more data in other frames, an identifier of more than 29 bits, or a time beyond `MOST_NS` or NaN.
     """
     most = MAX_DATA if message.is_fd else CLASSIC_BYTES
     data = bytes(message.data)

@@ -247,7 +247,8 @@ def _indexed(data: bytes, ends: Sequence[int], indexes: Sequence[bytes]) -> Cont
 def _walk_through(data: bytes, ends: Sequence[int]) -> Contents:
     """Find the records of chunks one by one, each by the length of the one before, and return them.
 
-    ends: offset at which each chunk ends.
+    A message that is too short, and a record that may not be in a chunk, are strangers; bytes that can't be a record
+    break off their chunk. ends: offset at which each chunk ends.
     """
     definitions: list[RawRecord] = []
     strangers: list[int] = []

@@ -147,9 +147,9 @@ def check_magic(begin: bytes, name: str) -> None:
 def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[RawRecord | IndexRun | Problem]:
     """Yield the records of a file up to its footer, or to bytes that can't be a record.
 
-    Message indexes that follow each other come as one IndexRun. A cut file or an overlong record ends with a Problem.
-    passed: kinds of records that come without their body. Raises LogError, which begins with `name`, if the file isn't
-    MCAP.
+    Message indexes that follow each other come as one IndexRun. Unless the footer and the file's last magic bytes are
+    reached, the last item is a Problem: the file is cut, or a record is overlong. passed: kinds of records that come
+    without their body. Raises LogError, which begins with `name`, if the file isn't MCAP.
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
@@ -250,7 +250,10 @@ def _has_shape(record: RawRecord) -> bool:
 
 
 def summary_of(file: IO[bytes]) -> list[RawRecord]:
-    """Return the records of a file's summary, whether or not its CRC fits; [] if the file has no footer."""
+    """Return the records of a file's summary, whether or not its CRC fits.
+
+    [] if the file has no footer, or the summary more than MOST_RECORD_BYTES.
+    """
     found = _find(file)
     if found is None or found[0] - found[1] > MOST_RECORD_BYTES:
         return []

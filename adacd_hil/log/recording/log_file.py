@@ -147,7 +147,11 @@ class Sink:
             return self._tasks.popleft()
 
     def _write(self, data: bytes, packets: int) -> None:
-        """Write data to the present file; after an error drop them and count their packets as lost."""
+        """Write data to the present file; after an error drop them and count their packets as lost.
+
+        The write that fails is cut from the file, which then ends with the last whole one. `on_written` gets the number
+        of packets of each other write.
+        """
         if not self.error:
             try:
                 _write_all(self._descriptor, data)

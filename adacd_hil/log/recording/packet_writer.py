@@ -62,7 +62,8 @@ class PacketWriter:
         """Write the content of a packet; return False, and write none of it, if the file can't hold all of it.
 
         It can't hold a message without a channel, a /scheme message that is too short, or a time beyond a stamp's
-        range.
+        range. If packets are missing since the last one, write an event with their number first. Behind a /scheme
+        message write one of /joint_states.
         """
         if not self._fits(packet):
             return False
@@ -123,7 +124,10 @@ class PacketWriter:
         self._add(ChannelId.EVENTS, time_ns, time_ns, pack_log(pack_stamp(time_ns), event))
 
     def _add(self, channel: int, t_ns: int, publish_ns: int, payload: bytes) -> None:
-        """Add a message; raise its log time to the topic's last one if earlier: readers expect ascending times."""
+        """Add a message; raise its log time to the topic's last one if earlier: readers expect ascending times.
+
+        Collect it in `shown`, too, unless that is None.
+        """
         log_ns = self._latest_ns[channel]
         if t_ns > log_ns:
             log_ns = self._latest_ns[channel] = t_ns

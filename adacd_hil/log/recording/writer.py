@@ -200,7 +200,8 @@ class WriterProcess:
     def _write(self, taken: bytes) -> None:
         """Write packets from the ring; count them as lost if the disk has failed, or in real time is too slow.
 
-        In lockstep end chunks by log time.
+        A packet that can't be unpacked or written counts as lost, too. In lockstep end chunks by log time. While a
+        viewer is connected, send it the messages.
         """
         if self._sink.error or (not self._setup.is_blocking and self._sink.is_behind):
             self._lose(sum(1 for _ in split(taken)))

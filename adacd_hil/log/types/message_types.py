@@ -89,7 +89,11 @@ class Member(NamedTuple):
 
 
 def ros_field_name(name: str) -> str:
-    """Return `name` as ROS 2 demands of fields: lower case, words separated by single underscores."""
+    """Return `name` as ROS 2 demands of fields: lower case, words separated by single underscores.
+
+    A capital after a small letter or digit begins a word. An `n` is put before a name that would not begin with a
+    letter.
+    """
     words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
     spelled = re.sub(r"[^a-z0-9]+", "_", words).strip("_")
     return spelled if spelled[:1].isalpha() else f"n{spelled}"
@@ -167,7 +171,8 @@ def body_struct(members: Iterable[Member], has_block: bool = False) -> struct.St
 def payload_dtype(text: str, fields: tuple[str, ...] = ()) -> "np.dtype[Any]":
     """Return the numpy type of a payload, from its `.msg` text; fields: our names of its fields, if they differ.
 
-    The stamp becomes `sec` and `nanosec`. Raises LogError for anything but a stamp and numbers of fixed count.
+    The stamp becomes `sec` and `nanosec`. Raises LogError for anything but a stamp and numbers of fixed count, another
+    number of `fields`, two fields of one name, and more than 1 MiB.
     """
     names = ["sec", "nanosec"]
     formats: list[Any] = ["<u4", "<u4"]
@@ -246,7 +251,10 @@ LEVELS = {"info": 2, "warning": 3, "error": 4}
 
 
 def pack_stamp(time_ns: int) -> bytes:
-    """Return a time as the 8 bytes of a builtin_interfaces/Time."""
+    """Return a time as the 8 bytes of a builtin_interfaces/Time.
+
+    Raises struct.error if negative or from END_OF_TIME_NS on.
+    """
     return _STAMP.pack(*divmod(time_ns, 1_000_000_000))
 
 

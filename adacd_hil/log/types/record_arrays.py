@@ -120,7 +120,7 @@ def _item(dtype: "np.dtype[Any]") -> str:
 
 
 def _lengthened(frames: NDArray[Any]) -> NDArray[Any]:
-    """Return frames as LONG_FRAME_DTYPE."""
+    """Return frames as LONG_FRAME_DTYPE, their data padded with zeros; the same array if they are of that type."""
     if frames.dtype == LONG_FRAME_DTYPE:
         return frames
     long = np.zeros(len(frames), LONG_FRAME_DTYPE)
@@ -228,7 +228,7 @@ class Series:
         return Series(self.records[rows], self._epoch_ns)
 
     def between(self, first_ns: int, end_ns: int) -> "Series":
-        """Return the messages with times from `first_ns` on and before `end_ns`."""
+        """Return the messages with times from `first_ns` on and before `end_ns`, ns on the clock of the run."""
         t_ns = self.t_ns
         return self.part((t_ns >= first_ns) & (t_ns < end_ns))
 

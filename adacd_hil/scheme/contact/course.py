@@ -108,7 +108,7 @@ def begin(m: CourseMemory) -> None:
 
 @compiled
 def goes_on(m: CourseMemory) -> bool:
-    """Return whether the reaction in force lets the arm move on along its path."""
+    """Return whether the arm moves on along its path: the reaction in force is NONE or SLOW_DOWN."""
     return bool(m.reaction in (Reaction.NONE, Reaction.SLOW_DOWN))
 
 
@@ -189,8 +189,9 @@ def _reconsider(
 ) -> None:
     """Choose the reaction anew if the contact has a higher level or another link, unless a withdrawal was given up.
 
-    Stop an arm that goes on along its path if is_latched, the supervisor has latched the contact, without a collision.
-    Check whether a withdrawal in force must be given up, see `_judge`. is_valid: there is a model to float with.
+    Stop an arm that goes on along its path once the supervisor has latched a contact without a collision (is_latched).
+    Give up a withdrawal in force if the torque has turned against it, see `_judge`. is_valid: there is a model to float
+    with.
     """
     level = max(level, m.level)
     is_other = level != m.level or m.link != m.cause_link

@@ -69,7 +69,9 @@ def on_link1(tau_1: float, sigma_1: float, length1_m: float) -> Place:
 def on_link2(tau_ext_wide_hat: Vector, q2: Vector, sigma: Vector, length_m: tuple[float, float]) -> Place:
     """Return the peak force and the lever arm of a contact on link 2, on the assumption of one touch without friction.
 
-    length_m: of both links.
+    tau_ext_wide_hat (n, 2), Nm, and q2 (n,), rad: of the contact's samples. sigma (2,): standard deviation of the
+    torques, Nm. length_m: of both links. Force and lever are unknown if the links are nearly at a right angle; a lever
+    off the link is returned with a location that names it so.
     """
     return Place(*_fit(tau_ext_wide_hat, q2, sigma, length_m[0], length_m[1]))
 
@@ -97,7 +99,7 @@ def blind_angle_of_link1(tau_1: float, q2: float, length_m: tuple[float, float],
 def _top(forces: Vector) -> float:
     """Return the moving median of forces (n,) that is largest in size, with its sign; 0 without forces.
 
-    Each median is over n / TOP_PARTS forces.
+    Each median is over n / TOP_PARTS forces; about TOP_PLACES windows, evenly spaced, are tried.
     """
     count = forces.shape[0]
     width = max(count // TOP_PARTS, 1)
@@ -116,7 +118,9 @@ def _fit(
 ) -> tuple[Location, float, float, float, float]:
     """Fit one force across link 2 to the strong samples; return location, force, its sigma, lever, its sigma.
 
-    Lever: the force's arm from joint 2. Units: N and m. A sigma is inf if its value is unknown.
+    Strong: at least WORTH of the strongest. Lever: the force's arm from joint 2. Units: N and m. A sigma is inf if its
+    value is unknown. The location is SINGULAR, with all unknown, if link 2 is nearly at a right angle to link 1;
+    INCONSISTENT or BEYOND_TIP if the lever is off the link; UNCERTAIN if its sigma is too large; else KNOWN.
     """
     weight = np.abs(tau[:, 0]) / sigma[0] + np.abs(tau[:, 1]) / sigma[1]
     strongest = int(np.argmax(weight))

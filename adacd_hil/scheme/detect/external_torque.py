@@ -113,8 +113,9 @@ def follow_contact(
 ) -> None:
     """Update each joint's contact: the integral (2,) of tau_ext_hat, Nm s, and the peak (2,) of tau_ext_wide_hat, Nm.
 
-    They begin with 0 again while a joint's torque is below ONSET_FRACTION of its threshold. is_reporting: a report is
-    still due, so they go on below it, too.
+    peak: the value of largest size, with its sign. While a joint's |tau_ext_hat| is at most ONSET_FRACTION of its
+    threshold, the integral is 0 and the peak the present value. is_reporting: a report is still due, so both go on
+    there, too.
     """
     for i in range(tau_ext_hat.shape[0]):
         if abs(tau_ext_hat[i]) <= ONSET_FRACTION * threshold[i] and not is_reporting:

@@ -94,7 +94,8 @@ def discard_tail(m: Memory) -> None:
 def follow_tail(k: Constants, m: Memory) -> None:
     """Add the residuals of one contact-free sample to the present block, except of joints that stood still lately.
 
-    At the end of a block renew the largest residuals, by the block before this one, and the floors `tail_Nm`.
+    A residual counts as at most its threshold without the floor. At the end of a block renew the largest residuals, by
+    the block before this one, and the floors `tail_Nm`; the largest ones fade over FORGOTTEN_S.
     """
     own = m.margin
     filters = m.filters.r.shape[0]
@@ -195,7 +196,7 @@ def begin_sight(m: Memory) -> None:
 
 @compiled
 def follow_test(k: Constants, m: Memory) -> None:
-    """Count the thresholds of one contact-free sample of a test; keep the largest, and the largest `smallest_push`."""
+    """Count each joint's least threshold in one sample of a test; keep the largest, and the largest `smallest_push`."""
     own = m.margin
     for i in range(own.dim_s.shape[0]):
         h = m.sensitivity.wide_threshold[i]
@@ -209,8 +210,8 @@ def follow_test(k: Constants, m: Memory) -> None:
 def follow_sight(k: Constants, m: Memory) -> bool:
     """Add one contact-free sample of monitoring to the mean smallest push; return whether to revoke the certificate.
 
-    True if a joint's mean over each MEAN_S of motion was over LESS times the worst of the test for BLIND_S in a row.
-    Skip a joint that stood still lately.
+    True if a joint's mean over each MEAN_S of motion was over LESS times the worst of the test for BLIND_S in a row;
+    False in cycles that end no mean. Skip a joint that stood still lately.
     """
     own = m.margin
     is_blind = False
@@ -249,9 +250,9 @@ def describe_push(m: Memory) -> str:
 
 
 def describe_dim(m: Memory) -> list[str]:
-    """Return a line for each joint whose mean smallest push is over LESS times the worst of the test.
+    """Return a line for each joint whose last mean smallest push is over LESS times the worst of the test.
 
-    A line gives both pushes, for how long, and the cause.
+    [] without such a joint. A line gives both pushes, for how long, and the cause.
     """
     own = m.margin
     return [
@@ -264,7 +265,10 @@ def describe_dim(m: Memory) -> list[str]:
 
 
 def _why_dim(m: Memory, joint: int) -> str:
-    """Return the first cause that applies to the raised thresholds of a joint, from 0, as text."""
+    """Return the first cause that applies to the raised thresholds of a joint, from 0, as text.
+
+    The last cause, residuals over the settings', is returned if no other applies.
+    """
     if np.any(m.margin.tail_Nm[:, joint] > m.sensitivity.h_model[:, joint]):
         return "residuals of both signs have come near the thresholds: the arm moves otherwise than its model"
     if m.sensitivity.strain[joint] > STRAIN_NAMED:

@@ -134,7 +134,11 @@ def follow_standstill(k: Constants, m: Memory, dq: Vector) -> None:
 
 @compiled
 def measure_noise(k: Constants, m: Memory, tau_J: Vector) -> None:
-    """Add one sample at rest to `roughness` (n,): the torque's variance over that of the settings, at least 1."""
+    """Add one sample at rest to `roughness` (n,): the torque's variance over that of the settings, at least 1.
+
+    The variance is that of all samples since the start, by the differences of successive ones; the first is only
+    stored.
+    """
     own = m.sensitivity
     own.rest_samples += 1.0
     for i in range(tau_J.shape[0]):

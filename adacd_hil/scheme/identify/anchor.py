@@ -104,8 +104,9 @@ def begin(k: Constants, m: Memory) -> None:
 def measure(k: Constants, m: Memory, tau_J: Vector, is_resting: bool) -> None:
     """Add one sample before the drives are enabled to the reading at rest; drop the reading if the arm moves.
 
-    The reading is a mean over about the last `rest_cycles` samples, so a person who leaned before and has gone is
-    forgotten. If a joint's holding torque is unknown, the reading doesn't become its anchor.
+    tau_J (n,): Nm. The reading is a mean over about the last `rest_cycles` samples, so a person who leaned before and
+    has gone is forgotten. If a joint's holding torque is unknown, the reading doesn't become its anchor. Set the age of
+    all anchors to 0.
     """
     own = m.anchor
     own.rest_count = min(own.rest_count + 1.0, k.anchor.rest_cycles) if is_resting else 0.0
@@ -243,7 +244,10 @@ def judged_Nm(m: Memory) -> Vector:
 
 
 def describe(k: Constants, m: Memory) -> str:
-    """Return, per joint, the anchor of the last judged offset, and its bound, Nm, as text."""
+    """Return as text the anchor that bounds each joint's last judged offset most closely, and the bound, Nm.
+
+    A joint without a bound of `beta_Nm` or closer is described as not anchored.
+    """
     texts = []
     for i in range(JOINTS):
         kind = tightest(k, m, i)
@@ -258,7 +262,7 @@ def describe(k: Constants, m: Memory) -> str:
 def describe_refused(m: Memory, is_reading: bool) -> list[str]:
     """Return a line for each joint and anchor that contradict each other in the last judged torques, with the bound.
 
-    is_reading: the judged torques were readings at rest, else torque offsets of a fit.
+    is_reading: the judged torques were readings at rest, else torque offsets of a fit. [] without a contradiction.
     """
     lines = []
     for i, value in enumerate(judged_Nm(m).tolist()):

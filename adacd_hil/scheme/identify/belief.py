@@ -38,10 +38,10 @@ _SETTLED = 1e-9
 
 @compiled
 def begin_fit(k: Constants, m: Memory, is_payload: bool) -> None:
-    """Set the belief to the prior, use it as the model, and empty the ring of waiting samples.
+    """Begin a fit: set the belief to the prior, use it as the model, and empty the ring of waiting samples.
 
-    Learn the lags again, and end a pause. is_payload: set the belief to the certified model instead, widened by an
-    unknown payload.
+    Learn the lags again, and set the cycles without learning to 0. is_payload: begin with the certified model in place
+    of the prior, widened by an unknown payload. The flag is stored.
     """
     own = m.models
     own.is_payload = 1.0 if is_payload else 0.0
@@ -59,7 +59,10 @@ def begin_fit(k: Constants, m: Memory, is_payload: bool) -> None:
 
 @compiled
 def freeze(m: Memory) -> None:
-    """Move negative friction in the belief to 0, use the belief as the model, and empty the ring of waiting samples."""
+    """Move negative friction in the belief to 0, use the belief as the model, and empty the ring of waiting samples.
+
+    The other parameters follow by their covariance with the friction; the covariance stays, see `keep_non_negative`.
+    """
     keep_non_negative(regressor.F_V1, regressor.F_C2 + 1, m.models.belief, m.models.P_belief)
     use(m)
     discard(m)
@@ -67,7 +70,7 @@ def freeze(m: Memory) -> None:
 
 @compiled
 def certify(k: Constants, m: Memory) -> None:
-    """Store the model in use as the certified one, set `promotions` to 0, and stop learning the lags."""
+    """Store the model in use as the certified one, set `promotions` to 0, and hold the lags, see `hold_lags`."""
     m.models.promotions = 0.0
     _certify(m)
     hold_lags(k, m)
@@ -75,7 +78,10 @@ def certify(k: Constants, m: Memory) -> None:
 
 @compiled
 def promote(m: Memory, theta: Vector, P: Vector) -> None:
-    """Use a better tested model, theta (p,) and P (p, p), as the certified one, and count it in `promotions`."""
+    """Set the model in use and the certified model to theta (p,) and P (p, p), and add 1 to `promotions`.
+
+    The belief stays.
+    """
     m.models.theta[:] = theta
     m.models.P[:] = P
     _certify(m)
@@ -108,7 +114,7 @@ def pause(m: Memory, cycles: float) -> None:
 def is_free(k: Constants, m: Memory, is_touched: bool) -> bool:
     """Count down the cycles without learning by one; return whether none is left.
 
-    A touch sets them to `recover_cycles`.
+    is_touched: raise them to at least `recover_cycles` in place of the count.
     """
     if is_touched:
         pause(m, k.recover_cycles)
@@ -151,8 +157,9 @@ def wander(drift_std: Vector, W_f: Vector, elapsed_s: float, P: Vector) -> None:
 def learn(k: Constants, m: Memory) -> bool:
     """Put each `learn_every`-th sample into the ring; correct the belief by the sample that leaves the full ring.
 
-    Return whether a sample left it. A joint's row of infinite variance, as of a joint at rest, corrects nothing. The
-    sample: `W_learnt` (n, p) and `tau_learnt` (n,) of the filters.
+    Return whether a sample left it. The sample: `W_learnt` (n, p) and `tau_learnt` (n,) of the filters, less the torque
+    of the lags if these are held. A joint's row of infinite variance, as of a joint at rest, corrects nothing. Each
+    other row also goes to `missing_torque.add` and `fit_check.add_residual`.
     """
     own = m.models
     W, tau_J, still = m.filters.W_learnt, m.filters.tau_learnt, m.sensitivity.still_smooth[filter_bank.LEARNT]
@@ -207,7 +214,7 @@ def hold_lags(k: Constants, m: Memory) -> None:
 def _take_out_lags(k: Constants, m: Memory, place: int) -> None:
     """Subtract the torque of the believed lags from the sample at index `place` of the ring.
 
-    Set its columns of lags to 0.
+    Set the sample's columns of lags to 0.
     """
     joints = m.ring.tau.shape[1]
     first = int(k.first_offset) + joints
@@ -219,7 +226,7 @@ def _take_out_lags(k: Constants, m: Memory, place: int) -> None:
 
 @compiled
 def discard(m: Memory) -> None:
-    """Empty the ring of waiting samples; they never correct the belief."""
+    """Empty the ring of waiting samples, which then never correct the belief, and count to the next sample from 0."""
     m.ring.used = 0.0
     m.ring.next = 0.0
     m.models.since_learnt = 0.0
@@ -229,9 +236,10 @@ def discard(m: Memory) -> None:
 def keep_non_negative(first: int, last: int, theta: Vector, P: Vector) -> None:
     """Move theta (p,) in place so that its parameters first .. last - 1 are all at least 0.
 
-    To the nearest such theta in the metric of P, theta + P lambda with lambda >= 0: each negative parameter is pushed
-    to zero and moves the others by their correlation in P; one that was moved too far is released again (Hildreth's
-    method). P stays: the constraint doesn't reduce the uncertainty.
+    The result is the nearest such theta in the metric of P, by Hildreth's method: a negative parameter is pushed to
+    zero and moves all others by their covariance in P (p, p); a push that turns out too large is taken back. A
+    parameter of variance 0, or one still negative after `_SWEEPS` sweeps, is clipped alone. P stays: the constraint
+    doesn't reduce the uncertainty.
     """
     pushed = np.zeros(last - first)
     for _ in range(_SWEEPS):

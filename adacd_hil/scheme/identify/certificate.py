@@ -98,8 +98,10 @@ def withhold(m: Memory, cause: int) -> None:
 def contradicted_by(k: Constants, m: Memory) -> int:
     """Return the first contradiction of the fit, one of ANCHOR to TOO_MUCH_BY_PLACE, or NOTHING.
 
-    In order: with the anchors, within the fit's own samples and steps (then the beliefs of its steps from before the
-    change are kept), with kept beliefs, with the bound on torque by position, with the last certificate.
+    In order: with the anchors, within the fit's own samples and steps, with kept beliefs, with the bound on torque by
+    position, with the last certificate. The second is BY_PLACE if a torque by position explains it, else CHANGED; the
+    beliefs of the fit's steps from before the change are kept then. Store the comparisons as evidence. Kept beliefs may
+    be dropped, see `earlier.is_no_more`.
     """
     if not anchor.is_within(k, m, m.models.belief, m.models.P_belief):
         return ANCHOR
@@ -117,9 +119,9 @@ def contradicted_by(k: Constants, m: Memory) -> int:
 
 @compiled
 def is_no_more(k: Constants, m: Memory) -> bool:
-    """Return whether no friction or inertia of the fit exceeds the last certificate's limit; store the comparison.
+    """Return whether no friction or inertia of the fit exceeds the last certificate's limit.
 
-    True without a last certificate, or with a payload.
+    True without a last certificate, or with a payload. Call `evidence.fit` before. Store the comparison as evidence.
     """
     is_agreed = True
     for q in range(m.evidence.fitted.shape[0]):
@@ -129,7 +131,11 @@ def is_no_more(k: Constants, m: Memory) -> bool:
 
 
 def describe_more(m: Memory, date_utc: str) -> list[str]:
-    """Return a line for each quantity of which the fit has more than the last certificate allows, with its bound."""
+    """Return a line for each quantity of which the fit has more than the last certificate allows, with its bound.
+
+    Of a joint's friction only the speed with the largest excess. [] without one. date_utc: of the last certificate, as
+    text.
+    """
     difference, limit = m.evidence.difference[LAST], m.evidence.limit[LAST]
     return [
         f"{what} is {difference[q]:.3f} {unit} more than in the certificate of {date_utc}, bound {limit[q]:.3f} {unit}"

@@ -109,7 +109,11 @@ def clear(m: Memory) -> None:
 
 @compiled
 def begin(k: Constants, m: Memory) -> None:
-    """Clear the sums, and add the samples from before the contact that wait in the ring, except of joints at rest."""
+    """Clear the sums, and add the samples from before the contact that wait in the ring.
+
+    A joint's row is left out if its share of standstill is STANDING or more. Raise `peak`, from 0, by the present
+    sample.
+    """
     clear(m)
     _follow_peak(m)
     for s in range(int(m.ring.used)):
@@ -120,7 +124,10 @@ def begin(k: Constants, m: Memory) -> None:
 
 @compiled
 def weigh(k: Constants, m: Memory) -> None:
-    """Add one sample of a contact to the sums, except of joints at rest, whose friction explains any torque."""
+    """Add one sample of a contact to the sums, except of joints at rest, whose friction explains any torque.
+
+    At rest: slower than SLOW_RAD_S, or with a share of standstill of STANDING or more. Raise `peak` by the sample.
+    """
     _follow_peak(m)
     for i in range(m.filters.tau_f.shape[1]):
         still = m.sensitivity.still_smooth[filter_bank.LEARNT, i]
@@ -223,7 +230,8 @@ class Doubt:
         """Store the contact that ends in this cycle; return the common cause of the last contacts, None without one.
 
         After a contradiction of the certificate store nothing and return the contradiction. Drop contacts that ended
-        more than WITHIN_S ago.
+        more than WITHIN_S ago. A weak contact, not at once after going on, raises the odds of a wrong model. A payload
+        goes before an error of friction, and a cause without a name comes last.
         """
         if self._contradiction is not None:
             return self._contradiction
@@ -248,7 +256,7 @@ class Doubt:
         )
 
     def _payload(self) -> CommonCause | None:
-        """Return the payload that explains the last FEWEST_LOADED or more contacts; None without one.
+        """Return the payload that explains the last FEWEST_LOADED contacts, or more if these don't suffice; or None.
 
         There must be evidence for it in both directions of its pull.
         """
@@ -268,7 +276,8 @@ class Doubt:
     def _alike(self) -> CommonCause | None:
         """Return the error that explains each of the last ALIKE contacts with about the same size, or None.
 
-        None also unless each of them came within HELD_S of going on.
+        The error: a payload or a friction. Of several the one whose sizes differ least; None if that is a friction of
+        an implausible size. None also unless each of the contacts came within HELD_S of going on.
         """
         last = list(self._contacts)[-ALIKE:]
         if len(last) < ALIKE or max(contact.waited_s for contact in last) > HELD_S:
@@ -288,7 +297,8 @@ class Doubt:
     def _other(self) -> CommonCause | None:
         """Return the error of friction that explains the last FEWEST contacts, or None.
 
-        Each of them but the first must have come within AT_ONCE_S of going on.
+        Each of them but the first must have come within AT_ONCE_S of going on. The size must be plausible, and over
+        SURE deviations. Of several errors the one that explains most of the squared residuals.
         """
         last = list(self._contacts)[-FEWEST:]
         if len(last) < FEWEST or max(contact.waited_s for contact in last[1:]) > AT_ONCE_S:
@@ -361,7 +371,11 @@ class Doubt:
 
 
 def _weighed(m: Memory, waited_s: float, now_s: float) -> _Weighed:
-    """Return a contact's sums without the torque that joints held at rest, and without the residual of a good model."""
+    """Return a contact's sums without the torque that joints held at rest, and without the residual of a good model.
+
+    At least LEAST_SHARE of the squared residual stays. waited_s: from going on to the contact's beginning. now_s: time
+    of its end since the run's start.
+    """
     own, squares = m.doubt, m.doubt.L.diagonal()
     ss, rs, ws = np.maximum(squares[CAUSES:], 1e-12), own.b[CAUSES:], own.L[CAUSES:, :CAUSES].T
     rw = own.b[:CAUSES] - ws @ (rs / ss)

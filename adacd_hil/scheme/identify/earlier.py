@@ -63,7 +63,7 @@ def forget(m: Memory) -> None:
 
 @compiled
 def _drop(m: Memory) -> None:
-    """Empty the sources of evidence of all beliefs kept from before a touch."""
+    """Empty the sources of evidence of all beliefs kept from before a touch, and set `kept_count` to 0."""
     m.earlier.kept_count = 0.0
     for s in range(KEPT, m.evidence.value.shape[0]):
         evidence.empty_source(m, s)
@@ -77,10 +77,11 @@ def is_keeping(m: Memory) -> bool:
 
 @compiled
 def keep_fit(k: Constants, m: Memory) -> None:
-    """Keep the fit's present belief and those at its steps, as a touch may have begun; not if beliefs are kept already.
+    """Keep the fit's present belief and those of its stored steps as evidence, as a touch may have begun.
 
-    If the fit has changed since a step, keep only the beliefs up to that step. Keep none before the second step. Set
-    the count of refused fits to 0 in any case.
+    The first YOUNG_STEPS steps are not kept. If the fit contradicts itself, keep only the steps up to the last before
+    that, and not the present belief. Keep none before the second step, or if beliefs are kept already. Set the count of
+    refused fits to 0 in any case.
     """
     m.earlier.refused_fits = 0.0
     if m.earlier.kept_count > 0.0 or m.fit_check.steps_used <= YOUNG_STEPS:
@@ -93,9 +94,10 @@ def keep_fit(k: Constants, m: Memory) -> None:
 
 @compiled
 def keep_steps(k: Constants, m: Memory, last: int) -> None:
-    """Keep the fit's beliefs at its steps up to number `last`, from 0, without the first YOUNG_STEPS.
+    """Keep as evidence the fit's beliefs at its stored steps up to number `last`, from 0.
 
-    -1 or less keeps none. Do nothing if beliefs are kept already.
+    The first YOUNG_STEPS are not kept; -1 or less keeps none. Set the count of refused fits to 0. Do nothing if beliefs
+    are kept already.
     """
     if m.earlier.kept_count > 0.0:
         return
@@ -125,9 +127,11 @@ def keep_belief(k: Constants, m: Memory, theta: Vector, P: Vector, unit: float, 
 
 @compiled
 def _fill_source(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit: float) -> bool:
-    """Fill the rows of source `s` from a belief; return False if a friction is clearly below 0.
+    """Fill source `s` from a belief, theta (p,) and P (p, p); return False if a friction is clearly below 0.
 
-    A person who pushes the arm on makes friction look negative: a negative one is stored as 0.
+    Clearly: by more than its floor and BELIEF_SIGMAS deviations; a person who pushes the arm on makes it look so. The
+    rows are filled in any case, a negative friction or inertia as 0. Rows of viscous friction stay. unit: scale of the
+    variances, see `fit_check.unit_of`.
     """
     has_friction = True
     for q in range(VISCOUS):
@@ -143,8 +147,9 @@ def _fill_source(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit
 def is_no_more(k: Constants, m: Memory) -> bool:
     """Return whether the fit agrees with the kept beliefs: same friction and unanchored offsets, no more inertia.
 
-    Drop a kept belief whose offset contradicts an anchor: it comes from a lean. If enough fits in a row agree against
-    the kept beliefs, drop all of these, set `has_lapsed` and return True. True also without kept beliefs.
+    Call `evidence.fit` before. Store the comparisons as evidence. Drop a kept belief whose offset contradicts an
+    anchor: it comes from a lean. Count a fit that contradicts the others; if enough such fits in a row agree, drop all
+    kept beliefs, set `has_lapsed` and return True. True also without kept beliefs.
     """
     is_no_more = True
     for s in range(KEPT, KEPT + int(m.earlier.kept_count)):
@@ -185,7 +190,8 @@ def _is_leant_on(k: Constants, m: Memory, s: int) -> bool:
 def _lapses(k: Constants, m: Memory) -> bool:
     """Count a fit that contradicts the kept beliefs; return whether enough such fits in a row agree to drop them.
 
-    Store the fit as source REFUSED. A fit that disagrees with the refused one before starts the count at 1.
+    Enough: LITTLE_FITS if this fit differs by little, LESS_FITS if it has less friction and otherwise no more. A fit
+    that disagrees with the refused one before starts the count at 1. Store the fit as source REFUSED.
     """
     own = m.earlier
     is_little, is_less, is_same, friction_Nm, else_Nm = True, True, True, 0.0, 0.0
@@ -208,9 +214,10 @@ def _lapses(k: Constants, m: Memory) -> bool:
 
 
 def describe_more(m: Memory) -> list[str]:
-    """Return the quantities in which the fit contradicts kept beliefs, by how much and since when, a line each.
+    """Return a line for each quantity in which the fit contradicts a kept belief: how much, since when, likely cause.
 
-    For a joint's friction only the speed with the largest excess.
+    Of several beliefs the line names that with the largest excess, of a joint's friction only the speed with the
+    largest. [] without a contradiction.
     """
     excesses = np.abs(m.evidence.difference[KEPT:] / m.evidence.limit[KEPT:])
     worst = KEPT + np.argmax(excesses, axis=0)

@@ -160,17 +160,17 @@ def of_belief(k: Constants, q: int, theta: Vector, P: Vector, unit: float) -> tu
 def split(variance: float, prior: float, unit: float) -> float:
     """Return a variance after scaling the samples' part of it by `unit`, and not the prior's part.
 
-    The inverses of both parts add up to the inverse of `variance`.
+    The inverses of both parts add up to the inverse of `variance`. If that is over `prior`, return `prior`.
     """
     return 1.0 / (1.0 / prior + max(1.0 / variance - 1.0 / prior, 0.0) / unit)
 
 
 @compiled
 def weigh(k: Constants, m: Memory, s: int, q: int) -> float:
-    """Return the fit's value of quantity `q` less that of source `s`, over its limit; fill `difference`, `limit`.
+    """Return the fit's value of quantity `q` less that of source `s`, over its limit; store `difference` and `limit`.
 
-    The fit contradicts the source beyond ±1. 0 if the source has no value, or if only more of `q` counts and the fit
-    has less.
+    Call `fit` or `put_fitted` before. The fit contradicts the source beyond ±1. 0 if the source has no value, or if
+    only more of `q` counts and the fit has less. NaN stays NaN in each case.
     """
     own = m.evidence
     difference = own.fitted[q] - own.value[s, q]
@@ -184,7 +184,7 @@ def weigh(k: Constants, m: Memory, s: int, q: int) -> float:
 
 @compiled
 def excess(m: Memory, s: int, q: int) -> float:
-    """Return the result of the last `weigh` of source `s` and quantity `q`; 0 if the row was skipped since."""
+    """Return the result of the last `weigh` of source `s` and quantity `q`; 0 if the row was cleared since."""
     return float(m.evidence.difference[s, q] / m.evidence.limit[s, q])
 
 
@@ -192,7 +192,7 @@ def excess(m: Memory, s: int, q: int) -> float:
 def largest_excess(m: Memory, first: int, last: int, q: int) -> int:
     """Return the source whose last `excess` of quantity `q` is largest in size, the first of equals.
 
-    first, last: the sources compared are those from first to last - 1.
+    first, last: the sources compared are those from first to last - 1; without any return `first`.
     """
     worst = first
     for s in range(first, last):

@@ -67,7 +67,7 @@ SMALLEST_UNIT = 0.1
 
 
 def step_samples_of(settings: Settings) -> int:
-    """Return the number of learnt samples between two steps, at which the fit's present belief is stored."""
+    """Return the number of learnt samples, at least 1, between two steps, at which the fit's belief is stored."""
     return max(round(STEP_S / (settings.bus.period_s * settings.certified.learn_every)), 1)
 
 
@@ -93,9 +93,10 @@ def add_residual(m: Memory, square: float) -> None:
 
 @compiled
 def follow(k: Constants, m: Memory, W_f: Vector, tau_f: Vector) -> None:
-    """Count a learnt sample and keep it for the check; after each `step_samples` of them store the belief as a step.
+    """Count a learnt sample, keep each `samples_every`-th for the check, and store the belief as a step if one is due.
 
-    W_f (n, p), tau_f (n,): the sample in the filter by which the fit is tested. Only the last STEPS steps are stored.
+    A step is due after each `step_samples` samples; the last STEPS of them are stored. W_f (n, p), tau_f (n,): the
+    sample in the filter by which the fit is tested.
     """
     own = m.fit_check
     _keep_sample(m, W_f, tau_f)
@@ -150,8 +151,8 @@ def fit_unit(m: Memory) -> float:
 def late_square(m: Memory) -> float:
     """Return the mean square of the residuals over their variances in the fit's later half; 1 before the second step.
 
-    Of a long fit only the last STEPS steps count. The earlier half is left out, so that a touch of the beginning
-    doesn't count.
+    Of a long fit only the residuals since the oldest stored step count. The earlier half is left out, so that a touch
+    of the beginning doesn't count.
     """
     own = m.fit_check
     used = int(own.steps_used)
@@ -197,7 +198,7 @@ def last_step_before_contradiction(k: Constants, m: Memory) -> int:
     """Return the number, from 0, of the last step whose belief contradicts the fit's; NONE without a contradiction.
 
     If no step does, but the fit doesn't explain a kept sample, return the last step before the first such sample; -1 if
-    that is older than all steps.
+    the sample came before the first step.
     """
     changed = last_unsteady_step(m)
     first = first_unexplained(m)
@@ -208,8 +209,9 @@ def last_step_before_contradiction(k: Constants, m: Memory) -> int:
 def first_unexplained(m: Memory) -> int:
     """Return the index, from 0, of the first kept sample that the fit's belief doesn't explain, less FIRST_EVERY - 1.
 
-    -1 without one, and for a payload's fit. Unexplained: a residual over `limit_Nm`. Up to `samples_every` - 1 learnt
-    samples before it are not kept, so not examined.
+    The index counts learnt samples. -1 without such a sample, for a payload's fit, and with fewer than two kept
+    samples. Unexplained: a residual over `limit_Nm`. Up to `samples_every` - 1 learnt samples before it are not kept,
+    so not examined.
     """
     kept, first = int(m.fit_check.samples_kept), -1
     if m.models.is_payload or kept < 2:
@@ -236,7 +238,7 @@ def residual(m: Memory, s: int, joint: int) -> float:
 
 @compiled
 def last_unsteady_step(m: Memory) -> int:
-    """Return the number of the last step, from 0, whose belief contradicts the fit's; NONE if none does."""
+    """Return the number, from 0, of the last stored step whose belief contradicts the fit's; NONE if none does."""
     used, steps = int(m.fit_check.steps_used), m.fit_check.steps_rows.shape[0]
     for number in range(used - 1, max(used - steps, 0) - 1, -1):
         if not changed_share(m, number % steps) <= 1.0:
@@ -258,7 +260,7 @@ def later_share(k: Constants, m: Memory, s: int) -> float:
     """Return the largest torque on the kept samples between the fit and the model after a step, over its limit.
 
     s: index at which the step is stored. Over 1: the samples after it contradict the fit. inf if they determine no
-    model.
+    model. The limit is wider in a model with gravity. Overwrites `later`, `factor` and `apart`.
     """
     own = m.fit_check
     if not find_later(m, s):
@@ -278,7 +280,10 @@ def later_share(k: Constants, m: Memory, s: int) -> float:
 
 @compiled
 def better_rms(m: Memory) -> float:
-    """Return the rms of the residuals, Nm, over the earlier or the later half of the kept samples, the smaller."""
+    """Return the rms of the residuals, Nm, over the earlier or the later half of the kept samples, the smaller.
+
+    0 with fewer than two samples. Of an odd number the last is left out.
+    """
     squares, half = np.zeros(2), int(m.fit_check.samples_kept) // 2
     for s in range(2 * half):
         for i in range(m.fit_check.samples_tau.shape[1]):

@@ -82,8 +82,9 @@ def rest(m: Memory) -> None:
 def follow(m: Memory, rates: Vector, smoothing: float, is_seen: bool) -> None:
     """Advance the filtered columns X (n, PLACE_TERMS) over one period, by the filter `LEARNT` and the pole behind it.
 
-    is_seen: False after a gap, when that filter keeps its values. rates (3,): its coefficients for one period, see
-    `torque_filter.FirstOrderHold`; smoothing: share of the pole's old output that stays after one period.
+    Store this sample's columns for the next call. is_seen: False after a gap, when that filter keeps its values, and
+    only the pole advances. rates (3,): the filter's coefficients for one period, see `torque_filter.FirstOrderHold`;
+    smoothing: share of the pole's old output that stays after one period.
     """
     decay, weight_old, weight_new = rates[0], rates[1], rates[2]
     X, X_old, X_f, X_learnt = m.regressor.X, m.missing_torque.X_old, m.missing_torque.X_f, m.missing_torque.X_learnt
@@ -165,7 +166,8 @@ def is_confirmed(k: Constants, m: Memory) -> bool:
     """Count a sample learnt while the arm monitors; return whether the model lacks a torque by position.
 
     Check after the first samples, then after stretches that double up to a limit; return False between checks. True if
-    the torque that an earlier stretch of samples showed explains this stretch, too. A check empties the sums.
+    the torque that an earlier stretch showed explains this stretch, too; `rms_Nm` (n,) is filled then, else 0. A check
+    keeps the torque that this stretch shows for later checks, and empties the sums.
     """
     own = m.missing_torque
     own.samples += 1.0
@@ -185,8 +187,9 @@ def is_confirmed(k: Constants, m: Memory) -> bool:
 def is_found(k: Constants, m: Memory) -> bool:
     """Return whether a torque that depends on the position, and that the model lacks, explains the samples in the sums.
 
-    Fill `basic` and `full`, the coefficients without and with that torque, and `rms_Nm` (n,), the torque of each joint,
-    0 if False. Always False, with only `rms_Nm` filled, for a model that has such columns.
+    It must be over LEAST_NM rms in a joint that has moved enough both ways. Fill `basic` and `full`, the coefficients
+    without and with that torque, and `rms_Nm` (n,), the torque of each joint, 0 if False. Always False, with only
+    `rms_Nm` filled, for a model that has such columns.
     """
     own = m.missing_torque
     own.rms_Nm[:] = 0.0
@@ -295,7 +298,7 @@ def log_evidence(m: Memory, b: Vector, s: Vector, x: Vector) -> float:
 
 @compiled
 def squares_left(m: Memory, x: Vector) -> float:
-    """Return Σ (r - v x)² / R: the weighted squares that coefficients x (f,) leave in the samples of the sums."""
+    """Return Σ (r - v x)² / R, at least 0: the weighted squares that coefficients x (f,) leave in the sums' samples."""
     own = m.missing_torque
     total = own.yy - 2.0 * linalg.dot(x, own.b)
     for i in range(own.L.shape[0]):

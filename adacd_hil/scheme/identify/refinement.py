@@ -31,10 +31,12 @@ def begin(m: Memory) -> None:
 
 @compiled
 def test(k: Constants, m: Memory) -> bool:
-    """Add one sample to the candidate's test; at the test's end use a better candidate as the certified model.
+    """Add one sample to the candidate's test; after `refine_cycles` samples certify the candidate if it is better.
 
-    Then begin the next test. Return True only if an anchor excludes the torque offset of a candidate that has passed
-    otherwise: the certificate is to be revoked.
+    Better: smaller squared residuals of the slow filter in moving joints, no residual over a threshold, a positive
+    definite mass matrix, and torque offsets within the anchors' bounds. It then becomes the model in use, too. After
+    each test begin the next with the present belief. Return True only if the anchors alone exclude the candidate: the
+    certificate is to be revoked.
     """
     own = m.candidate
     own.cycles += 1.0

@@ -45,7 +45,10 @@ def begin_fit(m: Memory) -> None:
 
 @compiled
 def follow(k: Constants, m: Memory, q: Vector, dq: Vector, W_f: Vector) -> bool:
-    """Add a sample, W_f (n, p), to the evidence of a fit; return whether it is complete, see `is_complete`."""
+    """Add a sample, W_f (n, p), to the evidence of a fit; return whether it is complete, see `is_complete`.
+
+    Only each EXCITATION_EVERY-th sample brings excitation and condition up to date.
+    """
     if gather(m.motion, q, dq, W_f, k.period_s):
         smallest, largest = eigenvalue_range(m.motion.information, k.scale, m.motion.scratch)
         m.fit.excitation = smallest
@@ -118,7 +121,7 @@ def test_limit_Nm(k: Constants, square: float) -> float:
 def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dict[str, str]) -> list[str]:
     """Return a line for each unmet condition of `is_complete`, with the motion that fulfils it.
 
-    names: of the parameters, in the belief's order. units: by parameter's name.
+    [] if the fit is complete. names: of the parameters, in the belief's order. units: by parameter's name.
     """
     own = m.motion
     lines = []
@@ -172,6 +175,9 @@ _MOTIONS = {
 
 
 def _motion_for(name: str) -> str:
-    """Return the text of a motion by which the parameter `name` is learnt, such as "accelerate joint 2 harder"."""
+    """Return the text of a motion by which the parameter `name` is learnt, such as "accelerate joint 2 harder".
+
+    The joint is the name's last character. An unknown parameter is learnt by slow motion with dwells.
+    """
     found = (text for key, text in _MOTIONS.items() if name.startswith(key))
     return next(found, "move joint {} slowly, and with dwells").format(name[-1])

@@ -116,7 +116,9 @@ def begin_refinement(constants: Structured, memory: Structured) -> None:
 def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
     """Process the block's q, dq, tau_J and fill the rest of the block; return bits of an observation (`transitions`).
 
-    is_complete: 1 for a fresh sample. steps: periods since the fresh sample before it. mode: bits MEASURE to WEIGH.
+    is_complete: 1 for a fresh sample; else the filters and the model stay. A fresh sample with a value that isn't
+    finite makes a gap. steps: periods since the fresh sample before it. mode: bits MEASURE to WEIGH; without WATCH the
+    thresholds are inf.
     """
     k, m, out = constants[0], memory[0], block[0]
     observation = observe(k.limits, k.period_s, block, steps, OVER_SPEED)
@@ -245,7 +247,9 @@ def _watch(k: Constants, m: Memory, out: CertifiedBlock, is_fresh: bool) -> int:
 def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode: int) -> int:
     """Learn, test or refine with this sample, by `mode`; return the result as bits of an observation, or 0.
 
-    The bits: FITTED, CERTIFIED, REFUTED, WITHHELD. is_touched: a joint is over its threshold in this cycle.
+    The bits: FITTED, CERTIFIED, REFUTED, WITHHELD, with the contradiction in `withheld_by`. is_touched: a joint is over
+    its threshold in this cycle. A touch pauses learning, but not a test. In LEARN and TEST its first cycle raises the
+    joints' thresholds and keeps the fit's beliefs as evidence; in REFINE it begins the evidence on the contact's cause.
     """
     was_free = m.models.recovering_cycles == 0.0
     is_free = belief.is_free(k, m, is_touched)
@@ -289,8 +293,8 @@ def _follow_noise(k: Constants, m: Memory, is_free: bool, mode: int) -> None:
 def _test(k: Constants, m: Memory, dq: Vector) -> int:
     """Add this sample to the test of the frozen model; return CERTIFIED, REFUTED, REFUTED and WITHHELD, or 0.
 
-    0 while the test goes on. WITHHELD: the model lacks a torque that depends on the position. Set `withheld_by` if
-    refuted.
+    0 while the test goes on. WITHHELD: the model lacks a torque that depends on the position. If refuted set
+    `withheld_by`, and, without a payload, keep the fit's beliefs as evidence.
     """
     sensitivity.follow_unit(k, m, False)
     margin.follow_test(k, m)

@@ -46,7 +46,8 @@ def parameter_names(settings: Settings) -> tuple[str, ...]:
 def _by_kind(values: tuple[float, ...], names: tuple[str, ...]) -> Vector:
     """Return the value for each name (p,) by its kind.
 
-    values: of inertia, viscous and Coulomb friction, gravity, offset, lag, further friction.
+    values: of inertia, viscous and Coulomb friction, gravity, offset, lag, further friction. A name of no other kind
+    gets the last one.
     """
     inertia, viscous, coulomb, gravity, offset, lag, further = values
     prefixes = (("F_v", viscous), ("F_c", coulomb), ("offset", offset), ("lag", lag))

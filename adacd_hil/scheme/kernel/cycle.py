@@ -183,7 +183,10 @@ def end_certified(
 ) -> int:
     """End a cycle of the certified scheme: follow the contact's reports and reaction, and fill the decision.
 
-    Return bits of further tasks for Python, REPORT to PUSHED. place: index of the cycle.
+    Write the cycle's row into `rows`, see `contact_report.put_row`. Return bits of further tasks for Python, or 0:
+    REPORT, a report is due; FORGET, once, when the contact that interrupted an adaptation has its last report; SECOND,
+    a second of monitoring is over; PUSHED, the stopped arm is over a threshold at the check asked for. place: index of
+    the cycle.
     """
     k, m, out, run = constants[0], memory[0], block[0], course_memory[0]
     decision, contact, state = decisions[place], run.contact, run.supervisor.state
@@ -229,7 +232,12 @@ def paper_cycle(
     course_constants: Structured,
     course_memory: Structured,
 ) -> int:
-    """Run one cycle of the paper's scheme; arguments and result as for `certified_cycle`."""
+    """Run one cycle of the paper's scheme; return bits of tasks for Python, or 0.
+
+    With a bit of BEFORE_CONTACT the cycle is not over: Python runs the tasks, then `end_paper`. place: index of the
+    cycle in samples, decisions and blocks; `decisions` and `blocks` are filled there. values: the numbers of `block`
+    (size,), same memory. course_*: supervisor and contact.
+    """
     sample, decision, run = samples[place], decisions[place], course_memory[0]
     period_s = interval_s(run, sample)
     mode = _PAPER_MODE[run.supervisor.state]
@@ -268,8 +276,9 @@ def end_paper(
 def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, decision: Decision) -> int:
     """Run the supervisor; return LEFT, REFUSED or ACCEPTED as bits, tasks for Python before the contact's course; or 0.
 
-    observation: the kernel's findings, see `transitions`. Fill previous state, findings and joints in contact of
-    `decision`. If the user accepts a pending refusal in this cycle, the cycle doesn't withhold a certificate.
+    ACCEPTED: the user asks to accept a refusal, pending or not; a pending one is not refused again in this cycle.
+    REFUSED: a certificate is withheld, and the state before wasn't MONITOR. observation: the kernel's findings, see
+    `transitions`. Fill previous state, findings and joints in contact of `decision`.
     """
     asked, previous = 0, m.supervisor.state
     if sample.request == Request.ACCEPT:

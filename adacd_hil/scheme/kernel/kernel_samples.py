@@ -38,7 +38,7 @@ SAMPLE = described(Sample, {"n": JOINTS})
 def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
     """Write arm state and request of one cycle into `samples` (1,), of type SAMPLE.
 
-    `age` is that of the oldest value.
+    `age` is that of the oldest value, `sampled_ns` the cycle's time if the state has no time of the SYNC.
     """
     age = max(*arm.age_q, *arm.age_tau_J)
     sampled_ns = arm.t_ns if arm.sampled_ns is None else arm.sampled_ns
@@ -47,7 +47,7 @@ def fill_sample(samples: Structured, arm: ArmState, request: int) -> None:
 
 
 def samples_of(arms: ArmBatch, requests: NDArray[np.uint8]) -> Structured:
-    """Return the arm states and requests of n cycles as an array of type SAMPLE (n,)."""
+    """Return arm states and requests of n cycles as an array of type SAMPLE (n,); `age`: that of the oldest value."""
     samples = np.zeros(arms.cycle.size, SAMPLE)
     for name in ("cycle", "periods", "steps", "sampled_ns", "fault", "is_complete", "is_enabled", "is_late"):
         samples[name] = getattr(arms, name)

@@ -171,9 +171,10 @@ def numbers_of(settings: Settings) -> Numbers:
 
 @compiled
 def begin_adaptation(constants: Structured, memory: Structured, block: Structured) -> None:
-    """Reset filters, gain P and evidence to begin an adaptation of an arm at rest; keep theta_hat.
+    """Reset filtered torque and regressor, P and evidence to begin an adaptation of an arm at rest; keep theta_hat.
 
-    Filters that started with the old payload would mix the old theta into the new one for about 4 / a.
+    The filters resume at the next sample. A step beside the certified scheme learns again, see `step_beside`. Filters
+    that started with the old payload would mix the old theta into the new one for about 4 / a.
     """
     c, m, out = constants[0], memory[0], block[0]
     m.has_gap = 1.0
@@ -192,7 +193,9 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
 def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
     """Process the block's q, dq, tau_J and fill the rest of the block; return bits of an observation (`transitions`).
 
-    is_complete: 1 for a fresh sample. steps: periods since the fresh sample before it. mode: LEARN, ARMED, REPORTING.
+    is_complete: 1 for a fresh sample; else filters and estimate stay. A fresh sample with a value that isn't finite
+    makes a gap. steps: periods since the fresh sample before it. mode: LEARN, ARMED, REPORTING; without ARMED the
+    thresholds are inf, and the contact's impulse and peak 0.
     """
     c, m, out = constants[0], memory[0], block[0]
     period_s = c.period_s

@@ -76,7 +76,10 @@ def regressor(q: Vector, dq: Vector, ddq: Vector, parameter_count: int, level_ra
 
 @compiled
 def inverse_dynamics(q: Vector, dq: Vector, ddq: Vector, theta: Vector, level_rad: float) -> Vector:
-    """Return tau (2,) = W theta, the torque that the model needs for this motion, Nm."""
+    """Return tau (2,) = W theta, the torque that the model needs for this motion, Nm.
+
+    theta (p,): without or with gravity. level_rad: q1 at which link 1 is level.
+    """
     W = regressor(q, dq, ddq, theta.shape[0], level_rad)
     tau = np.zeros(JOINTS)
     for i in range(JOINTS):

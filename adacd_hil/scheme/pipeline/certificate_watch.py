@@ -94,7 +94,8 @@ class CertificateWatch:
     def enter(self, previous: SchemeState, state: SchemeState) -> Event | None:
         """Store a certificate and return its event if the state changes from CERTIFY to MONITOR; else return None.
 
-        A certificate, or the enabling of the drives, ends a refusal.
+        The event is a warning if no anchor bounds a joint's torque offset. A certificate, or the enabling of the
+        drives, ends a refusal.
         """
         if state is SchemeState.ENABLE:
             self._refusal = None
@@ -133,8 +134,8 @@ class CertificateWatch:
     def refuse(self) -> Event | None:
         """Store a refusal of the reading at rest or of a fit, with its cause; return the event to report, or None.
 
-        None if the refusal before had the same cause; but each REPORT_EACH-th refused fit in a row is reported again.
-        Call it before the kernel forgets the fit.
+        None if the refusal before had the same cause; but each REPORT_EACH-th refusal of a fit in a row is reported
+        again. Call it before the kernel forgets the fit.
         """
         before, m, cause = self._refusal, self._m, int(self._m.withheld_by)
         offsets = slice(int(self._k.first_offset), int(self._k.first_offset) + JOINTS)
@@ -156,14 +157,20 @@ class CertificateWatch:
         return Event("warning", "revoked", f"{verdict.text}: the certificate is taken back, {remedy}")
 
     def revoke(self) -> Event:
-        """Take the certificate back for the user and return the event; call it before kept beliefs are dropped."""
+        """Take the certificate back for the user and return the event; call it before kept beliefs are dropped.
+
+        The next certificate names the user's word if a certificate stood or beliefs are kept.
+        """
         if earlier.is_keeping(self._m):
             self._vouched_against = _THE_RUN
         self._take_back()
         return Event("warning", "revoked", "at the user's word the arm is learnt anew")
 
     def _take_back(self) -> None:
-        """Remove the last certificate from `certificates` if it still stands."""
+        """Remove the last certificate from `certificates` if it still stands.
+
+        The next certificate then names the user's word against it.
+        """
         if self._is_standing:
             self._certificates.pop()
             self._vouched_against = _TAKEN_BACK
@@ -215,10 +222,11 @@ class CertificateWatch:
         return lines
 
     def accept(self) -> Event:
-        """Drop the evidence that refuses a fit or reading, at the user's request; return the event to report.
+        """Drop the evidence that refuses a fit or reading, at the user's request; return a warning to report.
 
-        For offsets that an anchor excludes, set the refused offsets as the new anchor. This ends the refusal. Without a
-        refusal change nothing and return a warning.
+        By cause: a reading at rest drops the tare; an excluded offset makes the refused offsets the only anchor; an
+        excess over the last certificate drops that certificate; any other cause drops the kept beliefs. This ends the
+        refusal. In the last two cases the next certificate names the user's word. Without a refusal change no evidence.
         """
         refusal, self._refusal = self._refusal, None
         if refusal is None:

@@ -95,7 +95,7 @@ class CertifiedPipeline(Pipeline):
         paper_kernel.step(constants, memory.copy(), block.copy(), 1, 1, paper_kernel.LEARN)
 
     def describe_missing(self) -> list[str]:
-        """Return the lines of a present refusal, and a line for each condition that the fit still misses."""
+        """Return the lines of a present refusal, and a line for each condition that the fit misses; [] without both."""
         return [*self._watch.describe(), *termination.describe_missing(self._k, self._m, self._names, PARAMETER_UNITS)]
 
     def describe_withheld(self) -> list[str]:
@@ -171,8 +171,8 @@ class CertifiedPipeline(Pipeline):
         """Store the beginning or end of a contact in MONITOR; stop the arm if contacts have a common cause.
 
         Return the state after that. A common cause takes the certificate back, unless the reaction lets the arm go on.
-        Without a common cause report a contact that followed soon on another. is_touched: a joint is over its threshold
-        in this cycle.
+        Without a common cause report a contact that followed soon on another, and let a joint over its threshold at the
+        stop be checked for a push FORGOTTEN_S later. is_touched: a joint is over its threshold in this cycle.
         """
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
             is_contradicted = self._course.supervisor.cause == SchemeEvent.CONTRADICTED
@@ -210,7 +210,7 @@ class CertifiedPipeline(Pipeline):
         """Begin an adaptation: of a payload if the arm is certified, of the whole arm if not, or after a failed test.
 
         If the user has taken the certificate back, revoke it first. The paper's scheme beside begins one with a first
-        attempt, too.
+        attempt, too. After a contact an interrupted adaptation begins anew as it was.
         """
         cause = self._course.supervisor.cause
         is_first = cause in (SchemeEvent.REVOKED, SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED)
@@ -233,7 +233,10 @@ class CertifiedPipeline(Pipeline):
         certified_kernel.begin_adaptation(*self.numbers[:2], self._is_payload, is_first)
 
     def _revoke(self) -> None:
-        """Take back the certificate for the user, drop the kept beliefs, and set the feedforward's model to 0."""
+        """Take back the certificate for the user and add the event; drop the kept beliefs.
+
+        Set the feedforward's model to 0, and mark it as not valid.
+        """
         self._course.is_model_valid = False
         self.theta_ff = np.zeros(self.theta_ff.size)
         self._events.append(self._watch.revoke())

@@ -7,5 +7,8 @@ from adacd_hil.settings.configuration import Settings
 
 
 def new_pipeline(settings: Settings) -> Pipeline:
-    """Return the pipeline of a run, before its first cycle."""
+    """Return the pipeline of the certified scheme if `settings.scheme` is `certified`, else of the paper's.
+
+    It is new: as before the first cycle of a run.
+    """
     return CertifiedPipeline(settings) if settings.scheme == "certified" else PaperPipeline(settings)

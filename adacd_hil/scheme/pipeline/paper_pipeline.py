@@ -45,7 +45,8 @@ class PaperPipeline(Pipeline):
     def _follow(self, asked: int, previous: SchemeState, cycle: int, observation: int) -> None:  # noqa: ARG002
         """Begin an adaptation on entering ADAPT; at its end use its estimate as the feedforward's model.
 
-        That model is valid if its mass matrix is positive definite. After REVOKED set it to 0 first.
+        The end is the change from ADAPT to MONITOR. The model is valid if its mass matrix is positive definite. After
+        REVOKED set the model to 0, not valid, before the adaptation begins.
         """
         state = self.state
         if previous is SchemeState.ADAPT and state is SchemeState.MONITOR:

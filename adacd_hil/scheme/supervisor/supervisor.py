@@ -195,9 +195,10 @@ def supervise(
 
 @compiled
 def doubt(m: SupervisorMemory) -> None:
-    """Move to STOPPED after a contact, latched, because the model is wrong: hold the arm until the user decides.
+    """Move from MONITOR to STOPPED, or stay stopped, and latch it, because contacts show that the model is wrong.
 
-    An acknowledgement then takes back the knowledge of the arm; a payload may change without an announcement.
+    The arm holds until the user decides. An acknowledgement then takes back the knowledge of the arm; a payload may
+    change without an announcement.
     """
     event: int = SchemeEvent.DOUBTED
     _enter(m, next_state(m.state, event, m.origin), event)
@@ -207,7 +208,11 @@ def doubt(m: SupervisorMemory) -> None:
 
 @compiled
 def _count(m: SupervisorMemory, arm: Sample, observation: int) -> None:
-    """Count periods in the state, and cycles in a row at rest, in motion, without contact, blind, and with old data."""
+    """Count periods in the state and in learning states, and cycles in a row by the findings of this one.
+
+    The cycles: at rest, in motion, without contact, without a new sample, with data older than one cycle. observation:
+    bits of the findings.
+    """
     m.phase_periods += arm.periods
     if IS_LEARNING[m.state]:
         m.learning_periods += arm.periods
@@ -220,7 +225,10 @@ def _count(m: SupervisorMemory, arm: Sample, observation: int) -> None:
 
 @compiled
 def _take(m: SupervisorMemory, request: int) -> None:
-    """Set the request's bit in `pending` if it may wait in this state; else drop it."""
+    """Set the request's bit in `pending` if it may wait in this state; else drop it.
+
+    A kept PAYLOAD sets `is_announced_here`, a PAYLOAD_CHANGED kept during a reaction `is_weight_announced`.
+    """
     if _keeps(m, request, m.state):
         m.pending |= 1 << request
         if request == Request.PAYLOAD:
@@ -258,7 +266,10 @@ def _has_grown(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observa
 
 @compiled
 def _is_announced(m: SupervisorMemory) -> bool:
-    """Return whether an announced change of payload ends the state; STOPPED only if it was announced in STOPPED."""
+    """Return whether an announced change of payload ends MONITOR or STOPPED, in which it is called.
+
+    STOPPED only if the change was announced in this stay there.
+    """
     is_awaited = _is_pending(m, Request.PAYLOAD) and m.state == SchemeState.MONITOR
     return bool(m.is_announced_here or is_awaited)
 
@@ -278,7 +289,9 @@ def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
 def _enter(m: SupervisorMemory, state: int, event: int) -> None:
     """Enter another state by `event`, reset its counts, and drop the requests that don't wait there.
 
-    Do nothing if `state` is the present one.
+    Do nothing if `state` is the present one. REACT stores its origin, ADAPT in place of CERTIFY, and is latched for any
+    event but CONTACT. An adaptation by ENABLED, PAYLOAD_CHANGED or REVOKED gets its full time. A doubt of the model
+    ends, except in STOPPED.
     """
     if state == m.state:
         return
@@ -465,8 +478,9 @@ def _overdue(k: SupervisorConstants, m: SupervisorMemory) -> int:
 def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation: int) -> int:
     """Return the first fault in this cycle, or NONE.
 
-    In this order: the arm's own, a value that isn't a number, a late host, old data, no new sample for too long,
-    position or speed over a limit, drives that aren't enabled.
+    In this order: the arm's own; a value that isn't a number; a late host, except where the arm holds for it; old data;
+    no new sample for too long; position or speed over a limit, speed not in the first periods of REACT; drives that
+    aren't enabled in a powered state. observation: bits of the findings.
     """
     state = m.state
     fault: int = FaultReason.NONE

@@ -132,7 +132,7 @@ _NEXT = _numbered()
 def next_state(state: int, event: int, origin: int) -> int:
     """Return the next state from the table; a pair that is not in it leaves the state as it is.
 
-    origin: the state from which REACT was entered last.
+    origin: the state to which REACT and STOPPED return.
     """
     following = int(_NEXT[state, event])
     if following == TO_ORIGIN:

@@ -99,7 +99,11 @@ class _FileCheck:
         self._file.seek(position)
 
     def _record(self, record: RawRecord) -> None:
-        """Add a record to the CRC of its section and check it; a DataEnd ends the data section."""
+        """Add a record to the CRC of its section and check it; a DataEnd ends the data section.
+
+        A record that can't be parsed makes a finding. A record other than a MessageIndex ends the indexes of the latest
+        chunk.
+        """
         head = HEAD.pack(record.opcode, len(record.body))
         if record.opcode != Opcode.MESSAGE_INDEX:
             self._chunks.end_indexes()
@@ -284,7 +288,10 @@ def check_log(path: Path, progress: Callable[[str], None] = lambda _: None) -> L
 
 
 def _check_parts(path: Path, checked: dict[int, _FileCheck], findings: Findings) -> None:
-    """Check that no part of a log is missing, and that all are of one run; add findings."""
+    """Check that no part of a log is missing, and that all are of one run; add findings.
+
+    A part whose metadata have another number than its name has a finding, too.
+    """
     last = max(checked)
     for missing in missing_parts(path, checked):
         findings.add_finding("missing-part", f"{missing.name} is missing")

@@ -93,7 +93,8 @@ class ChunkCheck:
     def chunk(self, record: RawRecord) -> None:
         """Check a chunk, its messages and definitions; add findings.
 
-        Keep the facts with which its indexes are compared.
+        Keep the facts with which its indexes are compared. A chunk without a CRC is counted. Raises LogError if the
+        record can't be parsed.
         """
         chunk: Chunk = parse(record.opcode, record.body)
         facts = ChunkFacts(
@@ -148,7 +149,7 @@ class ChunkCheck:
     def message_index(self, record: RawRecord) -> None:
         """Compare a message index with the messages of the chunk before it; add findings.
 
-        If that chunk couldn't be opened, only note where the index is.
+        Store its place and length with that chunk's facts. If the chunk couldn't be opened, do only this.
         """
         channel = int.from_bytes(record.body[:2], "little")
         latest = self._latest
@@ -169,7 +170,7 @@ class ChunkCheck:
             self._findings.add_finding("message-index", text, record.offset)
 
     def end_indexes(self) -> None:
-        """Add a finding if the latest chunk lacks a message index.
+        """Add a finding if the latest chunk lacks a message index; then no more of its indexes can follow.
 
         Call it at each record that is no message index, and at the end.
         """
@@ -221,7 +222,10 @@ class ChunkCheck:
             self._content.messages(contents, self._definitions, offset)
 
     def compare(self, index: ChunkIndex, offset: int) -> None:
-        """Compare a chunk index of the summary with its chunk; add findings. offset: of the index in the file."""
+        """Compare a chunk index of the summary with its chunk, and mark the chunk as indexed; add findings.
+
+        offset: of the index in the file.
+        """
         facts = self.facts.get(index.chunk_start_offset)
         if facts is None:
             text = f"a chunk index points to byte {index.chunk_start_offset}, where no chunk begins"
@@ -331,7 +335,10 @@ class SummaryCheck:
             self._findings.add_finding("summary-channels", text, offset)
 
     def footer(self, record: RawRecord, crc: int) -> None:
-        """Compare the footer with the summary; add findings. crc: that of the summary up to the footer's own CRC."""
+        """Compare the footer with the summary; add findings. crc: that of the summary up to the footer's own CRC.
+
+        A summary without a CRC is counted. Raises LogError if the record can't be parsed.
+        """
         footer: Footer = parse(record.opcode, record.body)
         if footer.summary_start != self._start:
             text = f"the Footer says that the summary begins at byte {footer.summary_start}, it is {self._start}"
