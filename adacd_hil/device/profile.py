@@ -476,14 +476,19 @@ class PlacedDevice:
         """Return the CAN identifier of a PDO of this device: its `cob_id` plus the node id."""
         return pdo.cob_id + self.node_id
 
+    def listed(self, name: ObjectName) -> EdsVariable:
+        """Return an object of the EDS. Raises ConfigError when it isn't listed."""
+        found = find_variable(self.objects, name.index, name.sub)
+        if found is None:
+            raise ConfigError(f"device profile {self.profile.name}: object {name} is not in {self.profile.eds}")
+        return found
+
     def variable(self, name: ObjectName) -> EdsVariable:
         """Return an object of the EDS that is an integer.
 
         Raises ConfigError when it isn't listed, is a float or no number, or hasn't the type of STANDARD_TYPES.
         """
-        found = find_variable(self.objects, name.index, name.sub)
-        if found is None:
-            raise ConfigError(f"device profile {self.profile.name}: object {name} is not in {self.profile.eds}")
+        found = self.listed(name)
         if found.is_float:
             raise ConfigError(
                 f"device profile {self.profile.name}: object {name} ({found.name}) is a float, REAL{found.bits}; the "
