@@ -21,7 +21,8 @@ from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.cli.own_devices import rehearse as rehearse_file
-from firmware_sim.scenario.scenario import Scenario
+from firmware_sim.scenario.rehearsal import DeviceCounts, ToldArm, compose_scenario
+from firmware_sim.scenario.scenario import ArmTruth, Scenario
 
 SHORT = "lasts_s = 0.4\n"
 
@@ -178,6 +179,16 @@ def test_a_light_arm_is_not_thrown_and_has_sensors_of_its_size(tmp_path: Path) -
     model_Nm = model.contacts[2].force_N * model.contacts[2].point_m
     assert torque_Nm / gamma == pytest.approx(model_Nm / model.arm.inertia()[2])  # as fast as profile P
     assert scenario.sensors.torque_range_Nm == pytest.approx((25.0 / 3.0, 50.0 / 3.0))
+
+
+def test_a_hand_guides_an_arm_of_half_the_size_to_a_place_in_its_reach() -> None:
+    settings = load_settings("certified")
+    arm = dataclasses.replace(settings.arm, link_length_m=(0.175, 0.15))  # profile P: 0.35 and 0.3 m
+    told = ToldArm(dataclasses.replace(settings, arm=arm), frozenset({"arm.link_length_m"}))
+    counts = DeviceCounts((0.0, 0.0), (100.0, 100.0), (1e-3, 1e-3), (0.0, 0.0))
+    hand = {"link": 2, "point_m": 0.3, "move_to_m": [0.4, -0.2], "speed_m_s": 0.1}
+    table, _ = compose_scenario(told, ArmTruth(), counts, {"hands": [hand]}, is_builtin=True)
+    assert table["hands"] == [{**hand, "point_m": 0.15, "move_to_m": [0.2, -0.1]}]
 
 
 def test_the_payload_of_a_heavy_arm_is_one_that_a_scenario_takes(tmp_path: Path) -> None:
