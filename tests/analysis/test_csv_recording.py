@@ -1,5 +1,6 @@
 """CSV files as loggers write them: what is read, what is left out and counted, and which key a refusal names."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -130,12 +131,35 @@ def test_times_that_are_missing_without_a_period_name_the_key(read):
 
 
 def test_a_row_of_units_is_compared_with_the_map(read):
-    recording = read(table(plain, "t,angle,torque\n[s],(rad),N m\n"))
-    check(recording)
-    assert recording.notes == ("row 2 names units ([s], (rad), N m)",)
-    for units, said in (("s,deg,Nm", "'deg' for column 'angle'"), ("ms,rad,Nm", "'ms' for column 't'")):
-        with pytest.raises(ConfigError, match=f"row of units says {said}, the map"):
-            read(table(plain, f"t,angle,torque\n{units}\n"))
+    for units, seen in (
+        ("[s],(rad),N m", "[s], (rad), N m"),
+        ("s,nan,Nm", "s, Nm"),
+        (",rad,", "rad"),
+        ("# s,rad,Nm", "s, rad, Nm"),
+    ):
+        recording = read(table(plain, f"t,angle,torque\n{units}\n"))
+        check(recording)
+        assert recording.notes == (f"row 2 names units ({seen})",)
+    assert read(table(plain, "t,angle,torque\n# A\n# by hand, deg\n")).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("units", "text", "column"),
+    [
+        ("s,deg,Nm", "deg", "angle"),
+        ("ms,rad,Nm", "ms", "t"),
+        ("s,deg,", "deg", "angle"),
+        ("0,deg,Nm", "deg", "angle"),
+        ("s,deg", "deg", "angle"),
+        ("#s,deg,Nm", "deg", "angle"),
+        ("s,rad,Nm\n[s],[deg],[Nm]", "[deg]", "angle"),
+        ("s,mdeg,Nm", "mdeg", "angle"),
+        ("---,---,---", "---", "t"),
+    ],
+)
+def test_another_unit_below_the_heads_is_refused(read, units, text, column):
+    with pytest.raises(ConfigError, match=rf"row \d: '{re.escape(text)}' in column '{column}'"):
+        read(table(plain, f"t,angle,torque\n{units}\n"))
 
 
 SPOILT = {
