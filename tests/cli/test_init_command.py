@@ -398,17 +398,26 @@ def test_an_eds_beside_named_profiles_of_its_kind_is_refused(out):
 
 
 def test_two_eds_of_a_kind_are_of_joint_1_and_2_and_more_or_namesakes_are_refused(out, tmp_path):
-    for name in ("a", "b"):
+    for name in ("a", "b", "c"):
         (tmp_path / name).mkdir()
         shutil.copy(contract_folder() / "stock_drive.eds", tmp_path / name / f"{name}.eds")
     (tmp_path / "b" / "a.eds").write_text((tmp_path / "a" / "a.eds").read_text() + "\n")
-    first, second, namesake = (str(tmp_path / name) for name in ("a/a.eds", "b/b.eds", "b/a.eds"))
+    first, second, third, namesake = (str(tmp_path / name) for name in ("a/a.eds", "b/b.eds", "c/c.eds", "b/a.eds"))
     assert init(out, *NO_BUS, "--eds", first, "--eds", second).exit_code == 0
     assert [Path(name).name for name in written(out).devices.drive] == ["my-arm-a.toml", "my-arm-b.toml"]
-    for eds in ((first, namesake), (first, second, first)):
+    for eds in ((first, namesake), (first, second, third)):
         refused = init(tmp_path / "another" / "arm.toml", *NO_BUS, *[word for one in eds for word in ("--eds", one)])
         assert refused.exit_code == USAGE
     assert not (tmp_path / "another").exists()
+
+
+def test_one_eds_handed_for_each_joint_gives_each_its_own_gear(out, tmp_path):
+    eds = EdsVariant().write(tmp_path / "drive.eds")
+    for again in (eds, tmp_path / "." / "lab" / ".." / "drive.eds"):
+        words = ("--eds", str(eds), "--eds", str(again), "--gear", "30", "50")
+        assert init(out, *NO_BUS, *words, "--force").exit_code == 0
+        profiles = [load_profile(str(out.parent / name), "drive") for name in written(out).devices.drive]
+        assert [profile.settings.scale.gear_ratio for profile in profiles] == [30.0, 50.0]
 
 
 @pytest.mark.parametrize(("outer_kg", "is_warned"), [("1", False), ("4", True)])
