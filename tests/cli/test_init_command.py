@@ -528,7 +528,8 @@ def test_a_device_that_is_missing_or_no_drive_is_named(out, on_bus, silent, opti
 def test_a_log_gives_its_arm_without_its_user(tmp_path, out):
     config = tmp_path / "arm.toml"
     config.write_text(
-        'extends = "certified"\nassumed = ["arm.sign", "arm.holding_torque_Nm"]\n[arm]\nlink_length_m = [0.4, 0.25]\n'
+        'extends = "certified"\nassumed = ["arm.sign", "arm.holding_torque_Nm", "devices.drive"]\n'
+        "[arm]\nlink_length_m = [0.4, 0.25]\n"
         "torque_limit_Nm = [9, 4]\ncad_theta = []\n[operator]\nacknowledge_after_s = 0.6\n"
         'script = [{ at_s = 0.3, request = "finish" }]\n'
     )
@@ -540,8 +541,12 @@ def test_a_log_gives_its_arm_without_its_user(tmp_path, out):
     settings = written(out)
     for name in ("link_length_m", "torque_limit_Nm", "cad_theta"):
         assert getattr(settings.arm, name) == getattr(own.arm, name)
-    assert settings.assumed == own.assumed
+    assert set(settings.assumed) == set(own.assumed)
     assert (settings.operator.acknowledges, settings.operator.script) == (False, ())
+    assert init(out, "--from", str(tmp_path / "run"), "--drive", *["adacd-drive"] * 2, "--force").exit_code == 0
+    assert written(out).assumed == ("arm.sign", "arm.holding_torque_Nm")
+    lines = out.read_text().splitlines()
+    assert "run.mcap" not in lines[lines.index('drive = ["adacd-drive", "adacd-drive"]') - 1]
 
 
 def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out, monkeypatch):
