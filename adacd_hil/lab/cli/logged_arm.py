@@ -12,9 +12,8 @@ from adacd_hil.device.contract import find_contract
 from adacd_hil.file_access import exists
 from adacd_hil.lab.cli.arm_drafting import DraftFiles
 from adacd_hil.lab.commission.arm_draft import Entry, assumed_keys, draft_as_toml
-from adacd_hil.log.log_files import CONFIG_NAME
 from adacd_hil.log.log_parts import log_in
-from adacd_hil.log.log_walk import attachment
+from adacd_hil.log.log_walk import read_head
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
@@ -40,16 +39,21 @@ def draft_from_log(log: Path, options: SimpleNamespace, files: DraftFiles) -> tu
     """Return the text of a configuration for the arm of a log, and a summary for JSON; write no file.
 
     options: as of `Drafting`. Adds the device profiles to `files`, and checks the configuration with them. Raises
-    LogError if the log can't be read or lacks settings, CommandError for options other than --drive and --sensor, a
-    missing profile, or a configuration with errors.
+    LogError if the log can't be read or lacks settings, CommandError for a configuration in place of a log, options
+    other than --drive and --sensor, a missing profile, or a configuration with errors.
     """
     given = [name for name, value in vars(options).items() if value not in (None, (), False)]
     if further := [name for name in given if name not in ("drive", "sensor")]:
         option = f"--{further[0].removeprefix('is_').replace('_', '-')}"
         raise CommandError(f"--from takes the arm from the log: leave out {option}", ExitCode.USAGE)
+    if log.suffix == ".toml":
+        raise CommandError(
+            f"--from takes the log of a run, a run.mcap or its folder, and {log} is a configuration: use it as it is, "
+            f"`--config {quoted(log)}`, or write another one that `extends` it",
+            ExitCode.USAGE,
+        )
     path = log_in(log)
-    text = attachment(path, CONFIG_NAME)
-    settings = settings_of(path, {} if text is None else {CONFIG_NAME: text})
+    settings = settings_of(path, read_head(path).attachments)
     base = "certified" if settings.scheme == "certified" else "paper"
     warnings: list[str] = []
     entries = _differences(settings, base, path, warnings)
