@@ -197,6 +197,25 @@ def test_the_payload_of_a_heavy_arm_is_one_that_a_scenario_takes(tmp_path: Path)
     assert scenario.payloads[0].mass_kg == 10.0
 
 
+@pytest.mark.parametrize(
+    ("kind", "count", "said"),
+    [
+        ("drive", "velocity_rad_s = 50.0", "Feedback has 2.86e+03 deg/s a count"),
+        ("drive", "velocity_rad_s = 1e-9", "Feedback carries ±123 deg/s"),
+        ("sensor", "torque_Nm = 2.0", "Torque has 2 Nm a count"),
+    ],
+)
+def test_a_count_that_is_too_large_or_too_small_for_the_arm_is_named(
+    tmp_path: Path, kind: str, count: str, said: str
+) -> None:
+    shipped = {"drive": "stock-drive", "sensor": "int32-sensor"}
+    (tmp_path / "own.toml").write_text(f'extends = "{shipped[kind]}"\n[scale]\n{count}\n')
+    devices = f'{kind} = ["own.toml", "{shipped[kind]}"]\ncontract = ""\n'
+    (tmp_path / "mine.toml").write_text(f'extends = "stock"\n[devices]\n{devices}')
+    named = [line for line in examine_configuration(str(tmp_path / "mine.toml")).warnings if "own.toml right?" in line]
+    assert [said in line for line in named] == [True]
+
+
 def test_a_drive_whose_position_does_not_reach_the_arm_s_limit_is_named(tmp_path: Path) -> None:
     fine = 'extends = "stock-drive"\n[scale]\nincrements_per_joint_rev = 6553600000\n'  # ±118 deg in 32 bits
     (tmp_path / "fine.toml").write_text(fine)
