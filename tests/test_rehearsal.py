@@ -7,11 +7,13 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
 import pytest
 from called import called
 from eds_variants import EdsVariant
 from own_arm import LINKS, OWN_ARM, describe_arm, describe_geared_arm, touches
 
+from adacd_hil.api import load
 from adacd_hil.cli.embedded_run import resolve
 from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.device.device_files import load_profile
@@ -214,6 +216,18 @@ def test_a_count_that_is_too_large_or_too_small_for_the_arm_is_named(
     (tmp_path / "mine.toml").write_text(f'extends = "stock"\n[devices]\n{devices}')
     named = [line for line in examine_configuration(str(tmp_path / "mine.toml")).warnings if "own.toml right?" in line]
     assert [said in line for line in named] == [True]
+
+
+@pytest.mark.slow
+def test_a_velocity_beyond_its_counts_is_sent_as_the_largest_one(tmp_path: Path) -> None:
+    (tmp_path / "own.toml").write_text('extends = "stock-drive"\n[scale]\nvelocity_rad_s = 1e-12\n')
+    mine = 'extends = "stock"\n[devices]\ndrive = ["own.toml", "own.toml"]\ncontract = ""\n'
+    (tmp_path / "my-arm.toml").write_text(mine)
+    (tmp_path / "short.toml").write_text(SHORT)
+    status, said = rehearse(tmp_path, "played")
+    assert status == 0, said
+    moved = np.abs(load(tmp_path / "played" / "run.mcap")["dq"]).max()
+    assert moved == pytest.approx((2**31 - 1) * 1e-12)
 
 
 def test_a_drive_whose_position_does_not_reach_the_arm_s_limit_is_named(tmp_path: Path) -> None:
