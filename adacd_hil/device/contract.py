@@ -235,7 +235,7 @@ def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], pe
 def _mapped(device: PlacedDevice, pdo: PdoSettings, name: ObjectName) -> EdsVariable:
     """Return an object of a PDO by its name.
 
-    Raises ConfigError if it isn't in the EDS or no integer of the type of STANDARD_TYPES, if by the EDS no PDO may
+    Raises ConfigError if it isn't in the EDS or no integer of the type of STANDARD_OBJECTS, if by the EDS no PDO may
     carry it, or if the device receives it but it is read-only.
     """
     variable = device.variable(name)

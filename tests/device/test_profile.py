@@ -125,6 +125,16 @@ def test_what_is_one_sample_or_one_command_travels_in_one_frame(
     assert line in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("right", "wrong", "said"),
+    [("0x6064", "0x606C", "'position': object 0x606C"), ("0x6041", "0x6040", "'statusword': object 0x6040")],
+)
+def test_a_signal_of_another_object_s_meaning_is_refused(right: str, wrong: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        parse(ProfileSettings, tomllib.loads(DRIVE.read_text().replace(right, wrong)))
+    assert parse(ProfileSettings, tomllib.loads(DRIVE.read_text().replace(right, "0x2063")))
+
+
 @pytest.mark.parametrize("transmission", [0, 2, 255])
 def test_a_sample_comes_on_every_sync(transmission: int) -> None:
     table = tomllib.loads(DRIVE.read_text())
