@@ -181,6 +181,8 @@ def with_default(value: str) -> str:
         (with_default("1\nLowLimit=--1"), r"\[1018sub1\] LowLimit = '--1' is no integer"),
         (EDS.replace("VendorName=", "VendorName=\x1b[2J", 1), r"line \d+ has the control character 0x1B"),
         (EDS.encode("utf-16-le").decode("latin-1"), "line 1 has the control character 0x00"),
+        (EDS.replace("DataType=0x0007", "DataType=UNSIGNED32", 1), r"\[1000\] DataType = 'UNSIGNED32' is no integer"),
+        ("", "no object is in it"),
     ],
 )
 def test_what_canopen_would_read_over_in_an_eds_is_one_line(text: str, line: str, tmp_path: Path) -> None:
