@@ -80,6 +80,7 @@ def test_a_users_file_is_a_profile_and_an_eds_beside_it_comes_first(tmp_path: Pa
         (("[scale]", "serial = [1]\n[scale]"), "serial has 1 numbers, 2 expected"),
         (("[scale]", "[scale]\ngear_ratio = 2"), "`scale.gear_ratio` has no effect: this is a sensor"),
         (("[scale]", "quick_stop_option = 2\n[scale]"), "`quick_stop_option` has no effect: this is a sensor"),
+        (('"0x9130:1", signal = "torque"', '"0x6064", signal = "velocity"'), "'velocity': object 0x6064 is 'position'"),
         (("[scale]", 'setup = [{object = "0x6040", value = 6}]\n[scale]'), "object '0x6040' commands the drive"),
         (("[scale]", 'setup = [{object = "0x60B2", value = 9}]\n[scale]'), "object '0x60B2' commands the drive"),
     ],
@@ -123,16 +124,6 @@ def test_what_is_one_sample_or_one_command_travels_in_one_frame(
     with pytest.raises(ConfigError) as caught:
         parse(ProfileSettings, table)
     assert line in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("right", "wrong", "said"),
-    [("0x6064", "0x606C", "'position': object 0x606C"), ("0x6041", "0x6040", "'statusword': object 0x6040")],
-)
-def test_a_signal_of_another_object_s_meaning_is_refused(right: str, wrong: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
-        parse(ProfileSettings, tomllib.loads(DRIVE.read_text().replace(right, wrong)))
-    assert parse(ProfileSettings, tomllib.loads(DRIVE.read_text().replace(right, "0x2063")))
 
 
 @pytest.mark.parametrize("transmission", [0, 2, 255])
