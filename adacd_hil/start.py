@@ -1,4 +1,4 @@
-"""Start of a program from the console: Ctrl-C during the imports of its commands ends it without a traceback.
+"""Start and end of a program from the console: exit statuses, and Ctrl-C during the imports without a traceback.
 
 The imports take a few tenths of a second. A KeyboardInterrupt would be raised inside other packages' modules, which
 turn it into errors of their own. No file or device is open so early, so the process ends at once.
@@ -9,11 +9,27 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import IntEnum
 from types import FrameType
 from typing import NoReturn
 
-INTERRUPTED = 130
-"""Exit status of the host's program after Ctrl-C; here, as its other ones take long to import."""
+
+class ExitCode(IntEnum):
+    """Exit statuses of the commands; their help explains them to the user."""
+
+    OK = 0
+    FAILURE = 1
+    USAGE = 2
+    PARTIAL = 3
+    SAFETY_STOP = 4
+    BUS_MISSING = 5
+    DETECTOR_MISSING = 6
+    INTERRUPTED = 130
+
+
+def explain_statuses(**meanings: str) -> str:
+    """Return the sentence of a help text with exit statuses; meanings: of each, by its name in ExitCode."""
+    return f"Exit status: {'; '.join(f'{ExitCode[name]} {meaning}' for name, meaning in meanings.items())}."
 
 
 def start_program(load: Callable[[], Callable[[], NoReturn]], interrupted: int, line: str = "") -> NoReturn:

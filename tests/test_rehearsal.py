@@ -7,11 +7,13 @@ from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
 import pytest
 from called import called
 from eds_variants import EdsVariant
 from own_arm import LINKS, OWN_ARM, describe_arm, describe_geared_arm, touches
 
+from adacd_hil.api import load
 from adacd_hil.cli.embedded_run import resolve
 from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.device.device_files import load_profile
@@ -21,7 +23,8 @@ from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
 from firmware_sim.cli.own_devices import rehearse as rehearse_file
-from firmware_sim.scenario.scenario import Scenario
+from firmware_sim.scenario.rehearsal import DeviceCounts, ToldArm, compose_scenario
+from firmware_sim.scenario.scenario import ArmTruth, Scenario
 
 SHORT = "lasts_s = 0.4\n"
 
@@ -180,10 +183,52 @@ def test_a_light_arm_is_not_thrown_and_has_sensors_of_its_size(tmp_path: Path) -
     assert scenario.sensors.torque_range_Nm == pytest.approx((25.0 / 3.0, 50.0 / 3.0))
 
 
+def test_a_hand_guides_an_arm_of_half_the_size_to_a_place_in_its_reach() -> None:
+    settings = load_settings("certified")
+    arm = dataclasses.replace(settings.arm, link_length_m=(0.175, 0.15))  # profile P: 0.35 and 0.3 m
+    told = ToldArm(dataclasses.replace(settings, arm=arm), frozenset({"arm.link_length_m"}))
+    counts = DeviceCounts((0.0, 0.0), (100.0, 100.0), (1e-3, 1e-3), (0.0, 0.0))
+    hand = {"link": 2, "point_m": 0.3, "move_to_m": [0.4, -0.2], "speed_m_s": 0.1}
+    table, _ = compose_scenario(told, ArmTruth(), counts, {"hands": [hand]}, is_builtin=True)
+    assert table["hands"] == [{**hand, "point_m": 0.15, "move_to_m": [0.2, -0.1]}]
+
+
 def test_the_payload_of_a_heavy_arm_is_one_that_a_scenario_takes(tmp_path: Path) -> None:
     heavy = "[arm]\nlink_length_m = [0.6, 0.3]\nmass_kg = [40.0, 30.0]\nrated_torque_Nm = [900.0, 500.0]\n"
     scenario, _ = composed(tmp_path, heavy + "torque_limit_Nm = [900.0, 500.0]\n", "paper")
     assert scenario.payloads[0].mass_kg == 10.0
+
+
+def with_count(folder: Path, kind: str, count: str) -> str:
+    """Write a configuration whose device of joint 1 has this worth of a count."""
+    shipped = {"drive": "stock-drive", "sensor": "int32-sensor"}[kind]
+    (folder / "own.toml").write_text(f'extends = "{shipped}"\n[scale]\n{count}\n')
+    mine = f'extends = "stock"\n[devices]\n{kind} = ["own.toml", "{shipped}"]\ncontract = ""\n'
+    (folder / "my-arm.toml").write_text(mine)
+    return str(folder / "my-arm.toml")
+
+
+@pytest.mark.parametrize(
+    ("kind", "count", "said"),
+    [
+        ("drive", "velocity_rad_s = 50.0", "Feedback has 2.86e+03 deg/s a count"),
+        ("drive", "velocity_rad_s = 1e-9", "Feedback carries ±123 deg/s"),
+        ("sensor", "torque_Nm = 2.0", "Torque has 2 Nm a count"),
+    ],
+)
+def test_a_count_that_does_not_fit_the_arm_is_named(tmp_path: Path, kind: str, count: str, said: str) -> None:
+    warnings = examine_configuration(with_count(tmp_path, kind, count)).warnings
+    assert [said in line for line in warnings if "own.toml right?" in line] == [True]
+
+
+@pytest.mark.slow
+def test_a_velocity_beyond_its_counts_is_sent_as_the_largest_one(tmp_path: Path) -> None:
+    with_count(tmp_path, "drive", "velocity_rad_s = 1e-12")
+    (tmp_path / "short.toml").write_text(SHORT)
+    status, said = rehearse(tmp_path, "played")
+    assert status == 0, said
+    moved = np.abs(load(tmp_path / "played" / "run.mcap")["dq"][:, 0]).max()
+    assert moved == pytest.approx((2**31 - 1) * 1e-12)
 
 
 def test_a_drive_whose_position_does_not_reach_the_arm_s_limit_is_named(tmp_path: Path) -> None:

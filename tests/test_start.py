@@ -1,6 +1,5 @@
-"""A program's first moments: Ctrl-C while it still imports ends it without a traceback, and help comes at once."""
+"""A program's first moments: Ctrl-C while it still imports ends it without a traceback."""
 
-import resource
 import signal
 import subprocess
 import sys
@@ -8,7 +7,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from experiment_runs import BIN
 
 SCRIPTS = tomllib.loads((Path(__file__).parent.parent / "pyproject.toml").read_text())["project"]["scripts"]
 INTERRUPT = """
@@ -22,8 +20,6 @@ class Interrupting:
 sys.meta_path.insert(0, Interrupting())
 getattr(importlib.import_module(module), function)()
 """
-MOST_HELP_S = 0.25
-"""Of a processor: `adacd-hil` takes 0.10 s of an idle one. Others beside make it longer: the best counts."""
 ENDS = {"adacd-hil": (130, b"adacd-hil: interrupted\n"), "firmware-sim": (0, b"")}
 
 
@@ -74,15 +70,3 @@ def test_ctrl_c_is_ignored_where_it_was() -> None:
     )
     assert (done.returncode, done.stderr) == (0, b"")
     assert done.stdout.startswith(b"adacd-hil, version ")
-
-
-@pytest.mark.slow
-def test_help_comes_at_once() -> None:
-    took_s = []
-    for _ in range(3):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        done = subprocess.run([BIN / "adacd-hil", "--help"], capture_output=True, check=True)
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        took_s.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-        assert b"Options:" in done.stdout
-    assert min(took_s) <= MOST_HELP_S

@@ -1,6 +1,6 @@
 """Plays the README's three ways to begin as a newcomer would: by its text alone, in a fresh clone, on a terminal.
 
-    python tools/first_hour.py                # all three: clones, installs, takes half an hour
+    python tools/first_hour.py                # all three: clones, installs
     python tools/first_hour.py arm --json
 
 Every command of a way's passage, and of the page that the passage leads to, is typed once, in the order in which it

@@ -2,15 +2,15 @@
 
     python tools/play_into_host.py LOG CONFIG PLAYER FILE --folder FOLDER
 
-LOG: of a run, 10 ms periods are realistic in user-mode Linux. CONFIG: of the host. PLAYER: canplayer, can_player or
+LOG: of a run with the period PERIOD_MS. CONFIG: of the host. PLAYER: canplayer, can_player or
 adacd-hil. FILE: what it plays, the cyclic frames of LOG's devices only:
 
     can_logconvert LOG all.log
     grep -E ' 18[1-4]#' all.log >cyclic.log
     can_logconvert cyclic.log cyclic.mcap
 
-SDO, NMT and heartbeats are answered by `firmware-sim play LOG --answers-only`. A host takes frames that come within
-70 % of a period after its SYNC, and a player knows no SYNC: one whose frames come at another time is started again,
+SDO, NMT and heartbeats are answered by `firmware-sim play LOG --answers-only`. A host takes frames that come early
+enough after its SYNC, and a player knows no SYNC: one whose frames come at another time is started again,
 later by what is missing, while the host waits in COMMISSION. CONFIG has `sample_period = "measured"`: what is played
 goes by the clock. Needs vcan0, as `tools/with-vcan` gives.
 """
@@ -99,7 +99,8 @@ def decisions(log: RunLog) -> tuple[list[str], list[tuple[int, tuple[int, int]]]
 
 def main() -> None:
     """Play, compare, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    described = (__doc__ or "").replace("PERIOD_MS", f"{PERIOD_MS:g} ms")
+    parser = argparse.ArgumentParser(description=described, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("log", type=Path)
     parser.add_argument("config", type=Path)
     parser.add_argument("player", choices=["canplayer", "can_player", "adacd-hil"])

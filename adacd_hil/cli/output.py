@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
-from enum import IntEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -38,24 +37,8 @@ if TYPE_CHECKING:
 Given = TypeVar("Given")
 Done = TypeVar("Done")
 
-
-class ExitCode(IntEnum):
-    """Exit statuses of the commands; `EPILOG` explains them to the user."""
-
-    OK = 0
-    FAILURE = 1
-    USAGE = 2
-    PARTIAL = 3
-    SAFETY_STOP = 4
-    BUS_MISSING = 5
-    DETECTOR_MISSING = 6
-    INTERRUPTED = start.INTERRUPTED
-
-
-def explain_statuses(**meanings: str) -> str:
-    """Return the sentence of a help text with exit statuses; meanings: of each, by its name in ExitCode."""
-    return f"Exit status: {'; '.join(f'{ExitCode[name]} {meaning}' for name, meaning in meanings.items())}."
-
+ExitCode = start.ExitCode
+explain_statuses = start.explain_statuses
 
 EPILOG = explain_statuses(
     OK="done",

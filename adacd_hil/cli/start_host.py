@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import NoReturn
 
-from adacd_hil.start import INTERRUPTED, start_program
+from adacd_hil.start import ExitCode, start_program
 
 
 def start_host() -> NoReturn:
@@ -14,4 +14,4 @@ def start_host() -> NoReturn:
 
         return main
 
-    start_program(load, INTERRUPTED, "adacd-hil: interrupted")
+    start_program(load, ExitCode.INTERRUPTED, "adacd-hil: interrupted")

@@ -1,6 +1,7 @@
 """Checks of a configuration without a bus: all errors and likely mistakes at once, a line each."""
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import PurePath
@@ -12,6 +13,7 @@ from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import load_profile, place_devices
 from adacd_hil.device.drive_units import read_drive_units
 from adacd_hil.device.profile import PlacedDevice
+from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import (
     ConfigurationLayer,
@@ -96,7 +98,7 @@ def examine_settings(settings: Settings, layers: Sequence[ConfigurationLayer] = 
     excess = describe_excess(codec, settings)
     late = [excess] if excess else []
     mistakes = [line for look in _LOOKS for line in look(settings)]
-    mistakes += [*_narrow(codec, settings), *_ranges(codec, settings, devices), *_unseen(devices), *_gears(devices)]
+    mistakes += [*_misfits(codec, settings), *_ranges(codec, settings, devices), *_unseen(devices), *_gears(devices)]
     mistakes += [*_unused(codec, settings), *_layer_warnings(layers), *late]
     guesses = *settings.assumed, *profile_guesses(settings)
     return ConfigurationFindings([], mistakes, settings, guesses, bool(late))
@@ -227,29 +229,34 @@ def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
     return found
 
 
-def _narrow(codec: Codec, settings: Settings) -> Iterator[str]:
-    """Yield a warning for each position frame below the largest position, and each torque frame below rated torque.
+_COARSE_SHARE = 0.1
+"""Part of the largest value above which one count is more likely a mistake."""
+_MEASURED = (
+    ("Drive", "Feedback", "position", "deg", "position_limit_deg", "increments_per_joint_rev"),
+    ("Drive", "Feedback", "velocity", "deg/s", "velocity_limit_deg_s", "velocity_rad_s"),
+    ("Sensor", "Torque", "torque", "Nm", "rated_torque_Nm", "torque_Nm"),
+)
+"""Of each signal: device, frame, name, unit, key of its largest value in `arm`, and key of its count in `scale`."""
 
-    The largest position is `arm.position_limit_deg` plus the size of `arm.zero_deg`. A frame's range is that of its raw
-    values, scaled.
+
+def _misfits(codec: Codec, settings: Settings) -> Iterator[str]:
+    """Yield a warning for each signal that can't carry its largest value, or has counts above `_COARSE_SHARE` of it.
+
+    Of a position, the size of `arm.zero_deg` is added to the largest value.
     """
-    limits_deg, zeros_deg = settings.arm.position_limit_deg, settings.arm.zero_deg
-    for joint, (limit_deg, zero_deg) in enumerate(zip(limits_deg, zeros_deg, strict=True)):
-        message = codec.message(f"Drive{joint + 1}Feedback")
-        signal = message.values[message.place("position")]
-        if (most_deg := math.degrees(signal.raw_high * signal.scale)) < limit_deg + abs(zero_deg):
-            yield (
-                f"{message.name} carries ±{most_deg:.3g} deg, `arm.position_limit_deg[{joint}]` = {limit_deg:g} deg: "
-                f"is `increments_per_joint_rev` of {settings.devices.drive[joint]} right?"
-            )
-    for joint, rated_Nm in enumerate(settings.arm.rated_torque_Nm):
-        message = codec.message(f"Sensor{joint + 1}Torque")
-        signal = message.values[message.place("torque")]
-        if (most_Nm := signal.raw_high * signal.scale) < rated_Nm:
-            yield (
-                f"{message.name} carries ±{most_Nm:.3g} Nm, `arm.rated_torque_Nm[{joint}]` = {rated_Nm:g} Nm: is "
-                f"`torque_Nm` of {settings.devices.sensor[joint]} right?"
-            )
+    for joint, (device, frame, name, unit, limit, key) in itertools.product(range(JOINTS), _MEASURED):
+        message = codec.message(f"{device}{joint + 1}{frame}")
+        signal = message.values[message.place(name)]
+        count = signal.scale * (math.degrees(1.0) if unit.startswith("deg") else 1.0)
+        largest = getattr(settings.arm, limit)[joint]
+        if signal.raw_high * count < largest + (abs(settings.arm.zero_deg[joint]) if name == "position" else 0.0):
+            words = f"carries ±{signal.raw_high * count:.3g} {unit}"
+        elif count > _COARSE_SHARE * largest:
+            words = f"has {count:.3g} {unit} a count of {name}"
+        else:
+            continue
+        profile = getattr(settings.devices, device.lower())[joint]
+        yield f"{message.name} {words}, `arm.{limit}[{joint}]` = {largest:g} {unit}: is `{key}` of {profile} right?"
 
 
 def _ranges(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> Iterator[str]:

@@ -6,6 +6,7 @@ handed to their consumers. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 
 
 import functools
 import logging
+import math
 import struct
 import tomllib
 from collections.abc import Callable, Iterator
@@ -73,7 +74,7 @@ _SILENT = (
 class EdsVariable(NamedTuple):
     """One object of an EDS. bits: its size in a PDO, 0 if it is no number. default: None without an integer one.
 
-    is_writable: over SDO. is_mappable: whether a PDO may carry it.
+    is_writable, is_readable: over SDO. is_mappable: whether a PDO may carry it. low, high: bounds of its number.
     """
 
     name: str
@@ -83,6 +84,9 @@ class EdsVariable(NamedTuple):
     is_writable: bool
     is_float: bool = False
     is_mappable: bool = True
+    is_readable: bool = True
+    low: float = -math.inf
+    high: float = math.inf
 
 
 def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
@@ -106,8 +110,28 @@ def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
     is_signed = entry.data_type in canopen.objectdictionary.SIGNED_TYPES
     bits, number = len(entry) if is_number else 0, default if isinstance(default, int) else None
     is_float = entry.data_type in canopen.objectdictionary.FLOAT_TYPES
-    is_mappable = bool(entry.pdo_mappable)
-    return EdsVariable(name, bits, is_signed, number, "w" in entry.access_type, is_float, is_mappable)
+    low, high = _bounds(entry, is_signed, is_float)
+    can_write, can_read = (letter in entry.access_type for letter in "wr")
+    return EdsVariable(
+        name, bits, is_signed, number, can_write, is_float, bool(entry.pdo_mappable), can_read, low, high
+    )
+
+
+def _bounds(entry: Any, is_signed: bool, is_float: bool) -> tuple[float, float]:
+    """Return the bounds of an object by its data type, and by LowLimit and HighLimit unless they leave no range.
+
+    (0, -1) for an object that is no number.
+    """
+    if not entry.fixed_size:
+        return 0, -1
+    bits = 1 if entry.data_type == canopen.objectdictionary.BOOLEAN else len(entry)
+    least = -math.inf if is_float else -(1 << bits - 1) if is_signed else 0
+    most = math.inf if is_float else (1 << bits - is_signed) - 1
+    low, high = (
+        max(least, least if entry.min is None else entry.min),
+        min(most, most if entry.max is None else entry.max),
+    )
+    return (low, high) if low < high else (least, most)
 
 
 class _BusNetwork(canopen.Network):

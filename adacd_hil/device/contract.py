@@ -186,7 +186,8 @@ def _scales(message: MessageCodec) -> str:
 def _messages(settings: Settings, devices: Sequence[PlacedDevice]) -> list[_DbcMessage]:
     """Return the messages of an arm, sorted by identifier: NMT, SYNC, heartbeats, EMCY, SDO and the profiles' PDOs.
 
-    Raises ConfigError for a PDO that doesn't fit its EDS, bounds or frame, and for two messages with one identifier.
+    Raises ConfigError for a PDO that doesn't fit its EDS, bounds or frame, a `setup` that doesn't fit its EDS, and for
+    two messages with one identifier.
     """
     names = tuple(device.name.upper() for device in devices)
     heartbeat_ms = settings.bus.heartbeat_ms
@@ -197,6 +198,7 @@ def _messages(settings: Settings, devices: Sequence[PlacedDevice]) -> list[_DbcM
         _heartbeat("Host", settings.bus.host_node, "HOST", names, heartbeat_ms),
     ]
     for device in devices:
+        _check_setup(device)
         node, sender, host = device.node_id, device.name.upper(), ("HOST",)
         messages += [
             _DbcMessage(
@@ -236,7 +238,7 @@ def _heartbeat(name: str, node: int, sender: str, receivers: tuple[str, ...], pe
 def _mapped(device: PlacedDevice, pdo: PdoSettings, name: ObjectName) -> EdsVariable:
     """Return an object of a PDO by its name.
 
-    Raises ConfigError if it isn't in the EDS or no integer of the type of STANDARD_TYPES, if by the EDS no PDO may
+    Raises ConfigError if it isn't in the EDS or no integer of the type of STANDARD_OBJECTS, if by the EDS no PDO may
     carry it, or if the device receives it but it is read-only.
     """
     variable = device.variable(name)
@@ -313,6 +315,20 @@ def _check_bounds(device: PlacedDevice, pdo: PdoSettings, signals: list[_DbcSign
                     f"device profile {device.profile.name}: {what}: {key} = {bound:g} is outside its range, "
                     f"{low:g} to {high:g}"
                 )
+
+
+def _check_setup(device: PlacedDevice) -> None:
+    """Raise ConfigError for a `setup` of an object or value that by the EDS can't be written and read back."""
+    for write in device.settings.setup:
+        found = device.listed(write.name)
+        refused = "" if found.is_writable and found.is_readable else "AccessType isn't rw"
+        if not found.low <= write.value <= found.high:
+            refused = f"takes {found.low} to {found.high}" if found.low <= found.high else "is no number"
+        if refused:
+            raise ConfigError(
+                f"device profile {device.profile.name}: `setup` writes {write.value} to {write.name} ({found.name}): "
+                f"{refused} in {device.profile.eds}; correct it there if the device takes it"
+            )
 
 
 def _check_identifiers(messages: list[_DbcMessage]) -> None:

@@ -26,6 +26,7 @@ _EDS_INTEGERS = {
     for form in (str(number), f"0X{number:X}", f"0X{number:02X}", f"0X{number:04X}")
 }
 _EDS_NUMBERS = ("DefaultValue", "ParameterValue", "LowLimit", "HighLimit")
+_EDS_KINDS = ("ObjectType", "DataType", "PDOMapping")
 _EDS_NUMBER = re.compile(r"(?i:\s*(?:\$NODEID\s*\+?)?\s*[-+]?\s*(?:0x[0-9a-f]+|[0-9]+)?\s*(?:\+?\s*\$NODEID)?\s*)")
 """CiA 306, 4.5.1: decimal, octal or hexadecimal, the node id before or after it."""
 
@@ -72,9 +73,9 @@ def _parse(data: bytes, node_id: int | None) -> Any:
 
 
 def _check_eds(text: str) -> None:
-    """Raise ConfigError for control characters, and for values of standard integer objects that are no numbers.
+    """Raise ConfigError for control characters, no object, and values or types of objects that are no numbers.
 
-    Raises configparser.Error for a text that is no INI file.
+    The values are those of standard integer objects. Raises configparser.Error for a text that is no INI file.
     """
     if found := _EDS_CONTROL.search(text):
         line = text.count("\n", 0, found.start()) + 1
@@ -82,13 +83,14 @@ def _check_eds(text: str) -> None:
     eds = configparser.RawConfigParser(inline_comment_prefixes=(";",))
     eds.optionxform = str  # type: ignore[assignment,method-assign]
     eds.read_string(text, "object dictionary.eds")
-    for section in eds.sections():
-        if not _EDS_OBJECT.fullmatch(section) or int(section[:4], 16) in _MAKERS_OBJECTS:
-            continue
+    objects = [section for section in eds.sections() if _EDS_OBJECT.fullmatch(section)]
+    if not objects:
+        raise ConfigError("no object is in it")
+    for section in objects:
         entries = eds[section]
-        if entries.get("DataType", "").strip().upper() not in _EDS_INTEGERS:
-            continue
-        for key in _EDS_NUMBERS:
+        is_standard = int(section[:4], 16) not in _MAKERS_OBJECTS
+        is_checked = is_standard and entries.get("DataType", "").strip().upper() in _EDS_INTEGERS
+        for key in (*_EDS_KINDS, *(_EDS_NUMBERS if is_checked else ())):
             value = entries.get(key, "")
             if value and not _EDS_NUMBER.fullmatch(value):
                 raise ConfigError(f"[{section}] {key} = {value[:40]!r} is no integer")

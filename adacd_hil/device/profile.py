@@ -96,14 +96,21 @@ _KEYS_OF_KIND = {
 }
 """Keys of a profile that have an effect on devices of one kind only."""
 
-_WORDS, _INTEGERS = (0x603F, 0x6040, 0x6041, 0x6072), (0x6071, 0x6077, 0x60B2)
-STANDARD_TYPES = {
-    **dict.fromkeys(_WORDS, (16, False)),
-    **dict.fromkeys(_INTEGERS, (16, True)),
-    **dict.fromkeys((0x6060, 0x6061), (8, True)),
-    **dict.fromkeys((0x6064, 0x606C), (32, True)),
+STANDARD_OBJECTS = {
+    0x603F: (16, False, "error_code"),
+    0x6040: (16, False, "controlword"),
+    0x6041: (16, False, "statusword"),
+    0x6060: (8, True, "mode"),
+    0x6061: (8, True, "mode_display"),
+    0x6064: (32, True, "position"),
+    0x606C: (32, True, "velocity"),
+    0x6071: (16, True, "target_torque"),
+    0x6072: (16, False, "max_torque"),
+    0x6077: (16, True, "torque_actual"),
+    0x60B2: (16, True, "torque_offset"),
 }
-"""Bits and sign of the objects by which a drive lives, by index. Source: CiA 402-2."""
+"""Bits, sign and signal of the objects by which a drive lives, by index. Source: CiA 402-2."""
+_STANDARD_SIGNALS = {signal for _, _, signal in STANDARD_OBJECTS.values()}
 
 _DBC_MARKS = '"', "\\"
 """What the text of a unit can't have in a DBC."""
@@ -129,6 +136,9 @@ class SignalSettings:
             raise ValueError(
                 f"signal {self.signal!r}: unit = {self.unit!r} can't have {' '.join(_DBC_MARKS)} or a line end"
             )
+        *_, meant = STANDARD_OBJECTS.get(self.name.index, ("",))
+        if meant and self.signal in _STANDARD_SIGNALS - {meant}:
+            raise ValueError(f"signal {self.signal!r}: object {self.object} is {meant!r} by CiA 402")
         if self.of and not self.is_bounded:
             raise ValueError(f"signal {self.signal!r}: `of` needs `low` or `high`")
         if self.low is not None and self.high is not None and self.low > self.high:
@@ -484,14 +494,19 @@ class PlacedDevice:
         """Return the CAN identifier of a PDO of this device: its `cob_id` plus the node id."""
         return pdo.cob_id + self.node_id
 
-    def variable(self, name: ObjectName) -> EdsVariable:
-        """Return an object of the EDS that is an integer.
-
-        Raises ConfigError when it isn't listed, is a float or no number, or hasn't the type of STANDARD_TYPES.
-        """
+    def listed(self, name: ObjectName) -> EdsVariable:
+        """Return an object of the EDS. Raises ConfigError when it isn't listed."""
         found = find_variable(self.objects, name.index, name.sub)
         if found is None:
             raise ConfigError(f"device profile {self.profile.name}: object {name} is not in {self.profile.eds}")
+        return found
+
+    def variable(self, name: ObjectName) -> EdsVariable:
+        """Return an object of the EDS that is an integer.
+
+        Raises ConfigError when it isn't listed, is a float or no number, or hasn't the type of STANDARD_OBJECTS.
+        """
+        found = self.listed(name)
         if found.is_float:
             raise ConfigError(
                 f"device profile {self.profile.name}: object {name} ({found.name}) is a float, REAL{found.bits}; the "
@@ -499,7 +514,7 @@ class PlacedDevice:
             )
         if not found.bits:
             raise ConfigError(f"device profile {self.profile.name}: object {name} ({found.name}) fits no PDO")
-        bits, is_signed = STANDARD_TYPES.get(name.index, (found.bits, found.is_signed))
+        bits, is_signed, _ = STANDARD_OBJECTS.get(name.index, (found.bits, found.is_signed, ""))
         if (found.bits, found.is_signed) != (bits, is_signed):
             raise ConfigError(
                 f"device profile {self.profile.name}: {name} is {_type(found.bits, found.is_signed)} in "

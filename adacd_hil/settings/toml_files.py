@@ -41,7 +41,7 @@ def _instead(path: Path, kind: str) -> str:
     "" without a near name if `kind` is no configuration.
     """
     try:
-        beside = sorted(other.name for other in path.parent.glob("*.toml"))
+        beside = sorted(other.name for other in path.parent.glob("*.toml") if exists(other))
     except OSError:
         beside = []
     if nearest := nearest_name(path.name, beside):

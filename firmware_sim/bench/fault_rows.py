@@ -13,6 +13,7 @@ from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, VELOCITY_LSB_RAD_S
+from firmware_sim.canopen.object_dictionary import ObjectDictionary
 from firmware_sim.scenario.faults import BROADCAST, HOST, NODES, FaultSettings
 
 EVERYBODY = -1
@@ -197,6 +198,17 @@ def find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Place
         if row.kind == "freeze_counter" and not message.is_protected:
             raise ConfigError(f"faults[{index}]: {message.name} has no counter to freeze in {codec.path.name}")
     return frozenset((node, message.can_id) for node, message in found)
+
+
+def check_objects(rows: Sequence[FaultSettings], devices: Sequence[ObjectDictionary]) -> None:
+    """Raise ConfigError if a fault's object is not in its device, or can't have the fault's value.
+
+    devices: in the order of NODES.
+    """
+    for index, row in enumerate(rows):
+        for place in row.nodes if row.kind == "object_value" else ():
+            if problem := devices[place].describe_misfit(*row.object_key, row.raw or 0):
+                raise ConfigError(f"faults[{index}]: {row.node}: {problem}")
 
 
 def _message_name(row: FaultSettings, node: int) -> str:

@@ -14,12 +14,12 @@ import itertools
 from collections.abc import Callable, Sequence
 
 from adacd_hil.records import JOINTS
-from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.bus import Bus
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.time_marks import DEVICE_MARK, NEVER_NS, MarkKind, pack_mark
 from firmware_sim.arm.sensing import Measurement
 from firmware_sim.bench.fault_plan import ActionKind, FaultPlan, NodeAction
+from firmware_sim.bench.fault_rows import check_objects
 from firmware_sim.body.sensors import count_Nm
 from firmware_sim.canopen.object_dictionary import Send
 from firmware_sim.nodes.device import EmulatedDevice
@@ -151,16 +151,9 @@ class Injector:
     def attach(
         self, devices: Sequence[EmulatedDevice], drives: Sequence[DriveNode], sensors: Sequence[SensorNode]
     ) -> None:
-        """Set the nodes on which faults act.
-
-        Raises ConfigError if a fault replaces the value of an object that its device lacks, or by a value that the
-        object can't have.
-        """
+        """Set the nodes on which faults act. Raises ConfigError as `check_objects`."""
         self._devices, self._drives, self._sensors = devices, drives, sensors
-        for index, row in enumerate(self._rows):
-            for place in row.nodes if row.kind == "object_value" else ():
-                if problem := devices[place].describe_misfit(*row.object_key, row.raw or 0):
-                    raise ConfigError(f"faults[{index}]: {row.node}: {problem}")
+        check_objects(self._rows, devices)
 
     def power_on(self, t_ns: int) -> None:
         """Set `t_ns` as the time of power-on, from which some faults count."""

@@ -6,7 +6,6 @@ import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from enum import IntEnum
 from pathlib import Path
 from typing import Any, NoReturn, get_args
 
@@ -26,6 +25,7 @@ from adacd_hil.scheduling import freeze_garbage, request_realtime
 from adacd_hil.settings.arm_settings import BusSettings
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_text import to_short_toml, to_toml
+from adacd_hil.start import ExitCode, explain_statuses
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import open_terminals, terminal_columns, write_result
 from adacd_hil.wire.bus import BusError, BusMissingError
@@ -45,20 +45,12 @@ from firmware_sim.cli.scenario_list import check, describe_all
 from firmware_sim.cli.service import Service, open_devices_end, stop_by_signal
 from firmware_sim.scenario.scenario import Scenario, load_scenario, load_truth, truth_names
 
-
-class EmulatorExit(IntEnum):
-    """Exit statuses."""
-
-    OK = 0
-    FAILURE = 1
-    USAGE = 2
-    BUS_MISSING = 5
-
-
-EPILOG = (
-    f"Exit status: {EmulatorExit.OK} ended by SIGINT, SIGTERM, SIGHUP or --once; {EmulatorExit.FAILURE} failure (the "
-    f"bus or the truth log failed); {EmulatorExit.USAGE} wrong usage or configuration; {EmulatorExit.BUS_MISSING} bus "
-    "missing."
+_ENDED = "ended by SIGINT, SIGTERM, SIGHUP or --once"
+EPILOG = explain_statuses(
+    OK=_ENDED,
+    FAILURE="failure (the bus or the truth log failed)",
+    USAGE="wrong usage or configuration",
+    BUS_MISSING="bus missing",
 )
 
 _USAGE_ERRORS = (click.ClickException, ConfigError, CodecError, LogExistsError)
@@ -199,9 +191,12 @@ def run(
 
 @cli.command(
     "play",
-    epilog=f"Exit status: {EmulatorExit.OK} ended by SIGINT, SIGTERM, SIGHUP or --once; {EmulatorExit.FAILURE} failure "
-    f"(the bus failed, the recording is damaged or of another contract); {EmulatorExit.USAGE} wrong usage; "
-    f"{EmulatorExit.BUS_MISSING} bus missing.",
+    epilog=explain_statuses(
+        OK=_ENDED,
+        FAILURE="failure (the bus failed, the recording is damaged or of another contract)",
+        USAGE="wrong usage",
+        BUS_MISSING="bus missing",
+    ),
 )
 @click.argument("log", type=GivenPath(dir_okay=False))
 @on_bus
@@ -261,7 +256,7 @@ def list_scenarios(as_json: bool) -> int:
         columns = ("name", "group", "about")
         table = fit_table([columns, *([row[name] for name in columns] for row in described)], width=terminal_columns())
         write_result("\n".join(table))
-    return EmulatorExit.OK
+    return ExitCode.OK
 
 
 @cli.command("truths", epilog=EPILOG)
@@ -273,7 +268,7 @@ def list_truths(as_json: bool) -> int:
         print(json.dumps(rows, indent=2, ensure_ascii=False))
     else:
         write_result("\n".join(fit_table([(row["name"], row["about"]) for row in rows], width=terminal_columns())))
-    return EmulatorExit.OK
+    return ExitCode.OK
 
 
 @cli.command("show", epilog=EPILOG)
@@ -290,12 +285,10 @@ def show_scenario(scenario: str, is_whole: bool, profile: str | None, seed: int 
         print(json.dumps(tomllib.loads(text), indent=2, ensure_ascii=False))
     else:
         print(text, end="")
-    return EmulatorExit.OK
+    return ExitCode.OK
 
 
-@cli.command(
-    "check", epilog=f"Exit status: {EmulatorExit.OK} every file can be played; {EmulatorExit.USAGE} one can't."
-)
+@cli.command("check", epilog=explain_statuses(OK="every file can be played", USAGE="one can't"))
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @click.option(
     "--contract", type=click.Choice(list(CONTRACTS)), default="arm", show_default=True, help="Whose frames faults hit."
@@ -309,7 +302,7 @@ def check_files(files: tuple[str, ...], contract: str, as_json: bool) -> int:
         print(json.dumps([vars(finding) for finding in findings], indent=2, ensure_ascii=False))
     else:
         write_result("\n".join(in_line(line) for finding in findings for line in finding.lines))
-    return EmulatorExit.USAGE if any(finding.problems for finding in findings) else EmulatorExit.OK
+    return ExitCode.USAGE if any(finding.problems for finding in findings) else ExitCode.OK
 
 
 def _log_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> None:
@@ -343,9 +336,7 @@ def _make_folder(path: Path) -> None:
         raise ConfigError(f"--out {path} can't be made a folder: {error.strerror}") from None
 
 
-def _report(
-    bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: TruthLog | None, as_json: bool
-) -> EmulatorExit:
+def _report(bench: Bench, scenario: Scenario, clock_mode: ClockMode, truth: TruthLog | None, as_json: bool) -> ExitCode:
     """Close the truth log, and delete it if no host came; return the exit status.
 
     It is FAILURE, with a line on stderr, if the log is incomplete. as_json: print counts and drive states on stdout.
@@ -360,7 +351,7 @@ def _report(
         "drive_states": [drive.state.value for drive in bench.drives],
         "error_codes": [drive.error_code for drive in bench.drives],
     }
-    code = EmulatorExit.OK
+    code = ExitCode.OK
     if truth is not None:
         summary = truth.close()
         is_empty = not summary.messages and summary.is_complete  # no host came
@@ -373,7 +364,7 @@ def _report(
         }
         if not summary.is_complete:
             _complain(summary.error or f"{summary.path} lacks {summary.dropped} cycles: the disk was too slow")
-            code = EmulatorExit.FAILURE
+            code = ExitCode.FAILURE
     if as_json:
         print(json.dumps(described))
     return code
@@ -407,7 +398,7 @@ def _report_played(bench: RecordedBench, cycles: RecordedCycles | None, as_json:
             "problem": problem,
         }
         print(json.dumps(described))
-    return EmulatorExit.FAILURE if problem else EmulatorExit.OK
+    return ExitCode.FAILURE if problem else ExitCode.OK
 
 
 def _refuse_beside_config() -> None:
@@ -423,7 +414,7 @@ def _complain(line: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the command line, by default that of this process, and exit with a status of `EmulatorExit`."""
+    """Run the command line, by default that of this process, and exit with a documented status."""
     if arguments is None:
         open_terminals()
     logging.getLogger("canopen").addHandler(logging.NullHandler())
@@ -431,14 +422,14 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         code = cli.main(arguments, prog_name="firmware-sim", standalone_mode=False)
     except click.exceptions.NoArgsIsHelpError as error:
         print(error.format_message(), file=sys.stderr)
-        code = EmulatorExit.USAGE
+        code = ExitCode.USAGE
     except (click.Abort, KeyboardInterrupt):
-        code = EmulatorExit.OK
+        code = ExitCode.OK
     except (*_USAGE_ERRORS, *_FAILURES) as error:
         _complain(error.format_message() if isinstance(error, click.ClickException) else error_text(error))
-        code = EmulatorExit.USAGE if isinstance(error, _USAGE_ERRORS) else EmulatorExit.FAILURE
+        code = ExitCode.USAGE if isinstance(error, _USAGE_ERRORS) else ExitCode.FAILURE
         if isinstance(error, BusMissingError):
-            code = EmulatorExit.BUS_MISSING
+            code = ExitCode.BUS_MISSING
     sys.exit(code)
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
-from adacd_hil.device.profile import STANDARD_TYPES, ObjectName, PdoSettings, PlacedDevice, SignalSettings
+from adacd_hil.device.profile import STANDARD_OBJECTS, ObjectName, PdoSettings, PlacedDevice, SignalSettings
 from adacd_hil.records import JOINTS
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import ConfigurationLayer, configuration_layers, resolved_table
@@ -258,7 +258,7 @@ _BOTH_WAYS = ("position", "velocity", "torque", "target_torque")
 def _check_objects(device: PlacedDevice) -> None:
     """Raise ConfigError if an object hasn't the standard's type, or a signal with negative values is unsigned."""
     place = f"device profile {device.profile.name}"
-    for index in STANDARD_TYPES:
+    for index in STANDARD_OBJECTS:
         if device.has(index):
             device.variable(ObjectName(index))
     for signal in (signal for pdo in device.settings.pdo for signal in pdo.signals if signal.signal in _BOTH_WAYS):

@@ -7,6 +7,9 @@ from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec
 from firmware_sim.bench.fault_plan import FaultPlan
+from firmware_sim.bench.fault_rows import check_objects
+from firmware_sim.canopen.object_dictionary import ObjectDictionary, contract_of
+from firmware_sim.scenario.faults import NODES
 from firmware_sim.scenario.scenario import Scenario, builtin_scenarios, load_scenario, read_table
 
 
@@ -46,7 +49,7 @@ def describe_all() -> list[dict[str, Any]]:
 
 
 def check(file: str, codec: Codec) -> ScenarioFinding:
-    """Check a scenario file and its faults' frames against a contract.
+    """Check a scenario file, and its faults' frames and objects against a contract.
 
     Return its problems, or a summary if it has none. A file that can't be read is a problem, too. Objects whose values
     faults replace aren't looked up in the EDS.
@@ -58,6 +61,9 @@ def check(file: str, codec: Codec) -> ScenarioFinding:
     try:
         scenario = parse(Scenario, table)
         FaultPlan(scenario.faults, scenario.seed, codec)
+        contract = contract_of(codec)
+        places = [contract.describe_device(place) for place in range(len(NODES))]
+        check_objects(scenario.faults, [ObjectDictionary(1, device, lambda *_: None) for device in places])
     except ConfigError as error:
         return ScenarioFinding(file, error.problems)
     return ScenarioFinding(file, (), _checked(scenario, codec))
@@ -76,7 +82,7 @@ def _checked(scenario: Scenario, codec: Codec) -> str:
     ]
     parts = ["keys, types and bounds", *counts, f"all of it against arm {scenario.profile}"]
     if scenario.faults:
-        parts.append(f"frames of faults against contract {codec.path.stem}")
+        parts.append(f"frames and objects of faults against contract {codec.path.stem}")
     if late:
         parts.append(f"`demo` ends before {', '.join(late)}: lasts_s = {scenario.lasts_s:g} s")
     if scenario.expect is not None:

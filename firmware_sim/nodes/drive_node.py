@@ -57,6 +57,11 @@ _RAMPED = {DriveEvent.SHUTDOWN: 0x605B, DriveEvent.SWITCH_ON: 0x605C}  # option 
 _EVENTS = frozenset({(0x6041, 0), (0x6061, 0), (0x603F, 0)})
 
 
+def _held(count: float) -> int:
+    """Return a value of 0x6064 or 0x606C as the nearest INTEGER32."""
+    return round(min(max(count, -(2**31)), 2**31 - 1))
+
+
 class DriveNode(Application):
     """One drive on the bus. `motor_mode` and `torque_Nm`, the set-point, are its command to the motor."""
 
@@ -217,13 +222,13 @@ class DriveNode(Application):
         """
         t_ns = self._clock.own_ns(t_ns)
         self._patience.sync_ns = t_ns
-        self._position = position if self._position_scale == 1.0 else round(position * self._position_scale)
+        self._position = position if self._position_scale == 1.0 else _held(position * self._position_scale)
         lsb_rad_s = self._velocity_lsb_rad_s
         if lsb_rad_s is None:
             self._velocity = velocity
         else:
             speed_rad_s = velocity * VELOCITY_LSB_RAD_S if is_distorted else self._speed_rad_s
-            self._velocity = round(speed_rad_s / lsb_rad_s)
+            self._velocity = _held(speed_rad_s / lsb_rad_s)
         if self._pdos.act_on_sync(t_ns):
             self._patience.silent_syncs = 0
             self._acted_commands += 1

@@ -46,6 +46,8 @@ _FRAMES = tuple(FRAME_NODES)
 _TIMED = ("kind", "at_s", "since")
 _END = ("duration_s", "count")
 _LONGEST = 64  # bytes of a mask or of a flood's frame
+_IDLE_AT_0 = ("probability", "delay_us", "step", "drift_ppm")
+"""Keys with which a fault never acts if they are 0; of `delay_us` unless there is a `jitter_us`."""
 _COUNTED = ("feedback", "torque", "command")
 
 
@@ -106,7 +108,7 @@ class FaultSettings:
     since: str | None = setting(
         None, choices=SINCE, meaning="what at_s counts from: drives enabled (default), power on"
     )
-    duration_s: float | None = setting(None, unit="s", low=0.0, high=1e6, meaning="from onset to end; absent: no end")
+    duration_s: float | None = setting(None, unit="s", low=1e-6, high=1e6, meaning="from onset to end; absent: no end")
     count: int | None = setting(None, low=1, high=10**9, meaning="ends when so many frames or values were hit")
     probability: float | None = setting(None, low=0.0, high=1.0, meaning="of each frame or value to be hit; absent: 1")
     frame: str | None = setting(None, choices=_FRAMES, meaning="which frames; they imply the direction")
@@ -144,6 +146,11 @@ class FaultSettings:
             raise ValueError("`bits` and `mask` can't both be flipped")
         _check_hex("mask", self.mask)
         _check_hex("data", self.data)
+        for key in _IDLE_AT_0:
+            if getattr(self, key) == 0.0 and not (key == "delay_us" and self.jitter_us):
+                raise ValueError(f"{key} = 0 has no effect")
+        if self.mask is not None and not any(bytes.fromhex(self.mask)):
+            raise ValueError(f"mask = {self.mask!r} has no effect")
         if self.kind == "saturate" and self.value is None and self.signal != "torque":
             raise ValueError(f"saturate of {self.signal} lacks the key `value`: it has no end of range")
         if self.kind == "duplicate_node_id" and self.same_as == self.node:

@@ -426,7 +426,8 @@ def _mechanics(told: ToldArm, links: _Links, said: dict[str, Any], assumed: list
     return mechanics
 
 
-_LENGTHS: Final = ("x_m", "y_m", "radius_m")
+_PLACES: Final = ("x_m", "y_m", "radius_m", "move_to_m")
+"""Keys of touches in metres of the world: they grow with the arm's reach."""
 
 
 def _fit(table: dict[str, Any], settings: Settings, links: _Links, rated: Pair, assumed: list[str]) -> None:
@@ -451,15 +452,9 @@ def _fit(table: dict[str, Any], settings: Settings, links: _Links, rated: Pair, 
         table["payload_kg"] *= heavier
     if "payloads" in table:
         table["payloads"] = [_heavier(row, heavier, longer[1]) for row in table["payloads"]]
-    for key in ("contacts", "hands"):
+    for key in ("contacts", "hands", "bodies", "walls"):
         if key in table:
-            table[key] = [_stronger(row, longer, stronger) for row in table[key]]
-    for key in ("bodies", "walls"):
-        if key in table:
-            table[key] = [
-                {name: value * reach if name in _LENGTHS else value for name, value in row.items()}
-                for row in table[key]
-            ]
+            table[key] = [_sized(row, reach, longer, stronger) for row in table[key]]
     if (longer, stronger) != ((1.0, 1.0), (1.0, 1.0)):
         assumed.append(
             f"places of touches times {longer[0]:.3g} and {longer[1]:.3g}, as the links over profile P's, torques "
@@ -476,10 +471,12 @@ def _heavier(row: dict[str, Any], heavier: float, longer: float) -> dict[str, An
     return fitted
 
 
-def _stronger(row: dict[str, Any], longer: Pair, stronger: Pair) -> dict[str, Any]:
-    link = row["link"] - 1
-    fitted = {**row, "point_m": row["point_m"] * longer[link]}
-    for key in ("force_N", "force_limit_N"):
-        if key in row:
-            fitted[key] = row[key] * stronger[link] / longer[link]
-    return fitted
+def _sized(row: dict[str, Any], reach: float, longer: Pair, stronger: Pair) -> dict[str, Any]:
+    link = row.get("link", 1) - 1
+    force = stronger[link] / longer[link]
+    factors = {**dict.fromkeys(_PLACES, reach), "point_m": longer[link], "force_N": force, "force_limit_N": force}
+    return {key: _grown(value, factors[key]) if key in factors else value for key, value in row.items()}
+
+
+def _grown(value: Any, factor: float) -> Any:
+    return [_grown(one, factor) for one in value] if isinstance(value, list) else value * factor

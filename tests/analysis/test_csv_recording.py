@@ -130,11 +130,14 @@ def test_times_that_are_missing_without_a_period_name_the_key(read):
 
 
 def test_a_row_of_units_is_compared_with_the_map(read):
-    recording = read(table(plain, "t,angle,torque\n[s],(rad),N m\n"))
-    check(recording)
-    assert recording.notes == ("row 2 names units ([s], (rad), N m)",)
-    for units, said in (("s,deg,Nm", "'deg' for column 'angle'"), ("ms,rad,Nm", "'ms' for column 't'")):
-        with pytest.raises(ConfigError, match=f"row of units says {said}, the map"):
+    known = {"[s],(rad),N m": "[s], (rad), N m", "s,nan,Nm": "s, Nm", ",rad,": "rad", "# s,rad,Nm": "s, rad, Nm"}
+    for units, seen in known.items():
+        recording = read(table(plain, f"t,angle,torque\n{units}\n"))
+        check(recording)
+        assert recording.notes == (f"row 2 names units ({seen})",)
+    assert read(table(plain, "t,angle,torque\n# A\n# by hand, deg\n")).notes == ()
+    for units in ("s,deg,Nm", "s,deg,", "0,deg,Nm", "s,deg", "#s,deg,Nm", "s,rad,Nm\ns,deg,Nm", "s,mdeg,Nm", "-,-,-"):
+        with pytest.raises(ConfigError, match=r"row \d: '(m?deg' in column 'angle|-' in column 't)'"):
             read(table(plain, f"t,angle,torque\n{units}\n"))
 
 

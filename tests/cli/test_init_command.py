@@ -398,17 +398,26 @@ def test_an_eds_beside_named_profiles_of_its_kind_is_refused(out):
 
 
 def test_two_eds_of_a_kind_are_of_joint_1_and_2_and_more_or_namesakes_are_refused(out, tmp_path):
-    for name in ("a", "b"):
+    for name in ("a", "b", "c"):
         (tmp_path / name).mkdir()
         shutil.copy(contract_folder() / "stock_drive.eds", tmp_path / name / f"{name}.eds")
     (tmp_path / "b" / "a.eds").write_text((tmp_path / "a" / "a.eds").read_text() + "\n")
-    first, second, namesake = (str(tmp_path / name) for name in ("a/a.eds", "b/b.eds", "b/a.eds"))
+    first, second, third, namesake = (str(tmp_path / name) for name in ("a/a.eds", "b/b.eds", "c/c.eds", "b/a.eds"))
     assert init(out, *NO_BUS, "--eds", first, "--eds", second).exit_code == 0
     assert [Path(name).name for name in written(out).devices.drive] == ["my-arm-a.toml", "my-arm-b.toml"]
-    for eds in ((first, namesake), (first, second, first)):
+    for eds in ((first, namesake), (first, second, third)):
         refused = init(tmp_path / "another" / "arm.toml", *NO_BUS, *[word for one in eds for word in ("--eds", one)])
         assert refused.exit_code == USAGE
     assert not (tmp_path / "another").exists()
+
+
+def test_one_eds_handed_for_each_joint_gives_each_its_own_gear(out, tmp_path):
+    eds = EdsVariant().write(tmp_path / "drive.eds")
+    for again in (eds, tmp_path / "." / "lab" / ".." / "drive.eds"):
+        words = ("--eds", str(eds), "--eds", str(again), "--gear", "30", "50")
+        assert init(out, *NO_BUS, *words, "--force").exit_code == 0
+        profiles = [load_profile(str(out.parent / name), "drive") for name in written(out).devices.drive]
+        assert [profile.settings.scale.gear_ratio for profile in profiles] == [30.0, 50.0]
 
 
 @pytest.mark.parametrize(("outer_kg", "is_warned"), [("1", False), ("4", True)])
@@ -519,7 +528,8 @@ def test_a_device_that_is_missing_or_no_drive_is_named(out, on_bus, silent, opti
 def test_a_log_gives_its_arm_without_its_user(tmp_path, out):
     config = tmp_path / "arm.toml"
     config.write_text(
-        'extends = "certified"\nassumed = ["arm.sign", "arm.holding_torque_Nm"]\n[arm]\nlink_length_m = [0.4, 0.25]\n'
+        'extends = "certified"\nassumed = ["arm.sign", "arm.holding_torque_Nm", "devices.drive"]\n'
+        "[arm]\nlink_length_m = [0.4, 0.25]\n"
         "torque_limit_Nm = [9, 4]\ncad_theta = []\n[operator]\nacknowledge_after_s = 0.6\n"
         'script = [{ at_s = 0.3, request = "finish" }]\n'
     )
@@ -531,8 +541,21 @@ def test_a_log_gives_its_arm_without_its_user(tmp_path, out):
     settings = written(out)
     for name in ("link_length_m", "torque_limit_Nm", "cad_theta"):
         assert getattr(settings.arm, name) == getattr(own.arm, name)
-    assert settings.assumed == own.assumed
+    assert set(settings.assumed) == set(own.assumed)
     assert (settings.operator.acknowledges, settings.operator.script) == (False, ())
+    assert init(out, "--from", str(tmp_path / "run"), "--drive", *["adacd-drive"] * 2, "--force").exit_code == 0
+    assert written(out).assumed == ("arm.sign", "arm.holding_torque_Nm")
+    lines = out.read_text().splitlines()
+    assert "run.mcap" not in lines[lines.index('drive = ["adacd-drive", "adacd-drive"]') - 1]
+
+
+def test_what_is_no_log_gives_no_arm(tmp_path, out):
+    for name, status, line in (("arm.toml", USAGE, "--config"), ("none.mcap", 1, "none.mcap"), ("no.mcap", 1, "empty")):
+        (tmp_path / name.replace("none", "other")).touch()
+        refused = init(out, "--from", str(tmp_path / name))
+        assert (refused.exit_code, out.exists()) == (status, False)
+        (complaint,) = complaints(refused)
+        assert line in complaint
 
 
 def test_on_a_terminal_everything_is_asked_and_wrong_answers_again(out, monkeypatch):

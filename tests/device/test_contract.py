@@ -118,11 +118,22 @@ def test_a_contract_that_says_otherwise_than_the_profiles_is_named(
         loaded_contract(parse(Settings, {"devices": {"contract": str(path), **devices}}))
 
 
+def writes(name: str, value: int) -> tuple[str, str]:
+    """Return the change that gives the profile an extra write at set-up."""
+    return "[scale]", f'setup = [{{object = "{name}", value = {value}}}]\n[scale]'
+
+
 @pytest.mark.parametrize(
     ("change", "line"),
     [
         (("cob_id = 0x280", "cob_id = 0x180"), "both have identifier 0x181"),
         (("0x603F", "0x603E"), r"object 0x603E is not in /.*/drive\.eds"),
+        (writes("0x3333", 1), "object 0x3333 is not in"),
+        (writes("0x6502", 1), "0x6502 .*AccessType"),
+        (writes("0x1008", 1), "0x1008 .* is no number"),
+        (writes("0x605A", 40000), "0x605A .* -32768 to 32767"),  # INTEGER16
+        (writes("0x2200", 0), "0x2200 .* 1 to 255"),  # LowLimit, HighLimit
+        (writes("0x2200", 256), "0x2200 .* 1 to 255"),
     ],
 )
 def test_a_profile_that_no_contract_can_be_composed_of_is_named(

@@ -80,6 +80,7 @@ def test_a_users_file_is_a_profile_and_an_eds_beside_it_comes_first(tmp_path: Pa
         (("[scale]", "serial = [1]\n[scale]"), "serial has 1 numbers, 2 expected"),
         (("[scale]", "[scale]\ngear_ratio = 2"), "`scale.gear_ratio` has no effect: this is a sensor"),
         (("[scale]", "quick_stop_option = 2\n[scale]"), "`quick_stop_option` has no effect: this is a sensor"),
+        (('"0x9130:1", signal = "torque"', '"0x6064", signal = "velocity"'), "'velocity': object 0x6064 is 'position'"),
         (("[scale]", 'setup = [{object = "0x6040", value = 6}]\n[scale]'), "object '0x6040' commands the drive"),
         (("[scale]", 'setup = [{object = "0x60B2", value = 9}]\n[scale]'), "object '0x60B2' commands the drive"),
     ],
@@ -171,6 +172,8 @@ def with_default(value: str) -> str:
         (with_default("1\nLowLimit=--1"), r"\[1018sub1\] LowLimit = '--1' is no integer"),
         (EDS.replace("VendorName=", "VendorName=\x1b[2J", 1), r"line \d+ has the control character 0x1B"),
         (EDS.encode("utf-16-le").decode("latin-1"), "line 1 has the control character 0x00"),
+        (EDS.replace("DataType=0x0007", "DataType=UNSIGNED32", 1), r"\[1000\] DataType = 'UNSIGNED32' is no integer"),
+        ("", "no object is in it"),
     ],
 )
 def test_what_canopen_would_read_over_in_an_eds_is_one_line(text: str, line: str, tmp_path: Path) -> None:

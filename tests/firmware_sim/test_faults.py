@@ -28,7 +28,7 @@ EXAMPLES = {
     "bus_off": {"node": "drive2"},
     "wrong_node_id": {"node": "drive1", "node_id": 9},
     "duplicate_node_id": {"node": "drive2", "same_as": "drive1"},
-    "late_sync": {"delay_us": 200.0},
+    "late_sync": {"delay_us": 0.0, "jitter_us": 200.0},
     "clock_drift": {"node": "drive1", "drift_ppm": 100.0},
     "power_loss": {"duration_s": 0.5},
     "silence": {"node": "sensor2"},
@@ -108,6 +108,12 @@ def test_every_key_that_a_kind_has_not_is_refused(kind):
         (example("duplicate_node_id", same_as="drive2"), "same_as = 'drive2' is the node itself"),
         (example("object_value", index=0x0FFF), "`faults[0].index` = 0xFFF is below 0x1000"),
         (example("babble", can_id=0x800), "`faults[0].can_id` = 0x800 is above 0x7FF"),
+        (example("lose", duration_s=0.0), "`faults[0].duration_s` = 0"),
+        (example("lose", probability=0.0), "probability = 0 has no effect"),
+        (example("delay", delay_us=0.0, jitter_us=0.0), "delay_us = 0 has no effect"),
+        (example("jump", step=0.0), "step = 0 has no effect"),
+        (example("clock_drift", drift_ppm=0.0), "drift_ppm = 0 has no effect"),
+        (example("corrupt", mask="0000"), "mask = '0000' has no effect"),
     ],
 )
 def test_a_fault_that_cannot_be_is_refused_in_one_line(row, message):

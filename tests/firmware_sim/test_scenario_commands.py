@@ -77,3 +77,8 @@ def test_check_knows_the_contract(capsys, tmp_path):
     assert run_main("check", str(path), "--contract", "arm") == 0
     assert run_main("check", str(path), "--contract", "arm_stock") == 2
     assert "faults[0]: Sensor1Torque has no counter" in capsys.readouterr().out.splitlines()[-1]
+    value = "[[faults]]\nkind = 'object_value'\nnode = 'drive1'\nindex = {}\nraw = {}\nat_s = 1.0\n"
+    for index, raw, status in ((0x6077, 32767, 0), (0x6077, 32768, 2), (0x9999, 1, 2)):
+        path.write_text(value.format(index, raw))
+        assert run_main("check", str(path)) == status
+        assert f"0x{index:X}" in capsys.readouterr().out or status == 0

@@ -148,6 +148,10 @@ def test_an_error_says_what_kind_of_file_it_is_of(kind, read, tmp_path):
     path = tmp_path / "x.toml"
     with pytest.raises(ConfigError, match=rf"^{kind} {path} does not exist"):
         read(path)
+    path.symlink_to("nowhere")
+    with pytest.raises(ConfigError, match=rf"^{kind} {path} does not exist(?!.*did you mean)"):
+        read(path)
+    path.unlink()
     path.write_text("[broken\n")
     with pytest.raises(ConfigError, match=rf"^{kind} {path}: Expected"):
         read(path)

@@ -155,6 +155,8 @@ class Drafting:
         self._answers: dict[str, tuple[Any, str]] = {}
         self._drafts: dict[tuple[str, int], ProfileDraft] = {}
         """Drafted and completed profiles, by kind and joint."""
+        self._files: dict[str, dict[str, str]] = {}
+        """Names of added profiles by stem and text."""
 
     def draft(self) -> tuple[str, dict[str, Any]]:
         """Scan the bus, ask the user, derive the other values; return the text of a configuration, and a summary.
@@ -475,7 +477,7 @@ class Drafting:
         return names
 
     def _eds_files(self) -> list[tuple[Path, str]]:
-        """Return the given EDS files with the kind of each, "drive" or "sensor"; ask if 0x1000 names neither."""
+        """Return the given EDS files, each once, with the kind, "drive" or "sensor"; ask if 0x1000 names neither."""
         options = self.options
         found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
         for eds in options.eds:
@@ -488,7 +490,7 @@ class Drafting:
                     _drive_or_sensor,
                 )
             found.append((eds, kind))
-        return found
+        return list(dict.fromkeys(found))
 
     def _add_drafts(self, eds: Path, kind: str, ratings: dict[int, DeviceRatings]) -> dict[tuple[str, int], str]:
         """Draft profiles of an EDS; add them and the EDS to the files to be written.
@@ -500,9 +502,8 @@ class Drafting:
         drafts = self._draft(eds, kind, ratings)
         self.writing.add_file(self.writing.out.parent / eds.name, eds.read_bytes())
         names: dict[tuple[str, int], str] = {}
-        files: dict[str, str] = {}
         for joint, draft in drafts.items():
-            name = names[kind, joint] = self._add_profile(draft.text, eds.stem, files)
+            name = names[kind, joint] = self._add_profile(draft.text, eds.stem)
             self._drafts[kind, joint] = draft
             for line in (*draft.guesses, *draft.remarks):
                 if (warning := f"{name}: {line}") not in self.warnings:
@@ -510,12 +511,13 @@ class Drafting:
             self.guessed |= {name} if _ESSENTIAL & draft.guessed.keys() else set()
         return names
 
-    def _add_profile(self, text: str, stem: str, files: dict[str, str]) -> str:
+    def _add_profile(self, text: str, stem: str) -> str:
         """Add the text of a joint's profile to the files to be written; return the file's name, with `stem` in it.
 
-        files: names by text, of the joint before; equal texts share a file.
+        Equal texts share a file.
         """
-        name = files.setdefault(text, f"{self.writing.out.stem}-{stem}{'-2' if files else ''}.toml")
+        files = self._files.setdefault(stem, {})
+        name = files.setdefault(text, f"{self.writing.out.stem}-{stem}{f'-{len(files) + 1}' if files else ''}.toml")
         self.writing.add_file(self.writing.out.parent / name, text)
         return name
 
@@ -561,7 +563,7 @@ class Drafting:
         An extension is a profile that `extends` it by the answers. The extensions are added to the files to be written.
         A shipped profile whose guesses all stay is added to `guessed`.
         """
-        completed, files = list(names), dict[str, str]()
+        completed = list(names)
         for joint, name in enumerate(names):
             if name not in profile_names():
                 continue
@@ -573,7 +575,7 @@ class Drafting:
             left = [key for key in draft.guessed if key in profile.settings.assumed]
             if len(left) < len(profile.settings.assumed):
                 text = _extension(name, profile.settings.scale, draft.settings.scale, left)
-                completed[joint] = self._add_profile(text, name, files)
+                completed[joint] = self._add_profile(text, name)
                 self._drafts[kind, joint] = draft._replace(
                     guessed={key: draft.guessed[key] for key in left}, remarks=()
                 )

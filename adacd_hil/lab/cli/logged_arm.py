@@ -11,10 +11,9 @@ from adacd_hil.dates import format_date
 from adacd_hil.device.contract import find_contract
 from adacd_hil.file_access import exists
 from adacd_hil.lab.cli.arm_drafting import DraftFiles
-from adacd_hil.lab.commission.arm_draft import Entry, draft_as_toml
-from adacd_hil.log.log_files import CONFIG_NAME
+from adacd_hil.lab.commission.arm_draft import Entry, assumed_keys, draft_as_toml
 from adacd_hil.log.log_parts import log_in
-from adacd_hil.log.log_walk import attachment
+from adacd_hil.log.log_walk import read_head
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
@@ -40,28 +39,32 @@ def draft_from_log(log: Path, options: SimpleNamespace, files: DraftFiles) -> tu
     """Return the text of a configuration for the arm of a log, and a summary for JSON; write no file.
 
     options: as of `Drafting`. Adds the device profiles to `files`, and checks the configuration with them. Raises
-    LogError if the log can't be read or lacks settings, CommandError for options other than --drive and --sensor, a
-    missing profile, or a configuration with errors.
+    LogError if the log can't be read or lacks settings, CommandError for a configuration in place of a log, options
+    other than --drive and --sensor, a missing profile, or a configuration with errors.
     """
     given = [name for name, value in vars(options).items() if value not in (None, (), False)]
     if further := [name for name in given if name not in ("drive", "sensor")]:
         option = f"--{further[0].removeprefix('is_').replace('_', '-')}"
         raise CommandError(f"--from takes the arm from the log: leave out {option}", ExitCode.USAGE)
+    if log.suffix == ".toml":
+        raise CommandError(
+            f"--from takes the log of a run, a run.mcap or its folder, and {log} is a configuration: use it as it is, "
+            f"`--config {quoted(log)}`, or write another one that `extends` it",
+            ExitCode.USAGE,
+        )
     path = log_in(log)
-    text = attachment(path, CONFIG_NAME)
-    settings = settings_of(path, {} if text is None else {CONFIG_NAME: text})
+    settings = settings_of(path, read_head(path).attachments)
     base = "certified" if settings.scheme == "certified" else "paper"
     warnings: list[str] = []
     entries = _differences(settings, base, path, warnings)
-    entries = [_placed(entry, files, options) for entry in entries]
-    for kind in ("drive", "sensor"):
-        names = getattr(options, kind)
-        if names is not None and all(entry.key != f"devices.{kind}" for entry in entries):
-            entries.append(Entry(f"devices.{kind}", tuple(files.beside(name, kind) for name in names), "given"))
+    named = {kind: names for kind in ("drive", "sensor") if (names := getattr(options, kind)) is not None}
+    entries = [_placed(entry, files) for entry in entries if entry.key.removeprefix("devices.") not in named]
+    for kind, names in named.items():
+        entries.append(Entry(f"devices.{kind}", tuple(files.beside(name, kind) for name in names), "given"))
     title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]} from the log {path.name}."
     written = draft_as_toml(entries, title, quoted(files.out), base)
     warnings += files.examine(written).mistakes
-    return written, {"from": str(path), "assumed": list(settings.assumed), "warnings": warnings}
+    return written, {"from": str(path), "assumed": assumed_keys(entries), "warnings": warnings}
 
 
 def _differences(settings: Settings, base: str, path: Path, warnings: list[str]) -> list[Entry]:
@@ -88,21 +91,20 @@ def _differences(settings: Settings, base: str, path: Path, warnings: list[str])
     return [*entries, *(Entry(key, None, "not known", True) for key in unset)]
 
 
-def _placed(entry: Entry, files: DraftFiles, options: SimpleNamespace) -> Entry:
+def _placed(entry: Entry, files: DraftFiles) -> Entry:
     """Return an entry with paths as seen from the new configuration's folder; one not of `devices` unchanged.
 
     A contract that isn't there is left out. Raises CommandError if a device profile isn't there.
     """
     kind = entry.key.removeprefix("devices.")
     if entry.key in ("devices.drive", "devices.sensor"):
-        names = getattr(options, kind) or entry.value
-        for name in names:
+        for name in entry.value:
             if Path(name).suffix and not exists(Path(name)):
                 raise CommandError(
                     f"the log names the device profile {name}, which is not here: give --{kind} PROFILE PROFILE",
                     ExitCode.USAGE,
                 )
-        return entry._replace(value=tuple(files.beside(name, kind) for name in names))
+        return entry._replace(value=tuple(files.beside(name, kind) for name in entry.value))
     if entry.key == "devices.contract" and entry.value:
         try:
             is_there = exists(find_contract(entry.value))

@@ -132,8 +132,8 @@ def runs(
     """List the runs in FOLDER, default `runs`: verdict, certificate, thresholds, margin, contacts; oldest first.
 
     Figures come from the report beside a log. A run without one is described by its events, and not judged: `adacd-hil
-    report FOLDER` reports all, --judge reads their logs and stores nothing. Links, and folders deeper than four levels,
-    are skipped.
+    report FOLDER` reports all, --judge reads their logs and stores nothing. Links, and folders deep below FOLDER, are
+    skipped.
     """
     from adacd_hil.lab.runs import run_table
 
@@ -166,7 +166,7 @@ def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "R
     """Find when thresholds, friction and torque offsets of an arm last changed over the runs in FOLDER; draw them.
 
     Runs without a report are judged first, which reads their logs. A friction or an offset has changed if it differs by
-    more than four standard deviations of both certificates.
+    more than the standard deviations of both certificates explain.
     """
     from adacd_hil.lab.runs.run_pages import trend_page
     from adacd_hil.lab.runs.run_table import write_result

@@ -1,12 +1,13 @@
 """A recording in a CSV file: head, rows, and hints at the key of the map that would make a cell readable.
 
 A row is skipped if it has fewer cells than the head, or a cell that isn't a number; an empty cell is a missing value.
-A row of units below the head is compared with the map.
+A row of units below the head, perhaps a comment, is compared with the map.
 """
 
 import csv
 import io
 import math
+import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -102,16 +103,15 @@ def _head(path: Path, first: list[str], described: RecordingMap) -> list[str]:
 def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]]:
     """Yield each row's number in the file, from 1, and its cells.
 
-    The first `csv.skip_rows` lines are skipped, but counted in the numbers. Empty rows, and comments ("#") below the
-    first row, are skipped, too. Raises LogError as `opened_text` and `split_rows`.
+    The first `csv.skip_rows` lines are skipped, but counted in the numbers. Empty rows are skipped, too. Raises
+    LogError as `opened_text` and `split_rows`.
     """
     form = described.csv
     with opened_text(path) as file:
         for _ in range(form.skip_rows):
             next(file, "")
         for number, cells in enumerate(split_rows(path, file, form.delimiter), start=1 + form.skip_rows):
-            is_comment = bool(cells) and cells[0].startswith("#") and number > 1 + form.skip_rows
-            if not is_comment and any(map(str.strip, cells)):
+            if any(map(str.strip, cells)):
                 yield number, cells
 
 
@@ -205,16 +205,13 @@ def _numbers(
     """Yield each row's number in the file and its values, the time first; an empty cell is nan.
 
     Without a time column a row's time is its count, dropped rows included, times the map's period. Rows with too few
-    cells, more filled ones than `width`, or a cell that isn't a number are dropped and counted in `into`. A first row
-    of units is skipped with a note in `into`. width: number of cells of a row. Raises ConfigError if the row of units
-    differs from the map.
+    cells, more filled ones than `width`, or a cell that isn't a number are dropped and counted in `into`. A row of
+    units is skipped with a note in `into`. width: number of cells of a row. Raises ConfigError as `_below_units`.
     """
     has_time = bool(columns[0].name)
     wanted = columns if has_time else columns[1:]
     plain = [(column.place, column.read) for column in wanted]
-    first, count = 0, -1
-    for number, cells in rows:
-        first, count = first or number, count + 1
+    for count, (number, cells) in enumerate(_below_units(path, iter(rows), wanted, into)):
         if len(cells) < width:
             into.drop(_CUT, f"row {number}: it has {len(cells)} cells of {width}")
             continue
@@ -222,10 +219,6 @@ def _numbers(
             row = [read(cells[place]) for place, read in plain]
         except (ValueError, OverflowError):
             row, wrong = _read_unusual_row(cells, wanted)
-            if wrong and number == first and len(wrong) == len(wanted) and _is_of_units(path, wrong):
-                into.notes.append(f"row {number} names units ({', '.join(text for _, text in wrong)})")
-                first, count = number + 1, count - 1
-                continue
             if wrong:
                 column, text = wrong[0]
                 remedy = _remedy(text, column, described)
@@ -235,6 +228,38 @@ def _numbers(
             into.drop(_UNREADABLE, f"row {number}: it has {len(cells)} cells, more than the head's {width}")
             continue
         yield number, row if has_time else [count * described.sampling.period_s, *row]
+
+
+def _below_units(
+    path: Path, rows: Iterator[tuple[int, list[str]]], wanted: list[_Column], into: RecordedRows
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows but comments, and but rows of units above the first row of numbers, which are noted in `into`.
+
+    A row is of units if one of its wanted cells is a unit, or if they are all empty or texts without digits; a comment
+    if all are texts, one of them a unit. Raises ConfigError if a text in a row of units isn't the column's unit in the
+    map.
+    """
+    for number, cells in rows:
+        is_comment = cells[0].startswith("#")
+        texts = [cells[0].removeprefix("#"), *cells[1:]]
+        row, wrong = _read_unusual_row(texts, [column for column in wanted if column.place < len(cells)])
+        names_unit = any(unit_of(text) for _, text in wrong)
+        if is_comment and not (names_unit and len(wrong) == len(wanted)):
+            continue
+        is_text = (
+            wrong and not any(map(math.isfinite, row)) and not re.search(r"\d", "".join(text for _, text in wrong))
+        )
+        if not (names_unit or is_text):
+            yield number, cells
+            break
+        for column, text in wrong:
+            if column.unit not in ("", ISO, unit_of(text)):
+                raise ConfigError(
+                    f"recording {path}, row {number}: {text!r} in column {column.name!r} is neither a number nor its "
+                    f"unit in the map, {column.unit!r}: correct `units`, or delete the row"
+                )
+        into.notes.append(f"row {number} names units ({', '.join(text for _, text in wrong)})")
+    yield from (row for row in rows if not row[1][0].startswith("#"))
 
 
 def _read_unusual_row(cells: list[str], wanted: list[_Column]) -> tuple[list[float], list[tuple[_Column, str]]]:
@@ -247,21 +272,6 @@ def _read_unusual_row(cells: list[str], wanted: list[_Column]) -> tuple[list[flo
         except (ValueError, OverflowError):
             wrong.append((column, text))
     return row, wrong
-
-
-def _is_of_units(path: Path, wrong: list[tuple[_Column, str]]) -> bool:
-    """Return whether unreadable cells, with their columns, have no digits, as in a row of units.
-
-    Raises ConfigError if one of them is a unit other than the map's.
-    """
-    for column, text in wrong:
-        unit = unit_of(text)
-        if unit and column.unit not in ("", ISO, unit):
-            raise ConfigError(
-                f"recording {path}: its row of units says {unit!r} for column {column.name!r}, the map "
-                f"{column.unit!r} (`units`)"
-            )
-    return not any(map(str.isdigit, "".join(text for _, text in wrong)))
 
 
 def _remedy(text: str, column: _Column, described: RecordingMap) -> str:
