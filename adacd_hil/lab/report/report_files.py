@@ -23,7 +23,7 @@ from adacd_hil.lab.score.evaluation import RunGatherer, evaluate
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.lab.score.report_wording import number_text
 from adacd_hil.lab.score.run_arrays import Run, section_at
-from adacd_hil.lab.score.verdict import headlines
+from adacd_hil.lab.score.verdict import headlines, is_good
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.log.logged_run import Progress
 from adacd_hil.log.time_window import WHOLE, TimeWindow
@@ -56,9 +56,8 @@ class Report:
 
     def as_text(self) -> str:
         """Return the result of the run, contacts that went wrong, next steps and the report's path, for a terminal."""
-        first, *further = headlines(self.metrics)
-        lines = [in_line(f"{'Good' if self.metrics.is_clean else 'NOT GOOD'}: {first}")]
-        lines += [in_line(self.source.notice)] if self.source.notice else []
+        first, *further = headlines(self.metrics, self.source)
+        lines = [in_line(f"{'Good' if is_good(self.metrics, self.source) else 'NOT GOOD'}: {first}")]
         lines += [in_line(f"- {line}") for line in further]
         wrong = [contact for contact in self.metrics.contacts if went_wrong(contact)]
         if wrong:

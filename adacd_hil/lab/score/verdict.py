@@ -20,6 +20,7 @@ from adacd_hil.lab.score.metrics import (
     Finding,
     Metrics,
     PaperRow,
+    ReportSource,
 )
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
 from adacd_hil.lab.score.run_arrays import Run, Section
@@ -118,16 +119,24 @@ _HEADLINE_LETTERS: Final = 160
 """Enough for a fault's device, a difference of two signals with long names, its value and its bounds."""
 
 
-def headlines(metrics: Metrics) -> list[str]:
-    """Return the findings as lines for a first screen, the bad ones first, each cut at `_HEADLINE_LETTERS`.
+def is_good(metrics: Metrics, source: ReportSource) -> bool:
+    """Return whether a report is good: no finding is bad, and log and truth have all that the findings are about."""
+    return metrics.is_clean and source.is_complete
 
-    Findings on the paper's scheme beside, and on cyclic data without a loss, are left out.
+
+def headlines(metrics: Metrics, source: ReportSource) -> list[str]:
+    """Return the lines of a first screen: bad findings, the whole notice on log and truth, the other findings.
+
+    A finding is cut at `_HEADLINE_LETTERS`. Findings on the paper's scheme beside, and on cyclic data without a loss,
+    are left out.
     """
-    ordered = sorted(metrics.findings, key=lambda finding: not finding.is_bad)
-    plain = [finding.text for finding in ordered if not finding.text.startswith((_BESIDE, _NO_LOSS))]
-    if metrics.false_alarms == 0:
-        plain = [text.replace(", none false", ", no false alarm") for text in plain]
-    return [textwrap.shorten(text[:1].upper() + text[1:], _HEADLINE_LETTERS, placeholder=" …") for text in plain]
+    lines: dict[bool, list[str]] = {True: [], False: [source.notice] if source.notice else []}
+    for text, is_bad in metrics.findings:
+        if not text.startswith((_BESIDE, _NO_LOSS)):
+            plain = text.replace(", none false", ", no false alarm") if metrics.false_alarms == 0 else text
+            line = textwrap.shorten(plain[:1].upper() + plain[1:], _HEADLINE_LETTERS, placeholder=" …")
+            lines[is_bad].append(line)
+    return lines[True] + lines[False]
 
 
 def is_margin_below_1(evidence: CertifiedEvidence | None) -> TypeGuard[CertifiedEvidence]:
