@@ -11,6 +11,7 @@ from typing import NamedTuple
 from adacd_hil.lab.report.page import STEPS, went_wrong
 from adacd_hil.lab.score.metrics import Metrics, ReportSource
 from adacd_hil.lab.score.run_arrays import EMBEDDED, Run
+from adacd_hil.lab.score.run_faults import find_breaks
 from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked
 from adacd_hil.printable import in_line
 from adacd_hil.settings.toml_files import builtin_names, toml_names
@@ -48,7 +49,7 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
 def _repairs(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]:
     """Return a next step for each kind of failure that the run shows; [] if there is none."""
     log = _quoted(source.log_name)
-    has_stopped = bool(metrics.fault) or (not metrics.adaptation_s and run.stretch is None)
+    has_stopped = bool(metrics.fault or find_breaks(run)) or (not metrics.adaptation_s and run.stretch is None)
     stopped = _checked(run, source, "Mend the cause above.")
     late = _checked(run, source, "Frames came late or were lost, more than allowed.")
     rows = (

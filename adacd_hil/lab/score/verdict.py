@@ -24,6 +24,7 @@ from adacd_hil.lab.score.metrics import (
 )
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
 from adacd_hil.lab.score.run_arrays import Run, Section
+from adacd_hil.lab.score.run_faults import Break
 from adacd_hil.lab.score.run_judge import uncovered_watch
 from adacd_hil.log.logged_run import is_armed_in
 from adacd_hil.records import JOINTS
@@ -40,14 +41,11 @@ _NO_LOSS: Final = "no cyclic data was late or lost"
 
 
 def list_findings(
-    run: Run, metrics: Metrics, score: Score, faults: tuple[Fault, ...], causes: tuple[str, ...]
+    run: Run, metrics: Metrics, score: Score, faults: tuple[Fault, ...], breaks: tuple[Break, ...]
 ) -> tuple[Finding, ...]:
-    """Return the findings of a run, failures first. causes: those of attempts that ended without a fault.
-
-    A run without cycles has one bad finding.
-    """
+    """Return the findings of a run, failures first. A run without cycles has one bad finding."""
     if run.cycle.size == 0:
-        cause = "; ".join(causes) or "the log does not say why"
+        cause = "; ".join(each.cause for each in breaks) or "the log does not say why"
         return (Finding(f"no cycle was run: {cause}", True),)
     evidence, adaptation_s, data = metrics.evidence, metrics.adaptation_s, metrics.data
     done = "identified" if evidence is None else "certified"
@@ -66,7 +64,9 @@ def list_findings(
     if evidence is not None and evidence.paper_beside is not None and is_papers_experiment(run):
         beside = _beside_text(list(evidence.paper_beside.adaptation_s.values()))
     grave = _fault_texts(faults)
-    grave += [f"the run was broken off: {'; '.join(causes)}"] if causes else []
+    for is_last, what in ((True, "the run was broken off"), (False, "the run was broken off and began anew")):
+        causes = [each.cause for each in breaks if each.is_last == is_last]
+        grave += [f"{what}: {'; '.join(causes)}"] if causes else []
     grave += evidence.revoked if is_revoked(evidence) else ()
     grave += filter(None, [_blind_text(run)])
     if is_margin_below_1(evidence):
