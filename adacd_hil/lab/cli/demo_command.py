@@ -51,7 +51,9 @@ def play(
         from adacd_hil.lab.report.report_files import write_report
 
         try:
-            report = write_report(summary.log.path, truth_path, folder.path, config=config, scenario=scenario)
+            report = write_report(
+                summary.log.path, truth_path, folder.path, config=config, scenario=scenario, truth=truth or ""
+            )
         except (OSError, LogError) as error:
             status = exit_code(summary)
             if status is ExitCode.OK:

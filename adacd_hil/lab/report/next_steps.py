@@ -87,6 +87,7 @@ def _checked(run: Run, source: ReportSource, text: str) -> NextStep:
     interface, channel = run.metadata.get("interface", ""), run.metadata.get("channel", "")
     if interface in ("", EMBEDDED):
         played = f" --scenario {_scenario(run, source)}" if run.metadata.get("scenario") else ""
+        played += f" --truth {_truth(run, source)}" if run.metadata.get("truth") else ""
         return NextStep(f"{text} Play it again.", f"adacd-hil demo --config {_configuration(run, source)}{played}")
     bus = f"-i {_quoted(interface)} -c {_quoted(channel or 'can0')}"
     return NextStep(
@@ -111,6 +112,12 @@ def _scenario(run: Run, source: ReportSource) -> str:
     return _quoted(source.scenario or (name if is_builtin else f"{name}.toml"))
 
 
+def _truth(run: Run, source: ReportSource) -> str:
+    """Return a run's truth for `demo`, quoted for the shell; where the source lacks it, as of `_configuration`."""
+    name, *digest = run.metadata["truth"].split()
+    return _quoted(source.truth or (f"{name}.toml" if digest else name))
+
+
 def _quoted(text: str) -> str:
     return shlex.quote(in_line(text))
 
@@ -127,6 +134,8 @@ def origin_words(run: Run) -> list[str]:
         words.append(f"on {interface} {said.get('channel', '')}".strip())
     if said.get("scenario"):
         words.append(f"scenario {said['scenario']}")
+    if truth := said.get("truth", said.get("emulator_truth")):
+        words.append(f"truth {truth}")
     if "version" in said:
         words.append(f"adacd-hil {said['version']}")
     return words
