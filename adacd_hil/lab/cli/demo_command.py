@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from adacd_hil.cli.embedded_run import SCENARIO, resolve, run_embedded
-from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
+from adacd_hil.cli.output import CommandError, ExitCode, exit_code, run_folder
 from adacd_hil.control.session import LiveView, SessionSummary
 from adacd_hil.error_texts import error_text
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
@@ -64,15 +64,6 @@ def play(
     if summary.error:
         raise CommandError(summary.error, exit_code(summary))
     return report, exit_code(summary)
-
-
-def next_of_report(html_path: Path) -> tuple[str, ...]:
-    """Return the commands to suggest after a demo: to open the report, and to replay the log beside it."""
-    log_path = html_path.with_name(LOG_NAME)
-    return (
-        f"xdg-open {quoted(html_path)}",
-        f"adacd-hil replay {quoted(log_path)}   # the same decisions, bit for bit?",
-    )
 
 
 def _ending(summary: SessionSummary) -> str:
