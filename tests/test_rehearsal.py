@@ -53,6 +53,11 @@ def test_a_demo_that_faults_is_played_again_by_the_command_that_it_prints(tmp_pa
     files = ["--config", "my lab/arm.toml", "--scenario", "my lab/silent.toml", "--truth", "my lab/real.toml"]
     with contextlib.chdir(tmp_path):
         played = called("demo", *files, "--out", "my lab/run")
+        reported = called("report", "my lab/run").stdout.splitlines()
+    elsewhere = next(
+        reported[place - 1] for place, line in enumerate(reported) if line.startswith("    adacd-hil demo")
+    )
+    assert [name in elsewhere for name in ("arm.toml", "silent.toml", "real.toml")] == [True] * 3
     printed = [shlex.split(line) for line in played.stdout.splitlines() if line.startswith("    adacd-hil ")]
     assert (played.exit_code, printed[0]) == (4, ["adacd-hil", "demo", *files])
     named = {run_metadata(lab / "run" / name)["truth"] for name in ("run.mcap", "truth.mcap")}

@@ -238,12 +238,16 @@ def answer(as_json: bool, described: Any, text: str, *next_commands: str) -> Non
         show(text, *next_commands)
 
 
+def as_called(command: str) -> str:
+    """Return a command with this program's name as its user typed it; a command of another program unchanged."""
+    called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
+    return f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
+
+
 def suggest(*next_commands: str) -> None:
     """Print commands to run next on standard error, with this program's name as its user typed it."""
-    called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
     for place, command in enumerate(next_commands):
-        typed = f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
-        line = _as_typed(f"{'next:' if place == 0 else '     '} {in_line(typed)}")
+        line = _as_typed(f"{'next:' if place == 0 else '     '} {in_line(as_called(command))}")
         write_screen(painted(f"{line}\n", sys.stderr), sys.stderr)
 
 

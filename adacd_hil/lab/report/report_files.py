@@ -7,11 +7,14 @@ import csv
 import dataclasses
 import io
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from adacd_hil.cli.output import as_called
+from adacd_hil.file_access import exists
 from adacd_hil.file_replacement import replace_files
 from adacd_hil.lab.report.next_steps import NextStep, next_steps
 from adacd_hil.lab.report.page import has_paper, went_wrong
@@ -66,7 +69,7 @@ class Report:
             lines += _contact_lines(wrong[:PRINTED_CONTACTS], terminal_columns())
         lines.append("")
         for step in self.next_steps:
-            lines += [in_line(step.text), *([f"    {in_line(step.command)}"] if step.command else [])]
+            lines += [in_line(step.text), *([f"    {in_line(as_called(step.command))}"] if step.command else [])]
         return "\n".join([*lines, in_line(f"Report: {self.html_path}")])
 
 
@@ -106,7 +109,13 @@ def write_report(
     run, gathered, source = read_run(log_path, truth_path, stretch, progress)
     report = write_run_report(run, out_dir, source, gathered)
     here = source._replace(log_name=str(log_path), config=config, scenario=scenario, truth=truth)
-    return dataclasses.replace(report, next_steps=tuple(next_steps(report.metrics, run, here)[0]))
+    return dataclasses.replace(report, next_steps=tuple(map(_placed, next_steps(report.metrics, run, here)[0])))
+
+
+def _placed(step: NextStep) -> NextStep:
+    """Return a next step whose text names the files of its command that aren't where it is typed."""
+    missing = [word for word in shlex.split(step.command) if word.endswith(".toml") and not exists(Path(word))]
+    return step._replace(text=f"{step.text} In the folder of {' and '.join(missing)}:") if missing else step
 
 
 def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: RunGatherer | None = None) -> Report:
