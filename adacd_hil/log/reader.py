@@ -101,11 +101,9 @@ class RunLog:
     summary: dict[str, str]  # frames, messages, dropped, ending, as far as the parts have their ends
     attachments: dict[str, bytes]
     topics: Mapping[str, Series]
-    decoded: Mapping[str, Series]  # by DBC message
     frames: NDArray[Any]  # (n,) of FRAME_DTYPE or LONG_FRAME_DTYPE, both ways, in the order of the bus
     events: list[LoggedEvent]
     contacts: list[tuple[int, ContactReport]]  # when each report was made, ns, and the report
-    parts: int  # files that it was read from
 
     @property
     def is_complete(self) -> bool:
@@ -156,11 +154,9 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
         summary=stream.summary,
         attachments=stream.attachments,
         topics=series,
-        decoded={name.removeprefix(DECODED): values for name, values in series.items() if name.startswith(DECODED)},
         frames=piece.frames,
         events=stream.events(piece),
         contacts=contacts_of(series[CONTACT.name]),
-        parts=stream.parts,
     )
 
 
@@ -273,7 +269,6 @@ class LogStream:
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, str] = {}
         self.summary: dict[str, str] = {}
-        self.parts = 0
         self.topics: dict[str, Topic] = {}
         """The requested topics that are defined in the parts read so far."""
         self._wanted = topics
@@ -391,7 +386,7 @@ class LogStream:
     def _pieces(self) -> Iterator[Piece]:
         """Yield the messages of all parts in pieces; topics, summary and problem, empty at first, grow meanwhile."""
         builder = PieceBuilder(self._cycles_per_piece, self.epoch_ns)
-        self._problems, self.summary, self.parts = [], {}, 0
+        self._problems, self.summary = [], {}
         joined = -1
         for step in self._plan:
             if isinstance(step, str):
@@ -406,7 +401,6 @@ class LogStream:
             if walk.problem:
                 self._problems.append(walk.problem if self._is_alone else f"{path.name}: {walk.problem}")
             self._problems += [f"{path.name}: {name} has another type than before" for name in sorted(walk.other_types)]
-            self.parts += 1
             self.attachments = {**walk.extras.attachments, **self.attachments}
             self._sum_up(walk.extras.metadata.get(SUMMARY_METADATA, {}))
         if joined == self._last and self.summary.get(ENDING_KEY) == CONTINUED:
