@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -57,8 +57,6 @@ from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactReport,
     Event,
-    FaultReason,
-    SchemeState,
 )
 
 __all__ = [
@@ -193,19 +191,6 @@ def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
         if payload is not None:
             topics[channel.topic] = Topic(channel.topic, channel.type.name, record_dtype(payload))
     return topics
-
-
-_STATES: Final = {"state": SchemeState, "previous_state": SchemeState, "fault": FaultReason}
-
-
-def check_states(scheme: Series) -> None:
-    """Raise LogError for a record of /scheme with an unknown state or fault."""
-    for name, kind in _STATES.items():
-        if name in scheme.fields:
-            odd = np.flatnonzero(~np.isin(scheme.records[name], [int(member) for member in kind]))
-            if odd.size:
-                value, cycle = scheme.records[name][odd[0]], scheme.records["cycle"][odd[0]]
-                raise LogError(f"{SCHEME.name} has {name} {value} in cycle {cycle}, which this version does not know")
 
 
 def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
