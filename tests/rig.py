@@ -252,12 +252,12 @@ def torque_of(frame: Frame) -> int:
 def torques_from(log: RunLog, cycle: int) -> np.ndarray:
     """Return the target torques on the wire from this cycle on."""
     start_ns = cycle * PERIOD_NS
-    commands = [log.decoded[name] for name in ("Drive1Command", "Drive2Command")]
+    commands = [log.topics[f"/decoded/{name}"] for name in ("Drive1Command", "Drive2Command")]
     return np.concatenate([command["target_torque"][command.t_ns >= start_ns] for command in commands])
 
 
 def controlwords(log: RunLog) -> np.ndarray:
-    return log.decoded["Drive1Command"]["controlword"]
+    return log.topics["/decoded/Drive1Command"]["controlword"]
 
 
 def messages(log: RunLog, name: str) -> list[str]:

@@ -53,7 +53,7 @@ def middle(arrived: list[int]) -> list[int]:
 
 def test_stamps_are_those_of_the_modelled_bus(play) -> None:
     log, _ = play(latency_us=200.0)
-    sync, feedback = log.decoded["Sync"], log.decoded["Drive1Feedback"]
+    sync, feedback = log.topics["/decoded/Sync"], log.topics["/decoded/Drive1Feedback"]
     count = min(len(sync.t_ns), len(feedback.t_ns))
     assert usual(feedback.t_ns[:count] - sync.t_ns[:count]) == 65_000 + 135_000
 

@@ -19,6 +19,7 @@ from adacd_hil.control.configuration_check import examine_configuration
 from adacd_hil.device.device_files import load_profile
 from adacd_hil.lab.report.run_reading import read_run
 from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.log.log_walk import run_metadata
 from adacd_hil.scheme.kernel.certified_memory import constants_of, new_memory
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.schema import ConfigError
@@ -51,11 +52,21 @@ def test_a_demo_that_faults_is_played_again_by_the_command_that_it_prints(tmp_pa
     lab.mkdir()
     (lab / "arm.toml").write_text(OWN_ARM)
     (lab / "silent.toml").write_text('lasts_s = 0.5\n[[faults]]\nkind = "silence"\nnode = "sensor1"\nat_s = 0.2\n')
-    files = ["--config", "my lab/arm.toml", "--scenario", "my lab/silent.toml"]
+    (lab / "real.toml").write_text("[arm]\ntorque_offset_Nm = [0.1, 0.0]\n")
+    files = ["--config", "my lab/arm.toml", "--scenario", "my lab/silent.toml", "--truth", "my lab/real.toml"]
     with contextlib.chdir(tmp_path):
         played = called("demo", *files, "--out", "my lab/run")
+        reported = called("report", "my lab/run").stdout.splitlines()
+    elsewhere = next(
+        reported[place - 1] for place, line in enumerate(reported) if line.startswith("    adacd-hil demo")
+    )
+    assert [name in elsewhere for name in ("arm.toml", "silent.toml", "real.toml")] == [True] * 3
     printed = [shlex.split(line) for line in played.stdout.splitlines() if line.startswith("    adacd-hil ")]
     assert (played.exit_code, printed[0]) == (4, ["adacd-hil", "demo", *files])
+    named = {run_metadata(lab / "run" / name)["truth"] for name in ("run.mcap", "truth.mcap")}
+    (lab / "real.toml").write_text("[arm]\ntorque_offset_Nm = [0.2, 0.0]\n")
+    other = rehearse_file(str(lab / "arm.toml"), "idle", str(lab / "real.toml")).scenario.truth
+    assert (len(named), [name.split()[0] for name in (*named, other)], other in named) == (1, ["real", "real"], False)
 
 
 @pytest.mark.slow

@@ -150,7 +150,11 @@ def run_embedded(
                 ScriptedOperator(settings.operator),
                 out,
                 "embedded",
-                metadata={"scenario": scenario.name, "seed": str(scenario.seed)},
+                metadata={
+                    "scenario": scenario.name,
+                    "seed": str(scenario.seed),
+                    **({"truth": scenario.truth} if scenario.truth else {}),
+                },
                 progress=progress,
                 viewer_files=viewer_files(settings),
                 live=live,

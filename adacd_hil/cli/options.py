@@ -3,6 +3,7 @@
 import errno
 import functools
 import math
+import shlex
 import socket
 from collections.abc import Callable
 from importlib.metadata import entry_points
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import click
+from click.core import ParameterSource
 
 from adacd_hil.cli.completion import (
     complete_channel,
@@ -19,7 +21,7 @@ from adacd_hil.cli.completion import (
     complete_run,
     complete_setting,
 )
-from adacd_hil.cli.output import CommandError, ExitCode, explained
+from adacd_hil.cli.output import PROGRAM, CommandError, ExitCode, explained
 from adacd_hil.extras import install_command
 from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenPath
 from adacd_hil.log.log_files import MOST_VIEWERS
@@ -205,6 +207,20 @@ _LIVE_OPTIONS = (
         help="Viewers at a time.",
     ),
 )
+
+
+def typed_again(*added: str) -> str:
+    """Return the command that runs, with the arguments and options that were typed, and further words."""
+    context = click.get_current_context()
+    words = [PROGRAM, context.info_name or ""]
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            value = context.params[name]
+            for each in value if isinstance(value, tuple) else (value,):
+                words += parameter.opts[-1:] if isinstance(parameter, click.Option) else []
+                words += [] if each is True else [str(each)]
+    return shlex.join([*words, *added])
 
 
 def require_live(asked_for: str) -> None:

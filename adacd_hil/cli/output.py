@@ -45,7 +45,7 @@ EPILOG = explain_statuses(
     FAILURE="failure (a tare: refused)",
     USAGE="wrong usage or configuration",
     PARTIAL="partial result (the log lost something, or a disk is full)",
-    SAFETY_STOP="safety stop (the run faulted or the arm fell silent)",
+    SAFETY_STOP="safety stop (a fault, or a bus or arm that failed, ended the run)",
     BUS_MISSING="bus or devices missing",
     DETECTOR_MISSING="a registered detector can't be used",
     INTERRUPTED="interrupted",
@@ -221,12 +221,16 @@ def answer(as_json: bool, described: Any, text: str, *next_commands: str) -> Non
         show(text, *next_commands)
 
 
+def as_called(command: str) -> str:
+    """Return a command with this program's name as its user typed it; a command of another program unchanged."""
+    called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
+    return f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
+
+
 def suggest(*next_commands: str) -> None:
     """Print commands to run next on standard error, with this program's name as its user typed it."""
-    called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
     for place, command in enumerate(next_commands):
-        typed = f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
-        line = _as_typed(f"{'next:' if place == 0 else '     '} {in_line(typed)}")
+        line = _as_typed(f"{'next:' if place == 0 else '     '} {in_line(as_called(command))}")
         write_screen(painted(f"{line}\n", sys.stderr), sys.stderr)
 
 

@@ -94,10 +94,10 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Truth:
-    """The emulator's truth on its own cycles (m,): external torque (m, 2), Nm, contact, payload, parameters (m, 7).
+    """The emulator's truth in some of its cycles (m,): external torque (m, 2), Nm, and the contact.
 
-    contact_link, contact_index: of the contact in a cycle. Of a long run it has the cycles of contacts and the one
-    after each. Payload and parameters then have cycles of their own, `model_cycle` (k,): those from which on they hold.
+    contact_link, contact_index: of the contact in a cycle; attempt: of each cycle, from 0. Of a long run it has the
+    cycles of contacts and the one after each. payload_kg (k,), theta (k, 7): with the cycles from which on they hold.
     """
 
     cycle: Cycles
@@ -106,11 +106,11 @@ class Truth:
     contact_index: Vector
     payload_kg: Vector
     theta: Vector
-    force_N: Vector | None = None  # size of the contact force (m,)
+    attempt: Cycles
+    model_cycle: Cycles
+    model_attempt: Cycles
+    force_N: Vector | None = None  # size of the contact force (m,); None: of an older emulator
     time_s: Vector | None = None  # of its cycles (m,), since motion start; None: between those of the run
-    model_cycle: Cycles | None = None
-    model_attempt: Cycles | None = None
-    attempt: Cycles | None = None  # of its cycles (m,), from 0; None: all are of one
     span: Span | None = None
     """Cycles that the emulator recorded, whichever are kept; None: all."""
 
@@ -123,7 +123,7 @@ class Truth:
 
         None if the truth is empty. 0 for a cycle before the first.
         """
-        cycles = self.cycle if self.model_cycle is None else self.model_cycle
+        cycles = self.model_cycle
         return max(int(np.searchsorted(cycles, cycle, side="right")) - 1, 0) if cycles.size else None
 
 

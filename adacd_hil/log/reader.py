@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -57,8 +57,6 @@ from adacd_hil.records import (
     PARAMETER_NAMES,
     ContactReport,
     Event,
-    FaultReason,
-    SchemeState,
 )
 
 __all__ = [
@@ -101,11 +99,9 @@ class RunLog:
     summary: dict[str, str]  # frames, messages, dropped, ending, as far as the parts have their ends
     attachments: dict[str, bytes]
     topics: Mapping[str, Series]
-    decoded: Mapping[str, Series]  # by DBC message
     frames: NDArray[Any]  # (n,) of FRAME_DTYPE or LONG_FRAME_DTYPE, both ways, in the order of the bus
     events: list[LoggedEvent]
     contacts: list[tuple[int, ContactReport]]  # when each report was made, ns, and the report
-    parts: int  # files that it was read from
 
     @property
     def is_complete(self) -> bool:
@@ -156,11 +152,9 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
         summary=stream.summary,
         attachments=stream.attachments,
         topics=series,
-        decoded={name.removeprefix(DECODED): values for name, values in series.items() if name.startswith(DECODED)},
         frames=piece.frames,
         events=stream.events(piece),
         contacts=contacts_of(series[CONTACT.name]),
-        parts=stream.parts,
     )
 
 
@@ -197,19 +191,6 @@ def _own_topics(metadata: Mapping[str, str]) -> dict[str, Topic]:
         if payload is not None:
             topics[channel.topic] = Topic(channel.topic, channel.type.name, record_dtype(payload))
     return topics
-
-
-_STATES: Final = {"state": SchemeState, "previous_state": SchemeState, "fault": FaultReason}
-
-
-def check_states(scheme: Series) -> None:
-    """Raise LogError for a record of /scheme with an unknown state or fault; a field that the log lacks passes."""
-    for name, kind in _STATES.items():
-        if name in scheme.fields:
-            odd = np.flatnonzero(~np.isin(scheme.records[name], [int(member) for member in kind]))
-            if odd.size:
-                value, cycle = scheme.records[name][odd[0]], scheme.records["cycle"][odd[0]]
-                raise LogError(f"{SCHEME.name} has {name} {value} in cycle {cycle}, which this version does not know")
 
 
 def contacts_of(series: Series) -> list[tuple[int, ContactReport]]:
@@ -273,7 +254,6 @@ class LogStream:
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, str] = {}
         self.summary: dict[str, str] = {}
-        self.parts = 0
         self.topics: dict[str, Topic] = {}
         """The requested topics that are defined in the parts read so far."""
         self._wanted = topics
@@ -391,7 +371,7 @@ class LogStream:
     def _pieces(self) -> Iterator[Piece]:
         """Yield the messages of all parts in pieces; topics, summary and problem, empty at first, grow meanwhile."""
         builder = PieceBuilder(self._cycles_per_piece, self.epoch_ns)
-        self._problems, self.summary, self.parts = [], {}, 0
+        self._problems, self.summary = [], {}
         joined = -1
         for step in self._plan:
             if isinstance(step, str):
@@ -406,7 +386,6 @@ class LogStream:
             if walk.problem:
                 self._problems.append(walk.problem if self._is_alone else f"{path.name}: {walk.problem}")
             self._problems += [f"{path.name}: {name} has another type than before" for name in sorted(walk.other_types)]
-            self.parts += 1
             self.attachments = {**walk.extras.attachments, **self.attachments}
             self._sum_up(walk.extras.metadata.get(SUMMARY_METADATA, {}))
         if joined == self._last and self.summary.get(ENDING_KEY) == CONTINUED:

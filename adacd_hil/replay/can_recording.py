@@ -24,7 +24,7 @@ from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.drive import DISABLE_CYCLES
 from adacd_hil.device.profile import PlacedDevice
 from adacd_hil.device.recorded_arm import Ticks
-from adacd_hil.log.frames.frame_log import read_frames
+from adacd_hil.log.frames.frame_log import of_one_channel, read_frames
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.reader import LogStream, Piece, Series
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS, receivable_frames
@@ -84,13 +84,14 @@ def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording
     """Read a recording, and put its frames in the order in which the host would have read them.
 
     Frames after all cyclic ones of a cycle, and in real time those after the host's wait, go to the next cycle. Of
-    several CAN channels, only the one with the most SYNCs counts; frames that a `Bus` doesn't receive are dropped. By
-    the DBC's senders the host's frames count as sent. Raises LogError if it can't be read, or has no SYNC with a
-    counter; CodecError if the DBC lacks Sync or a device's cyclic frame.
+    several CAN channels, the one with SYNCs counts; frames that a `Bus` doesn't receive are dropped. By the DBC's
+    senders the host's frames count as sent. Raises LogError if it can't be read, or has no SYNC with a counter, or
+    SYNCs of two channels; CodecError if the DBC lacks Sync or a device's cyclic frame.
     """
     found = read_frames(path)
     sync_id = codec.message("Sync").can_id
-    frames = receivable_frames(_of_busiest_channel(found.frames, sync_id))
+    (syncs,) = of_one_channel([found.frames[found.frames["can_id"] == sync_id]], found.channels, path)
+    frames = receivable_frames(found.frames[np.isin(found.frames["channel"], syncs["channel"])])
     frames["is_tx"] = np.isin(frames["can_id"], [m.can_id for m in codec.messages.values() if "HOST" in m.senders])
     sync = np.flatnonzero((frames["can_id"] == sync_id) & ~frames["is_error"] & (frames["length"] > 0))
     if sync.size == 0:
@@ -116,12 +117,6 @@ def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording
     return CanRecording(
         frames[order], owner[order], number[since][order], offset_ns[order], number, t_ns, is_realtime, found.problem
     )
-
-
-def _of_busiest_channel(frames: NDArray[Any], sync_id: int) -> NDArray[Any]:
-    """Return the frames of the CAN channel with the most SYNCs; all frames without a SYNC."""
-    channels = frames["channel"][frames["can_id"] == sync_id]
-    return frames[frames["channel"] == np.bincount(channels).argmax()] if channels.size else frames
 
 
 def _unwrap(counter: Places, t_ns: Places, period_ns: int) -> Places:

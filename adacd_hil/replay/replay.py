@@ -39,7 +39,7 @@ from adacd_hil.replay.scheme_comparison import (
     different_arithmetic,
 )
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
-from adacd_hil.scheme.pipeline.pipeline import SchemeBatch
+from adacd_hil.scheme.pipeline.pipeline import Pipeline, SchemeBatch
 from adacd_hil.score.emulator_truth import KnownContacts, contacts_beside
 from adacd_hil.score.wording import number_of, unjudged_sentence
 from adacd_hil.settings.configuration import Settings
@@ -109,8 +109,8 @@ class _Player:
         self.attempts = 0
         self._asking = asking
         self._checks_arms = checks_arms
-        self._pipeline = new_pipeline(settings)
-        self._state = SchemeState.INIT
+        self._pipeline: Pipeline  # of the attempt, with which the first stretch begins
+        self._state: SchemeState
         self._reports: dict[int, ContactReport] = {}  # of this part, by time
         self._cycles: dict[int, int] = {}
 

@@ -213,7 +213,7 @@ def _place(row: NDArray[Any]) -> tuple[int, int]:
     return int(row["attempt"][0]), int(row["cycle"][0])
 
 
-_PLAYED = ("scenario", "seed")
+_PLAYED = ("scenario", "seed", "truth")
 
 
 def foreign_truth(log: Path, truth: Path) -> str:

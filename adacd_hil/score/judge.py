@@ -290,13 +290,13 @@ def true_contacts(truth: Truth | None, first_number: int = 1) -> tuple[TrueConta
     found = []
     bounds = contact_bounds(truth.contact_index, truth.attempt)
     for number, (start, end) in enumerate(bounds, first_number):
-        has_after = end < len(truth.cycle) and (truth.attempt is None or truth.attempt[end] == truth.attempt[start])
+        has_after = end < len(truth.cycle) and truth.attempt[end] == truth.attempt[start]
         rows = slice(start, end + int(has_after))
         found.append(
             TrueContact(
                 number=number,
                 link=int(truth.contact_link[start]),
-                attempt=0 if truth.attempt is None else int(truth.attempt[start]),
+                attempt=int(truth.attempt[start]),
                 rows=end - start,
                 cycle=truth.cycle[rows],
                 tau_ext=truth.tau_ext[rows],

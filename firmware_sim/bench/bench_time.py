@@ -88,15 +88,20 @@ class TruthLog(Recorder):
     ) -> None:
         """Create the file. `blocking`: wait for the writer rather than lose a cycle. epoch_ns: added to all times.
 
-        scenario: attached, and its faults are named in the metadata.
+        scenario: attached, and its faults and truth are named in the metadata.
 
         Raises LogExistsError if there is a log already, LogError if it can't be written.
         """
         faults = () if scenario is None else scenario.faults
+        truth = {} if scenario is None or not scenario.truth else {"truth": scenario.truth}
         super().__init__(
             path,
             attachments={} if scenario is None else {SCENARIO_NAME: to_toml(scenario).encode()},
-            metadata={**(metadata or {}), **{f"fault_{index}": row.timed_text for index, row in enumerate(faults)}},
+            metadata={
+                **(metadata or {}),
+                **truth,
+                **{f"fault_{index}": row.timed_text for index, row in enumerate(faults)},
+            },
             epoch_ns=epoch_ns,
             blocking=blocking,
             messages=(),

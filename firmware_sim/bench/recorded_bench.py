@@ -10,11 +10,12 @@ SYNC by the SYNC counter, as the bench counts them; SYNCs that were lost leave a
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from adacd_hil.log.frames.frame_log import open_frames
+from adacd_hil.log.frames.frame_log import of_one_channel, open_frames
 from adacd_hil.records import JOINTS, Vector
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_frames import SYNC_OVERFLOW
@@ -52,6 +53,7 @@ class RecordedCycles:
         """Whether the recording has no more."""
         self._answer_ids = answers_to_sync(codec)
         self._sync_id, self._nmt_id = (codec.message(name).can_id for name in ("Sync", "Nmt"))
+        self._path = path
         self._source = open_frames(path)
         self._cycles = self._read()
         self._next = self._fetch()
@@ -116,14 +118,16 @@ class RecordedCycles:
 
         Error frames, remote frames and those with extended identifiers are left out.
         """
-        wanted = [self._sync_id, self._nmt_id, *self._answer_ids]
-        for frames in self._source:
-            is_data = ~frames["is_error"] & ~frames["is_remote"] & ~frames["is_extended"]
-            chosen = frames[is_data & np.isin(frames["can_id"], wanted)]
+        for chosen in of_one_channel(map(self._chosen, self._source), self._source.channels, self._path):
             for can_id, length, data in zip(
                 chosen["can_id"].tolist(), chosen["length"].tolist(), chosen["data"], strict=True
             ):
                 yield can_id, data[:length].tobytes()
+
+    def _chosen(self, frames: NDArray[Any]) -> NDArray[Any]:
+        is_data = ~frames["is_error"] & ~frames["is_remote"] & ~frames["is_extended"]
+        is_wanted = np.isin(frames["can_id"], [self._sync_id, self._nmt_id, *self._answer_ids])
+        return np.asarray(frames[is_data & is_wanted])
 
 
 _TORQUE = DriveMode.TORQUE

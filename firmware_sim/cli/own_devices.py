@@ -142,6 +142,7 @@ def rehearse_settings(
             raise ConfigError(f"truth {truth_name}: `{name}` = {section!r} must be a table")
         table[name] = {**table.get(name, {}), **section}
     composed, assumed = compose_scenario(told, truth, _counts(codec, devices), table, is_builtin)
+    composed["truth"] = truth.name
     habits = [truth.habits or _maker_habits(device) for device in devices[:JOINTS]]
     if any(one != HabitSettings() for one in habits):
         composed["habits"] = [dict(vars(one)) for one in habits]

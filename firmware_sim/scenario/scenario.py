@@ -23,6 +23,8 @@ reverses devices; `[habits]` are ways of the drives, in place of those of their 
 laid over them. A truth that comes with the package has one mistake that users make, of any arm.
 """
 
+import hashlib
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -214,6 +216,7 @@ class Scenario:
     )
     profile: str = setting("P", choices=tuple(ARMS), meaning="which arm")
     own_arm: EmulatedArm | None = setting(None, meaning="an arm of one's own in place of the profile")
+    truth: str = setting("", meaning="name of the truth in that arm, with the digest of a file")
     seed: int = setting(1, low=0, high=2**63 - 1, meaning="of the sensor noise")
     noise: bool = setting(True, meaning="noise of torque sensors and encoders; quantisation stays")
     start_deg: tuple[float, float] = setting(
@@ -449,9 +452,14 @@ def truth_names() -> list[str]:
 def load_truth(name_or_file: str) -> tuple[ArmTruth, dict[str, Any]]:
     """Return a truth, a built-in name or a TOML file, and its sections `sensors`, `drives`, `mechanics`, unchecked.
 
+    The name of a file gets a digest of its content.
+
     Raises ConfigError if the file is missing, can't be read or has errors.
     """
     table = _read("truth", name_or_file)
+    if name_or_file not in truth_names():
+        content = json.dumps(table, sort_keys=True, default=str).encode()
+        table["name"] = f"{table['name']} {hashlib.sha256(content).hexdigest()[:12]}"
     sections = {key: table.pop(key) for key in SCENARIO_SECTIONS if key in table}
     try:
         return parse(ArmTruth, table), sections

@@ -60,6 +60,9 @@ def make_run(
         contact_index=np.full(count, -1.0),
         payload_kg=np.zeros(count),
         theta=np.tile(THETA, (count, 1)),
+        attempt=zeros,
+        model_cycle=cycle,
+        model_attempt=zeros,
         force_N=np.zeros(count),
     )
     run = Run(

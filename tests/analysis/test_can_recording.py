@@ -78,8 +78,21 @@ def test_the_counter_goes_round_and_a_gap_is_measured_by_time(tmp_path):
     assert recording.number.tolist() == cycles
 
 
-def test_a_recording_without_sync_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["can0 181#0000000000000000"], "no SYNC"),
+        (["can0 080#01", "can1 080#01", "can0 080#02"], "can0 and can1"),
+    ],
+)
+def test_a_recording_without_sync_or_with_that_of_two_buses_is_refused(tmp_path, lines, words):
     path = tmp_path / "bus.log"
-    path.write_text("(0.000000) can0 181#0000000000000000\n")
-    with pytest.raises(LogError, match="no SYNC"):
+    path.write_text("".join(f"(0.000000) {line}\n" for line in lines))
+    with pytest.raises(LogError, match=words):
         load_recording(path, settings_of_run(), CODEC)
+
+
+def test_of_two_buses_the_one_with_sync_counts(tmp_path):
+    path = tmp_path / "bus.log"
+    path.write_text("(0.000) can1 181#00\n(0.001) can0 080#01\n(0.002) can0 080#02\n")
+    assert load_recording(path, settings_of_run(), CODEC).frames["can_id"].tolist() == [0x080, 0x080]

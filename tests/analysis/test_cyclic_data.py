@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from hand_made_run import EPOCH_NS, A, M, make_certified_run, make_run, with_columns, without_cycles
 
+from adacd_hil.lab.report.next_steps import next_steps
 from adacd_hil.lab.score.evaluation import evaluate
+from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.report_wording import percent_text
 from adacd_hil.lab.score.run_arrays import CheckCounts, CycleColumns
-from adacd_hil.lab.score.run_faults import find_faults
+from adacd_hil.lab.score.run_faults import find_breaks, find_faults
 from adacd_hil.lab.score.verdict import data_text
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import Event, SchemeState
@@ -154,16 +156,19 @@ def test_a_run_that_never_booted_has_its_cause_as_verdict():
 
 
 @pytest.mark.parametrize(
-    "changes",
+    ("changes", "is_last"),
     [
-        {"events": (said(9000, "run", "can0 went away"), said(0, "run", "hello", "info"))},
-        {"broken_off": "can0 went away"},
+        ({"events": (said(20_000, "run", "can0 went away"), said(0, "run", "hello", "info"))}, True),
+        ({"events": (said(100, "run", "can0 went away"),)}, False),
+        ({"broken_off": "can0 went away"}, True),
     ],
 )
-def test_what_broke_a_run_off_makes_it_unclean(changes):
-    metrics = evaluate(make_run(**changes))
-    assert metrics.verdict.startswith("The run was broken off: can0 went away; no contact")
-    assert metrics.is_clean is False
+def test_what_broke_a_run_off_makes_it_unclean_and_did_not_end_it_if_cycles_follow(changes, is_last):
+    run = make_run(**changes)
+    metrics = evaluate(run)
+    assert find_breaks(run) == (("can0 went away", is_last),)
+    assert ("began anew: can0 went away; no contact" in metrics.verdict, metrics.is_clean) == (not is_last, False)
+    assert next_steps(metrics, run, ReportSource("run.mcap"))[0][0].command.startswith("adacd-hil demo ")
 
 
 @pytest.mark.parametrize(("metadata", "is_clean"), [({}, True), ({"scenario": "paper"}, False)])

@@ -41,6 +41,7 @@ def make_logs(
         ({"scenario": "idle", "seed": "4"}, {}, 4, ""),
         ({"scenario": "idle", "seed": "4"}, {}, 5, "its seed is 5, the log's 4"),
         ({"scenario": "paper", "seed": "4"}, {}, 4, "its scenario is idle, the log's paper"),
+        ({"truth": "mine 12"}, {"truth": "mine 34"}, None, "its truth is mine 34, the log's mine 12"),
         ({"scenario": "idle"}, {"scenario": "paper"}, None, "its scenario is paper, the log's idle"),
         ({}, {CONFIG_DIGEST_KEY: config_digest(CONFIG)}, None, ""),
         ({}, {CONFIG_DIGEST_KEY: config_digest(f"{CONFIG}[realtime]\ncpu = 'any'\n")}, None, ""),

@@ -86,6 +86,14 @@ def test_a_model_of_another_arm_is_refused(arm, arrays, other):
         )
 
 
+@pytest.mark.parametrize("fitted", ["measured", "derived"])
+def test_a_model_of_the_other_kind_of_velocity_is_refused(arm, arrays, fitted):
+    derived = {name: arrays[name] for name in ("t", "q", "tau_J")}
+    first, second = (arrays, derived) if fitted == "measured" else (derived, arrays)
+    with pytest.raises(ArrayError, match="one kind of velocity"):
+        detect(second, arm, model=fit(first, arm))
+
+
 def test_a_lag_without_velocities_is_refused(arm, arrays):
     with pytest.raises(ArrayError, match=r"^velocity_lag_s = 0.001 s is of dq, which is not given"):
         detect({name: arrays[name] for name in ("t", "q", "tau_J")}, arm, velocity_lag_s=1e-3)

@@ -205,12 +205,13 @@ def test_a_contact_of_a_stretch_is_what_it_is_in_the_whole_log(certified):
 
 def test_a_cut_says_so_and_names_the_topics_that_it_lacks(certified, tmp_path):
     sources = []
-    for name, topics in (("whole", ()), ("part", (SCHEME.name, CYCLE.name))):
+    for name, topics in (("whole", ()), ("part", (SCHEME.name, CYCLE.name)), ("times", (CYCLE.name,))):
         cut(certified, tmp_path / f"{name}.mcap", TimeWindow(end_s=2.0), topics)
         sources.append(read_run(tmp_path / f"{name}.mcap", None).source)
     assert {source.truth_problem for source in sources} == {"the log is a cut of its run until 2 s"}
-    assert [source.is_complete for source in sources] == [True, False]
-    assert [source.log_problem.partition(",")[0] for source in sources] == ["", "it has no /contact and no /events"]
+    assert [source.is_complete for source in sources] == [True, False, False]
+    lacking = ["", "it has no /contact and no /events", "it has no /scheme"]
+    assert [source.log_problem.partition(",")[0] for source in sources] == lacking
 
 
 def test_a_long_stretch_comes_to_the_same_as_one_that_is_kept_whole(few_kept, path):
@@ -245,7 +246,7 @@ def scheme_of(cycles, state=SchemeState.MONITOR):
 def truth_at(cycles, attempt=0):
     nothing = np.zeros(len(cycles))
     cycle, attempts = np.array(cycles), np.full(len(cycles), attempt)
-    truth = Truth(cycle, np.zeros((len(cycles), 2)), nothing, nothing, nothing, nothing, attempt=attempts)
+    truth = Truth(cycle, np.zeros((len(cycles), 2)), nothing, nothing, nothing, nothing, attempts, cycle, attempts)
     return TruthTable(truth, {}, "")
 
 

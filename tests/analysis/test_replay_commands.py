@@ -1,10 +1,12 @@
 """`adacd-hil replay` and `compare`: what they print, and the status that they end with."""
 
 import json
+import shlex
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from analysis.replay_rig import write_candump
 from called import called, complaints
 from log.made_log import flipped as bit_flipped
 from log.made_log import kinds, put_together, rechunk, take_apart
@@ -106,6 +108,15 @@ def test_a_stretch_that_holds_nothing_is_one_line(log, command):
         (said,) = complaints(done)
         assert (done.exit_code, done.stdout) == (code, "")
         assert line in said
+
+
+def test_the_suggested_command_has_what_was_typed(log, tmp_path):
+    recorded = tmp_path / "bus log.log"
+    write_candump(log, recorded)
+    given = ["replay", str(recorded), "--against", str(log), "--frames", "--shown", "3"]
+    (suggested,) = [shlex.split(line, comments=True) for line in called(*given).stderr.splitlines() if "next:" in line]
+    assert suggested == ["next:", "adacd-hil", *given, "--set", "filter.a_rad_s=20"]
+    assert called(*suggested[2:]).exit_code in (OK, PARTIAL)
 
 
 def test_other_settings_stand_beside_the_original(log):

@@ -134,12 +134,14 @@ def test_the_text_says_what_went_wrong_what_to_do_and_where_the_page_is(report):
     assert lines[-1] == f"Report: {report.html_path}"
 
 
-@pytest.mark.long
-def test_text_and_page_say_what_the_log_lacks(report, tmp_path):
-    cut = ReportSource("run.mcap", "cut after 12 s")
-    assert replace(report, source=cut).as_text().splitlines()[1] == "The log is not whole: cut after 12 s"
-    made = write_run_report(make_run((A, 10)), tmp_path, cut)
-    assert "The log is not whole: cut after 12 s" in made.html_path.read_text(encoding="utf-8")
+def test_the_headline_of_a_log_that_is_not_whole_is_its_problem_unless_the_run_went_wrong(report, tmp_path):
+    cut = ReportSource("run.mcap", "cut after 12 s", is_complete=False)
+    assert replace(report, source=cut).as_text().splitlines()[1] == f"- {cut.notice}"
+    made = write_run_report(make_run((A, 1000), (M, 1000)), tmp_path, cut)
+    assert made.metrics.is_clean
+    assert made.as_text().startswith(f"NOT GOOD: {cut.notice}\n")
+    page = made.html_path.read_text(encoding="utf-8")
+    assert (f"<h1>{cut.notice}</h1>" in page.replace("\u00a0", " "), '<header class="bad">' in page) == (True, True)
 
 
 def test_the_page_is_well_formed_and_has_no_inline_style_and_no_foreign_element(html):
@@ -192,10 +194,10 @@ def test_the_first_screen_of_a_bad_run_has_one_cause_and_a_list():
     run = make_run((A, 100), (SchemeState.FAULT, 50), (A, 100), (SchemeState.FAULT, 50))
     cause = "drive1: " + "an error with a very long name, " * 30
     run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("error", "supervisor", f"x; {cause}")),))
-    first, *further = headlines(evaluate(run))
+    first, *further = headlines(evaluate(run), SOURCE)
     assert (first[:30], len(first) <= 160, len(further) >= 2) == ("FAULT (DRIVE) at 0.10 s: drive1"[:30], True, True)
-    first, *_ = headlines(evaluate(make_run((A, 1000), (M, 500), (SchemeState.PAYLOAD, 20), (A, 100))))
-    assert "not again" in first
+    again = make_run((A, 1000), (M, 500), (SchemeState.PAYLOAD, 20), (A, 100))
+    assert "not again" in headlines(evaluate(again), SOURCE)[0]
 
 
 def test_the_headline_of_a_value_outside_its_bounds_has_the_value():
@@ -203,7 +205,7 @@ def test_the_headline_of_a_value_outside_its_bounds_has_the_value():
     bound = ValueBound("torque_of_channel_2 - torque_of_channel_1", "Nm", 0, 1, -0.2, 0.2)
     cause = f"Sensor1: {bound.describe((4.05156, 0.2))}"
     run = replace(run, events=(LoggedEvent(int(run.t_ns[100]), Event("error", "supervisor", f"x; {cause}")),))
-    assert headlines(evaluate(run))[0].endswith(cause)
+    assert headlines(evaluate(run), SOURCE)[0].endswith(cause)
 
 
 def test_every_curve_of_the_plan_has_its_place_on_the_page(html):

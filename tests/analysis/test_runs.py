@@ -28,10 +28,13 @@ from adacd_hil.lab.runs.run_summary import (
     judged,
     reported,
     summarise,
+    with_devices,
 )
 from adacd_hil.lab.runs.run_trend import trends
 from adacd_hil.lab.score.evaluation import evaluate
 from adacd_hil.lab.score.metrics import ReportSource
+from adacd_hil.log.recording.recorder import Recorder
+from adacd_hil.records import Event
 from adacd_hil.settings.configuration_files import load_settings
 
 pytestmark = pytest.mark.slow
@@ -197,6 +200,26 @@ def test_two_arms_of_one_name_have_a_trend_each():
         "lab/P": ["r0", "r2", "r3"],
         "lab/P, arm.link_length_m = [0.45, 0.35]": ["r1", "r4"],
     }
+
+
+def test_runs_without_a_serial_number_in_common_are_of_two_arms_and_without_any_one_is_assumed():
+    old, new, other = ({("drive", serial) for serial in pair} for pair in ((1, 2), (2, 3), (8, 9)))
+    found = trends(series(devices=list(map(frozenset, (old, other, new, (), {("drive", 3)}, other, {("sensor", 8)})))))
+    assert {each.arm: [run.name for run in each.runs] for each in found} == {
+        "lab/P": ["r0", "r2", "r3", "r4"],
+        "lab/P, serial numbers 8": ["r6"],
+        "lab/P, serial numbers 8, 9": ["r1", "r5"],
+    }
+    assert [each.assumed[:6] for each in found] == ["1 of 4", "", ""]
+
+
+def test_the_devices_of_a_run_are_those_with_a_serial_number_in_its_log(one: Path, tmp_path: Path):
+    said = [Event("info", "Drive", f"node 1: vendor 0x1, product 0x2, revision 0x3, serial {n}") for n in (77, 0)]
+    with Recorder(tmp_path / "run.mcap", metadata={"config": "lab"}, blocking=True) as recorder:
+        for event in said:
+            recorder.event(0, event)
+    found = [with_devices(summarise(folder)).devices for folder in (tmp_path, one)]
+    assert found == [{("vendor 0x1, product 0x2", 77)}, set()]
 
 
 def test_an_emulated_arm_is_another_than_that_on_a_bus():

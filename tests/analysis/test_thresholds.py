@@ -33,6 +33,7 @@ from adacd_hil.lab.thresholds.recorded_thresholds import (
 from adacd_hil.log.log_files import LogError
 from adacd_hil.plain_values import plain_values
 from adacd_hil.records import SchemeState
+from adacd_hil.score.judge import TrueContact
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.toml_files import read_toml
 
@@ -70,7 +71,8 @@ def log_of(seconds, seed=1, **changes):
     }
     for name, value in changes.items():
         scheme[name] = value(scheme[name].copy())
-
+    scheme["previous_state"] = np.roll(scheme["state"], 1)
+    scheme["threshold"] = np.full((count, 2), 0.1)
     return Series(scheme)
 
 
@@ -148,6 +150,30 @@ def test_what_is_near_a_contact_a_gap_or_another_state_does_not_count(changes, b
     np.testing.assert_array_equal(is_free, expected)
 
 
+TOUCH = TrueContact(number=1, link=1, cycle=np.array([4990, 5020]), tau_ext=np.full((2, 2), 1.0), rows=1)
+
+
+@pytest.mark.parametrize(
+    ("truth", "free", "false_alarms"),
+    [
+        (None, [*range(601, 4400), *range(6900, 10_000)], None),
+        ((), [*range(601, 5101), *range(6900, 10_000)], 1),
+        ((TOUCH,), [*range(601, 4390), *range(6900, 10_000)], 0),
+    ],
+    ids=["truth unknown", "nobody there", "touched"],
+)
+def test_an_alarm_stands_for_a_contact_unless_the_truth_says_that_nobody_was_there(
+    monkeypatch, truth, free, false_alarms
+):
+    monkeypatch.setattr(module, "contacts_beside", lambda *_: truth if truth is None else (truth, ((0, 0), (0, 9999))))
+    monkeypatch.setattr(module, "logged_settings", lambda _: Settings())
+    reacts = {"state": between(5000, 6300, SchemeState.REACT), "contact_joints": between(5000, 5010, 2)}
+    with logs_of({"run.mcap": log_of(10.0, **reacts)}, 700) as (path,):
+        motion = read_motion(path)
+    assert np.flatnonzero(motion.is_free).tolist() == free
+    assert (motion.alarms, None if motion.contacts is None else motion.false_alarms) == (1, false_alarms)
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -214,7 +240,7 @@ def test_of_long_motion_some_windows_tell_the_lag_and_all_of_it_the_peaks(monkey
 @pytest.mark.slow
 @compiled_only
 def test_thresholds_are_found_limited_by_noise_and_checked(statistics, tmp_path):
-    found = compute_thresholds(statistics, 1.0, ["a.mcap"])
+    found = compute_thresholds(statistics, 1.0)
     rows = {(row.detector, row.channel): row for row in found.channels}
     smooth = rows["smoothed bank", "smoothed 50"]
     # sigma of the torque's noise in that channel is 2.9 mNm, of the velocity's 2.5e-4 rad/s less than that

@@ -14,6 +14,7 @@ import pytest
 from called import called
 
 from adacd_hil.lab.score.rates import least_rate_per_h, rate_bound_per_h, share_bounds
+from adacd_hil.lab.thresholds import free_motion
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.lab.tune import tune_candidates, tune_roc
 from adacd_hil.lab.tune.tune import base_of, best_of, problems_of, slowest_adaptation, suggested_toml, write_tuning
@@ -389,7 +390,7 @@ def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
     cycle = read_log(log, ("/scheme",)).scheme["cycle"].reshape(-1)
     first, last = np.quantile(cycle[whole.motion.is_free], (0.2, 0.8), method="lower").tolist()
     short = contacts, ((attempt, first), (attempt, last))
-    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: short)
+    monkeypatch.setattr(free_motion, "contacts_beside", lambda *_: short)
     (read,) = read_logs([log])
     is_covered = (first <= cycle) & (cycle <= last)
     assert read.motion.is_free.tolist() == (whole.motion.is_free & is_covered).tolist()
@@ -399,7 +400,7 @@ def test_motion_is_free_only_as_long_as_the_truth_goes_on(log, monkeypatch):
 def test_contacts_of_a_later_attempt_are_counted_from_its_beginning(log, monkeypatch):
     (first,), span = contacts_beside(log)
     later = [dataclasses.replace(first, number=n + 1, attempt=n) for n in range(3)]
-    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: (later, span))
+    monkeypatch.setattr(free_motion, "contacts_beside", lambda *_: (later, span))
     (read,) = read_logs([log])
     cycle = read_log(log, ("/scheme",)).scheme["cycle"]
     gap = 1205 - first.onset  # between the attempts
@@ -430,7 +431,7 @@ def test_of_a_stretch_its_motion_and_its_contacts_count(log):
 def test_of_one_log_every_other_contact_is_for_choosing(log, monkeypatch):
     (first,), span = contacts_beside(log)
     three = [dataclasses.replace(first, number=number) for number in (1, 2, 3)]
-    monkeypatch.setattr(tune_roc, "contacts_beside", lambda *_: (three, span))
+    monkeypatch.setattr(free_motion, "contacts_beside", lambda *_: (three, span))
     assert [window.is_chosen_on for window in read_logs([log])[0].windows] == [True, False, True]
 
 

@@ -107,6 +107,16 @@ def test_a_choice_that_leaves_no_frame_is_a_failure(log, listener, options, stat
     assert words in done.output
 
 
+def test_a_recording_of_two_buses_is_refused_unless_the_choice_is_of_one(listener, tmp_path):
+    path = tmp_path / "any.log"
+    path.write_text("(1.0) can0 080#01\n(1.0) can1 080#01\n(1.1) can1 181#0000000000000000\n")
+    done = run(path)
+    assert (done.exit_code, heard(listener), len(done.stderr.splitlines())) == (1, [], 1)
+    assert all(name in done.stderr for name in ("can0", "can1"))
+    assert run(path, "--id", "181").exit_code == 0
+    assert [m.arbitration_id for m in heard(listener)] == [0x181]
+
+
 def test_a_real_bus_gets_what_devices_send_and_commands_when_asked_for(log, listener, monkeypatch):
     monkeypatch.setattr(play_module, "is_virtual", lambda *_: False)
     done = run(log)

@@ -87,7 +87,7 @@ def test_with_the_tare_the_run_sees_no_torque_at_rest_and_the_log_holds_raw_tare
     assert result.exit_code == 0, result.stderr
     log, offset = lab.log, read_tare(lab.tare_file).offset_Nm
     tared = log.scheme["tau_J"]
-    raw = np.column_stack([log.decoded[f"Sensor{joint}Torque"]["torque"] for joint in (1, 2)])[: len(tared)]
+    raw = np.column_stack([log.topics[f"/decoded/Sensor{joint}Torque"]["torque"] for joint in (1, 2)])[: len(tared)]
     np.testing.assert_allclose(tared[:REST_CYCLES].mean(axis=0), 0.0, atol=4 * 0.02 * (1 / 200 + 1 / 300) ** 0.5)
     np.testing.assert_allclose(raw[:REST_CYCLES].mean(axis=0), OFFSET, atol=4 * 0.02 / 200**0.5)
     np.testing.assert_allclose(tared, raw - offset, atol=1e-12)

@@ -76,7 +76,7 @@ def test_a_fault_that_nobody_acknowledges_ends_the_run(tmp_path: Path) -> None:
 def test_torque_begins_with_zero_where_the_arm_is_once_the_drives_are_enabled_again(recovered: Recovered) -> None:
     log, start = recovered.log, recovered.adapt
     quiet = slice(log.scheme.t_ns[recovered.fault], log.scheme.t_ns[recovered.adapt])
-    command = log.decoded["Drive1Command"]
+    command = log.topics["/decoded/Drive1Command"]
     is_quiet = (command.t_ns >= quiet.start) & (command.t_ns < quiet.stop)
     assert np.count_nonzero(is_quiet) > 200
     assert np.count_nonzero(command["target_torque"][is_quiet]) == 0

@@ -203,7 +203,7 @@ def test_what_was_dropped_is_counted_in_one_part_only(tmp_path):
         writer.wait_until_taken()
     word = writer.end()
     log = read_log(path)
-    assert log.parts == int(word["parts"]) >= 3
+    assert len(find_parts(path)) == int(word["parts"]) >= 3
     assert log.problem == "5 packets never reached the log"
     assert missing_in(log) == [5]
 

@@ -48,7 +48,7 @@ def test_parquet_holds_every_topic_bit_for_bit(log, tmp_path):
     assert table["state"] == expected.scheme["state"].tolist()
     assert table["cycle_t_ns"] == table["t_ns"]
     feedback = columns_of(tmp_path / "decoded_Drive1Feedback.parquet")
-    assert feedback["velocity"] == expected.decoded["Drive1Feedback"]["velocity"].tolist()
+    assert feedback["velocity"] == expected.topics["/decoded/Drive1Feedback"]["velocity"].tolist()
     assert columns_of(tmp_path / "events.parquet")["message"] == [event.event.message for event in expected.events]
     assert summary.rows[tmp_path / "contact.parquet"] == len(expected.contacts) == 1
     assert not (tmp_path / "from_can_bus.parquet").exists()
@@ -69,10 +69,10 @@ def test_frames_of_others_become_tables_by_the_contract(log, tmp_path):
         for message in McapReader(log):
             target(message)
     export_tables(tmp_path / "x.blf", tmp_path / "tables", "parquet", ("Drive1*",), load_decoder())
-    expected = read_log(log).decoded
     for name in ("Drive1Feedback", "Drive1Command"):
+        expected = read_log(log).topics[f"/decoded/{name}"]
         table = columns_of(tmp_path / "tables" / f"decoded_{name}.parquet")
-        assert table[expected[name].fields[0]] == expected[name][expected[name].fields[0]].tolist()
+        assert table[expected.fields[0]] == expected[expected.fields[0]].tolist()
 
 
 def test_a_topic_that_is_not_there_names_the_nearest():

@@ -213,3 +213,7 @@ def test_the_largest_share_is_that_of_the_threshold_in_force():
     assert margin.largest_share(memory) == pytest.approx(0.5)
     memory.margin.tail_Nm[1, 1] = 1.25 * MODEL_NM  # where the floor is the threshold in force, it is what counts
     assert margin.largest_share(memory) == pytest.approx(0.4)
+
+
+def test_a_residual_too_small_to_square_makes_no_excursion():
+    assert margin.rate_per_h(10.0, 60.0, 1e-200) == 0.0

@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from adacd_hil.cli.completion import complete_setting
-from adacd_hil.cli.options import FiniteRange, json_option, logs_argument, profile_option, set_option, stretch_options
+from adacd_hil.cli.options import (
+    FiniteRange,
+    json_option,
+    logs_argument,
+    profile_option,
+    set_option,
+    stretch_options,
+    typed_again,
+)
 from adacd_hil.cli.output import (
     CommandError,
     ExitCode,
@@ -17,7 +25,6 @@ from adacd_hil.cli.output import (
     explained,
     format_table,
     one_by_one,
-    quoted,
 )
 from adacd_hil.given_path import GIVEN_FILE, GivenPath
 from adacd_hil.log.log_files import SHOWN
@@ -90,29 +97,22 @@ def replay(logs: tuple[Path, ...], shown: int, as_json: bool, stretch: "TimeWind
     if results:
         described = [_as_json(*result, shown, stretch) for result in results]
         text = "\n\n".join(_as_text(*result, shown, stretch) for result in results)
-        first, (own, *_), _ = results[0]
-        answer(
-            as_json,
-            described,
-            text,
-            *_next(first, own, has_changes=any(options[name] for name in ("changes", "vary", "config"))),
-        )
+        _, (own, *_), names = results[0]
+        answer(as_json, described, text, *_next(own, has_changes=bool(names)))
     codes = [_code(replays) for _, replays, _ in results]
     order = [ExitCode.OK, ExitCode.PARTIAL, ExitCode.FAILURE]
     return complain_of(refused) or max(codes, key=order.index)
 
 
-def _next(given: Path, own: "Replay", has_changes: bool) -> tuple[str, ...]:
-    """Return the commands to suggest after a replay; () if no cycle was replayed.
+def _next(own: "Replay", has_changes: bool) -> tuple[str, ...]:
+    """Return the command to suggest after a replay; () if no cycle was replayed, or with other settings, too.
 
-    given: the log. own: its replay with its own settings. has_changes: other settings were replayed, too.
+    own: the first log's replay with its own settings. has_changes: other settings were replayed, too.
     """
-    if not own.cycles:
+    if has_changes or not own.cycles:
         return ()
-    if has_changes:
-        return (f"adacd-hil sweep {quoted(given)} --vary KEY=A,B,C   # many values at once",)
     key = "certified.noise_sigmas=8" if own.settings.scheme == "certified" else "filter.a_rad_s=20"
-    return (f"adacd-hil replay {quoted(given)} --set {key}   # and with another setting?",)
+    return (f"{typed_again('--set', key)}   # and with another setting?",)
 
 
 _Result = tuple[Path, "list[Replay]", list[str]]

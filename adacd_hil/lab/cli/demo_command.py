@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from adacd_hil.cli.embedded_run import SCENARIO, resolve, run_embedded
-from adacd_hil.cli.output import CommandError, ExitCode, exit_code, quoted, run_folder
+from adacd_hil.cli.output import CommandError, ExitCode, exit_code, run_folder
 from adacd_hil.control.session import LiveView, SessionSummary
 from adacd_hil.error_texts import error_text
 from adacd_hil.log.log_files import LOG_NAME, TRUTH_NAME, LogError
@@ -51,7 +51,9 @@ def play(
         from adacd_hil.lab.report.report_files import write_report
 
         try:
-            report = write_report(summary.log.path, truth_path, folder.path, config=config, scenario=scenario)
+            report = write_report(
+                summary.log.path, truth_path, folder.path, config=config, scenario=scenario, truth=truth or ""
+            )
         except (OSError, LogError) as error:
             status = exit_code(summary)
             if status is ExitCode.OK:
@@ -62,15 +64,6 @@ def play(
     if summary.error:
         raise CommandError(summary.error, exit_code(summary))
     return report, exit_code(summary)
-
-
-def next_of_report(html_path: Path) -> tuple[str, ...]:
-    """Return the commands to suggest after a demo: to open the report, and to replay the log beside it."""
-    log_path = html_path.with_name(LOG_NAME)
-    return (
-        f"xdg-open {quoted(html_path)}",
-        f"adacd-hil replay {quoted(log_path)}   # the same decisions, bit for bit?",
-    )
 
 
 def _ending(summary: SessionSummary) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.options import json_option
+from adacd_hil.cli.options import json_option, typed_again
 from adacd_hil.cli.output import CommandError, ExitCode, answer, explain_statuses, explained, format_table, quoted, show
 from adacd_hil.file_access import write_new_file
 from adacd_hil.file_replacement import replace_file
@@ -85,7 +85,7 @@ def identify(
         tested = read[len(recordings)] if test else None
         progress(f"fitting {sum(recording.duration_s for recording in fitted):.1f} s")
         found = run(described, fitted, tested, read[len(recordings) + bool(test) :])
-    answer(as_json, found.by_key(), _as_text(found), *_next(found, map_path, recordings[0]))
+    answer(as_json, found.by_key(), _as_text(found), *_next(found, recordings[0]))
     if out is not None:
         with Progress() as progress, failing_as(f"pictures in {out} can't be written"):
             _write(found, out)
@@ -125,13 +125,13 @@ def _init(given: tuple[Path, ...], map_path: Path | None) -> ExitCode:
     return ExitCode.OK
 
 
-def _next(found: "Identified", map_path: Path, recording: Path) -> tuple[str, ...]:
+def _next(found: "Identified", recording: Path) -> tuple[str, ...]:
     if found.verdict.remedy:
         return (f"{found.verdict.remedy}; then identify again",)
     if found.watched:
         return ()
-    again = f"adacd-hil identify {quoted(recording)} --map {quoted(map_path)}"
-    return (f"{again} --watch TOUCHED.csv   # contacts in a recording of a touched arm",)
+    again = typed_again("--watch", str(recording))
+    return (f"{again}   # contacts in it; or name a recording of a touched arm",)
 
 
 def _write(found: "Identified", out: Path) -> None:

@@ -32,6 +32,7 @@ from adacd_hil.cli.output import (
     explain_statuses,
     explained,
     print_and_write,
+    quoted,
     writable_folder,
 )
 from adacd_hil.given_path import WRITTEN_FILE, WRITTEN_FOLDER
@@ -84,10 +85,10 @@ def demo(as_json: bool, **options: Any) -> ExitCode:
     The configuration's script plays the user of the paper's experiment, without one that of `demo`. In any other
     scenario this user acknowledges stops, and asks to finish at the scenario's `lasts_s`.
     """
-    from adacd_hil.lab.cli.demo_command import next_of_report, play
+    from adacd_hil.lab.cli.demo_command import play
 
     report, code = play(**options)
-    answer(as_json, report.content, report.as_text(), *next_of_report(report.html_path))
+    answer(as_json, report.content, report.as_text(), f"xdg-open {quoted(report.html_path)}")
     return code
 
 

@@ -165,11 +165,11 @@ class Playback:
         """
         import numpy as np
 
-        from adacd_hil.log.frames.frame_log import open_frames
+        from adacd_hil.log.frames.frame_log import of_one_channel, open_frames
         from adacd_hil.log.types.record_arrays import is_sendable
 
         source = open_frames(self.log)
-        for frames in self.choice.pieces(source):
+        for frames in of_one_channel(self.choice.pieces(source), source.channels, self.log):
             can_go = is_sendable(frames)
             self.unsendable += int(np.count_nonzero(~can_go))
             if self.is_harmless:

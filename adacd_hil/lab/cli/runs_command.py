@@ -169,6 +169,7 @@ def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "R
     more than the standard deviations of both certificates explain.
     """
     from adacd_hil.lab.runs.run_pages import trend_page
+    from adacd_hil.lab.runs.run_summary import with_devices
     from adacd_hil.lab.runs.run_table import write_result
     from adacd_hil.lab.runs.run_trend import trends
 
@@ -177,7 +178,7 @@ def trend(folder: Path, share: float, out: Path | None, as_json: bool, asked: "R
             f"--out {out} doesn't end in .html: a trend is a page, which a browser prints", ExitCode.USAGE
         )
     with Progress() as progress:
-        found = _chosen(folder, asked, True, progress)
+        found = list(map(with_devices, _chosen(folder, asked, True, progress)))
         made = trends(found, share)
         if out is not None:
             write_result(trend_page(made), out)
@@ -254,7 +255,7 @@ def _trend_text(made: "Trend") -> str:
 
     left = f", {len(made.left_out)} left out" if made.left_out else ""
     lines = [in_line(line) for line in (f"{made.arm}: {counted(len(made.runs), 'run')}{left}", made.sentence)]
-    lines += [in_line(line) for line in made.further]
+    lines += [in_line(line) for line in (*made.further, made.assumed) if line]
     lines += [in_line(f"left out: {run.name}: {run.status}: {run.verdict}") for run in made.left_out]
     if made.runs:
         lines += ["", format_table(HEAD[:6], [row_texts(run)[:6] for run in made.runs], right=NUMBERS[:1])]

@@ -9,6 +9,7 @@ from adacd_hil.lab.thresholds.detector_comparison import Comparison, compare_det
 from adacd_hil.lab.thresholds.recorded_thresholds import Thresholds, thresholds_of_logs
 from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.plain_values import json_text
+from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
 
 
@@ -74,6 +75,7 @@ def as_text(thresholds: Thresholds, comparison: Comparison | None) -> str:
     lines += ["", format_table(head, checks, (1, 2, 3, 4))]
     if thresholds.missing:
         lines += ["", f"Too little motion for: {', '.join(thresholds.missing)}"]
+    lines += ["", *(in_line(f"Note: {note}") for note in thresholds.notes)]
     if comparison is not None:
         lines += ["", "Median delay of a step, ms, best detector first:", format_table(*comparison.table())]
     return "\n".join(lines)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from adacd_hil.cli.options import FiniteRange, json_option, logs_argument, stretch_options
+from adacd_hil.cli.options import FiniteRange, json_option, logs_argument, stretch_options, typed_again
 from adacd_hil.cli.output import (
     ExitCode,
     explain_statuses,
@@ -95,14 +95,14 @@ def tune(
 
 
 def _next(log_path: Path, found: "Tuning", out: Path | None) -> tuple[str, ...]:
-    """Return the command to suggest: to write the configuration, or to try the written one `out` on the log.
+    """Return the command to suggest: to write the configuration, or to try the written one `out` on the first log.
 
     () if nothing is suggested.
     """
     if found.best is None:
         return ()
     if out is None:
-        return (f"adacd-hil tune {quoted(log_path)} --out tuned.toml   # writes the suggestion as a configuration",)
+        return (f"{typed_again('--out', 'tuned.toml')}   # writes the suggestion as a configuration",)
     return (f"adacd-hil replay {quoted(log_path)} --config {quoted(out)}   # with these settings",)
 
 

@@ -232,9 +232,9 @@ def detect(
     `qd` and `tau` stand for `t`, `dq` and `tau_J`. All finite; except t, at most 1e6 in size. Gaps in time split them;
     parts of fewer than `SHORTEST_SAMPLES` are left out.
 
-    model: of `fit`, instead of a fit here; it excludes fit_s and scheme. fit_s: span of `t` in which the arm moves
-    freely; default: the first 40 %. A touch in it is learnt. velocity_lag_s: time by which dq is older than tau_J, as
-    behind a tracking loop; 1.25e-3 for the emulated drives. scheme: `OfflineSettings` by name, such as
+    model: of `fit`, with dq as here, instead of a fit here; it excludes fit_s and scheme. fit_s: span of `t` in which
+    the arm moves freely; default: the first 40 %. A touch in it is learnt. velocity_lag_s: time by which dq is older
+    than tau_J, as behind a tracking loop; 1.25e-3 for the emulated drives. scheme: `OfflineSettings` by name, such as
     detection_cutoff_rad_s=20.0, deviations=6.0, noise_Nm=(0.02, 0.02); the default noise is estimated from the arrays.
 
     Raises ArrayError, a ValueError, in one line with quantity, value and bound: for unusable input, too little free
@@ -250,8 +250,11 @@ def detect(
         raise ArrayError(
             f"model is given, and so is {'fit_s' if fit_s is not None else next(iter(scheme))}: choose one"
         )
-    _check_arm(model, arm)
     found = model.identified
+    _check_arm(model, arm)
+    if (has_dq := recording.columns.values.shape[1] > 2 * arm.joints) != bool(found.described.columns.dq):
+        given, fitted = ("given", "without") if has_dq else ("missing", "with")
+        raise ArrayError(f"dq is {given}, the model was fitted {fitted} it: thresholds hold for one kind of velocity")
     period_s = found.settings.period_s
     if not math.isclose(recording.period_s, period_s, rel_tol=0.05):
         raise ArrayError(f"t has a period of {recording.period_s:g} s, the model was fitted at {period_s:g} s")

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from adacd_hil.extras import install_command
 from adacd_hil.file_replacement import has_other_head, replacing
 from adacd_hil.lab.logs.joint_states import joint_state_columns
-from adacd_hil.log.frames.frame_log import open_frames
+from adacd_hil.log.frames.frame_log import of_one_channel, open_frames
 from adacd_hil.log.log_files import LogError, failing_as
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS
@@ -291,7 +291,9 @@ def _export_frames(
     source = open_frames(path)
     owner = f"{path} has frames only, and their contract {decoder.path.name}"
     chosen = choose_topics([DECODED + name for name in decoder.messages], wanted, owner=owner)
-    pieces = iter(source)
+    can_ids = [message.can_id for message in decoder.messages.values()]
+    known = (frames[np.isin(frames["can_id"], can_ids)] for frames in source)
+    pieces = of_one_channel(known, source.channels, path)
     with Tables(out, kind, {"contract": decoder.path.name}) as tables:
         for frames in pieces:
             for name, columns in frame_columns(frames, decoder):

@@ -11,6 +11,7 @@ from typing import NamedTuple
 from adacd_hil.lab.report.page import STEPS, went_wrong
 from adacd_hil.lab.score.metrics import Metrics, ReportSource
 from adacd_hil.lab.score.run_arrays import EMBEDDED, Run
+from adacd_hil.lab.score.run_faults import find_breaks
 from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked
 from adacd_hil.printable import in_line
 from adacd_hil.settings.toml_files import builtin_names, toml_names
@@ -48,7 +49,7 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
 def _repairs(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]:
     """Return a next step for each kind of failure that the run shows; [] if there is none."""
     log = _quoted(source.log_name)
-    has_stopped = bool(metrics.fault) or (not metrics.adaptation_s and run.stretch is None)
+    has_stopped = bool(metrics.fault or find_breaks(run)) or (not metrics.adaptation_s and run.stretch is None)
     stopped = _checked(run, source, "Mend the cause above.")
     late = _checked(run, source, "Frames came late or were lost, more than allowed.")
     rows = (
@@ -86,6 +87,7 @@ def _checked(run: Run, source: ReportSource, text: str) -> NextStep:
     interface, channel = run.metadata.get("interface", ""), run.metadata.get("channel", "")
     if interface in ("", EMBEDDED):
         played = f" --scenario {_scenario(run, source)}" if run.metadata.get("scenario") else ""
+        played += f" --truth {_truth(run, source)}" if run.metadata.get("truth") else ""
         return NextStep(f"{text} Play it again.", f"adacd-hil demo --config {_configuration(run, source)}{played}")
     bus = f"-i {_quoted(interface)} -c {_quoted(channel or 'can0')}"
     return NextStep(
@@ -110,6 +112,12 @@ def _scenario(run: Run, source: ReportSource) -> str:
     return _quoted(source.scenario or (name if is_builtin else f"{name}.toml"))
 
 
+def _truth(run: Run, source: ReportSource) -> str:
+    """Return a run's truth for `demo`, quoted for the shell; where the source lacks it, as of `_configuration`."""
+    name, *digest = run.metadata["truth"].split()
+    return _quoted(source.truth or (f"{name}.toml" if digest else name))
+
+
 def _quoted(text: str) -> str:
     return shlex.quote(in_line(text))
 
@@ -126,6 +134,8 @@ def origin_words(run: Run) -> list[str]:
         words.append(f"on {interface} {said.get('channel', '')}".strip())
     if said.get("scenario"):
         words.append(f"scenario {said['scenario']}")
+    if truth := said.get("truth", said.get("emulator_truth")):
+        words.append(f"truth {truth}")
     if "version" in said:
         words.append(f"adacd-hil {said['version']}")
     return words

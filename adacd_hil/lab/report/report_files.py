@@ -7,11 +7,14 @@ import csv
 import dataclasses
 import io
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from adacd_hil.cli.output import as_called
+from adacd_hil.file_access import exists
 from adacd_hil.file_replacement import replace_files
 from adacd_hil.lab.report.next_steps import NextStep, next_steps
 from adacd_hil.lab.report.page import has_paper, went_wrong
@@ -23,7 +26,7 @@ from adacd_hil.lab.score.evaluation import RunGatherer, evaluate
 from adacd_hil.lab.score.metrics import Metrics, ReportedContact, ReportSource
 from adacd_hil.lab.score.report_wording import number_text
 from adacd_hil.lab.score.run_arrays import Run, section_at
-from adacd_hil.lab.score.verdict import headlines
+from adacd_hil.lab.score.verdict import headlines, is_good
 from adacd_hil.log.log_files import failing_as
 from adacd_hil.log.logged_run import Progress
 from adacd_hil.log.time_window import WHOLE, TimeWindow
@@ -56,9 +59,8 @@ class Report:
 
     def as_text(self) -> str:
         """Return the result of the run, contacts that went wrong, next steps and the report's path, for a terminal."""
-        first, *further = headlines(self.metrics)
-        lines = [in_line(f"{'Good' if self.metrics.is_clean else 'NOT GOOD'}: {first}")]
-        lines += [in_line(self.source.notice)] if self.source.notice else []
+        first, *further = headlines(self.metrics, self.source)
+        lines = [in_line(f"{'Good' if is_good(self.metrics, self.source) else 'NOT GOOD'}: {first}")]
         lines += [in_line(f"- {line}") for line in further]
         wrong = [contact for contact in self.metrics.contacts if went_wrong(contact)]
         if wrong:
@@ -67,7 +69,7 @@ class Report:
             lines += _contact_lines(wrong[:PRINTED_CONTACTS], terminal_columns())
         lines.append("")
         for step in self.next_steps:
-            lines += [in_line(step.text), *([f"    {in_line(step.command)}"] if step.command else [])]
+            lines += [in_line(step.text), *([f"    {in_line(as_called(step.command))}"] if step.command else [])]
         return "\n".join([*lines, in_line(f"Report: {self.html_path}")])
 
 
@@ -96,17 +98,24 @@ def write_report(
     progress: Progress = lambda _: None,
     config: str = "",
     scenario: str = "",
+    truth: str = "",
 ) -> Report:
     """Read a log, or a stretch of it, with the emulator's truth if there is one; write and return its report.
 
     Raises LogError if a log can't be read or the report can't be written, ConfigError for the log's configuration.
-    progress: called with a line on the cycles read. config, scenario: as of `ReportSource`, for the next steps
-    that are returned, which name the log by `log_path`.
+    progress: called with a line on the cycles read. config, scenario, truth: as of `ReportSource`, for the
+    next steps that are returned, which name the log by `log_path`.
     """
     run, gathered, source = read_run(log_path, truth_path, stretch, progress)
     report = write_run_report(run, out_dir, source, gathered)
-    here = source._replace(log_name=str(log_path), config=config, scenario=scenario)
-    return dataclasses.replace(report, next_steps=tuple(next_steps(report.metrics, run, here)[0]))
+    here = source._replace(log_name=str(log_path), config=config, scenario=scenario, truth=truth)
+    return dataclasses.replace(report, next_steps=tuple(map(_placed, next_steps(report.metrics, run, here)[0])))
+
+
+def _placed(step: NextStep) -> NextStep:
+    """Return a next step whose text names the files of its command that aren't where it is typed."""
+    missing = [word for word in shlex.split(step.command) if word.endswith(".toml") and not exists(Path(word))]
+    return step._replace(text=f"{step.text} In the folder of {' and '.join(missing)}:") if missing else step
 
 
 def write_run_report(run: Run, out_dir: Path, source: ReportSource, gathered: RunGatherer | None = None) -> Report:

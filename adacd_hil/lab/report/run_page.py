@@ -53,7 +53,7 @@ from adacd_hil.lab.score.report_wording import (
 )
 from adacd_hil.lab.score.run_arrays import Run
 from adacd_hil.lab.score.run_judge import row_at
-from adacd_hil.lab.score.verdict import LISTED, headlines
+from adacd_hil.lab.score.verdict import LISTED, headlines, is_good
 from adacd_hil.records import Location, Vector
 from adacd_hil.score.smallest_push import PUSH_WITHIN
 from adacd_hil.score.wording import NONE, why_not_found
@@ -370,12 +370,11 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> dict[str, Any]
     words = origin_words(run)
     if run.stretch is not None:
         words.append(stretch_text(run.stretch))
-    first, *further = headlines(metrics)
+    first, *further = headlines(metrics, source)
     return {
         "over": " · ".join(["run report", *words]),
         "headline": first,
-        "is_good": metrics.is_clean,
-        "problems": [source.notice] if source.notice else [],
+        "is_good": is_good(metrics, source),
         "findings": further,
     }
 

@@ -54,11 +54,11 @@ from adacd_hil.lab.score.run_judge import find_detections, timed_contacts, uncov
 from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, DBC_NAME, ENDING_KEY, TRUTH_NAME, LogError
 from adacd_hil.log.log_parts import CUT, PLANNED_ENDINGS
 from adacd_hil.log.logged_run import Cycles, Mask, Milestones, Progress, host_cycles, settings_of
-from adacd_hil.log.reader import LoggedEvent, LogStream, Series, check_states, contacts_of, start_of_log
+from adacd_hil.log.reader import LoggedEvent, LogStream, Series, contacts_of, start_of_log
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, FRAME_CHECKS, SCHEME
 from adacd_hil.printable import one_line
-from adacd_hil.records import JOINTS, ContactReport, CycleRecord, Request, SchemeState
+from adacd_hil.records import JOINTS, ContactReport, CycleRecord, FaultReason, Request, SchemeState
 from adacd_hil.score.emulator_truth import Rows, TruthTable, extreme_rows, foreign_truth, read_truth
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
@@ -176,10 +176,10 @@ def _read(
     progress: called with a line on the cycles read.
     """
     milestones = Milestones(lambda count: progress(f"{stream.path}: {count} cycles read"))
-    cycles = 0
+    cycles, last = 0, (-1, -1)
     for piece in stream:
         scheme = piece.series[SCHEME.name]
-        check_states(scheme)
+        last = _checked(stream.path, scheme, last)
         cycles += len(scheme)
         milestones.reach(cycles)
         series = piece.series
@@ -190,6 +190,31 @@ def _read(
         reading.add_piece(series, stream.events(piece))
         if until_ns is not None and len(scheme) and reading.is_settled(until_ns, int(scheme.t_ns[-1])):
             return
+
+
+_STATES: Final = {"state": SchemeState, "previous_state": SchemeState, "fault": FaultReason}
+
+
+def _checked(path: Path, scheme: Series, last: tuple[int, int]) -> tuple[int, int]:
+    """Return number and time, ns, of the last cycle so far; last: those of the one before the piece.
+
+    Raises LogError for a record of /scheme with an unknown state or fault, or that is not after the one before.
+    """
+    cycle = scheme.records["cycle"].astype(np.int64)
+    for name, kind in _STATES.items():
+        if name in scheme.fields:
+            odd = np.flatnonzero(~np.isin(scheme.records[name], [int(member) for member in kind]))
+            if odd.size:
+                value = scheme.records[name][odd[0]]
+                raise LogError(
+                    f"{SCHEME.name} has {name} {value} in cycle {cycle[odd[0]]}, which this version does not know"
+                )
+    for column, before in zip((cycle, scheme.t_ns), last, strict=True):
+        backward = np.flatnonzero(np.diff(column, prepend=before) <= 0)
+        if backward.size:
+            number = cycle[backward[0]]
+            raise LogError(f"log {path}, {SCHEME.name}: cycle {number} is not after the one before, by number or time")
+    return (int(cycle[-1]), int(scheme.t_ns[-1])) if len(scheme) else last
 
 
 def _with_ending(
@@ -207,7 +232,8 @@ def _with_ending(
         unjudged = f"{TRUTH_NAME} doesn't cover all of MONITOR"
     damage = f"{TRUTH_NAME} is not whole: {truth.problem}" if truth is not None and truth.problem else ""
     of_truth = "; ".join(filter(None, (truth_problem, damage, unjudged)))
-    lacking = [topic for topic in (CONTACT.name, EVENTS.name) if run.cycle.size and topic not in stream.topics]
+    needed = (CONTACT.name, EVENTS.name) if run.cycle.size else (SCHEME.name,) if CYCLE.name in stream.topics else ()
+    lacking = [topic for topic in needed if topic not in stream.topics]
     lacks = f"it has no {' and no '.join(lacking)}, so that not all that happened is known" if lacking else ""
     log_problem = "; ".join(filter(None, (stream.problem, lacks)))
     is_complete = not (log_problem or of_truth)

@@ -209,10 +209,9 @@ def _true_parameter(run: Run, name: str) -> Vector | None:
     truth = run.truth
     if truth is None or name not in PARAMETER_NAMES:
         return None
-    since = truth.cycle if truth.model_cycle is None else truth.model_cycle
-    if not since.size:
+    if not truth.model_cycle.size:
         return None
-    rows = np.maximum(np.searchsorted(since, run.cycle, side="right") - 1, 0)
+    rows = np.maximum(np.searchsorted(truth.model_cycle, run.cycle, side="right") - 1, 0)
     return np.asarray(truth.theta[rows, PARAMETER_NAMES.index(name)])
 
 

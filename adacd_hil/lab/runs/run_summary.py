@@ -30,6 +30,8 @@ from adacd_hil.log.log_files import CONFIG_NAME, EPOCH_KEY, LOG_NAME, TRUTH_NAME
 from adacd_hil.log.log_parts import PLANNED_ENDINGS, parts_of
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import settings_of
+from adacd_hil.log.reader import LogStream
+from adacd_hil.log.types.topics import CYCLE, EVENTS
 from adacd_hil.printable import one_line
 from adacd_hil.records import FRICTION_AT, FRICTION_AT_RAD_S
 from adacd_hil.settings.configuration import Settings
@@ -41,6 +43,8 @@ CERTIFIED, IDENTIFIED, TAKEN_BACK, NO_CERTIFICATE = "certified", "identified", "
 """States of a certificate. `identified`: by the paper's scheme, which issues no certificates."""
 _MOST_REPORT_BYTES: Final = 64 << 20
 _DATED: Final = re.compile(r"(\d{4}-\d\d-\d\d)[T_ ](\d\d)[-:]?(\d\d)[-:]?(\d\d)")
+_IDENTITY: Final = re.compile(r"node \d+: (vendor \S+, product \S+), revision \S+, serial (\d+)")
+"""The event of a device that was identified."""
 _MOTION_START: Final = "-> ADAPT"
 _TO_MONITOR: Final = ("ADAPT -> MONITOR", "CERTIFY -> MONITOR")
 _DAMAGES: Final = (LookupError, TypeError, ValueError, AttributeError)
@@ -69,7 +73,8 @@ class RunSummary:
     verdict: the reason in a sentence. expected: contacts that there were while detection was armed, None on a real arm;
     found: the detected ones of those, or all detections if the run isn't judged. margin: smallest threshold over
     residual. duration_s: from the log's first message to its last. friction_Nm (at FRICTION_AT_RAD_S), offset_Nm: of
-    the first certificate without payload.
+    the first certificate without payload. devices: maker with product, and serial number, of each that has one; none
+    before `with_devices`.
     """
 
     name: str
@@ -96,6 +101,7 @@ class RunSummary:
     offset_std_Nm: Pair | None = None
     duration_s: float | None = None
     settings: Settings | None = None
+    devices: frozenset[tuple[str, int]] = frozenset()
 
     @property
     def is_clean(self) -> bool:
@@ -194,6 +200,18 @@ def judged(summary: RunSummary) -> RunSummary:
         return _with_report(summary, report_json(evaluate(run, gathered), run.metadata, source))
     except (LogError, ValueError) as error:  # a ConfigError is one
         return dataclasses.replace(summary, status=BROKEN, verdict=one_line(error))
+
+
+def with_devices(summary: RunSummary) -> RunSummary:
+    """Return the summary with the devices that the beginning of its log names, unchanged for a log that names none."""
+    try:
+        stream = LogStream(summary.log, (EVENTS.name, CYCLE.name), cycles_per_piece=1, is_ahead=False)
+        piece = next(iter(stream), None)
+        events = [] if piece is None else stream.events(piece)
+    except LogError:
+        return summary
+    told = [match for logged in events if (match := _IDENTITY.fullmatch(logged.event.message))]
+    return dataclasses.replace(summary, devices=frozenset((each[1], int(each[2])) for each in told if int(each[2])))
 
 
 def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:

@@ -7,13 +7,14 @@ identified parameters. If settings of the detection differ from those of the run
 deviations of both certificates together, the bound by which a run doubts the last certificate. The friction that the
 paper's scheme identifies has no deviation, so its changes are not judged. Margins are only drawn.
 
-Runs of an emulated arm in the same process are apart from those of the arm on a bus.
+Runs of an emulated arm in the same process are apart from those of the arm on a bus, and so are runs whose devices have
+no serial number in common.
 
 Shapes: n runs in order of their beginnings, a column for each joint (n, 2).
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -65,7 +66,8 @@ class Trend:
     """The runs of an arm with a judge's figures, the oldest first; left_out: its other runs.
 
     quantities: thresholds, friction and offsets. margins (n,), nan where not known. sentence: on the last change of
-    the thresholds; further: on those of friction and offsets, () without runs.
+    the thresholds; further: on those of friction and offsets, () without runs. assumed: a sentence on runs without
+    serial numbers, "" if all have some.
     """
 
     arm: str
@@ -75,6 +77,7 @@ class Trend:
     margins: Vector
     sentence: str
     further: tuple[str, ...]
+    assumed: str
 
     def by_key(self) -> dict[str, Any]:
         """Return the trend by the keys of `trend --json`: runs, margins, sentences, and values and changes by quantity.
@@ -98,15 +101,16 @@ class Trend:
             },
             "thresholds_last_changed": self.sentence,
             "drift": self.further,
+            "assumed": self.assumed,
         }
 
 
 def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE) -> list[Trend]:
     """Return the trend of each arm, sorted by name; runs that are not judged are left out of it, but listed.
 
-    Runs of one name whose settings are of two arms are apart; the name of the later arm has the settings that differ.
-    threshold_share: share of a threshold; a larger difference is a change. If settings of the detection differ from the
-    run before, `MEANT_SHARE` of it counts.
+    Runs of one name whose settings or devices are of two arms are apart; the name of the later arm has the differing
+    settings or the serial numbers. threshold_share: share of a threshold; a larger difference is a change. If settings
+    of the detection differ from the run before, `MEANT_SHARE` of it counts.
     """
     by_arm: dict[str, list[RunSummary]] = {}
     for run in in_order(runs):
@@ -115,8 +119,22 @@ def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE)
             next((each.settings for each in by_arm.get(name, ()) if each.settings), None), run.settings
         )
         name += "".join(f", {key} = {value}" for key, (_, value) in differing.items())
-        by_arm.setdefault(name, []).append(run)
+        by_arm.setdefault(_by_devices(name, run, by_arm), []).append(run)
     return [_trend(arm, found, threshold_share) for arm, found in sorted(by_arm.items())]
+
+
+def _by_devices(name: str, run: RunSummary, by_arm: Mapping[str, Sequence[RunSummary]]) -> str:
+    """Return the name of a run's arm: `name`, unless the devices of its runs are known and this run has none of them.
+
+    Then the name has the serial numbers. by_arm: earlier runs.
+    """
+    others = [key for key in by_arm if key == name or key.startswith(f"{name}, serial numbers ")]
+    for key in others:
+        known = frozenset().union(*(each.devices for each in by_arm[key]))
+        if not known or not run.devices or known & run.devices:
+            return key
+    serials = ", ".join(str(serial) for serial in sorted(serial for _, serial in run.devices))
+    return f"{name}, serial numbers {serials}" if others else name
 
 
 def arm_of(run: RunSummary) -> str:
@@ -140,6 +158,7 @@ def _trend(arm: str, runs: Sequence[RunSummary], threshold_share: float) -> Tren
         quantity("friction", f"Friction at {FRICTION_AT_RAD_S:g} rad/s, Nm"),
         quantity("offset", "Torque offset, Nm"),
     )
+    unknown = sum(not run.devices for run in judged)
     drifts = (_drift_sentence(found[1], "friction"), _drift_sentence(found[2], "torque offsets")) if judged else ()
     return Trend(
         arm,
@@ -149,6 +168,9 @@ def _trend(arm: str, runs: Sequence[RunSummary], threshold_share: float) -> Tren
         margins=np.array([math.nan if run.margin is None else run.margin for run in judged]),
         sentence=_threshold_sentence(judged, found[0]),
         further=drifts,
+        assumed=f"{unknown} of {len(judged)} logs without a serial number of a device: assumed to be of this arm."
+        if unknown
+        else "",
     )
 
 

@@ -34,7 +34,7 @@ from adacd_hil.lab.score.run_arrays import (
     section_at,
     split_sections,
 )
-from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_causes, find_faults
+from adacd_hil.lab.score.run_faults import CyclicDataGatherer, find_breaks, find_faults
 from adacd_hil.lab.score.run_judge import (
     channels_at,
     contacts_of,
@@ -126,7 +126,7 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
         evidence=evaluate_certified(run, sections, gathered.untouched),
         armed_false_alarms=score.armed_false_alarms if has_truth else None,
     )
-    findings = list_findings(run, metrics, score, faults, find_causes(run))
+    findings = list_findings(run, metrics, score, faults, find_breaks(run))
     return replace(metrics, paper=compare_with_paper(run, metrics), findings=findings)
 
 

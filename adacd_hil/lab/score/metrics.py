@@ -250,7 +250,7 @@ class ReportSource(NamedTuple):
 
     is_complete: log and truth are whole, no packet was dropped on the way to them, and all alarms could be judged.
     log_problem: the parts that the log lacks, one line. truth_problem: why the truth could not judge some or all of the
-    run. config, scenario: names or files that the run was started with; "" if unknown.
+    run. config, scenario, truth: names or files that the run was started with; "" if unknown.
     """
 
     log_name: str
@@ -259,6 +259,7 @@ class ReportSource(NamedTuple):
     truth_problem: str = ""
     config: str = ""
     scenario: str = ""
+    truth: str = ""
 
     @property
     def problem(self) -> str:

@@ -391,9 +391,6 @@ def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> 
     of later attempts, and those after the host's last cycle, are left out: the arm goes on when the host has died.
     """
     rows = table.rows
-    assert rows.attempt is not None
-    assert rows.model_cycle is not None
-    assert rows.model_attempt is not None
     if not rows.model_cycle.size:
         return None
     cycle = host_cycles(rows.cycle, rows.attempt, begins)

@@ -7,7 +7,7 @@ new frame or a repeated one; they are logged once a second, so the counts of the
 ended, are missing.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,20 +60,32 @@ def _cause(run: Run, t_ns: int) -> str:
     return ""
 
 
-def find_causes(run: Run) -> tuple[str, ...]:
-    """Return the logged causes that ended attempts, or the log, without a fault, each once; () without any.
+class Break(NamedTuple):
+    """A logged cause that ended an attempt, or the log, without a fault.
+
+    is_last: the run ended by it; False: it began anew.
+    """
+
+    cause: str
+    is_last: bool
+
+
+def find_breaks(run: Run) -> tuple[Break, ...]:
+    """Return the breaks of a run in their order, each once; () without any.
 
     An interruption by the user counts only if a scenario played: the rest of its script is missing.
     """
+    last_ns = int(run.t_ns[-1]) if run.t_ns.size else 0
     is_scripted = "scenario" in run.metadata
-    said = [
-        event.message
-        for event in (logged.event for logged in run.events)
-        if (event.name == _RUN and event.level == "error") or (event.name == "interrupted" and is_scripted)
-    ]
+    found = []
+    for t_ns, event in run.events:
+        if event.name == _RUN and event.level == "error":
+            found.append(Break(_shortened(event.message), last_ns <= t_ns))
+        elif event.name == "interrupted" and is_scripted:
+            found.append(Break(_shortened(event.message), True))
     if run.broken_off:
-        said.append(run.broken_off)
-    return tuple(dict.fromkeys(map(_shortened, said)))
+        found.append(Break(_shortened(run.broken_off), True))
+    return tuple(dict.fromkeys(found))
 
 
 def _shortened(text: str) -> str:

@@ -20,9 +20,11 @@ from adacd_hil.lab.score.metrics import (
     Finding,
     Metrics,
     PaperRow,
+    ReportSource,
 )
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
 from adacd_hil.lab.score.run_arrays import Run, Section
+from adacd_hil.lab.score.run_faults import Break
 from adacd_hil.lab.score.run_judge import uncovered_watch
 from adacd_hil.log.logged_run import is_armed_in
 from adacd_hil.records import JOINTS
@@ -39,14 +41,11 @@ _NO_LOSS: Final = "no cyclic data was late or lost"
 
 
 def list_findings(
-    run: Run, metrics: Metrics, score: Score, faults: tuple[Fault, ...], causes: tuple[str, ...]
+    run: Run, metrics: Metrics, score: Score, faults: tuple[Fault, ...], breaks: tuple[Break, ...]
 ) -> tuple[Finding, ...]:
-    """Return the findings of a run, failures first. causes: those of attempts that ended without a fault.
-
-    A run without cycles has one bad finding.
-    """
+    """Return the findings of a run, failures first. A run without cycles has one bad finding."""
     if run.cycle.size == 0:
-        cause = "; ".join(causes) or "the log does not say why"
+        cause = "; ".join(each.cause for each in breaks) or "the log does not say why"
         return (Finding(f"no cycle was run: {cause}", True),)
     evidence, adaptation_s, data = metrics.evidence, metrics.adaptation_s, metrics.data
     done = "identified" if evidence is None else "certified"
@@ -65,7 +64,9 @@ def list_findings(
     if evidence is not None and evidence.paper_beside is not None and is_papers_experiment(run):
         beside = _beside_text(list(evidence.paper_beside.adaptation_s.values()))
     grave = _fault_texts(faults)
-    grave += [f"the run was broken off: {'; '.join(causes)}"] if causes else []
+    for is_last, what in ((True, "the run was broken off"), (False, "the run was broken off and began anew")):
+        causes = [each.cause for each in breaks if each.is_last == is_last]
+        grave += [f"{what}: {'; '.join(causes)}"] if causes else []
     grave += evidence.revoked if is_revoked(evidence) else ()
     grave += filter(None, [_blind_text(run)])
     if is_margin_below_1(evidence):
@@ -119,16 +120,24 @@ _HEADLINE_LETTERS: Final = 160
 """Enough for a fault's device, a difference of two signals with long names, its value and its bounds."""
 
 
-def headlines(metrics: Metrics) -> list[str]:
-    """Return the findings as lines for a first screen, the bad ones first, each cut at `_HEADLINE_LETTERS`.
+def is_good(metrics: Metrics, source: ReportSource) -> bool:
+    """Return whether a report is good: no finding is bad, and log and truth have all that the findings are about."""
+    return metrics.is_clean and source.is_complete
 
-    Findings on the paper's scheme beside, and on cyclic data without a loss, are left out.
+
+def headlines(metrics: Metrics, source: ReportSource) -> list[str]:
+    """Return the lines of a first screen: bad findings, the whole notice on log and truth, the other findings.
+
+    A finding is cut at `_HEADLINE_LETTERS`. Findings on the paper's scheme beside, and on cyclic data without a loss,
+    are left out.
     """
-    ordered = sorted(metrics.findings, key=lambda finding: not finding.is_bad)
-    plain = [finding.text for finding in ordered if not finding.text.startswith((_BESIDE, _NO_LOSS))]
-    if metrics.false_alarms == 0:
-        plain = [text.replace(", none false", ", no false alarm") for text in plain]
-    return [textwrap.shorten(text[:1].upper() + text[1:], _HEADLINE_LETTERS, placeholder=" …") for text in plain]
+    lines: dict[bool, list[str]] = {True: [], False: [source.notice] if source.notice else []}
+    for text, is_bad in metrics.findings:
+        if not text.startswith((_BESIDE, _NO_LOSS)):
+            plain = text.replace(", none false", ", no false alarm") if metrics.false_alarms == 0 else text
+            line = textwrap.shorten(plain[:1].upper() + plain[1:], _HEADLINE_LETTERS, placeholder=" …")
+            lines[is_bad].append(line)
+    return lines[True] + lines[False]
 
 
 def is_margin_below_1(evidence: CertifiedEvidence | None) -> TypeGuard[CertifiedEvidence]:

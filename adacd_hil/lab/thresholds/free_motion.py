@@ -1,13 +1,19 @@
 """Contact-free motion in logs: which samples are free of contact, read piece by piece, in bounded memory.
 
 Samples count if they lie in MONITOR, at least `APART_S` after its beginning, after a gap and after a contact, and at
-least as long before a contact. A touch that no detector found counts as free motion.
+least as long before a contact.
 
-Per sample one byte is kept: whether it is free. All other data are read from the log again when needed.
+With truth.mcap beside the log, contacts are the true ones. Then a false alarm counts, with the `BLOCK_S` after it,
+though the arm reacts. Without, each alarm stands for a contact, and a touch that no detector found counts as free
+motion.
+
+Per sample one byte is kept: whether it is free; with the truth also its time, state and thresholds. All other data are
+read from the log again when needed.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,14 +22,26 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from adacd_hil.lab.detectors.detectors import make_stream
+from adacd_hil.lab.score.run_arrays import AttemptBegins
+from adacd_hil.lab.thresholds.false_alarms import BLOCK_S
 from adacd_hil.log.log_files import CONFIG_NAME, LogError
 from adacd_hil.log.log_walk import attachment
-from adacd_hil.log.logged_run import Milestones, Progress, is_armed_in, settings_of
+from adacd_hil.log.logged_run import (
+    Cycles,
+    Milestones,
+    Progress,
+    begins_alarm,
+    host_span,
+    is_armed_in,
+    settings_of,
+)
 from adacd_hil.log.reader import LogStream, Series, begin_of_log
-from adacd_hil.log.time_window import WHOLE, TimeWindow
+from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
-from adacd_hil.records import PARAMETER_NAMES, Vector
+from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.kernel.kernel_samples import LONGEST_SHARE, SHORTEST_SHARE
+from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, contacts_beside, placed_contacts
+from adacd_hil.score.judge import Detection, TrueContact, explained_times, judge
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.setting_keys import changed_keys
 
@@ -48,7 +66,6 @@ _ARM_KEYS: Final = tuple(
 """Settings that another arm has otherwise; limits, signs and zeros may differ between the runs of one arm."""
 
 Mask = NDArray[np.bool_]
-Watch = Callable[[Series], None]
 
 
 @dataclass(frozen=True)
@@ -77,7 +94,9 @@ class LoggedMotion:
     is_free (N,): samples without contact. parameters: number of columns of theta. bounds_ns: the stretch; None: all of
     the log.
 
-    level_rad: q1 at which link 1 is level; 0 without gravity.
+    level_rad: q1 at which link 1 is level; 0 without gravity. t_ns (N,): times; empty if neither wanted nor needed.
+    contacts: the true ones that begin in the motion, None if unknown. alarms, false_alarms: number of those of MONITOR,
+    and of the false ones of them, 0 if the contacts are unknown.
     """
 
     path: Path
@@ -86,6 +105,10 @@ class LoggedMotion:
     is_free: Mask
     bounds_ns: tuple[int, int] | None
     level_rad: float
+    t_ns: Cycles = field(default_factory=lambda: np.zeros(0, np.int64))
+    contacts: tuple[TrueContact, ...] | None = None
+    alarms: int = 0
+    false_alarms: int = 0
 
     def pieces(self) -> Iterator[Motion]:
         """Yield the samples piece by piece, in the order of time. Raises LogError if the log can't be read."""
@@ -121,38 +144,138 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
 
 
 def read_motion(
-    path: Path, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None, watch: Watch = lambda _: None
+    path: Path, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None, with_times: bool = False
 ) -> LoggedMotion:
     """Return the motion in a log, or in a stretch of it, with its contact-free samples marked; reads the log twice.
 
-    A sample is free if it and all within APART_S are armed, without a joint over its threshold, a gap or NaN. progress:
-    called with a line on the cycles read. watch: called with each piece of /scheme. Raises LogError if the log can't be
-    read, has no /scheme or no measured period, or no sample is free of contact.
+    A sample is free if it and all within APART_S are armed, without a contact, a gap or NaN. progress: called with a
+    line on the cycles read. with_times: whether `t_ns` is wanted. Raises LogError if the log can't be read, has no
+    /scheme or no measured period, or no sample is free of contact.
     """
     bounds_ns, where = None, ""
     if not stretch.is_whole:
         bounds_ns, where = stretch.bounds_ns(begin_of_log(path)), f" {stretch.text}"
     period_s = _period(path, bounds_ns, where)
-    parts: list[Mask] = []
+    truth = contacts_beside(path, progress)
+    index = _Index()
+    armed: list[Mask] = []
+    sound: list[Mask] = []
+    alarms: list[int] = []  # rows
     before: int | None = None
     parameters = count = 0
     milestones = Milestones(lambda at: progress(f"{path}: looking for contact-free motion, {at} cycles"))
     for scheme in schemes(path, bounds_ns):
-        watch(scheme)
+        if with_times or truth is not None:
+            index.add_scheme(scheme)
         cycle = scheme["cycle"].astype(np.int64).reshape(-1)
-        is_good = is_armed_in(scheme["state"].reshape(-1)) & (scheme["contact_joints"].reshape(-1) == 0)
-        is_good &= _intervals(scheme, cycle, before, period_s) > 0.0
+        state, previous = (scheme[name].astype(np.uint8).reshape(-1) for name in ("state", "previous_state"))
+        is_over = scheme["contact_joints"].reshape(-1) != 0
+        is_alarm = begins_alarm(previous, state, is_over, np.zeros_like(is_over)) & is_armed_in(previous)
+        alarms += (np.flatnonzero(is_alarm) + count).tolist()
+        armed.append(is_armed_in(state) if truth is not None else is_armed_in(state) & ~is_over)
+        is_sound = _intervals(scheme, cycle, before, period_s) > 0.0
         for name in ("q", "tau_J", "dq", "theta_hat"):
-            is_good &= np.isfinite(scheme[name]).all(axis=1)
-        parts.append(is_good)
+            is_sound &= np.isfinite(scheme[name]).all(axis=1)
+        sound.append(is_sound)
         before, parameters, count = int(cycle[-1]), scheme["theta_hat"].shape[1], count + len(cycle)
         milestones.reach(count)
-    is_free = ~_spread(~np.concatenate(parts), round(APART_S / period_s))
-    if not is_free.any():
+    settings = logged_settings(path) if parameters > len(PARAMETER_NAMES) or truth is not None else None
+    is_armed, is_sound, cycles = np.concatenate(armed), np.concatenate(sound), index.joined()
+    motion = LoggedMotion(
+        path=path,
+        period_s=period_s,
+        parameters=parameters,
+        is_free=_apart(is_armed & is_sound, period_s),
+        bounds_ns=bounds_ns,
+        level_rad=0.0 if settings is None or parameters == len(PARAMETER_NAMES) else settings.level_rad,
+        t_ns=cycles.t_ns,
+        alarms=len(alarms),
+    )
+    if truth is not None and settings is not None:
+        motion = _judged(motion, is_armed, is_sound, cycles, alarms, truth, _begins(motion, index), settings)
+    if not motion.is_free.any():
         raise LogError(f"log {path} has no motion in MONITOR that is free of contact{where}")
-    settings = logged_settings(path) if parameters > len(PARAMETER_NAMES) else None
-    level_rad = 0.0 if settings is None else settings.level_rad
-    return LoggedMotion(path, period_s, parameters, is_free, bounds_ns, level_rad)
+    return motion
+
+
+def _judged(
+    motion: LoggedMotion,
+    is_armed: Mask,
+    is_sound: Mask,
+    cycles: HostCycles,
+    alarms: Sequence[int],
+    truth: KnownContacts,
+    begins: Sequence[int],
+    settings: Settings,
+) -> LoggedMotion:
+    """Return a motion with its true contacts, and free of these alone; its alarms are judged by them.
+
+    is_armed, is_sound (N,): samples in MONITOR, and without gap or NaN. alarms: their rows. begins: first cycle of each
+    attempt. A false alarm's samples are free for `BLOCK_S`, so that the block with its peak is.
+    """
+    counted = [contact.counted_from(begins[contact.attempt]) for contact in truth[0] if contact.attempt < len(begins)]
+    contacts = placed_contacts([each for each in counted if cycles.cycle[0] <= each.end], cycles, settings)
+    is_known = host_span(truth[1], np.array(begins)).covers(cycles.cycle)
+    raised = [Detection(int(cycles.t_ns[row]), True, bool(is_known[row]), row) for row in alarms]
+    false_alarms = judge(contacts, raised).false_alarms
+    is_good, counted_s = is_armed.copy(), BLOCK_S + APART_S
+    for alarm in false_alarms:
+        is_good[alarm.row : alarm.row + round(counted_s / motion.period_s) + 1] = True
+    is_good &= is_sound
+    for first, last in zip(
+        *(np.searchsorted(cycles.t_ns, at).tolist() for at in explained_times(contacts)), strict=True
+    ):
+        is_good[first : last + 1] = False
+    return replace(
+        motion,
+        is_free=_apart(is_good, motion.period_s) & is_known,
+        contacts=tuple(each for each in contacts if motion.bounds_ns is None or cycles.cycle[0] <= each.onset),
+        false_alarms=len(false_alarms),
+    )
+
+
+def _apart(is_good: Mask, period_s: float) -> Mask:
+    """Return the mask (n,) of the samples with only good ones within `APART_S`."""
+    return ~_spread(~is_good, round(APART_S / period_s))
+
+
+class _Index:
+    """Gathers the cycles of a log in growing arrays; joining pieces at the end would need twice the memory."""
+
+    def __init__(self) -> None:
+        self.attempts = AttemptBegins()
+        self._cycle, self._t_ns, self._before, self._threshold = array("q"), array("q"), array("B"), array("d")
+
+    def add_scheme(self, scheme: Series) -> None:
+        """Add the next piece of /scheme, in the order of time. Not after `joined`."""
+        self.attempts.add_cycles(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+        self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
+        self._t_ns.frombytes(scheme.t_ns.tobytes())
+        self._before.frombytes(scheme["previous_state"].astype(np.uint8).tobytes())
+        self._threshold.frombytes(scheme["threshold"].astype(np.float64).tobytes())
+
+    def joined(self) -> HostCycles:
+        """Return all cycles that were added, without a copy; no cycle can be added after that."""
+        return HostCycles(
+            np.frombuffer(self._cycle, np.int64),
+            np.frombuffer(self._t_ns, np.int64),
+            np.frombuffer(self._before, np.uint8),
+            np.frombuffer(self._threshold).reshape(-1, JOINTS),
+        )
+
+
+def _begins(motion: LoggedMotion, index: _Index) -> list[int]:
+    """Return the first cycle of each attempt of a log, attempts before its stretch included.
+
+    index: to which the stretch's /scheme was added. Raises LogError if the log can't be read.
+    """
+    attempts = index.attempts
+    if motion.bounds_ns is not None:
+        attempts = AttemptBegins()
+        for scheme in schemes(motion.path, (EVER_NS[0], motion.bounds_ns[1])):
+            attempts.add_cycles(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
+    begins: list[int] = attempts.begins.tolist()
+    return begins
 
 
 def logged_settings(path: Path) -> Settings | None:

@@ -1,9 +1,8 @@
 """Thresholds from logs: contact-free motion, each detector's statistics on it, and the thresholds.
 
-`free_motion` defines the motion that counts. A touch that no detector found counts, too, and raises thresholds. The
-detectors run over all of this motion, and thresholds come from all of their statistics. The velocity's lag (by
-regression of the stream on the filtered slope of the torque), the stream's covariance and the causes of a threshold
-come from the same motion, of more than `MOST_SAMPLES` from windows of it.
+`free_motion` defines the motion that counts. The detectors run over all of this motion, and thresholds come from all of
+their statistics. The velocity's lag (by regression of the stream on the filtered slope of the torque), the stream's
+covariance and the causes of a threshold come from the same motion, of more than `MOST_SAMPLES` from windows of it.
 """
 
 from collections.abc import Sequence
@@ -48,6 +47,7 @@ from adacd_hil.log.logged_run import Milestones, Progress
 from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.records import JOINTS, PARAMETER_NAMES, Vector
 from adacd_hil.scheme.model.regressor import mass_matrix
+from adacd_hil.score.wording import number_of
 
 _LONGEST_LAG_S: Final = 5e-3
 _MODEL_RAD_S: Final = 20.0
@@ -186,7 +186,7 @@ class Thresholds:
     """Thresholds for a wanted rate of false alarms of a detector, from `hours` of contact-free motion in the logs.
 
     is_extrapolated: less than one alarm is expected in that motion. lag_s: of the velocity, identified. missing:
-    detectors whose tail can't be fitted from this motion.
+    detectors whose tail can't be fitted from this motion. notes: a line for each log, on how its alarms count.
     """
 
     rate_per_h: float
@@ -195,6 +195,7 @@ class Thresholds:
     lag_s: float
     logs: tuple[str, ...]
     missing: tuple[str, ...]
+    notes: tuple[str, ...]
     detectors: tuple[DetectorRow, ...]
     channels: tuple[ChannelRow, ...]
 
@@ -220,10 +221,10 @@ def calibrate_all(
     return found, tuple(missing)
 
 
-def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence[str] = ()) -> Thresholds:
+def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence[LoggedMotion] = ()) -> Thresholds:
     """Return thresholds of all detectors for a rate of false alarms, with bounds, checks and causes; write no file.
 
-    logs: names of the logs, stored in the result. Raises TooLittleMotionError if no detector's tail can be fitted.
+    logs: of the statistics, named in the result. Raises TooLittleMotionError if no detector's tail can be fitted.
     """
     calibrated, missing = calibrate_all(statistics, rate_per_h)
     rows, channel_rows = [], []
@@ -241,11 +242,20 @@ def compute_thresholds(statistics: Statistics, rate_per_h: float, logs: Sequence
         hours=statistics.hours,
         is_extrapolated=any(calibration.extrapolation > 1.0 for _, calibration in calibrated.values()),
         lag_s=statistics.lag_s,
-        logs=tuple(logs),
+        logs=tuple(str(log.path) for log in logs),
         missing=missing,
+        notes=tuple(map(_alarms_note, logs)),
         detectors=tuple(rows),
         channels=tuple(channel_rows),
     )
+
+
+def _alarms_note(log: LoggedMotion) -> str:
+    """Return a line on how the alarms of a log count."""
+    alarms = number_of(log.alarms, "detection")
+    if log.contacts is None:
+        return f"{log.path}: the true contacts are not known: {alarms} in MONITOR counted as contacts, none as false"
+    return f"{log.path}: {alarms} in MONITOR, {log.false_alarms} of them false by the truth"
 
 
 def check_prediction(peaks: Vector) -> tuple[float, float] | None:
@@ -331,4 +341,4 @@ def thresholds_of_logs(
             raise LogError(f"log {path} has {log.parameters} parameters")
         logs.append(log)
     statistics = run_detectors(logs, progress)
-    return compute_thresholds(statistics, rate_per_h, [str(path) for path in paths]), statistics
+    return compute_thresholds(statistics, rate_per_h, logs), statistics

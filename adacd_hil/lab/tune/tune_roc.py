@@ -10,7 +10,6 @@ other log; of one log, on every other tenth of its time, and its contacts altern
 import dataclasses
 import hashlib
 import math
-from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,6 @@ from numpy.typing import NDArray
 from adacd_hil.file_access import open_input
 from adacd_hil.lab.score.rates import rate_bound_per_h, share_bounds
 from adacd_hil.lab.score.report_wording import delay_figures
-from adacd_hil.lab.score.run_arrays import AttemptBegins
 from adacd_hil.lab.thresholds.false_alarms import (
     BLOCK_S,
     TailCalibration,
@@ -32,14 +30,12 @@ from adacd_hil.lab.thresholds.false_alarms import (
     counted_hours,
     largest_ratio,
 )
-from adacd_hil.lab.thresholds.free_motion import APART_S, LoggedMotion, read_motion, schemes
+from adacd_hil.lab.thresholds.free_motion import LoggedMotion, read_motion
 from adacd_hil.log.log_files import LogError
-from adacd_hil.log.logged_run import Progress, host_span
-from adacd_hil.log.reader import Series
-from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
-from adacd_hil.records import JOINTS, Vector
+from adacd_hil.log.logged_run import Progress
+from adacd_hil.log.time_window import WHOLE, TimeWindow
+from adacd_hil.records import Vector
 from adacd_hil.replay.log_source import LogSource
-from adacd_hil.score.emulator_truth import HostCycles, contacts_beside, placed_contacts
 from adacd_hil.score.judge import Times, TrueContact, explained_times
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
@@ -313,71 +309,16 @@ def _read(path: Path, place: int, count: int, config: str | None, stretch: TimeW
     its contract can't be used.
     """
     own = LogSource(path).settings
-    parts = _Index()
-    motion = read_motion(path, stretch, progress, parts.add_scheme)
-    index = parts.joined()
-    truth = contacts_beside(path, progress)
-    blocks = -(-len(index.t_ns) // round(BLOCK_S / motion.period_s))
+    motion = read_motion(path, stretch, progress, with_times=True)
+    blocks = -(-len(motion.t_ns) // round(BLOCK_S / motion.period_s))
     tenths = np.arange(blocks) * _TENTHS // blocks
     is_all_chosen_on = None if count == 1 else place % 2 == 0
     is_chosen_on = tenths % 2 == 0 if is_all_chosen_on is None else np.full(blocks, is_all_chosen_on)
-    windows = None
-    if truth is not None:
-        begins = _begins(motion, parts)
-        contacts = [
-            contact.counted_from(begins[contact.attempt]) for contact in truth[0] if contact.attempt < len(begins)
-        ]
-        if not stretch.is_whole:
-            contacts = [contact for contact in contacts if index.cycle[0] <= contact.onset]
-        windows = _windows(placed_contacts(contacts, index, own), index.t_ns, is_all_chosen_on)
-        is_free = motion.is_free & host_span(truth[1], np.array(begins)).covers(index.cycle)
-        apart = round(APART_S / motion.period_s)
-        for window in windows:
-            is_free[max(window.first - apart, 0) : window.last + apart] = False
-        motion = dataclasses.replace(motion, is_free=is_free)
+    windows = None if motion.contacts is None else _windows(motion.contacts, motion.t_ns, is_all_chosen_on)
     with open_input(path) as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     settings = own if config is None else keep_log_settings(own, load_settings(config, own.arm.profile))
-    return TunedLog(path, digest, settings, motion, index.t_ns, windows, is_chosen_on, stretch)
-
-
-class _Index:
-    """Gathers the cycles of a log in growing arrays; joining pieces at the end would need twice the memory."""
-
-    def __init__(self) -> None:
-        self.attempts = AttemptBegins()
-        self._cycle, self._t_ns, self._before, self._threshold = array("q"), array("q"), array("B"), array("d")
-
-    def add_scheme(self, scheme: Series) -> None:
-        """Add the next piece of /scheme, in the order of time. Not after `joined`."""
-        self.attempts.add_cycles(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
-        self._cycle.frombytes(scheme["cycle"].astype(np.int64).tobytes())
-        self._t_ns.frombytes(scheme.t_ns.tobytes())
-        self._before.frombytes(scheme["previous_state"].astype(np.uint8).tobytes())
-        self._threshold.frombytes(scheme["threshold"].astype(np.float64).tobytes())
-
-    def joined(self) -> HostCycles:
-        """Return all cycles that were added, without a copy; no cycle can be added after that."""
-        return HostCycles(
-            np.frombuffer(self._cycle, np.int64),
-            np.frombuffer(self._t_ns, np.int64),
-            np.frombuffer(self._before, np.uint8),
-            np.frombuffer(self._threshold).reshape(-1, JOINTS),
-        )
-
-
-def _begins(motion: LoggedMotion, parts: _Index) -> list[int]:
-    """Return the first cycle of each attempt of a log, attempts before its stretch included.
-
-    parts: to which the stretch's /scheme was added. Raises LogError if the log can't be read.
-    """
-    attempts = parts.attempts
-    if motion.bounds_ns is not None:
-        attempts = AttemptBegins()
-        for scheme in schemes(motion.path, (EVER_NS[0], motion.bounds_ns[1])):
-            attempts.add_cycles(scheme["cycle"].reshape(-1), scheme["state"].reshape(-1))
-    begins: list[int] = attempts.begins.tolist()
-    return begins
+    return TunedLog(path, digest, settings, motion, motion.t_ns, windows, is_chosen_on, stretch)
 
 
 def _windows(contacts: Sequence[TrueContact], t_ns: Times, is_all_chosen_on: bool | None) -> tuple[Window, ...]:

@@ -11,10 +11,12 @@ lib.h.
 """
 
 import importlib.util
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from adacd_hil.extras import install_command
 from adacd_hil.log.frames.mcap_frames import McapFrames
@@ -59,3 +61,17 @@ def read_frames(path: Path) -> FrameLog:
     source = open_frames(path)
     pieces = [np.zeros(0, RECORDED_FRAME_DTYPE), *source]
     return FrameLog(tuple(source.channels), np.concatenate(pieces), source.epoch_ns, source.problem)
+
+
+def of_one_channel(pieces: Iterable[NDArray[Any]], channels: Sequence[str], path: Path) -> Iterator[NDArray[Any]]:
+    """Yield the arrays of frames, chosen from a recording, as long as all are of one of its CAN channels.
+
+    channels: names, complete up to the frames yielded. Raises LogError, before it yields them, for frames of a second.
+    """
+    met: set[int] = set()
+    for frames in pieces:
+        met.update(np.unique(frames["channel"]).tolist())
+        if len(met) > 1:
+            names = " and ".join(channels[number] or "one without a name" for number in sorted(met))
+            raise LogError(f"{path} has frames of more than one CAN channel, {names}: give a recording of one bus")
+        yield frames

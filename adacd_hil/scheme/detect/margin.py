@@ -130,7 +130,7 @@ def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> flo
     excursions_Hz: nu, independent excursions per second. seen_s: T. largest_share: s, largest residual in T over the
     threshold; 1 / s = m(T) gives RATE. 0 without a residual.
     """
-    if not largest_share > 0.0:
+    if not largest_share**2 > 0.0:
         return 0.0
     seen = max(excursions_Hz * max(seen_s, 1.0), 1.01)
     return float(HOUR_S * excursions_Hz * seen ** (-1.0 / largest_share**2))
