@@ -82,6 +82,13 @@ def test_joints_are_explained_though_their_sensors_have_no_noise_and_the_margin_
     assert "contacts show from about joint" in remark
 
 
+def test_a_coarse_sensor_is_not_clipped_and_rare_rows_have_no_jump(tmp_path, upright):
+    rare = record(urdf_text(2, UPRIGHT), 40.0, 0.05)
+    for motion in (replace(upright, tau=upright.tau.round()), replace(rare, q=rare.q * [1.0, 1.9])):
+        verdict = judged(tmp_path, motion).verdict
+        assert not re.search("clipped|jumps", " ".join([*verdict.reasons, *verdict.remarks]))
+
+
 # What can't be explained.
 
 
@@ -123,6 +130,12 @@ def two_sources(motion: Motion) -> Motion:
 def set_to_zero_anew(motion: Motion) -> Motion:
     q = motion.q.copy()
     q[1000:, 1] += 0.12
+    return replace(motion, q=q)
+
+
+def held(motion: Motion) -> Motion:
+    q = motion.q.copy()
+    q[850:1000, 1] = q[850, 1]
     return replace(motion, q=q)
 
 
@@ -177,6 +190,11 @@ UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
         set_to_zero_anew,
         r"the position of joint2 \(q2\) jumps by 0.1.* rad at 5 s: its zero has changed",
         "--from and --until",
+    ),
+    "an encoder that stands still for a while": (
+        held,
+        r"the position of joint2 \(q2\) jumps by .* rad at 5 s: it was stuck before",
+        "check that encoder",
     ),
     "positions that are noise": (
         lambda m: replace(m, q=30.0 * noise(m.q.shape)),
