@@ -196,6 +196,11 @@ UNEXPLAINED: dict[str, tuple[Callable[[Motion], Motion], str, str]] = {
         r"the position of joint2 \(q2\) jumps by .* rad at 5 s: it was stuck before",
         "check that encoder",
     ),
+    "a torque that is late": (
+        lambda m: replace(m, tau=np.column_stack([m.tau[:, 0], np.roll(m.tau[:, 1], 8)])),
+        "the torque of joint2 is late, by about 40 ms",
+        "shift what is late",
+    ),
     "positions that are noise": (
         lambda m: replace(m, q=30.0 * noise(m.q.shape)),
         "the position of joint1 (q1) and joint2 (q2) is noise",
@@ -490,9 +495,10 @@ def test_torques_of_a_third_of_what_the_masses_need_are_a_remark(tmp_path, uprig
     verdict = judged(tmp_path, replace(upright, tau=0.35 * upright.tau)).verdict
     assert any(remark.startswith("the torques are 0.3") and "a gain is wrong" in remark for remark in verdict.remarks)
     assert verdict.is_explained
-    late = judged(tmp_path, replace(upright, tau=np.roll(0.35 * upright.tau, 16, axis=0))).verdict
-    assert not late.is_explained
-    assert any(remark.startswith("the torques are 0.3") for remark in late.remarks)
+    cogging = replace(upright, tau=0.35 * upright.tau * (1.0 + 0.04 * np.sin(9.0 * upright.q)))
+    verdict = judged(tmp_path, cogging).verdict
+    assert not verdict.is_explained
+    assert any(remark.startswith("the torques are 0.4") for remark in verdict.remarks)
 
 
 def test_masses_of_a_urdf_that_are_none_make_no_verdict(tmp_path, upright):
