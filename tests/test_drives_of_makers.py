@@ -63,6 +63,10 @@ KINDS = {
     .without(*(f"{record}sub{sub}" for record in ("1600", "1A00", "1A01") for sub in range(3, 9)))
     .with_value(380_000, "6076")
     .with_value(30, "6091sub1"),
+    "a gear of 169 : 6 behind an encoder that the EDS leaves open": EdsVariant()
+    .with_value(169, "6091sub1")
+    .with_value(6, "6091sub2")
+    .with_value("", "608Fsub1"),
     "one increment from the factory": EdsVariant().with_value(1, "608Fsub1", "6091sub1"),
     "fixed mapping with the mode in it": fixed_pdos(),
 }

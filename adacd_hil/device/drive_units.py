@@ -56,12 +56,13 @@ class DriveUnits(NamedTuple):
         return (self.increments_per_joint_rev or 0.0) >= LEAST_INCREMENTS
 
     def is_other_gear(self, ratio: float) -> bool:
-        """Return whether 0x6091 contradicts a profile's `scale.gear_ratio`; False if the drive has no 0x6091.
+        """Return whether 0x6091 differs from a profile's `scale.gear_ratio` by more than 0.1 %; False without 0x6091.
 
         1 in the profile doesn't contradict: 0x6076 is then the joint's. Nor does 1 : 1 in the drive, the factory's
         value.
         """
-        return self.gear_ratio not in (None, 1.0) and ratio not in (1.0, self.gear_ratio)
+        is_stated = self.gear_ratio not in (None, 1.0) and ratio != 1.0
+        return is_stated and not math.isclose(ratio, self.gear_ratio or 0.0, rel_tol=1e-3)
 
 
 def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:

@@ -64,25 +64,26 @@ def parse_eds(data: bytes, path: Path, node_id: int | None) -> Any:
 
 @functools.lru_cache(maxsize=32)
 def _parse(data: bytes, node_id: int | None) -> Any:
-    """Check an EDS with `_check_eds`; return canopen's object dictionary of it, the same one for the same arguments."""
+    """Check an EDS; return canopen's object dictionary of it, the same one for the same arguments."""
     text = data.decode("utf-8", "replace").removeprefix("\ufeff")
-    _check_eds(text)
-    stream = io.StringIO(readable_eds(text))
+    if found := _EDS_CONTROL.search(text):
+        line = text.count("\n", 0, found.start()) + 1
+        raise ConfigError(f"line {line} has the control character 0x{ord(found[0]):02X}")
+    text = readable_eds(text)
+    _check_numbers(text)
+    stream = io.StringIO(text)
     stream.name = "object dictionary.eds"
     return canopen.import_od(stream, node_id)
 
 
-def _check_eds(text: str) -> None:
-    """Raise ConfigError for control characters, no object, and values or types of objects that are no numbers.
+def _check_numbers(text: str) -> None:
+    """Raise ConfigError for no object, and values or types of objects that are no numbers. text: as of `readable_eds`.
 
-    The values are those of standard integer objects. Raises configparser.Error for a text that is no INI file.
+    The values are those of standard integer objects.
     """
-    if found := _EDS_CONTROL.search(text):
-        line = text.count("\n", 0, found.start()) + 1
-        raise ConfigError(f"line {line} has the control character 0x{ord(found[0]):02X}")
-    eds = configparser.RawConfigParser(inline_comment_prefixes=(";",))
+    eds = configparser.RawConfigParser()
     eds.optionxform = str  # type: ignore[assignment,method-assign]
-    eds.read_string(text, "object dictionary.eds")
+    eds.read_string(text)
     objects = [section for section in eds.sections() if _EDS_OBJECT.fullmatch(section)]
     if not objects:
         raise ConfigError("no object is in it")

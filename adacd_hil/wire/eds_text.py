@@ -1,48 +1,57 @@
-"""Repairs the text of an EDS: removes or completes sections that make canopen refuse the file.
+"""Repairs the text of an EDS, where the files of makers differ from what canopen reads.
 
-Vendors announce comments and omit them, leave numbers of `[DeviceInfo]` empty, and list dummies that don't exist.
-canopen reads these sections first, and fails on each of them.
+Vendors announce comments and omit them, leave numbers of `[DeviceInfo]` empty, list dummies that don't exist, write
+sub-indices before their object or in short form (CompactSubObj), and mind no case. Source: CiA 306.
 """
 
-import re
-from collections.abc import Iterator
+import configparser
+import io
 
-_SECTION = re.compile(r"\s*\[([^\]]*)\]")
-_DEVICE_NAMES = ("vendorname", "productname", "ordercode")
-_DUMMIES = range(1, 8)
-_USED_DUMMY = re.compile(r"\s*Dummy(\d{4})\s*=\s*(0x0*)?1\s*(;.*)?", re.IGNORECASE)
+_DEVICE_NAMES = ("VendorName", "ProductName", "OrderCode")
+_DUMMIES = tuple(f"Dummy{number:04d}" for number in range(1, 8))
+_KEYS = ("ParameterName", "ObjectType", "DataType", "AccessType", "DefaultValue", "ParameterValue", "PDOMapping")
+_SPELLINGS = {key.lower(): key for key in _KEYS}
+_COUNT = {"ParameterName": "Number of entries", "DataType": "5", "AccessType": "ro"}
 
 
 def readable_eds(text: str) -> str:
-    """Return the text without `[Comments]` and unreadable numbers of `[DeviceInfo]`.
+    """Return the text as canopen reads it, without `[Comments]` and unreadable numbers of `[DeviceInfo]`.
 
-    `[DummyUsage]`, if present, is written anew with exactly the dummies 1 to 7, each used or not as in the text.
+    `[DummyUsage]`, if present, has exactly the dummies 1 to 7, each used or not as in the text. Raises
+    configparser.Error for a text that is no INI file, or has no section.
     """
-    return "\n".join(_readable(text.splitlines()))
+    given, eds = _parser(), _parser()
+    given.read_string(text, "object dictionary.eds")
+    if not given.sections():
+        raise configparser.Error("the file is empty: it has no section")
+    given.remove_section("Comments")
+    for name in sorted(given.sections(), key=len):  # an object before its sub-indices
+        rows = dict(given[name])
+        if name == "DeviceInfo":
+            rows = {key: value for key, value in rows.items() if key in _DEVICE_NAMES or _number(value) is not None}
+        elif name.lower() == "dummyusage":
+            rows = {key: str(int(_number(rows.get(key, "")) == 1)) for key in _DUMMIES}
+        subs = _number(rows.pop("CompactSubObj", "")) or 0
+        eds[name.replace("SUB", "sub")] = rows
+        if subs:
+            default, at = rows.get("DefaultValue", ""), f"{name}Value"
+            eds[f"{name}sub0"] = _COUNT | {"DefaultValue": str(subs)}
+            for sub in range(1, min(subs, 254) + 1):
+                eds[f"{name}sub{sub:X}"] = rows | {"DefaultValue": given.get(at, str(sub), fallback=default)}
+            given.remove_section(f"{name}Name")
+    stream = io.StringIO()
+    eds.write(stream)
+    return stream.getvalue()
 
 
-def _readable(lines: list[str]) -> Iterator[str]:
-    """Yield the lines that `readable_eds` keeps, and those of `[DummyUsage]` that it writes."""
-    section = ""
-    for line in lines:
-        if head := _SECTION.match(line):
-            section = head[1].strip().lower()
-            if section != "comments":
-                yield line
-            if section == "dummyusage":
-                used = {int(dummy[1]) for line in lines if (dummy := _USED_DUMMY.fullmatch(line))}
-                yield from (f"Dummy{number:04d}={int(number in used)}" for number in _DUMMIES)
-        elif section not in ("comments", "dummyusage") and (section != "deviceinfo" or _is_device_datum(line)):
-            yield line
+def _parser() -> configparser.RawConfigParser:
+    parser = configparser.RawConfigParser(inline_comment_prefixes=(";",))
+    parser.optionxform = lambda name: _SPELLINGS.get(name.lower(), name)  # type: ignore[assignment,method-assign]
+    return parser
 
 
-def _is_device_datum(line: str) -> bool:
-    """Return whether canopen can read a line of `[DeviceInfo]`: no entry, a name, or an entry with an integer."""
-    key, is_pair, value = line.partition("=")
-    if not is_pair or key.strip().lower() in _DEVICE_NAMES:
-        return True
+def _number(text: str) -> int | None:
     try:
-        int(value.partition(";")[0].strip(), 0)
+        return int(text, 0)
     except ValueError:
-        return False
-    return True
+        return None

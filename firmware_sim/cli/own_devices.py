@@ -227,9 +227,10 @@ def _counts_of_position(device: PlacedDevice) -> dict[tuple[int, int], int]:
     scale = device.settings.scale
     told_in, told_out = _default(device, 0x6091, 1), _default(device, 0x6091, 2)
     gear = Fraction(told_in, told_out) if told_in and told_out else Fraction(scale.gear_ratio).limit_denominator(1000)
+    encoder = Fraction(scale.increments_per_joint_rev).limit_denominator(1000) / gear
     return {
-        (0x608F, 1): round(scale.increments_per_joint_rev / gear),
-        (0x608F, 2): 1,
+        (0x608F, 1): encoder.numerator,
+        (0x608F, 2): encoder.denominator,
         (0x6091, 1): gear.numerator,
         (0x6091, 2): gear.denominator,
         (0x6092, 1): round(scale.increments_per_joint_rev),

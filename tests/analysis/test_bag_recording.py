@@ -167,11 +167,13 @@ def test_a_topic_of_the_map_that_a_bag_lacks_names_the_nearest(tmp_path):
 def test_damaged_and_missing_bags_are_one_line(tmp_path, described):
     whole = write_mcap(tmp_path / "whole.mcap", states()).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "footer.mcap").write_bytes(whole[:-28] + (1 << 60).to_bytes(8, "little") + whole[-20:])
     (tmp_path / "head.bag").write_bytes(b"#ROSBAG V2.0\n" + bytes(40))
     (tmp_path / "folder").mkdir()
     (tmp_path / "other.db3").write_bytes(b"SQLite format 3\0" + bytes(100))
     for name, said in (
         ("cut.mcap", "`adacd-hil log recover` saves"),
+        ("footer.mcap", "`adacd-hil log recover` saves"),
         ("head.bag", "can't be read"),
         ("folder", "has no metadata.yaml"),
         ("other.db3", "can't be read"),

@@ -185,7 +185,7 @@ REFUSED = {
     "milliseconds": (
         table(lambda k, q, tau: f"{5 * k},{q},{tau}"),
         [],
-        'rows are 5 s apart, 1e-05 to 0.1 s are expected; with `units.time` = "ms" they are 5 ms',
+        'rows are 5 s apart, 1e-05 to 0.05 s are expected; with `units.time` = "ms" they are 5 ms',
     ),
     "microseconds taken for milliseconds": (
         table(lambda k, q, tau: f"{5000 * k},{q},{tau}"),
@@ -204,7 +204,9 @@ REFUSED = {
     "compressed": (b"\x1f\x8b\x08\x00" + bytes(100), [], "is compressed: gunzip it"),
     "no text": (b"t,angle,torque\n" + b"\xb0\xff\n" * 60, [], "is no text in UTF-8"),
     "UTF-16": (table(plain).encode("utf-16"), [], "is UTF-16: save it as UTF-8"),
-    "nothing": ("", [], "has no column 't'"),
+    "nothing": ("", [], "is empty"),
+    "a head twice": (table(plain, "t,angle,angle\n"), [], "has 2 columns 'angle'"),
+    "16 rows a second": (table(lambda k, q, tau: f"{0.06 * k},{q},{tau}"), [], "rows are 0.06 s apart"),
 }
 
 

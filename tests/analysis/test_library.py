@@ -132,7 +132,7 @@ WRONG = {
     "tau_J[9, 0] = -2e+06 Nm is not at most 1e+06 Nm": lambda a: spoilt(a, "tau_J", (9, 0), -2e6),
     "q is of complex128, real numbers in rad are expected": lambda a: {**a, "q": a["q"] + 1j},
     "q is of list, real numbers in rad are expected": lambda a: {**a, "q": [[0.0], [0.0, 1.0]]},
-    "t has a median period of 2 s, 1e-05 to 0.1 s are expected": lambda a: {**a, "t": a["t"] * 1000.0},
+    "t has a median period of 2 s, 1e-05 to 0.05 s are expected": lambda a: {**a, "t": a["t"] * 1000.0},
     "touched has shape (6000,) of float64, (6000,) of bool is expected": lambda a: {**a, "touched": a["t"]},
     "tau_J is of masked values, real numbers in Nm are expected": lambda a: {
         **a,

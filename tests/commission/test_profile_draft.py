@@ -121,6 +121,12 @@ def test_an_event_timer_that_is_absent_is_a_remark(eds):
     assert any("0x1801:5" in line for line in drafted.remarks)
 
 
+def test_a_polarity_of_the_position_alone_is_a_remark(eds):
+    for polarity, is_odd in ((0x80, True), (0xE0, False)):
+        remarks = draft(eds, EdsVariant().with_object("607E", polarity, DataType="0x0005")).remarks
+        assert any("0x607E" in line for line in remarks) is is_odd
+
+
 @pytest.mark.parametrize(
     ("variant", "reason"),
     [

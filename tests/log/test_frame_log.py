@@ -228,6 +228,18 @@ def test_a_line_of_a_trc_that_tells_the_state_of_the_bus_is_no_frame(tmp_path):
     assert (log.frames["data"][:, 1].tolist(), log.problem) == ([1, 2, 3, 4, 5], "")
 
 
+def test_an_error_frame_of_a_trc_and_data_shorter_than_their_dlc_are_counted(tmp_path):
+    rows = "1 1.0 DT 181 Rx 1 07\n2 2.0 ER - Rx 5 04 00 02 00 00\n3 3.0 ST - Rx 4 00 00 00 04\n"
+    (tmp_path / "x.trc").write_text(f";$FILEVERSION=2.1\n;$STARTTIME=45000.0\n;$COLUMNS=N,O,T,I,d,L,D\n{rows}")
+    head = "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
+    (tmp_path / "x.csv").write_text(f"{head}1.0,0x181,0,0,0,1,Bw==\n2.0,0x181,0,0,0,2,!!!\n")
+    for name, cause in (("x.trc", "'ER'"), ("x.csv", "0 bytes of data, its DLC is 2")):
+        log = read_frames(tmp_path / name)
+        assert log.frames["data"][:, 0].tolist() == [7]
+        assert cause in log.problem
+        assert "more records" not in log.problem
+
+
 def test_a_cut_line_of_a_trc_is_counted(tmp_path, capfd):
     path = tmp_path / "x.trc"
     path.write_text(

@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 from called import called
 from joint_state_bags import State, write_mcap
+from mcap.writer import Writer
 
 NAMES = ("lift", "pan", "elbow")
 
@@ -43,6 +44,17 @@ def test_a_table_of_them_has_the_joints_names(tmp_path: Path) -> None:
     assert (table[2]["position_lift"], table[2]["position_elbow"], table[2]["effort_pan"]) == ("2.0", "4.0", "6.0")
     assert table[2]["velocity_pan"] == "nan"
     assert int(table[1]["t_ns"]) - int(table[0]["t_ns"]) == 10_000_000
+
+
+def test_messages_of_another_encoding_on_their_topic_make_no_empty_table(tmp_path: Path) -> None:
+    with (tmp_path / "r.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("sensor_msgs/JointState", "jsonschema", b"{}")
+        writer.add_message(writer.register_channel("/joint_states", "json", schema), 1, b"{}", 1)
+        writer.finish()
+    exported = called("log", "export", tmp_path / "r.mcap", "--format", "csv", "--out", tmp_path / "out")
+    assert (exported.exit_code, list((tmp_path / "out").glob("*.csv"))) == (1, [])
 
 
 @pytest.mark.parametrize("is_gripper_first", [False, True])

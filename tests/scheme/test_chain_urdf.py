@@ -55,6 +55,7 @@ def test_a_continuous_joint_has_no_position_limits():
         ("", "not XML: no element found: line 1, column 0"),
         ("<sdf/>", "the outermost element is <sdf>, not <robot>"),
         (robot(""), "no <link>"),
+        (robot(f'{LINKS}{TURN}<x:hand xmlns:x="http://www.ros.org/wiki/xacro"/>'), "<xacro:hand> is in it"),
         (robot("<link/>"), "a <link> has no name"),
         (robot('<link name="a"/><link name="a"/>'), 'link "a" is there twice'),
         (robot(LINKS + TURN + joint("x", "fixed", "d", "c")), 'link "d", the parent of joint "x", does not exist'),

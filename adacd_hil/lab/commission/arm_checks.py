@@ -28,6 +28,7 @@ from adacd_hil.lab.commission.communication_test import (
     ZeroTorqueLoop,
 )
 from adacd_hil.lab.commission.host_checks import Check, Finding, failed, ok, skipped, warning
+from adacd_hil.lab.commission.profile_draft import POLARITIES
 from adacd_hil.lab.commission.survey import NMT_STATES, compare, read_number, survey
 from adacd_hil.lab.commission.tare import ArmMovedError, check_motion
 from adacd_hil.lab.commission.traffic import Traffic, listen
@@ -308,16 +309,11 @@ def _increments(slave: Slave) -> Finding:
     )
 
 
-_POLARITIES = (0x00, 0xE0)
-"""0x607E of a drive that turns none or all of position (bit 7), velocity (bit 6) and torque (bit 5, not of all makers)
-round."""
-
-
 def _polarity(slave: Slave) -> Finding:
     """Return the finding on a drive's 0x607E: a warning if it reverses only some quantities. Raises DeviceError."""
     polarity = slave.read(0x607E)
     text = f"{slave.name}: polarity 0x607E = 0x{polarity:02X}"
-    if polarity & 0xE0 in _POLARITIES:
+    if polarity & 0xE0 in POLARITIES:
         return ok(text)
     return warning(
         f"{text}: position and torque may count against each other, and the arm run away",

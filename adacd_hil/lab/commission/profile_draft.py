@@ -248,6 +248,9 @@ _RPM_UNITS = {prefix << 24 | 0x00B44700 for prefix in (0, *range(0xF7, 0x100))}
 TORQUE_KEYS = {"scale.gear_ratio", "scale.rated_torque_count_Nm"}
 """Factors from 0x6076 to the torque at the joint, except the efficiency, which is within a third of 1."""
 _MOST_OPTION = 8  # of 0x605A
+POLARITIES = (0x00, 0xE0)
+"""0x607E of a drive that turns none or all of position (bit 7), velocity (bit 6) and torque (bit 5, not of all makers)
+round."""
 
 
 class _Record(NamedTuple):
@@ -583,7 +586,7 @@ class _DriveWriter(_ProfileWriter):
             gear = by_drive if by_drive not in (None, 1.0) else self._likely_gear(motor_Nm)
             why = "0x6091 is a factory value" if by_drive is not None else "the EDS has no 0x6091"
             lines = [self.guess("gear_ratio", gear, f"{gear:g}: {why}")]
-        text = [*lines, f"gear_ratio = {gear:.10g}"]
+        text = [*lines, f"gear_ratio = {gear:.16g}"]
         if gear != 1.0:
             efficiency = self.answers.get("gear_efficiency", 1.0)
             if "gear_efficiency" not in self.answers:
@@ -699,6 +702,10 @@ class _DriveWriter(_ProfileWriter):
 
     def frames(self) -> list[str]:
         self._check()
+        if (polarity := self.default(0x607E) & 0xE0) not in POLARITIES:
+            self.remarks.append(
+                f"0x607E (polarity) = 0x{polarity:02X}: position and torque may count against each other"
+            )
         sample, statusword = ((0x6064, 0), (0x606C, 0)), (0x6041, 0)
         sent = self.records(is_received=False)
         fitting = (record for record in sent if record.can_sync and record.takes(*sample))

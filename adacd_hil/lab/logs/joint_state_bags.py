@@ -53,9 +53,9 @@ def opened_bag(path: Path) -> Iterator[Bag]:
             yield bag
     except (LogError, ConfigError):
         raise
-    except OSError as error:
-        raise LogError(f"recording {path}: {error.strerror or error}") from None
-    except Exception as error:  # damaged bytes can raise any error
+    except Exception as error:  # damaged bytes can raise any error, that of a seek too
+        if isinstance(error, OSError) and error.filename is not None:
+            raise LogError(f"recording {path}: {error.strerror or error}") from None
         remedy = "; `adacd-hil log recover` saves what is left of a cut MCAP file" if path.suffix == ".mcap" else ""
         reason = " ".join(str(error).split()) or type(error).__name__
         raise LogError(f"recording {path} can't be read: {reason}{remedy}") from None

@@ -270,7 +270,7 @@ def _export_topics(
         for piece in stream:
             others = stream.joint_states(piece)
             for topic, series in piece.series.items():
-                if topic in topics and topic not in others:
+                if topic in topics and topic not in others and (len(series) or stream.metadata):
                     tables.add_rows(topic, series_columns(series, stream.epoch_ns))
             for topic, payloads in others.items():
                 for names, columns in joint_state_columns(payloads):

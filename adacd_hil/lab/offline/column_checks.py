@@ -43,7 +43,7 @@ _NOISE_STEP: Final = 0.5
 """Mean square of the steps from sample to sample over twice the variance: 1 for white noise, 0.01 for a motion of 1 Hz
 at 50 Hz."""
 _NOISE_PERIOD_S: Final = 0.02
-"""Longest period for that check: at longer ones a fast motion has such steps, too."""
+"""Longest period for that check and for jumps: at longer ones a fast motion has such steps, too."""
 _JUMP_RAD, _JUMP_TIMES, _MOST_JUMPS = 0.05, 10.0, 3
 """Least step of a position that is a jump, its ratio to the steps just before and after (no joint starts and stops
 within two samples), and most jumps of an encoder."""
@@ -323,28 +323,31 @@ def _of_jumps(described: RecordingMap, recordings: Sequence[ForeignRecording]) -
     for joint in np.flatnonzero(described.urdf.chain.is_prismatic == 0.0).tolist():
         jumps = [jump for recording in recordings for jump in _jumps(recording, joint)]
         if 0 < len(jumps) <= _MOST_JUMPS:
-            step, time_s = jumps[0]
+            step, time_s, was_still = jumps[0]
             yield RecordingFinding(
-                f"the position of {column_name(described, 'q', joint)} jumps by {step:.3g} rad at {time_s:.4g} s: its "
-                "zero has changed",
+                f"the position of {column_name(described, 'q', joint)} jumps by {step:.3g} rad at {time_s:.4g} s: "
+                f"{'it was stuck before, or ' * was_still}its zero has changed",
                 "use the part before it or the part after it, with --from and --until, and check that encoder",
                 is_wrong=True,
             )
             return
 
 
-def _jumps(recording: ForeignRecording, joint: int) -> Iterator[tuple[float, float]]:
+def _jumps(recording: ForeignRecording, joint: int) -> Iterator[tuple[float, float, bool]]:
     """Yield size, rad with sign, and time, s since the first row, of each lasting jump of a joint's position.
 
-    A jump is a step above `_JUMP_RAD` and `_JUMP_TIMES` the steps just before and after. joint: from 0.
+    The third value: whether the position was the same for `_STUCK_S` before. A jump is a step above `_JUMP_RAD` and
+    `_JUMP_TIMES` the steps just before and after. There is none for a period above `_NOISE_PERIOD_S`. joint: from 0.
     """
-    for stretch in recording.stretches:
+    still = round(_STUCK_S / recording.period_s)
+    for stretch in recording.stretches if recording.period_s <= _NOISE_PERIOD_S else ():
         q = stretch.record.q[:, joint]
         steps = q[2:] - q[:-2]  # over two samples: the row of a jump may lie between two samples
         size, before, after = np.abs(steps[2:-2]), np.abs(steps[:-4]), np.abs(steps[4:])
         rows = np.flatnonzero((size > _JUMP_RAD) & (size > _JUMP_TIMES * np.maximum(before, after)))
         for row in rows[np.diff(rows, prepend=-3) > 2].tolist():
-            yield float(steps[row + 2]), stretch.start_s + (row + 4) * recording.period_s
+            was_still = bool(row > still and np.ptp(q[row - still : row]) == 0.0)
+            yield float(steps[row + 2]), stretch.start_s + (row + 4) * recording.period_s, was_still
 
 
 def _spikes(column: Vector) -> NDArray[np.int64]:
@@ -486,6 +489,7 @@ def _clipped_at(torque: Vector) -> Iterator[float]:
     Then many readings equal it, some in a long run, and more than lie in the band beside it. A torque with fewer than
     `_FEWEST_LEVELS` distinct readings yields none.
     """
+    torque = torque.round(9)  # interpolation leaves rounding beside the steps of a coarse sensor
     levels = np.unique(torque)
     if len(levels) < _FEWEST_LEVELS:
         return

@@ -67,7 +67,9 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
         if not getattr(described.columns, key):
             raise ConfigError(f"missing key `columns.{key}`: which columns of {path}?")
     rows = _rows(path, described)
-    first = next(rows, (1, []))
+    first = next(rows, None)
+    if first is None:
+        raise LogError(f"recording {path} is empty")
     head = _head(path, first[1], described)
     columns = _columns(path, head if described.csv.has_header else [], len(head), described)
     read = RecordedRows(path, len(columns), described.time_s, span)
@@ -183,8 +185,10 @@ def _time_column(path: Path, heads: list[str], cells: int, described: RecordingM
 def _place(path: Path, name: str, heads: list[str], cells: int) -> int:
     """Return the index, from 0, of a column by its head, or else by its number from 1.
 
-    cells: number of columns. Raises ConfigError if the file has no such column.
+    cells: number of columns. Raises ConfigError if the file has no such column, or several.
     """
+    if heads.count(name) > 1:
+        raise ConfigError(f"recording {path} has {heads.count(name)} columns {name!r}; write a column's number, from 1")
     if name in heads:
         return heads.index(name)
     if name.isdecimal() and 1 <= int(name) <= cells:

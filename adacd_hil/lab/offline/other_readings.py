@@ -35,6 +35,10 @@ _BETTER: Final = 0.2
 """Largest ratio of its unexplained share to the map's; any ratio will do if the map's arm is impossible."""
 _ALIKE: Final = 1.3
 """Factor on the best unexplained share within which a simpler reading is preferred, and others are reported, too."""
+_LATE: Final = (1, 2, 4, 6)
+"""Samples, of about `_PERIOD_S`, by which columns are tried to be late."""
+_LATE_ABOVE: Final = 0.01
+"""Share that the map leaves unexplained, below which nothing is called late: filters delay by little, too."""
 _RIDGE: Final = 1e-8
 _IDLE_FRICTION: Final = 0.05
 """Share of the largest friction: power that a joint without friction may seem to give."""
@@ -60,7 +64,8 @@ class _Motion(NamedTuple):
     """An interpretation of the motion: q = T q_recorded, tau = R tau_recorded, each (n, n).
 
     R None: torques as recorded. model: the arm's. turned: the joint whose position has the other sign, if that is the
-    only change. is_of_velocities: T turns the velocities, too.
+    only change. is_of_velocities: T turns the velocities, too. late: samples by which each position, with its velocity,
+    then each torque is late (2 n,); () if none is.
     """
 
     text: str
@@ -70,6 +75,7 @@ class _Motion(NamedTuple):
     R: Vector | None = None
     turned: int | None = None
     is_of_velocities: bool = True
+    late: tuple[int, ...] = ()
 
 
 class _Torques(NamedTuple):
@@ -119,7 +125,9 @@ def find_readings(
     settings = replace(settings, period_s=step * settings.period_s, fit_every=max(1, round(settings.fit_every / step)))
     units = [] if described.joints == 1 else list(_other_units(described, tested))
     tried: list[Reading] = []
-    for motion in _motions(described, model):
+    for motion in itertools.chain(_motions(described, model), _late(described, model, settings.period_s)):
+        if motion.late and not any(each.weight == 0 and each.unexplained > _LATE_ABOVE for each in tried):
+            break
         fit, test = (_equations(part, settings, motion) for part in (fitted, tested))
         if fit is not None and test is not None:
             # Beside another motion, one torque or all may be turned, and no unit differs.
@@ -187,7 +195,7 @@ def _equations(records: list[Record], settings: OfflineSettings, motion: _Motion
     None if a record's filtered regressor isn't finite.
     """
     model, rows = motion.model, []
-    for record in records:
+    for record in (_in_time(record, motion.late) for record in records):
         tau_J = record.tau_J if motion.R is None else record.tau_J @ motion.R.T
         dq = record.dq @ motion.T.T if motion.is_of_velocities else record.dq
         rows.append(offline.fit_rows(model, Record(record.q @ motion.T.T, dq, tau_J), settings))
@@ -336,6 +344,28 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
             remedy = f"`arm.gravity_m_s2` = [{', '.join(f'{value:g}' for value in gravity)}]"
             other = offline.model_of(model.chain._replace(gravity_m_s2=gravity), model.has_rotors)
             yield _Motion(text, remedy, other, straight)
+
+
+def _late(described: RecordingMap, model: ArmModel, period_s: float) -> Iterator[_Motion]:
+    """Yield interpretations with one or all positions, or torques, late by `_LATE` samples."""
+    n, names = model.joints, described.urdf.joint_names
+    for samples, (first, what) in itertools.product(_LATE, ((0, "position"), (n, "torque"))):
+        for joints in [*((i,) for i in range(n)), *([tuple(range(n))] if n > 1 else [])]:
+            late = tuple(samples * (i - first in joints) for i in range(2 * n))
+            whose = f"all {what}s are" if len(joints) > 1 else f"the {what} of {names[joints[0]]} is"
+            text = f"{whose} late, by about {1e3 * samples * period_s:.0f} ms"
+            remedy = "record all columns at one time, or shift what is late"
+            yield _Motion(text, remedy, model, np.eye(n), late=late)
+
+
+def _in_time(record: Record, late: tuple[int, ...]) -> Record:
+    """Return the record with its late columns shifted back, and as many fewer samples; late: as of `_Motion`."""
+    if not late or len(record.q) <= max(late):
+        return record
+    n, rows = record.q.shape[1], len(record.q) - max(late)
+    shifted = [np.column_stack([column[by : by + rows] for column, by in zip(table.T, lates, strict=True)])
+               for table, lates in ((record.q, late[:n]), (record.dq, late[:n]), (record.tau_J, late[n:]))]  # fmt: skip
+    return Record(*shifted)
 
 
 def _coupled(text: str, model: ArmModel, T: Vector) -> Iterator[_Motion]:

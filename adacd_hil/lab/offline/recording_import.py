@@ -25,10 +25,10 @@ from adacd_hil.records import Vector
 from adacd_hil.score.judge import contact_bounds
 from adacd_hil.score.wording import number_of
 
-SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-5, 0.1
+SHORTEST_PERIOD_S, LONGEST_PERIOD_S = 1e-5, 0.05
 _LEAST_NOISE_NM = 1e-4
 _MOST_BESIDE_JUMP_RAD = 0.8
-"""Most motion in the time of a position jump: 8 rad/s in the longest period."""
+"""Most motion in the time of a position jump: 16 rad/s in the longest period."""
 _JITTER = 0.25
 """Share of a period by which the intervals of rows may vary: a derived velocity is wrong by as much."""
 _DEGREE = 3  # of the polynomial whose slope is a derived velocity
@@ -241,7 +241,7 @@ def _period_s(path: Path, time_s: Vector, described: RecordingMap) -> float:
     would fit.
     """
     period_s = float(np.median(np.diff(time_s)))
-    if SHORTEST_PERIOD_S <= period_s <= LONGEST_PERIOD_S:
+    if SHORTEST_PERIOD_S <= round(period_s, 9) <= LONGEST_PERIOD_S:
         return period_s
     unit = time_unit_of(period_s / described.time_s)
     remedy = f'; with `units.time` = "{unit}" they are {period_s / described.time_s:g} {unit}' if unit else ""

@@ -119,7 +119,7 @@ class SamplingSection:
         0.0,
         unit="s",
         low=0.0,
-        high=0.1,
+        high=0.05,
         meaning="of the samples, and of the rows without a time; 0: the recording's median",
     )
     longest_gap_s: float = setting(0.05, unit="s", low=1e-3, high=10.0, meaning="a longer one parts the recording")

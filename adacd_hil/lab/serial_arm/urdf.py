@@ -117,6 +117,8 @@ def read_urdf(
         raise UrdfError(f"not XML: {error}") from error
     if robot.tag != "robot":
         raise UrdfError(f"the outermost element is <{robot.tag}>, not <robot>")
+    if left := [element.tag for element in robot.iter() if "/xacro}" in str(element.tag)]:
+        raise UrdfError(f"<xacro:{left[0].rpartition('}')[2]}> is in it: let xacro make the URDF of it")
     links, named = _named(robot, "link"), _named(robot, "joint")
     unknown = [name for name in locked if name not in named]
     if unknown:

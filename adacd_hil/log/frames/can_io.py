@@ -46,15 +46,16 @@ def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
     """Convert a python-can message to a frame, and add `start_ns` to its time.
 
     Of remote and error frames, length and data are cut to the most that their kind of frame has. Raises ValueError for
-    more data in other frames, an identifier of more than 29 bits, or a time beyond `MOST_NS` or NaN.
+    more data in other frames, or less than their DLC says, an identifier of more than 29 bits, or a time beyond
+    `MOST_NS` or NaN.
     """
     most = MAX_DATA if message.is_fd else CLASSIC_BYTES
     data = bytes(message.data)
     length = len(data)
     if message.is_remote_frame or message.is_error_frame:  # their DLC goes up to 15
         data, length = data[:most], min(message.dlc, most)
-    if length > most:
-        raise ValueError(f"frame 0x{message.arbitration_id:X} has {length} bytes of data")
+    if not min(message.dlc, CLASSIC_BYTES) <= length <= most:
+        raise ValueError(f"frame 0x{message.arbitration_id:X} has {length} bytes of data, its DLC is {message.dlc}")
     if not 0 <= message.arbitration_id < 1 << 29:
         raise ValueError(f"identifier 0x{message.arbitration_id:X} has more than 29 bits")
     if not abs(message.timestamp or 0.0) + start_ns * 1e-9 < MOST_NS * 1e-9:  # nor is NaN
@@ -191,7 +192,8 @@ class _PassedOver(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         words = record.getMessage()
-        if not words.startswith(_HARMLESS) and not words.endswith(" ''"):  # an empty line
+        is_lost = record.levelno > logging.INFO or words.endswith(_TRC_ERRORS)
+        if is_lost and not words.startswith(_HARMLESS) and not words.endswith(" ''"):  # an empty line
             self.pass_over(words)
 
     def pass_over(self, words: str) -> None:
@@ -202,6 +204,8 @@ class _PassedOver(logging.Handler):
 
 _LOGGER = logging.getLogger("can.io")
 _LOGGER.addHandler(logging.NullHandler())  # python-can's words go through `_PassedOver`, not to the terminal
+_LOGGER.setLevel(logging.INFO)
+_TRC_ERRORS = ("type 'ER'", "type 'Error'")
 _HARMLESS = ("Unknown object header version", "DLC vs Data Length mismatch")
 """Beginnings of warnings: on objects other than frames, or that `_BlfReader` counts; on frames that are read."""
 _READERS: dict[str, Any] = {".blf": _BlfReader, ".asc": _AscReader, ".log": _CandumpReader}
