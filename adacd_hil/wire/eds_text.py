@@ -18,12 +18,10 @@ def readable_eds(text: str) -> str:
     """Return the text as canopen reads it, without `[Comments]` and unreadable numbers of `[DeviceInfo]`.
 
     `[DummyUsage]`, if present, has exactly the dummies 1 to 7, each used or not as in the text. Raises
-    configparser.Error for a text that is no INI file, or has no section.
+    configparser.Error for a text that is no INI file.
     """
     given, eds = _parser(), _parser()
     given.read_string(text, "object dictionary.eds")
-    if not given.sections():
-        raise configparser.Error("the file is empty: it has no section")
     given.remove_section("Comments")
     for name in sorted(given.sections(), key=len):  # an object before its sub-indices
         rows = dict(given[name])
