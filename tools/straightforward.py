@@ -28,7 +28,7 @@ from cantools.autosar import end_to_end
 from mcap.writer import CompressionType, Writer
 
 from adacd_hil.device.arm import FEEDBACK_SHARE
-from adacd_hil.scheme.detect.external_torque import WIDE_SAMPLES
+from adacd_hil.scheme.detect.undone_filter import WIDE_SAMPLES
 from adacd_hil.scheme.identify.excitation import EXCITATION_EVERY
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings

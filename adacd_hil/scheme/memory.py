@@ -172,7 +172,7 @@ class Sensitivity:
 
     still, still_smooth, low_speed: shares of standstill and of low speed in a filter's memory. h: thresholds; h_model:
     without standstill and the tail's floor. doubt: deviation by the model's uncertainty. hold, held: torque that
-    friction may hold at rest. lost: variance by missing samples. roughness, velocity_roughness: noise over that of the
+    friction may hold at rest. roughness, velocity_roughness: noise over that of the
     settings, squared. unit, strain: factors on variances and on thresholds. used, peak_share: largest residual over its
     threshold. wide: of the torque with a filter undone.
     """
@@ -182,7 +182,6 @@ class Sensitivity:
     low_speed: EachFilter
     doubt: EachFilter
     held: EachFilter
-    lost: EachFilter
     h: EachChannel
     h_model: EachChannel
     roughness: PerJoint
@@ -208,11 +207,17 @@ class Sensitivity:
     rest_samples: float
 
 
-class Margin:
-    """Largest residuals of free motion, and smallest detectable push: written by `margin`.
+class LostSamples:
+    """Variance of the external torque by missing samples, Nm²: written by `lost_samples`."""
+
+    lost_Nm2: EachFilter
+
+
+class Tail:
+    """Largest residuals of free motion: written by `tail`.
 
     peak, peak_now, peak_last: by sign, kept, of the present block, of the one before. tail_Nm: floors of thresholds by
-    them. seen, seen_: counts and worst values of the test. sum_, mean_push_Nm, dim_s: of monitoring.
+    them.
     """
 
     peak: Annotated[Vector, "2 channels n"]
@@ -221,6 +226,14 @@ class Margin:
     tail_Nm: EachChannel
     block_used: float
     tail_s: float
+
+
+class Sight:
+    """Smallest detectable push: written by `sight`.
+
+    seen, seen_: counts and worst values of the test. sum_, mean_push_Nm, dim_s: of monitoring.
+    """
+
     seen_worst_Nm: PerJoint
     seen_push_Nm: PerJoint
     sum_push_Nm: PerJoint
@@ -249,7 +262,7 @@ class Evidence:
 
 
 class Anchor:
-    """Anchors of the torque offsets, and the fit's largest torque that depends on the position: written by `anchor`.
+    """Anchors of the torque offsets: written by `anchor`.
 
     rest_count: samples in the reading at rest. anchor_Nm, anchor_std: by kind of anchor, inf for a missing one.
     """
@@ -257,6 +270,11 @@ class Anchor:
     rest_count: float
     anchor_Nm: Annotated[Vector, "kinds n"]
     anchor_std: Annotated[Vector, "kinds n"]
+
+
+class PlaceBound:
+    """The fit's largest torque that depends on the position: written by `place_bound`."""
+
     by_place_Nm: PerJoint
 
 
@@ -352,7 +370,7 @@ class Watch:
 class Memory:
     """The memory of the certified scheme.
 
-    wide_history: the last external torques by the filter that is undone, newest first, see `external_torque`.
+    wide_history: the last external torques by the filter that is undone, newest first, see `undone_filter`.
     withheld_by: contradiction for which a certificate is withheld or taken back, see `certificate`.
     """
 
@@ -366,9 +384,12 @@ class Memory:
     motion: Motion
     fit: Fit
     sensitivity: Sensitivity
-    margin: Margin
+    lost: LostSamples
+    tail: Tail
+    sight: Sight
     evidence: Evidence
     anchor: Anchor
+    place_bound: PlaceBound
     fit_check: FitCheck
     earlier: Earlier
     withheld_by: float
@@ -429,11 +450,17 @@ class EvidenceConstants:
 
 
 @dataclass(frozen=True)
-class MarginConstants:
-    """Constants of `margin`, see its `constants_of`; excursions_Hz, shown: by channel (2 C - 1,)."""
+class TailConstants:
+    """Constants of `tail`, see its `constants_of`; excursions_Hz: by channel (2 C - 1,)."""
 
     excursions_Hz: Vector
     block_cycles: float
+
+
+@dataclass(frozen=True)
+class SightConstants:
+    """Constants of `sight`, see its `constants_of`; shown: by channel (2 C - 1,)."""
+
     mean_cycles: float
     shown: Vector
 
@@ -519,6 +546,7 @@ class Constants:
     noise: NoiseConstants
     anchor: AnchorConstants
     evidence: EvidenceConstants
-    margin: MarginConstants
+    tail: TailConstants
+    sight: SightConstants
     missing_torque: TermConstants
     limits: Limits

@@ -1,4 +1,4 @@
-"""The smallest push that is found in time, as a distribution over cycles: see `adacd_hil.scheme.detect.margin`.
+"""The smallest push that is found in time, as a distribution over cycles: see `adacd_hil.scheme.detect.sight`.
 
 An estimate, since threshold and residual change meanwhile: of 300 pushes 2 % larger than at their moment 247 were found
 in 100 ms, the others as the threshold rose. Of 300 as large as at the worst moment all were, after 59 ms at most.
@@ -10,11 +10,11 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, Vector
-from adacd_hil.scheme.detect import margin as detect_margin
+from adacd_hil.scheme.detect import sight, tail
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.settings.configuration import Settings
 
-PUSH_WITHIN = f"{1e3 * detect_margin.WITHIN_S:g} ms"
+PUSH_WITHIN = f"{1e3 * sight.WITHIN_S:g} ms"
 """In how much time it is found, as text."""
 
 
@@ -36,9 +36,9 @@ class PushGatherer:
     """Gathers residuals and thresholds in MONITOR without contact, and the smallest push that would be found."""
 
     def __init__(self, settings: Settings) -> None:
-        self._shown = detect_margin.constants_of(settings).shown
+        self._shown = sight.constants_of(settings).shown
         self._period_s = settings.bus.period_s
-        self._excursions_Hz = detect_margin.constants_of(settings).excursions_Hz
+        self._excursions_Hz = tail.constants_of(settings).excursions_Hz
         self._share = np.zeros((self._shown.size, JOINTS))  # largest of residual over threshold
         self._push, self._threshold = ([Distribution() for _ in range(JOINTS)] for _ in range(2))
 
@@ -62,7 +62,7 @@ class PushGatherer:
             threshold_Nm=tuple(each.percentiles() for each in self._threshold),
             hours=seen_s / 3600.0,
             tail_rate_per_h=sum(
-                detect_margin.rate_per_h(float(nu), seen_s, float(share))
+                tail.rate_per_h(float(nu), seen_s, float(share))
                 for nu, shares in zip(self._excursions_Hz, self._share, strict=True)
                 for share in shares
             ),
@@ -71,7 +71,7 @@ class PushGatherer:
 
 @compiled
 def _fill(tau_ext: Vector, threshold: Vector, shown: Vector, push: Vector) -> None:
-    """Fill `push` (k, 2), Nm, by `margin.smallest_push` of k cycles. shown: each channel's response to a step."""
+    """Fill `push` (k, 2), Nm, by `sight.smallest_push` of k cycles. shown: each channel's response to a step."""
     for k in range(push.shape[0]):
         for i in range(push.shape[1]):
-            push[k, i] = detect_margin.smallest_push(tau_ext[k], threshold[k], shown, i)
+            push[k, i] = sight.smallest_push(tau_ext[k], threshold[k], shown, i)

@@ -3,7 +3,7 @@
 from adacd_hil.records import JOINTS, ContactLevel, Reaction, SchemeState
 from adacd_hil.scheme.contact import course
 from adacd_hil.scheme.supervisor import supervisor
-from adacd_hil.scheme.supervisor.transitions import ANY_CONTACT, CONTACT, CONTACT_SHIFT
+from adacd_hil.scheme.supervisor.findings import ANY_CONTACT, CONTACT, CONTACT_SHIFT
 from adacd_hil.structured import zeros_of
 
 

@@ -9,7 +9,7 @@ from excited_arm import FREE, NAMES, OFFSETS, PERIOD_S, SETTINGS, TouchedLoop, a
 from long_cases import long_but
 
 from adacd_hil.records import FaultReason, Request, SchemeState
-from adacd_hil.scheme.detect import margin
+from adacd_hil.scheme.detect import sight
 from adacd_hil.scheme.identify import anchor, evidence
 from adacd_hil.scheme.pipeline.certificate_watch import THIS_RUN_ONLY
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
@@ -80,16 +80,16 @@ def test_a_certificate_says_of_each_joint_what_anchors_it_and_warns_where_nothin
     loop.run_until(SchemeState.MONITOR)
     assert abs(loop.offset_error_Nm[0]) == pytest.approx(leant_Nm, abs=0.1)
     (text,) = loop.said("certificate")
-    sight = re.escape(margin.describe_sight(loop.m))
+    seen = re.escape(sight.describe_sight(loop.m))
     date = settings.history.date_utc
     compared = f"friction and inertia: within what the certificate of {date} allows" if date else THIS_RUN_ONLY
-    assert re.fullmatch(rf"torque offsets anchored: joint 1 {joint_1}; joint 2 {joint_2}; {sight}; {compared}", text)
+    assert re.fullmatch(rf"torque offsets anchored: joint 1 {joint_1}; joint 2 {joint_2}; {seen}; {compared}", text)
     (told,) = loop.told("certificate")
     open_joints = [number + 1 for number, said in enumerate((joint_1, joint_2)) if said == NOT_AT_ALL]
     assert loop.levels("certificate") == ["warning" if open_joints else "info"]
     assert told.count("warning: a lean on ") == bool(open_joints)
     assert re.findall(r"joint (\d)", told.partition(";")[0] if open_joints else "") == list(map(str, open_joints))
-    assert told.endswith(margin.describe_push(loop.m))
+    assert told.endswith(sight.describe_push(loop.m))
 
 
 def test_the_last_certificates_zero_counts_from_the_configurations():

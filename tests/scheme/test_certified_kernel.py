@@ -8,9 +8,9 @@ from excited_arm import NAMES, OFFSETS, PERIOD_S, SETTINGS, Kernel, play, record
 from planar_arm import THETA
 from smooth_motion import smooth_motion, torque_of
 
-from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.detect import lost_samples
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
-from adacd_hil.scheme.supervisor import transitions
+from adacd_hil.scheme.supervisor import findings
 
 COUNT = len(NAMES)
 LAGS = [NAMES.index("lag1"), NAMES.index("lag2")]
@@ -51,10 +51,10 @@ def test_the_weight_of_a_payload_at_rest_is_no_contact_as_the_arm_begins_to_lear
     rest = np.zeros(2), np.zeros(2), np.array([9.5, 1.5]) + weight
     for _ in range(600):
         seen = kernel.step(*rest, mode=certified_kernel.WATCH)
-    assert seen & transitions.CONTACT
+    assert seen & findings.CONTACT
     certified_kernel.begin_adaptation(kernel.constants, kernel.memory, True, True)
     learning = certified_kernel.WATCH | certified_kernel.LEARN
-    assert not any(kernel.step(*rest, mode=learning) & transitions.CONTACT for _ in range(300))
+    assert not any(kernel.step(*rest, mode=learning) & findings.CONTACT for _ in range(300))
 
 
 def test_a_gap_is_cut_out_of_time_and_so_are_samples_that_were_lost(smooth):
@@ -64,7 +64,7 @@ def test_a_gap_is_cut_out_of_time_and_so_are_samples_that_were_lost(smooth):
     before = residual[-1]
     kernel.step(q[299] + 9.0, dq[299], tau_J[299] + 9.0, is_complete=0)
     np.testing.assert_array_equal(kernel.m.filters.r, before)
-    kernel.step(q[309], dq[309], tau_J[309], periods=sensitivity.MOST_FILLED + 2)
+    kernel.step(q[309], dq[309], tau_J[309], periods=lost_samples.MOST_FILLED + 2)
     np.testing.assert_allclose(kernel.m.filters.r, before, atol=1e-12)
     kernel.step(q[450], dq[450], tau_J[450], periods=150)
     np.testing.assert_allclose(kernel.m.filters.r, before, atol=1e-12)
@@ -79,11 +79,11 @@ def test_a_few_lost_samples_lie_between_their_neighbours(smooth, lost):
     pushed, whole = Kernel(theta=SMOOTH), Kernel(theta=SMOOTH)
     for kernel in (pushed, whole):
         kernel.run(q[:300], dq[:300], tau_J[:300])
-    assert pushed.step(q[300], dq[300], tau_J[300], is_complete=0) & transitions.UNSEEN
+    assert pushed.step(q[300], dq[300], tau_J[300], is_complete=0) & findings.UNSEEN
     after = slice(300, 301 + lost)
     expected = whole.run(q[after], dq[after], tau_J[after] - 1.0)[1][-1]
     seen = pushed.step(q[300 + lost], dq[300 + lost], tau_J[300 + lost] - 1.0, periods=lost + 1)
-    assert not seen & transitions.UNSEEN
+    assert not seen & findings.UNSEEN
     assert np.all(np.abs(pushed.m.filters.r) > 0.4 * np.abs(expected))
     unpushed = Kernel(theta=SMOOTH)
     unpushed.run(q[:300], dq[:300], tau_J[:300])
@@ -94,10 +94,10 @@ def test_a_few_lost_samples_lie_between_their_neighbours(smooth, lost):
 def test_an_incomplete_cycle_and_the_sample_after_a_gap_are_said_to_be_unseen(smooth):
     q, dq, tau_J = smooth
     kernel = Kernel(theta=SMOOTH)
-    found = [kernel.step(q[k], dq[k], tau_J[k]) & transitions.UNSEEN for k in range(3)]
-    found.append(kernel.step(q[3], dq[3], tau_J[3], is_complete=0) & transitions.UNSEEN)
-    found.append(kernel.step(q[12], dq[12], tau_J[12], periods=10) & transitions.UNSEEN)
-    found.append(kernel.step(q[13], dq[13], tau_J[13]) & transitions.UNSEEN)
+    found = [kernel.step(q[k], dq[k], tau_J[k]) & findings.UNSEEN for k in range(3)]
+    found.append(kernel.step(q[3], dq[3], tau_J[3], is_complete=0) & findings.UNSEEN)
+    found.append(kernel.step(q[12], dq[12], tau_J[12], periods=10) & findings.UNSEEN)
+    found.append(kernel.step(q[13], dq[13], tau_J[13]) & findings.UNSEEN)
     assert [bool(bits) for bits in found] == [True, False, False, True, True, False]
 
 
@@ -109,7 +109,7 @@ def test_a_sample_that_is_no_number_is_told_and_filtered_by_nobody(smooth):
     for place in range(3):
         values = [q[50].copy(), dq[50].copy(), tau_J[50].copy()]
         values[place][1] = np.nan
-        assert kernel.step(*values) & transitions.NOT_A_NUMBER
+        assert kernel.step(*values) & findings.NOT_A_NUMBER
         np.testing.assert_array_equal(kernel.m.filters.r, before)
 
 
@@ -167,15 +167,15 @@ def certain(tau_J, mode=certified_kernel.WATCH, count=60):
 def test_contact_and_collision_are_two_levels():
     for torque_Nm, is_collision in ((-0.5, False), (-4.0, True)):
         found, _ = certain([torque_Nm, 0.0])
-        assert found[-1] & transitions.CONTACT
-        assert bool(found[-1] & transitions.COLLISION) is is_collision
-    assert not certain([-0.01, 0.0])[0][-1] & transitions.CONTACT
+        assert found[-1] & findings.CONTACT
+        assert bool(found[-1] & findings.COLLISION) is is_collision
+    assert not certain([-0.01, 0.0])[0][-1] & findings.CONTACT
 
 
 def test_a_lost_sample_keeps_the_contact_that_was_there():
     _, kernel = certain([-1.0, 0.0])
     found = kernel.step([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], certified_kernel.WATCH, is_complete=0)
-    assert found & transitions.CONTACT
+    assert found & findings.CONTACT
 
 
 def test_a_frozen_model_that_fails_its_test_is_refuted():
@@ -184,10 +184,10 @@ def test_a_frozen_model_that_fails_its_test_is_refuted():
     rest = np.zeros((400, 2))
     beta = SETTINGS.certified.beta_Nm
     found, residual = kernel.run(rest, rest, np.tile([0.0, -2.0 * beta], (400, 1)), certified_kernel.TEST)
-    refuted = (found & transitions.REFUTED) != 0
+    refuted = (found & findings.REFUTED) != 0
     np.testing.assert_array_equal(refuted, np.abs(residual[:, 0, 1]) > beta)
     assert refuted.any()
-    assert not np.any(found[refuted] & transitions.CERTIFIED)
+    assert not np.any(found[refuted] & findings.CERTIFIED)
 
 
 def test_a_contact_pauses_the_test_of_a_candidate_until_the_arm_has_recovered():
@@ -197,14 +197,14 @@ def test_a_contact_pauses_the_test_of_a_candidate_until_the_arm_has_recovered():
     for _ in range(100):
         kernel.step(rest, rest, rest, mode)
     before = 100.0
-    while not kernel.step(rest, rest, [-2.0, 0.0], mode) & transitions.CONTACT:
+    while not kernel.step(rest, rest, [-2.0, 0.0], mode) & findings.CONTACT:
         before += 1.0
     sums = ("cycles", "square", "frozen_square", "worst")
     paused = [float(kernel.m.candidate[name]) for name in sums]
     assert paused[0] == before
     assert kernel.m.ring.used == 0.0
     assert kernel.m.models.recovering_cycles == RECOVER
-    while kernel.step(rest, rest, rest, mode) & transitions.CONTACT:
+    while kernel.step(rest, rest, rest, mode) & findings.CONTACT:
         pass
     for _ in range(RECOVER - 2):
         kernel.step(rest, rest, rest, mode)
@@ -222,7 +222,7 @@ def test_each_contact_before_the_certificate_strains_the_thresholds_once(mode, s
     for _ in range(2):
         for torque_Nm, count in ((-5.0, 30), (0.0, 600 + RECOVER)):
             found = [kernel.step(rest, rest, [torque_Nm, 0.0], mode) for _ in range(count)]
-            assert bool(found[-1] & transitions.CONTACT) is (torque_Nm != 0.0)
+            assert bool(found[-1] & findings.CONTACT) is (torque_Nm != 0.0)
     assert kernel.m.sensitivity.strain.tolist() == [strain, 1.0]
 
 
@@ -233,8 +233,8 @@ def test_a_test_in_which_a_joint_rests_proves_nothing(speeds):
     certified_kernel.begin_test(kernel.constants, kernel.memory)
     kernel.m.models.theta[:] = 0.0
     found = [kernel.step([0.0, 0.0], speeds, [0.0, 0.0], certified_kernel.TEST) for _ in range(2 * TESTED)]
-    assert not np.any(np.array(found) & (transitions.CERTIFIED | transitions.REFUTED))
-    assert kernel.step([0.0, 0.0], [0.5, -0.5], [0.0, 0.0], certified_kernel.TEST) & transitions.CERTIFIED
+    assert not np.any(np.array(found) & (findings.CERTIFIED | findings.REFUTED))
+    assert kernel.step([0.0, 0.0], [0.5, -0.5], [0.0, 0.0], certified_kernel.TEST) & findings.CERTIFIED
 
 
 def test_an_arm_that_rests_teaches_no_offset_where_friction_holds():

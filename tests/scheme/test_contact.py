@@ -7,7 +7,7 @@ from smooth_motion import PLACES, PaperKernel, run_kernel, settings_with
 
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.contact.contact_report import integrated_report
-from adacd_hil.scheme.detect.external_torque import follow_contact
+from adacd_hil.scheme.detect.undone_filter import follow_contact
 from adacd_hil.scheme.kernel import paper_kernel
 
 T = 1e-3

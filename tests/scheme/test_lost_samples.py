@@ -5,9 +5,9 @@ import pytest
 from excited_arm import PERIOD_S, Kernel, kernel_of, record
 from planar_arm import THETA
 
-from adacd_hil.scheme.detect import sensitivity
+from adacd_hil.scheme.detect import lost_samples
 from adacd_hil.scheme.kernel import certified_kernel
-from adacd_hil.scheme.supervisor import transitions
+from adacd_hil.scheme.supervisor import findings
 
 K, _ = kernel_of()
 MODE = certified_kernel.WATCH | certified_kernel.REFINE
@@ -19,9 +19,9 @@ def followed(steps, dq=(0.3, 0.3), is_seen=True, lost_Nm2=0.0):
     m.gaps.last[1] = 0.3
     m.sensitivity.hold[:] = 0.1
     m.regressor.M[:] = np.eye(2)
-    m.sensitivity.lost[:] = lost_Nm2
-    sensitivity.follow_lost(K, m, np.array(dq), steps, steps * PERIOD_S, is_seen)
-    return m.sensitivity.lost.copy()
+    m.lost.lost_Nm2[:] = lost_Nm2
+    lost_samples.follow_lost(K, m, np.array(dq), steps, steps * PERIOD_S, is_seen)
+    return m.lost.lost_Nm2.copy()
 
 
 def test_a_sample_after_a_sample_leaves_nothing_open_and_what_was_open_is_forgotten():
@@ -34,7 +34,7 @@ def test_a_sample_after_a_sample_leaves_nothing_open_and_what_was_open_is_forgot
 def test_a_line_leaves_open_the_noise_of_its_ends_the_torque_s_bend_and_friction_where_the_joint_turned(steps):
     turn = K.cutoff * steps * PERIOD_S
     noise = (K.noise_sigmas * K.torque_noise_Nm * turn) ** 2 * 0.5 * (1.0 - 1.0 / steps)
-    bend = sensitivity.CURVATURE_NM_S2 * (steps * PERIOD_S) ** 2 / 12.0
+    bend = lost_samples.CURVATURE_NM_S2 * (steps * PERIOD_S) ** 2 / 12.0
     expected = np.array([noise + (turn * bend) ** 2, noise + (turn * (bend + 0.1)) ** 2]).T
     np.testing.assert_allclose(followed(steps, dq=(0.3, -0.3)), expected, rtol=1e-12)
 
@@ -55,10 +55,10 @@ class LossyArm(Kernel):
             is_lost = lost(k) and mode == MODE
             found = self.step(*sample, mode, 0 if is_lost else 1, since, since * PERIOD_S)
             since = since + 1 if is_lost else 1
-            if found & transitions.FITTED:
+            if found & findings.FITTED:
                 certified_kernel.begin_test(self.constants, self.memory)
                 mode = certified_kernel.WATCH | certified_kernel.TEST
-            elif found & transitions.CERTIFIED:
+            elif found & findings.CERTIFIED:
                 certified_kernel.begin_refinement(self.constants, self.memory)
                 mode = MODE
             elif mode == MODE:
@@ -72,10 +72,10 @@ class LossyArm(Kernel):
 @pytest.mark.parametrize("burst", [1, 4, 8])
 def test_bursts_that_are_put_on_a_line_raise_no_alarm(burst):
     whole, lossy = LossyArm(lambda _k: False), LossyArm(lambda k: k % 40 < burst)
-    assert not np.bitwise_or.reduce(lossy.found) & transitions.CONTACT
+    assert not np.bitwise_or.reduce(lossy.found) & findings.CONTACT
     assert len(lossy.found) == len(whole.found)
     assert np.max(np.array(lossy.h) / np.array(whole.h)) > 1.0
-    assert np.sum([found & transitions.UNSEEN != 0 for found in lossy.found]) == pytest.approx(
+    assert np.sum([found & findings.UNSEEN != 0 for found in lossy.found]) == pytest.approx(
         burst / 40 * len(lossy.found), rel=0.05
     )
 
@@ -83,7 +83,7 @@ def test_bursts_that_are_put_on_a_line_raise_no_alarm(burst):
 def test_an_arm_whose_every_second_sample_is_lost_is_not_taken_for_one_that_stands_still():
     """No sample follows on the one before it then; each is compared with the last there was all the same."""
     whole, lossy = LossyArm(lambda _k: False), LossyArm(lambda k: k % 2 == 1)
-    assert not np.bitwise_or.reduce(lossy.found) & transitions.CONTACT
+    assert not np.bitwise_or.reduce(lossy.found) & findings.CONTACT
     np.testing.assert_allclose(np.array(lossy.still)[:, :2], np.array(whole.still)[:, :2], atol=0.25)
     moving = np.abs(np.array(whole.dq)) > 0.3
     assert moving.any(axis=0).all()

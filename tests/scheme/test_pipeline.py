@@ -13,7 +13,7 @@ from adacd_hil.control.motions import corner_to_corner
 from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
-from adacd_hil.scheme.supervisor import transitions
+from adacd_hil.scheme.supervisor import findings
 from adacd_hil.settings.configuration_files import load_settings
 
 PAPER = load_settings("paper", "P")
@@ -123,12 +123,12 @@ def test_an_adaptation_begins_without_the_evidence_of_the_last():
     q, dq, ddq = smooth_motion(np.arange(3000) * 1e-3)
     for row in zip(q, dq, torque_of(q, dq, ddq, THETA["M"]), strict=True):
         moving = kernel.step(paper_kernel.LEARN, **dict(zip(("q", "dq", "tau_J"), row, strict=True)))
-    assert moving & transitions.ADAPTED
+    assert moving & findings.ADAPTED
     assert kernel.out.excitation > 1e-5
     kernel.begin()
     kernel.step(paper_kernel.LEARN, dq=0.0)
     assert kernel.out.quiet_s == settings.bus.period_s
-    assert not any(kernel.step(paper_kernel.LEARN) & transitions.ADAPTED for _ in range(200))
+    assert not any(kernel.step(paper_kernel.LEARN) & findings.ADAPTED for _ in range(200))
     assert kernel.out.excitation < 1e-12
 
 
@@ -144,7 +144,7 @@ def test_an_adaptation_needs_travel_and_speed_of_its_own(missing, sign):
         kernel.begin()
         for k in range(200):
             found = kernel.step(paper_kernel.LEARN, q=this_time["q"][k % 2], dq=this_time["dq"][k % 2])
-        seen.append(bool(found & transitions.ADAPTED))
+        seen.append(bool(found & findings.ADAPTED))
     assert seen == [True, False]
 
 

@@ -6,8 +6,8 @@ from excited_arm import PERIOD_S, SETTINGS, Record, kernel_of, play, record
 from planar_arm import THETA
 
 from adacd_hil.records import SchemeState
-from adacd_hil.scheme.detect.margin import WITHIN_S, smallest_push
-from adacd_hil.scheme.supervisor import transitions
+from adacd_hil.scheme.detect.sight import WITHIN_S, smallest_push
+from adacd_hil.scheme.supervisor import findings
 from adacd_hil.score.smallest_push import PushGatherer
 
 SECONDS = 9.0
@@ -22,7 +22,7 @@ def test_a_push_as_large_as_at_the_worst_moment_is_found_where_it_is_hardest_and
     pushes = PushGatherer(SETTINGS)
     pushes.add_residuals(untouched.y[armed], untouched.h[armed])
     within = round(WITHIN_S / PERIOD_S)
-    shown, early = kernel_of()[0].margin.shown, armed[:-within]
+    shown, early = kernel_of()[0].sight.shown, armed[:-within]
     for joint, figures in enumerate(pushes.smallest_push().push_Nm):
         assert 0.02 < figures["p50"] < figures["p99"] < figures["max"] < 1.0
         own = np.array([smallest_push(untouched.y[k], untouched.h[k], shown, joint) for k in early])
@@ -32,7 +32,7 @@ def test_a_push_as_large_as_at_the_worst_moment_is_found_where_it_is_hardest_and
             q, dq, tau_J = (each[: at + within + 1].copy() for each in (measured.q, measured.dq, measured.tau_J))
             tau_J[at:, joint] += torque_Nm
             seen = play(Record(q, dq, tau_J)).observation[at:]
-            return bool((seen.astype(int) & transitions.CONTACT).any())
+            return bool((seen.astype(int) & findings.CONTACT).any())
 
         assert all(is_found(at, sign * figures["max"]) for at in hard for sign in (-1.0, 1.0))
         assert not all(is_found(at, sign * 0.4 * figures["max"]) for at in hard for sign in (-1.0, 1.0))

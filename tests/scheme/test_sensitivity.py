@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from excited_arm import NAMES, SETTINGS, kernel_of
 
-from adacd_hil.scheme.detect import external_torque, sensitivity
+from adacd_hil.scheme.detect import sensitivity
 
 CERTIFIED = SETTINGS.certified
 T = SETTINGS.bus.period_s
@@ -303,11 +303,8 @@ def test_while_the_arm_is_monitored_a_push_of_one_sign_raises_no_unit(sign):
 
 
 def test_the_unit_keeps_to_its_bounds():
-    assert (
-        units_after(np.zeros(2), 200, 1.005 * external_torque.SMALLEST_UNIT).tolist()
-        == [external_torque.SMALLEST_UNIT] * 2
-    )
-    assert units_after(np.full(2, 1e9), 1).tolist() == [external_torque.LARGEST_UNIT] * 2
+    assert units_after(np.zeros(2), 200, 1.005 * sensitivity.SMALLEST_UNIT).tolist() == [sensitivity.SMALLEST_UNIT] * 2
+    assert units_after(np.full(2, 1e9), 1).tolist() == [sensitivity.LARGEST_UNIT] * 2
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,9 @@ from smooth_motion import settings_with
 
 from adacd_hil.records import ArmState, FaultReason, Request, SchemeState
 from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, fill_sample
-from adacd_hil.scheme.supervisor import supervisor, transitions
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, SchemeEvent, next_state
+from adacd_hil.scheme.supervisor import findings, supervisor
+from adacd_hil.scheme.supervisor.findings import CONTACT_SHIFT
+from adacd_hil.scheme.supervisor.transitions import SchemeEvent, next_state
 from adacd_hil.structured import zeros_of
 
 # What each event does in each state, by hand: rows are states, columns events, "." means that nothing happens, "back"
@@ -99,20 +100,20 @@ ARM = {
     "skips-999": {"periods": 999},
 }
 FOUND = {
-    "rest": transitions.AT_REST,
-    "unloaded": transitions.UNLOADED,
-    "resting": transitions.AT_REST | transitions.UNLOADED,
-    "contact": transitions.CONTACT,
-    "collision": transitions.CONTACT | transitions.COLLISION,
-    "nan": transitions.NOT_A_NUMBER,
-    "over-limit": transitions.OVER_LIMIT,
-    "over-speed": transitions.OVER_SPEED,
-    "unseen": transitions.UNSEEN,
-    "adapted": transitions.ADAPTED,
-    "fitted": transitions.FITTED,
-    "certified": transitions.CERTIFIED,
-    "refuted": transitions.REFUTED,
-    "withheld": transitions.WITHHELD,
+    "rest": findings.AT_REST,
+    "unloaded": findings.UNLOADED,
+    "resting": findings.AT_REST | findings.UNLOADED,
+    "contact": findings.CONTACT,
+    "collision": findings.CONTACT | findings.COLLISION,
+    "nan": findings.NOT_A_NUMBER,
+    "over-limit": findings.OVER_LIMIT,
+    "over-speed": findings.OVER_SPEED,
+    "unseen": findings.UNSEEN,
+    "adapted": findings.ADAPTED,
+    "fitted": findings.FITTED,
+    "certified": findings.CERTIFIED,
+    "refuted": findings.REFUTED,
+    "withheld": findings.WITHHELD,
 }
 ASKED = {request.name.lower(): request for request in Request}
 WAY = {
@@ -424,4 +425,4 @@ def test_a_doubted_arm(steps, cause):
 
 
 def test_the_joints_of_an_observation_are_beyond_its_flags():
-    assert transitions.WITHHELD < 1 << CONTACT_SHIFT
+    assert findings.WITHHELD < 1 << CONTACT_SHIFT

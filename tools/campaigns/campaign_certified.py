@@ -9,9 +9,9 @@ from played_record import play_record
 
 from adacd_hil.control.motions import Excitation
 from adacd_hil.records import JOINTS, SchemeState
-from adacd_hil.scheme.detect.external_torque import WIDE_SAMPLES
+from adacd_hil.scheme.detect.undone_filter import WIDE_SAMPLES
 from adacd_hil.scheme.model.filter_bank import WIDE
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
+from adacd_hil.scheme.supervisor.findings import CONTACT_SHIFT
 from adacd_hil.settings.configuration import Settings
 
 _PHASES = {int(SchemeState.CERTIFY): TESTING, int(SchemeState.MONITOR): ARMED}
@@ -60,7 +60,7 @@ class CertifiedScheme:
 
     @staticmethod
     def _undo(y: np.ndarray, cutoff_rad_s: float) -> np.ndarray:
-        """Undo a filter, as `adacd_hil.scheme.detect.external_torque.undo_filter` does."""
+        """Undo a filter, as `adacd_hil.scheme.detect.undone_filter.undo_filter` does."""
         decay = np.exp(-cutoff_rad_s * PERIOD_S)
         sharp = y.copy()
         sharp[1:] = (y[1:] - decay * y[:-1]) / (1.0 - decay)

@@ -9,7 +9,7 @@ from campaign_bound import Bound
 from campaign_trials import STEPS_NM, Row
 
 from adacd_hil.cli.output import format_table
-from adacd_hil.scheme.detect.margin import WITHIN_S
+from adacd_hil.scheme.detect.sight import WITHIN_S
 
 Rows = dict[str, list[Row]]
 Bounds = dict[tuple[str, bool], Bound]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
 from adacd_hil.scheme.kernel import paper_kernel
-from adacd_hil.scheme.supervisor.transitions import ADAPTED, CONTACT_SHIFT
+from adacd_hil.scheme.supervisor.findings import ADAPTED, CONTACT_SHIFT
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 

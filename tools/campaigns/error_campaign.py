@@ -32,7 +32,7 @@ from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.sensitivity import AGREES
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
 from adacd_hil.scheme.supervisor import transitions
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT
+from adacd_hil.scheme.supervisor.findings import CONTACT_SHIFT
 from adacd_hil.score.judge import begins_of
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings

@@ -11,7 +11,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import SchemeState, Vector
 from adacd_hil.scheme.kernel import certified_kernel, certified_memory
 from adacd_hil.scheme.kernel.kernel_samples import Numbers
-from adacd_hil.scheme.supervisor.transitions import CERTIFIED, CONTACT, FITTED, REFUTED, WITHHELD
+from adacd_hil.scheme.supervisor.findings import CERTIFIED, CONTACT, FITTED, REFUTED, WITHHELD
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Structured
 

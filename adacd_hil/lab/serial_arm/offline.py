@@ -46,7 +46,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.lab.serial_arm import chain
 from adacd_hil.lab.serial_arm.chain import BaseParameters, Chain, Indices
 from adacd_hil.records import Vector
-from adacd_hil.scheme.detect import external_torque
+from adacd_hil.scheme.detect import external_torque, undone_filter
 from adacd_hil.scheme.identify import estimator
 from adacd_hil.scheme.model import torque_filter
 from adacd_hil.settings.schema import setting
@@ -354,7 +354,7 @@ def find_contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[
     the threshold.
     """
     over = ~(np.abs(tau_ext_hat) <= threshold)
-    touched = np.flatnonzero(np.any(~(np.abs(tau_ext_hat) <= external_torque.ONSET_FRACTION * threshold), axis=1))
+    touched = np.flatnonzero(np.any(~(np.abs(tau_ext_hat) <= undone_filter.ONSET_FRACTION * threshold), axis=1))
     firsts = touched[np.diff(touched, prepend=-window - 2) > window]
     loud = np.flatnonzero(np.any(over, axis=1))
     _, first_loud = np.unique(np.searchsorted(firsts, loud, side="right"), return_index=True)

@@ -23,7 +23,7 @@ from adacd_hil.records import JOINTS, ContactKind, ContactLevel, ContactReport, 
 from adacd_hil.scheme.contact import localisation
 from adacd_hil.scheme.contact.contact_kind import classify
 from adacd_hil.scheme.contact.course import CourseMemory
-from adacd_hil.scheme.detect.external_torque import ONSET_FRACTION
+from adacd_hil.scheme.detect.undone_filter import ONSET_FRACTION
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.scheme_settings import KIND_S
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, ContactLevel, Reaction, SchemeState, Vector
+from adacd_hil.scheme.supervisor.findings import COLLISION, CONTACT_SHIFT
 from adacd_hil.scheme.supervisor.supervisor import IS_REACTING, SupervisorMemory
-from adacd_hil.scheme.supervisor.transitions import COLLISION, CONTACT_SHIFT
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.scheme_settings import KIND_S
 from adacd_hil.structured import PerJoint

@@ -15,25 +15,13 @@
   sign, an error of the model has both. In smoothed channels g is smoothed, too: a bound, since |F x| <= F |x|.
 - R: the velocity's noise over that of the settings, squared, measured in its second difference.
 - e: 1, or more of a joint that has shown contacts while the arm learnt, or right after going on (`raise_strain`).
-- G: uncertainty after lost samples, see below. tail: floor by the largest residual seen (`margin`).
+- G: uncertainty after lost samples (`lost_samples`). tail: floor by the largest residual seen (`tail`).
 - s, s': shares of standstill, and of low speed, in the filter's memory. At standstill friction may hold any torque
   up to F_s: F_c, static friction and friction by load where they are in the model, and as much more as the first two
   are uncertain.
 
 Shapes: C filters, 2 C - 1 channels, n joints, p parameters; r, still, doubt (C, n); y, h (2 C - 1, n); W_f (C, n, p);
 M (n, n). Units: Nm.
-
-**Lost samples.** Lost samples are interpolated on a straight line, or cut out of time. The thresholds widen by the
-resulting uncertainty.
-
-Of n periods, n - 1 of them on the line between their neighbours, dt in all, a filter of cut-off a sees up to
-
-    G += (k_tau sigma a dt)² (1 - 1 / n) / 2 + (a dt (CURVATURE dt² / 12 + F_c [sgn dq has changed]))²
-
-more: the noise of two samples in the place of n, and the line's error in torque and friction. After a gap that is cut
-out, the velocity's noise stays in S, G += (2 a nu)² (M R M')_ii. The filters forget it: G e^(-2 a t).
-
-Shapes: C filters, n joints; lost (C, n), Nm².
 """
 
 import math
@@ -43,7 +31,7 @@ import numpy as np
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
-from adacd_hil.scheme.detect import external_torque
+from adacd_hil.scheme.detect.undone_filter import WIDE_SAMPLES
 from adacd_hil.scheme.memory import Constants, Memory, NoiseConstants
 from adacd_hil.scheme.model import filter_bank, further_friction, regressor
 from adacd_hil.settings.scheme_settings import CertifiedSettings
@@ -78,6 +66,9 @@ BARE = 1.15
 without."""
 UNIT_PEAK = 2.5
 """Mean square of the residual in its hard moments over that of all: friction errs where a joint turns round."""
+SMALLEST_UNIT = 0.05
+LARGEST_UNIT = 9.0
+"""Bounds of the unit: a model counts as at most 4.5 times better, or 3 times worse, than its covariance."""
 UNIT_S = 20.0
 """Memory of the unit: some swings of a slow motion."""
 UNIT_TEST_S = 0.3
@@ -273,7 +264,7 @@ def follow_unit(k: Constants, m: Memory, is_monitored: bool) -> None:
 def _approach(unit: float, square: float, share: float) -> float:
     """Return `unit` moved by `share` of its way to `square`, within SMALLEST_UNIT and LARGEST_UNIT."""
     unit += share * (square - unit)
-    return float(min(max(unit, external_torque.SMALLEST_UNIT), external_torque.LARGEST_UNIT))
+    return float(min(max(unit, SMALLEST_UNIT), LARGEST_UNIT))
 
 
 @compiled
@@ -348,11 +339,11 @@ def _threshold(k: Constants, m: Memory, channel: int, joint: int, momentum: floa
     momentum: result of `momentum_noise`. g: deviation by the model's uncertainty, Nm.
     """
     own = m.sensitivity
-    lost = own.lost[filter_bank.filter_of(channel, own.lost.shape[0]), joint]
+    lost = m.lost.lost_Nm2[filter_bank.filter_of(channel, own.still.shape[0]), joint]
     noise = k.noise.torque_variance[channel] * own.roughness[joint] + k.noise.velocity_variance[channel] * momentum
     noise += k.noise.torque_gain[channel] * own.torque_step_Nm[joint] ** 2 / 12.0 + lost
     own.h_model[channel, joint] = own.strain[joint] * np.sqrt(noise + g * g) + own.torque_pull_Nm[joint]
-    return float(max(own.h_model[channel, joint], m.margin.tail_Nm[channel, joint]))
+    return float(max(own.h_model[channel, joint], m.tail.tail_Nm[channel, joint]))
 
 
 @compiled
@@ -364,7 +355,7 @@ def fill_wide(k: Constants, m: Memory) -> None:
     channels'.
     """
     own = m.sensitivity
-    samples = float(external_torque.WIDE_SAMPLES)
+    samples = float(WIDE_SAMPLES)
     span_s = samples * k.period_s
     for i in range(m.filters.r.shape[1]):
         momentum = momentum_noise(m, i)
@@ -406,11 +397,6 @@ def joints_over(y: Vector, h: Vector) -> int:
 
 STATIC_SHARE = 1.0
 """Largest uncertain static friction beyond Coulomb's, as a share of it: bearings and gears have up to twice."""
-CURVATURE_NM_S2 = 500.0
-"""Second derivative of the torque: 2.5 Nm at 2.2 Hz, or 0.5 Nm at 5 Hz."""
-
-MOST_FILLED = 8
-"""Largest number of missing samples that are interpolated."""
 
 
 def begin(m: Memory) -> None:
@@ -443,24 +429,3 @@ def take_peak_shares(m: Memory) -> Vector:
     shares = np.array(m.sensitivity.peak_share)
     m.sensitivity.peak_share[:] = 0.0
     return shares
-
-
-@compiled
-def follow_lost(k: Constants, m: Memory, dq: Vector, steps: int, period_s: float, is_seen: bool) -> None:
-    """Update `lost` (C, n), the variance by missing samples, by a sample that came `steps` periods after the last.
-
-    period_s: time since the last sample. is_seen: the missing samples were interpolated; False: that time was cut out.
-    """
-    lost, before = m.sensitivity.lost, m.gaps.last[1]
-    for c in range(lost.shape[0]):
-        turn = k.cutoff[c] * period_s
-        decay = math.exp(-2.0 * turn)
-        noise = (k.noise_sigmas * k.torque_noise_Nm * turn) ** 2 * 0.5 * (1.0 - 1.0 / steps)
-        for i in range(lost.shape[1]):
-            lost[c, i] *= decay
-            if is_seen and steps > 1:
-                has_turned = np.sign(dq[i]) != np.sign(before[i])
-                left_out = CURVATURE_NM_S2 * period_s**2 / 12.0 + (m.sensitivity.hold[i] if has_turned else 0.0)
-                lost[c, i] += noise * m.sensitivity.roughness[i] + (turn * left_out) ** 2
-            elif not is_seen:
-                lost[c, i] += (2.0 * k.cutoff[c] * k.noise.velocity_noise_rad_s) ** 2 * momentum_noise(m, i)

@@ -18,7 +18,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import FRICTION_SPEEDS_RAD_S, JOINTS
-from adacd_hil.scheme.identify import anchor, earlier, evidence, fit_check, missing_torque
+from adacd_hil.scheme.identify import anchor, earlier, evidence, fit_check, missing_torque, place_bound
 from adacd_hil.scheme.identify.evidence import FRICTIONS, INERTIAS, LAST, OFFSETS, VISCOUS
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.settings.configuration import Settings
@@ -112,7 +112,7 @@ def contradicted_by(k: Constants, m: Memory) -> int:
     evidence.fit(k, m, m.models.belief, m.models.P_belief, fit_check.fit_unit(m))
     if not earlier.is_no_more(k, m):
         return MORE
-    if not anchor.is_place_bounded(k, m):
+    if not place_bound.is_bounded(k, m):
         return TOO_MUCH_BY_PLACE
     return NOTHING if is_no_more(k, m) else MORE_THAN_LAST
 

@@ -31,7 +31,7 @@ import numpy as np
 from adacd_hil import linalg
 from adacd_hil.compiled import compiled
 from adacd_hil.records import Vector
-from adacd_hil.scheme.detect.external_torque import LARGEST_UNIT
+from adacd_hil.scheme.detect.sensitivity import LARGEST_UNIT
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model.regressor import A5
 from adacd_hil.settings.configuration import Settings

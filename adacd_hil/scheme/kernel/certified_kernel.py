@@ -19,7 +19,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import CertifiedBlock, Vector
-from adacd_hil.scheme.detect import external_torque, margin, sensitivity
+from adacd_hil.scheme.detect import external_torque, lost_samples, sensitivity, sight, tail, undone_filter
 from adacd_hil.scheme.identify import (
     anchor,
     belief,
@@ -40,7 +40,7 @@ from adacd_hil.scheme.kernel.kernel_samples import (
 )
 from adacd_hil.scheme.memory import Constants, Memory
 from adacd_hil.scheme.model import filter_bank, regressor
-from adacd_hil.scheme.supervisor.transitions import (
+from adacd_hil.scheme.supervisor.findings import (
     AT_REST,
     CERTIFIED,
     COLLISION,
@@ -85,7 +85,7 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
         filter_bank.rest(m)
         missing_torque.rest(m)
     fit_check.begin(m)
-    margin.begin_tail(m)
+    tail.begin_tail(m)
     sensitivity.begin_fit(m)
     termination.begin_fit(m)
 
@@ -95,7 +95,7 @@ def begin_test(constants: Structured, memory: Structured) -> None:
     """Use the belief, without negative friction, as the model, and begin its test, with all counts at 0."""
     k, m = constants[0], memory[0]
     belief.freeze(m)
-    margin.begin_sight(m)
+    sight.begin_sight(m)
     termination.begin_test(k, m, fit_check.late_square(m))
 
 
@@ -114,7 +114,7 @@ def begin_refinement(constants: Structured, memory: Structured) -> None:
 
 @compiled
 def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
-    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of an observation (`transitions`).
+    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of an observation (`findings`).
 
     is_complete: 1 for a fresh sample; else the filters and the model stay. A fresh sample with a value that isn't
     finite makes a gap. steps: periods since the fresh sample before it. mode: bits MEASURE to WEIGH; without WATCH the
@@ -160,7 +160,7 @@ def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
     """
     nominal_s: float = k.period_s
     period_s: float = out.period_s
-    is_seen = m.gaps.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, sensitivity.MOST_FILLED)
+    is_seen = m.gaps.has_gap == 0.0 and is_filled(steps, period_s, nominal_s, lost_samples.MOST_FILLED)
     each_s = period_s / steps if is_seen else period_s
     if is_seen:
         filter_bank.choose_rates(k, m, each_s)
@@ -169,7 +169,7 @@ def _filter(k: Constants, m: Memory, out: CertifiedBlock, steps: int) -> bool:
             m.gaps.is_steady = 0.0
             q, dq, tau_J = m.gaps.between[0], m.gaps.between[1], m.gaps.between[2]
             _take_sample(k, m, q, dq, tau_J, each_s, is_seen, out.tau_ext_wide_hat)
-    sensitivity.follow_lost(k, m, out.dq, max(steps, 1), period_s, is_seen)
+    lost_samples.follow_lost(k, m, out.dq, max(steps, 1), period_s, is_seen)
     sensitivity.follow_torque_step(k, m, out.tau_J)
     if not is_seen and np.max(np.abs(out.dq)) > regressor.SLOW_RAD_S:
         belief.pause(m, k.settle_cycles)
@@ -216,7 +216,7 @@ def _take_sample(
     sensitivity.follow_standstill(k, m, dq)
     sensitivity.follow_velocity_noise(k, m, dq, m.gaps.is_steady != 0.0)
     sensitivity.follow_friction(k, m, tau_J)
-    external_torque.undo_filter(
+    undone_filter.undo_filter(
         m.filters.r[filter_bank.WIDE], k.decay[filter_bank.WIDE], m.wide_history, tau_ext_wide_hat
     )
 
@@ -282,11 +282,11 @@ def _follow_noise(k: Constants, m: Memory, is_free: bool, mode: int) -> None:
     """
     if not is_free:
         belief.discard(m)
-        margin.discard_tail(m)
+        tail.discard_tail(m)
         return
     sensitivity.keep_velocity_noise(k, m)
     if mode & (TEST | REFINE):
-        margin.follow_tail(k, m)
+        tail.follow_tail(k, m)
 
 
 @compiled
@@ -297,7 +297,7 @@ def _test(k: Constants, m: Memory, dq: Vector) -> int:
     `withheld_by`, and, without a payload, keep the fit's beliefs as evidence.
     """
     sensitivity.follow_unit(k, m, False)
-    margin.follow_test(k, m)
+    sight.follow_test(k, m)
     result = termination.test(k, m, dq, m.filters.r[filter_bank.SLOW])
     if result >= 0:
         return CERTIFIED if result > 0 else 0
@@ -317,7 +317,7 @@ def _refine(k: Constants, m: Memory) -> int:
     """
     sensitivity.follow_unit(k, m, True)
     sensitivity.decay_strain(k, m)
-    cause = certificate.BLIND if margin.follow_sight(k, m) else certificate.NOTHING
+    cause = certificate.BLIND if sight.follow_sight(k, m) else certificate.NOTHING
     if belief.learn(k, m):
         belief.wander(k.drift_std, m.filters.W_learnt, k.period_s * k.learn_every, m.models.P_belief)
         if missing_torque.is_confirmed(k, m):

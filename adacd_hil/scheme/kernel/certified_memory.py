@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from adacd_hil.records import JOINTS, POSITION_TERMS, CertifiedBlock, Vector, block_sizes
-from adacd_hil.scheme.detect import external_torque, margin, sensitivity
+from adacd_hil.scheme.detect import sensitivity, sight, tail, undone_filter
 from adacd_hil.scheme.identify import (
     anchor,
     belief,
@@ -18,6 +18,7 @@ from adacd_hil.scheme.identify import (
     evidence,
     fit_check,
     missing_torque,
+    place_bound,
 )
 from adacd_hil.scheme.kernel.kernel_samples import Numbers, limits_of
 from adacd_hil.scheme.memory import Constants, Memory
@@ -69,7 +70,7 @@ def prior_std_of(settings: Settings) -> Vector:
         if name.startswith(CROSS_TALK):
             std[j] = settings.certified.cross_talk_std
         elif name.startswith(POSITION_TERMS):
-            std[j] = settings.arm.position_torque_Nm / anchor.LARGEST_OF_STD
+            std[j] = settings.arm.position_torque_Nm / place_bound.LARGEST_OF_STD
         else:
             std[j] *= next((share for term, share in further_friction.SHARES.items() if name.startswith(term)), 1.0)
     return std
@@ -171,7 +172,8 @@ def constants_of(settings: Settings) -> Structured:
             evidence=evidence.constants_of(settings, prior_std),
             step_samples=fit_check.step_samples_of(settings),
             waiting=_waiting_of(settings),
-            margin=margin.constants_of(settings),
+            tail=tail.constants_of(settings),
+            sight=sight.constants_of(settings),
             missing_torque=missing_torque.constants_of(settings, prior_std),
             collision_Nm=np.array(settings.detector.collision_Nm),
             limits=limits_of(settings),
@@ -208,7 +210,7 @@ def sizes_of(settings: Settings) -> dict[str, int]:
         "places": JOINTS * torque_by_place.PLACE_TERMS,
         "filters": settings.filter_count,
         "channels": settings.channel_count,
-        "wide": external_torque.WIDE_SAMPLES + 1,
+        "wide": undone_filter.WIDE_SAMPLES + 1,
         "places_in_ring": max(LEAST_PLACES, _waiting_of(settings)),
         "kinds": anchor.KINDS,
         "sources": evidence.SOURCES,
@@ -216,7 +218,7 @@ def sizes_of(settings: Settings) -> dict[str, int]:
         "steps": fit_check.STEPS,
         "room": fit_check.ROOM,
         "causes_n": doubt.CAUSES + JOINTS,
-        "bins": margin.BINS,
+        "bins": sight.BINS,
     }
 
 

@@ -23,8 +23,8 @@ from adacd_hil.scheme.kernel.kernel_samples import put_sample
 from adacd_hil.scheme.memory import Sample
 from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.supervisor import supervisor
+from adacd_hil.scheme.supervisor.findings import CONTACT_SHIFT, WITHHELD
 from adacd_hil.scheme.supervisor.supervisor import IS_LEARNING, IS_REACTING, SupervisorConstants, SupervisorMemory
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, WITHHELD
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Structured, described, zeros_of
 
@@ -41,7 +41,7 @@ BEFORE_CONTACT = LEFT | REFUSED | TOOK_OVER | ACCEPTED
 
 
 class Decision:
-    """The result of a cycle. observation: bits of an observation (`transitions`).
+    """The result of a cycle. observation: bits of an observation (`findings`).
 
     contact_joints: bit i for joint i + 1.
     """
@@ -278,7 +278,7 @@ def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, deci
 
     ACCEPTED: the user asks to accept a refusal, pending or not; a pending one is not refused again in this cycle.
     REFUSED: a certificate is withheld, and the state before wasn't MONITOR. observation: the kernel's findings, see
-    `transitions`. Fill previous state, findings and joints in contact of `decision`.
+    `findings`. Fill previous state, findings and joints in contact of `decision`.
     """
     asked, previous = 0, m.supervisor.state
     if sample.request == Request.ACCEPT:

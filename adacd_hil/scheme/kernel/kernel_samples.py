@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, ArmBatch, ArmState, SchemeBlock, Vector
 from adacd_hil.scheme.memory import Limits, Sample
-from adacd_hil.scheme.supervisor.transitions import AT_REST, NOT_A_NUMBER, OVER_LIMIT, UNLOADED, UNSEEN
+from adacd_hil.scheme.supervisor.findings import AT_REST, NOT_A_NUMBER, OVER_LIMIT, UNLOADED, UNSEEN
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Structured, described
 

@@ -9,7 +9,7 @@ in `torque_filter`. The step's result has the bit UNSEEN unless the filters took
 
 The measured interval enters the quantities that integrate: filters, estimator, information, impulse. It does not enter
 the quantities that count. T of eq. (15) is counted in cycles, whose grid keeps its phase, so it is right to a period.
-`external_torque.undo_filter` needs only the ends of the mean of five derivatives, and the five periods between them.
+`undone_filter.undo_filter` needs only the ends of the mean of five derivatives, and the five periods between them.
 
 **Beside.** Beside the certified scheme it takes the same samples by the same step (`step_beside`): it adapts until eq.
 (15) holds, then compares with its thresholds. Its results are in the block of the scheme in charge.
@@ -22,7 +22,7 @@ import numpy as np
 
 from adacd_hil.compiled import compiled
 from adacd_hil.records import JOINTS, CertifiedBlock, SchemeBlock, Vector, block_sizes
-from adacd_hil.scheme.detect import external_torque
+from adacd_hil.scheme.detect import external_torque, undone_filter
 from adacd_hil.scheme.identify import estimator, excitation, termination
 from adacd_hil.scheme.kernel.kernel_samples import (
     Numbers,
@@ -35,14 +35,7 @@ from adacd_hil.scheme.kernel.kernel_samples import (
 )
 from adacd_hil.scheme.memory import Limits, Motion, Sample
 from adacd_hil.scheme.model import regressor, torque_filter
-from adacd_hil.scheme.supervisor.transitions import (
-    ADAPTED,
-    ANY_CONTACT,
-    CONTACT_SHIFT,
-    NOT_A_NUMBER,
-    OVER_LIMIT,
-    UNSEEN,
-)
+from adacd_hil.scheme.supervisor.findings import ADAPTED, ANY_CONTACT, CONTACT_SHIFT, NOT_A_NUMBER, OVER_LIMIT, UNSEEN
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.structured import Columns, PerJoint, PerParameter, Square, Structured, packed, zeros_of
 
@@ -149,7 +142,7 @@ def constants_of(settings: Settings) -> Structured:
 
 def new_memory(parameter_count: int) -> Structured:
     """Return the memory before the first sample: a gap, with tau_f = 0, W_f = 0 and theta_hat = 0."""
-    memory = zeros_of(PaperMemory, {"n": JOINTS, "p": parameter_count, "wide": external_torque.WIDE_SAMPLES + 1})
+    memory = zeros_of(PaperMemory, {"n": JOINTS, "p": parameter_count, "wide": undone_filter.WIDE_SAMPLES + 1})
     m: PaperMemory = memory[0]
     m.has_gap = 1.0
     return memory
@@ -191,7 +184,7 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
 
 @compiled
 def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
-    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of an observation (`transitions`).
+    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of an observation (`findings`).
 
     is_complete: 1 for a fresh sample; else filters and estimate stay. A fresh sample with a value that isn't finite
     makes a gap. steps: periods since the fresh sample before it. mode: LEARN, ARMED, REPORTING; without ARMED the
@@ -282,7 +275,7 @@ def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: S
     external_torque.predict(m.W_f, c.theta_cad, out.tau_f_cad)
     external_torque.estimate_external(out.tau_f, out.tau_f_hat, c.dc_gain, out.tau_ext_hat)
     external_torque.estimate_external(out.tau_f, out.tau_f_cad, c.dc_gain, out.tau_ext_hat_cad)
-    external_torque.undo_filter(out.tau_ext_hat, c.decay, m.wide_history, out.tau_ext_wide_hat)
+    undone_filter.undo_filter(out.tau_ext_hat, c.decay, m.wide_history, out.tau_ext_wide_hat)
 
 
 @compiled
@@ -318,7 +311,7 @@ def _watch(
     F_c = out.theta_hat[regressor.F_C1 : regressor.F_C2 + 1]
     external_torque.fill_threshold(c.threshold_Nm, m.standstill, F_c, out.threshold)
     if is_fresh:
-        external_torque.follow_contact(
+        undone_filter.follow_contact(
             out.tau_ext_hat,
             out.tau_ext_wide_hat,
             out.threshold,

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from adacd_hil.records import JOINTS, BriefedEvent, Event, SchemeState, Vector
-from adacd_hil.scheme.detect import margin
-from adacd_hil.scheme.identify import anchor, certificate, earlier, missing_torque
+from adacd_hil.scheme.detect import sight
+from adacd_hil.scheme.identify import anchor, certificate, earlier, missing_torque, place_bound
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.identify.doubt import CommonCause
 from adacd_hil.scheme.memory import Constants, Memory
@@ -105,15 +105,15 @@ class CertificateWatch:
         known_by, self._vouched_against = self._known_by(), ""
         k, m = self._k, self._m
         level = "warning" if anchor.open_joints(k, m) else "info"
-        by_place = anchor.describe_place(k, m)
-        text = f"{anchor.describe(k, m)}; {margin.describe_sight(m)}; {known_by}{by_place}"
+        by_place = place_bound.describe(k, m)
+        text = f"{anchor.describe(k, m)}; {sight.describe_sight(m)}; {known_by}{by_place}"
         self._is_standing = True
         self._certificates.append(certificate.certificate_of(k, m, text))
         return BriefedEvent.of(Event(level, "certificate", text), self._certified_in_brief(known_by))
 
     def _certified_in_brief(self, known_by: str) -> str:
         """Return a certificate's short text: unanchored joints, the smallest push, and a weak basis of its friction."""
-        texts = [margin.describe_push(self._m)]
+        texts = [sight.describe_push(self._m)]
         joints = " and ".join(f"joint {i + 1}" for i in anchor.open_joints(self._k, self._m))
         if joints:
             texts.insert(0, f"warning: a lean on {joints} from before the start counts as a torque offset")
@@ -214,11 +214,11 @@ class CertificateWatch:
             case certificate.BY_PLACE:
                 lines = missing_torque.describe(m)
             case certificate.TOO_MUCH_BY_PLACE:
-                lines = anchor.describe_place_refused(k, m)
+                lines = place_bound.describe_refused(k, m)
             case certificate.MORE_THAN_LAST:
                 lines = certificate.describe_more(m, self._last_utc)
             case _:
-                lines = margin.describe_dim(m)
+                lines = sight.describe_dim(m)
         return lines
 
     def accept(self) -> Event:

@@ -9,7 +9,7 @@ import numpy as np
 from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, Event, SchemeState
 from adacd_hil.scheme.contact import course
 from adacd_hil.scheme.contact.contact_report import compile_recalled, new_rows, recalled_report
-from adacd_hil.scheme.detect import margin, sensitivity
+from adacd_hil.scheme.detect import sensitivity, sight
 from adacd_hil.scheme.detect.margin_watch import MarginWatch
 from adacd_hil.scheme.identify import anchor, certificate, doubt, earlier, termination
 from adacd_hil.scheme.identify.certificate import Certificate
@@ -30,7 +30,8 @@ from adacd_hil.scheme.model import filter_bank
 from adacd_hil.scheme.pipeline.certificate_watch import CertificateWatch
 from adacd_hil.scheme.pipeline.pipeline import Pipeline
 from adacd_hil.scheme.supervisor import supervisor
-from adacd_hil.scheme.supervisor.transitions import CONTACT_SHIFT, SchemeEvent
+from adacd_hil.scheme.supervisor.findings import CONTACT_SHIFT
+from adacd_hil.scheme.supervisor.transitions import SchemeEvent
 from adacd_hil.settings.configuration import Settings
 
 FORGOTTEN_S = 1.0
@@ -118,7 +119,7 @@ class CertifiedPipeline(Pipeline):
         Report an acceptance or a refusal. At a new state weigh the contact, which may stop the arm, and run the state's
         first actions. After a refusal that stays in ADAPT learn anew. At TOOK_OVER update the feedforward. asked: bits
         of the tasks, see `kernel.cycle`. previous: state before this cycle. observation: the cycle's findings, see
-        `transitions`.
+        `findings`.
         """
         state = self.state
         if asked & ACCEPTED:
@@ -161,7 +162,7 @@ class CertifiedPipeline(Pipeline):
         Report a margin or a smallest push that has become worse. A warning is reported once, until it has ended.
         """
         self._margin.add_block(sensitivity.take_peak_shares(self._m))
-        dim = "; ".join(margin.describe_dim(self._m))
+        dim = "; ".join(sight.describe_dim(self._m))
         for name, warning in (("margin", self._margin.warning), ("sight", dim)):
             if warning and name not in self._warned:
                 self._events.append(Event("warning", name, warning))

@@ -126,7 +126,7 @@ class Pipeline(ABC):
         """Run a scheme's tasks of BEFORE_CONTACT, such as a new state's first actions, before the contact's course.
 
         asked: bits of the tasks, see `kernel.cycle`. previous: state before this cycle. observation: the cycle's
-        findings, see `transitions`.
+        findings, see `findings`.
         """
 
     @abstractmethod

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from adacd_hil.compiled import compiled
 from adacd_hil.records import FaultReason, Request, SchemeState
 from adacd_hil.scheme.memory import Sample
-from adacd_hil.scheme.supervisor.transitions import (
+from adacd_hil.scheme.supervisor.findings import (
     ADAPTED,
     ANY_CONTACT,
     AT_REST,
@@ -42,10 +42,8 @@ from adacd_hil.scheme.supervisor.transitions import (
     UNLOADED,
     UNSEEN,
     WITHHELD,
-    SchemeEvent,
-    leads_on,
-    next_state,
 )
+from adacd_hil.scheme.supervisor.transitions import SchemeEvent, leads_on, next_state
 from adacd_hil.settings.configuration import Settings
 
 REST_HOLD_S = 0.05
@@ -179,7 +177,7 @@ def supervise(
     """Advance the supervisor in `m` by a cycle.
 
     Count findings, keep or drop the request, and latch a contact that has grown. Change the state at most once: for a
-    fault, else a contact, else progress. observation: bits of the findings, see `transitions`. is_reporting: a
+    fault, else a contact, else progress. observation: bits of the findings, see `findings`. is_reporting: a
     contact's report is not final yet, so REACT can't end as settled. goes_on: the reaction in force lets the arm move
     on, so that a contact clears without rest.
     """
