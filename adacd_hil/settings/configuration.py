@@ -85,7 +85,7 @@ class Settings:
 
     @property
     def further_names(self) -> tuple[str, ...]:
-        """Names of the certified scheme's parameters after the dynamic ones, such as `offset1`; () for the paper's.
+        """Names of the certified scheme's parameters after the dynamic ones; () for the paper's.
 
         Offsets, lags, friction terms, cross-talk and torques by position, as far as the settings ask for them.
         """
