@@ -135,7 +135,10 @@ class Exchange:
             self._master.accept(frame)
 
     def leave(self) -> int:
-        """Return the time at which this cycle's commands leave, ns; in lockstep, move the clock by modelled work."""
+        """Return the present time, ns, and stamp the frames sent from now on with it, until the next cycle.
+
+        In lockstep first move the clock by the modelled work. Call it once per cycle, before `end`.
+        """
         self._bus.held_ns = leaving_ns = self._pacer.command_time(self.feedback_ns)
         return leaving_ns
 

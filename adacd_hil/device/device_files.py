@@ -110,7 +110,10 @@ def logged_devices(settings: Settings, attachments: Mapping[str, bytes]) -> list
 
 
 def _logged_profile(name: str, attachments: Mapping[str, bytes]) -> DeviceProfile:
-    """Return the attached profile of a device. Raises KeyError if its file or EDS is missing or can't be used."""
+    """Return the attached profile of a device, with its EDS unread.
+
+    Raises KeyError if the profile or the EDS is missing, or the profile can't be parsed.
+    """
     try:
         settings = parse(ProfileSettings, parse_toml(attachments[f"{name}.toml"]))
     except ConfigError:

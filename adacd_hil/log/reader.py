@@ -305,9 +305,9 @@ class LogStream:
         self.attachments = {**head.attachments, **self.attachments}
 
     def _missing(self, start: int, stop: int) -> list[str]:
-        """Return one line that names the first and the last missing part of those from start to stop - 1.
+        """Return a line that says that the parts start to stop - 1 are missing; [] if stop isn't beyond start.
 
-        [] if there are none.
+        It names the first and the last one, and doesn't look for the files.
         """
         names = [part_path(self.path, number).name for number in sorted({start, stop - 1})] if start < stop else []
         return [f"{' to '.join(names)} {'is' if len(names) == 1 else 'are'} missing"] if names else []

@@ -60,8 +60,9 @@ class CanRecording(NamedTuple):
     def in_time(self, number: Places, t_ns: Places, part: slice) -> NDArray[Any]:
         """Return copies of the frames in the slice `part`, with t_ns and cycle_t_ns on the clock of given cycles.
 
-        number, t_ns (n,): these cycles and their times. A frame of a cycle that isn't given gets a time between its
-        neighbours.
+        number, t_ns (n,): these cycles, ascending, and their times. A cycle that isn't given gets 1 ns more than the
+        last given one before it, or 1 ns less than the first. So t_ns may fall where several cycles in a row are
+        missing; the order of the frames stays.
         """
         frames = self.frames[part].copy()
         frames["t_ns"] = _time_of(self.since[part], number, t_ns) + self.offset_ns[part]

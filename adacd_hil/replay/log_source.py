@@ -135,7 +135,11 @@ class AttemptSplitter:
         return sorted(begins.items())
 
     def _named_begins(self, arm: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return by /arm whether each cycle belongs to another attempt than the one before (n,)."""
+        """Return for each cycle of /arm (n,) whether an attempt begins there, and store the last cycle's attempt.
+
+        The first cycle is compared with the last one of the call before. At the log's begin it counts only if its
+        attempt begins with it. Call it once per piece, in the log's order.
+        """
         first = arm["first_cycle"].astype(np.int64)
         is_new = np.diff(first, prepend=self._first_cycle) != 0
         if len(first):
@@ -316,9 +320,11 @@ class LogSource:
         return LogStream(self._path, topics, self._cycles_per_piece, is_ahead=False)  # replay reads in a thread
 
     def devices(self, settings: Settings) -> list[PlacedDevice]:
-        """Return the devices of some settings: those attached to the log, if the settings name the same as the run's.
+        """Return the devices that the settings name.
 
-        Raises ConfigError if one can't be loaded.
+        They come from the log if the settings name the run's devices. They come from their files if the settings name
+        others, if the log lacks one, or if a profile in the log can't be parsed. Raises ConfigError if a profile or EDS
+        can't be used.
         """
         is_own = settings.devices == self.settings.devices
         own = logged_devices(settings, self._stream.attachments) if is_own else None

@@ -37,7 +37,7 @@ class EstimatorSettings:
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the estimated parameters in the order of theta: a1 to F_c2, with `gravity` also a4 and a5."""
+        """Names of the estimated parameters in the order of theta: a1 to F_c2; with `gravity` a4 and a5 follow."""
         return PARAMETER_NAMES + (GRAVITY_PARAMETER_NAMES if self.gravity else ())
 
     def __post_init__(self) -> None:

@@ -89,7 +89,7 @@ _WIRES = {
 
 
 def is_bus_off(frame: Frame) -> bool:
-    """Return whether an error frame reports bus-off."""
+    """Return whether an error frame reports bus-off. Call it with error frames only: others have data in that bit."""
     return bool(frame.can_id & _BUS_OFF)
 
 

@@ -525,9 +525,10 @@ class DriveNode(Application):
             self.has_news = True
 
     def _is_cause_present(self, t_ns: int) -> bool:
-        """Return whether a reset fault would return: drive or motor fails, a watchdog is tripped, or commands miss.
+        """Return whether the cause of the fault is still there, so that a reset would do nothing.
 
-        Watchdogs that only warn don't count.
+        A failure of drive or motor counts, and a tripped watchdog that doesn't only warn. Missing commands count only
+        if they caused this fault.
         """
         if self._failure or self._tripped - WARNINGS or self._arm.motor_error_code[self._joint]:
             return True

@@ -414,9 +414,9 @@ def free_hours(log: TunedLog) -> float:
 
 
 def tuning_by_key(found: Tuning) -> dict[str, Any]:
-    """Return the result by the keys of tune.json: logs, suggestion, candidates, detectors, notes.
+    """Return the result by the keys of tune.json, from rate_per_h to limits; `suggested` is None without a suggestion.
 
-    Values are tuples, arrays and paths, too.
+    `json_text` writes the values: some are tuples, arrays and paths.
     """
 
     def candidate(each: Candidate) -> dict[str, Any]:

@@ -234,9 +234,10 @@ class Series:
 
     @property
     def block(self) -> Vector:
-        """Float64 values of each message (n, k), from the first float64 field on: in our own topics the logged block.
+        """Bytes of each message from the first float64 field on, read as float64 (n, k); (n, 0) without such a field.
 
-        (n, 0) for a topic without float64 fields.
+        In /scheme and /control that is the logged block. Fields of other types behind it become meaningless numbers, or
+        raise ValueError.
         """
         fields: Mapping[str, Any] = self.records.dtype.fields or {}
         offsets = [int(fields[name][1]) for name in self.fields if fields[name][0].base == np.dtype("<f8")]

@@ -56,9 +56,10 @@ def constants_of(settings: Settings) -> SightConstants:
 
 @compiled
 def smallest_push(y: Vector, h: Vector, shown: Vector, joint: int) -> float:
-    """Return the smallest push on a joint, Nm, detected within WITHIN_S if the present y and h stay as they are.
+    """Return the smallest push on a joint, Nm, that is detected within WITHIN_S whatever its sign.
 
-    joint: from 0.
+    It assumes that y and h stay as they are. y, h (2 C - 1, n): output and threshold of each channel, Nm. shown (2 C -
+    1,): response of each channel to a step of 1, as in `constants_of`. joint: from 0.
     """
     filters = (y.shape[0] + 1) // 2
     least = np.inf
