@@ -125,7 +125,7 @@ def test_each_assumption_is_a_line_and_goes_when_the_truth_has_the_value(
     ("truth", "said"),
     [
         ("wrong-rated-torque", "Drive2 (node 12): rated torque 0x6076 = 6400 mNm, 8000 mNm expected"),
-        ("swapped-joints", "8000 mNm, 20000 mNm expected; it is that of joint 2: the drives are exchanged"),
+        ("swapped-joints", "it is that of joint 2: the drives are exchanged; exchange `devices.drive_node`"),
     ],
 )
 def test_what_the_drives_contradict_is_refused_before_they_are_enabled(folder: Path, truth: str, said: str) -> None:
