@@ -17,6 +17,7 @@ import canopen
 import numpy as np
 import pytest
 from loaded import loaded_contract
+from own_arm import OWN_SENSOR
 
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
@@ -520,23 +521,10 @@ def test_a_drive_that_refuses_another_mode_under_halt_is_taken_out_of_it_first()
     rig.enable()
 
 
-DIGITS_PROFILE = """
-kind = "sensor"
-eds = "torque_sensor.eds"
-features = ["heartbeat_consumer", "sync_counter"]
-[scale]
-torque_Nm = 1e-6
-[[pdo]]
-message = "Torque"
-number = 1
-cob_id = 0x180
-signals = [{ object = "0x9130:1", signal = "torque" }]
-"""
-
-
 def rig_with_profile(folder: Path, line: str = "") -> Rig:
     path = folder / "own.toml"
-    path.write_text(DIGITS_PROFILE.replace("[scale]", f"{line}\n[scale]"))
+    features = 'features = ["heartbeat_consumer", "sync_counter"]'
+    path.write_text(OWN_SENSOR.replace("[scale]", f"{features}\n{line}\n[scale]"))
     return Rig("torque_sensor.eds", sensor=(str(path), str(path)))
 
 
