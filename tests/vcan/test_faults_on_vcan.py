@@ -19,6 +19,7 @@ from typing import NamedTuple
 import pytest
 from experiment_runs import BIN, emulator
 from hang import HANG_S
+from rig import torque_of
 
 from adacd_hil.log.reader import read_log
 
@@ -178,12 +179,6 @@ def parse(line: str) -> Witnessed | None:
         return Witnessed(float(parts[0].strip("()")), int(can_id, 16), bytes.fromhex(data))
     except ValueError:
         return None
-
-
-def torque_of(frame: Witnessed) -> int:
-    """Return the target torque of a command frame, 0 of any other."""
-    is_command = frame.can_id in (0x201, 0x202) and len(frame.data) == 6
-    return int.from_bytes(frame.data[4:6], "little", signed=True) if is_command else 0
 
 
 def is_drive_off(frame: Witnessed) -> bool:
