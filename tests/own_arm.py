@@ -23,6 +23,18 @@ sensor_node = [21, 22]
 contract = ""
 """
 
+OWN_SENSOR = """
+kind = "sensor"
+eds = "torque_sensor.eds"
+[scale]
+torque_Nm = 1e-6
+[[pdo]]
+message = "Torque"
+number = 1
+cob_id = 0x180
+signals = [{ object = "0x9130:1", signal = "torque" }]
+"""
+
 OTHER_LAYOUT = """
 [[pdo]]
 message = "Feedback"

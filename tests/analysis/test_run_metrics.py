@@ -286,10 +286,6 @@ def covered_run():
     return replace(run, truth=replace(run.truth, span=Span(FIRST_CYCLE + 1500, FIRST_CYCLE + 4000)))
 
 
-def stopped_run():
-    return make_run((A, 1000), (M, 1000), (R, 100), (S, 3000), (M, 1000))
-
-
 @pytest.mark.parametrize(
     ("make", "label", "counting", "not_counting"),
     [
@@ -298,7 +294,7 @@ def stopped_run():
         (real_arm, "B", (2999 - SETTLING_ROWS, 3100 + SETTLING_ROWS), (3001 - SETTLING_ROWS, 3098 + SETTLING_ROWS)),
         (lambda: make_run(finish_cycle=FIRST_CYCLE + 9000), "E", (8999,), (9000,)),
         (covered_run, "B", (1500, 4000), (1499, 4001)),
-        (stopped_run, "B", (), (4000,)),
+        (lambda: make_run((A, 1000), (M, 1000), (R, 100), (S, 3000), (M, 1000)), "B", (), (4000,)),
     ],
     ids=["contact and ten time constants", "withdrawal", "about a real arm's detection", "parking", "truth", "stop"],
 )

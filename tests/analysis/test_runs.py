@@ -129,13 +129,9 @@ def test_a_log_that_is_being_written_is_running(tmp_path):
     assert run.status == RUNNING
 
 
-def certified_table() -> dict[str, Any]:
-    run = make_certified_run()
-    return report_json(evaluate(run), run.metadata, ReportSource("run.mcap"))
-
-
 def test_friction_and_offsets_are_those_of_the_first_certificate_without_payload(one):
-    table = certified_table()
+    made = make_certified_run()
+    table: dict[str, Any] = report_json(evaluate(made), made.metadata, ReportSource("run.mcap"))
     payload = {key: [9.0] * len(values) for key, values in CERTIFICATE.items()}
     table["certified"]["certificates"] = [{**payload, "is_payload": True}, {**CERTIFICATE, "is_payload": False}]
     run = reported(one, "a", table)

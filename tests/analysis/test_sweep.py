@@ -8,6 +8,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from called import called
@@ -27,26 +28,11 @@ def plan_of_runs(seeds=range(1, 6), variants=THRESHOLDS) -> Plan:
     return plan_of([Subject(scenario="paper", seed=seed) for seed in seeds], variants, "paper", "", "1")
 
 
-class ThreadWorkers:
-    """Threads of this process, which ends with the test."""
-
-    room = 2
-
-    def __init__(self) -> None:
-        self.pool = ThreadPoolExecutor(2)
-
-    def submit(self, work, task):
-        return self.pool.submit(work, task)
-
-    def replace_dead(self) -> None:
-        raise AssertionError("no thread has died")
-
-
 @pytest.fixture(scope="module")
 def client():
-    workers = ThreadWorkers()
-    with workers.pool:
-        yield workers
+    """Threads of this process, which end with the tests, and of which none dies."""
+    with ThreadPoolExecutor(2) as pool:
+        yield SimpleNamespace(room=2, submit=pool.submit)
 
 
 @pytest.mark.slow

@@ -187,10 +187,6 @@ def test_logs_that_can_not_be_used_are_named(changes, words):
         statistics_of({"a.mcap": log_of(2.0), "b.mcap": log_of(2.0, **changes)})
 
 
-def arm_with(**changes) -> Settings:
-    return replace(Settings(), arm=replace(Settings().arm, **changes))
-
-
 @pytest.mark.parametrize(
     ("changes", "error", "words"),
     [
@@ -201,7 +197,7 @@ def arm_with(**changes) -> Settings:
     ids=["another arm", "another emulated arm", "another zero, another limit"],
 )
 def test_logs_of_two_arms_are_refused(monkeypatch, changes, error, words):
-    found = {"a.mcap": Settings(), "b.mcap": arm_with(**changes)}
+    found = {"a.mcap": Settings(), "b.mcap": replace(Settings(), arm=replace(Settings().arm, **changes))}
     monkeypatch.setattr(module, "logged_settings", lambda path: found[path.name])
     with pytest.raises(error, match=words):
         compute_thresholds(statistics_of({name: log_of(2.0) for name in found}), 1.0)

@@ -48,7 +48,10 @@ def test_a_silent_device_and_a_missing_priority_are_warned_of():
         "without real-time priority (SCHED_OTHER) the times are those of a busy desktop",
         "never a cyclic frame from Sensor2",
     ]
+    sensor = described["devices"]["Sensor2"]
+    assert (sensor["never"], sum(sensor["ages"])) == (200, 0)
     lines = as_text(described).splitlines()
+    assert "overruns 0, frames lost 0, frames missing 200, commands late 0, in 200 cycles" in lines
     assert lines[4].startswith("Sensor2: fresh in 0.00 % of the periods; ")
     assert "SYNC → feedback, µs (SYNC sent to last frame decoded): no value" in lines
     assert lines[-1].startswith("not sufficient: 0.00 %")

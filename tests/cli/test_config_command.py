@@ -25,14 +25,9 @@ def shown(*arguments: str) -> dict[str, tuple[str, str]]:
     return {row["key"]: (row["value"], row["origin"]) for row in json.loads(result.stdout)}
 
 
-@pytest.fixture
-def own_arm(tmp_path: Path) -> str:
-    path = tmp_path / "my-arm.toml"
-    path.write_text('extends = "certified"\n[arm]\nlink_length_m = [0.4, 0.25]\ncad_theta = []\n')
-    return str(path)
-
-
-def test_each_value_is_told_with_where_it_is_from(own_arm):
+def test_each_value_is_told_with_where_it_is_from(tmp_path):
+    own_arm = str(tmp_path / "my-arm.toml")
+    Path(own_arm).write_text('extends = "certified"\n[arm]\nlink_length_m = [0.4, 0.25]\ncad_theta = []\n')
     told = shown("--config", own_arm, "--set", "filter.a_rad_s=12")
     assert told["arm.link_length_m"] == ("[0.4, 0.25]", own_arm)
     assert told["filter.a_rad_s"] == ("12", "--set")

@@ -95,10 +95,6 @@ def test_frames_that_the_kernel_dropped_are_counted_and_said_at_most_once_a_seco
     assert event.message.startswith("3 received frames")
 
 
-def no_acknowledge(t_s: float) -> Frame:
-    return Frame(0x020, bytes(8), int(t_s * 1e9), is_error=True)
-
-
 def texts(events: RateLimitedEvents) -> list[str]:
     return [event.message for event in events.take_events()]
 
@@ -106,7 +102,7 @@ def texts(events: RateLimitedEvents) -> list[str]:
 def test_each_kind_of_error_frame_is_said_once_a_second_and_the_rest_counted() -> None:
     events = RateLimitedEvents()
     for t_s in (0.0, 0.4, 0.999, 1.0):
-        say_trouble(events, no_acknowledge(t_s))
+        say_trouble(events, Frame(0x020, bytes(8), int(t_s * 1e9), is_error=True))
     passive = Frame(0x204, bytes((0, 0x20, 0, 0, 0, 0, 130, 0)), 1_100_000_000, is_error=True)
     say_trouble(events, passive)
     assert texts(events) == [

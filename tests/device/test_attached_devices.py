@@ -7,14 +7,9 @@ import pytest
 
 from adacd_hil.device.attached_devices import device_attachments
 from adacd_hil.device.device_files import load_profile, logged_devices, place_devices
-from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.toml_text import to_toml
 from adacd_hil.wire.dbc_contract import contract_folder
-
-
-def with_drives(settings: Settings, first: Path, second: Path) -> Settings:
-    return dataclasses.replace(settings, devices=dataclasses.replace(settings.devices, drive=(str(first), str(second))))
 
 
 def own_drive(folder: Path, name: str, eds: bytes) -> Path:
@@ -42,7 +37,8 @@ def test_the_attached_devices_are_those_of_the_run(name: str) -> None:
 def test_two_files_of_one_name_are_kept_apart(tmp_path: Path, name: str) -> None:
     eds = (contract_folder() / "stock_drive.eds").read_bytes()
     files = own_drive(tmp_path / "a", name, eds), own_drive(tmp_path / "b", name, eds + b"\n; another\n")
-    settings = with_drives(load_settings("stock"), *files)
+    stock = load_settings("stock")
+    settings = dataclasses.replace(stock, devices=dataclasses.replace(stock.devices, drive=tuple(map(str, files))))
     run = place_devices(settings)
     for file in files:
         file.unlink()

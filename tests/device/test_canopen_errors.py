@@ -1,6 +1,7 @@
 """Whatever canopen raises becomes one line with device, node and object; what the bus raises passes."""
 
 import struct
+from types import SimpleNamespace
 
 import canopen
 import pytest
@@ -48,17 +49,6 @@ def test_an_error_that_says_it_all_passes(error: Exception) -> None:
     assert caught.value is error
 
 
-class Node:
-    """A node whose answer canopen can't read."""
-
-    id = 5
-
-    class sdo:  # noqa: N801
-        @staticmethod
-        def upload(index: int, subindex: int) -> bytes:
-            return struct.unpack("<I", b"")[0]
-
-
 def test_an_object_that_comes_garbled_names_the_node() -> None:
     with pytest.raises(DeviceError, match=r"^node \(node 5\): object 0x1008:0: unpack requires"):
-        read_object(Node, 0x1008)
+        read_object(SimpleNamespace(id=5, sdo=SimpleNamespace(upload=lambda *_: struct.unpack("<I", b""))), 0x1008)

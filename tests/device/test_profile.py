@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from eds_variants import EdsVariant
 from loaded import loaded_contract
+from own_arm import OWN_SENSOR
 
 from adacd_hil.device.device_files import load_profile, profile_names
 from adacd_hil.device.eds_file import read_eds
@@ -19,19 +20,7 @@ from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.settings.toml_text import to_short_toml, to_toml
 from adacd_hil.wire.dbc_contract import contract_folder
 
-SENSOR = """
-kind = "sensor"
-eds = "torque_sensor.eds"
-[scale]
-torque_Nm = 1e-6
-[[pdo]]
-message = "Torque"
-number = 1
-cob_id = 0x180
-signals = [{ object = "0x9130:1", signal = "torque" }]
-"""
-
-HEADED = SENSOR.replace(
+HEADED = OWN_SENSOR.replace(
     "[scale]", 'protection = "P05"\nheader = ["0x2100:1", "0x2100:2", "0x2100:3"]\n[scale]'
 ).replace('signal = "torque" }', 'signal = "torque" }, { object = "0x2111", signal = "e2e_counter" }')
 HEADED += 'data_ids = ["0001", "0002"]\n'
@@ -51,14 +40,14 @@ def test_a_profile_written_as_toml_reads_back_to_the_same(name: str) -> None:
 
 
 def test_a_users_file_is_a_profile_and_an_eds_beside_it_comes_first(tmp_path: Path) -> None:
-    profile = load_profile(profile_file(tmp_path, SENSOR), "sensor")
+    profile = load_profile(profile_file(tmp_path, OWN_SENSOR), "sensor")
     assert (profile.name, profile.eds.name, profile.settings.pdo[0].mapping_index) == (
         "mine",
         "torque_sensor.eds",
         0x1A00,
     )
     (tmp_path / "torque_sensor.eds").write_text("")
-    assert load_profile(profile_file(tmp_path, SENSOR), "sensor").eds == tmp_path / "torque_sensor.eds"
+    assert load_profile(profile_file(tmp_path, OWN_SENSOR), "sensor").eds == tmp_path / "torque_sensor.eds"
 
 
 @pytest.mark.parametrize(
@@ -75,7 +64,7 @@ def test_a_users_file_is_a_profile_and_an_eds_beside_it_comes_first(tmp_path: Pa
         (("torque_Nm = 1e-6", ""), "a sensor needs torque_Nm"),
         (("[scale]", 'protection = "P02"\n[scale]'), "header has 0 objects, P02 takes 2"),
         (("cob_id", 'data_ids = ["00", "11"]\ncob_id'), "data_ids need protection P02 or P05"),
-        ((SENSOR, HEADED), "signal 'e2e_counter' has the name of a part of the header"),
+        ((OWN_SENSOR, HEADED), "signal 'e2e_counter' has the name of a part of the header"),
         (("[scale]", "features = ['sync_conter']\n[scale]"), "did you mean 'sync_counter'?"),
         (("[scale]", "serial = [1]\n[scale]"), "serial has 1 numbers, 2 expected"),
         (("[scale]", "[scale]\ngear_ratio = 2"), "`scale.gear_ratio` has no effect: this is a sensor"),
@@ -87,7 +76,7 @@ def test_a_users_file_is_a_profile_and_an_eds_beside_it_comes_first(tmp_path: Pa
 )
 def test_a_profile_that_cant_be_used_is_one_line(tmp_path: Path, change: tuple[str, str], line: str) -> None:
     with pytest.raises(ConfigError) as raised:
-        load_profile(profile_file(tmp_path, SENSOR.replace(*change)), "sensor")
+        load_profile(profile_file(tmp_path, OWN_SENSOR.replace(*change)), "sensor")
     assert line in str(raised.value)
     assert "\n" not in str(raised.value)
 
@@ -199,7 +188,7 @@ def test_a_float_is_not_read_as_an_integer(tmp_path: Path) -> None:
     (tmp_path / "torque_sensor.eds").write_text(
         eds[:torque] + eds[torque:].replace("DataType=0x0004", "DataType=0x0008")
     )
-    sensor = profile_file(tmp_path, SENSOR.replace("1e-6", "1.0"))
+    sensor = profile_file(tmp_path, OWN_SENSOR.replace("1e-6", "1.0"))
     devices = dataclasses.replace(load_settings("certified").devices, sensor=(sensor, sensor), contract="")
     with pytest.raises(
         ConfigError, match=r"0x9130:1 \(AI input PV 32 bit, AI input PV 1\) is a float, REAL32; .* integers"

@@ -22,10 +22,6 @@ STOCK = {
 }
 
 
-def eds_of(file: str, node: int) -> canopen.ObjectDictionary:
-    return canopen.import_od(str(contract_folder() / file), node)
-
-
 def layout_of(eds: canopen.ObjectDictionary, entries: tuple[int, ...]) -> list[tuple[int, int, bool]]:
     """Place mapped objects: start bit, length, is signed; each entry's length must be the object's."""
     places, start = [], 0
@@ -67,7 +63,8 @@ def test_mappings_by_default_and_what_is_to_be_mapped_on_stock_drives_are_the_db
     database = cantools.database.load_file(contract.path)
     seen = set()
     for node in (*DRIVE_NODES, *SENSOR_NODES):
-        eds = eds_of(contract.drive_eds if node in DRIVE_NODES else contract.sensor_eds, node)
+        file = contract.drive_eds if node in DRIVE_NODES else contract.sensor_eds
+        eds = canopen.import_od(str(contract_folder() / file), node)
         pdos = default_pdos(eds)
         if name == "arm_stock" and node in DRIVE_NODES:
             pdos = {base + node: entries for base, _, entries in STOCK.values()}

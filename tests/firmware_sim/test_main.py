@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -152,27 +151,18 @@ def test_once_ends_when_the_host_that_started_the_nodes_stops_or_resets_them_or_
     assert end_ms * MS <= clock.now_ns() <= (end_ms + 20) * MS
 
 
-def spawn(folder: Path, *arguments: str) -> subprocess.Popen[str]:
-    run = [sys.executable, "-m", "firmware_sim.cli.emulator_main", "run"]
-    command = [*run, *arguments, "--out", str(folder), "--json"]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
-def await_ready(said):
-    """Read until the nodes have announced themselves; before that it may compile."""
-    while (line := said.readline()) != "ready\n":
-        assert line.startswith("compiling ")
-
-
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.wallclock
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_before_a_host_ends_it_with_exit_code_0_and_leaves_nothing(tmp_path, number):
-    process = spawn(tmp_path / "out", "-i", "virtual", "-c", "test", "--scenario", "idle")
+    run = [sys.executable, "-m", "firmware_sim.cli.emulator_main", "run", "-i", "virtual", "-c", "test"]
+    command = [*run, "--scenario", "idle", "--out", tmp_path / "out", "--json"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
-        await_ready(process.stderr)
+        while (line := process.stderr.readline()) != "ready\n":
+            assert line.startswith("compiling ")
         process.send_signal(number)
         out, err = process.communicate(timeout=HANG_S)
     finally:

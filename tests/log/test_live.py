@@ -8,6 +8,7 @@ import signal
 import socket
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hang import HANG_S
@@ -235,16 +236,6 @@ def test_a_live_view_that_is_stopped_never_makes_the_writer_wait():
         os.kill(fed.live.process.pid, signal.SIGCONT)
 
 
-class OtherEnd:
-    """A server that says one thing."""
-
-    def __init__(self, word):
-        self._word = word
-
-    def recv(self, timeout):
-        return self._word
-
-
 def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_waits_for_nobody(tmp_path):
     run = make_run(1)
     run.cycles[0].event = LAST
@@ -280,4 +271,4 @@ def test_in_real_time_the_writer_shows_sooner_than_it_flushes_and_waits_for_nobo
 def test_a_server_that_is_none_of_ours_is_one_line(word, monkeypatch):
     monkeypatch.setattr("adacd_hil.lab.live.client.OPEN_TIMEOUT_S", 0.05)
     with pytest.raises(LogError, match=r"^it does not serve a log of adacd-hil$"):
-        LiveClient(OtherEnd(word), None)
+        LiveClient(SimpleNamespace(recv=lambda timeout: word), None)

@@ -4,6 +4,7 @@ import contextlib
 import json
 import sys
 import threading
+from types import SimpleNamespace
 
 import click
 import numpy as np
@@ -119,25 +120,15 @@ def test_a_residual_beyond_the_threshold_fills_the_bar_and_a_fault_is_named(desc
     assert text.startswith("MONITOR by DRIVE")
 
 
-class CertifiedClient:
-    """Has one record of the certified scheme, whose bank has three channels."""
-
-    def __init__(self):
-        (scheme,) = (c for c in run_channels(7, (), 2, 3) if c.topic == "/scheme")
-        self.record = np.zeros(1, payload_dtype(scheme.type.text))[0]
-        self.record["tau_ext_bank"] = (0.1, 0.2, -0.9, 0.4, 0.3, 5.0)
-        self.record["threshold_bank"] = (1.0, 1.0, 1.0, 1.0, 1.0, np.inf)
-
-    def decode(self, message):
-        return self.record
-
-
 def test_of_the_certified_scheme_the_filter_nearest_to_its_threshold_counts():
-    client = CertifiedClient()
-    monitor = LiveMonitor(client)
+    (scheme,) = (c for c in run_channels(7, (), 2, 3) if c.topic == "/scheme")
+    record = np.zeros(1, payload_dtype(scheme.type.text))[0]
+    record["tau_ext_bank"] = (0.1, 0.2, -0.9, 0.4, 0.3, 5.0)
+    record["threshold_bank"] = (1.0, 1.0, 1.0, 1.0, 1.0, np.inf)
+    monitor = LiveMonitor(SimpleNamespace(decode=lambda message: record))
     monitor.accept_message(LiveMessage("/scheme", 0, b""))
     assert [joint["share"] for joint in monitor.describe()["joints"]] == [0.9, 0.4]
-    client.record["threshold_bank"] = np.inf
+    record["threshold_bank"] = np.inf
     assert [joint["share"] for joint in monitor.describe()["joints"]] == [None, None]
 
 
@@ -195,28 +186,14 @@ def test_no_escape_sequence_of_an_event_reaches_the_terminal():
     assert {letter for letter in text if not letter.isprintable()} <= {"\n"}
 
 
-class StrangeClient:
-    """Has messages that no log of ours has."""
-
-    is_open = True
-
-    def __init__(self, message):
-        self._messages = [message]
-
-    def receive(self, timeout_s):
-        return self._messages.pop() if self._messages else None
-
-    def decode(self, message):
-        return np.zeros(1, [("state", np.uint8)])[0]
-
-
 @pytest.mark.parametrize(
     "message", [LiveMessage("/events", 0, b"short"), LiveMessage("/scheme", 0, b""), LiveMessage("/contact", 0, b"")]
 )
 def test_a_server_of_something_else_is_one_line_and_status_1(monkeypatch, message):
     @contextlib.contextmanager
     def strange(url, topics):
-        yield StrangeClient(message)
+        unknown = np.zeros(1, [("state", np.uint8)])[0]
+        yield SimpleNamespace(is_open=True, receive=lambda timeout_s: message, decode=lambda message: unknown)
 
     monkeypatch.setattr("adacd_hil.lab.cli.live_monitor.live_client", strange)
     result = CliRunner().invoke(cli, ["monitor", "--url", "ws://x:1", "--seconds", "0.1"])

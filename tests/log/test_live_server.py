@@ -12,7 +12,6 @@ import struct
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from hang import HANG_S
@@ -437,23 +436,14 @@ def test_the_live_view_ends_when_the_writer_dies(tmp_path):
         os.sched_yield()
 
 
-class Unstarted(NamedTuple):
-    """A server that listens and has not begun to serve; `writer`: what the log's writer tells it through."""
-
-    server: LiveServer
-    listening: socket.socket
-    address: tuple[str, int]
-    writer: socket.socket
-
-
 @pytest.fixture
 def unstarted():
+    """A server that listens and has not begun to serve, its socket, and what the log's writer tells it through."""
     ring = Ring(2**16)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     reader = RingReader(ring.descriptor)
     server = LiveServer(ServerSetup(SETUP, setup_of(None), CHANNEL_IDS, EPOCH_NS), reader, theirs)
-    listening = listen(SETUP)
-    yield Unstarted(server, listening, listening.getsockname(), ours)
+    yield server, listen(SETUP), ours
     for end in (ours, theirs, ring):
         end.close()
 
@@ -462,7 +452,8 @@ def unstarted():
 def test_a_viewer_that_comes_as_the_run_ends_leaves_nothing_open(steps, unstarted, monkeypatch):
     """It comes so many steps of the server's loop after the end was said."""
     monkeypatch.setattr(server_module, "LINGER_S", 0.1)
-    server, listening, address, writer = unstarted
+    server, listening, writer = unstarted
+    address = listening.getsockname()
 
     async def meet():
         serving = asyncio.create_task(server.run(listening))

@@ -61,11 +61,6 @@ def others(recorded):
     return by_others(recorded[0])
 
 
-def records_of(path):
-    with path.open("rb") as file:
-        return list(StreamReader(file, emit_chunks=True, validate_crcs=True).records)
-
-
 def decodable(run):
     """List (message, frame) of the frames that the DBC knows."""
     known = [(CODEC_FD.by_id.get(frame.can_id), frame) for *_, frame in run.frames]
@@ -183,7 +178,8 @@ def test_publish_time_is_the_cycle_and_log_time_never_runs_backwards(run, others
 
 
 def test_the_file_lets_a_viewer_know_seek_and_check_what_it_holds(run, recorded):
-    header, *records = records_of(recorded[0])
+    with recorded[0].open("rb") as file:
+        header, *records = StreamReader(file, emit_chunks=True, validate_crcs=True).records
     assert isinstance(header, Header)
     assert header.profile == "ros2"
     assert header.library.startswith(f"adacd-hil {__version__}")

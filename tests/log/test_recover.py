@@ -231,13 +231,9 @@ def test_a_part_whose_metadata_have_one_damaged_entry_is_still_of_the_run(tmp_pa
     assert recovery.losses.describe() == "metadata may be wrong"
 
 
-@pytest.fixture(scope="module")
-def undamaged(tmp_path_factory):
-    return make_undamaged(tmp_path_factory.mktemp("undamaged"), cycles=60)
-
-
 @pytest.mark.slow
-def test_of_a_log_damaged_at_random_all_is_found_and_nothing_wrong_is_saved(undamaged, tmp_path):
+def test_of_a_log_damaged_at_random_all_is_found_and_nothing_wrong_is_saved(tmp_path):
+    undamaged = make_undamaged(tmp_path, cycles=60)
     results = [run_trial(undamaged, seed, tmp_path / "trial") for seed in range(15)]
     assert [result for result in results if result.violations] == []
     assert {result.exit_status for result in results} >= {0, 3}

@@ -20,13 +20,6 @@ from adacd_hil.log.mcap.chunked_file import LIBRARY
 CYCLES = 120
 
 
-@pytest.fixture(scope="module")
-def log_path(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("log")
-    record(folder / "run.mcap", make_run(CYCLES, has_fd=True), messages=fd_codec().messages.values())
-    return folder / "run.mcap"
-
-
 def header_of(path):
     return kinds(take_apart(path.read_bytes()), Opcode.HEADER)[0].read(Header)
 
@@ -67,7 +60,9 @@ def by_mcap(path):
 
 
 @pytest.mark.slow
-def test_rosbags_reads_every_message_of_every_topic(log_path):
+def test_rosbags_reads_every_message_of_every_topic(tmp_path):
+    log_path = tmp_path / "run.mcap"
+    record(log_path, make_run(CYCLES, has_fd=True), messages=fd_codec().messages.values())
     theirs = by_rosbags(log_path)
     assert {"/scheme", "/joint_states", "/from_can_bus_fd", "/to_can_bus", "/events", "/contact"} <= set(theirs)
     assert len(theirs["/scheme"]) == CYCLES

@@ -60,10 +60,6 @@ def frames_of(pieces):
     return [frame for piece in pieces for frame in plain_frames(piece.frames)]
 
 
-def payloads_of(pieces, topic):
-    return b"".join(payloads(piece.series[topic]) for piece in pieces)
-
-
 def times_of(piece):
     """The cycles that a piece has something of, by topic; frames last."""
     times = [set((s.records["publish_time"].astype(np.int64) - EPOCH_NS).tolist()) for s in piece.series.values()]
@@ -77,7 +73,7 @@ def test_the_pieces_together_are_the_log(cycles, path, run, others):
     pieces = list(stream)
     assert stream.problem == ""
     for topic in others.keys() - {*FRAMES, "/events"}:
-        assert payloads_of(pieces, topic) == b"".join(others[topic]), topic
+        assert b"".join(payloads(piece.series[topic]) for piece in pieces) == b"".join(others[topic]), topic
     assert [payload for piece in pieces for payload in piece.payloads["/events"]] == others["/events"]
     assert frames_of(pieces) == run.frames
     assert not any(topic in piece.series for topic in FRAMES for piece in pieces)

@@ -162,17 +162,13 @@ def test_a_lag_that_is_held_moves_no_more_and_the_others_are_learnt_as_if_it_wer
     np.testing.assert_allclose(m.models.belief[OTHERS], theta, rtol=1e-6)
 
 
-def random_covariance(random, count=5):
-    root = random.standard_normal((count, count))
-    return root @ root.T + np.eye(count)
-
-
 @pytest.mark.parametrize("negative", range(5))
 def test_physically_possible_friction_is_the_nearest_to_what_was_learnt(negative):
     """In the metric of P, against a solver that we did not write."""
     random = np.random.default_rng(negative)
     for _ in range(5):
-        P, theta = random_covariance(random), np.abs(random.standard_normal(5))
+        root = random.standard_normal((5, 5))
+        P, theta = root @ root.T + np.eye(5), np.abs(random.standard_normal(5))
         theta[1 : 1 + negative] *= -1.0
         root = np.linalg.cholesky(np.linalg.inv(P)).T
         bounds = np.full(5, -np.inf), np.full(5, np.inf)

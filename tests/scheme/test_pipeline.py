@@ -10,7 +10,7 @@ from planar_arm import THETA
 from smooth_motion import PLACES, PaperKernel, settings_with, smooth_motion, torque_of
 
 from adacd_hil.control.motions import corner_to_corner
-from adacd_hil.records import FaultReason, Request, SchemeState
+from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
 from adacd_hil.scheme.supervisor import findings
@@ -43,13 +43,6 @@ class PaperLoop(ExcitedLoop):
     def monitor(self):
         outputs = self.run_until(SchemeState.MONITOR, 20_000)
         return outputs + self.run(300)
-
-    def change_payload(self, added):
-        self.request = Request.PAYLOAD
-        self.run(400)
-        self.theta = self.theta + added
-        self.request = Request.PAYLOAD_CHANGED
-        self.run_until(SchemeState.ADAPT)
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Each instrument says with --help what it does, and the names of modules and files that it holds as text exist."""
+"""Each instrument says with --help what it does, uses public names only, and names modules and files that exist."""
 
 import ast
 import contextlib
@@ -16,6 +16,10 @@ import pytest
 from tool_files import PROGRAMS, PYTHON_TOOLS, ROOT
 
 PATH = re.compile(r"(?<![\w/.])(?:adacd_hil|firmware_sim|tests|tools|docs|dbc)/[\w/-]+\.(?:py|md|c|toml|dbc)")
+PRIVATE = re.compile(
+    r"(?<!\bself)(?<!\bcls)(?<!\bos)\._(?!asdict|replace|fields|make)[A-Za-z]\w*|import (?:\([^)]*|.*)\b_[A-Za-z]\w*"
+)
+"""A private name of another module or object, imported, taken or patched by its path; not that of a named tuple."""
 
 
 @pytest.mark.slow
@@ -67,6 +71,11 @@ def test_modules_and_paths_that_a_tool_names_exist(tool: Path) -> None:
     assert [name for name in sorted(dotted_names(tool)) if not exists(name)] == []
     text = tool.read_text(encoding="utf-8")
     assert [path for path in dict.fromkeys(PATH.findall(text)) if not (ROOT / path).exists()] == []
+
+
+@pytest.mark.parametrize("tool", PYTHON_TOOLS, ids=lambda path: path.name)
+def test_a_tool_uses_public_names_only(tool: Path) -> None:
+    assert PRIVATE.findall(tool.read_text(encoding="utf-8")) == []
 
 
 @pytest.mark.parametrize(("module", "patterns"), mutate.TARGETS.items())

@@ -35,18 +35,14 @@ ROWS = {
 }
 
 
-def scenario_text() -> str:
+@pytest.fixture(scope="module")
+def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
+    folder = tmp_path_factory.mktemp("faults")
     rows = "\n".join(
         f'[[faults]]\nkind = "{name.split()[0]}"\nat_s = {0.03 * (place + 1):.2f}\n' + keys.replace(", ", "\n")
         for place, (name, keys) in enumerate(ROWS.items())
     )
-    return f"start_deg = [-30.0, -60.0]\nseed = 7\n{rows}\n"
-
-
-@pytest.fixture(scope="module")
-def played(tmp_path_factory: pytest.TempPathFactory) -> Played:
-    folder = tmp_path_factory.mktemp("faults")
-    (folder / "scenario.toml").write_text(scenario_text())
+    (folder / "scenario.toml").write_text(f"start_deg = [-30.0, -60.0]\nseed = 7\n{rows}\n")
     (folder / "settings.toml").write_text(SETTINGS)
     with contextlib.ExitStack() as stack:
         if shutil.which("candump"):

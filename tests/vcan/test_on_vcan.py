@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from experiment_runs import BIN, contents, demo, emulator, run_on_vcan
+from experiment_runs import BIN, emulator, run_on_vcan
 
 from adacd_hil.log.reader import read_log
 from adacd_hil.settings.configuration_files import load_settings
@@ -14,47 +14,7 @@ from adacd_hil.settings.configuration_files import load_settings
 pytestmark = [pytest.mark.vcan, pytest.mark.slow]
 
 SEED = "7"
-FIRST_CONTACT = """
-extends = "demo_paper"
-[operator]
-script = [{ at_s = 4.5, request = "finish" }]
-[termination]
-hold_s = 1.5
-[trajectory]
-half_period_s = [1.125, 2.25]
-"""
-PUSH = """
-about = "One push, soon."
-lasts_s = 4.5
-start_deg = [-30.0, -60.0]
-[[contacts]]
-at_s = 3.2
-link = 1
-point_m = 0.3
-force_N = 10.0
-duration_s = 0.5
-"""
-"""A short adaptation, one contact and the reaction to it: what comes after is the same code."""
 TWO_CONTACTS = 'extends = "demo_paper"\n[operator]\nscript = [{ at_s = 14.5, request = "finish" }]\n'
-
-
-@pytest.mark.long
-def test_lockstep_on_vcan_finds_the_contact_and_logs_the_same_as_the_embedded_bus_bit_for_bit(
-    tmp_path: Path,
-) -> None:
-    files = [str(tmp_path / name) for name in ("settings.toml", "push.toml")]
-    Path(files[0]).write_text(FIRST_CONTACT)
-    Path(files[1]).write_text(PUSH)
-    with emulator(tmp_path, "--seed", SEED, "--scenario", files[1]):
-        lockstep = run_on_vcan(tmp_path, "--clock", "lockstep", "--config", files[0])
-    assert (lockstep.status, lockstep.json["state"], lockstep.json["dropped"]) == (0, "MONITOR", 0)
-    assert {report.link for _, report in read_log(lockstep.log).contacts} == {1}
-    (tmp_path / "embedded").mkdir()
-    embedded = demo(tmp_path / "embedded", "--seed", SEED, "--config", files[0], "--scenario", files[1])
-    for name in ("run.mcap", "truth.mcap"):
-        ours, theirs = (contents(folder / name) for folder in (embedded.folder, lockstep.folder))
-        assert [topic for topic in ours if ours[topic] != theirs.get(topic)] == []
-        assert len(ours["/truth" if name == "truth.mcap" else "/cycle"]) > 300_000
 
 
 STALLING = """

@@ -10,7 +10,7 @@ from edited_contract import edited
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from adacd_hil.wire.codec import CodecError, MessageCodec
+from adacd_hil.wire.codec import CodecError
 from adacd_hil.wire.dbc_contract import contract_folder, load_codec, parse_codec
 from adacd_hil.wire.e2e import E2eStatus
 
@@ -76,12 +76,6 @@ def test_a_frame_written_by_hand_decodes_to_its_values_and_they_encode_to_it(
         assert message.decode(frame)[:3] == (0x1CCA, 7.0, 165.0)
 
 
-def raw_values(message: MessageCodec) -> st.SearchStrategy[dict[str, int]]:
-    return st.fixed_dictionaries(
-        {signal.name: st.integers(signal.raw_low, signal.raw_high) for signal in message.signals}
-    )
-
-
 @pytest.mark.parametrize(("contract", "name"), MESSAGES)
 @settings(max_examples=30)
 @given(data=st.data())
@@ -91,7 +85,8 @@ def test_cantools_decodes_and_encodes_every_frame_to_the_same(contract: str, nam
     theirs = peer.decode(wire, decode_choices=False)
     assert message.decode(wire) == tuple(theirs[signal.name] for signal in message.signals)
     assert message.decode_values(wire) == tuple(theirs[signal.name] for signal in message.values)
-    raw = data.draw(raw_values(message))
+    ranges = {signal.name: st.integers(signal.raw_low, signal.raw_high) for signal in message.signals}
+    raw = data.draw(st.fixed_dictionaries(ranges))
     physical = tuple(raw[signal.name] * signal.scale + signal.offset for signal in message.values)
     sender, receiver = message.sender(), message.receiver()
     for _ in range(3):

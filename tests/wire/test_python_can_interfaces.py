@@ -2,7 +2,6 @@
 
 import can
 import pytest
-from called import called
 from can.interfaces import BACKENDS
 
 from adacd_hil.clock import MonotonicClock
@@ -23,12 +22,6 @@ from adacd_hil.wire.open_bus import open_bus
 def test_the_remedy_is_the_interface_s_own(interface, remedy):
     with pytest.raises(BusMissingError, match=remedy):
         open_bus(interface, "0", MonotonicClock())
-
-
-def test_a_command_ends_as_without_a_bus():
-    done = called("scan", "-i", "kvaser", "-c", "0")
-    assert done.exit_code == 5
-    assert len(done.stderr.splitlines()) == 1
 
 
 class MakersError(Exception):
