@@ -368,10 +368,8 @@ class LogSource:
                 f"{splitter.headless_cycles} cycles at its beginning can't be replayed: the attempt began before"
             )
         for cycle, missing in splitter.gaps[:SHOWN]:
-            notes.append(
-                f"{missing} cycles with their frames are missing before cycle {cycle}: what follows in that "
-                "attempt is replayed but can't be compared"
-            )
+            lacks = f"{missing} cycles with their frames are missing before" if missing > 0 else "the log goes back to"
+            notes.append(f"{lacks} cycle {cycle}: what follows in that attempt is replayed but can't be compared")
         if len(splitter.gaps) > SHOWN:
             notes.append(f"and {len(splitter.gaps) - SHOWN} more gaps")
         if splitter.unpaired:

@@ -91,6 +91,7 @@ FORMS = {
     ),
     "a comment before the heads": (table(plain, "# t,angle,torque\n"), []),
     "a delimiter at the end of each row": (table(lambda *row: plain(*row) + ",", "t,angle,torque,\n"), []),
+    "a numbered time, beside a period": (table(plain), ['time = "t" -> time = "1"', "[sampling]\nperiod_s = 0.005"]),
     "empty lines": (table(plain, "t,angle,torque\n\n") + "\n\n", []),
     "a mark of the byte order, and of another system's line ends": (
         "\ufeff" + table(plain).replace("\n", "\r\n"),
@@ -111,7 +112,7 @@ def test_forms_of_a_table_are_read(read, form):
 def test_a_period_stands_for_the_times(read):
     text = table(lambda _, q, tau: f"{q},{tau}", "angle,torque\n")
     period = "[sampling]\nperiod_s = 0.005"
-    for keys in ((period, 'time = "t"\n -> '), (period,)):
+    for keys in ((period, 'time = "t"\n -> '), (period,), (period, '[units]\ntime = "ms"')):
         recording = read(text, *keys)
         check(recording)
         assert recording.notes == ("no column of times: a row every 0.005 s (sampling.period_s)",)
@@ -147,6 +148,8 @@ SPOILT = {
     "a word": (lambda rows: [*rows[:50], "0.245,ERR,1\n", *rows[51:]], "1 row that can't be read", "'angle' is 'ERR'"),
     "out of order": (lambda rows: [*rows[:50], "0.1,0,0\n", *rows[50:]], "1 row out of order", "goes back to 0.1 s"),
     "without a time": (lambda rows: [*rows[:50], ",0,0\n", *rows[50:]], "1 row without a time", "row 51"),
+    "a time without end": (lambda rows: [*rows[:50], "inf,0,0\n", *rows[50:]], "1 row without a time", "row 51"),
+    "no time at all": (lambda rows: [*rows[:50], "snan,0,0\n", *rows[50:]], "1 row that can't be read", "row 51"),
     "too long": (lambda rows: [*rows[:50], "0.245,0,0,9\n", *rows[51:]], "1 row that can't be read", "4 cells"),
     "without a value": (lambda rows: [*rows[:50], "0.2449,,1\n", *rows[50:]], "1 row without all values", ""),
 }

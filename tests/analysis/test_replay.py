@@ -233,6 +233,17 @@ def test_a_gap_is_said_and_what_follows_it_in_the_attempt_is_not_compared(log, w
     assert not found.is_whole
 
 
+def test_a_log_that_goes_back_is_compared_up_to_there(log):
+    def set_back(piece):
+        arms = writable(piece.series["/arm"])
+        arms["cycle"][700:] -= 25
+        return with_records(piece, "/arm", arms)
+
+    found = changed(log, set_back)
+    assert not found.is_whole
+    assert any("goes back to cycle 675" in note for note in found.notes)
+
+
 @pytest.mark.parametrize("is_old", [False, True])
 def test_of_a_log_that_begins_in_the_middle_the_next_attempt_is_compared(log, is_old):
     found = changed(log, without_cycles(0, 500), cycles_per_piece=1000, is_old=is_old)

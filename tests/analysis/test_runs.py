@@ -72,6 +72,10 @@ def test_a_report_beside_the_log_has_the_figures(one):
     assert run.certificate == CertificateState(IDENTIFIED, 0.06, 1)
     assert run.threshold_Nm == (0.15, 0.15)
     assert (run.found, run.expected, run.scenario) == (0, None, "paper")
+    (one / "run.mcap").unlink()
+    record(one / "run.mcap", replace(make_run((A, 60), (M, 60)), settings=load_settings("certified")))
+    (one / "report.json").touch()
+    assert summarise(one).threshold_Nm is None  # as of a certified run without a cycle
 
 
 def test_a_log_in_lockstep_is_dated_by_its_folder_then_by_its_file(one):

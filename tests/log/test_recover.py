@@ -22,6 +22,7 @@ from mcap.opcode import Opcode
 from mcap.records import Metadata
 
 from adacd_hil.lab.logs.check.log_check import check_log
+from adacd_hil.lab.logs.log_info import read_info
 from adacd_hil.lab.logs.recover import recover
 from adacd_hil.log.log_files import LogError, find_parts
 from adacd_hil.log.reader import read_log
@@ -75,6 +76,17 @@ def test_a_cut_log_keeps_every_whole_chunk_and_says_that_the_end_is_lost(whole, 
     assert metadata["summary"]["lost_messages"] == "unknown"
     assert read_log(recovery.out).problem == "recovered without the end, an unknown number of messages"
     assert [finding.rule for finding in check_log(recovery.out).findings] == ["lost"]
+
+
+@pytest.mark.parametrize("more", [WHOLE, b"more"])
+def test_bytes_behind_the_end_are_no_part_of_a_whole_log(more, whole, tmp_path):
+    recovery, messages, _, _ = recovered(tmp_path, WHOLE + more)
+    assert messages == whole[0]
+    assert (recovery.losses.is_any, recovery.losses.bytes, recovery.losses.messages) == (True, len(more), None)
+    path = tmp_path / "log.mcap"
+    assert read_info(path).problems
+    assert f"{len(more)} bytes" in read_log(path).problem
+    assert [finding.rule for finding in check_log(path).findings] == ["magic"]
 
 
 @pytest.mark.parametrize("number", range(len(CHUNKS)))

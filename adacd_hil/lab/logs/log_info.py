@@ -139,8 +139,11 @@ class _InfoView:
             records = [record for record in end.summary if record.opcode == Opcode.STATISTICS]
             statistics = parse(Opcode.STATISTICS, records[0].body) if records else None
             channels = {parse(Opcode.CHANNEL, r.body).id for r in end.summary if r.opcode == Opcode.CHANNEL}
-            if statistics is not None and not statistics.channel_message_counts.keys() <= channels:
-                statistics = None  # the summary doesn't say whose messages it counts
+            if statistics is not None:
+                indexes = sum(record.opcode == Opcode.CHUNK_INDEX for record in end.summary)
+                is_indexed = self._is_brief or 0 < statistics.chunk_count <= indexes or not statistics.message_count
+                if not (is_indexed and statistics.channel_message_counts.keys() <= channels):
+                    statistics = None  # the summary doesn't say whose messages it counts, or where they are
         is_damaged = end is None
         if end is not None and statistics is not None:
             self._take_whole(file, end, statistics)
@@ -212,9 +215,10 @@ class _InfoView:
     def _know(self, definitions: Definitions) -> None:
         """Store type and payload size of each topic; the first definition of a topic stays."""
         for channel in definitions.channels.values():
-            schema = definitions.schemas.get(channel.schema_id)
-            name = schema.name if schema is not None else channel.message_encoding
-            self._channels.setdefault(channel.topic, (name, payload_size(channel, schema)))
+            if channel.topic not in self._channels:
+                schema = definitions.schemas.get(channel.schema_id)
+                name = schema.name if schema is not None else channel.message_encoding
+                self._channels[channel.topic] = name, payload_size(channel, schema)
 
     def _span(self, start_ns: int, end_ns: int) -> None:
         self._start_ns = min(self._start_ns, start_ns)

@@ -25,16 +25,17 @@ _WINDOW = 1 << 20
 
 
 class FileGap(NamedTuple):
-    """Bytes of a file that belong to no record."""
+    """Bytes of a file that belong to no record. is_behind: they follow the end, as of a second file."""
 
     offset: int
     size: int
+    is_behind: bool = False
 
 
 def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap]:
     """Yield the records of a file, and the gaps between them, where no record could be found.
 
-    It ends after a Footer that MCAP's magic follows, or at the end of the file.
+    All that follows a Footer with MCAP's magic is one gap.
     """
     size = os.fstat(file.fileno()).st_size
     position = len(MAGIC) if read_bytes(file, 0, len(MAGIC)) == MAGIC else 0
@@ -49,6 +50,9 @@ def scan(file: IO[bytes]) -> Iterator[RawRecord | FileGap]:
         yield record
         position = record.end
         if record.opcode == Opcode.FOOTER and read_bytes(file, position, len(MAGIC)) == MAGIC:
+            position += len(MAGIC)
+            if position < size:
+                yield FileGap(position, size - position, is_behind=True)
             return
 
 

@@ -161,12 +161,11 @@ class Salvage:
     def __iter__(self) -> Iterator[Attachment | Metadata | Contents]:
         with open_input(self._path) as file:
             for item in scan(file):
-                if self._has_data_end:
-                    break
-                if isinstance(item, RawRecord):
+                if isinstance(item, FileGap):
+                    if item.is_behind or not self._has_data_end:
+                        self._lose(item.offset, item.size, "behind the end" if item.is_behind else "no record")
+                elif not self._has_data_end:
                     yield from self._take(item)
-                elif isinstance(item, FileGap):
-                    self._lose(item.offset, item.size, "no record")
             if self._has_data_end and not self.is_vouched and not self._is_explained:
                 self._doubt(file)
         self._sum_up()

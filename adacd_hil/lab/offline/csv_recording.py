@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -72,8 +72,9 @@ def read_csv(path: Path, described: RecordingMap, span: TimeWindow | None) -> Re
         raise LogError(f"recording {path} is empty")
     head = _head(path, first[1], described)
     columns = _columns(path, head if described.csv.has_header else [], len(head), described)
-    read = RecordedRows(path, len(columns), described.time_s, span)
-    if not columns[0].name:
+    has_time = bool(columns[0].name)
+    read = RecordedRows(path, len(columns), described.time_s if has_time else 1.0, span)
+    if not has_time:
         read.notes.append(f"no column of times: a row every {described.sampling.period_s:g} s (sampling.period_s)")
     if not described.csv.has_header:
         rows = chain([first], rows)
@@ -172,12 +173,13 @@ def _time_column(path: Path, heads: list[str], cells: int, described: RecordingM
     name, units = described.columns.time, described.units
     read = _time_reader(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
     has_period = described.sampling.period_s > 0.0
-    if name and not (has_period and name not in heads and nearest_name(name, heads) is None):
+    if name:
         try:
             return _Column(name, _place(path, name, heads, cells), read, units.time)
         except ConfigError as error:
-            raise ConfigError(f"{error}; without times, give their distance by `sampling.period_s`") from None
-    if not has_period:
+            if not has_period or name in heads or nearest_name(name, heads) is not None:
+                raise ConfigError(f"{error}; without times, give their distance by `sampling.period_s`") from None
+    elif not has_period:
         raise ConfigError("missing key `columns.time`; where there are no times `sampling.period_s` is the period")
     return _Column("", 0, read)
 
@@ -305,11 +307,11 @@ def _time_reader(read: Callable[[str], Decimal], decimal: str) -> Callable[[str]
         nonlocal first
         try:
             moment = read(text.strip().replace(decimal, "."))
-        except InvalidOperation:
+            if first is None and moment.is_finite():
+                first = moment
+            return float(moment - (first or 0))
+        except ArithmeticError:
             raise ValueError(text) from None
-        if first is None and moment.is_finite():
-            first = moment
-        return float(moment - (first or 0))
 
     return read_time
 

@@ -141,17 +141,16 @@ class RecordedRows:
             return
         table = np.array(self._block).reshape(-1, self._width)
         self._block = []
-        time_s = table[:, 1] * self._unit_s
+        time_s = np.where(np.isfinite(table[:, 1]), table[:, 1] * self._unit_s, np.nan)
         if np.isneginf(self._begin_s) and np.any(np.isfinite(time_s)):
             self._begin_s = float(time_s[np.isfinite(time_s)][0])
         before_s = np.fmax.accumulate(np.concatenate(([self._latest_s], time_s)))
         self._count_wrong_rows(table, time_s == before_s[:-1], _DOUBLED, "{time} once more")
         self._doubled.append(_differences(table[:, 2:])[np.diff(time_s) == 0.0])
         self._count_wrong_rows(table, time_s < before_s[:-1], "out of order", "time goes back to {time}")
-        self._count_wrong_rows(table, ~np.isfinite(time_s), "without a time", "it has no time")
-        is_later = np.isfinite(time_s) & (time_s > before_s[:-1])
+        self._count_wrong_rows(table, np.isnan(time_s), "without a time", "it has no time")
         self._latest_s = float(before_s[-1])
-        self._kept.append(table[is_later])
+        self._kept.append(table[time_s > before_s[:-1]])
         self._is_long |= self.count > MOST_ROWS
         if self._is_long:
             self._kept = [self._within(part) for part in self._kept]

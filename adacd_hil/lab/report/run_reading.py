@@ -47,6 +47,7 @@ from adacd_hil.lab.score.run_arrays import (
     columns_of_series,
     host_truth,
     is_realtime,
+    last_cycle,
     split_sections,
     truth_rows,
 )
@@ -209,12 +210,7 @@ def _checked(path: Path, scheme: Series, last: tuple[int, int]) -> tuple[int, in
                 raise LogError(
                     f"{SCHEME.name} has {name} {value} in cycle {cycle[odd[0]]}, which this version does not know"
                 )
-    for column, before in zip((cycle, scheme.t_ns), last, strict=True):
-        backward = np.flatnonzero(np.diff(column, prepend=before) <= 0)
-        if backward.size:
-            number = cycle[backward[0]]
-            raise LogError(f"log {path}, {SCHEME.name}: cycle {number} is not after the one before, by number or time")
-    return (int(cycle[-1]), int(scheme.t_ns[-1])) if len(scheme) else last
+    return last_cycle(path, scheme, last)
 
 
 def _with_ending(

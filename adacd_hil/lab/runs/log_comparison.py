@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.lab.score.run_arrays import last_cycle
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import Milestones, Progress, settings_of
 from adacd_hil.log.reader import LogStream, Series, begin_of_log, each_once, report_values
@@ -74,8 +75,13 @@ class RunReader:
         return self._bounds is not None and bool(len(series)) and int(series.records["cycle"][0]) >= self._bounds[1]
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Yield the records of /scheme, piece by piece, and gather states, parameters, contacts and times."""
+        """Yield the records of /scheme, piece by piece, and gather states, parameters, contacts and times.
+
+        Raises LogError if the log can't be read, or as `last_cycle`.
+        """
+        at = (-1, -1)
         for piece in self._stream:
+            at = last_cycle(self.path, piece.series[SCHEME.name], at)
             if self._is_over(piece.series[SCHEME.name]):
                 break
             scheme = self._wanted(piece.series[SCHEME.name])

@@ -360,7 +360,8 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
     armed = [contact for contact in table["contacts"] if _flag(contact["is_armed"])]
     false_alarms = table["false_alarms"]
     has_truth = false_alarms is not None
-    configured_Nm = None if summary.settings is None else summary.settings.detector.threshold_Nm
+    settings = summary.settings
+    configured_Nm = settings.detector.threshold_Nm if settings is not None and settings.scheme == "paper" else None
     return dataclasses.replace(
         summary,
         status=GOOD if is_good else NOT_GOOD,

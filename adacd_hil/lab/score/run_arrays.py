@@ -10,11 +10,13 @@ STOPPED belong to the section that they interrupt. The paper's experiment gives 
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import (
     Cycles,
     Mask,
@@ -25,7 +27,7 @@ from adacd_hil.log.logged_run import (
 )
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.time_window import TimeWindow
-from adacd_hil.log.types.topics import CYCLE
+from adacd_hil.log.types.topics import CYCLE, SCHEME
 from adacd_hil.records import ContactReport, CycleRecord, SchemeState, Vector
 from adacd_hil.score.emulator_truth import TruthTable
 from adacd_hil.settings.configuration import Settings
@@ -414,3 +416,15 @@ def truth_rows(truth: Truth, rows: NDArray[np.bool_]) -> Truth:
     names = ("cycle", "tau_ext", "contact_link", "contact_index", "force_N", "time_s", "attempt")
     columns = {name: getattr(truth, name) for name in names}
     return replace(truth, **{name: column[rows] for name, column in columns.items() if column is not None})
+
+
+def last_cycle(path: Path, scheme: Series, before: tuple[int, int] = (-1, -1)) -> tuple[int, int]:
+    """Return number and time, ns, of the last cycle of a piece of /scheme; before: those of the one before the piece.
+
+    Raises LogError, which names the log's `path`, for a cycle that is not after the one before, as of two joined logs.
+    """
+    cycle = scheme.records["cycle"].astype(np.int64)
+    for column, last in zip((cycle, scheme.t_ns), before, strict=True):
+        for number in cycle[np.diff(column, prepend=last) <= 0][:1].tolist():
+            raise LogError(f"log {path}, {SCHEME.name}: cycle {number} is not after the one before, by number or time")
+    return (int(cycle[-1]), int(scheme.t_ns[-1])) if len(scheme) else before

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from adacd_hil.lab.detectors.detectors import make_stream
-from adacd_hil.lab.score.run_arrays import AttemptBegins
+from adacd_hil.lab.score.run_arrays import AttemptBegins, last_cycle
 from adacd_hil.lab.thresholds.false_alarms import BLOCK_S
 from adacd_hil.log.log_files import CONFIG_NAME, LogError
 from adacd_hil.log.log_walk import attachment
@@ -131,10 +131,12 @@ class LoggedMotion:
 def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
     """Yield /scheme of a log, or its part between two times, in pieces that are not empty.
 
-    Raises LogError if the log can't be read.
+    Raises LogError if the log can't be read, or as `last_cycle`.
     """
+    last = (-1, -1)
     for piece in LogStream(path, TOPICS):
         scheme = piece.series[SCHEME.name]
+        last = last_cycle(path, scheme, last)
         if bounds_ns is not None and len(scheme):
             if scheme.t_ns[0] >= bounds_ns[1]:
                 return

@@ -148,8 +148,8 @@ def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[R
     """Yield the records of a file up to its footer, or to bytes that can't be a record.
 
     Message indexes that follow each other come as one IndexRun. Unless the footer and the file's last magic bytes are
-    reached, the last item is a Problem: the file is cut, or a record is overlong. passed: kinds of records that come
-    without their body. Raises LogError, which begins with `name`, if the file isn't MCAP.
+    reached, and nothing follows, the last item is a Problem; so it is behind an overlong record. passed: kinds of
+    records that come without their body. Raises LogError, which begins with `name`, if the file isn't MCAP.
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
@@ -181,6 +181,8 @@ def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[R
         position = end
         if opcode == Opcode.FOOTER:
             is_whole = file.read(len(MAGIC)) == MAGIC
+            if is_whole and (rest := size - file.tell()) > 0:
+                yield Problem(f"{rest} bytes follow the end")
             break
     if not is_whole:
         yield Problem(f"cut after {size} bytes", is_damage=True)

@@ -75,18 +75,18 @@ class _FileCheck:
         self._crc = crc32(magic) if is_right else 0
         end = len(magic) if is_right else 0
         for item in scan(self._file):
-            if isinstance(item, FileGap):
-                self._gap(item)
-                end = item.offset + item.size
-            else:
+            if isinstance(item, RawRecord):
                 self._record(item)
                 end = item.end
+            elif item.is_behind:
+                self.findings.add_finding("magic", f"{item.size} bytes follow the end", item.offset)
+            else:
+                self._gap(item)
+                end = item.offset + item.size
         self._file.seek(end)
-        if self._counts[Opcode.FOOTER] and self._file.read(len(MAGIC)) == MAGIC:
-            self._has_trailer = True
-            end += len(MAGIC)
+        self._has_trailer = bool(self._counts[Opcode.FOOTER]) and self._file.read(len(MAGIC)) == MAGIC
         self._chunks.end_indexes()
-        self._finish(end)
+        self._finish()
         counts, channels = self._chunks.counts, self._definitions.channels
         self.messages = int(counts.sum())
         self.frames = sum(int(counts[number]) for number in channels if channels[number].topic in FRAME_TOPICS)
@@ -193,17 +193,14 @@ class _FileCheck:
                 "attachment-crc", f"the attachment {attachment.name} fails its CRC", record.offset
             )
 
-    def _finish(self, end: int) -> None:
-        """Add the findings on the file as a whole; end: offset of the first byte that was not read."""
+    def _finish(self) -> None:
+        """Add the findings on the file as a whole."""
         for opcode, rule in _ONCE.items():
             if not self._counts[opcode]:
                 self.findings.add_finding(rule, f"there is no {name_of(opcode)}")
-        self._file.seek(0, 2)
-        size = self._file.tell()
         if not self._has_trailer:
+            size = self._file.seek(0, 2)
             self.findings.add_finding("magic", "the file doesn't end with a Footer and MCAP's magic", size)
-        elif end < size:
-            self.findings.add_finding("magic", f"{size - end} bytes follow the end", end)
         self._definitions.finish(self._chunks.counts)
         self._summary.finish()
         self._judge_missing_crcs()
