@@ -9,6 +9,7 @@ from rig import CycleRig, Rig, SessionRig, scripted
 
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.log.reader import RunLog
+from adacd_hil.log.types.topics import DECODED
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.settings.parsing import parse
 from adacd_hil.wire.bus import BusError, Frame
@@ -72,7 +73,7 @@ class Outcome(NamedTuple):
         """Count the commands with a torque from the cycle of the fault on."""
         (at, *_) = np.flatnonzero(self.log.scheme["cycle"] == self.faulted)
         start_ns = self.log.scheme.t_ns[at]
-        commands = [self.log.decoded[name] for name in ("Drive1Command", "Drive2Command")]
+        commands = [self.log.topics[f"{DECODED}{name}"] for name in ("Drive1Command", "Drive2Command")]
         return sum(int(np.count_nonzero(c["target_torque"][c.t_ns >= start_ns])) for c in commands)
 
 

@@ -363,7 +363,7 @@ def test_a_torque_of_a_sensor_with_a_wide_range_changes_by_its_own_counts(row, c
 
 
 def test_sync_is_late_while_the_row_is_active():
-    plan = plan_of(example("late_sync", delay_us=200.0, duration_s=1.0))
+    plan = plan_of(example("late_sync", delay_us=200.0, jitter_us=0.0, duration_s=1.0))
     late = []
     for second in (0, 1, 2):
         plan.advance(second * S)

@@ -19,7 +19,7 @@ from adacd_hil.scheme.contact.contact_report import new_rows, put_row, recalled_
 from adacd_hil.scheme.kernel import paper_kernel
 from adacd_hil.scheme.kernel.cycle import DECISION, decide, follow_contact, new_course
 from adacd_hil.scheme.kernel.kernel_samples import SAMPLE, fill_sample
-from adacd_hil.scheme.supervisor import transitions
+from adacd_hil.scheme.supervisor import findings
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings, merge
 from adacd_hil.settings.parsing import parse
@@ -97,10 +97,10 @@ class Rig:
         arm = self._arm(self._body.sample())
         self._torques = [arm.tau_J] * 3
         self._q_d[:] = arm.q
-        rest = transitions.AT_REST | transitions.UNLOADED
+        rest = findings.AT_REST | findings.UNLOADED
         while self._supervised is not SchemeState.MONITOR:
             is_late = self._supervised is SchemeState.ADAPT
-            self._decide(arm, Request.NONE, rest | (transitions.ADAPTED if is_late else 0))
+            self._decide(arm, Request.NONE, rest | (findings.ADAPTED if is_late else 0))
 
     @property
     def _supervised(self) -> SchemeState:
@@ -140,12 +140,12 @@ class Rig:
         delayed = (1.0 - LAG_SHARE) * self._torques[1] + LAG_SHARE * self._torques[2]
         block["q"][:], block["dq"][:], block["tau_J"][:] = arm.q, arm.dq, delayed
         observation = paper_kernel.step(self._constants, self._memory, self._block, 1, 1, paper_kernel.ARMED)
-        observation &= ~transitions.COLLISION
+        observation &= ~findings.COLLISION
         if np.any(np.abs(block["tau_ext_hat"]) > self._collision_Nm):
-            observation |= transitions.COLLISION
+            observation |= findings.COLLISION
         is_outside = np.any(np.abs(arm.q) > self.settings.arm.position_limit_rad)
-        if observation & transitions.OVER_LIMIT and not is_outside:
-            observation = observation & ~transitions.OVER_LIMIT | transitions.OVER_SPEED
+        if observation & findings.OVER_LIMIT and not is_outside:
+            observation = observation & ~findings.OVER_LIMIT | findings.OVER_SPEED
         return observation
 
     def step(self) -> Sample:

@@ -31,7 +31,7 @@ from adacd_hil.compiled import compiled
 from adacd_hil.records import SchemeState
 from adacd_hil.scheme.detect.sensitivity import AGREES
 from adacd_hil.scheme.model.filter_bank import channels_of, step_response
-from adacd_hil.scheme.supervisor import transitions
+from adacd_hil.scheme.supervisor import findings
 from adacd_hil.scheme.supervisor.findings import CONTACT_SHIFT
 from adacd_hil.score.judge import begins_of
 from adacd_hil.settings.configuration import Settings
@@ -209,7 +209,7 @@ def play(case: Case, minutes: float, changes: Mapping[str, str]) -> Played:
         case,
         armed_s=(armed - begin) * PERIOD_S,
         hours=float(is_monitored.sum()) * PERIOD_S / 3600.0,
-        taken_back=int(np.count_nonzero(is_monitored & (observation.astype(np.int64) & transitions.WITHHELD != 0))),
+        taken_back=int(np.count_nonzero(is_monitored & (observation.astype(np.int64) & findings.WITHHELD != 0))),
         alarms=int(np.count_nonzero(begins_of(over, APART))),
         median_Nm=tuple(float(np.median(slow[is_quiet, i])) for i in range(2)),
         most_Nm=tuple(float(np.percentile(slow[is_quiet, i], 99.0)) for i in range(2)),
