@@ -328,7 +328,7 @@ class Cycle:
         """
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is SchemeState.REACT and output.contact is None:
-            late = f"{FaultReason.DEADLINE.name}; {self._watch.deadline.describe_misses()}"
+            late = "; ".join([FaultReason.DEADLINE.name, *self._watch.deadline.describe_misses()])
             why = late if arm.is_late else "what was learnt since contradicts the certificate"
             return Event("warning", "supervisor", f"{text}: {why}")
         if output.state is SchemeState.COMMISSION and output.previous_state is SchemeState.ENABLE:

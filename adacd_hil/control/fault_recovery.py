@@ -166,7 +166,6 @@ class FaultReport:
             FaultReason.DATA_AGE: (lambda: describe_gaps(arm),),
             FaultReason.BLIND: (lambda: describe_gaps(arm),),
             FaultReason.LIMIT: (lambda: describe_excess(arm),),
-            FaultReason.DEADLINE: (lambda: [watch.deadline.describe_misses()],),
             FaultReason.COMMISSION_TIMEOUT: (
                 pipeline.describe_withheld,
                 self.commission.list_unrest,
@@ -184,11 +183,12 @@ class FaultReport:
         self.commission.count_cycle(state, arm)
 
     def list_causes(self, fault: FaultReason) -> list[str]:
-        """Return the causes of a fault as lines: first those of its reason, then those of devices and bus."""
+        """Return the causes of a fault as lines: first those of its reason, then those of host, devices and bus."""
         return [
             *([self._checks.line] if fault is self._checks.reason else ()),
             *self._checks.suspicions(fault),
             *(line for describe in self._causes.get(fault, ()) for line in describe()),
+            *self._watch.deadline.describe_misses(),
             *describe_faults(self._arm),
             *self._watch.lost,
             *self._master.describe_emergencies(),
