@@ -60,7 +60,7 @@ def test_a_fault_of_the_arm_keeps_its_name() -> None:
 
 
 def play(folder: Path, on_misses: str, misses: int = 3, emergency: str = "") -> RunLog:
-    """Let an arm that is soon adapted move, and its host stall for 5 ms in the middle of it; drive 1 may send EMCY then."""
+    """Let an arm that is soon adapted move, and its host stall for 5 ms in the middle, before an EMCY of drive 1."""
     rig = SessionRig(folder, finish_s=0.7)
     settings = rig.session.settings
     rig.session.settings = dataclasses.replace(
