@@ -53,6 +53,7 @@ def adacd_hil(folder: Path, *arguments: str) -> Played:
     done = subprocess.run(
         [BIN / "adacd-hil", *arguments], capture_output=True, text=True, timeout=HANG_S, check=False, cwd=folder
     )
+    print(f"status {done.returncode}", done.stdout, done.stderr, sep="\n")  # pytest shows it if the test fails
     return Played(folder, done.returncode, done.stdout, done.stderr)
 
 
@@ -81,6 +82,7 @@ def firmware_sim(*words: str | Path) -> Iterator[Emulating]:
         finally:
             process.terminate()
             process.said = process.communicate(timeout=HANG_S)
+            print(f"status {process.returncode}", *process.said, sep="\n")
 
 
 def emulator(folder: Path, *arguments: str) -> contextlib.AbstractContextManager[Emulating]:

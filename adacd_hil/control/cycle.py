@@ -13,7 +13,7 @@ import numpy as np
 from adacd_hil.clock import Clock
 from adacd_hil.control.controller import Controller, Floating
 from adacd_hil.control.exchange import Exchange
-from adacd_hil.control.fault_recovery import BOUNDS, FaultReport, SelfChecks, StopEscalation
+from adacd_hil.control.fault_recovery import BOUNDS, STOP, FaultReport, SelfChecks, StopEscalation
 from adacd_hil.control.first_motion import FirstMotion, is_shown
 from adacd_hil.control.gate import Gate, GateFlag
 from adacd_hil.control.operator import Operator, RunNarration
@@ -67,7 +67,7 @@ class RunResult:
     """How an attempt ended. `fault`: NONE when it ended as asked. `data`: how much of the cyclic data came.
 
     `cycles`: number of the last cycle + 1; `overruns`: skipped periods; both since the session's first cycle. `state`:
-    the last one.
+    the last one. `enabled`: drives that last reported Operation enabled.
     """
 
     cycles: int
@@ -76,6 +76,7 @@ class RunResult:
     fault: FaultReason
     is_interrupted: bool
     data: DataShares
+    enabled: tuple[str, ...]
 
 
 class Cycle:
@@ -207,6 +208,7 @@ class Cycle:
             fault,
             self._interrupts > 0,
             self._data.finish_shares(),
+            tuple(drive.name for drive in self._escalation.enabled),
         )
 
     @property
@@ -311,7 +313,7 @@ class Cycle:
         events = [event for source in self._sources if source.events for event in source.take_events()]
         for event in (*events, *self._pipeline.take_events()):
             recorder.event(t_ns, event)
-            if event.name in CERTIFICATE_EVENTS or event.name in (MOTION, BOUNDS) or is_shown(event):
+            if event.name in CERTIFICATE_EVENTS or event.name in (MOTION, BOUNDS, STOP) or is_shown(event):
                 self._narration.event(t_ns, event.operator_text)
         if output.state is not self._state:
             event = self._transition(output, arm)
@@ -326,7 +328,7 @@ class Cycle:
         """
         text = f"{output.previous_state.name} -> {output.state.name}"
         if output.state is SchemeState.REACT and output.contact is None:
-            late = f"{FaultReason.DEADLINE.name}; {self._watch.deadline.describe_misses()}"
+            late = "; ".join([FaultReason.DEADLINE.name, *self._watch.deadline.describe_misses()])
             why = late if arm.is_late else "what was learnt since contradicts the certificate"
             return Event("warning", "supervisor", f"{text}: {why}")
         if output.state is SchemeState.COMMISSION and output.previous_state is SchemeState.ENABLE:

@@ -166,7 +166,6 @@ class FaultReport:
             FaultReason.DATA_AGE: (lambda: describe_gaps(arm),),
             FaultReason.BLIND: (lambda: describe_gaps(arm),),
             FaultReason.LIMIT: (lambda: describe_excess(arm),),
-            FaultReason.DEADLINE: (lambda: [watch.deadline.describe_misses()],),
             FaultReason.COMMISSION_TIMEOUT: (
                 pipeline.describe_withheld,
                 self.commission.list_unrest,
@@ -184,11 +183,12 @@ class FaultReport:
         self.commission.count_cycle(state, arm)
 
     def list_causes(self, fault: FaultReason) -> list[str]:
-        """Return the causes of a fault as lines: first those of its reason, then those of devices and bus."""
+        """Return the causes of a fault as lines: first those of its reason, then those of host, devices and bus."""
         return [
             *([self._checks.line] if fault is self._checks.reason else ()),
             *self._checks.suspicions(fault),
             *(line for describe in self._causes.get(fault, ()) for line in describe()),
+            *self._watch.deadline.describe_misses(),
             *describe_faults(self._arm),
             *self._watch.lost,
             *self._master.describe_emergencies(),
@@ -351,6 +351,8 @@ class Recovery:
 PATIENCE_CYCLES = 10
 """Cycles until a quick stop by command shows in a drive's status: it acts at the next SYNC, whose status shows it;
 eight more for lost frames."""
+STOP = "stop"
+"""Name of the event that tells that a drive didn't obey the quick stop: shown at once."""
 
 
 class StopEscalation(RateLimitedEvents):
@@ -365,6 +367,11 @@ class StopEscalation(RateLimitedEvents):
         self._arm, self._master = arm, master
         self._due = 0
 
+    @property
+    def enabled(self) -> list[Drive]:
+        """The drives that last reported Operation enabled."""
+        return [drive for drive in self._arm.drives if drive.state is Cia402State.OPERATION_ENABLED]
+
     def step(self, cycles: int, t_ns: int, fault: FaultReason) -> None:
         """Send NMT pre-operational to each drive that is still enabled PATIENCE_CYCLES after FAULT, and report it.
 
@@ -374,9 +381,8 @@ class StopEscalation(RateLimitedEvents):
         patience = 1 if fault is FaultReason.FOREIGN_FRAMES else PATIENCE_CYCLES
         if cycles < max(self._due, patience):
             return
-        for drive in self._arm.drives:
-            if drive.state is Cia402State.OPERATION_ENABLED:
-                self._due = cycles + PATIENCE_CYCLES
-                self._master.leave_operational(drive.node_id)
-                text = f"{drive.name} is in Operation enabled {cycles} cycles after FAULT: NMT pre-operational"
-                self.report(t_ns, drive.name, Event("error", "stop", text))
+        for drive in self.enabled:
+            self._due = cycles + PATIENCE_CYCLES
+            self._master.leave_operational(drive.node_id)
+            text = f"{drive.name} last reported Operation enabled, {cycles} cycles after FAULT: NMT pre-operational"
+            self.report(t_ns, drive.name, Event("error", STOP, text))

@@ -87,7 +87,7 @@ _STATES = {
     SchemeState.MONITOR: "watches for touches",
     SchemeState.STOPPED: "stopped, until you acknowledge",
     SchemeState.PAYLOAD: "parks, so that the payload can be changed",
-    SchemeState.FAULT: "fault: the drives are disabled",
+    SchemeState.FAULT: "fault: disables the drives",
 }
 _REACTIONS = {
     Reaction.NONE: "goes on",

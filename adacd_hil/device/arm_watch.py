@@ -247,7 +247,6 @@ class DeadlineWatch:
         self._is_holding = realtime.on_misses == "hold"
         self._misses: deque[tuple[int, int]] = deque()  # cycle that came late, periods skipped before it
         self._count = 0
-        self._verdict = ""
 
     def judge(self, arm: ArmState) -> ArmState:
         """Count the periods skipped before a cycle; return its state, changed if there were too many recently.
@@ -263,11 +262,11 @@ class DeadlineWatch:
             self._count -= misses.popleft()[1]
         if self._count < self._most:
             return arm
-        self._verdict = f"{self._count} periods missed within {self._window_s:g} s; {self._most} are too many"
         if self._is_holding:
             return arm._replace(is_late=True)
         return arm._replace(fault=FaultReason.DEADLINE) if arm.fault is FaultReason.NONE else arm
 
-    def describe_misses(self) -> str:
-        """Return in words how many periods were missed when they last were too many; "" if they never were."""
-        return self._verdict
+    def describe_misses(self) -> list[str]:
+        """Return [line] with the number of periods missed within the window until now; [] if none was."""
+        line = f"{self._count} periods missed within {self._window_s:g} s; {self._most} are too many"
+        return [line] if self._count else []

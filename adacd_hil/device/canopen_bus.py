@@ -62,8 +62,8 @@ class RefusedError(DeviceError):
 
 
 _REFUSED = (
-    "the device refuses this value, or any in this state: see the object in its manual; `setup` of its profile writes "
-    "objects that must come first"
+    "the device refuses this request, perhaps only in this state: see the object in its manual; `setup` of its profile "
+    "writes objects that must come first"
 )
 _SILENT = (
     "see that it has power and that nobody else asks it; a slow device needs `patience.answer_s` or "

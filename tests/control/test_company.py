@@ -8,6 +8,7 @@ import pytest
 from long_cases import long_but
 from rig import CODEC, TROUBLE_CYCLE, SessionRig, messages, torques_from, transition
 
+from adacd_hil.cli.commands.run_command import as_text, summarise
 from adacd_hil.log.reader import RunLog
 from adacd_hil.records import FaultReason, Request, SchemeState
 
@@ -101,8 +102,13 @@ def test_a_drive_that_does_not_hear_the_quick_stop_is_taken_out_of_operation_by_
         rig.tamper = lambda cycle, can_id, data: None if can_id == 0x183 else data
 
     rig.before_sync[TROUBLE_CYCLE] = trouble
-    result, log = rig.play()
-    assert result.fault is FaultReason.DATA_AGE
+    said: list[str] = []
+    rig.session.progress = said.append
+    summary, log = rig.run()
+    assert summary.result is not None
+    assert (summary.result.fault, summary.result.enabled) == (FaultReason.DATA_AGE, ("Drive1",))
+    told = as_text(summarise(summary)).splitlines()[0]
+    assert ("Drive1" in told, "disabled" in told) == (True, False)
     at = faulted(log)
     sent = [
         (int(frame["t_ns"]) // 1_000_000, bytes(frame["data"][:2]))
@@ -111,7 +117,10 @@ def test_a_drive_that_does_not_hear_the_quick_stop_is_taken_out_of_operation_by_
     ]
     stops = [time_ms - at for time_ms, data in sent if data == bytes((0x80, 1)) and time_ms > at]
     assert stops[0] == 10
-    assert messages(log, "stop")[0] == "Drive1 is in Operation enabled 10 cycles after FAULT: NMT pre-operational"
+    assert (
+        messages(log, "stop")[0] == "Drive1 last reported Operation enabled, 10 cycles after FAULT: NMT pre-operational"
+    )
+    assert sum(messages(log, "stop")[0] in line for line in said) == 1
 
 
 def test_a_drive_whose_torque_is_not_the_commanded_one_faults(tmp_path: Path) -> None:

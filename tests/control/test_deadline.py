@@ -59,8 +59,8 @@ def test_a_fault_of_the_arm_keeps_its_name() -> None:
     assert judged([(9, 1)], FaultReason.SENSOR).fault is FaultReason.SENSOR
 
 
-def play(folder: Path, on_misses: str) -> RunLog:
-    """Let an arm that is soon adapted move, and its host stall for 5 ms in the middle of it."""
+def play(folder: Path, on_misses: str, misses: int = 3, emergency: str = "") -> RunLog:
+    """Let an arm that is soon adapted move, and its host stall for 5 ms in the middle, before an EMCY of drive 1."""
     rig = SessionRig(folder, finish_s=0.7)
     settings = rig.session.settings
     rig.session.settings = dataclasses.replace(
@@ -71,10 +71,12 @@ def play(folder: Path, on_misses: str) -> RunLog:
         ),
         detector=dataclasses.replace(settings.detector, threshold_Nm=(50.0, 50.0)),
         operator=dataclasses.replace(settings.operator, acknowledge_after_s=0.0),
-        realtime=RealtimeSettings(misses=3, on_misses=on_misses),
+        realtime=RealtimeSettings(misses=misses, on_misses=on_misses),
     )
     clock = rig.session.clock
     rig.before_sync[STALL_CYCLE] = lambda: clock.sleep_until_ns(clock.now_ns() + 5_100_000)
+    if emergency:
+        rig.before_sync[STALL_CYCLE + 10] = lambda: rig.bus.deliver(0x081, bytes.fromhex(emergency))
     return rig.run()[1]
 
 
@@ -84,6 +86,12 @@ def test_a_host_that_stalls_faults_with_a_quick_stop_and_says_how_many_it_missed
     assert FaultReason(int(log.scheme["fault"][-1])) is FaultReason.DEADLINE
     assert transition(log, "FAULT") == "MONITOR -> FAULT: DEADLINE; 4 periods missed within 1 s; 3 are too many"
     assert log.control["quick_stop"][-1]
+
+
+@pytest.mark.slow
+def test_a_drive_that_faults_after_a_stall_of_the_host_is_told_with_the_stall_before_it(tmp_path: Path) -> None:
+    said = transition(play(tmp_path, "stop", misses=5, emergency="0087010000000000"), "FAULT")
+    assert said.startswith("MONITOR -> FAULT: DRIVE; 4 periods missed within 1 s; 5 are too many; Drive1: ")
 
 
 @pytest.mark.slow

@@ -214,6 +214,7 @@ def summarise(summary: SessionSummary) -> dict[str, Any]:
             "state": summary.result.state.name,
             "fault": summary.result.fault.name,
             "recoveries": summary.recoveries,
+            "enabled": summary.result.enabled,
             "data": dataclasses.asdict(summary.result.data),
         }
     elif summary.has_started:
@@ -250,12 +251,16 @@ def _verdict(result: dict[str, Any]) -> str:
     if "cycles" not in result:
         return "The run did not start."
     if result["fault"] != FaultReason.NONE.name:
-        return f"The run ended by a fault: {result['fault']}. The drives are disabled."
+        enabled = " and ".join(result["enabled"])
+        drives = (
+            f"{enabled} last reported Operation enabled: cut the power first" if enabled else "The drives are disabled"
+        )
+        return f"The run ended by a fault: {result['fault']}. {drives}."
     lost = "" if not result["dropped"] and not result["log_error"] else "; the log is not whole"
     return f"The run ended without a fault, in {result['state']}, after {result['cycles']} cycles{lost}."
 
 
-_FOR_MACHINES = ("data", "certificates", "broke_off")
+_FOR_MACHINES = ("data", "certificates", "broke_off", "enabled")
 """Keys of `summarise` that `as_text` prints in other words, or that the run has printed already."""
 
 
