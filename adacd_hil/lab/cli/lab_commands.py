@@ -190,8 +190,8 @@ def excitation(config: str, out: Path | None, as_json: bool, **options: Any) -> 
     from adacd_hil.lab.cli import excitation_command as command
     from adacd_hil.plain_values import json_text
 
-    with writable_folder(out):
-        found = command.search(config, out, **options)
+    with writable_folder(out, config):
+        found = command.search(config, **options)
         text = json_text(found) if as_json else command.as_text(found)
         print_and_write(text, out, command.as_toml(config, found["excitation"]), as_json)
     return ExitCode.OK
