@@ -41,16 +41,24 @@ Done = TypeVar("Done")
 ExitCode = start.ExitCode
 explain_statuses = start.explain_statuses
 
-EPILOG = explain_statuses(
-    OK="done",
-    FAILURE="failure (a tare: refused)",
-    USAGE="wrong usage or configuration",
-    PARTIAL="partial result (the log lost something, or a disk is full)",
-    SAFETY_STOP="safety stop (a fault, or a bus or arm that failed, ended the run)",
-    BUS_MISSING="bus or devices missing",
-    DETECTOR_MISSING="a registered detector can't be used",
-    INTERRUPTED="interrupted",
-)
+_MEANINGS = {
+    "OK": "done",
+    "FAILURE": "failure",
+    "USAGE": "wrong usage or configuration",
+    "PARTIAL": "partial result (the log lost something, or a disk is full)",
+    "SAFETY_STOP": "safety stop (a fault, or a bus or arm that failed, ended the run)",
+    "BUS_MISSING": "bus or devices missing",
+    "DETECTOR_MISSING": "a registered detector can't be used",
+    "INTERRUPTED": "interrupted",
+}
+
+
+def epilog(**own: str) -> str:
+    """Return the exit statuses for a command's help; own: meanings that this command alone has."""
+    return explain_statuses(**_MEANINGS | own)
+
+
+EPILOG = epilog()
 
 
 def tell(line: str) -> None:
