@@ -34,6 +34,7 @@ from adacd_hil.lab.report.traces import panels_of
 from adacd_hil.lab.score.evaluation import QUEUES, RunGatherer
 from adacd_hil.lab.score.margins import SETTLING_TIME_CONSTANTS
 from adacd_hil.lab.score.metrics import ReportSource
+from adacd_hil.lab.score.report_wording import lacks_text
 from adacd_hil.lab.score.run_arrays import (
     QUANTITIES,
     AttemptBegins,
@@ -230,9 +231,7 @@ def _with_ending(
     damage = f"{TRUTH_NAME} is not whole: {truth.problem}" if truth is not None and truth.problem else ""
     of_truth = "; ".join(filter(None, (truth_problem, damage, unjudged)))
     needed = (CONTACT.name, EVENTS.name) if run.cycle.size else (SCHEME.name,) if CYCLE.name in stream.topics else ()
-    lacking = [topic for topic in needed if topic not in stream.topics]
-    lacks = f"it has no {' and no '.join(lacking)}, so that not all that happened is known" if lacking else ""
-    log_problem = "; ".join(filter(None, (stream.problem, lacks)))
+    log_problem = "; ".join(filter(None, (stream.problem, lacks_text(needed, stream.topics))))
     is_complete = not (log_problem or of_truth)
     if run.is_cut:
         bounds_s = ((word, stream.summary.get(f"{word}_s", "inf")) for word in ("from", "until"))
