@@ -16,15 +16,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from adacd_hil import start
 from adacd_hil.clock import wall_ns
 from adacd_hil.error_texts import error_text, is_disk_full
-from adacd_hil.file_replacement import Replacement, removing_empty_folders, replace_file
+from adacd_hil.file_replacement import Replacement, has_other_head, removing_empty_folders, replace_file
 from adacd_hil.log.recording.run_folder import check_free, is_there
 from adacd_hil.plain_values import json_text
 from adacd_hil.printable import in_line, one_line
+from adacd_hil.settings.toml_files import builtin_names
 from adacd_hil.table_layout import fit_table
 from adacd_hil.terminal import fold, painted, terminal_columns, write_result, write_screen
 
@@ -40,16 +41,24 @@ Done = TypeVar("Done")
 ExitCode = start.ExitCode
 explain_statuses = start.explain_statuses
 
-EPILOG = explain_statuses(
-    OK="done",
-    FAILURE="failure (a tare: refused)",
-    USAGE="wrong usage or configuration",
-    PARTIAL="partial result (the log lost something, or a disk is full)",
-    SAFETY_STOP="safety stop (a fault, or a bus or arm that failed, ended the run)",
-    BUS_MISSING="bus or devices missing",
-    DETECTOR_MISSING="a registered detector can't be used",
-    INTERRUPTED="interrupted",
-)
+_MEANINGS = {
+    "OK": "done",
+    "FAILURE": "failure",
+    "USAGE": "wrong usage or configuration",
+    "PARTIAL": "partial result (the log lost something, or a disk is full)",
+    "SAFETY_STOP": "safety stop (a fault, or a bus or arm that failed, ended the run)",
+    "BUS_MISSING": "bus or devices missing",
+    "DETECTOR_MISSING": "a registered detector can't be used",
+    "INTERRUPTED": "interrupted",
+}
+
+
+def epilog(**own: str) -> str:
+    """Return the exit statuses for a command's help; own: meanings that this command alone has."""
+    return explain_statuses(**_MEANINGS | own)
+
+
+EPILOG = epilog()
 
 
 def tell(line: str) -> None:
@@ -261,11 +270,22 @@ def quoted(path: Path) -> str:
     return shlex.quote(str(path))
 
 
+RESULT_HEAD: Final = "# A result of adacd-hil. The next one may replace this file.\n"
+"""First line of a TOML file that `print_and_write` writes: a file without it is the user's."""
+_NO_RESULT: Final = "what is there is no result of adacd-hil; give another name"
+
+
+def extendable(config: str) -> str:
+    """Return the name or file of a configuration as a file in any folder can extend it."""
+    return config if config in builtin_names() else str(Path(config).resolve())
+
+
 @contextmanager
-def writable_folder(out: Path | None) -> Iterator[None]:
+def writable_folder(out: Path | None, extended: str | None = None) -> Iterator[None]:
     """Make the folder of a result before the block, and test that the file `out` can be written; do nothing for None.
 
-    A folder that was made and is empty at the end is removed. Raises CommandError if it can't be written.
+    A folder that was made and is empty at the end is removed. extended: the configuration that the result will extend.
+    Raises CommandError if the file can't be written, is no earlier result, or is that configuration.
     """
     if out is None:
         yield
@@ -274,16 +294,21 @@ def writable_folder(out: Path | None) -> Iterator[None]:
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
             Replacement(out).discard()
+            if has_other_head(out, RESULT_HEAD.encode()):
+                raise FileExistsError(errno.EEXIST, _NO_RESULT, str(out))
         except OSError as error:
             is_parent = isinstance(error, FileExistsError) and error.filename != str(out)
             reason = f"{error.filename} is no folder" if is_parent else error.strerror
             raise CommandError(f"{out} can't be written: {reason}") from error
+        if extended is not None and out.exists() and Path(extended).exists() and out.samefile(extended):
+            raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
         yield
 
 
 def print_and_write(text: str, out: Path | None, content: str, has_all: bool) -> None:
     """Print a result's text, and write `content` to the file `out`, unless that is None; make its folder if missing.
 
+    The file begins with RESULT_HEAD.
     has_all: the text contains `content`. If the file can't be written, print `content` too, unless has_all, and raise
     CommandError.
     """
@@ -291,7 +316,7 @@ def print_and_write(text: str, out: Path | None, content: str, has_all: bool) ->
     if out is not None:
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
-            replace_file(out, content)
+            replace_file(out, f"{RESULT_HEAD}{content}")
         except OSError as error:
             failure = error
     print(text) if has_all else write_result(text)

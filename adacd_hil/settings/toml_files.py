@@ -64,10 +64,12 @@ def parse_toml(text: bytes | str) -> dict[str, Any]:
         table = tomllib.loads(decoded)
     except RecursionError:
         raise ConfigError(f"more than {_DEEPEST} tables or lists within each other") from None
-    except ValueError as error:  # TOML syntax, or an integer that is too long to be parsed
+    except tomllib.TOMLDecodeError as error:
         comma = _DECIMAL_COMMA.search(decoded)
         hint = f"; `{comma[0]}`: a decimal point, not a comma?" if comma else ""
         raise ConfigError(f"{one_line(error)}{hint}") from None
+    except ValueError:  # too many digits for Python
+        raise ConfigError("an integer has more than 64 bits") from None
     _check_extent(table)
     return table
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.wire.codec import Codec, CodecError, MessageCodec
+from adacd_hil.wire.frame_lengths import CLASSIC_BYTES, FRAME_LENGTHS
 from adacd_hil.wire.time_marks import NEVER_NS
 from firmware_sim.arm.sensing import POSITION_LSB_RAD, TORQUE_COUNTS, VELOCITY_LSB_RAD_S
 from firmware_sim.canopen.object_dictionary import ObjectDictionary
@@ -183,8 +184,12 @@ def find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Place
 
     EVERYBODY is the node of a broadcast, ANY_FRAME the identifier of frame "any".
 
-    Raises ConfigError if the contract lacks a frame, or if a frame has no counter to freeze.
+    Raises ConfigError if the contract lacks a frame, if a frame has no counter to freeze or ends before the bits of the
+    mask, if no frame has the length of a flood's data, or if a wrong node id is the right one.
     """
+    _check_flood(codec, index, row)
+    if row.node_id is not None and row.node_id == codec.node_id(f"{(row.node or '').capitalize()}Heartbeat"):
+        raise ConfigError(f"faults[{index}]: node_id = {row.node_id} is {row.node}'s own, without effect")
     if row.frame is None:
         return frozenset()
     if row.frame == "any":
@@ -197,7 +202,18 @@ def find_frames(codec: Codec, index: int, row: FaultSettings) -> frozenset[Place
     for _, message in found:
         if row.kind == "freeze_counter" and not message.is_protected:
             raise ConfigError(f"faults[{index}]: {message.name} has no counter to freeze in {codec.path.name}")
+        if row.mask is not None and not any(bytes.fromhex(row.mask)[: message.length]):
+            place = f"the {message.length} bytes of {message.name}"
+            raise ConfigError(f"faults[{index}]: mask = {row.mask!r} has no bit in {place}")
     return frozenset((node, message.can_id) for node, message in found)
+
+
+def _check_flood(codec: Codec, index: int, row: FaultSettings) -> None:
+    size = 0 if row.data is None else len(bytes.fromhex(row.data))
+    lengths = FRAME_LENGTHS if codec.is_fd else FRAME_LENGTHS[: CLASSIC_BYTES + 1]
+    if size not in lengths:
+        expected = ", ".join(map(str, lengths[1:]))
+        raise ConfigError(f"faults[{index}]: data has {size} bytes; frames of {codec.path.name} have {expected}")
 
 
 def check_objects(rows: Sequence[FaultSettings], devices: Sequence[ObjectDictionary]) -> None:

@@ -245,6 +245,8 @@ class Scenario:
     def __post_init__(self) -> None:
         if len(self.about.splitlines()) > 1:
             raise ConfigError(f"`about` has {len(self.about.splitlines())} lines, 1 expected")
+        if len(self.habits) not in (0, len(self.start_deg)):
+            raise ConfigError(f"`habits` has {len(self.habits)} rows, {len(self.start_deg)} expected")
         self.mechanics.check(self.arm, self.start_deg, self.payload_bodies)
         self._check_points("contacts", self.contacts)
         self._check_points("hands", self.hands)

@@ -140,3 +140,5 @@ def test_the_command_writes_a_configuration_with_what_it_found(tmp_path):
     written = load_settings(str(out))
     assert written.excitation == parse(ExcitationSettings, printed["excitation"])
     assert written.certified.learn_every == 20
+    again = called("excitation", "--config", str(out), "--seconds", "0", "--out", str(out))
+    assert again.exit_code == 2  # it would extend itself

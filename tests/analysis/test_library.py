@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from called import called
 from foreign_arms import urdf_text
 
 from adacd_hil import api
@@ -181,6 +182,14 @@ def test_a_log_is_arrays_with_a_row_for_each_cycle(log):
         run["tau_K"]
     with pytest.raises(ValueError, match="read-only"):
         run["q"][0] = 1.0
+
+
+def test_a_log_without_contacts_is_none_without_a_contact(log, tmp_path):
+    called("log", "cut", log, "--topic", "/scheme", "--topic", "/events", "--out", tmp_path / "part.mcap")
+    run = load(tmp_path / "part.mcap")
+    assert len(run) > 0
+    assert "/contact" in run.problem
+    assert "/events" not in run.problem
 
 
 def test_cycles_that_lack_a_topic_or_go_back_are_told(log, monkeypatch):

@@ -137,6 +137,7 @@ def test_every_flipped_bit_is_found_and_named(log):
     assert by_field["q"].logged != by_field["q"].replayed
     assert by_field["request"].logged == "1"
     assert "/scheme.state" in by_field["state"].line()
+    assert by_field["q"]._replace(cycle=-1, t_ns=2_000_000).line().startswith("0.002000 s: /scheme.q")
 
 
 def test_an_nmt_frame_without_data_tells_nothing(log, whole):

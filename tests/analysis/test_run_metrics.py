@@ -22,12 +22,14 @@ from hand_made_run import (
 )
 
 from adacd_hil.lab.score.evaluation import evaluate
-from adacd_hil.lab.score.run_arrays import section_label, split_sections
+from adacd_hil.lab.score.run_arrays import StretchOfRun, section_label, split_sections
 from adacd_hil.log.logged_run import Span
+from adacd_hil.log.time_window import WHOLE
 from adacd_hil.records import FaultReason, SchemeState
 from adacd_hil.score.judge import filtered
 
 SETTLING_ROWS = 1000
+STRETCH = StretchOfRun(WHOLE, WHOLE, 0, 0.0)
 """10/a at a = 10 rad/s and 1 kHz."""
 
 
@@ -398,6 +400,11 @@ TWICE = "identified in 1.00 s and again in 0.80 s after"
         (make_run((A, 1000), (M, 10), (P, 10), (A, 10)), (NO_CONTACT, "but not again after the payload"), False),
         (FAULTED, ("The run ended in FAULT (DATA_AGE) at 1.50 s", NO_CONTACT), False),
         (make_run((SchemeState.COMMISSION, 10)), ("The arm was not watched", "the arm never moved to adapt"), False),
+        (make_run((SchemeState.COMMISSION, 10), is_cut=True), ("has no whole adaptation and no cycle in MON",), False),
+        (make_run((A, 1000), is_cut=True), ("has no whole adaptation and no cycle in MONITOR",), False),
+        (make_run((A, 1000), (M, 10), (P, 10), (A, 10), is_cut=True), ("identified in 1.00 s; no cyclic data",), True),
+        (make_run((SchemeState.COMMISSION, 10), stretch=STRETCH), ("has no whole adaptation and no cycle",), False),
+        (make_run((M, 10), stretch=STRETCH), (NO_CONTACT,), True),
     ],
 )
 def test_the_verdict_says_how_it_went_and_a_run_is_clean_if_nothing_went_wrong(run, parts, is_clean):

@@ -39,7 +39,7 @@ from adacd_hil.settings.configuration_files import load_settings
 
 pytestmark = pytest.mark.slow
 
-PARTIAL, USAGE = 3, 2
+FAILURE, PARTIAL, USAGE = 1, 3, 2
 DATED = "2026-11-25T14-22-33"
 CERTIFICATE = {
     "friction_Nm": [0.1, 0.2, 0.3, 0.4, 0.5, 0.6], "friction_std_Nm": [0.01] * 6,
@@ -291,6 +291,13 @@ def test_tables_have_a_row_for_each_run_and_fixed_types(many, tmp_path):
     assert table.num_rows == len(rows) == 4
     assert table.column_names == list(rows[0])
     assert str(table.schema.field("offset_1_Nm").type) == "double"  # though nothing is known of it
+
+
+@pytest.mark.parametrize("option", ["--csv", "--html", "--parquet"])
+def test_a_file_of_the_user_stays(many, tmp_path, option):
+    (tmp_path / "mine").write_text("t_s,q_1\n0.0,1.0\n")
+    assert called("runs", many, option, tmp_path / "mine").exit_code == FAILURE
+    assert (tmp_path / "mine").read_text() == "t_s,q_1\n0.0,1.0\n"
 
 
 def test_the_page_leads_to_the_reports_that_there_are(many):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from called import called
 
-from adacd_hil.cli.output import CommandError, writable_folder
+from adacd_hil.cli.output import RESULT_HEAD, CommandError, writable_folder
 from adacd_hil.settings.parsing import parse
 from adacd_hil.settings.run_settings import ExcitationSettings
 from adacd_hil.settings.toml_files import parse_toml
@@ -24,12 +24,12 @@ sine = [[0.0, 0.0], [0.0, 0.0]]
 
 
 def test_a_place_is_tried_and_left_as_it_was(tmp_path):
-    (tmp_path / "old.toml").write_text("kept")
+    (tmp_path / "old.toml").write_text(f"{RESULT_HEAD}kept")
     for out in (tmp_path / "old.toml", tmp_path / "new" / "newer" / "x.toml"):
         with writable_folder(out):
             assert not list(out.parent.glob(".*"))
     assert [path.name for path in tmp_path.iterdir()] == ["old.toml"]
-    assert (tmp_path / "old.toml").read_text() == "kept"
+    assert (tmp_path / "old.toml").read_text() == f"{RESULT_HEAD}kept"
 
 
 @pytest.mark.parametrize(
@@ -38,11 +38,13 @@ def test_a_place_is_tried_and_left_as_it_was(tmp_path):
         ("file/x.toml", ".*file is no folder"),
         ("", "it is a folder"),
         ("run.mcap", "it is a log"),
+        ("mine.toml", "what is there is no result"),
         ("/proc/none/x.toml", "No such file or directory"),
     ],
 )
 def test_a_place_that_takes_no_file_is_said_before_the_search(out, reason, tmp_path):
     (tmp_path / "file").touch()
+    (tmp_path / "mine.toml").write_text("extends = 'certified'\n")
     (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n")
     with pytest.raises(CommandError, match=rf"can't be written: {reason}"), writable_folder(tmp_path / out):
         raise AssertionError("searched")

@@ -166,6 +166,7 @@ MISTAKES: tuple[tuple[str, int, tuple[str, ...]], ...] = (
     ("excitation --out notes.txt/new.toml", FAILURE, ("notes.txt/new.toml can't be written: notes.txt is no folder",)),
     ("tune none.mcap --out notes.txt/new.toml", FAILURE, ("can't be written: notes.txt is no folder",)),
     ("thresholds none.mcap --out notes.txt/new.toml", FAILURE, ("can't be written: notes.txt is no folder",)),
+    ("excitation --config certified --out notes.txt", FAILURE, ("notes.txt can't be written: what is there is no",)),
     ("demo --out /sys/run", FAILURE, ("/sys/run: ", "give another place")),
     ("init /sys/new.toml --no-bus --yes", FAILURE, ("/sys/new.toml can't be written", "give another place")),
 )

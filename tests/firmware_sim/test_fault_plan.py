@@ -234,15 +234,20 @@ def test_a_frozen_counter_stands_still_under_a_right_crc(contract, name, frame, 
 
 
 @pytest.mark.parametrize(
-    ("kind", "frame", "contract", "message"),
+    ("row", "contract", "message"),
     [
-        ("freeze_counter", "feedback", "arm", "Drive1Feedback has no counter to freeze in arm.dbc"),
-        ("lose", "status", "arm_fd", "frame 'status' is not in arm_fd.dbc: "),
+        ({"kind": "freeze_counter", "frame": "feedback"}, "arm", "Drive1Feedback has no counter to freeze in arm.dbc"),
+        ({"kind": "lose", "frame": "status"}, "arm_fd", "frame 'status' is not in arm_fd.dbc: "),
+        ({"kind": "corrupt", "frame": "heartbeat", "mask": "0001"}, "arm", "mask = '0001' has no bit in the 1 "),
+        ({"kind": "babble", "can_id": 0x7F, "rate_Hz": 10.0, "data": "00" * 12}, "arm", "data has 12 bytes; "),
+        ({"kind": "babble", "can_id": 0x7F, "rate_Hz": 10.0, "data": "00" * 9}, "arm_fd", "data has 9 bytes; "),
+        ({"kind": "wrong_node_id", "node_id": 1}, "arm", "node_id = 1 is drive1's own"),
     ],
 )
-def test_a_frame_that_the_contract_has_not_is_refused(kind, frame, contract, message):
+def test_a_frame_that_the_contract_has_not_is_refused(row, contract, message):
+    timed = {} if "node_id" in row else {"at_s": 0.0}
     with pytest.raises(ConfigError) as refusal:
-        plan_of({"kind": kind, "node": "drive1", "frame": frame, "at_s": 0.0}, contract=contract)
+        plan_of({"node": "drive1", **timed, **row}, contract=contract)
     assert str(refusal.value).startswith(f"faults[0]: {message}")
 
 

@@ -35,6 +35,7 @@ REFUSED = [
     ("profil = 'M'", "unknown key `profil`; did you mean `profile`?"),
     ('about = "one\\ntwo"', "`about` has 2 lines, 1 expected"),
     ("start_deg = [", "scenario.toml"),
+    ("habits = [{ mode_s = 1.0 }]", "`habits` has 1 rows, 2 expected"),
     (f"contacts = [{CONTACT.replace('0.2', '0.31')}]", "`contacts[0].point_m` = 0.31 m is beyond the end of link 2"),
     (f"contacts = [{CONTACT}, {LATER.replace('0.2', '0.36')}]", "`contacts[1].point_m` = 0.36 m is beyond the end of"),
     (f"contacts = [{CONTACT}, {OVERLAPPING}]", "`contacts[1].at_s` = 1.05 s is before the end"),

@@ -32,7 +32,7 @@ BOMBS = {
     "a dotted table": (f"[{'a.' * DEEP}a]", "more than 16 tables or lists within each other"),
     "a quoted dotted key": ('"a".' * DEEP + '"a" = 1', "more than 16 tables or lists within each other"),
     "a key of 17 parts": ("a." * 17 + "b = 1", "more than 16 tables or lists within each other"),
-    "digits": ("x = " + "9" * 5000, "Exceeds the limit"),
+    "digits": ("x = " + "9" * 5000, "an integer has more than 64 bits"),
     "an integer of 65 bits": (f"x.y = {2**63}", "`x.y` is an integer of more than 64 bits"),
     "a negative one in a list": (f"x = [1, {-(2**63) - 1}]", "`x` is an integer of more than 64 bits"),
     "a hexadecimal one": ("x = 0x" + "f" * 5000, "`x` is an integer of more than 64 bits"),

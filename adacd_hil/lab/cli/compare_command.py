@@ -64,7 +64,13 @@ def _as_text(found: "LogComparison") -> str:
         same = ", all the same" if found.is_same_where_whole else ""
         lines.append(f"{found.cycles} cycles compared{same}, {found.only[0]} and {found.only[1]} only in one")
     fields = [
-        (each.field, f"{each.first_s:.3f} s", str(each.first_cycle), str(each.cycles), f"{each.largest:.3g}")
+        (
+            each.field,
+            f"{each.first_s:.3f} s",
+            str(each.first_cycle),
+            str(each.cycles),
+            f"{each.largest:.3g}" if each.largest else "–",
+        )
         for each in found.fields
     ]
     contacts = [(contact_in_words(first), contact_in_words(second)) for first, second in found.contacts]

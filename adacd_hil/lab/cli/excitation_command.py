@@ -1,16 +1,14 @@
 """The search for an excitation: the command's work and its table."""
 
 import json
-from pathlib import Path
 from typing import Any
 
-from adacd_hil.cli.output import CommandError, ExitCode, format_table
+from adacd_hil.cli.output import CommandError, extendable, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.tune.excitation_search import NoExcitationError, Search
 from adacd_hil.progress_lines import Progress
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.run_settings import ExcitationSettings
-from adacd_hil.settings.toml_files import builtin_names
 from adacd_hil.settings.toml_text import to_toml
 
 _LABELS = (
@@ -24,16 +22,14 @@ _LABELS = (
 )
 
 
-def search(config: str, out: Path | None, profile: str | None, seconds: float, seed: int) -> dict[str, Any]:
+def search(config: str, profile: str | None, seconds: float, seed: int) -> dict[str, Any]:
     """Search an excitation for a configuration; return the result by the keys of its JSON.
 
     `present`, None without one, and `found`: figures of the configuration's excitation and of the found one; `limits`:
     their bounds; `excitation`: the found one. seed: of the starting points of climbs. seconds: after which no further
-    climb is begun. out: file that the caller will write, refused if it is the configuration. Raises ConfigError for a
-    configuration that allows no search, CommandError for `out`, or if no motion keeps the limits.
+    climb is begun. Raises ConfigError for a configuration that allows no search, CommandError if no motion keeps the
+    limits.
     """
-    if out is not None and out.exists() and Path(config).exists() and out.samefile(config):
-        raise CommandError(f"--out {out} is the configuration itself; give another name", ExitCode.USAGE)
     task = Search(load_settings(config, profile))
     clock = MonotonicClock()
     end_ns = clock.now_ns() + round(1e9 * seconds)
@@ -53,8 +49,7 @@ def search(config: str, out: Path | None, profile: str | None, seconds: float, s
 
 def as_toml(config: str, excitation: ExcitationSettings) -> str:
     """Return an excitation as the TOML text of a configuration that extends `config`, a name or file."""
-    base = config if config in builtin_names() else str(Path(config).resolve())
-    return f"extends = {json.dumps(base)}\n\n[excitation]\n{to_toml(excitation)}"
+    return f"extends = {json.dumps(extendable(config))}\n\n[excitation]\n{to_toml(excitation)}"
 
 
 def as_text(outcome: dict[str, Any]) -> str:

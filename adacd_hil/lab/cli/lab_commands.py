@@ -29,6 +29,7 @@ from adacd_hil.cli.output import (
     ExitCode,
     answer,
     complain_of,
+    epilog,
     explain_statuses,
     explained,
     print_and_write,
@@ -92,7 +93,7 @@ def demo(as_json: bool, **options: Any) -> ExitCode:
     return code
 
 
-@click.command(epilog=EPILOG)
+@click.command(epilog=epilog(FAILURE="refused for the reason given, or failure, and the file is as it was"))
 @on_bus
 @click.option("--poses", type=int, help="Poses to measure in; default: tare.poses.")
 @click.option("--seconds", type=float, help="Measured time per pose; default: tare.window_s.")
@@ -103,8 +104,7 @@ def demo(as_json: bool, **options: Any) -> ExitCode:
 def tare(connection: "Connection", out: Path, as_json: bool, **options: Any) -> ExitCode:
     """Measure the offsets of the joint torque sensors at rest, with the drives disabled, and store them.
 
-    With more than one pose, the arm is moved by hand in between. Exit status 1: refused, for the reason given; the
-    file is as it was. `adacd-hil run --tare FILE` uses the offsets.
+    With more than one pose, the arm is moved by hand in between. `adacd-hil run --tare FILE` uses the offsets.
     """
     from adacd_hil.lab.cli.tare_command import as_text, tare_on_bus
 
@@ -190,8 +190,8 @@ def excitation(config: str, out: Path | None, as_json: bool, **options: Any) -> 
     from adacd_hil.lab.cli import excitation_command as command
     from adacd_hil.plain_values import json_text
 
-    with writable_folder(out):
-        found = command.search(config, out, **options)
+    with writable_folder(out, config):
+        found = command.search(config, **options)
         text = json_text(found) if as_json else command.as_text(found)
         print_and_write(text, out, command.as_toml(config, found["excitation"]), as_json)
     return ExitCode.OK
@@ -227,7 +227,7 @@ def budget(as_json: bool, **options: Any) -> ExitCode:
     return ExitCode.OK if found[1].is_fit else ExitCode.FAILURE
 
 
-@click.command(epilog=EPILOG)
+@click.command(epilog=epilog(BUS_MISSING="the bus or a node is missing, or a node is not the expected one"))
 @on_bus
 @click.option(
     "--seconds", type=FiniteRange(0.1, 600.0), default=LISTEN_S, show_default=True, help="How long to listen."
@@ -236,7 +236,7 @@ def budget(as_json: bool, **options: Any) -> ExitCode:
 def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
     """Find the nodes on a bus, their frames, and whether they are the configured arm.
 
-    Sends SDO uploads only and changes no node's state. Exit status 5 when a node is missing or not the expected one.
+    Sends SDO uploads only and changes no node's state.
     """
     from adacd_hil.lab.cli.scan_command import as_text, scan_bus
 
@@ -246,8 +246,8 @@ def scan(connection: "Connection", seconds: float, as_json: bool) -> ExitCode:
 
 
 @click.command(
-    epilog=f"Below a share of {SUFFICIENT_SHARE:.2f} the connection is not sufficient (exit status 1), below "
-    f"{GOOD_SHARE:.2f} there is a warning. {EPILOG}"
+    epilog=f"Below a share of {SUFFICIENT_SHARE:.2f} the connection is not sufficient, below {GOOD_SHARE:.2f} there is "
+    f"a warning. {epilog(FAILURE='not sufficient, or failure')}"
 )
 @on_bus
 @click.option("--seconds", type=FiniteRange(0.1, 3600.0), default=10.0, show_default=True, help="How long to test.")
@@ -266,15 +266,14 @@ def commtest(connection: "Connection", as_json: bool, **options: Any) -> ExitCod
     return code
 
 
-@click.command(epilog=EPILOG)
+@click.command(epilog=epilog(FAILURE="a check failed"))
 @on_bus
 @click.option("--move", "is_moving", is_flag=True, help="Ask for each joint to be moved by hand, to check its signs.")
 @json_option
 def doctor(connection: "Connection", is_moving: bool, as_json: bool) -> ExitCode:
     """Check host, bus and arm one by one, with a remedy for each failure. The drives are never enabled.
 
-    Exit status 1 when a check failed. Resets the nodes' communication and leaves them pre-operational; does neither
-    when it hears another master.
+    Resets the nodes' communication and leaves them pre-operational; does neither when it hears another master.
     """
     from adacd_hil.lab.cli import doctor_command as command
 

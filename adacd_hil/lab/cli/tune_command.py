@@ -10,6 +10,7 @@ from adacd_hil.cli.output import (
     ExitCode,
     explain_statuses,
     explained,
+    extendable,
     format_table,
     print_and_write,
     quoted,
@@ -77,12 +78,14 @@ def tune(
     from adacd_hil.replay.log_source import LogSource
 
     paths = different_logs(logs)
-    with writable_folder(out):
+    with writable_folder(out, config):
         base = base_of(LogSource(paths[0]).settings, config) if out is not None else None
         with Progress() as progress:
             found = find(paths, rate_per_h, config, progress, stretch)
         text = json_text(tuning_by_key(found)) if as_json else _as_text(found)
-        content = "" if base is None or found.best is None else suggested_toml(found, found.best, *base)
+        content = ""
+        if base is not None and found.best is not None:
+            content = suggested_toml(found, found.best, extendable(base[0]), base[1])
         written = out if content else None
         print_and_write(text, written, content, as_json)
         if not as_json:

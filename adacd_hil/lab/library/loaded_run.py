@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.extras import install_command
+from adacd_hil.lab.logs.log_info import read_info
 from adacd_hil.lab.score.metrics import certificates_in
+from adacd_hil.lab.score.report_wording import lacks_text
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.log.logged_run import settings_of
@@ -172,14 +174,16 @@ def load(run: str | Path) -> LoadedRun:
     """Return the run in a log, all parts of the log as one. run: a folder with run.mcap, or the log's first part.
 
     Cycles that lack a record of /scheme, /control or /cycle are left out; of a topic without any record, only its
-    fields. A cut or damaged log is read as far as it is intact. `problem` names the damage, else the cycles left out.
-    Raises LogError, in one line, if it can't be read, has no cycle, or its times don't grow.
+    fields. A cut or damaged log is read as far as it is intact. `problem` names the damage, else the cycles left out
+    and a lacking /contact or /events. Raises LogError, in one line, if it can't be read, has no cycle, or its times
+    don't grow.
     """
     path = log_in(run)
     log = read_log(path, _READ)
     arrays = _arrays(log)
     t_ns = arrays.pop("t_ns")
     left_out = max(len(log.topics[topic]) for topic in _TOPICS) - len(t_ns)
+    there = {each.topic for each in read_info(path, is_brief=True).topics}
     lack = f"{number_of(left_out, 'cycle')} without a record of each topic left out" if left_out else ""
     is_moving = np.flatnonzero(arrays["state"] == SchemeState.ADAPT)
     zero_ns = int(t_ns[is_moving[0] if is_moving.size else 0])
@@ -194,7 +198,7 @@ def load(run: str | Path) -> LoadedRun:
         contacts=tuple(RunContact((t_ns - zero_ns) * 1e-9, report) for t_ns, report in each_once(log.contacts)),
         metadata=log.metadata,
         attachments=log.attachments,
-        problem=log.problem or lack,
+        problem=log.problem or "; ".join(filter(None, (lack, lacks_text((CONTACT.name, EVENTS.name), there)))),
     )
 
 

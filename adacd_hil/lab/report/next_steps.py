@@ -12,7 +12,7 @@ from adacd_hil.lab.report.page import STEPS, went_wrong
 from adacd_hil.lab.score.metrics import Metrics, ReportSource
 from adacd_hil.lab.score.run_arrays import EMBEDDED, Run
 from adacd_hil.lab.score.run_faults import find_breaks
-from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked
+from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked, shows_nothing
 from adacd_hil.printable import in_line
 from adacd_hil.settings.toml_files import builtin_names, toml_names
 
@@ -30,6 +30,8 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
     steps = [NextStep("The log is not whole: see what it lacks.", f"adacd-hil log check {log}")] * bool(
         source.log_problem
     )
+    if shows_nothing(run, metrics) and not (metrics.fault or find_breaks(run)):
+        return [*steps, NextStep("Report the whole run.")], []
     if run.cycle.size == 0:
         return [*steps, _checked(run, source, "The arm was not moved. Mend the cause above.")], []
     steps += _repairs(metrics, run, source)
@@ -49,7 +51,7 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
 def _repairs(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]:
     """Return a next step for each kind of failure that the run shows; [] if there is none."""
     log = _quoted(source.log_name)
-    has_stopped = bool(metrics.fault or find_breaks(run)) or (not metrics.adaptation_s and run.stretch is None)
+    has_stopped = bool(metrics.fault or find_breaks(run)) or (not metrics.adaptation_s and not run.is_part)
     stopped = _checked(run, source, "Mend the cause above.")
     late = _checked(run, source, "Frames came late or were lost, more than allowed.")
     rows = (
@@ -60,7 +62,7 @@ def _repairs(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]
             NextStep("The certificate was taken back. Remove the cause, then let the arm learn anew, untouched."),
         ),
         (
-            not has_stopped and None in metrics.adaptation_s.values(),
+            not has_stopped and not run.is_cut and None in metrics.adaptation_s.values(),
             NextStep("The model was not learned; the notices may say why. Try another motion.",
                      f"adacd-hil excitation --config {_configuration(run, source)}"),
         ),

@@ -34,6 +34,7 @@ from adacd_hil.lab.report.traces import panels_of
 from adacd_hil.lab.score.evaluation import QUEUES, RunGatherer
 from adacd_hil.lab.score.margins import SETTLING_TIME_CONSTANTS
 from adacd_hil.lab.score.metrics import ReportSource
+from adacd_hil.lab.score.report_wording import lacks_text
 from adacd_hil.lab.score.run_arrays import (
     QUANTITIES,
     AttemptBegins,
@@ -216,24 +217,23 @@ def _checked(path: Path, scheme: Series, last: tuple[int, int]) -> tuple[int, in
 def _with_ending(
     run: Run, gathered: RunGatherer, stream: LogStream, truth: TruthTable | None, truth_problem: str
 ) -> ReadRun:
-    """Return a run with `broken_off`, if the log ended unplanned, and the counts of the log's summary.
+    """Return a run with `broken_off`, if the log ended unplanned, `is_cut`, and the counts of the log's summary.
 
     The run of a stretch has no counts. The source has the problems of log and truth, and unjudged alarms.
     """
     ending = stream.summary.get(ENDING_KEY, "")
     if ending and ending not in PLANNED_ENDINGS:
         run = replace(run, broken_off=one_line(ending))
+    run = replace(run, is_cut=ending == CUT)
     unjudged = unjudged_sentence(sum(not detection.is_known for detection in find_detections(run)))
     if not unjudged and uncovered_watch(run).any():
         unjudged = f"{TRUTH_NAME} doesn't cover all of MONITOR"
     damage = f"{TRUTH_NAME} is not whole: {truth.problem}" if truth is not None and truth.problem else ""
     of_truth = "; ".join(filter(None, (truth_problem, damage, unjudged)))
     needed = (CONTACT.name, EVENTS.name) if run.cycle.size else (SCHEME.name,) if CYCLE.name in stream.topics else ()
-    lacking = [topic for topic in needed if topic not in stream.topics]
-    lacks = f"it has no {' and no '.join(lacking)}, so that not all that happened is known" if lacking else ""
-    log_problem = "; ".join(filter(None, (stream.problem, lacks)))
+    log_problem = "; ".join(filter(None, (stream.problem, lacks_text(needed, stream.topics))))
     is_complete = not (log_problem or of_truth)
-    if ending == CUT:
+    if run.is_cut:
         bounds_s = ((word, stream.summary.get(f"{word}_s", "inf")) for word in ("from", "until"))
         words = ("the log is a cut of its run", *(f"{word} {at_s} s" for word, at_s in bounds_s if "inf" not in at_s))
         of_truth = "; ".join(filter(None, (of_truth, " ".join(words))))

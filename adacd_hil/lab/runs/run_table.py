@@ -5,6 +5,7 @@ empty. Parquet's columns have fixed types, so that tables of several folders can
 """
 
 import csv
+import errno
 import fnmatch
 import io
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +14,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
 
-from adacd_hil.file_replacement import replace_files, replacing
+from adacd_hil.file_replacement import has_other_head, replace_files, replacing
 from adacd_hil.lab.logs.signal_tables import import_pyarrow
 from adacd_hil.lab.runs.run_summary import CERTIFIED, GOOD, NO_CERTIFICATE, NOT_JUDGED, RUNNING, RunSummary
 from adacd_hil.lab.score.report_wording import number_text, pair_text
@@ -174,7 +175,7 @@ def as_csv(runs: Sequence[RunSummary]) -> str:
 def write_parquet(runs: Sequence[RunSummary], path: Path) -> None:
     """Write the table of runs as Parquet, and make its folder; an earlier file is replaced once the new one is whole.
 
-    Raises LogError without pyarrow, or if the file can't be written, as over a log or a folder.
+    Raises LogError without pyarrow, or if the file can't be written, as over a log, a folder or no Parquet.
     """
     arrow, parquet = import_pyarrow()
     rows = [_flat(values_of(run)) for run in runs]
@@ -183,6 +184,7 @@ def write_parquet(runs: Sequence[RunSummary], path: Path) -> None:
         for name, kind in _flat(COLUMNS).items()
     }
     with failing_as(f"{path} can't be written"):
+        _check_head(path, b"PAR1")
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as beside:
             parquet.write_table(arrow.table(columns), beside, compression="zstd")
@@ -191,7 +193,17 @@ def write_parquet(runs: Sequence[RunSummary], path: Path) -> None:
 def write_result(content: bytes | str, path: Path) -> None:
     """Write a file, and make its folder; an earlier file is replaced once the new one is whole.
 
-    Raises LogError if it can't be written, as over a log or a folder.
+    Raises LogError if it can't be written, as over a log, a folder or a file that begins otherwise.
     """
     with failing_as(f"{path} can't be written"):
+        _check_head(path, (content.encode() if isinstance(content, str) else content)[:_HEAD_BYTES])
         replace_files(path.parent, {path.name: content})
+
+
+_HEAD_BYTES = 12
+"""Of a table or page: those of two versions of it are alike this far."""
+
+
+def _check_head(path: Path, head: bytes) -> None:
+    if has_other_head(path, head):
+        raise FileExistsError(errno.EEXIST, "what is there is no result of this command; give another name", str(path))

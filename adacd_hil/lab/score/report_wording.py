@@ -1,7 +1,7 @@
 """One wording of each number, state and rate, for reports; those that a replay needs, too, are in `score.wording`."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Final
 
 import numpy as np
@@ -31,6 +31,12 @@ STATE_WORDS: Final = {
     SchemeState.FAULT: "fault",
 }
 """States as a report names them."""
+
+
+def lacks_text(needed: Collection[str], there: Collection[str]) -> str:
+    """Return a phrase on the needed topics that a log has not even without messages; "" if there is none."""
+    lacking = [topic for topic in needed if topic not in there]
+    return f"it has no {' and no '.join(lacking)}, so that not all that happened is known" if lacking else ""
 
 
 def state_words(name: str | None) -> str:

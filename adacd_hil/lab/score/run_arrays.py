@@ -241,6 +241,12 @@ class Run:
     stretch: StretchOfRun | None = None  # None: the whole log
     checks: CheckCounts | None = None  # None: not in the log
     broken_off: str = ""  # the reason for an unintended end of the log
+    is_cut: bool = False  # the log was cut from the run's
+
+    @property
+    def is_part(self) -> bool:
+        """Whether the run began before these cycles, or may have gone on after them, as was asked for."""
+        return self.is_cut or self.stretch is not None
 
     @property
     def first_contact(self) -> int:

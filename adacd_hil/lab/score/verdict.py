@@ -37,6 +37,7 @@ from adacd_hil.settings.configuration_files import load_settings
 LISTED: Final = 4
 """Adaptations that are listed one by one."""
 _BESIDE: Final = "the paper's scheme on the same stream"
+_SHOWS_NOTHING: Final = "this part of the run has no whole adaptation and no cycle in MONITOR: nothing can be judged"
 _NO_LOSS: Final = "no cyclic data was late or lost"
 
 
@@ -44,10 +45,13 @@ def list_findings(
     run: Run, metrics: Metrics, score: Score, faults: tuple[Fault, ...], breaks: tuple[Break, ...]
 ) -> tuple[Finding, ...]:
     """Return the findings of a run, failures first. A run without cycles has one bad finding."""
-    if run.cycle.size == 0:
+    if run.cycle.size == 0 and not run.is_cut:
         cause = "; ".join(each.cause for each in breaks) or "the log does not say why"
         return (Finding(f"no cycle was run: {cause}", True),)
-    evidence, adaptation_s, data = metrics.evidence, metrics.adaptation_s, metrics.data
+    if run.cycle.size == 0:
+        return (Finding(_SHOWS_NOTHING, True),)
+    evidence, data = metrics.evidence, metrics.data
+    adaptation_s = _judged_adaptations(run, metrics)
     done = "identified" if evidence is None else "certified"
     identified = identified_text(adaptation_s, metrics.payload_kg, begun_anew(metrics.sections), done)
     found = score_sentence(score)
@@ -76,10 +80,24 @@ def list_findings(
     misread = [contact for contact in metrics.contacts if contact.link_ok is False or contact.direction_ok is False]
     if misread:
         findings.append(Finding(f"link or direction of {number_of(len(misread), 'contact')} is wrong", True))
-    if adaptation_s or run.stretch is None:  # a part of a run need not have any
+    if shows_nothing(run, metrics):
+        findings.append(Finding(_SHOWS_NOTHING, True))
+    elif adaptation_s or not run.is_part:  # a part of a run need not have any
         findings.append(Finding(identified, not adaptation_s or None in adaptation_s.values()))
     findings += [Finding(beside), Finding(data_text(data), bool(data.excesses))]
     return tuple(finding for finding in findings if finding.text)
+
+
+def shows_nothing(run: Run, metrics: Metrics) -> bool:
+    """Return whether a part of a run has no whole adaptation and no cycle in MONITOR: then nothing can be judged."""
+    is_watched = any(section.kind == "detection" for section in metrics.sections)
+    return run.is_part and not is_watched and not _judged_adaptations(run, metrics)
+
+
+def _judged_adaptations(run: Run, metrics: Metrics) -> dict[str, float | None]:
+    """Return the adaptations of a run; of a cut only those that came to their end, as the cut may have ended others."""
+    times_s = metrics.adaptation_s
+    return {label: time_s for label, time_s in times_s.items() if time_s is not None or not run.is_cut}
 
 
 def _judged_text(run: Run, found: str) -> str:
