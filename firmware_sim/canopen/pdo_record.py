@@ -75,11 +75,7 @@ class PdoRecord:
         self._entries = [
             dictionary.value(mapping, sub) for sub in range(1, 65) if dictionary.has(mapping, sub)
         ]  # sub-indices without gaps
-        self._count = dictionary.value(mapping, 0)
-        try:
-            self._lay_out(self._count)
-        except Refusal:  # an EDS whose default no master could write
-            self._count = 0
+        self._set_count(dictionary.value(mapping, 0))
         dictionary.watch(index, 1, self._identify, self._check_cob_id)
         dictionary.watch(index, 2, self._set_type, one_of(*_TYPES))
         dictionary.watch(index, 3, self._set_inhibit, self._check_inhibit)
@@ -152,9 +148,16 @@ class PdoRecord:
         self._lay_out(value)
 
     def _map(self, value: int) -> None:
-        self._count = value
-        self._lay_out(value)
+        self._set_count(value)
         self._refresh()
+
+    def _set_count(self, count: int) -> None:
+        """Map the first `count` entries, or none if no master could write them, as the defaults of some EDS."""
+        try:
+            self._lay_out(count)
+        except Refusal:
+            self.layout, count = NOTHING, 0
+        self._count = count
 
     def _lay_out(self, count: int) -> None:
         """Set `layout` by the first `count` entries. Raise `Refusal` and change nothing if they can't be mapped."""

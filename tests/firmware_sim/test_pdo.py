@@ -185,6 +185,19 @@ def test_a_reset_of_communication_restores_mapping_and_identifier(host):
     assert (host.read(1, 0x1800, 1), host.read(1, 0x1800, 2), host.read(1, 0x1A00, 0)) == (0x181, 1, 2)
 
 
+def test_a_default_mapping_that_no_master_could_write_is_empty_after_a_reset_and_can_be_replaced(host, monkeypatch):
+    mapped = host.bench.devices[0].pdos.dictionary.find(0x1A00, 1)
+    monkeypatch.setattr(mapped, "default", COMMAND[0])  # rww: for receiving
+    host.nmt(Nmt.RESET_COMMUNICATION)
+    host.nmt(Nmt.START)
+    host.take()
+    host.sync()
+    assert host.taken(0x181) == []
+    remap(host, 1, 0x1800, (POSITION,), can_id=0x181, kind=1)
+    host.sync()
+    assert [len(data) for data in host.taken(0x181)] == [4]
+
+
 def test_the_content_of_a_received_frame_is_checked_with_the_mapped_header_only(host):
     remap(host, 1, 0x1400, (entry(0x2100, 8, 1), entry(0x2100, 8, 2), *COMMAND), can_id=0x201)
     host.start()
