@@ -6,7 +6,7 @@ from typing import Any
 
 from adacd_hil.cli.connection import Connection, on_interrupt
 from adacd_hil.cli.output import CommandError, ExitCode, tell
-from adacd_hil.clock import MonotonicClock, wall_ns
+from adacd_hil.clock import REALTIME, MonotonicClock, wall_ns
 from adacd_hil.control.pacing import prepare_spin
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
@@ -158,7 +158,7 @@ def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection
             "config": settings.name,
             "interface": connection.interface,
             "channel": connection.channel,
-            "clock": "realtime",
+            "clock": REALTIME,
             **achieved,
             "period_us": str(settings.bus.period_us),
         },
