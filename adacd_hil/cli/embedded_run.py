@@ -12,7 +12,7 @@ from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
-from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, EMBEDDED, TRUTH_NAME
 from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.log.viewer_layout import viewer_files
 from adacd_hil.records import Vector
@@ -150,7 +150,7 @@ def run_embedded(
                 clock,
                 ScriptedOperator(settings.operator),
                 out,
-                "embedded",
+                EMBEDDED,
                 metadata={
                     "scenario": scenario.name,
                     "seed": str(scenario.seed),

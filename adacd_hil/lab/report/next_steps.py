@@ -11,9 +11,10 @@ from typing import NamedTuple
 from adacd_hil.clock import LOCKSTEP
 from adacd_hil.lab.report.page import STEPS, went_wrong
 from adacd_hil.lab.score.metrics import Metrics, ReportSource
-from adacd_hil.lab.score.run_arrays import EMBEDDED, EMULATOR, Run
+from adacd_hil.lab.score.run_arrays import EMULATOR, Run
 from adacd_hil.lab.score.run_faults import find_breaks
 from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked
+from adacd_hil.log.log_files import EMBEDDED
 from adacd_hil.printable import in_line
 from adacd_hil.settings.toml_files import builtin_names, toml_names
 

@@ -121,8 +121,6 @@ def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> C
 
 EMULATOR: Final = "emulator_"
 """Prefix of metadata that only the truth has."""
-EMBEDDED: Final = "embedded"
-"""The interface that a log names where the arm is emulated in the host's own process."""
 
 
 class AttemptBegins:
