@@ -9,6 +9,8 @@ import os
 import time
 from typing import Protocol
 
+CLOCKS = LOCKSTEP, REALTIME = "lockstep", "realtime"
+
 _CLOCK_MONOTONIC = 1
 _TIMER_ABSTIME = 1
 _EINTR = 4

@@ -4,6 +4,9 @@ from datetime import UTC, datetime
 
 _NS_PER_S = 1_000_000_000
 _DATE = "%Y-%m-%dT%H:%M:%SZ"
+NS_PER_H = 3600 * _NS_PER_S
+MOST_AHEAD_H = 0.1
+"""Most by which a date in a file may be ahead of this machine's clock."""
 
 
 def format_date(t_ns: int) -> str:

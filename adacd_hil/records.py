@@ -224,6 +224,11 @@ class Reaction(IntEnum):
     SLOW_DOWN = 5  # continues on its path at a fraction of the speed
 
 
+BEGINNING = SchemeState.INIT, SchemeState.COMMISSION
+LEARNING = SchemeState.ADAPT, SchemeState.CERTIFY
+REACTING = SchemeState.REACT, SchemeState.STOPPED
+
+
 class FaultReason(IntEnum):
     """Reason of a FAULT."""
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from adacd_hil.cli.output import CommandError, ExitCode
-from adacd_hil.clock import Clock, MonotonicClock, VirtualClock
+from adacd_hil.clock import LOCKSTEP, Clock, MonotonicClock, VirtualClock
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
 from adacd_hil.device.profile import PlacedDevice
@@ -30,7 +30,7 @@ from adacd_hil.wire.open_bus import open_bus
 
 def make_clock(name: str) -> Clock:
     """Return the clock of a run: a new one of modelled time for `lockstep`, else the system's monotonic clock."""
-    return VirtualClock() if name == "lockstep" else MonotonicClock()
+    return VirtualClock() if name == LOCKSTEP else MonotonicClock()
 
 
 def check_clock(name: str, interface: str, channel: str) -> None:
@@ -39,7 +39,7 @@ def check_clock(name: str, interface: str, channel: str) -> None:
     name: of the clock, as in `--clock`. A channel that doesn't exist passes, and so does an interface that can't be
     used: opening them raises the error.
     """
-    if name == "lockstep" and may_be_hardware(interface, channel):
+    if name == LOCKSTEP and may_be_hardware(interface, channel):
         raise CommandError(
             f"--clock lockstep is for emulated arms; {interface} {channel} may be hardware: it needs --clock realtime",
             ExitCode.USAGE,
@@ -104,7 +104,7 @@ def check_shared(name: str, settings: Settings) -> None:
 
     name: of the clock, `lockstep` or `realtime`.
     """
-    if name == "lockstep" and settings.bus.is_shared:
+    if name == LOCKSTEP and settings.bus.is_shared:
         raise CommandError(
             f"`bus.arms` = {settings.bus.arms} hosts need --clock realtime; in lockstep one host sets the time",
             ExitCode.USAGE,

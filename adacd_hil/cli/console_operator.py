@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import TextIO
 
 from adacd_hil.control.operator import FaultAnswer, ScriptedOperator
-from adacd_hil.records import Request, SchemeState
+from adacd_hil.records import REACTING, Request, SchemeState
 from adacd_hil.remedies import nearest_name
-from adacd_hil.scheme.supervisor.supervisor import KEPT_IN, REACTING
+from adacd_hil.scheme.supervisor.supervisor import KEPT_IN
 
 CONSOLE_WORDS = {
     "ack": Request.ACKNOWLEDGE,

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.cli.connection import check_shared, make_clock, model_time, on_interrupt
+from adacd_hil.clock import LOCKSTEP
 from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.operator import ScriptedOperator
 from adacd_hil.control.session import LiveView, Session, SessionSummary
 from adacd_hil.device.contract import load_contract
 from adacd_hil.device.device_files import place_devices
-from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, TRUTH_NAME
+from adacd_hil.log.log_files import CONFIG_DIGEST_KEY, EMBEDDED, TRUTH_NAME
 from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
 from adacd_hil.log.viewer_layout import viewer_files
 from adacd_hil.records import Vector
@@ -109,7 +110,7 @@ def run_embedded(
     configuration of several arms. After an error the truth's log is discarded.
     """
     settings, scenario = cast.settings, cast.scenario
-    check_shared("lockstep", settings)  # an arm in this process is alone on its bus
+    check_shared(LOCKSTEP, settings)  # an arm in this process is alone on its bus
     devices = place_devices(settings)
     codec = load_contract(settings, devices)
     if excess := describe_excess(codec, settings):
@@ -120,7 +121,7 @@ def run_embedded(
     bus = model_time(embedded, clock, codec, settings)
     out.mkdir(parents=True, exist_ok=True)
     host = {CONFIG_DIGEST_KEY: config_digest(to_toml(settings))}
-    with TruthLog(out / TRUTH_NAME, blocking=clock_name == "lockstep", metadata=host, scenario=scenario) as truth:
+    with TruthLog(out / TRUTH_NAME, blocking=clock_name == LOCKSTEP, metadata=host, scenario=scenario) as truth:
         try:
             touched_ns: int | None = None  # since when somebody touches the arm, for the progress lines alone
 
@@ -149,7 +150,7 @@ def run_embedded(
                 clock,
                 ScriptedOperator(settings.operator),
                 out,
-                "embedded",
+                EMBEDDED,
                 metadata={
                     "scenario": scenario.name,
                     "seed": str(scenario.seed),

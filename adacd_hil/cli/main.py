@@ -19,6 +19,7 @@ from adacd_hil.cli.options import (
     run_folder_option,
 )
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, answer, complain
+from adacd_hil.clock import REALTIME
 from adacd_hil.extras import pip_command
 from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE, CommandGroup
 from adacd_hil.printable import one_line
@@ -58,7 +59,7 @@ def cli() -> None:
     shell_complete=complete_scenario,
 )
 @run_folder_option("run")
-@clock_option(default="realtime")
+@clock_option(default=REALTIME)
 @json_option
 @live_options
 def run(connection: "Connection", as_json: bool, **options: Any) -> ExitCode:

@@ -22,9 +22,11 @@ from adacd_hil.cli.completion import (
     complete_setting,
 )
 from adacd_hil.cli.output import PROGRAM, CommandError, ExitCode, explained
+from adacd_hil.clock import CLOCKS
 from adacd_hil.extras import install_command
 from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenPath
 from adacd_hil.log.log_files import MOST_VIEWERS
+from adacd_hil.settings.stated import ARM_PROFILES, BITRATES
 from adacd_hil.settings.toml_files import builtin_names
 
 if TYPE_CHECKING:
@@ -51,7 +53,7 @@ config_option = click.option(
     shell_complete=complete_configuration,
 )
 profile_option = click.option(
-    "--profile", type=click.Choice(["P", "S", "M"]), help="Arm profile; default: the configuration's."
+    "--profile", type=click.Choice(ARM_PROFILES), help="Arm profile; default: the configuration's."
 )
 log_argument = click.argument("log", type=GIVEN_FILE, shell_complete=complete_run)
 logs_argument = click.argument("logs", nargs=-1, required=True, type=GivenPath(), shell_complete=complete_run)
@@ -70,7 +72,7 @@ channel_option = functools.partial(
     shell_complete=complete_channel,
 )
 bitrate_option = click.option(
-    "-b", "--bitrate", type=click.IntRange(min=10_000), help="bit/s, where python-can sets it."
+    "-b", "--bitrate", type=click.IntRange(min=BITRATES[0]), help="bit/s, where python-can sets it."
 )
 set_option = click.option(
     "--set",
@@ -96,7 +98,7 @@ def run_folder_option(name: str) -> Callable[..., Any]:
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON on stdout.")
 clock_option = functools.partial(
-    click.option, "--clock", type=click.Choice(["lockstep", "realtime"]), show_default=True, help="Clock of the cycles."
+    click.option, "--clock", type=click.Choice(CLOCKS), show_default=True, help="Clock of the cycles."
 )
 
 

@@ -25,8 +25,9 @@ from adacd_hil.device.device_setup import ParameterWatch
 from adacd_hil.device.drive import Cia402State, Drive
 from adacd_hil.device.network import Master
 from adacd_hil.log.recording.recorder import Recorder
-from adacd_hil.records import JOINTS, ArmState, Event, FaultReason, Request, SchemeState, Vector
+from adacd_hil.records import BEGINNING, JOINTS, REACTING, ArmState, Event, FaultReason, Request, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import Pipeline
+from adacd_hil.scheme.supervisor.supervisor import POWERED
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import BusError, Tap
 
@@ -35,7 +36,7 @@ TORQUE_STATUSES = 2
 TORQUE_S = 0.05
 """Shortest time for which a drive's torque must differ: five times the settling time of a slow current loop."""
 _RUN_AWAY = (FaultReason.LIMIT, FaultReason.FOLLOWING)
-_JUDGED = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR, SchemeState.PAYLOAD)
+_JUDGED = POWERED.difference(REACTING)
 """States in which the arm follows an undisturbed motion."""
 
 
@@ -195,9 +196,6 @@ class FaultReport:
         ]
 
 
-_STATES = (SchemeState.INIT, SchemeState.COMMISSION)
-
-
 BOUNDS = "bounds"
 """Name of the event that tells a value outside its bounds before the drives are enabled: shown at once."""
 
@@ -232,7 +230,7 @@ class CommissionReport(EventSource):
 
         Add an event for each device with a value outside its bounds, once. state: of the scheme after the cycle before.
         """
-        if state not in _STATES:
+        if state not in BEGINNING:
             return
         self._cycles += 1
         for device in tuple(self._bounded):

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from adacd_hil.control.device_record import DeviceRecord
-from adacd_hil.dates import date_ns
+from adacd_hil.dates import MOST_AHEAD_H, NS_PER_H, date_ns
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.file_access import read_input
@@ -31,8 +31,6 @@ from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.settings.toml_text import to_toml
 
 HISTORY_FORMAT = 1
-_FUTURE_NS = 360_000_000_000
-"""Most by which a certificate's date may be ahead of this machine's clock."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +254,7 @@ def use_history(path: Path, now_ns: int) -> UsedHistory:
     """Read the arm's history for a run; a missing file is a first run. now_ns: wall clock.
 
     Raises ConfigError as `read_history` for a file that is there, for a link to a missing one, and for a certificate
-    over `_FUTURE_NS` in the future.
+    over `MOST_AHEAD_H` in the future.
     """
     if (link := dangling_link(path)) is not None:  # the history was moved: the arm is known, not on its first run
         raise ConfigError(f"history {path}: link {link} leads to {link.readlink()}, which is not there")
@@ -264,6 +262,6 @@ def use_history(path: Path, now_ns: int) -> UsedHistory:
         return UsedHistory(path, b"", None)
     text, history = _read(path)
     ahead_ns = date_ns(history.last.date_utc) - now_ns
-    if ahead_ns > _FUTURE_NS:
-        raise ConfigError(f"history {path}: its last certificate is {ahead_ns / 3.6e12:.1f} h ahead of this clock")
+    if ahead_ns > MOST_AHEAD_H * NS_PER_H:
+        raise ConfigError(f"history {path}: its last certificate is {ahead_ns / NS_PER_H:.1f} h ahead of this clock")
     return UsedHistory(path, text, history, max(-ahead_ns, 0) * 1e-9)

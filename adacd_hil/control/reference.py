@@ -21,9 +21,9 @@ import numpy as np
 
 from adacd_hil.control.motions import Admittance, Excitation, Pace, QuinticMove, corner_to_corner, motion_problems
 from adacd_hil.device.arm_watch import EventSource
-from adacd_hil.records import JOINTS, ArmState, Event, Reaction, SchemeOutput, SchemeState, Vector
+from adacd_hil.records import JOINTS, LEARNING, REACTING, ArmState, Event, Reaction, SchemeOutput, SchemeState, Vector
 from adacd_hil.scheme.contact.reaction import Withdrawal
-from adacd_hil.scheme.supervisor.supervisor import LEARNING, POWERED, REACTING
+from adacd_hil.scheme.supervisor.supervisor import POWERED
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.schema import ConfigError
 
@@ -49,7 +49,7 @@ ENDING = 0.6
 MOTION = "motion"
 """Name of the events that report limits which the desired motion can't keep."""
 
-_FOLLOWING = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.MONITOR)
+_FOLLOWING = (*LEARNING, SchemeState.MONITOR)
 _ON_PATH = (Reaction.NONE, Reaction.SLOW_DOWN)
 
 Path = Callable[[float, Vector, Vector, Vector], None]

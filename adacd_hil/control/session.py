@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from adacd_hil import __version__
-from adacd_hil.clock import Clock, MonotonicClock, VirtualClock, wall_ns
+from adacd_hil.clock import LOCKSTEP, REALTIME, Clock, MonotonicClock, VirtualClock, wall_ns
 from adacd_hil.control.cycle import Cycle, RunResult
 from adacd_hil.control.cycle_compilation import compiling_cycle
 from adacd_hil.control.fault_recovery import Recovery
@@ -23,7 +23,7 @@ from adacd_hil.device.network import Identity, Master
 from adacd_hil.device.profile import PlacedDevice, enable_timeout_s
 from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import write_new_file
-from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, LOG_NAME, arithmetic
+from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, LOG_NAME, SCRIPTED, arithmetic
 from adacd_hil.log.recording.processes import LiveService
 from adacd_hil.log.recording.recorder import LogSummary, Recorder
 from adacd_hil.log.types.topics import CERTIFIED_MODEL
@@ -343,10 +343,10 @@ class Session:
             "layout_digest": f"0x{self.codec.layout_digest:08X}",
             "interface": self.interface,
             "channel": self.bus.channel,
-            "clock": "lockstep" if self.is_lockstep else "realtime",
+            "clock": LOCKSTEP if self.is_lockstep else REALTIME,
             **grant.describe(),
             "period_us": str(settings.bus.period_us),
-            "operator": "script" if isinstance(self.operator, ScriptedOperator) else "console",
+            "operator": SCRIPTED if isinstance(self.operator, ScriptedOperator) else "console",
             **arithmetic(),
             **{key: value for file in self.files for key, value in file.metadata().items()},
             **self.metadata,

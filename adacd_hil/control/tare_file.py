@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from adacd_hil.control.device_record import DeviceRecord
-from adacd_hil.dates import date_ns
+from adacd_hil.dates import MOST_AHEAD_H, NS_PER_H, date_ns
 from adacd_hil.device.canopen_bus import DeviceError
 from adacd_hil.device.network import Identity
 from adacd_hil.file_access import read_input
@@ -29,10 +29,8 @@ from adacd_hil.settings.toml_text import to_toml
 TARE_FORMAT = 1
 SMALLEST_STD_NM = 0.001
 """Smallest standard deviation of a sensor's zero that is used, however long it was measured."""
-_NS_PER_H = 3_600_000_000_000
 TARED = ("arm.torque_offset_Nm", "arm.torque_offset_std_Nm")
 """Settings that a tare overrides."""
-_CLOCK_TOLERANCE_H = 0.1
 
 
 @dataclass(frozen=True)
@@ -230,7 +228,7 @@ def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
                 f"{list(present)}, which makes another gravity; tare again"
             )
     bounds = settings.tare
-    age_h = (now_ns - tare.measured_ns()) / _NS_PER_H
+    age_h = (now_ns - tare.measured_ns()) / NS_PER_H
     if 0.0 < bounds.max_age_h < age_h:
         raise ConfigError(
             f"tare {path} is {age_h:.1f} h old, more than tare.max_age_h = {bounds.max_age_h:g} h; tare again"
@@ -238,7 +236,7 @@ def use_tare(path: Path, settings: Settings, now_ns: int) -> UsedTare:
     warnings = []
     if age_h > bounds.warn_age_h:
         warnings.append(f"{path} is {age_h:.1f} h old, more than tare.warn_age_h = {bounds.warn_age_h:g} h")
-    if age_h < -_CLOCK_TOLERANCE_H:
+    if age_h < -MOST_AHEAD_H:
         warnings.append(f"{path} is dated {-age_h:.1f} h in the future: a clock is wrong")
     if tare.is_auto_zeroed:
         warnings.append(f"{path} counts on the zero that the sensors set themselves; a sensor that was reset forgot it")

@@ -19,7 +19,7 @@ from canopen.emcy import EmcyError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError, SdoError
 
 from adacd_hil.wire.bus import Bus, BusError, Frame
-from adacd_hil.wire.contract_frames import NMT_ID, SDO_REQUEST_ID
+from adacd_hil.wire.contract_frames import FUNCTION_MASK, NMT_ID, SDO_REQUEST_ID
 
 ANSWER_TIMEOUT_S = 0.5
 """Longest wait for an answer. CiA 301 gives no value; drives answer within 100 ms."""
@@ -188,7 +188,7 @@ class CanopenBus:
 
         Before a request, wait for the node's pause. Raises BusError if the bus fails.
         """
-        is_request = can_id & 0x780 == SDO_REQUEST_ID and data[0] != SDO_ABORT
+        is_request = can_id & FUNCTION_MASK == SDO_REQUEST_ID and data[0] != SDO_ABORT
         answer_s, pause_s = self._patience.get(can_id & 0x7F, (ANSWER_TIMEOUT_S, 0.0))
         if is_request and pause_s:
             self.pump(lambda _: False, pause_s)

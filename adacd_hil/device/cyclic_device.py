@@ -53,8 +53,8 @@ class CyclicDevice(ABC):
     def set_bounds(self, placed: PlacedDevice) -> None:
         """Take over the bounds of values and the period of the status from the device's profile.
 
-        The status may be 2.5 periods old, rounded up to whole cycles; any age without a period. Raises CodecError when
-        a frame lacks a bounded signal.
+        The status may be PATIENCE_PERIODS periods old, rounded up to whole cycles; any age without a period. Raises
+        CodecError when a frame lacks a bounded signal.
         """
         status, cyclic = placed.pdo("Status"), self._message.name.removeprefix(self.name)
         if status is not None and status.event_timer_ms:

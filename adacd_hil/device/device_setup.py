@@ -22,7 +22,7 @@ from adacd_hil.device.canopen_bus import (
 )
 from adacd_hil.device.drive import MODE_CYCLIC_SYNCHRONOUS_TORQUE, option_codes, shows_mode, torque_limit_permille
 from adacd_hil.device.drive_units import name_velocity_unit, read_drive_units, unit_prefix
-from adacd_hil.device.profile import ObjectName, PdoSettings, PlacedDevice, ScaleSettings
+from adacd_hil.device.profile import EVENT_TIMER, SYNC_WATCHDOG, ObjectName, PdoSettings, PlacedDevice, ScaleSettings
 from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
@@ -154,7 +154,7 @@ def command_deadline_ms(settings: Settings) -> int:
 
 _ROUNDED_SHARE = 0.005
 """Part by which a rated torque may be off because it was rounded to two or three digits."""
-_TORQUE_UNITS = {1.0: "Nm", 1e-3: "mNm", 1e-6: "µNm"}
+TORQUE_UNITS_NM = {"mNm": 1e-3, "µNm": 1e-6, "Nm": 1.0}
 
 
 def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequence[PlacedDevice]) -> list[str]:
@@ -185,7 +185,7 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequenc
         for index in (0x6072, 0x60E0, 0x60E1):
             if slave.can_write(index):
                 slave.write_checked(index, 0, torque_limit_permille(settings, joint), "per mille")
-    if profile.command_watchdog == "0x2200":
+    if profile.command_watchdog == SYNC_WATCHDOG:
         slave.write_checked(0x2200, 0, settings.bus.command_patience_cycles, "SYNCs")
     if slave.device.can("sync_tolerance"):
         slave.write_checked(0x2201, 0, round(10 * settings.bus.sync_patience_periods), "tenths of a period")
@@ -236,7 +236,8 @@ def _check_rated_torque(slave: Slave, settings: Settings, drives: Sequence[Place
 
 def torque_unit(scale: ScaleSettings) -> str:
     """Return the unit of one count of 0x6076: Nm, mNm, µNm, else as `x 0.002 Nm`."""
-    return _TORQUE_UNITS.get(scale.rated_torque_count_Nm, f"x {scale.rated_torque_count_Nm:g} Nm")
+    count_Nm = scale.rated_torque_count_Nm
+    return next((name for name, unit_Nm in TORQUE_UNITS_NM.items() if unit_Nm == count_Nm), f"x {count_Nm:g} Nm")
 
 
 def _check_units(slave: Slave, codec: Codec) -> list[str]:
@@ -509,7 +510,7 @@ def _event_timer(slave: Slave, pdo: PdoSettings, command_deadline_ms: int) -> in
 
     The latter for the command PDO if `command_watchdog` is `0x1400:5`.
     """
-    has_deadline = pdo.is_received and slave.device.settings.command_watchdog == "0x1400:5"
+    has_deadline = pdo.is_received and slave.device.settings.command_watchdog == EVENT_TIMER
     return command_deadline_ms if has_deadline else pdo.event_timer_ms
 
 

@@ -22,6 +22,7 @@ CREDIBLE_INCREMENTS = 4096
 """Per revolution of a joint, 1.5 mrad: fewer are more likely a factory value."""
 
 _INCREMENTS, _REVOLUTION = 0xB5, 0xB4
+RPM = 0x00B44700
 _ANGLES_RAD = {
     _REVOLUTION: math.tau,
     0x41: math.radians(1.0),
@@ -121,6 +122,6 @@ def name_velocity_unit(unit: int) -> str:
     if numerator not in _NAMES or denominator not in _TIME_NAMES:
         return f"0x{unit:08X}"
     power = f"10^{unit_prefix(unit)} " if unit_prefix(unit) else ""
-    if (numerator, denominator) == (_REVOLUTION, 0x47):
+    if unit & 0xFFFFFF == RPM:
         return f"{power}rpm"
     return f"{power}{_NAMES[numerator]}/{_TIME_NAMES[denominator]}"

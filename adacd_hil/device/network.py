@@ -23,7 +23,7 @@ from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, SYNC_ID, SYNC_OVERFLOW
+from adacd_hil.wire.contract_frames import FUNCTION_MASK, HEARTBEAT_ID, HOST_HEARTBEAT, SYNC_ID, SYNC_OVERFLOW
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
 
 START, ENTER_PRE_OPERATIONAL, RESET_COMMUNICATION = 0x01, 0x80, 0x82
@@ -124,7 +124,7 @@ class Master(EventSource):
         self._command(RESET_COMMUNICATION)
 
         def is_last_boot(frame: Frame) -> bool:
-            if frame.can_id & 0x780 == 0x700 and frame.data == b"\x00":
+            if frame.can_id & FUNCTION_MASK == HEARTBEAT_ID and frame.data == b"\x00":
                 waiting.pop(frame.can_id & 0x7F, None)
             return not waiting
 
@@ -315,8 +315,8 @@ class Master(EventSource):
     def failed_heartbeats(self, t_ns: int) -> list[str]:
         """Return the failures of the nodes' heartbeats now, one line per node; empty without a failure.
 
-        A node fails if it is silent for 2.5 heartbeat periods or isn't OPERATIONAL, only between `start` and `stop`.
-        Nodes are not watched if their EDS doesn't let the host write 0x1017.
+        A node fails if it is silent for PATIENCE_PERIODS or isn't OPERATIONAL, only between `start` and `stop`. Nodes
+        are not watched if their EDS doesn't let the host write 0x1017.
         """
         return self._heartbeats.judge_nodes(t_ns)
 

@@ -35,6 +35,10 @@ heartbeat_consumer 0x1016; sync_counter 0x1019; option_codes 0x605A, 0x605E; tor
 sync_tolerance 0x2201; watchdog_in_emcy: EMCY byte 3 is the watchdog's number, bytes 4 to 7 the
 device's time in ms.
 """
+LAST_SYNCHRONOUS = 240
+RECEIVED, SENT, TO_MAPPING = 0x1400, 0x1800, 0x200
+"""First communication parameters of RPDO and TPDO, and their distance to the mapping parameters."""
+COMMAND_WATCHDOGS = NO_WATCHDOG, SYNC_WATCHDOG, EVENT_TIMER = "none", "0x2200", "0x1400:5"
 EMCY_INHIBIT_100US = 100
 """0x1015 of every device that has it: one EMCY per device and 10 ms, so that a storm of errors can't take the bus."""
 
@@ -175,18 +179,18 @@ class PdoSettings:
 
     @property
     def is_synchronous(self) -> bool:
-        """Whether the PDO is exchanged on SYNC: its transmission type is 240 or less."""
-        return self.transmission <= 240
+        """Whether the PDO is exchanged on SYNC: its transmission type is LAST_SYNCHRONOUS or less."""
+        return self.transmission <= LAST_SYNCHRONOUS
 
     @property
     def communication_index(self) -> int:
         """Index of the communication parameters, 0x1400 to 0x15FF or 0x1800 to 0x19FF."""
-        return (0x1400 if self.is_received else 0x1800) + self.number - 1
+        return (RECEIVED if self.is_received else SENT) + self.number - 1
 
     @property
     def mapping_index(self) -> int:
         """Index of the mapping parameters, 0x1600 to 0x17FF or 0x1A00 to 0x1BFF."""
-        return self.communication_index + 0x200
+        return self.communication_index + TO_MAPPING
 
 
 @dataclass(frozen=True)
@@ -286,7 +290,7 @@ class ProfileSettings:
         meaning="written where it differs, always, or only compared",
     )
     command_watchdog: str = setting(
-        "none", choices=("none", "0x2200", "0x1400:5"), meaning="where the deadline of commands is set: SYNCs, or ms"
+        NO_WATCHDOG, choices=COMMAND_WATCHDOGS, meaning="where the deadline of commands is set: SYNCs, or ms"
     )
     features: tuple[str, ...] = setting((), choices=FEATURES, meaning="what the device can do besides")
     quick_stop_option: int | None = setting(None, low=0, high=8, meaning="0x605A that is written, or fixed")

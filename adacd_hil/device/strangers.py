@@ -22,7 +22,7 @@ from adacd_hil.records import Event
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame
 from adacd_hil.wire.codec import Codec
-from adacd_hil.wire.contract_frames import HOST_HEARTBEAT, NMT_ID, SDO_REQUEST_ID
+from adacd_hil.wire.contract_frames import FUNCTION_MASK, HOST_HEARTBEAT, NMT_ID, SDO_REQUEST_ID
 
 HOSTS_LISTEN_S = 0.3
 """How long a host listens before it resets an arm: 30 SYNCs of the longest period, 3 heartbeats of 100 ms."""
@@ -106,7 +106,7 @@ class Strangers(RateLimitedEvents):
                 return True  # to a node of another arm
             word = _NMT_WORDS.get(command, f"command {command}")
             doing = f"sends NMT {word} to {f'node {node_id}' if node_id else 'all nodes'}"
-        elif frame.can_id & 0x780 == SDO_REQUEST_ID and frame.data and frame.data[0] >> 5 in _READING:
+        elif frame.can_id & FUNCTION_MASK == SDO_REQUEST_ID and frame.data and frame.data[0] >> 5 in _READING:
             text = f"somebody else {doing.replace('writes', 'reads')} (0x{frame.can_id:03X})"
             self.report(frame.t_ns, (frame.can_id, "reads"), Event("warning", "bus", text))
             return True

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.log.log_files import CONFIG_NAME, LogError
-from adacd_hil.records import SchemeState, Vector
+from adacd_hil.records import REACTING, SchemeState, Vector
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import with_todays_keys
 from adacd_hil.settings.parsing import parse
@@ -134,7 +134,7 @@ def is_armed_in(state: NDArray[np.uint8]) -> Mask:
 
 def is_interrupted(state: NDArray[np.uint8]) -> Mask:
     """Return for each cycle (n,) whether its state is REACT or STOPPED."""
-    return np.isin(state, (SchemeState.REACT, SchemeState.STOPPED))
+    return np.isin(state, REACTING)
 
 
 def settings_of(path: Path, attachments: Mapping[str, bytes]) -> Settings:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import RecordedArm, Ticks
-from adacd_hil.log.log_files import SHOWN, LogError
+from adacd_hil.log.log_files import SCRIPTED, SHOWN, LogError
 from adacd_hil.log.logged_run import Milestones, Mismatch, Progress, is_armed_in
 from adacd_hil.log.time_window import EVER_NS, WHOLE, TimeWindow
 from adacd_hil.log.types.topics import SCHEME
@@ -44,8 +44,6 @@ from adacd_hil.score.emulator_truth import KnownContacts, contacts_beside
 from adacd_hil.score.wording import number_of, unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 
-SCRIPTED: Final = "script"
-"""Value of `operator` in a log's metadata: the user could not type."""
 _PROGRESS_CYCLES: Final = 200_000
 
 ReplaySource = LogSource | RecordingAlone

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 
 from adacd_hil.device.recorded_arm import Ticks
 from adacd_hil.log.logged_run import Mismatch, begins_alarm, host_span, is_armed_in
-from adacd_hil.records import JOINTS, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState
+from adacd_hil.records import JOINTS, LEARNING, PARAMETER_UNITS, ContactReport, FaultReason, SchemeState
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
-from adacd_hil.scheme.supervisor.supervisor import LEARNING
 from adacd_hil.score.distribution import Distribution
 from adacd_hil.score.emulator_truth import HostCycles, KnownContacts, placed_contacts
 from adacd_hil.score.judge import Detection, Score, TrueContact, judge

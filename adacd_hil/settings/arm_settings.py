@@ -9,6 +9,7 @@ import numpy as np
 
 from adacd_hil.records import Vector
 from adacd_hil.settings.schema import ConfigError, setting
+from adacd_hil.settings.stated import ARM_PROFILES, BITRATES
 
 UPRIGHT_DEG = 90.0
 """Tilt of a plane of motion in which all of gravity acts."""
@@ -20,7 +21,7 @@ SLIGHT_TILT_DEG = 2.0
 class ArmSettings:
     """The arm as the host knows it, and properties that only the emulator uses."""
 
-    profile: str = setting("P", choices=("P", "S", "M"), meaning="emulated arm that this configuration is for")
+    profile: str = setting(ARM_PROFILES[0], choices=ARM_PROFILES, meaning="emulated arm that this configuration is for")
     link_length_m: tuple[float, float] = setting((0.35, 0.30), unit="m", low=0.01, high=5.0, meaning="joint to joint")
     rated_torque_Nm: tuple[float, float] = setting(
         (12.0, 6.0),
@@ -146,7 +147,9 @@ class DevicesSettings:
     fault_reaction_option: int | None = setting(
         None, low=0, high=4, meaning="0x605E of the drives; unset: the profile's"
     )
-    bitrate: int = setting(1_000_000, unit="bit/s", low=10_000, high=1_000_000, meaning="of a composed contract")
+    bitrate: int = setting(
+        BITRATES[1], unit="bit/s", low=BITRATES[0], high=BITRATES[1], meaning="of a composed contract"
+    )
     data_bitrate: int = setting(
         5_000_000, unit="bit/s", low=0, high=8_000_000, meaning="bit rate of its CAN FD data phase; 0: classic CAN"
     )

@@ -9,6 +9,7 @@ from adacd_hil.file_access import exists
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.parsing import WITHDRAWN, parse
 from adacd_hil.settings.schema import ConfigError
+from adacd_hil.settings.stated import ARM_PROFILES
 from adacd_hil.settings.toml_files import builtin_folder, builtin_names, find_toml, read_toml
 
 _LONGEST_CHAIN = 8
@@ -83,7 +84,7 @@ def configuration_layers(name_or_file: str, profile: str | None = None) -> list[
     files = _load_chain(name_or_file)
     table = resolved_table(files)
     profiles = _table_in(table, "profiles", "`profiles`")
-    chosen = profile or _table_in(table, "arm", "`arm`").get("profile", "P")
+    chosen = profile or _table_in(table, "arm", "`arm`").get("profile", ARM_PROFILES[0])
     if not isinstance(chosen, str) or chosen not in profiles:
         raise ConfigError(f"profile {chosen!r} is not in configuration {name_or_file}; known: {', '.join(profiles)}")
     layers = []

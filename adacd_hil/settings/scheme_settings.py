@@ -31,7 +31,7 @@ class EstimatorSettings:
         (8.0, 4.0, 4.0, 0.5, 0.5, 0.5, 0.5),
         low=0.0,
         high=1e6,
-        meaning="diagonal of P(0), gain in continuous time, 1/s; a4 and a5 may be left out (50)",
+        meaning=f"diagonal of P(0), gain in continuous time, 1/s; a4 and a5 may be left out ({_GRAVITY_P0[0]:g})",
     )
     gravity: bool = setting(False, meaning="estimate a4 and a5: the joint axes are not vertical")
 

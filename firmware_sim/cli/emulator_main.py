@@ -16,7 +16,7 @@ from adacd_hil.compiled import compiling
 from adacd_hil.error_texts import error_text
 from adacd_hil.file_replacement import removing_empty_folders
 from adacd_hil.given_path import CommandGroup, GivenPath, WrittenPath
-from adacd_hil.log.log_files import TRUTH_NAME, LogError, LogExistsError
+from adacd_hil.log.log_files import SUFFIX, TRUTH_NAME, LogError, LogExistsError
 from adacd_hil.log.log_walk import run_metadata
 from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.printable import in_line, one_line
@@ -375,7 +375,7 @@ def _check_contract(log: Path, codec: Codec) -> None:
 
     Other formats, and logs without a digest, pass.
     """
-    digest = run_metadata(log).get("layout_digest", "") if log.suffix.lower() == ".mcap" else ""
+    digest = run_metadata(log).get("layout_digest", "") if log.suffix.lower() == SUFFIX else ""
     own = f"0x{codec.layout_digest:08X}"
     if digest and digest.casefold() != own.casefold():
         raise LogError(

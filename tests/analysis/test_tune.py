@@ -334,7 +334,7 @@ def test_the_suggestion_is_a_configuration_of_the_changed_keys_with_where_they_c
     for words in (
         "version", "SHA-256 " + "ab" * 32, "0.0020 h", "a?b.mcap", "1 false alarms per hour", "extrapolated 12-fold",
         "0 false alarms in 0.0833 h, 95 % bound 35.9 per hour; 1 of 1 contacts found (3 to 100 %)", "not shown",
-        "2 adaptations of 5.00 to 6.00 s, 0 missed, 0 false alarms, after 3.0 ms", "termination.beta_Nm",
+        "2 adaptations of 5.00 to 6.00 s, 0 missed, 0 false alarms, delay: median 3.0 ms", "termination.beta_Nm",
     ):  # fmt: skip
         assert words in text
 

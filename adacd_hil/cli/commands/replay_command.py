@@ -27,7 +27,7 @@ from adacd_hil.cli.output import (
     one_by_one,
 )
 from adacd_hil.given_path import GIVEN_FILE, GivenPath
-from adacd_hil.log.log_files import SHOWN
+from adacd_hil.log.log_files import SHOWN, SUFFIX
 from adacd_hil.log.log_parts import log_in
 from adacd_hil.printable import in_line
 from adacd_hil.progress_lines import Progress
@@ -197,7 +197,7 @@ def _open(
     from adacd_hil.wire.dbc_contract import load_codec
 
     path = log_in(given)
-    if against is not None or path.suffix.lower() == ".mcap" or not path.exists():
+    if against is not None or path.suffix.lower() == SUFFIX or not path.exists():
         if unused := [name for name, value in (("--profile", profile), ("--dbc", dbc)) if value is not None]:
             raise CommandError(f"{unused[0]} is for a recording without a log: a log has its own", ExitCode.USAGE)
         return (LogSource(path) if against is None else RecordingAgainstLog(path, log_in(against))), False

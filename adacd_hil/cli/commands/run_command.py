@@ -24,7 +24,7 @@ from adacd_hil.cli.connection import (
 )
 from adacd_hil.cli.console_operator import ConsoleOperator
 from adacd_hil.cli.output import CommandError, ExitCode, exit_code, is_terminal, quoted, run_folder, text_of
-from adacd_hil.clock import wall_ns
+from adacd_hil.clock import REALTIME, wall_ns
 from adacd_hil.control.configuration_check import guesses_in_brief
 from adacd_hil.control.history_file import Origin, UsedHistory, use_history
 from adacd_hil.control.operator import Operator, ScriptedOperator
@@ -109,7 +109,7 @@ def run_on_bus(
         ask_without_anchor(unanchored_joints(settings), connection.arguments)
     devices = place_devices(settings)
     codec = load_contract(settings, devices)
-    if clock == "realtime" and (excess := describe_excess(codec, settings)):
+    if clock == REALTIME and (excess := describe_excess(codec, settings)):
         raise ConfigError(excess)
     timer = make_clock(clock)
     with run_folder(out, (LOG_NAME,), "run") as folder, ExitStack() as stack, never_stopped():

@@ -17,6 +17,8 @@ from adacd_hil.clock import MonotonicClock, wall_ns
 from adacd_hil.control.configuration_check import ConfigurationFindings, examine_configuration
 from adacd_hil.dates import format_date
 from adacd_hil.device.device_files import load_profile, profile_names
+from adacd_hil.device.device_setup import TORQUE_UNITS_NM
+from adacd_hil.device.drive_units import RPM
 from adacd_hil.device.profile import ProfileSettings, ScaleSettings
 from adacd_hil.file_access import read_input
 from adacd_hil.file_replacement import replace_files
@@ -718,7 +720,7 @@ class Drafting:
                 return Fact(_checked("rated_torque_Nm", by_drives), f"0x6076 of the drives{behind}")
             if by_eds is not None and all(draft.is_rated_known for draft in drafts):
                 return Fact(_checked("rated_torque_Nm", by_eds), f"0x6076 of their EDS{behind}")
-        proposal = Fact((12.0, 6.0))
+        proposal = Fact(ArmSettings().rated_torque_Nm)
         if geometry.effort_Nm is not None and min(geometry.effort_Nm) > 0.0:
             proposal = Fact(geometry.effort_Nm)  # a URDF's effort is a limit, no rating
         for pair in (by_eds, by_drives):
@@ -852,13 +854,13 @@ _ESSENTIAL = {"scale.increments_per_joint_rev", "scale.torque_Nm", "scale.rated_
 """Keys of a profile that, as guesses, make `devices` of the configuration a guess, too."""
 _VELOCITY_UNITS: dict[str, float] = {
     "increment/s": 0x00B50300,
-    "rpm": 0x00B44700,
-    "0.1rpm": 0xFFB44700,
-    "mrpm": 0xFDB44700,
+    "rpm": RPM,
+    "0.1rpm": 0xFF << 24 | RPM,
+    "mrpm": 0xFD << 24 | RPM,
     "deg/s": 0x00410300,
     "rad/s": 0x00100300,
 }
-_TORQUE_UNITS_NM = {"mNm": 1e-3, "µNm": 1e-6, "uNm": 1e-6, "Nm": 1.0, "0.01Nm": 0.01}
+_TORQUE_UNITS_NM = {**TORQUE_UNITS_NM, "0.01Nm": 0.01, "uNm": TORQUE_UNITS_NM["µNm"]}
 
 
 @dataclass(frozen=True)

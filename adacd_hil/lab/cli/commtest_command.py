@@ -6,7 +6,7 @@ from typing import Any
 
 from adacd_hil.cli.connection import Connection, on_interrupt
 from adacd_hil.cli.output import CommandError, ExitCode, tell
-from adacd_hil.clock import MonotonicClock, wall_ns
+from adacd_hil.clock import REALTIME, MonotonicClock, wall_ns
 from adacd_hil.control.pacing import prepare_spin
 from adacd_hil.device.arm import Arm
 from adacd_hil.device.canopen_bus import DeviceError
@@ -24,7 +24,7 @@ from adacd_hil.lab.score.histogram import bar_chart, doubling_bins
 from adacd_hil.lab.score.metrics import TimingEvidence
 from adacd_hil.lab.score.run_arrays import QUANTITIES
 from adacd_hil.lab.stated_bounds import GOOD_SHARE
-from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, failing_as
+from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, SUFFIX, failing_as
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.log.recording.run_folder import check_free
 from adacd_hil.log.types.topics import ChannelId, pack_cycle
@@ -38,7 +38,7 @@ from adacd_hil.wire.bus import BusError, Tap
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_attributes import read_bitrates
 
-LOG_NAME = "commtest.mcap"
+LOG_NAME = f"commtest{SUFFIX}"
 HTML_NAME = "commtest.html"
 _FIRST_BIN_US = 10.0
 _BINS = 12
@@ -158,7 +158,7 @@ def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection
             "config": settings.name,
             "interface": connection.interface,
             "channel": connection.channel,
-            "clock": "realtime",
+            "clock": REALTIME,
             **achieved,
             "period_us": str(settings.bus.period_us),
         },

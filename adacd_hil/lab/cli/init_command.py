@@ -10,10 +10,12 @@ import click
 from adacd_hil.cli.completion import complete_run
 from adacd_hil.cli.options import channel_option, interface_option, json_option
 from adacd_hil.cli.output import EPILOG, CommandError, ExitCode, explained, quoted, show, suggest, text_of
+from adacd_hil.clock import LOCKSTEP
 from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE, GivenPath
 from adacd_hil.lab.cli.interview import Interview
 from adacd_hil.log.log_files import TARE_NAME
 from adacd_hil.plain_values import json_text
+from adacd_hil.settings.stated import BITRATES
 
 if TYPE_CHECKING:
     from adacd_hil.cli.connection import Connection
@@ -27,7 +29,7 @@ def _pair(name: str, help_text: str, kind: Any = float) -> Callable[..., Any]:
 @click.argument("out", metavar="[FILE]", type=WRITTEN_FILE, default=Path("my-arm.toml"))
 @interface_option(help="python-can interface; default: socketcan.")
 @channel_option()
-@click.option("-b", "--bitrate", type=click.IntRange(10_000, 1_000_000), help="bit/s of the bus.")
+@click.option("-b", "--bitrate", type=click.IntRange(*BITRATES), help="bit/s of the bus.")
 @click.option("--no-bus", "is_busless", is_flag=True, help="Without hardware: an arm to rehearse.")
 @click.option("--from", "log", type=GivenPath(), help="Take all from the log of a run.", shell_complete=complete_run)
 @click.option("--urdf", type=GIVEN_FILE, help="A URDF with two moving joints.")
@@ -99,7 +101,7 @@ def init(
     if interview.confirm(rehearse, "Rehearse with an emulated arm now?"):
         from adacd_hil.lab.cli.demo_command import play
 
-        report, code = play(str(out), "paper", None, None, "lockstep", None)
+        report, code = play(str(out), "paper", None, None, LOCKSTEP, None)
         summary["rehearsal"] = report.content
         if not as_json:
             show(report.as_text())

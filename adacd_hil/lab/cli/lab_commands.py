@@ -36,6 +36,7 @@ from adacd_hil.cli.output import (
     quoted,
     writable_folder,
 )
+from adacd_hil.clock import LOCKSTEP, REALTIME
 from adacd_hil.given_path import WRITTEN_FILE, WRITTEN_FOLDER
 from adacd_hil.lab.cli.compare_command import compare
 from adacd_hil.lab.cli.history_command import history
@@ -48,6 +49,7 @@ from adacd_hil.lab.cli.sweep_command import sweep
 from adacd_hil.lab.cli.tune_command import rate_option, tune
 from adacd_hil.lab.stated_bounds import GOOD_SHARE, LISTEN_S, PLAIN_S, SUFFICIENT_SHARE
 from adacd_hil.log.log_files import TARE_NAME
+from adacd_hil.settings.stated import BITRATES
 from adacd_hil.settings.toml_text import to_toml
 
 if TYPE_CHECKING:
@@ -73,7 +75,7 @@ if TYPE_CHECKING:
 )
 @run_folder_option("demo")
 @click.option("--seed", type=click.IntRange(min=0), help="Noise of the emulated sensors.")
-@clock_option(default="lockstep")
+@clock_option(default=LOCKSTEP)
 @profile_option
 @json_option
 @explained
@@ -99,7 +101,7 @@ def demo(as_json: bool, **options: Any) -> ExitCode:
 @click.option("--seconds", type=float, help="Measured time per pose; default: tare.window_s.")
 @click.option("--auto-zero", is_flag=True, help="Let the sensors set their own zero (0x6125) before.")
 @click.option("--out", type=WRITTEN_FILE, default=Path(TARE_NAME), show_default=True)
-@clock_option(default="realtime")
+@clock_option(default=REALTIME)
 @json_option
 def tare(connection: "Connection", out: Path, as_json: bool, **options: Any) -> ExitCode:
     """Measure the offsets of the joint torque sensors at rest, with the drives disabled, and store them.
@@ -209,7 +211,7 @@ def excitation(config: str, out: Path | None, as_json: bool, **options: Any) -> 
     type=click.IntRange(min=100, max=1_000_000),
     help="SYNC period; default: BusPeriod_us of the DBC, else bus.period_us of the configuration.",
 )
-@click.option("-b", "--bitrate", type=click.IntRange(min=10_000, max=1_000_000), help="bit/s; default: the DBC's.")
+@click.option("-b", "--bitrate", type=click.IntRange(*BITRATES), help="bit/s; default: the DBC's.")
 @click.option(
     "--data-bitrate", type=click.IntRange(min=10_000, max=8_000_000), help="bit/s of CAN FD; default: the DBC's."
 )

@@ -9,7 +9,7 @@ from adacd_hil.cli.connection import on_interrupt
 from adacd_hil.cli.output import ExitCode, format_table
 from adacd_hil.clock import MonotonicClock
 from adacd_hil.lab.cli.monitor_command import show_tables
-from adacd_hil.lab.live.client import LiveClient, LiveMessage, live_client
+from adacd_hil.lab.live.client import NO_LOG, LiveClient, LiveMessage, live_client
 from adacd_hil.lab.live.scene import threshold_shares
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, SCHEME
@@ -153,7 +153,7 @@ def watch_live(url: str, seconds: float | None, as_json: bool) -> ExitCode:
             with on_interrupt(monitor.stop):
                 show_tables(monitor.listen, lambda: {"url": url} | monitor.describe(), as_text, seconds, as_json)
         except (ValueError, LookupError, OverflowError, struct.error):
-            raise LogError("it does not serve a log of adacd-hil") from None
+            raise LogError(NO_LOG) from None
     return ExitCode.OK
 
 

@@ -20,6 +20,7 @@ from adacd_hil.cli.output import (
     text_of,
 )
 from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FILE, CommandGroup, WrittenPath
+from adacd_hil.log.log_files import SUFFIX
 from adacd_hil.printable import in_line
 
 if TYPE_CHECKING:
@@ -341,5 +342,5 @@ def find_dbc(log: Path, dbc: Path | None) -> tuple[bytes, Path]:
     from adacd_hil.log.log_walk import attachment
     from adacd_hil.wire.dbc_contract import read_dbc
 
-    text = attachment(log, DBC_NAME) if dbc is None and log.suffix.lower() == ".mcap" else None
+    text = attachment(log, DBC_NAME) if dbc is None and log.suffix.lower() == SUFFIX else None
     return read_dbc(dbc) if text is None else (text, log / DBC_NAME)

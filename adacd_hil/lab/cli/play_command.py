@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from adacd_hil.lab.logs.frame_choice import FrameChoice
     from adacd_hil.wire.bus import Frame
 
+_SHARES = 0.5, 0.99
+"""Quantiles of the lateness that are printed, beside the largest."""
 _BLOCK = 256
 """Most frames that are prepared between two sends."""
 _SWITCH_S = 50e-6
@@ -191,8 +193,8 @@ def _run(
     LogError if the recording can't be read, CommandError if the bus fails.
     """
     from adacd_hil.cli.connection import on_interrupt
+    from adacd_hil.lab.logs.playback import LATE_MS, repeat
     from adacd_hil.lab.logs.playback import play as play_frames
-    from adacd_hil.lab.logs.playback import repeat
 
     interrupted = threading.Event()
     for refusal in request_realtime().missing:
@@ -218,11 +220,10 @@ def _run(
     described = {
         "frames": lateness.frames,
         "lateness_us": {
-            "p50": lateness.quantile_us(0.5),
-            "p99": lateness.quantile_us(0.99),
+            **{f"p{100 * share:g}": lateness.quantile_us(share) for share in _SHARES},
             "max": -(-lateness.worst_ns // 1000),
         },
-        "late_by_1_ms": lateness.late_frames,
+        f"late_by_{LATE_MS:g}_ms": lateness.late_frames,
         "unsendable": playback.unsendable,
         "withheld": playback.withheld,
         "problem": playback.problem,
@@ -236,12 +237,12 @@ def _run(
 
 def _as_text(described: dict[str, Any]) -> str:
     """Return the result of `_run` as text for people: frames sent, withheld, not sendable, lateness, and a problem."""
-    from adacd_hil.lab.logs.playback import LATE_NS
+    from adacd_hil.lab.logs.playback import LATE_MS
 
-    late = described["lateness_us"]
+    late = ", ".join(f"{name} {value} µs" for name, value in described["lateness_us"].items())
     lines = [
-        f"{described['frames']} frames sent, late by p50 {late['p50']} µs, p99 {late['p99']} µs, max {late['max']} µs; "
-        f"{described['late_by_1_ms']} by more than {1e-6 * LATE_NS:g} ms"
+        f"{described['frames']} frames sent, late by {late}; "
+        f"{described[f'late_by_{LATE_MS:g}_ms']} by more than {LATE_MS:g} ms"
         if described["frames"]
         else "no frame sent: the recording has none that was asked for and can be sent"
     ]

@@ -12,6 +12,7 @@ import click
 from adacd_hil.cli.completion import complete_run, complete_scenario, complete_setting
 from adacd_hil.cli.options import json_option, profile_option
 from adacd_hil.cli.output import CommandError, ExitCode, answer, counted, explain_statuses, explained, text_of
+from adacd_hil.clock import LOCKSTEP
 from adacd_hil.given_path import GIVEN_FILE, WRITTEN_FOLDER, GivenPath
 from adacd_hil.log.log_files import LOG_NAME, SHOWN
 from adacd_hil.progress_lines import Progress
@@ -220,7 +221,7 @@ def _simulate(task: "Task", row: "SweepRow") -> "Values":
         cast = resolve(task.config or _CONFIG, subject.scenario, task.profile or None, subject.seed)
         settings = apply_settings(cast.settings, dict(row.changes))
         with tempfile.TemporaryDirectory(prefix="adacd-hil-sweep-") as name:
-            summary, _ = run_embedded(cast._replace(settings=settings), "lockstep", Path(name))
+            summary, _ = run_embedded(cast._replace(settings=settings), LOCKSTEP, Path(name))
             if summary.result is None:
                 return failed(subject, row, summary.error)
             return finished(subject, row, replay(summary.log.path))

@@ -111,6 +111,7 @@ def _next(log_path: Path, found: "Tuning", out: Path | None) -> tuple[str, ...]:
 
 def _as_text(found: "Tuning") -> str:
     from adacd_hil.lab.score.rates import CONFIDENCE_TEXT
+    from adacd_hil.lab.score.report_wording import DELAY_FIGURES
     from adacd_hil.lab.tune.tune import in_words
     from adacd_hil.lab.tune.tune_roc import LIMITS, free_hours
 
@@ -118,7 +119,15 @@ def _as_text(found: "Tuning") -> str:
     lines = [f"{found.rate_per_h:g} false alarms per hour wanted; {hours:.4f} h of contact-free motion", ""]
     if found.detectors:
         rate = f"{CONFIDENCE_TEXT} bound, 1/h"
-        head = ("detector", "found", CONFIDENCE_TEXT, "median ms", "p90 ms", "max ms", "alarms", rate, "thresholds")
+        head = (
+            "detector",
+            "found",
+            CONFIDENCE_TEXT,
+            *(f"{name} ms" for name in DELAY_FIGURES),
+            "alarms",
+            rate,
+            "thresholds",
+        )
         rows = [
             (choice.name, *_cells(choice.checked), "largest seen" if choice.calibration is None else choice.method)
             for choice in found.detectors

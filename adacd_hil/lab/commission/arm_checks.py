@@ -38,12 +38,12 @@ from adacd_hil.wire.bus import Bus, BusError, Tap
 from adacd_hil.wire.can_interface import InterfaceState
 from adacd_hil.wire.codec import Codec
 from adacd_hil.wire.contract_attributes import DEFAULT_BITRATE
+from adacd_hil.wire.contract_frames import FUNCTION_MASK, HEARTBEAT_ID, RPDO_IDS, TPDO_IDS
 
 LISTEN_S = 0.5
 """Listening time for other masters: five of the usual heartbeats of 100 ms."""
 HIGH_LOAD_PERCENT = 80.0
 """Bus load above which the worst case (stuff bits, a status and an SDO frame) does not fit a period."""
-_PDOS = (0x180, 0x200, 0x280, 0x300, 0x380, 0x400, 0x480, 0x500)
 
 
 @dataclass
@@ -326,7 +326,7 @@ def check_protection(patient: ArmExamination) -> Finding:
     names = [
         message.name
         for message in patient.codec.messages.values()
-        if message.can_id & 0x780 in _PDOS and not message.is_protected
+        if message.can_id & FUNCTION_MASK in (*TPDO_IDS, *RPDO_IDS) and not message.is_protected
     ]
     if names:
         return warning(
@@ -391,7 +391,7 @@ def check_heartbeats(patient: ArmExamination) -> Finding:
     expected_Hz = 1e3 / patient.settings.bus.heartbeat_ms
     silent, odd, slow, unwatched = [], [], [], []
     for slave in patient.master.slaves:
-        name, talk = slave.name, patient.traffic.talks.get(0x700 + slave.node_id)
+        name, talk = slave.name, patient.traffic.talks.get(HEARTBEAT_ID + slave.node_id)
         if not slave.device.is_heartbeat_known:
             unwatched.append(name)
         elif talk is None:

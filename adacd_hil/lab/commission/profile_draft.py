@@ -18,21 +18,27 @@ from typing import Any, NamedTuple
 from adacd_hil.device.canopen_bus import EdsVariable, find_variable
 from adacd_hil.device.device_files import load_profile, profile_names
 from adacd_hil.device.device_setup import CST_SUPPORTED, NEWTON_METRE
-from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, name_velocity_unit, read_drive_units, unit_prefix
+from adacd_hil.device.drive_units import CREDIBLE_INCREMENTS, RPM, name_velocity_unit, read_drive_units, unit_prefix
 from adacd_hil.device.eds_file import read_eds
 from adacd_hil.device.profile import (
+    EVENT_TIMER,
     HOST_SIGNALS,
+    LAST_SYNCHRONOUS,
+    RECEIVED,
+    SENT,
+    TO_MAPPING,
     DeviceProfile,
     ObjectName,
     PatienceSettings,
+    PdoSettings,
     ProfileSettings,
     ScaleSettings,
 )
-from adacd_hil.settings.parsing import parse
+from adacd_hil.settings.parsing import bounds_of, parse
 from adacd_hil.settings.schema import ConfigError
 from adacd_hil.settings.toml_files import parse_toml
 from adacd_hil.settings.toml_text import toml_value
-from adacd_hil.wire.contract_frames import NOT_VALID
+from adacd_hil.wire.contract_frames import NOT_VALID, RPDO_IDS, TPDO_IDS
 from adacd_hil.wire.frame_lengths import CLASSIC_BYTES
 
 DRIVE, SENSOR = "drive", "sensor"
@@ -232,7 +238,6 @@ _COMMANDED = ((0x6040, 0), (0x6071, 0))
 _EVENT_TYPE, _EVENT_MS = 255, 100
 _INHIBIT_100US = 50
 """Inhibit time of a status frame with the torque, which changes all the time: 5 ms leave two drives 4 % of a bus."""
-_RECEIVED, _SENT = 0x1400, 0x1800
 _MOST_RECORDS = 64
 """Most PDO parameter records that are read; CiA 301 allows 512, devices have 4 to 8."""
 _GUESSED_INCREMENTS = 1 << 20
@@ -243,11 +248,10 @@ _MOST_MOTOR_NM = 100.0
 _LEAST_JOINT_NM, _JOINT_NM = 3.0, 10.0
 """A rated torque below the first is a motor's; the guessed gear raises it to the second."""
 _LIKELY_GEAR, _MOST_GEAR = 50.0, 160.0
-_RPM_UNITS = {prefix << 24 | 0x00B44700 for prefix in (0, *range(0xF7, 0x100))}
+_RPM_UNITS = {prefix << 24 | RPM for prefix in (0, *range(0xF7, 0x100))}
 """0x60A9: rpm, and decimal fractions of it."""
 TORQUE_KEYS = {"scale.gear_ratio", "scale.rated_torque_count_Nm"}
 """Factors from 0x6076 to the torque at the joint, except the efficiency, which is within a third of 1."""
-_MOST_OPTION = 8  # of 0x605A
 POLARITIES = (0x00, 0xE0)
 """0x607E of a drive that turns none or all of position (bit 7), velocity (bit 6) and torque (bit 5, not of all makers)
 round."""
@@ -354,10 +358,10 @@ class _ProfileWriter(ABC):
 
         Those after the `_MOST_RECORDS`th parameter record are not read.
         """
-        base = _RECEIVED if is_received else _SENT
+        base = RECEIVED if is_received else SENT
         found = []
         for number in range(1, _MOST_RECORDS + 1):
-            index, mapping = base + number - 1, base + 0x200 + number - 1
+            index, mapping = base + number - 1, base + TO_MAPPING + number - 1
             cob_id = self._cob_id(index, number, is_received) if self.has(index, 1) and self.has(mapping, 0) else None
             if cob_id is None:
                 continue
@@ -387,10 +391,12 @@ class _ProfileWriter(ABC):
         # An identifier without $NODEID belongs to the node id of the file; a DCF states it.
         node = 1 if other != by_eds else (read_eds(self.eds, None).node_id or 1)
         cob_id = (by_eds & 0x7FF) - node
-        if 0x180 <= cob_id <= 0x57F:
+        least, most = bounds_of(PdoSettings, "cob_id")
+        if least <= cob_id <= most:
             return cob_id
-        predefined = (0x200 if is_received else 0x180) + 0x100 * (number - 1)
-        return predefined if self.can_write(index, 1) and predefined <= 0x57F else None
+        first, second, *_ = RPDO_IDS if is_received else TPDO_IDS
+        predefined = first + (second - first) * (number - 1)
+        return predefined if self.can_write(index, 1) and predefined <= most else None
 
     def text(self) -> str:
         """Return the profile as the text of a TOML file; store guesses and remarks.
@@ -472,11 +478,11 @@ class _ProfileWriter(ABC):
         if kept != 1:
             head.append(f"transmission = {kept}")
         inhibit = record.inhibit_100us
-        if kept > 240 and (0x6077, 0) in places and self.can_write(_SENT + record.number - 1, 3):
+        if kept > LAST_SYNCHRONOUS and (0x6077, 0) in places and self.can_write(SENT + record.number - 1, 3):
             inhibit = _INHIBIT_100US
         if inhibit:
             head.append(f"inhibit_100us = {inhibit}")
-        if kept > 240 and message == "Status" and record.has_timer:
+        if kept > LAST_SYNCHRONOUS and message == "Status" and record.has_timer:
             head.append(f"event_timer_ms = {_EVENT_MS}")
         elif record.timer_ms:
             head.append(f"event_timer_ms = {record.timer_ms}")
@@ -539,7 +545,7 @@ class _DriveWriter(_ProfileWriter):
     def watchdog(self) -> list[str]:
         command = self._command()
         if command.number == 1 and command.has_timer:
-            return ['command_watchdog = "0x1400:5"']
+            return [f'command_watchdog = "{EVENT_TIMER}"']
         self.remarks.append(
             "no deadline of commands (0x1400:5): only the loss of the host's heartbeat stops the drive"
             if self.can_write(0x1016, 1)
@@ -552,7 +558,8 @@ class _DriveWriter(_ProfileWriter):
         if can_write:
             return ["# Brake on a ramp, then without torque.", "quick_stop_option = 2", "fault_reaction_option = 2"]
         option = _default(self.objects, 0x605A, 0)
-        return [f"quick_stop_option = {option}"] if option is not None and 0 <= option <= _MOST_OPTION else []
+        least, most = bounds_of(ProfileSettings, "quick_stop_option")
+        return [f"quick_stop_option = {option}"] if option is not None and least <= option <= most else []
 
     def further(self) -> list[str]:
         if self.facts is None or self.facts.patience == PatienceSettings():
@@ -716,12 +723,12 @@ class _DriveWriter(_ProfileWriter):
             others = (record for record in sent if record is not feedback and record.takes(statusword))
             status = self.first(others, "no TPDO is left for 0x6041 (statusword)")
             # Without an inhibit time, a torque that changes all the time would fill the bus.
-            is_bounded = self.has(_SENT + status.number - 1, 3)
+            is_bounded = self.has(SENT + status.number - 1, 3)
             wanted = [place for place in _STATUS_OBJECTS if is_bounded or place != (0x6077, 0)]
             lines += self.pdo("Status", status, self.fill(wanted, status.room), _EVENT_TYPE)
             if status.transmission is None and not status.has_timer:
                 self.remarks.append(
-                    f"its statusword comes on change only, as 0x{_SENT + status.number - 1:X}:5 (event timer) is not "
+                    f"its statusword comes on change only, as 0x{SENT + status.number - 1:X}:5 (event timer) is not "
                     "there: a lost one is not noticed"
                 )
         return [*lines, *self.pdo("Command", self._command(), _COMMANDED)]

@@ -22,7 +22,18 @@ from adacd_hil.lab.commission.traffic import Talk, Traffic, listen
 from adacd_hil.lab.stated_bounds import LISTEN_S
 from adacd_hil.wire.bus import Bus, Frame, Tap
 from adacd_hil.wire.codec import Codec, MessageCodec
-from adacd_hil.wire.contract_frames import HEARTBEAT_ID
+from adacd_hil.wire.contract_frames import (
+    EMERGENCY_ID,
+    FUNCTION_MASK,
+    HEARTBEAT_ID,
+    NMT_ID,
+    NODE_MASK,
+    RPDO_IDS,
+    SDO_REQUEST_ID,
+    SDO_RESPONSE_ID,
+    SYNC_ID,
+    TPDO_IDS,
+)
 from adacd_hil.wire.dbc_decoder import DbcDecoder
 from adacd_hil.wire.e2e import E2eStatus
 from adacd_hil.wire.frame_lengths import MAX_STANDARD_ID
@@ -41,24 +52,20 @@ _PROFILES = {401: "I/O", 402: "drive", 404: "measuring device", 405: "PLC", 406:
 
 # Predefined connection set, CiA 301 table 38: function code to the service that a node sends with it.
 _PRODUCED = {
-    0x080: "EMCY",
-    0x180: "TPDO1",
-    0x280: "TPDO2",
-    0x380: "TPDO3",
-    0x480: "TPDO4",
-    0x580: "SDO response",
-    0x700: "heartbeat",
+    EMERGENCY_ID: "EMCY",
+    **{function: f"TPDO{number}" for number, function in enumerate(TPDO_IDS, 1)},
+    SDO_RESPONSE_ID: "SDO response",
+    HEARTBEAT_ID: "heartbeat",
 }
-_CONSUMED = {0x200: "RPDO1", 0x300: "RPDO2", 0x400: "RPDO3", 0x500: "RPDO4", 0x600: "SDO request"}
-_BROADCAST = {0x000: "NMT", 0x080: "SYNC", 0x100: "TIME"}
-_TPDOS = (0x180, 0x280, 0x380, 0x480)
+_CONSUMED = {function: f"RPDO{number}" for number, function in enumerate(RPDO_IDS, 1)} | {SDO_REQUEST_ID: "SDO request"}
+_BROADCAST = {NMT_ID: "NMT", SYNC_ID: "SYNC", 0x100: "TIME"}
 
 
 def function_name(can_id: int) -> str:
     """Return the service of an identifier in CiA 301's predefined connection set, such as "TPDO1"; "" outside it."""
     if can_id > MAX_STANDARD_ID:
         return ""
-    function, node_id = can_id & 0x780, can_id & 0x7F
+    function, node_id = can_id & FUNCTION_MASK, can_id & NODE_MASK
     if can_id in _BROADCAST:
         return _BROADCAST[can_id]
     return {**_PRODUCED, **_CONSUMED}.get(function, "") if node_id else ""
@@ -143,7 +150,7 @@ def survey(
     begin_ns = clock.now_ns()
     progress(f"asking nodes {_NODE_IDS[0]} to {_NODE_IDS[-1]} on {bus.channel}")
     for node_id in _NODE_IDS:
-        tap.send(0x600 + node_id, _UPLOAD_DEVICE_TYPE)
+        tap.send(SDO_REQUEST_ID + node_id, _UPLOAD_DEVICE_TYPE)
         listen(tap, clock, _BETWEEN_REQUESTS_S, traffic)
     listen(tap, clock, max(_ANSWER_S, duration_s - (clock.now_ns() - begin_ns) * 1e-9), traffic)
     elapsed_s = (clock.now_ns() - begin_ns) * 1e-9
@@ -164,23 +171,23 @@ def _collect(tap: Tap, traffic: Traffic) -> dict[int, Node]:
     """
     found: dict[int, Node] = {}
     for is_sent, frame in tap.take_passed():
-        function, node_id = frame.can_id & 0x780, frame.can_id & 0x7F
+        function, node_id = frame.can_id & FUNCTION_MASK, frame.can_id & NODE_MASK
         if is_sent or frame.is_error or frame.can_id > MAX_STANDARD_ID or node_id == 0:
             continue
         node = found.get(node_id) or Node(node_id)
-        if function == 0x580 and len(frame.data) == 8 and frame.data[1:4] == _UPLOAD_DEVICE_TYPE[1:4]:
+        if function == SDO_RESPONSE_ID and len(frame.data) == 8 and frame.data[1:4] == _UPLOAD_DEVICE_TYPE[1:4]:
             node.answers = True
             if frame.data[0] & 0xE2 == 0x42:  # expedited upload response
                 node.device_type = struct.unpack_from("<I", frame.data, 4)[0]
-        elif function == 0x700 and len(frame.data) == 1:
+        elif function == HEARTBEAT_ID and len(frame.data) == 1:
             node.nmt_state = frame.data[0] & 0x7F
-        elif function == 0x080 and len(frame.data) == 8:
+        elif function == EMERGENCY_ID and len(frame.data) == 8:
             node.emergencies.append((frame.data[0] | frame.data[1] << 8, frame.data[2]))
         else:
             continue
         found[node_id] = node
     for node in found.values():
-        node.has_pdos = any(function + node.node_id in traffic.talks for function in _TPDOS)
+        node.has_pdos = any(function + node.node_id in traffic.talks for function in TPDO_IDS)
     return dict(sorted(found.items()))
 
 
@@ -216,9 +223,9 @@ def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
     """
     others = []
     for talk in traffic.sorted():
-        node = nodes.get(talk.can_id & 0x7F) if talk.can_id <= MAX_STANDARD_ID else None
-        if node is not None and talk.can_id & 0x780 in _PRODUCED and talk.can_id not in _BROADCAST:
-            if talk.can_id & 0x780 != 0x580:  # answers to us
+        node = nodes.get(talk.can_id & NODE_MASK) if talk.can_id <= MAX_STANDARD_ID else None
+        if node is not None and talk.can_id & FUNCTION_MASK in _PRODUCED and talk.can_id not in _BROADCAST:
+            if talk.can_id & FUNCTION_MASK != SDO_RESPONSE_ID:  # answers to us
                 node.produces.append(talk)
         else:
             others.append(talk)
@@ -356,7 +363,7 @@ class BusView:
         wanted = [
             talk
             for talk in self._traffic.sorted()
-            if node_id is None or (talk.can_id <= MAX_STANDARD_ID and talk.can_id & 0x7F == node_id)
+            if node_id is None or (talk.can_id <= MAX_STANDARD_ID and talk.can_id & NODE_MASK == node_id)
         ]
         described = {
             "frames": self.frames,
@@ -381,7 +388,7 @@ class BusView:
         state = talk.data[0] & 0x7F if talk.data else -1
         name = message_name(self._codec, talk.can_id).removesuffix("Heartbeat")
         return {
-            "node_id": talk.can_id & 0x7F,
+            "node_id": talk.can_id & NODE_MASK,
             "name": "" if name.startswith("(") else name,
             "state": NMT_STATES.get(state, "unknown"),
             "age_s": round((t_ns - talk.last_ns) * 1e-9, 3),

@@ -21,6 +21,7 @@ from adacd_hil.lab.live.scene import DESCRIPTION_TOPIC
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.types.message_types import payload_dtype
 
+NO_LOG = "it does not serve a log of adacd-hil"
 MOST_MESSAGE_BYTES = 16 * 1024 * 1024
 """Longer messages don't come from our server."""
 
@@ -63,7 +64,7 @@ class LiveClient:
         while not self._waiting or self._waiting[-1].topic != DESCRIPTION_TOPIC:
             message = self._receive(max(0.0, (end_ns - clock.now_ns()) * 1e-9))
             if message is None or clock.now_ns() >= end_ns:
-                raise LogError("it does not serve a log of adacd-hil")
+                raise LogError(NO_LOG)
             self._waiting.append(message)
 
     def receive(self, timeout_s: float) -> LiveMessage | None:
@@ -96,7 +97,7 @@ class LiveClient:
                     _, number, log_ns = SHOWN_HEAD.unpack_from(data)
                     return LiveMessage(self._names[number], log_ns, data[SHOWN_HEAD.size :])
             except (ValueError, KeyError, TypeError, RecursionError):
-                raise LogError("it does not serve a log of adacd-hil") from None
+                raise LogError(NO_LOG) from None
             if clock.now_ns() >= end_ns:
                 break
         return None

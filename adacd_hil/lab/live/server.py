@@ -45,6 +45,7 @@ from adacd_hil.lab.live.admission import (
 )
 from adacd_hil.lab.live.feed import LiveTopics, ServerSetup, Shown, unpack_batch
 from adacd_hil.lab.live.live_view import LiveView
+from adacd_hil.log.log_files import LAYOUT_NAME
 from adacd_hil.log.recording import processes
 from adacd_hil.log.recording.processes import read_setup
 from adacd_hil.log.recording.ring import RingReader, split
@@ -382,7 +383,7 @@ def _page(connection: ServerConnection, host: str) -> Response:
 
     host: the admitted value of the request's Host header.
     """
-    page = Template(_PAGE.read_text(encoding="utf-8")).substitute(url=f"ws://{html.escape(host)}")
+    page = Template(_PAGE.read_text(encoding="utf-8")).substitute(url=f"ws://{html.escape(host)}", layout=LAYOUT_NAME)
     response = connection.respond(HTTPStatus.OK, page)
     del response.headers["Content-Type"]  # headers may be there twice
     response.headers.update(_PAGE_HEADERS)

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from adacd_hil.file_access import open_input
 from adacd_hil.lab.logs.joint_states import TYPE, JointStateMessage, decode_joint_state
-from adacd_hil.log.log_files import LOG_NAME, LogError
+from adacd_hil.log.log_files import LOG_NAME, SUFFIX, LogError
 from adacd_hil.log.mcap.record_layout import MAGIC
 from adacd_hil.settings.schema import ConfigError
 
@@ -56,7 +56,7 @@ def opened_bag(path: Path) -> Iterator[Bag]:
     except Exception as error:  # damaged bytes can raise any error, that of a seek too
         if isinstance(error, OSError) and error.filename is not None:
             raise LogError(f"recording {path}: {error.strerror or error}") from None
-        remedy = "; `adacd-hil log recover` saves what is left of a cut MCAP file" if path.suffix == ".mcap" else ""
+        remedy = "; `adacd-hil log recover` saves what is left of a cut MCAP file" if path.suffix == SUFFIX else ""
         reason = " ".join(str(error).split()) or type(error).__name__
         raise LogError(f"recording {path} can't be read: {reason}{remedy}") from None
 

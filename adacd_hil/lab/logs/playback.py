@@ -15,7 +15,7 @@ LEAD_NS: Final = 5_000_000
 """Time from the call to the first frame."""
 LOOP_PAUSE_NS: Final = 1_000_000
 """Time from the last frame of a recording to the first of its repetition, by the recording's clock."""
-LATE_NS: Final = 1_000_000
+LATE_MS: Final = 1.0
 """A frame later than this is counted as late."""
 _BUCKET_NS = 1_000
 _STOP_NS = 50_000_000
@@ -29,14 +29,14 @@ class Lateness:
     def __init__(self) -> None:
         self.frames = 0
         self.late_frames = 0
-        """Frames later than LATE_NS."""
+        """Frames later than LATE_MS."""
         self.worst_ns = 0
         self._counts: Counter[int] = Counter()
 
     def add_lateness(self, lateness_ns: int) -> None:
         """Count a frame that was sent `lateness_ns` after it was due."""
         self.frames += 1
-        self.late_frames += lateness_ns > LATE_NS
+        self.late_frames += lateness_ns > LATE_MS * 1e6
         self.worst_ns = max(self.worst_ns, lateness_ns)
         self._counts[lateness_ns // _BUCKET_NS] += 1
 

@@ -24,7 +24,7 @@ from adacd_hil.extras import install_command
 from adacd_hil.file_replacement import has_other_head, replacing
 from adacd_hil.lab.logs.joint_states import joint_state_columns
 from adacd_hil.log.frames.frame_log import of_one_channel, open_frames
-from adacd_hil.log.log_files import LogError, failing_as
+from adacd_hil.log.log_files import SUFFIX, LogError, failing_as
 from adacd_hil.log.reader import LoggedEvent, LogStream, Series
 from adacd_hil.log.types.record_arrays import FRAME_TOPICS
 from adacd_hil.log.types.topics import DECODED, EVENTS
@@ -221,7 +221,7 @@ def export_tables(
     all. decoder: decodes the frames of recordings that have no other topics. progress: called with the number of rows
     so far. Raises LogError if the recording can't be read, lacks a topic, or a table can't be written.
     """
-    is_mcap = path.suffix.lower() == ".mcap"
+    is_mcap = path.suffix.lower() == SUFFIX
     defined = _topics(path) if is_mcap else []
     raw = [topic for topic in defined if topic.rsplit("/", 1)[-1] in _RAW]
     topics = [topic for topic in defined if topic not in raw]

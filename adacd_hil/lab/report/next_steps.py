@@ -8,11 +8,13 @@ import shlex
 from importlib import resources
 from typing import NamedTuple
 
+from adacd_hil.clock import LOCKSTEP
 from adacd_hil.lab.report.page import STEPS, went_wrong
 from adacd_hil.lab.score.metrics import Metrics, ReportSource
-from adacd_hil.lab.score.run_arrays import EMBEDDED, Run
+from adacd_hil.lab.score.run_arrays import EMULATOR, Run
 from adacd_hil.lab.score.run_faults import find_breaks
 from adacd_hil.lab.score.verdict import is_margin_below_1, is_revoked, shows_nothing
+from adacd_hil.log.log_files import EMBEDDED
 from adacd_hil.printable import in_line
 from adacd_hil.settings.toml_files import builtin_names, toml_names
 
@@ -131,12 +133,12 @@ def origin_words(run: Run) -> list[str]:
     is_own = name not in builtin_names()
     words = [f"arm {name}" if is_own else f"configuration {name}, arm profile {profile}"] if name else []
     if interface == EMBEDDED:
-        words.append("emulated arm" + (", simulated time" if said.get("clock") == "lockstep" else ""))
+        words.append("emulated arm" + (", simulated time" if said.get("clock") == LOCKSTEP else ""))
     elif interface:
         words.append(f"on {interface} {said.get('channel', '')}".strip())
     if said.get("scenario"):
         words.append(f"scenario {said['scenario']}")
-    if truth := said.get("truth", said.get("emulator_truth")):
+    if truth := said.get("truth", said.get(EMULATOR + "truth")):
         words.append(f"truth {truth}")
     if "version" in said:
         words.append(f"adacd-hil {said['version']}")

@@ -21,6 +21,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from adacd_hil.lab.score.metrics import Beside, Metrics, ReportedContact
 from adacd_hil.lab.score.report_wording import number_text
 from adacd_hil.lab.score.run_arrays import StretchOfRun
+from adacd_hil.lab.score.verdict import BETA, CAD_BY_SECTION, FILTERS, FROZEN_BY_SECTION, HOLD, SMALLEST_MARGIN
 from adacd_hil.score.wording import NONE
 from adacd_hil.terminal import keep_units
 
@@ -196,14 +197,14 @@ def paper_head(metrics: Metrics) -> tuple[str, ...]:
 
 
 _PLAIN_NAMES: Final = {
-    "Frozen residual, first detection section, joints 1 / 2": "Largest unexplained torque, first detection section",
-    "Frozen residual, second detection section, joints 1 / 2": "Largest unexplained torque, second detection section",
-    "The CAD model's, first detection section": "The same with the CAD model, first detection section",
-    "The CAD model's, second detection section": "The same with the CAD model, second detection section",
-    "Bound β of eq. (15)": "Residual that learning must come below",
-    "Hold T of eq. (15)": "How long it must stay there, or was tested",
-    "Filter a / b": "Filter of the residual",
-    "Smallest threshold / residual": "Smallest margin: threshold over unexplained torque",
+    FROZEN_BY_SECTION[0]: "Largest unexplained torque, first detection section",
+    FROZEN_BY_SECTION[1]: "Largest unexplained torque, second detection section",
+    CAD_BY_SECTION[0]: "The same with the CAD model, first detection section",
+    CAD_BY_SECTION[1]: "The same with the CAD model, second detection section",
+    BETA: "Residual that learning must come below",
+    HOLD: "How long it must stay there, or was tested",
+    FILTERS: "Filter of the residual",
+    SMALLEST_MARGIN: "Smallest margin: threshold over unexplained torque",
 }
 """Names of quantities for readers who do not know the paper; report.json keeps the paper's."""
 

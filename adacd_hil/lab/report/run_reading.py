@@ -36,6 +36,7 @@ from adacd_hil.lab.score.margins import SETTLING_TIME_CONSTANTS
 from adacd_hil.lab.score.metrics import ReportSource
 from adacd_hil.lab.score.report_wording import lacks_text
 from adacd_hil.lab.score.run_arrays import (
+    EMULATOR,
     QUANTITIES,
     AttemptBegins,
     CertifiedStream,
@@ -60,12 +61,12 @@ from adacd_hil.log.reader import LoggedEvent, LogStream, Series, contacts_of, st
 from adacd_hil.log.time_window import WHOLE, TimeWindow
 from adacd_hil.log.types.topics import CONTACT, CYCLE, EVENTS, FRAME_CHECKS, SCHEME
 from adacd_hil.printable import one_line
-from adacd_hil.records import JOINTS, ContactReport, CycleRecord, FaultReason, Request, SchemeState
+from adacd_hil.records import JOINTS, LEARNING, REACTING, ContactReport, CycleRecord, FaultReason, Request, SchemeState
 from adacd_hil.score.emulator_truth import Rows, TruthTable, extreme_rows, foreign_truth, read_truth
 from adacd_hil.score.wording import unjudged_sentence
 from adacd_hil.settings.configuration import Settings
 
-BUSY: Final = (SchemeState.ADAPT, SchemeState.CERTIFY, SchemeState.REACT, SchemeState.STOPPED)
+BUSY: Final = (*LEARNING, *REACTING)
 """States that a stretch does not cut."""
 MARGIN_S: Final = 0.2
 """Margin of a stretch before a contact or a reaction."""
@@ -136,7 +137,7 @@ def read_run(
 def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
     """Return a run without a cycle, with metadata, settings and start of the log.
 
-    Metadata of the truth that the log lacks are there as "emulator_<key>", except the digest of the host's
+    Metadata of the truth that the log lacks are there as `EMULATOR` + key, except the digest of the host's
     configuration. If the log has a DBC, its digest is there as "dbc_sha256".
     """
     metadata = dict(stream.metadata)
@@ -144,7 +145,7 @@ def _shell(stream: LogStream, truth: TruthTable | None) -> Run:
         metadata["dbc_sha256"] = hashlib.sha256(stream.attachments[DBC_NAME]).hexdigest()
     if truth is not None:
         told = {key: value for key, value in truth.metadata.items() if key not in (*metadata, CONFIG_DIGEST_KEY)}
-        metadata |= {f"emulator_{key}": value for key, value in told.items()}
+        metadata |= {EMULATOR + key: value for key, value in told.items()}
     nothing = np.empty((0, JOINTS))
     return Run(
         cycle=np.empty(0, np.int64),

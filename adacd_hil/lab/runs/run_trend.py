@@ -22,9 +22,9 @@ import numpy as np
 
 from adacd_hil.lab.runs.run_summary import RunSummary
 from adacd_hil.lab.runs.run_table import in_order
-from adacd_hil.lab.score.run_arrays import EMBEDDED
 from adacd_hil.lab.stated_bounds import MEANT_SHARE, THRESHOLD_SHARE
 from adacd_hil.lab.thresholds.free_motion import arm_differences
+from adacd_hil.log.log_files import EMBEDDED
 from adacd_hil.records import FRICTION_AT_RAD_S, JOINTS, Vector
 from adacd_hil.scheme.identify.evidence import LAST_SIGMAS
 from adacd_hil.settings.setting_keys import changed_keys

@@ -127,17 +127,21 @@ def rate_sentence(false_alarms: int, bound_per_h: float) -> str:
     return f"{count} in that time: by counting alone, at most {bound_per_h:.3g} per hour at {CONFIDENCE_TEXT}"
 
 
+DELAY_FIGURES: Final = {"median": 0.5, "p90": 0.9, "max": 1.0}
+"""Quantiles of delays, by name."""
+
+
 def delay_figures(delays_ms: Sequence[float]) -> dict[str, float | None]:
-    """Return `median`, `p90` and `max` of delays, by these names; None without delays."""
-    figures = np.quantile(delays_ms, (0.5, 0.9, 1.0)).tolist() if delays_ms else (None, None, None)
-    return dict(zip(("median", "p90", "max"), figures, strict=True))
+    """Return the `DELAY_FIGURES` of delays, by name; None without delays."""
+    return {name: float(np.quantile(delays_ms, share)) if delays_ms else None for name, share in DELAY_FIGURES.items()}
 
 
 def delays_phrase(delays_ms: Sequence[float]) -> str:
-    """Return a phrase with median, 90th percentile and largest of delays, beginning with a comma; "" without delays."""
-    if not delays_ms:
-        return ""
-    return ", after {:.1f} ms (median), {:.1f} (p90), {:.1f} (largest)".format(*delay_figures(delays_ms).values())
+    """Return a phrase with the `DELAY_FIGURES` of delays, ms, beginning with a comma; "" without delays."""
+    figures = ", ".join(
+        f"{name} {delay:.1f} ms" for name, delay in delay_figures(delays_ms).items() if delay is not None
+    )
+    return f", delay: {figures}" if figures else ""
 
 
 def percent_text(share: float) -> str:

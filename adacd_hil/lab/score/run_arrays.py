@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from adacd_hil.clock import REALTIME
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.logged_run import (
     Cycles,
@@ -28,7 +29,7 @@ from adacd_hil.log.logged_run import (
 from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.time_window import TimeWindow
 from adacd_hil.log.types.topics import CYCLE, SCHEME
-from adacd_hil.records import ContactReport, CycleRecord, SchemeState, Vector
+from adacd_hil.records import BEGINNING, ContactReport, CycleRecord, SchemeState, Vector
 from adacd_hil.score.emulator_truth import TruthTable
 from adacd_hil.settings.configuration import Settings
 
@@ -118,11 +119,8 @@ def columns_of_records(t_ns: Sequence[int], records: Sequence[CycleRecord]) -> C
     return CycleColumns(np.array(t_ns, dtype=np.int64), columns)
 
 
-EMBEDDED: Final = "embedded"
-"""The interface that a log names where the arm is emulated in the host's own process."""
-
-
-_BEGINNING: Final = (SchemeState.INIT, SchemeState.COMMISSION)
+EMULATOR: Final = "emulator_"
+"""Prefix of metadata that only the truth has."""
 
 
 class AttemptBegins:
@@ -134,7 +132,7 @@ class AttemptBegins:
 
     def add_cycles(self, cycle: NDArray[Any], state: NDArray[np.uint8]) -> None:
         """Look for beginnings of attempts in the next cycles (k,), k > 0, and add their cycles to `begins`."""
-        is_beginning = np.isin(state, _BEGINNING)
+        is_beginning = np.isin(state, BEGINNING)
         if self._was_beginning is None and not is_beginning[0]:
             self._begins.append(0)
         before = np.concatenate(([bool(self._was_beginning)], is_beginning[:-1]))
@@ -389,7 +387,7 @@ def rows_of(time_s: Vector, section: Section, end_s: float) -> slice:
 
 def is_realtime(run: Run) -> bool:
     """Return whether the run went by the host's clock, not in lockstep."""
-    return run.metadata.get("clock") == "realtime"
+    return run.metadata.get("clock") == REALTIME
 
 
 def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:

@@ -23,7 +23,7 @@ from adacd_hil.lab.score.metrics import (
     ReportSource,
 )
 from adacd_hil.lab.score.report_wording import percent_text, score_sentence
-from adacd_hil.lab.score.run_arrays import Run, Section
+from adacd_hil.lab.score.run_arrays import EMULATOR, Run, Section
 from adacd_hil.lab.score.run_faults import Break
 from adacd_hil.lab.score.run_judge import uncovered_watch
 from adacd_hil.log.logged_run import is_armed_in
@@ -247,20 +247,26 @@ def identified_text(
 
 _EXPERIMENT = "paper"
 """The scenario that is the paper's experiment, and the configuration that has its arm."""
+_ADAPTED, _ADAPTED_AGAIN, _PAYLOAD = "First adaptation", "Adaptation after the payload change", "Payload"
+_FROZEN = tuple(f"Frozen residual {which} payload, joints 1 / 2" for which in ("without", "with"))
+_CAD = tuple(f"The CAD model's, {which} payload" for which in ("without", "with"))
+_FIRST_CONTACT: Final = "First contact detected at"
+_COUNTED = _FOUND, _DELAY, _FALSE = "Contacts detected", "Median delay", "False alarms"
+FROZEN_BY_SECTION = tuple(f"Frozen residual, {which} detection section, joints 1 / 2" for which in ("first", "second"))
+CAD_BY_SECTION = tuple(f"The CAD model's, {which} detection section" for which in ("first", "second"))
+BETA, HOLD, FILTERS = "Bound β of eq. (15)", "Hold T of eq. (15)", "Filter a / b"
+SMALLEST_MARGIN: Final = "Smallest threshold / residual"
 _ELSEWHERE = {
-    "Adaptation after the payload change": "Second adaptation",
-    "Payload": "Payload in the second adaptation",
-    "Frozen residual without payload, joints 1 / 2": "Frozen residual, first detection section, joints 1 / 2",
-    "Frozen residual with payload, joints 1 / 2": "Frozen residual, second detection section, joints 1 / 2",
-    "The CAD model's, without payload": "The CAD model's, first detection section",
-    "The CAD model's, with payload": "The CAD model's, second detection section",
+    _ADAPTED_AGAIN: "Second adaptation",
+    _PAYLOAD: "Payload in the second adaptation",
+    **dict(zip((*_FROZEN, *_CAD), (*FROZEN_BY_SECTION, *CAD_BY_SECTION), strict=True)),
 }
 """Quantities by the names that hold for any run."""
 
 
 def is_papers_experiment(run: Run) -> bool:
     """Return whether the emulator played the paper's scenario with the paper's arm, by lengths and CAD model."""
-    played = (run.metadata.get("scenario"), run.metadata.get("emulator_scenario"))
+    played = (run.metadata.get("scenario"), run.metadata.get(EMULATOR + "scenario"))
     arm, papers = run.settings.arm, _papers_arm(run.settings.arm.profile)
     return _EXPERIMENT in played and (arm.link_length_m, arm.cad_theta) == (papers.link_length_m, papers.cad_theta)
 
@@ -272,17 +278,15 @@ def _papers_arm(profile: str) -> ArmSettings:
 
 _WITHIN: Final = "within ±0.15"
 _PAPERS: Final = {
-    "First adaptation": "5.2 s",
-    "Adaptation after the payload change": "about 5.3 s",
-    "Payload": "1 kg",
-    "Frozen residual without payload, joints 1 / 2": _WITHIN,
-    "Frozen residual with payload, joints 1 / 2": _WITHIN,
-    "The CAD model's, without payload": "larger; joint 2 good",
-    "The CAD model's, with payload": "much larger, both joints",
-    "First contact detected at": "10 s",
+    _ADAPTED: "5.2 s",
+    _ADAPTED_AGAIN: "about 5.3 s",
+    _PAYLOAD: "1 kg",
+    **dict.fromkeys(_FROZEN, _WITHIN),
+    _CAD[0]: "larger; joint 2 good",
+    _CAD[1]: "much larger, both joints",
+    _FIRST_CONTACT: "10 s",
 }
 """The paper's figures by quantity."""
-_COUNTED: Final = ("Contacts detected", "Median delay", "False alarms")
 
 
 def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
@@ -296,9 +300,8 @@ def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
     frozen = [metrics.frozen_residual_max_Nm[label] for label in detections]
     cad, payloads = [residual.cad for residual in frozen], list(metrics.payload_kg.values())[1:2]
     same = {
-        "Payload": NONE if payloads in ([], [None]) else f"{payloads[0]:g} kg",
-        "The CAD model's, without payload": _residual_text(cad, 0),
-        "The CAD model's, with payload": _residual_text(cad, 1),
+        _PAYLOAD: NONE if payloads in ([], [None]) else f"{payloads[0]:g} kg",
+        **{name: _residual_text(cad, place) for place, name in enumerate(_CAD)},
     }
     ours = same | _figures(
         metrics,
@@ -306,13 +309,13 @@ def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
         [(contact.is_armed, contact.detected_s, contact.delay_ms) for contact in metrics.contacts],
     )
     if run.truth is None:
-        ours["Contacts detected"] = str(len(metrics.contacts))
+        ours[_FOUND] = str(len(metrics.contacts))
     a, b = settings.filter.a_rad_s, settings.filter.b_rad_s
     settled = (
-        ("Bound β of eq. (15)", "0.1 Nm", f"{settings.termination.beta_Nm:g} Nm"),
-        ("Hold T of eq. (15)", "5 s", f"{settings.termination.hold_s:g} s"),
+        (BETA, "0.1 Nm", f"{settings.termination.beta_Nm:g} Nm"),
+        (HOLD, "5 s", f"{settings.termination.hold_s:g} s"),
         ("Threshold, joints 1 / 2", "0.15 Nm", _pair(settings.detector.threshold_Nm)),
-        ("Filter a / b", "10 / 10 rad/s", f"{a:g} / {b:g} rad/s"),
+        (FILTERS, "10 / 10 rad/s", f"{a:g} / {b:g} rad/s"),
         ("Estimator", "least squares", settings.estimator.law.replace("_", " ")),
     )
     rate = f"{1e3 / settings.bus.period_us:g} kHz"
@@ -340,7 +343,7 @@ def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
     margin = evidence.smallest_margin
     push = f"Smallest push found within {PUSH_WITHIN}, estimated, joints 1 / 2"
     rows += [
-        PaperRow("Smallest threshold / residual", NONE, NONE, NONE if margin is None else f"{margin:.2f}"),
+        PaperRow(SMALLEST_MARGIN, NONE, NONE, NONE if margin is None else f"{margin:.2f}"),
         PaperRow(push, NONE, NONE, _push_text(evidence)),
         PaperRow("Control rate", "1 kHz", rate, rate),
     ]
@@ -358,14 +361,13 @@ def _figures(
     delays_ms = [delay_ms for is_armed, _, delay_ms in contacts if is_armed and delay_ms is not None]
     armed = sum(is_armed for is_armed, _, _ in contacts)
     return {
-        "First adaptation": _seconds(times_s, 0),
-        "Adaptation after the payload change": _seconds(times_s, 1),
-        "Frozen residual without payload, joints 1 / 2": _residual_text(frozen, 0),
-        "Frozen residual with payload, joints 1 / 2": _residual_text(frozen, 1),
-        "First contact detected at": f"{seen[0]:.2f} s" if seen else NONE,
-        "Contacts detected": NONE if found.missed is None else found_text(len(delays_ms), armed),
-        "Median delay": f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else NONE,
-        "False alarms": NONE if found.false_alarms is None else str(found.false_alarms),
+        _ADAPTED: _seconds(times_s, 0),
+        _ADAPTED_AGAIN: _seconds(times_s, 1),
+        **{name: _residual_text(frozen, place) for place, name in enumerate(_FROZEN)},
+        _FIRST_CONTACT: f"{seen[0]:.2f} s" if seen else NONE,
+        _FOUND: NONE if found.missed is None else found_text(len(delays_ms), armed),
+        _DELAY: f"{float(np.median(delays_ms)):.1f} ms" if delays_ms else NONE,
+        _FALSE: NONE if found.false_alarms is None else str(found.false_alarms),
     }
 
 

@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 
 from adacd_hil.extras import install_command
 from adacd_hil.log.frames.mcap_frames import McapFrames
-from adacd_hil.log.log_files import LogError
+from adacd_hil.log.log_files import SUFFIX, LogError
 from adacd_hil.log.types.record_arrays import RECORDED_FRAME_DTYPE, FrameLog
 from adacd_hil.remedies import nearest_name
 
 if TYPE_CHECKING:
     from adacd_hil.log.frames.can_io import PythonCanFrames
 
-SUFFIXES = (".mcap", ".log", ".blf", ".asc", ".mf4", ".trc", ".csv")
+SUFFIXES = (SUFFIX, ".log", ".blf", ".asc", ".mf4", ".trc", ".csv")
 
 
 def open_frames(path: Path) -> "McapFrames | PythonCanFrames":
@@ -37,7 +37,7 @@ def open_frames(path: Path) -> "McapFrames | PythonCanFrames":
     missing package, or a file that can't be read, the last also from the iteration.
     """
     suffix = path.suffix.lower()
-    if suffix == ".mcap":
+    if suffix == SUFFIX:
         return McapFrames(path)
     if suffix not in SUFFIXES:
         near = nearest_name(suffix, SUFFIXES)

@@ -14,6 +14,7 @@ from adacd_hil.log.log_files import (
     CLOSED,
     ENDING_KEY,
     RUN_METADATA,
+    SUFFIX,
     SUMMARY_METADATA,
     LogError,
     LogExistsError,
@@ -21,7 +22,7 @@ from adacd_hil.log.log_files import (
     find_parts,
 )
 
-_FAILED_NAME = "failed-start-{}.mcap"
+_FAILED_NAME = f"failed-start-{{}}{SUFFIX}"
 
 
 def check_free(path: Path) -> None:

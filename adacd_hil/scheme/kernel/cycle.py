@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from adacd_hil.compiled import compiled, released
-from adacd_hil.records import JOINTS, ContactLevel, Request, SchemeState, Vector
+from adacd_hil.records import JOINTS, REACTING, ContactLevel, Request, SchemeState, Vector
 from adacd_hil.scheme.contact import contact_report, course
 from adacd_hil.scheme.contact.course import CourseConstants, CourseMemory
 from adacd_hil.scheme.kernel import certified_kernel, paper_kernel
@@ -96,7 +96,7 @@ for _state, _mode in (
     _CERTIFIED_MODE[_state] = _mode
 _PAPER_MODE = np.zeros(len(SchemeState), np.int64)
 _PAPER_MODE[SchemeState.ADAPT] = paper_kernel.LEARN
-_PAPER_MODE[[SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED]] = paper_kernel.ARMED
+_PAPER_MODE[[SchemeState.MONITOR, *REACTING]] = paper_kernel.ARMED
 
 
 def new_course(settings: Settings) -> tuple[Structured, Structured]:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.compiled import compiled
-from adacd_hil.records import FaultReason, Request, SchemeState
+from adacd_hil.records import BEGINNING, LEARNING, REACTING, FaultReason, Request, SchemeState
 from adacd_hil.scheme.memory import Sample
 from adacd_hil.scheme.supervisor.findings import (
     ADAPTED,
@@ -53,9 +53,7 @@ with 700 °/s² it stays below 0.05 rad/s for 8 ms: a margin of 6."""
 UNREST_S = 0.02
 """How long an arm may move while its drives enable: an arm whose brakes have opened sags until the drives hold it."""
 
-LEARNING = frozenset((SchemeState.ADAPT, SchemeState.CERTIFY))
-REACTING = frozenset((SchemeState.REACT, SchemeState.STOPPED))
-POWERED = LEARNING | REACTING | {SchemeState.MONITOR, SchemeState.PAYLOAD}
+POWERED = frozenset((*LEARNING, *REACTING, SchemeState.MONITOR, SchemeState.PAYLOAD))
 """States in which the drives are enabled and may have torque."""
 
 KEPT_IN = MappingProxyType(
@@ -79,7 +77,7 @@ _IS_POWERED = among(POWERED)
 _IS_CHECKED = among(POWERED | {SchemeState.ENABLE})
 IS_LEARNING = among(LEARNING)
 IS_REACTING = among(REACTING)
-_IS_HELD_FROM = among((SchemeState.MONITOR, SchemeState.REACT, SchemeState.STOPPED))
+_IS_HELD_FROM = among((SchemeState.MONITOR, *REACTING))
 """States in which a late host makes the arm hold, or in which it holds already; in the others a late host is a
 fault."""
 _IS_KEPT = np.array([among(KEPT_IN.get(request, ())) for request in Request])
@@ -90,7 +88,7 @@ _FAULT_ASKED[Request.FAULT_FOLLOWING] = FaultReason.FOLLOWING
 _FAULT_ASKED[Request.FAULT_TAMPERED] = FaultReason.TAMPERED
 _FAULT_ASKED[Request.FAULT_MISCONFIGURED] = FaultReason.MISCONFIGURED
 _OVERDUE = np.zeros(len(SchemeState), np.int64)
-_OVERDUE[[SchemeState.INIT, SchemeState.COMMISSION]] = FaultReason.COMMISSION_TIMEOUT
+_OVERDUE[list(BEGINNING)] = FaultReason.COMMISSION_TIMEOUT
 _OVERDUE[SchemeState.ENABLE] = FaultReason.ENABLE_TIMEOUT
 _OVERDUE[IS_LEARNING] = FaultReason.ADAPT_TIMEOUT
 """Fault of a phase that takes too long, by state; NONE for a phase without a time limit."""
@@ -160,7 +158,7 @@ def fill_constants(settings: Settings, k: SupervisorConstants) -> None:
     k.patience_cycles = round(settings.reaction.patience_s / period_s)
     k.rebound_cycles = round(settings.reaction.rebound_s / period_s)
     limits = k.limit_periods
-    limits[[SchemeState.INIT, SchemeState.COMMISSION]] = round(safety.phase_timeout_s / period_s)
+    limits[list(BEGINNING)] = round(safety.phase_timeout_s / period_s)
     limits[SchemeState.ENABLE] = round((safety.enable_timeout_s or safety.phase_timeout_s) / period_s)
     limits[IS_LEARNING] = round(settings.termination.timeout_s / period_s)
 

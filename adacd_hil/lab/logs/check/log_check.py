@@ -23,6 +23,7 @@ from adacd_hil.log.log_files import (
     ENDING_KEY,
     PART_KEY,
     RUN_METADATA,
+    SUFFIX,
     SUMMARY_METADATA,
     LogError,
     failing_as,
@@ -250,9 +251,9 @@ def find_logs(given: Path) -> list[Path]:
     """
     if not given.is_dir():
         return [given]
-    files = sorted(given.rglob("*.mcap"))
+    files = sorted(given.rglob(f"*{SUFFIX}"))
     if not files:
-        raise LogError(f"folder {given} has no .mcap file")
+        raise LogError(f"folder {given} has no {SUFFIX} file")
     later = {part for file in files for number, part in find_parts(file).items() if number}
     return [file for file in files if file not in later]
 
