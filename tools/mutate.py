@@ -56,6 +56,7 @@ TARGETS: dict[str, tuple[str, ...]] = {  # module: its quick tests as globs, qui
     "firmware_sim/nodes/drive_profile.py": (
         "tests/firmware_sim/test_drive_states_table.py",
         "tests/firmware_sim/test_drive_node.py",
+        "tests/firmware_sim/test_drive_stops.py",
     ),
 }
 WARM = ("pytest", "numpy", "hypothesis", "cantools", "can", "canopen", "numba", "scipy.signal")
