@@ -12,15 +12,15 @@ its transmit queue:
 
 The host's frames reach the devices in the order in which they are through.
 
-How devices let time pass: `adacd_hil.wire.time_marks`. The host waits for devices that send no marks by the wall
-clock.
+How devices let time pass: `adacd_hil.wire.time_marks`. The host waits for devices that send no marks by its
+monotonic clock.
 """
 
 from collections import deque
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from adacd_hil.clock import VirtualClock
+from adacd_hil.clock import MonotonicClock, VirtualClock
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Bus, Frame, SilenceError, TransmitQueueError
 from adacd_hil.wire.codec import Codec
@@ -65,9 +65,9 @@ class LockstepBus(Bus):
     ) -> None:
         """Take over a bus, the one behind. frame_time: duration of a frame, ns. period_ns: between SYNCs.
 
-        sync_id: identifier of SYNC. answers: identifiers that devices send on every SYNC. patience_s: by the wall
-        clock, longest wait for devices that send no marks. queue_length: frames that wait at most while no node
-        acknowledges. is_fifo: the host's frames leave in the order in which they were handed over.
+        sync_id: identifier of SYNC. answers: identifiers that devices send on every SYNC. patience_s: longest wait for
+        devices, by the host's monotonic clock, whatever other frames come. queue_length: frames that wait at most while
+        no node acknowledges. is_fifo: the host's frames leave in the order in which they were handed over.
         """
         self.channel = bus.channel
         self._bus = bus
@@ -77,6 +77,9 @@ class LockstepBus(Bus):
         self._sync_id = sync_id
         self._answers = frozenset(answers)
         self._patience_s = patience_s
+        self._wall = MonotonicClock()
+        self._deadline_ns = 0
+        """End of the present wait for devices, by the host's monotonic clock."""
         self._queue_length = queue_length
         self._is_fifo = is_fifo
         self._queue: list[Offer] = []  # the host's
@@ -217,7 +220,7 @@ class LockstepBus(Bus):
     def _forward(self, can_id: int, data: bytes) -> None:
         """Give a frame that the host has transmitted to the devices; after SYNC take their answers.
 
-        Raises SilenceError if answers to a SYNC are expected and no frame comes, BusError if the bus behind fails.
+        Raises SilenceError if answers to a SYNC are expected and none comes, BusError if the bus behind fails.
         """
         self._bus.send(can_id, data)
         if can_id == self._sync_id:
@@ -227,10 +230,10 @@ class LockstepBus(Bus):
     def _take_answers(self) -> None:
         """Take the devices' answers to the SYNC just sent, until all are in, END comes, or the patience is over.
 
-        Raises SilenceError when answers are expected and no frame comes.
+        Raises SilenceError when answers are expected and none comes.
         """
-        missing = len(self._answers)
-        is_silent = missing > 0
+        self._begin_wait()
+        missing = count = len(self._answers)
         while missing:
             frame = self._receive()
             if frame is None:
@@ -238,10 +241,9 @@ class LockstepBus(Bus):
             if frame.can_id == DEVICE_MARK:
                 self._take_marked(frame)
                 return
-            is_silent = False
             self._offer(frame, self.sync_ns)
             missing -= frame.can_id in self._answers
-        if is_silent:
+        if 0 < count == missing:
             raise SilenceError(f"silence on {self.channel} for {self._patience_s:g} s")
 
     def _take_marked(self, mark: Frame) -> None:
@@ -264,9 +266,17 @@ class LockstepBus(Bus):
                     self._note(kind)
             frame = self._receive()
 
-    def _receive(self, timeout_s: float | None = None) -> Frame | None:
-        """Return the next frame of the bus behind; None after `timeout_s` (default: `patience_s`) without a frame."""
-        return self._bus.receive(self._patience_s if timeout_s is None else timeout_s)
+    def _begin_wait(self) -> None:
+        """Give the devices `patience_s` from now on."""
+        self._deadline_ns = self._wall.now_ns() + round(self._patience_s * 1e9)
+
+    def _receive(self) -> Frame | None:
+        """Return the next frame of the bus behind within the present wait, else None.
+
+        After its end, for as long again, still return the frames that are there: the host itself may have been late.
+        """
+        left_s = (self._deadline_ns - self._wall.now_ns()) * 1e-9
+        return self._bus.receive(max(left_s, 0.0)) if left_s > -self._patience_s else None
 
     def _offer(self, frame: Frame, t_ns: int) -> None:
         """Queue a device's frame to compete for the bus from `t_ns` on; an error frame is received at once."""
@@ -286,14 +296,14 @@ class LockstepBus(Bus):
     def _let_pass(self, limit_ns: int) -> bool:
         """Ask the devices to let time pass up to `limit_ns`; return False if no frame can come before.
 
-        Devices that send no marks are waited for by the wall clock. Return False at once while `_is_cyclic`: then time
-        passes for the devices by SYNC alone.
+        For devices that send no marks, wait by the host's monotonic clock. Return False at once while `_is_cyclic`:
+        then time passes for the devices by SYNC alone.
         """
         now_ns = self._clock.now_ns()
         if self._is_cyclic(now_ns):
             return False
         if not self._is_marked:
-            return self._take_while((limit_ns - now_ns) * 1e-9)
+            return now_ns < limit_ns and self._wait_until(limit_ns)
         return self._ask(limit_ns) or self._granted_ns < limit_ns
 
     def _ask(self, until_ns: int) -> bool:
@@ -303,12 +313,14 @@ class LockstepBus(Bus):
         patience.
         """
         self._bus.send(HOST_MARK, pack_mark(MarkKind.ADVANCE, until_ns))
+        self._begin_wait()
         return self._await_grant()
 
     def _attach(self) -> None:
         """Drop old frames, send the clock's time to the devices, and find out whether they send marks."""
         self._is_attached = True
-        while self._bus.receive(0.0) is not None:
+        self._begin_wait()
+        while self._wall.now_ns() < self._deadline_ns and self._bus.receive(0.0) is not None:
             pass
         self._ask(self._clock.now_ns())
 
@@ -334,22 +346,21 @@ class LockstepBus(Bus):
             self._offer(frame, max(self._granted_ns, self._free_ns))
         return bool(came)
 
-    def _take_while(self, timeout_s: float) -> bool:
-        """Queue the frames of the bus behind, waiting `timeout_s` for the first; return whether one came.
+    def _wait_until(self, limit_ns: int) -> bool:
+        """Let time pass by the host's monotonic clock up to `limit_ns`; return whether something came before.
 
-        Marks are not frames in this sense.
+        A frame that comes is queued.
         """
-        has_come = False
-        while (frame := self._receive(timeout_s)) is not None:
-            timeout_s = 0.0
-            if frame.can_id == DEVICE_MARK:
-                mark = unpack_mark(frame.data)
-                if mark is not None:
-                    self._note(mark[0])
-                continue
-            has_come = True
-            self._offer(frame, self._free_ns)
-        return has_come
+        now_ns, start_ns = self._clock.now_ns(), self._wall.now_ns()
+        frame = self._bus.receive((limit_ns - now_ns) * 1e-9)
+        if frame is None:
+            return False
+        self._clock.sleep_until_ns(min(now_ns + self._wall.now_ns() - start_ns, limit_ns))
+        if frame.can_id != DEVICE_MARK:
+            self._offer(frame, max(self._free_ns, self._clock.now_ns()))
+        elif (mark := unpack_mark(frame.data)) is not None:
+            self._note(mark[0])
+        return True
 
     def _note(self, kind: MarkKind) -> None:
         """Store whether a device acknowledges frames, by a mark DARK or LIT; ignore other marks."""

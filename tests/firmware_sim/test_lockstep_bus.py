@@ -1,5 +1,6 @@
 """Modelled time on the bus: arbitration, queues, and devices that live with the host's clock."""
 
+import time
 from collections import deque
 from collections.abc import Callable
 
@@ -12,6 +13,7 @@ from adacd_hil.wire.time_marks import DEVICE_MARK, HOST_MARK, MarkKind, pack_mar
 
 SYNC, PERIOD_NS = 0x080, 1_000_000
 FRAME_NS = 100_000  # every frame of these tests takes so long
+PATIENCE_S = 0.05
 
 
 class Devices(Bus):
@@ -76,8 +78,14 @@ class Devices(Bus):
 
 
 class Rig:
-    def __init__(self, answers: tuple[int, ...] = (), queue_length: int = 10, is_fifo: bool = False) -> None:
-        self.devices = Devices()
+    def __init__(
+        self,
+        answers: tuple[int, ...] = (),
+        queue_length: int = 10,
+        is_fifo: bool = False,
+        devices: Devices | None = None,
+    ) -> None:
+        self.devices = devices or Devices()
         self.clock = VirtualClock()
         self.bus = LockstepBus(
             self.devices,
@@ -85,7 +93,7 @@ class Rig:
             lambda can_id, data: FRAME_NS,
             period_ns=PERIOD_NS,
             answers=answers,
-            patience_s=0.0,
+            patience_s=PATIENCE_S,
             queue_length=queue_length,
             is_fifo=is_fifo,
         )
@@ -217,7 +225,7 @@ def test_devices_that_say_nothing_to_sync_have_gone() -> None:
     rig = Rig((0x181,))
     rig.devices.on_frame = lambda can_id, data: None
     rig.bus.send(SYNC, b"\x01")
-    with pytest.raises(SilenceError, match="silence on devices for 0 s"):
+    with pytest.raises(SilenceError, match=r"silence on devices for 0\.05 s"):
         rig.bus.receive(0.0007)
     rig.bus.send(SYNC, b"\x02")
     with pytest.raises(SilenceError):
@@ -262,6 +270,31 @@ def test_devices_without_marks_are_waited_for() -> None:
     rig.devices.is_marking = False
     rig.bus.send(SYNC, b"\x01")
     assert rig.receive_all(0.0009) == [(0x181, 200_000)]
+
+
+class Strangers(Devices):
+    """A bus on which nobody answers, but another node sends a frame every `every_s` by the wall clock."""
+
+    every_s = 0.0
+
+    def receive(self, timeout_s: float) -> Frame | None:
+        time.sleep(min(self.every_s, timeout_s))
+        return Frame(0x123, b"", 0) if timeout_s >= self.every_s else None
+
+
+@pytest.mark.parametrize("every_s", [0.0, 0.01, 0.1])
+@pytest.mark.parametrize("wait_s", [0.0, 0.1, 0.2])
+def test_a_wait_ends_however_much_another_node_sends(every_s: float, wait_s: float) -> None:
+    rig = Rig((0x181,), devices=Strangers())
+    rig.devices.is_marking, rig.devices.every_s = False, every_s
+    start_s = time.monotonic()
+    received = rig.receive_all(wait_s)
+    assert wait_s * 1e9 == rig.clock.now_ns()
+    assert all(t_ns <= rig.clock.now_ns() for _, t_ns in received)
+    rig.bus.send(SYNC, b"\x01")
+    with pytest.raises(SilenceError):
+        rig.receive_all(0.001)
+    assert time.monotonic() - start_s < 1.0 + wait_s
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00" * 8, b"\x07" + bytes(7), bytes(7)])
