@@ -48,7 +48,8 @@ from adacd_hil.records import (
 )
 from adacd_hil.scheme.identify.certificate import Certificate
 from adacd_hil.scheme.pipeline.new_pipeline import new_pipeline
-from adacd_hil.scheme.supervisor.supervisor import POWERED, KeptRequest
+from adacd_hil.scheme.supervisor.kept_request import KeptRequest
+from adacd_hil.scheme.supervisor.supervisor import POWERED
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.bus import Tap
 

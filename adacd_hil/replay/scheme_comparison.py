@@ -27,7 +27,7 @@ from adacd_hil.log.reader import LoggedEvent, Series
 from adacd_hil.log.types.topics import ARM, CONTACT, EVENTS, SCHEME
 from adacd_hil.records import JOINTS, ArmBatch, ContactReport, Event, Layout, Request, SchemeState, Vector
 from adacd_hil.scheme.pipeline.pipeline import SchemeBatch, layout_of
-from adacd_hil.scheme.supervisor.supervisor import KeptRequest
+from adacd_hil.scheme.supervisor.kept_request import KeptRequest
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.run_settings import OperatorSettings
 

@@ -21,12 +21,10 @@ _POLYNOMIAL_8 = 0x2F
 
 
 def _crc8_table() -> bytes:
-    table = bytearray(256)
-    for byte in range(256):
-        crc = byte
-        for _ in range(8):
-            crc = ((crc << 1) ^ _POLYNOMIAL_8) & 0xFF if crc & 0x80 else (crc << 1) & 0xFF
-        table[byte] = crc
+    table = bytearray(range(256))
+    for _ in range(8):
+        for byte, crc in enumerate(table):
+            table[byte] = (crc << 1 ^ _POLYNOMIAL_8) & 0xFF if crc & 0x80 else crc << 1
     return bytes(table)
 
 

@@ -90,6 +90,7 @@ ARM = {
     "incomplete": {"is_complete": False},
     "sensor": {"fault": FaultReason.SENSOR},
     "drive": {"fault": FaultReason.DRIVE},
+    "aged": {"age_q": (1, 1), "age_tau_J": (1, 1)},
     "old": {"age_q": (2, 2), "age_tau_J": (2, 2)},
     "older": {"age_q": (3, 3), "age_tau_J": (3, 3)},
     "q1-too-old": {"age_q": (4, 0)},
@@ -140,7 +141,6 @@ class Run:
         self.memory = zeros_of(supervisor.SupervisorMemory, {})
         self.m = self.memory[0]
         supervisor.fill_constants(settings, self.k[0])
-        supervisor.begin(self.m)
         self.sample = np.zeros(1, SAMPLE)
 
     @property
@@ -166,6 +166,7 @@ class Run:
                 assert word == "good", word
         fill_sample(self.sample, arm, request)
         supervisor.supervise(self.k[0], self.m, self.sample[0], found, *flags.values())
+        assert {int(self.m[name]) for name in self.memory.dtype.names if name.startswith("is_")} <= {0, 1}
 
     def play(self, steps):
         """Play steps, separated by commas, and check the states that they name."""
@@ -251,7 +252,7 @@ def test_a_faulted_run_stays_faulted(request_):
 
 
 @pytest.mark.parametrize("words", ["rest", "unloaded", "resting+sensor", "resting+tau1-too-old", "resting+nan",
-                                   "resting+over-limit", "resting+late"])  # fmt: skip
+                                   "resting+over-limit", "resting+late", "resting+withheld"])  # fmt: skip
 def test_one_bad_cycle_begins_commissioning_anew(words):
     run_in(SchemeState.COMMISSION).play(
         f"off+resting*19, off+{words}, off+resting*19 = COMMISSION, off+resting = ENABLE"
@@ -262,10 +263,15 @@ def test_one_bad_cycle_begins_commissioning_anew(words):
     ("state", "words", "cycles", "reason"),
     [
         ("INIT", "off+incomplete", 100, FaultReason.COMMISSION_TIMEOUT),
+        ("INIT", "incomplete", 100, FaultReason.COMMISSION_TIMEOUT),
         ("COMMISSION", "off", 100, FaultReason.COMMISSION_TIMEOUT),
         ("ENABLE", "off+resting", 100, FaultReason.ENABLE_TIMEOUT),
         ("ADAPT", "good", 1000, FaultReason.ADAPT_TIMEOUT),
         ("CERTIFY", "good", 999, FaultReason.ADAPT_TIMEOUT),
+        ("ADAPT", "certified", 1000, FaultReason.ADAPT_TIMEOUT),
+        ("ADAPT", "refuted", 1000, FaultReason.ADAPT_TIMEOUT),
+        ("CERTIFY", "adapted", 999, FaultReason.ADAPT_TIMEOUT),
+        ("CERTIFY", "fitted", 999, FaultReason.ADAPT_TIMEOUT),
     ],
 )
 def test_a_phase_that_takes_too_long_faults(state, words, cycles, reason):
@@ -326,6 +332,8 @@ a contact that grows is to be acknowledged | ADAPT | contact, collision, rest*10
 a contact with a late host is to be acknowledged | ADAPT | contact, contact+late, rest*1000 = STOPPED
 a contact that lasts is to be acknowledged | ADAPT | contact, contact*3000, rest*1000 = STOPPED
 a contact that lasts a little less is not | ADAPT | contact, contact*2799, rest*199 = REACT, rest = ADAPT
+a contact that lasts just as long is | ADAPT | contact, contact*2800, rest*199 = REACT, rest = STOPPED
+data one cycle old are fresh | MONITOR | aged*100 = MONITOR
 a contact after a collision is not latched by it | STOPPED | acknowledge, contact, rest*1000 = MONITOR
 a fit is tested and a refuted one is learnt on | CERTIFY | adapted+fitted = CERTIFY, refuted+certified = ADAPT, fitted, certified = MONITOR
 a test and the learning before it share one time limit | ADAPT | good*500, fitted, good*300, refuted, good*197 = ADAPT, good = FAULT
@@ -358,6 +366,9 @@ a payload announced before a stop does not release it: learning | ADAPT | payloa
 a payload announced before a stop does not release it: testing | CERTIFY | payload+collision, rest*50 = STOPPED, good*300 = STOPPED, payload = PAYLOAD
 a payload announced before a stop is served once that is acknowledged | MONITOR | payload+collision, rest*50 = STOPPED, good*300 = STOPPED, acknowledge = MONITOR, good = PAYLOAD
 a payload announced while the arm reacts is served once that is acknowledged | REACT | payload+collision, rest*50 = STOPPED, good*300 = STOPPED, acknowledge = MONITOR, good = PAYLOAD
+a payload announced again while it is changed is the same change | PAYLOAD | payload, rest*50, rest+payload_changed = ADAPT, adapted, good*10 = MONITOR
+evidence against the certificate keeps no stopped arm | STOPPED | withheld+acknowledge = MONITOR
+an adaptation asked for has its own time | ADAPT | good*900, adapted, collision, rest*50 = STOPPED, relearn, rest*50 = ADAPT, good*998 = ADAPT
 a payload announced in one stop does not release another | STOPPED | payload, collision, rest*50 = STOPPED, good*300 = STOPPED
 a changed payload waits until the arm rests | PAYLOAD | good*10, payload_changed = PAYLOAD, rest*49 = PAYLOAD, rest = ADAPT
 a changed payload that was not announced is ignored while the arm monitors | MONITOR | payload_changed+rest*200 = MONITOR
@@ -365,7 +376,7 @@ a changed payload that was not announced is ignored in a stop | STOPPED | payloa
 the end of the run is left to the control layer: learning | ADAPT | finish*10 = ADAPT
 the end of the run is left to the control layer: monitoring | MONITOR | finish*10 = MONITOR
 the end of the run is left to the control layer: stopped | STOPPED | finish*10 = STOPPED
-without gravity a payload's weight is no contact: the touch holds the arm | PAYLOAD | contact+rest*10, contact+rest+payload_changed, contact+rest*100 = REACT
+without gravity a payload's weight is no contact: the touch holds the arm | PAYLOAD | contact+rest*10, contact+rest+payload_changed, contact+rest*100 = REACT, rest*199 = REACT, rest = PAYLOAD
 without gravity the same of a collision | PAYLOAD | collision+rest*10, collision+rest+payload_changed, collision+rest*100 = STOPPED
 """  # noqa: E501
 UPRIGHT_STORIES = """
@@ -374,6 +385,8 @@ the weight of a changed payload does not hold the arm: a collision | PAYLOAD | c
 the weight holds the arm until somebody says that the payload was changed | PAYLOAD | contact+rest*12000, contact+rest+acknowledge = STOPPED, contact+rest+payload_changed = ADAPT
 a word of before a touch does not let the arm go on beneath it: a contact | PAYLOAD | payload_changed, contact = REACT, contact+rest*100 = REACT, contact+rest+payload_changed, contact+rest*100 ~ ADAPT
 a word of before a touch does not let the arm go on beneath it: a collision | PAYLOAD | payload_changed, collision = REACT, collision+rest*100 = STOPPED, collision+rest+payload_changed, collision+rest*100 ~ ADAPT
+a word of an earlier touch does not let the arm go on beneath a later one | PAYLOAD | contact, contact+rest+payload_changed, contact+rest*100 ~ ADAPT, adapted, payload = PAYLOAD, payload_changed, contact = REACT, contact+rest*100 = REACT
+another announcement of a payload is no word of its weight | PAYLOAD | payload_changed, contact, contact+payload = REACT, contact+rest*100 = REACT
 a touch outside of a payload change wants to be acknowledged | MONITOR | collision+rest*51 = STOPPED, rest+payload_changed, rest*12000 = STOPPED
 """  # noqa: E501
 PATIENT_STORIES = """
@@ -413,13 +426,19 @@ def test_only_a_stopped_arm_is_learnt_anew(state):
         ("good*1000 = STOPPED, acknowledge = ADAPT", SchemeEvent.REVOKED),
         ("payload_changed, rest*50 = ADAPT", SchemeEvent.PAYLOAD_CHANGED),
         ("acknowledge = ADAPT, adapted, collision, rest*50 = STOPPED, payload_changed, rest*100 = STOPPED", None),
+        ("acknowledge = ADAPT, adapted, contact, payload_changed, contact+rest*100 = REACT", None),
     ],
-    ids=["it holds until the user says how to go on", "a payload needs no announcement", "it ends with its stop"],
+    ids=[
+        "it holds until the user says how to go on",
+        "a payload needs no announcement",
+        "it ends with its stop",
+        "it says nothing of a later contact",
+    ],
 )
 def test_a_doubted_arm(steps, cause):
     run = run_in(SchemeState.MONITOR)
     supervisor.doubt(run.m)
-    assert run.state is SchemeState.STOPPED
+    assert (run.state, run.m.is_latched, run.m.is_doubted) == (SchemeState.STOPPED, 1, 1)
     run.play(steps)
     assert cause is None or run.m.cause == cause
 

@@ -106,7 +106,6 @@ def new_course(settings: Settings) -> tuple[Structured, Structured]:
     m: RunMemory = memory[0]
     supervisor.fill_constants(settings, k.supervisor)
     course.fill_constants(settings, k.contact)
-    supervisor.begin(m.supervisor)
     course.begin(m.contact)
     m.is_measured = settings.realtime.sample_period == "measured"
     return constants, memory

@@ -12,13 +12,13 @@ test without a model.
 
 A request is kept until it can be served, but only in the states of `KEPT_IN`; elsewhere it is dropped. A request from
 before a stop cannot release the stop: an acknowledgement is dropped, and a change of payload waits until the user has
-acknowledged the stop. A change of payload announced in STOPPED is served at once. `KeptRequest` outlives a fault that
-is acknowledged.
+acknowledged the stop. A change of payload announced in STOPPED is served at once.
 
-`supervise` is compiled; its whole memory is one record of whole numbers, `SupervisorMemory`.
+`supervise` is compiled; its whole memory is one record of whole numbers, `SupervisorMemory`. With all fields 0 it is in
+INIT.
 """
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from types import MappingProxyType
 from typing import Annotated
 
@@ -153,7 +153,7 @@ def fill_constants(settings: Settings, k: SupervisorConstants) -> None:
     k.blind_limit = settings.blind_cycles
     k.commission_cycles = settings.commission_cycles
     k.rest_cycles = round(REST_HOLD_S / period_s)
-    k.unrest_cycles = max(round(UNREST_S / period_s), 1)
+    k.unrest_cycles = round(UNREST_S / period_s)
     k.clear_cycles = round(settings.reaction.clear_s / period_s)
     k.patience_cycles = round(settings.reaction.patience_s / period_s)
     k.rebound_cycles = round(settings.reaction.rebound_s / period_s)
@@ -161,11 +161,6 @@ def fill_constants(settings: Settings, k: SupervisorConstants) -> None:
     limits[list(BEGINNING)] = round(safety.phase_timeout_s / period_s)
     limits[SchemeState.ENABLE] = round((safety.enable_timeout_s or safety.phase_timeout_s) / period_s)
     limits[IS_LEARNING] = round(settings.termination.timeout_s / period_s)
-
-
-def begin(m: SupervisorMemory) -> None:
-    """Set the state to INIT, and the origin to MONITOR. Call it before the first cycle, with all other fields 0."""
-    m.state, m.origin = SchemeState.INIT, SchemeState.MONITOR
 
 
 @compiled
@@ -182,7 +177,7 @@ def supervise(
     _count(m, arm, observation)
     if arm.request != Request.NONE:
         _take(m, arm.request)
-    if m.state == SchemeState.REACT and not m.is_latched and _has_grown(k, m, arm, observation):
+    if m.state == SchemeState.REACT and _has_grown(k, m, arm, observation):
         m.is_latched = 1
     event = _event(k, m, arm, observation, is_reporting, goes_on)
     if event != SchemeEvent.NONE:
@@ -223,13 +218,13 @@ def _count(m: SupervisorMemory, arm: Sample, observation: int) -> None:
 def _take(m: SupervisorMemory, request: int) -> None:
     """Set the request's bit in `pending` if it may wait in this state; else drop it.
 
-    A kept PAYLOAD sets `is_announced_here`, a PAYLOAD_CHANGED kept during a reaction `is_weight_announced`.
+    A kept PAYLOAD sets `is_announced_here`, a kept PAYLOAD_CHANGED `is_weight_announced`.
     """
     if _keeps(m, request, m.state):
         m.pending |= 1 << request
         if request == Request.PAYLOAD:
             m.is_announced_here = 1
-        if request == Request.PAYLOAD_CHANGED and IS_REACTING[m.state]:
+        if request == Request.PAYLOAD_CHANGED:
             m.is_weight_announced = 1
 
 
@@ -274,10 +269,10 @@ def _is_announced(m: SupervisorMemory) -> bool:
 def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
     """Return whether the user has announced a changed payload to which the contact is attributed.
 
-    It is if the model is in doubt; with gravity also if the payload was being changed, and the user announced its
-    weight since the contact began: an earlier announcement cannot exclude a person's touch.
+    It is if the model is in doubt; with gravity also if the user announced the weight since the contact began: an
+    earlier announcement cannot exclude a person's touch.
     """
-    is_weight = k.has_gravity and m.origin == SchemeState.PAYLOAD and m.is_weight_announced
+    is_weight = k.has_gravity and m.is_weight_announced
     return bool((m.is_doubted or is_weight) and _is_pending(m, Request.PAYLOAD_CHANGED))
 
 
@@ -286,8 +281,7 @@ def _enter(m: SupervisorMemory, state: int, event: int) -> None:
     """Enter another state by `event`, reset its counts, and drop the requests that don't wait there.
 
     Do nothing if `state` is the present one. REACT stores its origin, ADAPT in place of CERTIFY, and is latched for any
-    event but CONTACT. An adaptation by ENABLED, PAYLOAD_CHANGED or REVOKED gets its full time. A doubt of the model
-    ends, except in STOPPED.
+    event but CONTACT. An adaptation by PAYLOAD_CHANGED or REVOKED gets its full time. A doubt of the model ends.
     """
     if state == m.state:
         return
@@ -295,16 +289,15 @@ def _enter(m: SupervisorMemory, state: int, event: int) -> None:
         m.origin = SchemeState.ADAPT if m.state == SchemeState.CERTIFY else m.state
         m.is_latched = event != SchemeEvent.CONTACT
         m.is_weight_announced = 0
-    elif event in (SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED, SchemeEvent.REVOKED):
+    elif event in (SchemeEvent.PAYLOAD_CHANGED, SchemeEvent.REVOKED):
         m.learning_periods = 0
     m.cause = event
-    if state != SchemeState.STOPPED:
-        m.is_doubted = 0
+    m.is_doubted = 0
     m.state = state
     m.is_announced_here = 0
     m.phase_periods = 0
     m.commissioned_cycles = 0
-    for request in range(_IS_KEPT.shape[0]):
+    for request in range(len(_IS_KEPT)):
         if not _keeps(m, request, state):
             m.pending &= ~(1 << request)
 
@@ -496,33 +489,3 @@ def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
     elif _IS_POWERED[state] and not arm.is_enabled:
         fault = FaultReason.DRIVE
     return fault
-
-
-class KeptRequest:
-    """The end of the run, or a stop to change the payload, kept until it is served. One object per attempt.
-
-    carried: request left over from the attempt before; it is repeated once the drives are enabled again.
-    """
-
-    def __init__(self, carried: Request = Request.NONE) -> None:
-        self.request = carried
-        self._carried = carried
-
-    def take_carried(self) -> Request:
-        """Return the request left over from the attempt before, once; then NONE."""
-        carried, self._carried = self._carried, Request.NONE
-        return carried
-
-    def ask(self, request: Request, state: SchemeState) -> None:
-        """Keep a request to finish, or to change the payload in a state that serves it; ignore all others.
-
-        A request replaces the kept one, but nothing replaces FINISH. state: that of the cycle before.
-        """
-        is_kept = request is Request.FINISH or (request is Request.PAYLOAD and state in KEPT_IN[request])
-        if is_kept and self.request is not Request.FINISH:
-            self.request = request
-
-    def serve(self, states: Iterable[int]) -> None:
-        """Drop a kept request to change the payload if `states`, those of the last cycles, contain PAYLOAD."""
-        if self.request is Request.PAYLOAD and SchemeState.PAYLOAD in states:
-            self.request = Request.NONE
