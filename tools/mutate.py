@@ -52,6 +52,7 @@ TARGETS: dict[str, tuple[str, ...]] = {  # module: its quick tests as globs, qui
     "adacd_hil/control/gate.py": ("tests/control/test_gate.py",),
     "adacd_hil/wire/e2e.py": ("tests/wire/test_e2e*.py",),
     "adacd_hil/device/drive.py": ("tests/device/test_drive*.py",),
+    "adacd_hil/scheme/supervisor/kept_request.py": ("tests/scheme/test_kept_request.py",),
     "adacd_hil/scheme/supervisor/supervisor.py": ("tests/scheme/test_supervisor.py",),
     "firmware_sim/nodes/drive_profile.py": (
         "tests/firmware_sim/test_drive_states_table.py",

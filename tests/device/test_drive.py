@@ -18,6 +18,7 @@ from adacd_hil.device.drive import (
     option_codes,
     torque_limit_permille,
 )
+from adacd_hil.records import FaultReason
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.parsing import parse
@@ -142,6 +143,7 @@ def test_fault_reset_rises_once_for_each_fault_and_is_low_before(
         (6, 0x0217, 0.01, 0x00),  # a drive that leaves bit 10 alone stands still all the same
         (6, 0x0217, -1.0, 0x02),
         (8, 0x0217, 1.0, 0x02),
+        (8, 0x0A17, 1.0, 0x02),  # bit 11 is another's
     ],
 )
 def test_quick_stop_is_left_as_its_option_code_demands(
@@ -165,6 +167,7 @@ def test_a_drive_that_has_said_nothing_is_nowhere_and_not_ready(joint: int, code
     frame = begun.command(100, enable=True, quick_stop=False)
     message = codec.message(f"Drive{joint}Command")
     assert message.decode_values(frame)[0] == 0
+    assert codec is CLASSIC or message.decode_values(frame)[3] == 1000
 
 
 def test_a_status_frame_of_its_length_says_state_mode_torque_and_error() -> None:
@@ -205,6 +208,60 @@ def test_a_step_is_plausible_up_to_its_bound_off_what_the_velocity_says(
         assert (seen.sample_cycle, seen.implausible_frames) == ((5 + periods, 0) if is_plausible else (5, 1))
         kept_rad = position_rad if is_plausible else start_rad
         assert seen.values == pytest.approx((kept_rad, velocity_rad_s), abs=1e-5)
+
+
+def test_a_status_may_be_as_old_as_its_limit_while_the_drives_are_enabled() -> None:
+    seen = in_state(Cia402State.OPERATION_ENABLED)
+    assert seen.fault(10**9, is_enabled=True) is FaultReason.NONE  # a frame without a period has no age
+    seen.accept_status(status(0x0237), 3)
+    seen.status_age_limit = 40
+    assert [seen.fault(cycle, is_enabled=True) for cycle in (3, 43, 44)] == [
+        FaultReason.NONE,
+        FaultReason.NONE,
+        FaultReason.DATA_AGE,
+    ]
+    assert seen.fault(44, is_enabled=False) is FaultReason.NONE
+
+
+@pytest.mark.parametrize("is_enabled", [False, True])
+@pytest.mark.parametrize(("has_excess", "fault"), [(False, FaultReason.NONE), (True, FaultReason.DRIVE)])
+def test_a_value_outside_its_bounds_is_a_fault_of_the_drive(
+    monkeypatch: pytest.MonkeyPatch, has_excess: bool, fault: FaultReason, is_enabled: bool
+) -> None:
+    monkeypatch.setattr(Drive, "has_excess", lambda self, cycle: has_excess)
+    assert in_state(Cia402State.OPERATION_ENABLED).fault(5, is_enabled) is fault
+
+
+@pytest.mark.parametrize(("statusword", "is_limited"), [(0x0237, False), (0x0A37, True), (0xF7FF, False)])
+def test_bit_11_reports_a_limit_of_the_drives_own(statusword: int, is_limited: bool) -> None:
+    seen = drive()
+    seen.accept_status(status(statusword), 0)
+    assert seen.is_limited is is_limited
+
+
+def test_the_torques_of_the_last_commands_are_kept() -> None:
+    seen = in_state(Cia402State.OPERATION_ENABLED)
+    assert list(seen.recent_permille) == [0]
+    for torque in range(1, 12):
+        seen.command(torque, enable=torque != 11, quick_stop=torque == 10)
+    assert list(seen.recent_permille) == [4, 5, 6, 7, 8, 9, 0, 0]
+
+
+@pytest.mark.parametrize(("position_rad", "periods"), [(0.5, 1), (0.506, 1), (0.49, 4), (0.5, 2)])
+def test_a_frame_misses_the_last_position_and_the_travel_since(position_rad: float, periods: int) -> None:
+    seen = drive()
+    frame = feedback(position_rad, 2.0)
+    assert seen.position_error(frame, periods) == 0.0
+    seen.accept_cyclic(feedback(0.5, -1.0), 0)
+    expected = abs(position_rad - 0.5 - 2.0 * periods * PERIOD_S)
+    assert seen.position_error(frame, periods) == pytest.approx(expected, abs=2 * LSB_RAD)
+    assert [seen.position_error(wrong, periods) for wrong in (frame[:-1], frame + b"\x00", b"")] == [0.0] * 3
+    assert seen.values == pytest.approx((0.5, -1.0), abs=1e-5)
+
+
+def test_a_drive_that_may_not_jump_may_stand_still() -> None:
+    seen = Drive(CLASSIC, 1, PERIOD_S, position_jump_rad=0.0)
+    assert [seen.accept_cyclic(feedback(0.5, 0.0), cycle) for cycle in (0, 1)] == [True, True]
 
 
 def test_the_configurations_option_codes_outweigh_the_profiles() -> None:
@@ -268,8 +325,8 @@ def test_a_contract_without_a_statusword_is_refused() -> None:
         drive(parse_codec(text, FD.path))
 
 
-def wide_contract(folder: Path, signals: str, command: str = "") -> Codec:
-    """A contract of unprotected drives with the status in the feedback."""
+def wide_contract(folder: Path, signals: str, command: str = "", status: str = "") -> Codec:
+    """A contract of unprotected drives with the status in the feedback, or in a frame of its own."""
     text = (Path(adacd_hil.__file__).parent / "device_profiles" / "stock-drive.toml").read_text()
     head, _ = text.split("[[pdo]]", 1)
     text = (
@@ -290,6 +347,8 @@ signals = [
 ]
 """
     )
+    if status:
+        text += f'[[pdo]]\nmessage = "Status"\nnumber = 2\ncob_id = 0x280\nsignals = [{status}]\n'
     path = folder / "wide.toml"
     path.write_text(text)
     sensor = list(load_settings("stock").devices.sensor)
@@ -309,10 +368,39 @@ ERROR = '{ object = "0x603F", signal = "error_code" }'
 def test_the_status_may_travel_in_the_feedback(tmp_path: Path) -> None:
     codec = wide_contract(tmp_path, STATUS + MODE)
     arm = drive(codec)
-    frame = bytes(codec.message("Drive1Feedback").encode(0.5, 1.0, 0x0237, 10, 0x81))
+    frame = bytes(codec.message("Drive1Feedback").encode(2.5, 1.0, 0x0237, 10, 0x81))
     assert arm.accept_cyclic(frame, 7)
     assert (arm.state, arm.mode, arm.status_cycle) == (Cia402State.OPERATION_ENABLED, 10, 7)
     assert (arm.has_status_frame, arm.status_message, arm.is_enabled) == (False, None, True)
+    assert (arm.torque_actual_permille, arm.error_code, arm.shows_torque) == (0, 0, False)
+
+
+@pytest.mark.parametrize("first", ["mode_display", "torque_actual", "error_code"])
+def test_a_signal_of_the_status_may_be_the_first_of_its_frame(tmp_path: Path, first: str) -> None:
+    objects = {"mode_display": "0x6061", "torque_actual": "0x6077", "error_code": "0x603F"}
+    rows = f'{{ object = "{objects[first]}", signal = "{first}" }}, {STATUS}'
+    arm = drive(wide_contract(tmp_path, "", status=rows))
+    assert arm.status_message is not None
+    raw = {"mode_display": 9, "torque_actual": -7, "error_code": 0x8130}
+    arm.accept_status(bytes(arm.status_message.encode(raw[first], 0x0237)), 2)
+    assert arm.state is Cia402State.OPERATION_ENABLED
+    kept = {"mode_display": 10, "torque_actual": 0, "error_code": 0} | {first: raw[first]}
+    assert (arm.mode, arm.torque_actual_permille, arm.error_code) == tuple(kept.values())
+    assert arm.shows_torque is (first == "torque_actual")
+
+
+def test_the_status_may_travel_in_both_frames(tmp_path: Path) -> None:
+    torque = '{ object = "0x6077", signal = "torque_actual" }, '
+    codec = wide_contract(tmp_path, torque + MODE, status=STATUS + ERROR)
+    arm, feedback = drive(codec), codec.message("Drive1Feedback")
+    assert arm.status_message is not None
+    arm.accept_status(bytes(arm.status_message.encode(0x0237, 0x8130)), 2)
+    assert arm.accept_cyclic(bytes(feedback.encode(0.5, 1.0, -7, 10, 0x81)), 3)
+    assert (arm.state, arm.statusword, arm.mode) == (Cia402State.OPERATION_ENABLED, 0x0237, 10)
+    arm.accept_status(bytes(arm.status_message.encode(0x0237, 0x8131)), 4)
+    assert (arm.torque_actual_permille, arm.error_code, arm.shows_torque) == (-7, 0x8131, True)
+    assert arm.accept_cyclic(bytes(feedback.encode(0.5, 0.0, -8, 10, 0x81)), 5)
+    assert (arm.torque_actual_permille, arm.error_code, arm.status_cycle) == (-8, 0x8131, 5)
 
 
 def test_an_implausible_frame_changes_no_status_either(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """End-to-end protection: the CRCs against the standard's examples and cantools, and what the receivers accept."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
@@ -204,11 +205,32 @@ def test_only_ok_frames_may_be_used(status: E2eStatus, number: int, is_valid: bo
     assert status.is_valid is is_valid
 
 
-def test_the_header_takes_what_the_profile_says() -> None:
-    assert {protection: profile.header_bytes for protection, profile in PROFILES.items()} == {
-        Protection.PROFILE_2: 2,
-        Protection.PROFILE_5: 4,
-    }
+@pytest.mark.parametrize(
+    ("profile", "header_bytes", "bits", "status_place", "counter_place", "objects", "data_id_bytes", "is_id_list"),
+    [
+        (P02, 2, (8, 4, 4), (1, 4), (1, 0x0F), 2, 16, True),
+        (P05, 4, (16, 8, 8), (3, 0), (2, 0xFF), 3, 2, False),
+        (replace(P05, crc_bits=64, counter_bits=4, status_bits=4), 9, (64, 4, 4), (8, 4), (8, 0x0F), 3, 2, False),
+    ],
+    ids=["P02", "P05", "a wide CRC"],
+)
+def test_the_layout_of_a_header(
+    profile: E2eProfile,
+    header_bytes: int,
+    bits: tuple[int, ...],
+    status_place: tuple[int, int],
+    counter_place: tuple[int, int],
+    objects: int,
+    data_id_bytes: int,
+    is_id_list: bool,
+) -> None:
+    assert profile.header_bytes == header_bytes
+    assert profile.signals == tuple(zip(("e2e_crc", "e2e_counter", "e2e_status"), bits, strict=True))
+    assert (profile.status_place, profile.counter_place) == (status_place, counter_place)
+    assert (profile.objects, profile.data_id_bytes, profile.is_id_list) == (objects, data_id_bytes, is_id_list)
+    frame = bytearray(16)
+    frame[counter_place[0]] = 0xA5
+    assert profile.counter_of(frame) == 0xA5 & counter_place[1]
 
 
 @BOTH
