@@ -86,8 +86,11 @@ def test_wrong_frames_change_no_value_and_the_log_says_and_counts_them(
 def test_an_interrupt_parks_the_arm_before_the_drives_are_disabled(tmp_path: Path) -> None:
     rig = SessionRig(tmp_path, finish_s=30.0)
     rig.before_sync[TROUBLE_CYCLE] = rig.session.interrupt
+    said: list[str] = []
+    rig.session.progress = said.append
     result, log = rig.play()
     assert result.is_interrupted
+    assert sum("parks" in line for line in said) == 1
     assert messages(log, "interrupted") == ["the run was interrupted"]
     assert set(controlwords(log)[300:-20].tolist()) == {ENABLE_OPERATION}
     np.testing.assert_allclose(np.degrees(log.scheme["q"][-1]), [-30.0, -60.0], atol=1.0)
