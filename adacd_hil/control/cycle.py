@@ -316,7 +316,7 @@ class Cycle:
             recorder.event(t_ns, event)
             if event.name in CERTIFICATE_EVENTS or event.name in (MOTION, BOUNDS, STOP) or is_shown(event):
                 self._narration.event(t_ns, event.operator_text)
-        if request is Request.FINISH and self._state in POWERED:
+        if request is Request.FINISH and self._state in POWERED and not self._reference.is_parked(arm.cycle):
             self._narration.event(t_ns, f"parks, for {FINISH_S:g} s at most; then disables the drives")
         if output.state is not self._state:
             event = self._transition(output, arm)
