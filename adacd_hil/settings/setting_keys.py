@@ -202,16 +202,19 @@ def keep_log_settings(own: Settings, other: Settings) -> Settings:
 
 
 def parse_changes(given: Sequence[str]) -> dict[str, str]:
-    """Return the value, still as text, by key of `key=value` texts; of one key the last value counts.
+    """Return the value, still as text, by key of `key=value` texts.
 
-    Raises ConfigError for a text without `=` or without a key.
+    Raises ConfigError for a text without `=` or without a key, and for a key in two texts.
     """
     changes: dict[str, str] = {}
     for text in given:
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
             raise ConfigError(f"{text!r} must be key=value, such as detector.threshold_Nm=0.1")
-        changes[key.strip()] = value.strip()
+        key = key.strip()
+        if key in changes:
+            raise ConfigError(f"{key} is given twice, as {changes[key]} and {value.strip()}")
+        changes[key] = value.strip()
     return changes
 
 
@@ -220,10 +223,7 @@ def parse_variations(given: Sequence[str]) -> list[dict[str, str]]:
 
     Raises ConfigError for a text without `=` or without a key, and for a key in two texts.
     """
-    varied = parse_changes(given)
-    if len(varied) < len(given):
-        raise ConfigError(f"a key is varied twice: name all its values in one, such as {next(iter(varied))}=1,2,3")
-    lists = [[(key, value) for value in split_list(text)] for key, text in varied.items()]
+    lists = [[(key, value) for value in split_list(text)] for key, text in parse_changes(given).items()]
     return [dict(choice) for choice in itertools.product(*lists)]
 
 

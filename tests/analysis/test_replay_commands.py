@@ -142,6 +142,8 @@ def test_other_settings_stand_beside_the_original(log):
         (("--set", "detector.treshold=1"), "did you mean `detector.threshold_Nm`?"),
         (("--set", "bus.period_us=2000"), "`bus.period_us` made the numbers of the log; a replay can't change it"),
         (("--vary", "arm.torque_offset_Nm=0.1,0.2"), "`arm.torque_offset_Nm` made the numbers of the log"),
+        (("--set", "filter.a_rad_s=8", "--vary", "filter.a_rad_s=9,10"), "filter.a_rad_s is both set and varied"),
+        (("--set", "filter.a_rad_s=8", "--set", "filter.a_rad_s=9"), "filter.a_rad_s is given twice, as 8 and 9"),
         (("--set", "devices.drive_node=[5, 6]"), "`devices.drive_node` made the numbers of the log"),
     ],
 )

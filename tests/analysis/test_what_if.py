@@ -65,8 +65,10 @@ def test_several_lists_of_values_give_every_combination():
 
 
 def test_a_key_that_is_varied_twice_drops_no_value():
-    with pytest.raises(ConfigError, match="a key is varied twice"):
+    with pytest.raises(ConfigError, match="10,20 and 30"):
         parse_variations(["filter.a_rad_s=10,20", "filter.a_rad_s=30"])
+    with pytest.raises(ConfigError, match="8 and 9"):
+        parse_changes(["filter.a_rad_s=8", " filter.a_rad_s = 9"])
 
 
 def test_commas_in_brackets_and_quotes_part_nothing():

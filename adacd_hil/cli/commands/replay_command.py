@@ -155,10 +155,13 @@ def _replay_one(
     base = own
     if config is not None and not is_alone:
         base = keep_log_settings(own, load_settings(config, own.arm.profile))
-    for asked in (parse_changes(changes), *(parse_variations(vary) if vary else ())):
+    fixed, choices = parse_changes(changes), parse_variations(vary) if vary else []
+    for asked in (fixed, *choices):
         refuse_log_settings(asked)
-    base = apply_settings(base, parse_changes(changes))
-    variants = {_name(choice): apply_settings(base, choice) for choice in parse_variations(vary)} if vary else {}
+    for key in fixed.keys() & set(choices[0] if choices else ()):
+        raise CommandError(f"{key} is both set and varied", ExitCode.USAGE)
+    base = apply_settings(base, fixed)
+    variants = {_name(choice): apply_settings(base, choice) for choice in choices}
     if not variants and base != own:
         variants = {", ".join(filter(None, [config or "", *changes])): base}
     progress(f"replaying {given}" + (f" with {counted(len(variants), 'other setting')}" if variants else ""))
