@@ -56,6 +56,7 @@ TARGETS: dict[str, tuple[str, ...]] = {  # module: its quick tests as globs, qui
     "adacd_hil/scheme/supervisor/supervisor.py": ("tests/scheme/test_supervisor.py",),
     "firmware_sim/nodes/drive_profile.py": (
         "tests/firmware_sim/test_drive_states_table.py",
+        "tests/firmware_sim/test_drive_limits.py",
         "tests/firmware_sim/test_drive_node.py",
         "tests/firmware_sim/test_drive_stops.py",
     ),

@@ -41,9 +41,9 @@ def expected_command(word: int, previous: int) -> DriveEvent | None:
 
 @pytest.mark.parametrize("state", DriveState)
 def test_every_state_is_coded_as_the_standard_codes_it(state: DriveState) -> None:
-    """Before initialisation nothing is claimed."""
+    """Bit 4, voltage enabled, is set from initialisation on; before it nothing is claimed."""
     assert fits(STATE_BITS[state], CODING[state])
-    assert STATE_BITS[state] == 0 or state not in (S.START, S.NOT_READY_TO_SWITCH_ON)
+    assert STATE_BITS[state] & 0x10 == (0 if state in (S.START, S.NOT_READY_TO_SWITCH_ON) else 0x10)
 
 
 @pytest.mark.parametrize("previous", [0x0000, 0xFFFF])
