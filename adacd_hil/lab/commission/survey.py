@@ -121,7 +121,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Survey:
-    """Nodes found, ascending by node id. `others`: identifiers that belong to none of them.
+    """Nodes found, ascending by node id. `others`: identifiers that none of them sends.
 
     `duration_s`: length of the listening, without the reading of identities.
     """
@@ -217,9 +217,9 @@ def read_number(remote: Any, index: int, sub: int = 0) -> int | None:
 
 
 def _assign(nodes: Mapping[int, Node], traffic: Traffic) -> list[Talk]:
-    """Add each identifier to `produces` of its node by the predefined connection set; return those of no node.
+    """Add each identifier that a node sends by the predefined connection set to its `produces`; return the others.
 
-    SDO responses of these nodes, which are answers to us, are in neither.
+    SDO responses of these nodes, which are answers to us, are in neither. RPDOs and SDO requests are among the others.
     """
     others = []
     for talk in traffic.sorted():
@@ -324,7 +324,10 @@ class BusView:
         }
 
     def accept(self, frame: Frame) -> None:
-        """Add a frame to the counts, the bus load, and the statistics and checks of its identifier."""
+        """Add a frame to the counts, the bus load, and the statistics and checks of its identifier.
+
+        An error frame is only counted.
+        """
         self.frames += 1
         self._traffic.count_frame(frame)
         if frame.is_error:
@@ -354,9 +357,10 @@ class BusView:
 
         node_id: return only nodes and messages of this node; counts and load are still of the whole bus.
         strange_frames: of a length that the contract's bus can't carry; the load leaves them out. A node's state: by
-        its last heartbeat, age_s since then. Of a message: rate_Hz: over the last one or two `_WINDOW_NS`; lost: frames
-        that a counter shows to be missing, as occasions; errors: frames of a wrong length, or that failed the
-        end-to-end check; values: of the last frame that passed its checks, empty before.
+        its last heartbeat, age_s since then. Of a message: rate_Hz: over the last one or two `_WINDOW_NS`, less at
+        first, more if calls are farther apart; lost: frames that a counter shows to be missing, as occasions; errors:
+        frames of a wrong length, or that failed the end-to-end check; values: of the last frame that passed its checks,
+        empty before.
         """
         mark_ns, counts = self._marks[0]
         elapsed_s = (t_ns - mark_ns) * 1e-9

@@ -31,7 +31,7 @@ _GRAVITY = (A4, A5)
 
 
 class TareRefusedError(RuntimeError):
-    """The tare is refused; the message is one line with quantity, value, bound and unit."""
+    """The tare is refused; the message is one line, for a torque or a motion with value, bound and unit."""
 
 
 class ArmMovedError(TareRefusedError):

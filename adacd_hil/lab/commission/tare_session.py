@@ -245,10 +245,10 @@ class TareSession:
                 raise TareRefusedError(f"{name} has sent nothing usable for {age} cycles, bus.max_age_cycles = {bound}")
 
     def _auto_zero(self, nodes: list[Any], sensors: tuple[Identity, ...]) -> None:
-        """Let the sensors set their own zero at rest, in pre-operational, and measure before and after it.
+        """Let the sensors set their own zero at rest, in pre-operational; measure before and after it, and report both.
 
-        Raises TareRefusedError if the arm isn't at rest and unloaded before, or more torque than
-        `tare.auto_zero_limit_Nm` is left after; DeviceError if a sensor refuses or doesn't answer.
+        Raises TareRefusedError as `_measure`, before and after; if the arm isn't unloaded before; or if more torque
+        than `tare.auto_zero_limit_Nm` is left after. Raises DeviceError if a sensor refuses or doesn't answer.
         """
         before = self._measure()
         solve_tare([before], self.settings)  # refuse if the arm is pushed

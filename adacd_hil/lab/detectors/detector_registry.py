@@ -130,6 +130,7 @@ def register(name: str, make: Maker) -> None:
     """Register a detector under a name, for this process. make: begins one on a stream of a period, s.
 
     Raises ValueError for a name that is taken, empty or can't be printed, and for a detector that breaks the contract.
+    Errors of the detector are raised as they are.
     """
     if not name.strip() or not name.isprintable():
         raise ValueError(f"a detector needs a name that can be printed, not {name!r}")

@@ -45,7 +45,7 @@ _UNITS: Final = {"t": "s", "q": "rad", "dq": "rad/s", "tau_J": "Nm"}
 
 
 class ArrayError(ValueError):
-    """Arrays or options can't be used; the message is one line: quantity, value, bound, unit."""
+    """Arrays or options can't be used; the message is one line with the reason."""
 
 
 @dataclass(frozen=True)
@@ -237,8 +237,8 @@ def detect(
     than tau_J, as behind a tracking loop; 1.25e-3 for the emulated drives. scheme: `OfflineSettings` by name, such as
     detection_cutoff_rad_s=20.0, deviations=6.0, noise_Nm=(0.02, 0.02); the default noise is estimated from the arrays.
 
-    Raises ArrayError, a ValueError, in one line with quantity, value and bound: for unusable input, too little free
-    motion, or a model of another arm or period.
+    Raises ArrayError, a ValueError, for unusable input, too little free motion, or a model of another arm, period or
+    kind of velocity.
     """
     recording = _taken(arrays, arm, velocity_lag_s)
     begin_s = recording.columns.begin_s

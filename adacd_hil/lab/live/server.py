@@ -287,8 +287,8 @@ class LiveServer:
     def _obey(self, viewer: Viewer, data: Data) -> bool:
         """Carry out a viewer's request, JSON as text; return False if it asks for too many subscriptions.
 
-        A request that makes no sense is answered with an error, one that isn't supported with a warning, the first time
-        only.
+        Each request that makes no sense is answered with an error. Of those that aren't supported, only the viewer's
+        first one is answered, with a warning.
         """
         try:
             word = json.loads(data) if isinstance(data, str) else {}

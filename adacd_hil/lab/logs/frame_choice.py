@@ -19,9 +19,9 @@ HOST: Final = "HOST"
 class FrameChoice:
     """A choice of frames by sender, identifier and time.
 
-    `only`: whose frames. The contract's `host_ids` and `device_ids` give the sender; for other identifiers the
-    direction does: frames sent are the host's. `start_ns`, `end_ns` count from the first frame of the recording, None:
-    no bound; `can_ids` empty: all.
+    `only`: whose frames. The contract's `host_ids` and `device_ids` give the sender; for other identifiers, and for
+    error and remote frames, the direction does: frames sent are the host's. `start_ns`, `end_ns` count from the first
+    frame of the recording, None: no bound; `can_ids` empty: all.
     """
 
     only: Side

@@ -38,7 +38,7 @@ def is_bag(path: Path) -> bool:
 def opened_bag(path: Path) -> Iterator[Bag]:
     """Open a bag while the block lasts; yield its topics with types, and a function that reads one topic.
 
-    Raises LogError for any error of its reader, also within the block; a LogError or ConfigError of the block passes.
+    Any error of its reader or of the block becomes a LogError; a LogError or ConfigError of the block passes.
     """
     try:
         begin = b""
@@ -102,5 +102,5 @@ def _opened_rosbag(path: Path, is_ros1: bool) -> Iterator[Bag]:
 
 
 def joint_state_topics(topics: Mapping[str, str]) -> list[str]:
-    """Return the topics with type sensor_msgs/JointState, in any spelling; topics: type by name."""
+    """Return the topics with type sensor_msgs/JointState, spelt with or without "msg/"; topics: type by name."""
     return [topic for topic, kind in topics.items() if kind.replace("/msg/", "/") == TYPE.replace("/msg/", "/")]

@@ -12,7 +12,7 @@ from adacd_hil.clock import Clock
 from adacd_hil.wire.bus import Bus, Frame
 
 LEAD_NS: Final = 5_000_000
-"""Time from the call to the first frame."""
+"""Time from the reading of the first frame until it is due."""
 LOOP_PAUSE_NS: Final = 1_000_000
 """Time from the last frame of a recording to the first of its repetition, by the recording's clock."""
 LATE_MS: Final = 1.0
@@ -64,11 +64,11 @@ def play(
 ) -> Lateness:
     """Send frames at their times until they end or `is_stopped` returns True; return how late they were sent.
 
-    The first frame is due `LEAD_NS` after the call, on `clock`. Only identifier and data of a frame are sent. Frames
-    due at the same time are sent together, up to `_MOST_AT_ONCE`, and count as late as the first of them. frames: their
-    times are by any clock, only differences matter. speed: 2 plays twice as fast. longest_pause_ns: longer pauses of
-    the recording are shortened to this; None: none is. A frame with an earlier time than the one before is sent with
-    it. is_stopped: called at least every `_STOP_NS`. Raises BusError if the bus fails.
+    The first frame is due `LEAD_NS` after `frames` has yielded it, on `clock`. Only identifier and data of a frame are
+    sent. Frames due at the same time are sent together, up to `_MOST_AT_ONCE`, and count as late as the first of them.
+    frames: their times are by any clock, only differences matter. speed: 2 plays twice as fast. longest_pause_ns:
+    longer pauses of the recording are shortened to this; None: none is. A frame with an earlier time than the one
+    before is sent with it. is_stopped: called at least every `_STOP_NS`. Raises BusError if the bus fails.
     """
     lateness = Lateness()
     for due_ns, group in _grouped(_scheduled(frames, clock, speed, longest_pause_ns)):
@@ -108,7 +108,7 @@ def _scheduled(
 ) -> Iterator[tuple[int, Frame]]:
     """Yield each frame with the time at which it is due, ns of `clock`; the times never decrease.
 
-    The first is due `LEAD_NS` after it was asked for. A pause above `longest_pause_ns` is shortened to it before
+    The first is due `LEAD_NS` after `frames` has yielded it. A pause above `longest_pause_ns` is shortened to it before
     `speed` divides the time.
     """
     begin_ns, first_ns, cut_ns, latest_ns = 0, None, 0, 0

@@ -29,7 +29,10 @@ class McapReader(BinaryIOMessageReader):
     """
 
     def __init__(self, file: Any, **_: Any) -> None:
-        """Open a path, or read an open binary file. Raises LogError if it can't be read or isn't MCAP."""
+        """Open a path, or read an open binary file.
+
+        Raises OSError if the path can't be opened, LogError if the file can't be read or isn't MCAP.
+        """
         super().__init__(file, mode="rb")
         try:
             is_path = isinstance(file, str | os.PathLike)
@@ -80,7 +83,7 @@ class McapWriter(BinaryIOMessageWriter):
 
 
 _MOST_DIGITS = 9
-"""Of a channel that is a number."""
+"""A channel of fewer digits is a number."""
 
 
 class TimedMessage(can.Message):

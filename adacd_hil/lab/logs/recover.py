@@ -18,7 +18,10 @@ from adacd_hil.log.log_parts import LOST_KEY, RECOVERED
 
 
 class LogRecovery(NamedTuple):
-    """The result of `recover`: source, new log, and the numbers of saved messages, attachments and metadata records."""
+    """The result of `recover`: source, new log, numbers of saved messages, attachments and metadata records, losses.
+
+    Attachments and metadata count once per name; the summary of the source doesn't count.
+    """
 
     path: Path
     out: Path

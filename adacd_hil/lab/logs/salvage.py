@@ -5,8 +5,9 @@ nothing from the beginning of a chunk that was cut or damaged: of 1000 decompres
 Metadata and message indexes have no CRC of their own; recovery makes indexes anew and takes metadata where their shape
 is right.
 
-Many recorders write no CRC. A file of which no chunk has one is read as a reader of streams reads it: whole chunks that
-open, and messages outside of chunks up to the first damage. `Losses.unvouched` counts these messages.
+Many recorders write no CRC. A file in which neither a chunk nor the data section has one is read as a reader of streams
+reads it: whole chunks that open, and messages outside of chunks up to the first damage. `Losses.unvouched` counts these
+messages.
 """
 
 import contextlib

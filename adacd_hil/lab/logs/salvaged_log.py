@@ -15,9 +15,9 @@ from adacd_hil.log.mcap.mcap_records import Definitions
 class SalvagedLog:
     """The trusted records of all parts of a log. Iterate once for chunks and, of each name, the first attachment.
 
-    `metadata`, by name the first of each, and `definitions`, those of the present part, fill up on the way; then
-    `losses` is complete. A part of another run is left out, and named as missing. Iterating raises LogError if a file
-    can't be read, or if no record of the log can be trusted.
+    `metadata`, by name the first of each but the summary, and `definitions`, those of the present part, fill up on the
+    way; then `losses` is complete. A part of another run is left out from its metadata on, and named as missing.
+    Iterating raises LogError if a file can't be read, or if no record of the log can be trusted.
     """
 
     def __init__(self, path: Path, progress: Callable[[str], None] = lambda _: None) -> None:

@@ -310,7 +310,10 @@ def _export_frames(
 
 
 def _topics(path: Path) -> list[str]:
-    """Return the topics that an MCAP file defines before its first messages. Raises LogError if it can't be read."""
+    """Return the topics that a log defines within its first 5000 cycles; a shorter log is read to its end.
+
+    A cycle has messages of one publish time. path: of an MCAP file. Raises LogError if it can't be read.
+    """
     stream = LogStream(path, is_ahead=False)
     next(iter(stream), None)
     return list(stream.topics)

@@ -168,9 +168,10 @@ def _of_sources(described: RecordingMap, recordings: Sequence[ForeignRecording])
 
 
 def _of_torques(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report torques that are constant, stuck, clipped, or over `BEYOND_EFFORT` times the URDF's effort.
+    """Report torques that are constant, stuck or clipped, and the one farthest over `BEYOND_EFFORT` times its effort.
 
-    Constant torques aren't checked for being stuck or clipped. Currents aren't compared with the effort.
+    Constant torques aren't checked for being stuck or clipped. The effort is the URDF's; currents aren't compared with
+    it.
     """
     n = described.joints
     constant = [joint for joint in range(n) if np.ptp(columns.tau_J[:, joint]) == 0.0]
@@ -240,10 +241,11 @@ def _unit_or_scale(described: RecordingMap, key: str, unit: str, factor: float, 
 
 
 def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[RecordingFinding]:
-    """Report joints at rest or with dead encoders, noise, and the first turning joint far beyond the URDF's limits.
+    """Report joints at rest, dead encoders, noisy positions, and the first revolute joint far beyond the URDF's limits.
 
-    Far is over `_BEYOND_LIMITS` times a limit of position or speed. A joint without limits of position may go two turns
-    to each side; noise isn't compared with limits. If no joint moves, report that in place of each joint at rest.
+    Far is over `_BEYOND_LIMITS` times a limit of position or speed; a joint without limits of position has limits of
+    two turns to each side. Linear joints and noisy positions aren't compared with limits. If no joint moves, report
+    that in place of joints at rest and dead encoders.
     """
     n, urdf = described.joints, described.urdf
     travel = np.ptp(columns.q, axis=0)
@@ -316,7 +318,7 @@ def _of_spikes(described: RecordingMap, columns: _Columns) -> Iterator[Recording
 
 
 def _of_jumps(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
-    """Report the first turning joint whose position jumps and does not return, as of an encoder set to zero anew.
+    """Report the first revolute joint whose position jumps and does not return, as of an encoder set to zero anew.
 
     A joint with more than `_MOST_JUMPS` is passed over: other checks report such a column.
     """
@@ -380,9 +382,9 @@ def _is_noise(column: Vector, period_s: float) -> bool:
 def _of_rest(
     described: RecordingMap, part: str, recordings: Sequence[ForeignRecording], still: NDArray[np.bool_]
 ) -> Iterator[RecordingFinding]:
-    """Report joints that rest in the fitted, or the tested, part although they move in the other one.
+    """Report joints that rest in the fitted, or the tested, part although they don't rest over both parts together.
 
-    part: "fitted" or "tested", for the text. recordings: of this part. still (n,): joints that rest in both.
+    part: "fitted" or "tested", for the text. recordings: of this part. still (n,): joints that rest over both together.
     """
     rests = np.ptp(samples(recordings, "q"), axis=0) < STILL_RAD
     joints = np.flatnonzero(rests & ~still).tolist()
@@ -486,8 +488,8 @@ def clipped_torque(torque: Vector) -> tuple[float, float] | None:
 def _clipped_at(torque: Vector) -> Iterator[float]:
     """Yield the smallest and the largest reading of a torque (k,), each only if the sensor seems clipped there.
 
-    Then many readings equal it, some in a long run, and more than lie in the band beside it. A torque with fewer than
-    `_FEWEST_LEVELS` distinct readings yields none.
+    Then many readings equal it, some in a long run, and more than lie in the band beside it; from `_FINE_LEVELS`
+    distinct readings on, more than half as many suffice. A torque with fewer than `_FEWEST_LEVELS` yields none.
     """
     torque = torque.round(9)  # interpolation leaves rounding beside the steps of a coarse sensor
     levels = np.unique(torque)

@@ -168,7 +168,8 @@ def _columns(path: Path, heads: list[str], cells: int, described: RecordingMap) 
 def _time_column(path: Path, heads: list[str], cells: int, described: RecordingMap) -> _Column:
     """Return the time column. If the map gives a period and the file no such column, return one with the name "".
 
-    Raises ConfigError if the file lacks the column and the map gives no period, or the column's name looks misspelt.
+    Raises ConfigError if there are neither times nor a period, the file has several columns of the name, or the name
+    looks misspelt.
     """
     name, units = described.columns.time, described.units
     read = _time_reader(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)

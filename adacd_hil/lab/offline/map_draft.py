@@ -145,9 +145,9 @@ def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
 
 
 def _angle_unit(q: Vector, arm: SerialArm) -> tuple[str, str]:
-    """Return "deg" and the reason if a turning joint goes far beyond what the URDF allows in rad; else "rad", "".
+    """Return "deg" and the reason if a revolute joint goes far beyond its limit in the URDF, rad; else "rad", "".
 
-    Far beyond is over `_BEYOND` times as far. A joint without limits may make a whole turn. q (k, n).
+    Far beyond is over `_BEYOND` times the limit. A joint without limits has one of a whole turn to each side. q (k, n).
     """
     bound = np.maximum(np.abs(arm.position_low), np.abs(arm.position_high))
     bound = np.where(np.isfinite(bound) & (bound > 0.0), bound, 2.0 * np.pi)

@@ -359,7 +359,10 @@ def _late(described: RecordingMap, model: ArmModel, period_s: float) -> Iterator
 
 
 def _in_time(record: Record, late: tuple[int, ...]) -> Record:
-    """Return the record with its late columns shifted back, and as many fewer samples; late: as of `_Motion`."""
+    """Return the record with its late columns shifted back, and `max(late)` fewer samples; late: as of `_Motion`.
+
+    A record of at most as many samples is returned as it is.
+    """
     if not late or len(record.q) <= max(late):
         return record
     n, rows = record.q.shape[1], len(record.q) - max(late)

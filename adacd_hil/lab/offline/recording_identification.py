@@ -45,7 +45,7 @@ class Spell(NamedTuple):
 
 @dataclass(frozen=True)
 class Watched:
-    """External torques, thresholds and contacts that the model shows in a recording to which it was not fitted.
+    """External torques, thresholds and contacts that the model shows in a recording, fitted parts of it included.
 
     tau_ext_hat, threshold: of each stretch (k, n), Nm. touches, missed: numbers of touches, and of undetected ones;
     None if touches are unknown. delays_s: from the begin of each detected touch to its detection.

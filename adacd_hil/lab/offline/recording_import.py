@@ -176,10 +176,10 @@ def recording_of(
     """Make a recording from columns: drop rows that lack a value, resample at a fixed period, and split at gaps.
 
     Velocities of all joints are derived from the positions if they are missing, or a moving joint's is constant. Jumps
-    of a position by whole turns are removed. Stretches that are too short are dropped. path: of the recording, named in
-    errors. period_s: if the map gives none; 0: the median interval of the rows. Raises LogError if too few rows have
-    all values, no stretch without a gap has enough samples, or the samples are more than `MOST_ROWS`; also if the
-    median interval is used and is outside `SHORTEST_PERIOD_S` to `LONGEST_PERIOD_S`.
+    of a revolute joint's position by one turn are removed. Stretches that are too short are dropped. path: of the
+    recording, named in errors. period_s: if the map gives none; 0: the median interval of the rows. Raises LogError if
+    too few rows have all values, no stretch without a gap has enough samples, or the samples are more than `MOST_ROWS`;
+    also if the median interval is used and is outside `SHORTEST_PERIOD_S` to `LONGEST_PERIOD_S`.
     """
     n = described.joints
     is_whole = np.isfinite(given.values).all(axis=1)
@@ -284,7 +284,7 @@ def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[V
 def _without_jumps(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
     """Return a copy of the values with unwrapped positions, and a note on each joint that was unwrapped.
 
-    A turning joint is unwrapped if its steps above half a turn are all whole turns, within `_MOST_BESIDE_JUMP_RAD`.
+    A revolute joint is unwrapped if its steps above half a turn are all of one turn, within `_MOST_BESIDE_JUMP_RAD`.
     """
     notes = []
     values = values.copy()

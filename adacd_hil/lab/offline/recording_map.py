@@ -145,9 +145,10 @@ def _is_near(value: float, wanted: float) -> bool:
 
 @dataclass(frozen=True)
 class RecordingMap:
-    """A map, and the arm that it names. n, the number of moving joints, is the length of each list that isn't empty.
+    """A map, and the arm that it names.
 
-    scheme: keys of `OfflineSettings` with the map's values.
+    n, the number of moving joints, is the length of each list of columns or scales that isn't empty. scheme: keys of
+    `OfflineSettings` with the map's values.
     """
 
     urdf: SerialArm

@@ -10,9 +10,9 @@ effect nor an offset counts as explained. A torque that is noise has a share of 
 **Margin.** The smallest ratio of threshold to residual in the test, with thresholds from noise and the parameters' P.
 
 A joint is explained if its share is at least `WHOLE`, or if the residual stays below its threshold and the share is at
-least `HALF`: no model explains more of a torque that is mostly noise. The test is explained if all joints are, no
-column is dead, both parts are long enough and an arm can have the parameters. With a margin below 1 the model lacks
-more than noise; the verdict then names the smallest contact that still shows.
+least `HALF`: no model explains more of a torque that is mostly noise. The test is explained if all joints are, and no
+finding on columns, length, units, inertia or the map is against it. With a margin below 1 the model lacks more than
+noise; the verdict then names the smallest contact that still shows.
 """
 
 import math
@@ -120,9 +120,9 @@ class Fitted:
 def judge_fit(fit: Fitted) -> Verdict:
     """Return the verdict on a fit: whether the model explains the torque of the test, reasons if not, next step.
 
-    It isn't explained if a joint isn't, or a finding on columns, length, units or inertia is against it. With a dead
-    column or too short recordings, the model isn't judged further. Excitation and smallest contacts are remarked on
-    only if the test is explained.
+    It isn't explained if a joint isn't, or a finding on columns, length, units, inertia or the map is against it. With
+    a dead column or too short recordings, the model isn't judged further. Excitation and smallest contacts are remarked
+    on only if the test is explained.
     """
     joints = _shares(fit)
     columns = find_faults(fit.described, fit.fitted, fit.tested)
@@ -303,7 +303,7 @@ def _related_to_motion(fit: Fitted) -> Vector:
     """Return the share (n,) of each torque that simple terms of the joint's own motion explain, whatever the model.
 
     They are fitted to one of fit and test, and evaluated on the other, and the larger share is taken; terms: filtered
-    position, its sine and cosine, velocity, its sign, and acceleration.
+    position, its sine and cosine, velocity, its sign, acceleration, and a constant.
     """
     period_s, cutoff = fit.settings.period_s, fit.settings.fit_cutoff_rad_s
     shares = []
@@ -339,8 +339,8 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFi
     """Report a unit of torques or angles by which the torques differ from the URDF's masses, or an impossible inertia.
 
     The ratio to the masses is judged if it is over `_SIGMAS` deviations and every joint's share over `_MOSTLY`; an
-    angle needs shares of `WHOLE`. A large ratio that no unit explains is a remark. The inertia about joint 1 is judged
-    if no unit was reported and every share is at least `HALF`.
+    angle needs shares of `WHOLE`. A ratio that isn't reported as a unit is a remark if it is over `_ODD_SCALE` or below
+    its reciprocal. The inertia about joint 1 is judged if no unit was reported and every share is at least `HALF`.
     """
     scale, sigma = _scale_of_urdf(fit)
     mass_kg = _mass_at_reach(fit)
@@ -478,7 +478,10 @@ def _of_excitation(fit: Fitted) -> Iterator[RecordingFinding]:
 
 
 def _of_lack(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFinding]:
-    """Report each unexplained joint with torque: its share and residual, whatever the cause."""
+    """Report each unexplained joint with torque: its share and residual, whatever the cause.
+
+    If the torque stays at one value as if clipped, report that, too.
+    """
     for i, joint in enumerate(joints):
         if joint.is_explained or math.isnan(joint.share):
             continue

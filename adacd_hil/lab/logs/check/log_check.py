@@ -319,9 +319,9 @@ def _summary(facts: _FileCheck) -> dict[str, str]:
 
 
 def _check_words(facts: _FileCheck) -> None:
-    """Compare a log's metadata with its contents, and check how it ended; add findings.
+    """Compare the counts in a file's metadata with its contents; check its ending, dropped packets and losses.
 
-    A file without our metadata is skipped.
+    Adds findings. A file without our metadata is skipped.
     """
     findings, summary = facts.findings, _summary(facts)
     if RUN_METADATA not in facts.metadata:

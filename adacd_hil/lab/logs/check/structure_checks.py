@@ -253,7 +253,8 @@ _INDEXES: dict[int, str] = {Opcode.ATTACHMENT_INDEX: "attachment-index", Opcode.
 class SummaryCheck:
     """Compares the summary of a file with the data section.
 
-    Call it for each record of both, then for the footer, then `finish`.
+    Call `attachment` and `metadata` for those of the data section, `record` for each record of the summary, then
+    `footer`, then `finish`.
     """
 
     def __init__(self, findings: Findings, definitions: DefinitionCheck, chunks: ChunkCheck) -> None:
