@@ -113,7 +113,7 @@ def write_report(
 
 
 def _placed(step: NextStep) -> NextStep:
-    """Return a next step whose text names the files of its command that aren't where it is typed."""
+    """Return a next step whose text names the TOML files of its command that aren't where it is typed."""
     missing = [word for word in shlex.split(step.command) if word.endswith(".toml") and not exists(Path(word))]
     return step._replace(text=f"{step.text} In the folder of {' and '.join(missing)}:") if missing else step
 
