@@ -391,10 +391,11 @@ def is_realtime(run: Run) -> bool:
 
 
 def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
-    """Return the truth on the host's cycles; None if it has no row.
+    """Return the truth on the host's cycles; None if the emulator logged no cycle.
 
     begins: first cycle of each attempt of the run so far; last: the host's last cycle; time_s: of the rows (m,). Rows
     of later attempts, and those after the host's last cycle, are left out: the arm goes on when the host has died.
+    Payloads and parameters after that cycle stay, those of later attempts don't.
     """
     rows = table.rows
     if not rows.model_cycle.size:
