@@ -58,7 +58,10 @@ class Report:
         return self.source.is_complete
 
     def as_text(self) -> str:
-        """Return the result of the run, contacts that went wrong, next steps and the report's path, for a terminal."""
+        """Return the result of the run, the first contacts that went wrong, next steps and the report's path, as text.
+
+        It is for a terminal, and has at most PRINTED_CONTACTS contacts.
+        """
         first, *further = headlines(self.metrics, self.source)
         lines = [in_line(f"{'Good' if is_good(self.metrics, self.source) else 'NOT GOOD'}: {first}")]
         lines += [in_line(f"- {line}") for line in further]

@@ -181,7 +181,7 @@ def parameters_table(metrics: Metrics, run: Run) -> Table | None:
 def data_table(data: CyclicData) -> Table | None:
     """Return the table of shares of cyclic data that was missing, old or repeated, with the worst second.
 
-    None without a cycle.
+    None without a cycle with powered drives.
     """
     if not data.cycles:
         return None

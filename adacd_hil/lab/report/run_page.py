@@ -62,10 +62,11 @@ _Point = tuple[float, float]
 
 
 class Push(NamedTuple):
-    """A force at right angles to a link, to be drawn as an arrow. share: its size over that of the strongest one drawn.
+    """A force at right angles to a link, to be drawn as an arrow.
 
-    lever_m, from the link's joint, and lever_sigma_m: None where not known. Without `lever_m` the arrow points at the
-    link's middle; without `lever_sigma_m` it is dashed. side: +1 toward +q, -1, or 0 where not known: no arrow.
+    share: its size over that of the strongest one reported; 0.5 where the size is not known. lever_m, from the link's
+    joint, and lever_sigma_m: None where not known. Without `lever_m` the arrow points at the link's middle; without
+    `lever_sigma_m` it is dashed. side: +1 toward +q, -1, or 0 where not known: no arrow.
     """
 
     link: int

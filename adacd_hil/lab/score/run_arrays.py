@@ -35,7 +35,7 @@ from adacd_hil.settings.configuration import Settings
 
 
 class Quantity(NamedTuple):
-    """A time that each cycle has.
+    """A time of a cycle.
 
     column: its name in /cycle, where it is in ns. `is_reserve`: it should be large, not small.
     """
@@ -124,7 +124,10 @@ EMULATOR: Final = "emulator_"
 
 
 class AttemptBegins:
-    """Finds the cycles in which attempts begin: INIT or COMMISSION after another state. Cycles come piece by piece."""
+    """Finds the cycles in which attempts begin: in INIT or COMMISSION, after a cycle in neither of them.
+
+    Cycles come piece by piece.
+    """
 
     def __init__(self) -> None:
         self._begins: list[int] = []

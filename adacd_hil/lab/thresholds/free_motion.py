@@ -148,7 +148,7 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
 def read_motion(
     path: Path, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None, with_times: bool = False
 ) -> LoggedMotion:
-    """Return the motion in a log, or in a stretch of it, with its contact-free samples marked; reads the log twice.
+    """Return the motion in a log, or in a stretch of it, with its contact-free samples marked; reads it twice or more.
 
     A sample is free if it and all within APART_S are armed, without a contact, a gap or NaN. With the truth beside the
     log, the `BLOCK_S` after a false alarm are free, too, and samples that the truth does not cover are not. progress:
