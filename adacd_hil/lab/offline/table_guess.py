@@ -60,8 +60,8 @@ class TableGuess:
 
     heads: of all columns, "1", "2", … if the file has none. units_below: units in a row below the heads, "" where there
     is none. is_iso: the first column has dates and times: its first cell is no number. columns, units, reasons: by
-    role, "time", "q", "dq", "tau_J" or "contact": the heads of its columns, their unit if the file gives one, and why
-    an uncertain choice was made.
+    role, "time", "q", "dq", "tau_J" or "contact": the heads of its columns, their unit if the file gives one ("A" for
+    currents without one), and why an uncertain choice was made.
     """
 
     form: CsvSection
@@ -158,8 +158,8 @@ def _begins(rows: list[list[str]], decimal: str) -> bool:
 def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) -> _Form:
     """Return the form of a file whose data begin at row `first`, from 0.
 
-    The head is the closest row above with as many cells; a row of units may lie between. Without such a row, the heads
-    are "1", "2", ….
+    The head is the closest row above with as many cells, the first of them not empty; a row of units may lie between.
+    Without such a row, the heads are "1", "2", ….
     """
     count = len(rows[first])
     above = [k for k in range(first) if len(rows[k]) == count and rows[k][0].removeprefix("#").strip()]
@@ -278,8 +278,8 @@ def _by_values(guess: TableGuess, n: int) -> None:
     """Set columns and reasons of a guess by the values of the columns; n: number of joints.
 
     The first column is the time if it grows. If n adjacent columns are the slopes of n earlier ones, the earlier ones
-    are the positions, the later ones the velocities, and the n after them the torques. Otherwise the first n columns
-    are the positions, the next n the torques. With too few columns, no role is set.
+    are the positions, the later ones the velocities, and the n after them, if there are so many, the torques. Otherwise
+    the first n columns after the time are the positions, the next n the torques; with too few columns neither is set.
     """
     values, heads = guess.values, guess.heads
     grows = [place for place in range(values.shape[1]) if np.all(np.diff(values[:, place]) > 0.0)]

@@ -51,7 +51,10 @@ def next_steps(metrics: Metrics, run: Run, source: ReportSource) -> tuple[list[N
 
 
 def _repairs(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]:
-    """Return a next step for each kind of failure that the run shows; [] if there is none."""
+    """Return a next step for each kind of failure that the run shows; [] if there is none.
+
+    If the run stopped, late frames and a model that was not learned have no step of their own.
+    """
     log = _quoted(source.log_name)
     has_stopped = bool(metrics.fault or find_breaks(run)) or (not metrics.adaptation_s and not run.is_part)
     stopped = _checked(run, source, "Mend the cause above.")
@@ -86,7 +89,8 @@ def _repairs(metrics: Metrics, run: Run, source: ReportSource) -> list[NextStep]
 def _checked(run: Run, source: ReportSource, text: str) -> NextStep:
     """Return a next step: `text`, and the `doctor` command for host, bus and arm.
 
-    For an emulated arm, or a log that names no interface, the command is `demo`, to play the run again.
+    For an arm that was emulated in the host's process, or a log that names no interface, the command is `demo`, to play
+    the run again.
     """
     interface, channel = run.metadata.get("interface", ""), run.metadata.get("channel", "")
     if interface in ("", EMBEDDED):
@@ -103,7 +107,8 @@ def _checked(run: Run, source: ReportSource, text: str) -> NextStep:
 def _configuration(run: Run, source: ReportSource) -> str:
     """Return a run's configuration for a command, quoted for the shell.
 
-    Where the source lacks it, a built-in name, or `<arm's name>.toml`.
+    Where the source lacks it, the name in the log's metadata if it is built in, else `<name>.toml`; `my-arm.toml`
+    without a name.
     """
     name = run.metadata.get("config", "")
     return _quoted(source.config or (name if name in builtin_names() else f"{name or 'my-arm'}.toml"))
@@ -117,7 +122,10 @@ def _scenario(run: Run, source: ReportSource) -> str:
 
 
 def _truth(run: Run, source: ReportSource) -> str:
-    """Return a run's truth for `demo`, quoted for the shell; where the source lacks it, as of `_configuration`."""
+    """Return a run's truth for `demo`, quoted for the shell.
+
+    Where the source lacks it, the name in the log's metadata, with ".toml" if a digest stands behind it.
+    """
     name, *digest = run.metadata["truth"].split()
     return _quoted(source.truth or (f"{name}.toml" if digest else name))
 
@@ -127,7 +135,7 @@ def _quoted(text: str) -> str:
 
 
 def origin_words(run: Run) -> list[str]:
-    """Return phrases on a run's arm, bus, scenario and version, without those that the log doesn't name."""
+    """Return phrases on a run's arm, bus, scenario, truth and version, without those that the log doesn't name."""
     said = run.metadata
     name, profile, interface = said.get("config", ""), said.get("profile", ""), said.get("interface", "")
     is_own = name not in builtin_names()

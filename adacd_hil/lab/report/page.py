@@ -160,7 +160,7 @@ def shown_contacts(metrics: Metrics, most: int) -> tuple[ReportedContact, ...]:
 
 
 def went_wrong(contact: ReportedContact) -> bool:
-    """Return whether armed detection missed a contact, or found it on a wrong link or with a wrong direction."""
+    """Return whether a contact was missed by armed detection, or found on a wrong link or with a wrong direction."""
     is_missed = contact.is_armed and contact.detected_s is None
     return is_missed or contact.link_ok is False or contact.direction_ok is False
 
@@ -212,8 +212,8 @@ _PLAIN_NAMES: Final = {
 def paper_cells(metrics: Metrics) -> list[tuple[str, ...]]:
     """Return a row of texts per quantity: name, the paper's value, its scheme's on the same stream, the measured one.
 
-    Columns as in `paper_head`: the two of the paper only if its experiment was played. Quantities without any value are
-    left out.
+    Columns as in `paper_head`: the two of the paper only if its experiment was played, the second of them only for a
+    certified run. Quantities without any value are left out.
     """
     rows = []
     for row in metrics.paper:

@@ -58,7 +58,10 @@ class Report:
         return self.source.is_complete
 
     def as_text(self) -> str:
-        """Return the result of the run, contacts that went wrong, next steps and the report's path, for a terminal."""
+        """Return the result of the run, the first contacts that went wrong, next steps and the report's path, as text.
+
+        It is for a terminal, and has at most PRINTED_CONTACTS contacts.
+        """
         first, *further = headlines(self.metrics, self.source)
         lines = [in_line(f"{'Good' if is_good(self.metrics, self.source) else 'NOT GOOD'}: {first}")]
         lines += [in_line(f"- {line}") for line in further]
@@ -113,7 +116,7 @@ def write_report(
 
 
 def _placed(step: NextStep) -> NextStep:
-    """Return a next step whose text names the files of its command that aren't where it is typed."""
+    """Return a next step whose text names the TOML files of its command that aren't where it is typed."""
     missing = [word for word in shlex.split(step.command) if word.endswith(".toml") and not exists(Path(word))]
     return step._replace(text=f"{step.text} In the folder of {' and '.join(missing)}:") if missing else step
 

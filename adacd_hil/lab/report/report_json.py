@@ -19,7 +19,7 @@ _DIGITS: Final = 6
 def report_json(
     metrics: Metrics, metadata: Mapping[str, str], source: ReportSource, stretch: StretchOfRun | None = None
 ) -> dict[str, Any]:
-    """Return the content of report.json as plain values, rounded to `_DIGITS` digits.
+    """Return the content of report.json as plain values, rounded to `_DIGITS` significant digits.
 
     The keys are described in `adacd_hil.lab.score.metrics`. stretch: None: the whole log was read.
     """

@@ -64,7 +64,7 @@ def margins_table(evidence: CertifiedEvidence | None) -> Table | None:
 def push_table(evidence: CertifiedEvidence | None) -> Table | None:
     """Return the table of the smallest push found within PUSH_WITHIN and the threshold in force, by joint.
 
-    None if the run has no certified evidence of it.
+    Columns: median, a high percentile and the worst, Nm. None if the run has no certified evidence of it.
     """
     push = None if evidence is None else evidence.smallest_push
     if push is None:
@@ -82,7 +82,7 @@ def push_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def counted_sentence(metrics: Metrics) -> str:
-    """Return a sentence with the number of false alarms and the bound of their rate; "" if the bound is unknown."""
+    """Return a sentence with the number of false alarms in MONITOR and the bound of their rate; "" without a bound."""
     bound = metrics.false_alarm_bound_per_h
     return "" if bound is None else rate_sentence(metrics.armed_false_alarms or 0, bound)
 
@@ -181,7 +181,7 @@ def parameters_table(metrics: Metrics, run: Run) -> Table | None:
 def data_table(data: CyclicData) -> Table | None:
     """Return the table of shares of cyclic data that was missing, old or repeated, with the worst second.
 
-    None without a cycle.
+    None without a cycle with powered drives.
     """
     if not data.cycles:
         return None

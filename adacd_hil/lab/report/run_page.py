@@ -62,10 +62,11 @@ _Point = tuple[float, float]
 
 
 class Push(NamedTuple):
-    """A force at right angles to a link, to be drawn as an arrow. share: its size over that of the strongest one drawn.
+    """A force at right angles to a link, to be drawn as an arrow.
 
-    lever_m, from the link's joint, and lever_sigma_m: None where not known. Without `lever_m` the arrow points at the
-    link's middle; without `lever_sigma_m` it is dashed. side: +1 toward +q, -1, or 0 where not known: no arrow.
+    share: its size over that of the strongest one reported; 0.5 where the size is not known. lever_m, from the link's
+    joint, and lever_sigma_m: None where not known. Without `lever_m` the arrow points at the link's middle; without
+    `lever_sigma_m` it is dashed. side: +1 toward +q, -1, or 0 where not known: no arrow.
     """
 
     link: int
@@ -86,9 +87,9 @@ class Stroke(NamedTuple):
 def draw_arm(q: Vector, length_m: tuple[float, float], push: Push | None, description: str) -> dict[str, Any]:
     """Return a drawing of the arm, for its template, at joint angles q, rad (2,), with the arrow of a push, if any.
 
-    Lengths are in mm. description: of the picture, in words. Keys: view: left, top, width and height of the picture
-    with y down; reach: length of both links; links: their strokes; force: strokes of arrow and spread; arrowhead: its
-    corners.
+    Lengths of the drawing are in mm. description: of the picture, in words. Keys: view: left, top, width and height of
+    the picture with y down; reach: length of both links; links: their strokes; force: strokes of arrow and spread;
+    arrowhead: its corners.
     """
     angles = (float(q[0]), float(q[0] + q[1]))
     l1, l2 = (1000.0 * length for length in length_m)
@@ -305,8 +306,9 @@ def _arm(contact: ReportedContact, run: Run, strongest_N: float) -> dict[str, An
 def _push(contact: ReportedContact, strongest_N: float, length1_m: float) -> Push | None:
     """Return the force of a contact for the drawing; None if neither a link was found nor the true one is known.
 
-    It is on the link that was found, else on the true one. Place and size are those reported; without a reported place
-    the size is half the largest, and the place unknown. strongest_N: largest force to be shown.
+    It is on the link that was found, else on the true one. Place and size are those reported; on link 1, of which only
+    the least force is known, the place is the end of the link. Without a reported place the size is half the largest,
+    and the place unknown. strongest_N: largest force to be shown. length1_m: of link 1.
     """
     link = contact.link if contact.link_detected is None else contact.link_detected
     if link is None:
@@ -382,7 +384,8 @@ def _heading(metrics: Metrics, run: Run, source: ReportSource) -> dict[str, Any]
 def _tiles(metrics: Metrics) -> list[tuple[str, str, str]]:
     """Return label, number as text, and unit of each figure on the first screen; unknown figures are left out.
 
-    They are adaptation times, contacts found, false alarms, links named rightly, and the median delay.
+    They are adaptation times, the first LISTED, and false alarms; of the contacts while detection was armed: those
+    found, links named rightly, and the median delay.
     """
     armed = [contact for contact in metrics.contacts if contact.is_armed]
     seen = [contact for contact in armed if contact.detected_s is not None]

@@ -11,7 +11,7 @@ A run of at most `FULL_CYCLES` cycles keeps all of them. A longer one keeps:
 | outline | the first and the last of every piece; those in which the state changes, the paper's scheme is armed or |
 | | disarmed, or a true contact begins, with their neighbours |
 | curves | the smallest and the largest value of each in at most `BUCKETS` buckets |
-| contacts | all from 0.15 s before to 0.6 s after the first `TRACED_CONTACTS` |
+| contacts | all from 0.15 s before to 0.6 s after the first `TRACED_CONTACTS` true ones, and as many detections |
 | adaptations | the first `ADAPTATION_S` of the first `ADAPTATIONS` |
 | times of the cycle | the smallest and the largest value of each in at most `TIME_BUCKETS` buckets |
 | noise | `_NOISE_CYCLES` at the beginning of every `_NOISE_BUCKETS`-th bucket, by which the steps of the curves are |
@@ -176,7 +176,7 @@ def _read(
 ) -> None:
     """Add the pieces of a log to `reading`: all, those within `bounds_ns`, or until it is settled at `until_ns`.
 
-    progress: called with a line on the cycles read.
+    progress: called with a line on the cycles read. Raises LogError as `_checked`.
     """
     milestones = Milestones(lambda count: progress(f"{stream.path}: {count} cycles read"))
     cycles, last = 0, (-1, -1)
@@ -220,7 +220,8 @@ def _with_ending(
 ) -> ReadRun:
     """Return a run with `broken_off`, if the log ended unplanned, `is_cut`, and the counts of the log's summary.
 
-    The run of a stretch has no counts. The source has the problems of log and truth, and unjudged alarms.
+    The run of a stretch has no counts. The source has the problems of log and truth, unjudged alarms, and the bounds of
+    a cut, which is complete all the same.
     """
     ending = stream.summary.get(ENDING_KEY, "")
     if ending and ending not in PLANNED_ENDINGS:
@@ -291,8 +292,8 @@ class RunReading:
     def add_piece(self, series: Mapping[str, Series], events: list[LoggedEvent]) -> None:
         """Add the next piece of the log: its records by topic, and its events.
 
-        Once `_WAITING` cycles aren't in `sums`, add those older than the settling time; of a long run drop those of
-        them that aren't drawn.
+        Add the cycles' times to `sums` at once. Once more than `_WAITING` cycles wait for the rest, add those older
+        than the settling time and `_BEYOND_S`; of a long run drop those of them that aren't drawn.
         """
         self._reports += [report for _, report in contacts_of(series[CONTACT.name])]
         self._events += events
@@ -374,7 +375,8 @@ class RunReading:
     def is_settled(self, until_ns: int, last_ns: int) -> bool:
         """Return whether contacts, reactions and adaptations from before `until_ns` are over at the cycle at `last_ns`.
 
-        They are if the settling time before `last_ns` begins after `until_ns` and has no cycle in a state of `BUSY`.
+        They are if the settling time before `last_ns` begins after `until_ns`, and has no cycle in a state of `BUSY`
+        and no row of the truth.
         """
         before_ns = last_ns - round(self._settling_s * 1e9)
         return before_ns > until_ns and self._busy_ns < before_ns
@@ -410,7 +412,7 @@ class RunReading:
     def _thin_times(self) -> None:
         """Of a long run, drop rows of /cycle in which no time, queue or overrun is smallest or largest in its bucket.
 
-        They are those read since this function last dropped any.
+        Only rows read since it last dropped any are judged, or all if the buckets double.
         """
         self._waiting = 0
         if self._times.cycles > self._full_cycles:
@@ -577,8 +579,9 @@ class KeptRows:
         """Drop the rows from `first` to before `end` in which no curve is smallest or largest in its bucket.
 
         Buckets double once there are more than `most_buckets`; then rows before `first` are thinned, too. curves:
-        returns the curves (k,) of k rows. Rows within `around_ns`, first and last ns each, are never dropped; in every
-        `_NOISE_BUCKETS`-th bucket the first `noise_cycles` are left, too. Return the number of dropped rows.
+        returns the curves (k,) of k rows. Rows that `add_records` marked as kept, and those within `around_ns`, first
+        and last ns each, are never dropped; in every `_NOISE_BUCKETS`-th bucket the first `noise_cycles` are left, too.
+        Return the number of dropped rows.
         """
         while self.cycles > self._most_buckets * self.bucket:
             first, self.bucket = 0, 2 * self.bucket
@@ -594,7 +597,10 @@ class KeptRows:
         return dropped
 
     def run(self, shell: Run, rows: slice = slice(None)) -> Run:
-        """Return `shell` with the cycles of all or some of the gathered rows."""
+        """Return a run with the cycles of the gathered rows, of those in the slice `rows` only.
+
+        shell: a run without cycles; it gives all other fields, such as settings and motion start.
+        """
         columns = {name: self.column(name)[rows] for name in ("t_ns", *self.names)}
         return replace(shell, **_arrays(columns, shell.settings))
 

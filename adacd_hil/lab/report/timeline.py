@@ -160,7 +160,7 @@ def _x(scale: _Scale, time_s: float) -> float:
 def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[list[Stay]]:
     """Yield the stays in groups, one mark each.
 
-    Of more than MARKS stays, neighbours narrower than a mark form a group.
+    Of more than MARKS stays, neighbours that together are no wider than the narrowest mark form a group.
     """
     group: list[Stay] = []
     for stay in stays:

@@ -219,9 +219,9 @@ _TIMES: Final = ((LATENESS, "identified"), (COMPUTE, "joint1"), (SYNC_TO_COMMAND
 
 
 def timing_track(columns: CycleColumns, period_us: float, zero_ns: int, has_grid: bool) -> Track:
-    """Return a track of the cycles' times, queues and skipped periods, as far as logged, over s since `zero_ns`.
+    """Return a track of the times of `_TIMES`, queues and skipped periods, as far as logged, over s since `zero_ns`.
 
-    has_grid: False in lockstep, where lateness and queues are left out.
+    Without a skipped period, these have no panel. has_grid: False in lockstep, where lateness and queues are left out.
     """
     panels = []
     for quantity, colour in _TIMES:

@@ -167,7 +167,7 @@ class FieldDifference(NamedTuple):
 
     first_cycle: of the first log; first_s: s since motion start. largest: difference; 0.0 for integers, inf where one
     value is NaN and the other isn't. A field of /contact is named "contact.<field>", counted once for each contact;
-    its difference is 0.0.
+    its difference is 0.0. For a contact that only the second log has, first_cycle and first_s are of that log.
     """
 
     field: str
@@ -203,15 +203,15 @@ class LogComparison:
 
     @property
     def is_same(self) -> bool:
-        """Whether no field of /scheme or /contact differs, and no cycle is in one log only.
+        """Whether no field that both logs have of /scheme and /contact differs, and no cycle is in one log only.
 
-        Settings, metadata and timing may differ.
+        Settings, metadata and timing may differ. Fields that only one log has are named in `notes`.
         """
         return not self.fields and self.only == (0, 0)
 
     @property
     def is_same_where_whole(self) -> bool:
-        """Whether cycles were compared, no field differs, and a log that lacks cycles of the other log is damaged."""
+        """Whether cycles were compared, no field that both logs have differs, and only damaged logs lack cycles."""
         damages = self.second.problem, self.first.problem
         lacks = any(count and not damage for count, damage in zip(self.only, damages, strict=True))
         return self.cycles > 0 and not self.fields and not lacks

@@ -73,8 +73,8 @@ class RunSummary:
     verdict: the reason in a sentence. expected: contacts that there were while detection was armed, None on a real arm;
     found: the detected ones of those, or all detections if the run isn't judged. margin: smallest threshold over
     residual. duration_s: from the log's first message to its last. friction_Nm (at FRICTION_AT_RAD_S), offset_Nm: of
-    the first certificate without payload. devices: maker with product, and serial number, of each that has one; none
-    before `with_devices`.
+    the first certificate without payload; the paper's scheme gives friction alone, of its first complete adaptation.
+    devices: maker with product, and serial number, of each that has one; none before `with_devices`.
     """
 
     name: str
@@ -201,7 +201,10 @@ def judged(summary: RunSummary) -> RunSummary:
 
 
 def with_devices(summary: RunSummary) -> RunSummary:
-    """Return the summary with the devices that the beginning of its log names, unchanged for a log that names none."""
+    """Return the summary with the devices that the beginning of its log names with a serial number.
+
+    The set is empty if it names none; a summary whose log can't be read is returned unchanged.
+    """
     try:
         stream = LogStream(summary.log, (EVENTS.name, CYCLE.name), cycles_per_piece=1, is_ahead=False)
         piece = next(iter(stream), None)

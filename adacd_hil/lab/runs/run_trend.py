@@ -124,9 +124,10 @@ def trends(runs: Iterable[RunSummary], threshold_share: float = THRESHOLD_SHARE)
 
 
 def _by_devices(name: str, run: RunSummary, by_arm: Mapping[str, Sequence[RunSummary]]) -> str:
-    """Return the name of a run's arm: `name`, unless the devices of its runs are known and this run has none of them.
+    """Return the key in `by_arm`, earlier runs by arm, of the arm of this name that a run belongs to, or a new key.
 
-    Then the name has the serial numbers. by_arm: earlier runs.
+    It belongs to the first one with a device in common, or if the devices of either are unknown. A new key is `name`
+    for the first arm of the name, else `name` with the run's serial numbers.
     """
     others = [key for key in by_arm if key == name or key.startswith(f"{name}, serial numbers ")]
     for key in others:

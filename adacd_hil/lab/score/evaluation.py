@@ -173,7 +173,7 @@ def _reported(run: Run, detection: Detection | None) -> dict[str, Any]:
 def _told(report: ContactReport) -> dict[str, Any]:
     """Return those fields of a `ReportedContact`, by name, that only the certified scheme reports.
 
-    Values without a finite standard deviation are None.
+    A force, a lever arm and a standard deviation are None if that deviation isn't finite.
     """
     return {
         "level": report.level.name,

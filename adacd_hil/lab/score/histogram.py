@@ -30,7 +30,7 @@ def histogram_by_key(counts: NDArray[np.int64]) -> dict[str, Any]:
 
 
 def doubling_bins(values: Values, first: float, count: int) -> list[tuple[float, int]]:
-    """Return (upper bound, number of values) of bins whose bounds double from `first` on; the last bound is inf.
+    """Return (upper bound, number of values) of bins whose bounds double from `first` on; bin `count` ends at inf.
 
     A value on a bound belongs to the upper bin. count: largest number of bins. Empty bins at the end are left out,
     except the first.

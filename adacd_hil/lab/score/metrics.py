@@ -11,8 +11,8 @@ section: up to MONITOR, the test of the frozen model and contacts on the way inc
 [onset, end + 10/a] of a true contact, or less than 10/a after a cycle in REACT: 10 time constants leave 0.2 mNm of
 5 Nm. In a detection section only armed cycles (MONITOR) count; in an adaptation section all do, and only the CAD
 model's residual is given, because theta_hat still moves. Without the truth, [detection - 10/a, detection + 10/a]
-stands for the contact. After the request to finish the arm parks and stands, where friction may hold any torque up
-to F_c: those cycles don't count.
+stands for the contact; with it, cycles that it does not cover don't count. After the request to finish the arm parks
+and stands, where friction may hold any torque up to F_c: those cycles don't count.
 
 **A detection** is an alarm of `adacd_hil.score.judge`. That module decides which contacts were found or missed, and
 which detections are false alarms; detection is armed in MONITOR.
@@ -178,8 +178,8 @@ class CertifiedEvidence:
 
     margins: by section. promotions: refined models that took over in the run. is_anchored: whether every certificate in
     the log names the anchors of all its offsets; True without a certificate. revoked: why certificates were withdrawn,
-    the earliest first. smallest_push: None if the scheme was never armed. certificates: those that were not withdrawn,
-    as the log has them at its end; () for a log without its end, or of an earlier version.
+    the earliest first. smallest_push: None without a cycle in MONITOR free of contact. certificates: those that were
+    not withdrawn, as the log has them at its end; () for a log without its end, or of an earlier version.
     """
 
     tests: dict[str, int]
@@ -236,7 +236,7 @@ class PaperRow(NamedTuple):
     """One row of the table that compares the run with the paper, as texts.
 
     paper: the paper's value, None if the run is not of the paper's experiment; beside: that of the paper's scheme on
-    the same stream, None if it didn't run.
+    the same stream, None if the paper's scheme is the run's own.
     """
 
     quantity: str
@@ -378,7 +378,7 @@ class Metrics:
     def false_alarm_bound_per_h(self) -> float | None:
         """Upper bound, one-sided, of the certified scheme's rate of false alarms in MONITOR, 1/h, by their number.
 
-        None without the truth, for the paper's scheme, or if the scheme was never armed.
+        None without the truth, for the paper's scheme, or without a cycle in MONITOR free of contact.
         """
         push = None if self.evidence is None else self.evidence.smallest_push
         if push is None or self.armed_false_alarms is None:

@@ -35,7 +35,7 @@ from adacd_hil.settings.configuration import Settings
 
 
 class Quantity(NamedTuple):
-    """A time that each cycle has.
+    """A time of a cycle.
 
     column: its name in /cycle, where it is in ns. `is_reserve`: it should be large, not small.
     """
@@ -124,7 +124,10 @@ EMULATOR: Final = "emulator_"
 
 
 class AttemptBegins:
-    """Finds the cycles in which attempts begin: INIT or COMMISSION after another state. Cycles come piece by piece."""
+    """Finds the cycles in which attempts begin: in INIT or COMMISSION, after a cycle in neither of them.
+
+    Cycles come piece by piece.
+    """
 
     def __init__(self) -> None:
         self._begins: list[int] = []
@@ -391,10 +394,11 @@ def is_realtime(run: Run) -> bool:
 
 
 def host_truth(table: TruthTable, begins: Cycles, last: int, time_s: Vector) -> Truth | None:
-    """Return the truth on the host's cycles; None if it has no row.
+    """Return the truth on the host's cycles; None if the emulator logged no cycle.
 
     begins: first cycle of each attempt of the run so far; last: the host's last cycle; time_s: of the rows (m,). Rows
     of later attempts, and those after the host's last cycle, are left out: the arm goes on when the host has died.
+    Payloads and parameters after that cycle stay, those of later attempts don't.
     """
     rows = table.rows
     if not rows.model_cycle.size:

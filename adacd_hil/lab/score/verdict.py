@@ -44,7 +44,10 @@ _NO_LOSS: Final = "no cyclic data was late or lost"
 def list_findings(
     run: Run, metrics: Metrics, score: Score, faults: tuple[Fault, ...], breaks: tuple[Break, ...]
 ) -> tuple[Finding, ...]:
-    """Return the findings of a run, failures first. A run without cycles has one bad finding."""
+    """Return the findings of a run: failures first, then contacts, adaptations and cyclic data, each bad or not.
+
+    A run without cycles has one bad finding.
+    """
     if run.cycle.size == 0 and not run.is_cut:
         cause = "; ".join(each.cause for each in breaks) or "the log does not say why"
         return (Finding(f"no cycle was run: {cause}", True),)
@@ -89,7 +92,10 @@ def list_findings(
 
 
 def shows_nothing(run: Run, metrics: Metrics) -> bool:
-    """Return whether a part of a run has no whole adaptation and no cycle in MONITOR: then nothing can be judged."""
+    """Return whether a part of a run has neither a detection section nor an adaptation: then nothing can be judged.
+
+    In a log that was cut, an adaptation without its end doesn't count. False for a whole run.
+    """
     is_watched = any(section.kind == "detection" for section in metrics.sections)
     return run.is_part and not is_watched and not _judged_adaptations(run, metrics)
 

@@ -121,9 +121,9 @@ class ArmModel:
 
     @cached_property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the p parameters in the order of theta: base, then F_v, F_c and offset of each joint.
+        """Names of the p parameters in the order of theta: base, F_v of all joints, F_c of all, offset of all.
 
-        With has_rotors the rotor inertia of each joint comes last.
+        With has_rotors the rotor inertias of all joints come last.
         """
         kinds = ("F_v", "F_c", "offset", *(("rotor",) if self.has_rotors else ()))
         per_joint = (f"{kind}{i + 1}" for kind in kinds for i in range(self.joints))
@@ -184,7 +184,7 @@ class OfflineCertificate:
     residual_rms_Nm: Vector  # (n,)
     residual_max_Nm: Vector  # (n,)
     lack_Nm: Vector  # (n,), standard deviation of the residual beyond noise and P
-    threshold_Nm: Vector  # (n,), median over all samples, of noise and P
+    threshold_Nm: Vector  # (n,), median over all samples, of noise, P and friction held at standstill
     margins: Vector  # (n,), smallest ratio of threshold to residual over all samples; below 1 is a false alarm
 
     @property

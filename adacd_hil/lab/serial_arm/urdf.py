@@ -6,8 +6,8 @@ Angles are rad, rpy as in the URDF: R = Rz(yaw) Ry(pitch) Rx(roll). Source: http
 
 The arm must be one chain of moving joints. A joint outside the chain, such as a finger of a gripper, is named in
 `locked`: it counts as fixed at its zero. Only the data that the arm needs are checked: the place of a fixed or locked
-joint, and the inertia of a link that moves, if `theta_full` needs it. A limit of 0, as exporters write it, means
-unlimited.
+joint, and the inertia of a link that moves, if `theta_full` needs it. A speed or effort limit of 0, and two position
+limits of 0, as exporters write them, mean unlimited.
 """
 
 import math
@@ -49,7 +49,8 @@ class FramePose(NamedTuple):
 class SerialArm:
     """An arm as described by its URDF; n moving joints, from the base outward.
 
-    Limits are inf where the URDF has none or 0.
+    Limits are infinite where the URDF has none; so are a velocity or torque limit of 0, and position limits if both are
+    0.
     """
 
     name: str

@@ -66,7 +66,7 @@ class Comparison:
     def ranking(self) -> tuple[str, ...]:
         """Names of the detectors, best first, by the geometric mean of their median delays over all steps and joints.
 
-        A delay below 0.1 ms counts as 0.1 ms. A step that isn't found at over half of its onsets counts as ten times
+        A delay below 0.1 ms counts as 0.1 ms. A step that isn't found at half of its onsets or more counts as ten times
         `HORIZON_S`.
         """
         scores: dict[str, list[float]] = {}
@@ -92,7 +92,7 @@ class Comparison:
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         """Return head and rows of a table for a terminal, best detector first.
 
-        A dash stands for the delay of a step that is found in fewer than half of the cases.
+        A dash stands for the delay of a step that isn't found at half of its onsets or more.
         """
         head = ("detector", "joint", *(f"{torque:g} Nm" for torque in STEPS_NM), f"found at {STEPS_NM[0]:g} Nm")
         order = {name: place for place, name in enumerate(self.ranking)}

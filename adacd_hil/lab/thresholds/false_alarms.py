@@ -120,9 +120,10 @@ def counted_hours(peaks: Vector) -> float:
 
 
 def threshold_by_count(peaks: Vector, alarms: float) -> float:
-    """Return the lowest threshold above which block maxima (B,) have at most `alarms` alarms, by bisection.
+    """Return a threshold above which block maxima (B,) have at most `alarms` alarms, by bisection.
 
-    NaN blocks don't count.
+    It need not be the best one: values above a low threshold lie close together and count as few alarms, so it may be
+    as low as the smallest block. NaN blocks don't count.
     """
     low, high = float(np.nanmin(peaks)), float(np.nanmax(peaks))
     for _ in range(_BISECTIONS):

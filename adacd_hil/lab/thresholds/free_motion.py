@@ -1,7 +1,7 @@
 """Contact-free motion in logs: which samples are free of contact, read piece by piece, in bounded memory.
 
 Samples count if they lie in MONITOR, at least `APART_S` after its beginning, after a gap and after a contact, and at
-least as long before a contact.
+least as long before its end, a gap and a contact.
 
 With truth.mcap beside the log, contacts are the true ones. Then a false alarm counts, with the `BLOCK_S` after it,
 though the arm reacts. Without, each alarm stands for a contact, and a touch that no detector found counts as free
@@ -148,11 +148,12 @@ def schemes(path: Path, bounds_ns: tuple[int, int] | None) -> Iterator[Series]:
 def read_motion(
     path: Path, stretch: TimeWindow = WHOLE, progress: Progress = lambda _: None, with_times: bool = False
 ) -> LoggedMotion:
-    """Return the motion in a log, or in a stretch of it, with its contact-free samples marked; reads the log twice.
+    """Return the motion in a log, or in a stretch of it, with its contact-free samples marked; reads it twice or more.
 
-    A sample is free if it and all within APART_S are armed, without a contact, a gap or NaN. progress: called with a
-    line on the cycles read. with_times: whether `t_ns` is wanted. Raises LogError if the log can't be read, has no
-    /scheme or no measured period, or no sample is free of contact.
+    A sample is free if it and all within APART_S are armed, without a contact, a gap or NaN. With the truth beside the
+    log, the `BLOCK_S` after a false alarm are free, too, and samples that the truth does not cover are not. progress:
+    called with a line on the cycles read. with_times: whether `t_ns` is wanted. Raises LogError if the log can't be
+    read, has no /scheme or no measured period, or no sample is free of contact.
     """
     bounds_ns, where = None, ""
     if not stretch.is_whole:
@@ -213,7 +214,8 @@ def _judged(
     """Return a motion with its true contacts, and free of these alone; its alarms are judged by them.
 
     is_armed, is_sound (N,): samples in MONITOR, and without gap or NaN. alarms: their rows. begins: first cycle of each
-    attempt. A false alarm's samples are free for `BLOCK_S`, so that the block with its peak is.
+    attempt. A false alarm's samples are free for `BLOCK_S`, so that the block with its peak is. Samples that the truth
+    does not cover are not free.
     """
     counted = [contact.counted_from(begins[contact.attempt]) for contact in truth[0] if contact.attempt < len(begins)]
     contacts = placed_contacts([each for each in counted if cycles.cycle[0] <= each.end], cycles, settings)

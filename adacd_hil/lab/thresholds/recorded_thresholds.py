@@ -58,8 +58,8 @@ _CHECKED_ALARMS: Final = 20.0  # alarms in the held-out half that are enough to 
 def find_lag(motion: Motion) -> tuple[float, Vector]:
     """Return by how much the velocity is older than the torque, s, for both joints together and for each (n,).
 
-    It is within 0 and `_LONGEST_LAG_S`. A joint whose torque never changes has the lag of both together. If no torque
-    changes, all are `VELOCITY_LAG_S`.
+    It is within 0 and `_LONGEST_LAG_S`. Only free samples in which both joints move count. A joint whose torque changes
+    by no more than its noise has the lag of both together. If that holds for both, all are `VELOCITY_LAG_S`.
     """
     z, _ = make_stream(motion.q, motion.dq, motion.tau_J, motion.theta, motion.interval_s, lag_s=0.0)
     moving = motion.is_free & (np.abs(motion.dq) > 0.02).all(axis=1)
