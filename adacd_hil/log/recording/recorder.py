@@ -212,7 +212,10 @@ class Recorder:
         return is_put
 
     def close(self) -> LogSummary:
-        """End the log and return its summary; never raises; a second call returns the same summary."""
+        """End the log and return its summary; a second call returns the same summary.
+
+        Raises OSError if the writer has died or is silent, and the log's folder can't be listed.
+        """
         if self._summary is None:
             self._socket.settimeout(END_TIMEOUT_S)
             with contextlib.suppress(OSError):
