@@ -196,7 +196,7 @@ class RecordingAgainstLog(LogSource):
         return piece._replace(series=series, frames=frames)
 
     def notes(self) -> list[str]:
-        """Return the gaps and defects of log and recording that can't be replayed or compared, a line each."""
+        """Return the gaps and defects of log and recording that can't be replayed or compared, as lines."""
         notes = super().notes()
         if self._missing:
             notes.insert(0, f"{self._missing} cycles of the run are not in {self._recorded.name}")

@@ -205,7 +205,7 @@ class _Player:
 
 
 def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
-    """Return the outputs of single cycles as one batch, in which each field is an array."""
+    """Return the outputs of single cycles as one batch of arrays, with a list of the contacts' reports."""
     states = (("state", np.uint8), ("previous_state", np.uint8), ("fault", np.uint8), ("reaction", np.uint8))
     wholes = (("cycle", np.int64), ("contact_joints", np.int64), ("is_model_valid", np.bool_), *states)
     columns: dict[str, Any] = {

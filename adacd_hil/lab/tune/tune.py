@@ -173,7 +173,9 @@ def _outcome(logs: Sequence[TunedLog], replays: Sequence[Replay]) -> TuningOutco
 def problems_of(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate_per_h: float) -> tuple[str, ...]:
     """Return the reasons why a candidate is not fit, a few words each; () if it is.
 
-    own: outcome of the unchanged settings.
+    It is fit with a tail, as many finished adaptations as `own`, and no missed contact. The lower bound of its false
+    alarms' rate must not exceed `rate_per_h`, neither in the half to check on nor in the replay. own: outcome of the
+    unchanged settings.
     """
     problems = []
     if choice.calibration is None:
@@ -224,7 +226,8 @@ def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
 def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settings) -> str:
     """Return a suggestion as TOML that `load_settings` reads: the changed keys, with their origin in comments.
 
-    base_name, base: of the configuration that it extends, as from `base_of`.
+    The arm profile of the logs is added if that configuration has another. base_name, base: of the configuration that
+    it extends, as from `base_of`. Raises ConfigError if it can't be read.
     """
     own = tuning.logs[0].settings
     differing = [key for key in changed_keys(keep_log_settings(own, base), own) if key != "name"]

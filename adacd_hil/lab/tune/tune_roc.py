@@ -172,8 +172,9 @@ class Choice:
 def choose(observed: Observed, rate_per_h: float) -> Choice:
     """Return thresholds chosen on one half of the motion, with the alarms and contacts found that they give on both.
 
-    For these thresholds the tail's upper bound is `rate_per_h`; without a tail they are the largest values seen.
-    Raises TooLittleMotionError if the half to choose on has no contact-free motion.
+    For these thresholds the tail's upper bound is `rate_per_h`; without a tail they are the largest values seen. The
+    ROC has the alarms of the half to check on and the contacts of both. Raises TooLittleMotionError if the half to
+    choose on has no contact-free motion.
     """
     first = observed.half(True)
     if np.isnan(first).all():
