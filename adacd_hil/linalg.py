@@ -29,7 +29,7 @@ def misfit(w: Vector, theta: Vector, tau: float) -> float:
 
 @compiled
 def quadratic(A: Vector, x: Vector) -> float:
-    """Return x' A x of a symmetric A; 0 where rounding makes it negative."""
+    """Return x' A x of a symmetric A, whose lower half is read; 0 in place of a negative result."""
     total = 0.0
     for j in range(x.shape[0]):
         if x[j] != 0.0:

@@ -135,7 +135,8 @@ class CertifiedBlock(SchemeBlock):
 def block_sizes(parameter_count: int, further_count: int = 0, channel_count: int = 0) -> dict[str, int]:
     """Return the number of values of each kind of field by the size's name in the annotations of the blocks' classes.
 
-    further_count: parameters after the `parameter_count` dynamic ones. channel_count: of the detector bank, per joint.
+    A field of one number has the size "", which has no entry. further_count: parameters after the `parameter_count`
+    dynamic ones. channel_count: of the detector bank, per joint.
     """
     return {
         "n": JOINTS,

@@ -12,8 +12,8 @@ _LIKE = 0.66
 def nearest_name(word: str, known: Iterable[str]) -> str | None:
     """Return the known name that is most like `word` in each of its dotted parts; None if none is like it.
 
-    Like it: each part has a share of common letters of at least `_LIKE`. None, too, for a word that is shorter
-    than `_SHORTEST` or longer than `_LONGEST`. Case is ignored. Units may be missing: `threshold` stands for
+    Like it: each part has a share of common letters of at least `_LIKE`. None, too, for a word that is shorter than
+    `_SHORTEST` or longer than `_LONGEST`. Case is ignored. A short unit may be missing: `threshold` is like
     `threshold_Nm`. Of equally near names the first is returned.
     """
     if not _SHORTEST <= len(word) <= _LONGEST:

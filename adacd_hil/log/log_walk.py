@@ -59,7 +59,8 @@ class Extras:
 def read_head(path: Path) -> Extras:
     """Return the attachments and metadata at the beginning of a file, up to the metadata of the run.
 
-    Damaged ones are left out. Raises LogError if the file can't be read or isn't MCAP.
+    Without that metadata it reads the whole file. Damaged ones are left out. Raises LogError if the file can't be read
+    or isn't MCAP.
     """
     extras = Extras()
     with failing_as(f"log {path} can't be read"), open_input(path) as file:

@@ -121,7 +121,7 @@ class Truth:
     def model_row(self, cycle: int) -> int | None:
         """Return the index, in `payload_kg` and `theta`, of the values that hold in a cycle, in the truth's own count.
 
-        None if the truth is empty. 0 for a cycle before the first.
+        None if the truth has no such values. 0 for a cycle before the first.
         """
         cycles = self.model_cycle
         return max(int(np.searchsorted(cycles, cycle, side="right")) - 1, 0) if cycles.size else None

@@ -159,7 +159,10 @@ def read_log(path: str | Path, topics: Collection[str] | None = None) -> RunLog:
 
 
 def _own_layout(message_type: MessageType) -> "np.dtype[Any] | None":
-    """Return the numpy type of the payloads of a message type of ours or of bus frames; None if their size varies."""
+    """Return the numpy type of the payloads of a message type of ours or of bus frames; None if their size varies.
+
+    FD frames, whose size varies too, get the type of the longest one.
+    """
     if message_type.name in _KNOWN:
         return _KNOWN[message_type.name]
     try:
@@ -289,7 +292,8 @@ class LogStream:
     def _plan_part(self, head: Extras, path: Path, number: int) -> None:
         """Add a part to the plan, and its metadata and attachments to the log's.
 
-        A part of another log is a problem instead. number: by its name.
+        A part of another log is a problem instead. A file alone that names itself a further part is planned, with a
+        problem. number: by its name.
         """
         metadata = head.metadata.get(RUN_METADATA, {})
         said = metadata.pop(PART_KEY, str(number))
@@ -369,7 +373,10 @@ class LogStream:
             yield piece._replace(series={**piece.series, **absent})
 
     def _pieces(self) -> Iterator[Piece]:
-        """Yield the messages of all parts in pieces; topics, summary and problem, empty at first, grow meanwhile."""
+        """Yield the messages of all parts in pieces; empty summary and problem first.
+
+        These, topics and attachments grow meanwhile.
+        """
         builder = PieceBuilder(self._cycles_per_piece, self.epoch_ns)
         self._problems, self.summary = [], {}
         joined = -1

@@ -48,9 +48,9 @@ def bodies_of(
 ) -> tuple[LinkBody, LinkBody]:
     """Return two rigid links with the parameters `theta` (p,), p = 7 or with gravity 9.
 
-    Without gravity link 1 is a uniform rod. Raises ValueError if no rigid links have them, or if a5 differs by more
-    than 1 % from the value that a2 gives. theta: in the order of `records.PARAMETER_NAMES`. gravity_m_s2: in the plane
-    of motion.
+    Without gravity link 1 is a uniform rod. A negative a2 counts as 0. Raises ValueError if no rigid links have them,
+    or if a5 differs by more than 1 % from the value that a2 gives. theta: in the order of `records.PARAMETER_NAMES`.
+    gravity_m_s2: in the plane of motion.
     """
     alpha, beta, gamma = theta[_A1] - theta[_A3], theta[_A2], theta[_A3]
     if not (gamma > 0.0 and alpha * gamma > beta * beta):
@@ -86,7 +86,8 @@ _COLORS = {"link": "0.35 0.45 0.6 1", "joint": "0.25 0.27 0.3 1"}
 def robot_description(settings: Settings) -> str:
     """Return the URDF of the configured arm: lengths, limits, shapes, and the CAD model's masses and friction.
 
-    Without a CAD model, or with one that no rigid links have, it has no masses, and a comment with the reason.
+    Without a CAD model, or with one that no rigid links have, it has neither masses nor friction, but a comment with
+    the reason.
     """
     arm, tilt_rad = settings.arm, settings.tilt_rad
     robot = Element("robot", name="adacd")

@@ -73,7 +73,7 @@ class CanRecording(NamedTuple):
 def _time_of(wanted: Places, number: Places, t_ns: Places) -> Places:
     """Return the times of the cycles `wanted` (m,), from ascending cycles `number` (n,) and their times `t_ns`.
 
-    A cycle that isn't among them gets 1 ns more than the cycle before it, or 1 ns less than the first one.
+    A cycle that isn't among them gets 1 ns more than the last one before it, or 1 ns less than the first one.
     """
     place = np.searchsorted(number, wanted)
     is_known = number[np.minimum(place, len(number) - 1)] == wanted
@@ -84,10 +84,11 @@ def _time_of(wanted: Places, number: Places, t_ns: Places) -> Places:
 def load_recording(path: Path, settings: Settings, codec: Codec) -> CanRecording:
     """Read a recording, and put its frames in the order in which the host would have read them.
 
-    Frames after all cyclic ones of a cycle, and in real time those after the host's wait, go to the next cycle. Of
-    several CAN channels, the one with SYNCs counts; frames that a `Bus` doesn't receive are dropped. By the DBC's
-    senders the host's frames count as sent. Raises LogError if it can't be read, or has no SYNC with a counter, or
-    SYNCs of two channels; CodecError if the DBC lacks Sync or a device's cyclic frame.
+    Received frames after all cyclic ones of a cycle, and in real time those after the host's wait, go to the next
+    cycle, but for those before an attempt's first SYNC. Of several CAN channels, the one with SYNCs counts; frames that
+    a `Bus` doesn't receive are dropped. By the DBC's senders the host's frames count as sent. Raises LogError if it
+    can't be read, or has no SYNC with a counter, or SYNCs of two channels; CodecError if the DBC lacks Sync or a
+    device's cyclic frame.
     """
     found = read_frames(path)
     sync_id = codec.message("Sync").can_id
@@ -195,7 +196,7 @@ class RecordingAgainstLog(LogSource):
         return piece._replace(series=series, frames=frames)
 
     def notes(self) -> list[str]:
-        """Return the gaps and defects of log and recording that can't be replayed or compared, a line each."""
+        """Return the gaps and defects of log and recording that can't be replayed or compared, as lines."""
         notes = super().notes()
         if self._missing:
             notes.insert(0, f"{self._missing} cycles of the run are not in {self._recorded.name}")
@@ -240,7 +241,7 @@ class RecordingAlone:
     def __init__(self, path: Path, settings: Settings, codec: Codec) -> None:
         """Read the recording. In a recording of a bus in lockstep, samples get the nominal period.
 
-        Raises LogError if it can't be read, or has no SYNC with a counter.
+        Raises LogError or CodecError as `load_recording` does.
         """
         self._recording = load_recording(path, settings, codec)
         self._path = path

@@ -210,7 +210,11 @@ class AttemptSplitter:
             )
 
     def _read_periods(self, number: Places, arm: NDArray[Any], is_begin: NDArray[np.bool_]) -> tuple[Places, Places]:
-        """Return each cycle's periods by /arm (n,), and the number of cycles before it that the log lacks (n,)."""
+        """Return each cycle's periods by /arm (n,), and the number of cycles before it that the log lacks (n,).
+
+        Behind a gap within an attempt the periods are the steps of the cycle's number, at least 1. The number is
+        negative where the log goes back. Call it once per piece, in the log's order.
+        """
         periods = np.asarray(arm["periods"], np.int64)
         steps = np.diff(number, prepend=self._last_cycle)
         missing = np.where(is_begin, number - arm["first_cycle"].astype(np.int64), steps - periods)
@@ -231,7 +235,8 @@ class AttemptSplitter:
     ) -> tuple[Places, Places]:
         """Return each cycle's periods by its overruns (n,), and the number of cycles before it that the log lacks (n,).
 
-        The periods of an attempt's first cycle depend on the counters of SYNC, too.
+        The periods of an attempt's first cycle depend on the counters of SYNC, too. Behind a gap, and where the log
+        goes back, periods and number are as `_read_periods` returns them.
         """
         overruns = cycles["overruns"].astype(np.int64)
         skipped = np.diff(overruns, prepend=self._overruns)
@@ -331,10 +336,10 @@ class LogSource:
         return place_devices(settings) if own is None else own
 
     def parts(self, with_frames: bool) -> Iterator[Part]:
-        """Yield the content of the log piece by piece from front to end; each call begins with the first piece.
+        """Yield the content of the log piece by piece from front to end; call it once.
 
-        with_frames: read the frames, too; else stretches have none. Raises LogError if they are wanted and the log has
-        no topic for them.
+        Attempts and gaps are counted from piece to piece. with_frames: read the frames, too; else stretches have none.
+        Raises LogError if they are wanted and the log has no topic for them.
         """
         self._stream = self._open(with_frames)
         for read in self._stream:
@@ -357,9 +362,9 @@ class LogSource:
         return piece
 
     def notes(self) -> list[str]:
-        """Return the gaps and defects of the log that can't be replayed or compared, a line each.
+        """Return the gaps and defects of the log that can't be replayed or compared, as lines.
 
-        Complete after the last of `parts`.
+        At most SHOWN gaps have a line each; one more line counts the rest. Complete after the last of `parts`.
         """
         splitter = self._splitter
         notes = [f"the log is not whole: {self._stream.problem}"] if self._stream.problem else []

@@ -52,10 +52,11 @@ Watch = Callable[[int, Ticks, SchemeBatch], None]
 
 
 def replay(path: Path, script_of: ScriptOf | None = None) -> Replay:
-    """Replay a log with its own settings, compare each decision with the log, and return the outcome.
+    """Replay a log with its own settings, compare the decisions with the log's, and return the outcome.
 
-    script_of: plays the user of a configuration; with it, the requests of a run without typed requests are compared.
-    Raises LogError, ConfigError or CodecError if the log, its attachments or a device can't be read.
+    Behind missing cycles, decisions of the same attempt are not compared. script_of: plays the user of a configuration;
+    with it, the requests of a run without typed requests are compared. Raises LogError, ConfigError or CodecError if
+    the log, its attachments or a device can't be read.
     """
     source, remarks = LogSource(path), list[str]()
     truth = contacts_beside(path, remarks.append)
@@ -70,11 +71,12 @@ def replay_many(
     watch: Watch | None = None,
     stretch: TimeWindow = WHOLE,
 ) -> list[Replay]:
-    """Replay a log, or a stretch of it, once for each of the settings; the log is read and decoded once.
+    """Replay a log, or a stretch of it, once for each of the settings; the log is read once.
 
-    Only settings equal to the log's are compared with it. progress: prints a line about the work. watch: called with
-    the decisions of each variant. Raises LogError, ConfigError or CodecError if the log, its attachments or a device
-    can't be read; LogError also if no cycle of the stretch can be replayed.
+    Its frames are decoded once for all settings that decode alike, if at all. Only settings equal to the log's are
+    compared with it. progress: prints a line about the work. watch: called with the decisions of each variant. Raises
+    LogError, ConfigError or CodecError if the log, its attachments or a device can't be read; LogError also if no cycle
+    of the stretch can be replayed.
     """
     source, remarks = LogSource(path), list[str]()
     truth = contacts_beside(path, remarks.append)
@@ -144,10 +146,10 @@ class _Player:
         part: Part,
         events: Sequence[Event],
     ) -> None:
-        """Compare the decisions about a stretch's cycles with the log, and the requests, contacts and events in them.
+        """Compare the decisions about a stretch's cycles with the log, and the requests and events in them.
 
-        Do nothing if the log lacks its decisions, or earlier cycles of the attempt. asked: requests of the script (n,);
-        None: each logged one that is a Request is believed.
+        Keep the contacts' reports for `compare_contacts`. Do nothing if the log lacks its decisions, or earlier cycles
+        of the attempt. asked: requests of the script (n,); None: each logged one that is a Request is believed.
         """
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
@@ -203,7 +205,7 @@ class _Player:
 
 
 def _columns(outputs: Sequence[SchemeOutput]) -> SchemeBatch:
-    """Return the outputs of single cycles as one batch, in which each field is an array."""
+    """Return the outputs of single cycles as one batch of arrays, with a list of the contacts' reports."""
     states = (("state", np.uint8), ("previous_state", np.uint8), ("fault", np.uint8), ("reaction", np.uint8))
     wholes = (("cycle", np.int64), ("contact_joints", np.int64), ("is_model_valid", np.bool_), *states)
     columns: dict[str, Any] = {

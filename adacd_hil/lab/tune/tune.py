@@ -73,11 +73,11 @@ def tune(
 ) -> Tuning:
     """Find thresholds, filter and gain for a rate of false alarms from logs; write no file.
 
-    If no log records the true contacts, filter and gain stay as they are. config: name or file of the settings to start
-    from; None: the logs' own. stretch: of each log; the replays begin with the log, and only their results in the
-    stretch count. Raises TooLittleMotionError if the half to choose on has no free motion with the settings to start
-    from; LogError, ConfigError or CodecError if a log, its settings or its contract can't be used; DetectorError if a
-    registered detector can't be used.
+    If no log records the true contacts, or the rate is extrapolated more than FARTHEST-fold, filter and gain stay as
+    they are. config: name or file of the settings to start from; None: the logs' own. stretch: of each log; the replays
+    begin with the log, and only their results in the stretch count. Raises TooLittleMotionError if the half to choose
+    on has no free motion with the settings to start from; LogError, ConfigError or CodecError if a log, its settings or
+    its contract can't be used; DetectorError if a registered detector can't be used.
     """
     progress(f"reading {number_of(len(paths), 'log')}")
     logs = read_logs(paths, config, stretch, progress)
@@ -146,7 +146,7 @@ def replay_all(logs: Sequence[TunedLog], variants: Sequence[Changes], progress: 
 
 
 def _outcome(logs: Sequence[TunedLog], replays: Sequence[Replay]) -> TuningOutcome:
-    """Return the outcome of each log's replay with one variant; contacts count where the logged scheme was armed."""
+    """Return one outcome of all logs' replays with one variant; contacts count where the logged scheme was armed."""
     took_s = [each for found in replays for each in found.adaptation_s]
     judged = [(found, found.score) for found in replays if found.score is not None]
     armed = {(log.path, window.number) for log in logs for window in log.windows or () if window.is_armed}
@@ -173,7 +173,9 @@ def _outcome(logs: Sequence[TunedLog], replays: Sequence[Replay]) -> TuningOutco
 def problems_of(choice: Choice, outcome: TuningOutcome, own: TuningOutcome, rate_per_h: float) -> tuple[str, ...]:
     """Return the reasons why a candidate is not fit, a few words each; () if it is.
 
-    own: outcome of the unchanged settings.
+    It is fit with a tail, as many finished adaptations as `own`, and no missed contact. The lower bound of its false
+    alarms' rate must not exceed `rate_per_h`, neither in the half to check on nor in the replay. own: outcome of the
+    unchanged settings.
     """
     problems = []
     if choice.calibration is None:
@@ -212,8 +214,8 @@ def _delays(candidate: Candidate) -> tuple[float, ...]:
 def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
     """Return name and settings of the configuration that a suggestion extends.
 
-    config: as the user named it; None: the one that `settings` of the log name, with their arm's profile. Raises
-    ConfigError if that isn't built in, or a configuration can't be read.
+    settings: of the log. config: as the user named it; None: the one that `settings` name. In both cases it gets the
+    arm profile of `settings`. Raises ConfigError if that isn't built in, or a configuration can't be read.
     """
     name = settings.name if config is None else config
     if config is None and name not in builtin_names():
@@ -224,7 +226,8 @@ def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
 def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settings) -> str:
     """Return a suggestion as TOML that `load_settings` reads: the changed keys, with their origin in comments.
 
-    base_name, base: of the configuration that it extends, as from `base_of`.
+    The arm profile of the logs is added if that configuration has another. base_name, base: of the configuration that
+    it extends, as from `base_of`. Raises ConfigError if it can't be read.
     """
     own = tuning.logs[0].settings
     differing = [key for key in changed_keys(keep_log_settings(own, base), own) if key != "name"]
@@ -272,7 +275,10 @@ def _plain(path: Path) -> str:
 
 
 def in_words(found: Found) -> str:
-    """Return the effect of thresholds as a phrase: false alarms, their rate, and contacts found if these are known."""
+    """Return the effect of thresholds as a phrase: false alarms, hours, upper bound of the rate.
+
+    If the contacts are known, also those found, the bounds of their share, and the delays.
+    """
     bound = f"{CONFIDENCE_TEXT} bound {found.rate_bound_per_h:.3g} per hour"
     text = f"{found.alarms} false alarms in {found.hours:.4f} h, {bound}"
     if found.contacts is None:
@@ -293,7 +299,10 @@ def slowest_adaptation(outcome: TuningOutcome) -> str:
 
 
 def outcome_in_words(candidate: Candidate) -> str:
-    """Return a phrase on the replay of all logs with a candidate: adaptations, misses, false alarms, delays."""
+    """Return a phrase on the replay of all logs with a candidate: adaptations, misses, false alarms, delays.
+
+    Without the truth it names the adaptations alone.
+    """
     outcome = candidate.outcome
     slowest = slowest_adaptation(outcome)
     text = f"adaptation {slowest}"
@@ -325,7 +334,7 @@ def _axes(title: str) -> Iterator[tuple[Figure, Axes]]:
 def _curves(tuning: Tuning) -> Iterator[tuple[Choice, dict[str, Any]]]:
     """Yield each choice and its line's style and label: the suggestion first, then the detectors.
 
-    Without a suggestion, the logs' own filter comes first.
+    Without a suggestion, the logs' own filter comes first. There are at most 10 curves; further detectors are left out.
     """
     scheme = tuning.best or tuning.candidates[0]
     named = [(f"scheme: {scheme.name}", scheme.choice), *((choice.name, choice) for choice in tuning.detectors)]
@@ -336,7 +345,8 @@ def _curves(tuning: Tuning) -> Iterator[tuple[Choice, dict[str, Any]]]:
 def draw_roc(tuning: Tuning) -> Drawing:
     """Draw the share of contacts found against the bound of the false-alarm rate that was counted.
 
-    Without the truth, draw that bound against the factor on the thresholds.
+    Add the tail's predictions as dotted lines, and the interval of the first curve's share as a band. Without the
+    truth, draw only that bound against the factor on the thresholds.
     """
     title = "False alarms and contacts found"
     with _axes(title) as (figure, axes):

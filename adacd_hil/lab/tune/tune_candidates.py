@@ -270,9 +270,10 @@ def chosen_blocks(logs: Sequence[TunedLog]) -> NDArray[np.bool_]:
 
 
 def _trials(log: TunedLog, statistics: Statistics) -> Iterator[Trial]:
-    """Yield the statistics of all channels during each contact for which the logged scheme was armed, by its end.
+    """Yield the statistics of all channels during each contact for which the logged scheme was armed.
 
-    Raises LogError if the log can't be read.
+    The order is that of the log's pieces in which the contacts end, within a piece that of their onsets. Raises
+    LogError if the log can't be read.
     """
     waiting = sorted((window for window in log.windows or () if window.is_armed), key=lambda window: window.first)
     if not waiting:

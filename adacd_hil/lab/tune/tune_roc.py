@@ -119,7 +119,10 @@ class Found(NamedTuple):
         return share_bounds(len(self.delays_ms), self.contacts or 0)
 
     def by_key(self) -> dict[str, Any]:
-        """Return hours, false alarms and their bound, and contacts found, if known, by the keys of tune.json."""
+        """Return the effect by the keys of tune.json: hours, false alarms, upper bound of their rate, contacts.
+
+        If the contacts are known, also the number of those found, the bounds of their share, and the delays.
+        """
         plain: dict[str, Any] = {
             "hours": self.hours,
             "false_alarms": self.alarms,
@@ -169,8 +172,9 @@ class Choice:
 def choose(observed: Observed, rate_per_h: float) -> Choice:
     """Return thresholds chosen on one half of the motion, with the alarms and contacts found that they give on both.
 
-    For these thresholds the tail's upper bound is `rate_per_h`; without a tail they are the largest values seen.
-    Raises TooLittleMotionError if the half to choose on has no contact-free motion.
+    For these thresholds the tail's upper bound is `rate_per_h`; without a tail they are the largest values seen. The
+    ROC has the alarms of the half to check on and the contacts of both. Raises TooLittleMotionError if the half to
+    choose on has no contact-free motion.
     """
     first = observed.half(True)
     if np.isnan(first).all():
@@ -409,7 +413,7 @@ class Tuning:
 
 
 def free_hours(log: TunedLog) -> float:
-    """Return the time of the log's contact-free samples, h, all in MONITOR."""
+    """Return the time of the log's contact-free samples, h: in MONITOR, with the truth also after a false alarm."""
     return float(log.motion.is_free.sum()) * log.motion.period_s / 3600.0
 
 

@@ -46,8 +46,8 @@ def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
     """Convert a python-can message to a frame, and add `start_ns` to its time.
 
     Of remote and error frames, length and data are cut to the most that their kind of frame has. Raises ValueError for
-    more data in other frames, or less than their DLC says, an identifier of more than 29 bits, or a time beyond
-    `MOST_NS` or NaN.
+    more data in other frames, or less than their DLC says (above 8 bytes that isn't checked), an identifier of more
+    than 29 bits, or a time beyond `MOST_NS` or NaN.
     """
     most = MAX_DATA if message.is_fd else CLASSIC_BYTES
     data = bytes(message.data)
@@ -239,7 +239,7 @@ class PythonCanFrames:
     def __iter__(self) -> Iterator[NDArray[Any]]:
         """Yield the frames in arrays (n,) of RECORDED_FRAME_DTYPE; drop other records, and set `problem` at the end.
 
-        Raises LogError if the file has records, but none of them is a frame.
+        Raises LogError for a file without a readable frame, if a record of it was not read or python-can failed.
         """
         passed_over = _PassedOver()
         rows: list[tuple[Any, ...]] = []
@@ -271,7 +271,8 @@ class PythonCanFrames:
     def _messages(self, passed_over: _PassedOver) -> Iterator[tuple[can.Message, int]]:
         """Yield the messages up to the first error of python-can, each with a start time to add, ns.
 
-        The error counts as a record that was not read, in `passed_over`.
+        The error counts as a record that was not read, in `passed_over`; so does a BLF that is cut within an object.
+        Lines of a TRC on the state of the bus are skipped.
         """
         suffix = self._path.suffix.lower()
         kind = _READERS.get(suffix) or MESSAGE_READERS[suffix]

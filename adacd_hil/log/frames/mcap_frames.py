@@ -60,7 +60,8 @@ class _Source(NamedTuple):
 class McapFrames:
     """The frames of a log with all its parts: iterate once; `channels`, `epoch_ns` and `problem` are complete after it.
 
-    problem: the first damage or file that can't be read; "" without one. It raises no error in the iteration.
+    problem: the first damage or file that can't be read; "" without one. Damage raises no error in the iteration, but a
+    further part that isn't MCAP raises LogError.
     """
 
     def __init__(self, source: Path | IO[bytes]) -> None:
@@ -85,7 +86,7 @@ class McapFrames:
                 first.seek(0)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Yield the frames of each chunk that has some, in an array (n,) of RECORDED_FRAME_DTYPE."""
+        """Yield the frames of each intact chunk that has some, in an array (n,) of RECORDED_FRAME_DTYPE."""
         for source in self._files:
             if not isinstance(source, Path):
                 yield from self._read(source, "the file")

@@ -51,8 +51,8 @@ class Opening:
     def add_chunk(self, packed: int, size: int) -> None:
         """Add a chunk to the file's counts: `packed`, its bytes in the file, and `size`, its bytes when decompressed.
 
-        Raises ChunkError if the chunk has more than MOST_BYTES, or all chunks more than FREE_BYTES and MOST_RATIO times
-        their bytes in the file.
+        Raises ChunkError if the chunk has more than MOST_BYTES, or all chunks more than FREE_BYTES plus MOST_RATIO
+        times their bytes in the file.
         """
         if size > MOST_BYTES:
             raise ChunkError(f"opens to {size} bytes, more than {MOST_BYTES}")

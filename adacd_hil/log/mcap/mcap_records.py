@@ -147,9 +147,10 @@ def check_magic(begin: bytes, name: str) -> None:
 def walk(file: IO[bytes], name: str, passed: Collection[int] = ()) -> Iterator[RawRecord | IndexRun | Problem]:
     """Yield the records of a file up to its footer, or to bytes that can't be a record.
 
-    Message indexes that follow each other come as one IndexRun. Unless the footer and the file's last magic bytes are
-    reached, and nothing follows, the last item is a Problem; so it is behind an overlong record. passed: kinds of
-    records that come without their body. Raises LogError, which begins with `name`, if the file isn't MCAP.
+    Message indexes that follow each other come as one IndexRun, or as several if they are long. Unless the footer and
+    the file's last magic bytes are reached, and nothing follows, the last item is a Problem; so it is behind an
+    overlong record. passed: kinds of records that come without their body. Raises LogError, which begins with `name`,
+    if the file isn't MCAP.
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
@@ -224,7 +225,7 @@ class FileEnd(NamedTuple):
 def read_end(file: IO[bytes]) -> FileEnd | None:
     """Return the end of a file: its data section's end and CRC, and its summary.
 
-    None if the file has no footer, or no DataEnd before its summary.
+    None if the file has no footer or an impossible offset in it, or no DataEnd before its summary.
     """
     found = _find(file)
     if found is None:
@@ -254,7 +255,7 @@ def _has_shape(record: RawRecord) -> bool:
 def summary_of(file: IO[bytes]) -> list[RawRecord]:
     """Return the records of a file's summary, whether or not its CRC fits.
 
-    [] if the file has no footer, or the summary more than MOST_RECORD_BYTES.
+    [] if the file has no footer or an impossible offset in it, or the summary has more than MOST_RECORD_BYTES.
     """
     found = _find(file)
     if found is None or found[0] - found[1] > MOST_RECORD_BYTES:
@@ -266,7 +267,7 @@ def summary_of(file: IO[bytes]) -> list[RawRecord]:
 def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
     """Return the offset of the footer, that of the summary, and the footer.
 
-    None for a file that ends without a footer.
+    None for a file that ends without a footer, or whose footer has an impossible offset.
     """
     size = file.seek(0, os.SEEK_END)
     place = size - len(MAGIC) - _FOOTER

@@ -39,8 +39,8 @@ class Sink:
     ) -> None:
         """Write to `descriptor`, which belongs to the file `path`.
 
-        waits: `write` blocks while more than `most_waiting` bytes wait. on_written: called by the thread with the
-        number of packets that each write has brought to the disk.
+        waits: `write` blocks while `most_waiting` bytes or more wait. on_written: called by the thread with the number
+        of packets that each write has brought to the disk.
         """
         self.error = ""
         """Error that ended the present file early."""
@@ -103,7 +103,7 @@ class Sink:
 
     @property
     def is_behind(self) -> bool:
-        """Whether too many bytes wait for the disk: more than `most_waiting`, and then until half of it is written."""
+        """Whether too many bytes wait for the disk: more than `most_waiting`, then until half of it or less waits."""
         self._is_behind = self._waiting > (self._most_waiting // 2 if self._is_behind else self._most_waiting)
         return self._is_behind
 
@@ -150,7 +150,7 @@ class Sink:
         """Write data to the present file; after an error drop them and count their packets as lost.
 
         The write that fails is cut from the file, which then ends with the last whole one. `on_written` gets the number
-        of packets of each other write.
+        of packets of each other write; the first packets after a failure are reported by `say`.
         """
         if not self.error:
             try:

@@ -118,7 +118,7 @@ def _unpack_cycle(data: bytes) -> tuple[Packet, int]:
 def _unpack_event(data: bytes) -> tuple[Packet, int]:
     """Return the content of an event's packet, and the offset of its end.
 
-    Raises struct.error for a packet that is cut, ValueError for another kind of packet.
+    Raises struct.error for a packet that is cut within its head, ValueError for another kind of packet.
     """
     kind, dropped, t_ns, *sizes = _EVENT.unpack_from(data)
     if kind != EVENT:

@@ -74,9 +74,9 @@ def start_module(
 ) -> "subprocess.Popen[bytes]":
     """Start a process that runs a module of ours, and return it. Raises OSError if it can't be started.
 
-    Its arguments are the descriptors; it reads `setup`, pickled, from its standard input. It runs in a session of its
-    own, so that Ctrl-C reaches only the control process, and imports this package from its own folder, not from the
-    current one. stderr: as in subprocess; None: this process's.
+    Its arguments are the descriptors; it reads `setup`, pickled, from its standard input, and its standard output is
+    dropped. It runs in a session of its own, so that Ctrl-C reaches only the control process, and imports this package
+    from its own folder, not from the current one. stderr: as in subprocess; None: this process's.
     """
     process = subprocess.Popen(
         [sys.executable, "-P", "-m", module, *map(str, descriptors)],

@@ -82,11 +82,11 @@ class Recorder:
     ) -> None:
         """Create the file, which must not exist (see run_folder.py), and start the writer.
 
-        messages: of the DBC, whose frames are decoded. The counts: see `run_channels`; by default those of the paper's
-        scheme. attachments, metadata: at the file's beginning. epoch_ns: added to t_ns for the log's times; 0 in
-        lockstep. blocking: lockstep. channels: of a log that is no run's. settings: sizes of parts and buffer. live:
-        live view to open. Raises LogExistsError if a log is there already, LogError if the file or the writer can't be
-        made.
+        The log of a run whose start failed is moved aside first. messages: of the DBC, whose frames are decoded. The
+        counts: see `run_channels`; by default those of the paper's scheme. attachments, metadata: at the file's
+        beginning. epoch_ns: added to t_ns for the log's times; 0 in lockstep. blocking: lockstep. channels: of a log
+        that is no run's. settings: sizes of parts and buffer. live: live view to open. Raises LogExistsError if a log
+        is there already, LogError if the file or the writer can't be made.
         """
         settings = settings or LogSettings()
         own = {
@@ -170,7 +170,8 @@ class Recorder:
     ) -> None:
         """Hand a cycle to the writer. messages: (ChannelId, body); frames: oldest first, each with True if it was sent.
 
-        If the ring is full, wait in lockstep; in real time drop the cycle and count it in `dropped`.
+        If the ring is full, wait in lockstep; in real time, or if the writer is dead, drop the cycle and count it in
+        `dropped`.
         """
         self._put(packet.pack_cycle(t_ns, self.dropped, messages, frames))
 
@@ -212,7 +213,10 @@ class Recorder:
         return is_put
 
     def close(self) -> LogSummary:
-        """End the log and return its summary; never raises; a second call returns the same summary."""
+        """End the log and return its summary; a second call returns the same summary.
+
+        Raises OSError if the writer has died or is silent, and the log's folder can't be listed.
+        """
         if self._summary is None:
             self._socket.settimeout(END_TIMEOUT_S)
             with contextlib.suppress(OSError):

@@ -139,7 +139,10 @@ class WriterProcess:
         return self._sink.written > self._file.head_bytes
 
     def _flush(self, now_ns: int) -> None:
-        """Write the chunk in progress; if the part is full, end it and begin the next."""
+        """Write the chunk in progress; if the part is full, end it and begin the next.
+
+        Keep a full part while the disk has failed or is behind. now_ns: stored as the time of the latest flush.
+        """
         self._file.flush()
         self._flushed_ns = now_ns
         if self._is_part_full() and not self._sink.error and not self._sink.is_behind:

@@ -332,7 +332,10 @@ def pack_scheme(output: SchemeOutput, request: Request) -> bytes:
 
 
 def pack_arm(arm: ArmState, first_cycle: int) -> bytes:
-    """Return an /arm message as bytes, without the stamp; first_cycle: number of the attempt's first cycle."""
+    """Return an /arm message as bytes, without the stamp; first_cycle: number of the attempt's first cycle.
+
+    It lacks q, dq and tau_J, which /scheme has.
+    """
     cycle, t_ns, periods, _, _, _, age_q, age_tau_J, is_enabled, is_complete, fault, is_late, steps, sampled_ns = arm
     age_ns = 0 if sampled_ns is None else t_ns - sampled_ns
     ages = (*age_q, *age_tau_J)

@@ -52,7 +52,7 @@ def log_time_ns(payload: bytes) -> int:
 def unpack_log(payload: bytes) -> Event:
     """Return the event in a payload of foxglove_msgs/Log; an unknown level becomes "error".
 
-    Raises struct.error or IndexError if the payload is cut.
+    Raises struct.error or IndexError if the payload is cut before the event's name; a cut name is returned as it is.
     """
     level = _LEVEL_NAMES.get(payload[12], "error")
     position = 13
