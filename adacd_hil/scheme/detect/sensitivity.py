@@ -144,8 +144,9 @@ def measure_noise(k: Constants, m: Memory, tau_J: Vector) -> None:
 def follow_torque_step(k: Constants, m: Memory, tau_J: Vector) -> None:
     """Update the torque sensors' step L (n,), the smallest change ever seen, and its pull on their mean, by one sample.
 
-    A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most. L is
-    at most LARGEST_STEP_NM, and 0 until CHANGES changes were seen: the first ones may be a push.
+    A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most; the
+    pull is PULL times that. L is at most LARGEST_STEP_NM, and 0 until CHANGES changes were seen: the first ones may be
+    a push.
     """
     own = m.sensitivity
     for i in range(tau_J.shape[0]):

@@ -72,7 +72,7 @@ def test(k: Constants, m: Memory, dq: Vector, tau_ext_hat: Vector) -> int:
     """Add a sample to the test; return -1 if the model is refuted, 1 if it has passed, 0 if the test goes on.
 
     Refuted: a joint's |tau_ext_hat| is over `test_limit_Nm`. Passed: `test_cycles` samples, and each joint has once
-    reached `velocity_rad_s` in either direction.
+    reached the speed `velocity_rad_s`; one direction is enough.
     """
     own = m.motion
     m.fit.tested += 1.0
@@ -121,7 +121,8 @@ def test_limit_Nm(k: Constants, square: float) -> float:
 def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dict[str, str]) -> list[str]:
     """Return a line for each unmet condition of `is_complete`, with the motion that fulfils it.
 
-    [] if the fit is complete. names: of the parameters, in the belief's order. units: by parameter's name.
+    The line on too few samples names no motion. [] if the fit is complete. names: of the parameters, in the belief's
+    order. units: by parameter's name.
     """
     own = m.motion
     lines = []
