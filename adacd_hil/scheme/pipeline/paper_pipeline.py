@@ -20,7 +20,7 @@ class PaperPipeline(Pipeline):
     """Pipeline of the paper's scheme.
 
     A model is valid once an adaptation has finished with a mass matrix that is positive definite everywhere. It stays
-    so during later adaptations.
+    so during a later adaptation, unless the user has taken the model back (REVOKED).
     """
 
     _cycle, _end, _run = staticmethod(paper_cycle), staticmethod(end_paper), staticmethod(run_paper)
