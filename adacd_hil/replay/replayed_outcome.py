@@ -278,8 +278,8 @@ Row = tuple[str, ...]
 def side_by_side(replays: Sequence[Replay]) -> list[Row]:
     """Return a table of the replays, a row per quantity: its name, then its value in each replay, as texts.
 
-    Rows: time watched, contacts, delays, thresholds, adaptations, parameters, the last state. "–" stands for a value
-    that is unknown or missing.
+    Rows: time watched, contacts with their delays, missed ones, false alarms, thresholds, smallest pushes, adaptations,
+    parameters, the last state. "–" stands for a value that is unknown or missing.
     """
     rows = [("watched, s", *(f"{each.monitored_s:.2f}" for each in replays))]
     rows.append(("contacts detected", *map(_detected, replays)))

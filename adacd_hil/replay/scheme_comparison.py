@@ -361,7 +361,7 @@ class Asking:
     def _rows(self, ticks: Ticks, batch: SchemeBatch, first: int) -> list[int]:
         """Return the indices of the cycles from `first` on in which the script could make a request.
 
-        Also those in which its wait begins anew.
+        Also those in which its wait begins anew, and `first`: a request left by the attempt before may be made in it.
         """
         assert self._enabled is not None
         is_due = np.zeros(len(ticks.cycle), np.bool_)

@@ -235,12 +235,12 @@ def decay_strain(k: Constants, m: Memory) -> None:
 
 @compiled
 def follow_unit(k: Constants, m: Memory, is_monitored: bool) -> None:
-    """Update `unit` (n,), a factor on the belief's variances, by one sample without contact.
+    """Update `unit` (n,), a factor on the belief's variances, by one sample.
 
     The slow filter's residual counts; in a faster one the velocity's noise would count as the model's error.
-    is_monitored: the unit is the smaller one of those of positive and of negative residuals. Else the model is in its
-    test, and the unit is that of all residuals, with which both signs begin. A joint with an infinite variance, as one
-    at rest, keeps its unit.
+    is_monitored: the sample is without contact, and the unit is the smaller one of those of positive and of negative
+    residuals. Else the model is in its test, and the unit is that of all residuals, with which both signs begin. A
+    joint with an infinite variance, as one at rest, keeps its unit.
     """
     own, share = m.sensitivity, k.noise.unit_share if is_monitored else k.noise.unit_test_share
     for i in range(own.unit.shape[0]):

@@ -12,7 +12,8 @@ the quantities that count. T of eq. (15) is counted in cycles, whose grid keeps 
 `undone_filter.undo_filter` needs only the ends of the mean of five derivatives, and the five periods between them.
 
 **Beside.** Beside the certified scheme it takes the same samples by the same step (`step_beside`): it adapts until eq.
-(15) holds, then compares with its thresholds. Its results are in the block of the scheme in charge.
+(15) holds with enough excitation and motion, then compares with its thresholds. Its results are in the block of the
+scheme in charge.
 """
 
 from dataclasses import dataclass
@@ -336,8 +337,8 @@ def step_beside(
 ) -> None:
     """Process a sample in the paper's scheme while the certified scheme decides; write the results into `main`.
 
-    main: the certified scheme's block. The paper's scheme learns from `begin_adaptation` until eq. (15) holds, then its
-    thresholds are in force.
+    main: the certified scheme's block. The paper's scheme learns from `begin_adaptation` until `_learn` returns
+    ADAPTED, then its thresholds are in force.
     """
     m, own = memory[0], block[0]
     put_sample(block, sample, period_s)

@@ -1,4 +1,4 @@
-"""The paper's scheme: without a certificate; an adaptation waits for a single condition, eq. (15).
+"""The paper's scheme: without a certificate; an adaptation waits for eq. (15), with enough excitation and motion.
 
 The paper's `theta_hat` is the live estimate, after this cycle's correction; tau_f_hat of the same block was predicted
 before it.

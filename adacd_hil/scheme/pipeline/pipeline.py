@@ -140,7 +140,7 @@ class Pipeline(ABC):
     def describe_missing(self) -> list[str]:
         """Return the conditions that an adaptation still waits for, a line each.
 
-        [] in the paper's scheme, which waits for eq. (15) alone.
+        [] in the paper's scheme, also while it waits for eq. (15), excitation or motion.
         """
         return []
 

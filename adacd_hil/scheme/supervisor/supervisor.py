@@ -309,9 +309,9 @@ def _event(
 ) -> int:
     """Return the event of this cycle: a fault, else a contact, else progress of the state; else NONE.
 
-    Faults of arm and finding count in the states that are checked; without any event, a state that has lasted too long
-    is a fault. Store the fault's reason in `m.fault`; without a fault keep it. observation: bits found. is_reporting,
-    goes_on: as of `supervise`.
+    Faults of arm, finding and request count in the states that are checked; without any event, a state that has lasted
+    too long is a fault. Store the fault's reason in `m.fault`; without a fault keep it. observation: bits found.
+    is_reporting, goes_on: as of `supervise`.
     """
     fault = 0
     if _IS_CHECKED[m.state]:
