@@ -13,7 +13,7 @@ A fit is complete after its shortest time when
 
 - each joint has travelled and moved in both directions far and fast enough (a payload leaves friction as it was);
 - no combination of parameters stayed hidden: smallest eigenvalue and condition number of
-  D (∫ W_f' W_f) D; with a payload, earlier knowledge counts too, so only the next point is required;
+  D (∫ W_f' W_f) D; with a payload, earlier knowledge counts too, so only the next points are required;
 - each parameter is known: the standard deviation that the belief gives it is small enough;
 - the inertia is positive definite at every q.
 

@@ -96,7 +96,7 @@ class CertifiedPipeline(Pipeline):
         paper_kernel.step(constants, memory.copy(), block.copy(), 1, 1, paper_kernel.LEARN)
 
     def describe_missing(self) -> list[str]:
-        """Return the lines of a present refusal, and a line for each condition that the fit misses; [] without both."""
+        """Return the lines of a present refusal, and a line for each condition that the fit misses; [] without any."""
         return [*self._watch.describe(), *termination.describe_missing(self._k, self._m, self._names, PARAMETER_UNITS)]
 
     def describe_withheld(self) -> list[str]:
