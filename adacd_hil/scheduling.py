@@ -57,7 +57,7 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True)
 class RealtimeRequest:
-    """The request. scheduler: "fifo", "deadline" or "other". priority: of SCHED_FIFO, 1..98.
+    """The request. scheduler: "fifo", "deadline" or "other" (the present one stays). priority: of SCHED_FIFO, 1..98.
 
     cpu: "any", "isolated" (the first isolated one) or a processor's number. period_ns: of SCHED_DEADLINE.
     """
@@ -73,9 +73,9 @@ class RealtimeRequest:
 class RealtimeGrant:
     """The grant of the operating system.
 
-    `scheduler`: its name, with the priority. `missing`: requests that were refused. `cpu`: the processor that the
-    process stays on, None for any. `cpus`: processors that it was allowed before.
-    `is_awake`: idle states with a long wake-up are forbidden.
+    `scheduler`: its name, with the priority of SCHED_FIFO or the share of SCHED_DEADLINE. `missing`: requests that were
+    refused. `cpu`: the processor that the process stays on, None for any. `cpus`: processors that it was allowed
+    before. `is_awake`: idle states with a long wake-up are forbidden.
     """
 
     scheduler: str
@@ -174,7 +174,8 @@ def _pin(wish: str, cpus: frozenset[int]) -> tuple[int | None, list[Refusal]]:
 def _schedule(libc: ctypes.CDLL, request: RealtimeRequest) -> tuple[str, list[Refusal]]:
     """Set the requested scheduler; return the name of the one in force and the refusals.
 
-    If SCHED_DEADLINE is refused, SCHED_FIFO is requested; if that is refused, the present one stays.
+    If SCHED_DEADLINE is refused, SCHED_FIFO is requested; if that is refused, or "other" is requested, the present one
+    stays.
     """
     missing = []
     if request.scheduler == "other":

@@ -199,7 +199,7 @@ class OutcomeGatherer:
     def score(self) -> Score | None:
         """Return which true contacts were detected and which alarms were false; None if the truth is not known.
 
-        An alarm behind a gap, or in a cycle that the emulator didn't record, is not judged.
+        An alarm behind a gap, or in a cycle that the emulator didn't record, is never false; it may find a contact.
         """
         if self._truth is None:
             return None
@@ -278,8 +278,8 @@ Row = tuple[str, ...]
 def side_by_side(replays: Sequence[Replay]) -> list[Row]:
     """Return a table of the replays, a row per quantity: its name, then its value in each replay, as texts.
 
-    Rows: time watched, contacts, delays, thresholds, adaptations, parameters, the last state. "–" stands for a value
-    that is unknown or missing.
+    Rows: time watched, contacts with their delays, missed ones, false alarms, thresholds, smallest pushes, adaptations,
+    parameters, the last state. "–" stands for a value that is unknown or missing.
     """
     rows = [("watched, s", *(f"{each.monitored_s:.2f}" for each in replays))]
     rows.append(("contacts detected", *map(_detected, replays)))
@@ -378,8 +378,8 @@ def _end(found: Replay) -> str:
 def as_json(found: Replay) -> dict[str, Any]:
     """Return a replay's outcome in plain values for JSON; times in s since the first ADAPT, see `Replay.time_s`.
 
-    Contacts, false alarms and missed contacts are None if the truth is not known. Thresholds that aren't finite are
-    left out.
+    Contacts are the true ones; they, false alarms and missed contacts are None if the truth is not known. Left out are
+    thresholds that aren't finite, contact reports, the comparison with the log, and notes.
     """
     return {
         "cycles": found.cycles,

@@ -215,8 +215,9 @@ class SchemeComparison:
     def compare_requests(self, ticks: Ticks, logged: NDArray[np.uint8], asked: NDArray[np.uint8]) -> None:
         """Compare logged requests of a stretch (n,) with the script's (n,); keep the differences in `unexplained`.
 
-        The first FINISH that isn't in the script may be an interrupt; if the script asks for FINISH later, in a cycle
-        where the log doesn't, it was none. Faults that the host's own checks requested are no difference.
+        The first FINISH that isn't in the script may be an interrupt; if the script asks for FINISH in a cycle of this
+        or a later stretch where the log doesn't, it was none. Faults that the host's own checks requested are no
+        difference.
         """
         for row in np.flatnonzero(logged != asked).tolist():
             cycle, t_ns = int(ticks.cycle[row]), int(ticks.t_ns[row])
@@ -333,9 +334,10 @@ class Asking:
             self._enabled = cycle
 
     def requests(self, ticks: Ticks, batch: SchemeBatch) -> NDArray[np.uint8]:
-        """Return the script's requests in a stretch (n,), given the scheme's states in it.
+        """Return the user's requests in a stretch (n,), as `ask` does, given the scheme's states in it.
 
-        NONE until the drives are enabled. Call it for all stretches of an attempt, in the order of time.
+        NONE until the drives are enabled. Keep a request that the scheme hasn't served, for the next attempt. Call it
+        for all stretches of an attempt, in the order of time.
         """
         asked = np.zeros(len(ticks.cycle), np.uint8)
         if self._enabled is None:
@@ -359,7 +361,7 @@ class Asking:
     def _rows(self, ticks: Ticks, batch: SchemeBatch, first: int) -> list[int]:
         """Return the indices of the cycles from `first` on in which the script could make a request.
 
-        Also those in which its wait begins anew.
+        Also those in which its wait begins anew, and `first`: a request left by the attempt before may be made in it.
         """
         assert self._enabled is not None
         is_due = np.zeros(len(ticks.cycle), np.bool_)

@@ -1,7 +1,7 @@
 """Constants and memory of the certified scheme's compiled code, each declared once with its type and shape.
 
-Each record of memory belongs to one module, which alone writes it; any module may read. In compiled code, and in
-functions that describe its results, k is `Constants` and m is `Memory`.
+The docstring of a record of memory names the module that writes it, of `Gaps` and `Watch` two; any module may read. In
+compiled code, and in functions that describe its results, k is `Constants` and m is `Memory`.
 
 Sizes: n joints; p parameters (dynamic ones, torque offsets, lags, further friction); t terms by place, f = p + n t;
 filters of the bank, channels of its detection. The others are constants of the module that owns the record.
@@ -168,13 +168,13 @@ class Fit:
 
 
 class Sensitivity:
-    """Noise, standstill, friction at rest, missing samples, and the thresholds by them: written by `sensitivity`.
+    """Noise, standstill, friction at rest, and the thresholds by them: written by `sensitivity`.
 
     still, still_smooth, low_speed: shares of standstill and of low speed in a filter's memory. h: thresholds; h_model:
     without standstill and the tail's floor. doubt: deviation by the model's uncertainty. hold, held: torque that
-    friction may hold at rest. roughness, velocity_roughness: noise over that of the
-    settings, squared. unit, strain: factors on variances and on thresholds. used, peak_share: largest residual over its
-    threshold. wide: of the torque with a filter undone.
+    friction may hold at rest. roughness, velocity_roughness: noise over that of the settings, squared. unit, strain:
+    factors on variances and on thresholds. used, peak_share: largest residual over its threshold. wide: of the torque
+    with a filter undone.
     """
 
     still: EachFilter

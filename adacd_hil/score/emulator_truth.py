@@ -1,8 +1,8 @@
 """The truth of a run from the emulator's log: the cycles of its contacts, the model of the arm, its true contacts.
 
-Of a contact the first cycles and the last second are kept as they are. In between, of every `_BUCKET` cycles those
-with the smallest and largest torque of each joint and the largest force; that many contacts of many seconds fit in
-memory, and the peaks and the filtered torque at their end stay exact.
+Of a contact the first cycles and the last `_ENDING` are kept as they are. In between, of every `_BUCKET` cycles those
+with the smallest and largest torque of each joint, and force; that many contacts of many seconds fit in memory, and the
+largest torques and the filtered torque at their end stay exact.
 
 The reader refuses a log of another run, as far as both logs name their scenario.
 """
@@ -110,7 +110,10 @@ class _TruthRows:
         self._waiting = np.zeros(0, _ROW)
 
     def add_records(self, truth: Series) -> None:
-        """Keep, of the next cycles of the truth, those of contacts and those in which payload or parameters change."""
+        """Keep, of the next cycles of the truth, those of contacts and those in which payload or parameters change.
+
+        Also the first cycle after a contact. Of a long contact some are left out, see the module.
+        """
         if not len(truth):
             return
         rows = self._rows(truth)
@@ -330,8 +333,8 @@ KnownContacts = tuple[tuple[TrueContact, ...], EmulatorSpan]
 def contacts_beside(path: Path, progress: Progress = lambda _: None) -> KnownContacts | None:
     """Return the true contacts of a log's run from truth.mcap beside it, and the cycles of which they are known.
 
-    None without that file, for a truth of another run, of which `progress` gets a line, and if the emulator never
-    cycled. Raises LogError for a log that can't be read.
+    None without that file, if the emulator never cycled, and for a truth of another run or one whose heads can't be
+    read, of which `progress` gets a line. Raises LogError for a truth with invalid metadata.
     """
     truth = path.with_name(TRUTH_NAME)
     if not truth.exists():

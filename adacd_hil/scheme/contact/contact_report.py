@@ -118,8 +118,9 @@ def _report(m: CourseMemory, link: int, direction: tuple[int, int], **evidence: 
 def integrated_report(m: CourseMemory, y: Vector, integral: Vector, peak: Vector, a_rad_s: float) -> ContactReport:
     """Return the report of a contact in the paper's scheme, and store its link in `m`.
 
-    Link 2 if joint 2 has crossed its threshold, else 1. y, integral, peak (2,): filtered external torque, its integral
-    and its peak since the contact began. a_rad_s: bandwidth of that filter; the impulse is y / a + integral.
+    Link 2 if joint 2 has crossed its threshold, else 1. y, integral (2,): filtered external torque, Nm, and its
+    integral since the contact began, Nm s. peak (2,): the largest torque since then with the filter undone, Nm.
+    a_rad_s: bandwidth of that filter; the impulse is y / a + integral.
     """
     direction = int(m.direction[0]), int(m.direction[1])
     link = 2 if direction[1] else 1

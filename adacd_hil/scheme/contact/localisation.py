@@ -36,7 +36,7 @@ TOP_PARTS = 3
 """One in so many of a contact's strong samples: the force is a median over these. On a half-sine's top it takes off 1.5
 %."""
 TOP_PLACES = 16
-"""Largest number of windows of that part that are tried: it bounds the work, whatever the number of samples."""
+"""At most twice as many windows of that part are tried: it bounds the work, whatever the number of samples."""
 
 MODEL_SHARE = 0.015
 """Standard deviation of a large torque as a part of it: distortion of a blow by the mean and the velocity loop."""
@@ -99,7 +99,7 @@ def blind_angle_of_link1(tau_1: float, q2: float, length_m: tuple[float, float],
 def _top(forces: Vector) -> float:
     """Return the moving median of forces (n,) that is largest in size, with its sign; 0 without forces.
 
-    Each median is over n / TOP_PARTS forces; about TOP_PLACES windows, evenly spaced, are tried.
+    Each median is over n / TOP_PARTS forces; at most 2 TOP_PLACES windows, evenly spaced, are tried.
     """
     count = forces.shape[0]
     width = max(count // TOP_PARTS, 1)

@@ -144,8 +144,9 @@ def measure_noise(k: Constants, m: Memory, tau_J: Vector) -> None:
 def follow_torque_step(k: Constants, m: Memory, tau_J: Vector) -> None:
     """Update the torque sensors' step L (n,), the smallest change ever seen, and its pull on their mean, by one sample.
 
-    A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most. L is
-    at most LARGEST_STEP_NM, and 0 until CHANGES changes were seen: the first ones may be a push.
+    A mean of samples of standard deviation sigma, rounded to L, is off by L / pi exp(-2 (pi sigma / L)²) at most; the
+    pull is PULL times that. L is at most LARGEST_STEP_NM, and 0 until CHANGES changes were seen: the first ones may be
+    a push.
     """
     own = m.sensitivity
     for i in range(tau_J.shape[0]):
@@ -234,12 +235,12 @@ def decay_strain(k: Constants, m: Memory) -> None:
 
 @compiled
 def follow_unit(k: Constants, m: Memory, is_monitored: bool) -> None:
-    """Update `unit` (n,), a factor on the belief's variances, by one sample without contact.
+    """Update `unit` (n,), a factor on the belief's variances, by one sample.
 
     The slow filter's residual counts; in a faster one the velocity's noise would count as the model's error.
-    is_monitored: the unit is the smaller one of those of positive and of negative residuals. Else the model is in its
-    test, and the unit is that of all residuals, with which both signs begin. A joint with an infinite variance, as one
-    at rest, keeps its unit.
+    is_monitored: the sample is without contact, and the unit is the smaller one of those of positive and of negative
+    residuals. Else the model is in its test, and the unit is that of all residuals, with which both signs begin. A
+    joint with an infinite variance, as one at rest, keeps its unit.
     """
     own, share = m.sensitivity, k.noise.unit_share if is_monitored else k.noise.unit_test_share
     for i in range(own.unit.shape[0]):

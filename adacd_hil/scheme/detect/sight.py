@@ -122,7 +122,10 @@ def follow_sight(k: Constants, m: Memory) -> bool:
 
 
 def describe_sight(m: Memory) -> str:
-    """Return the smallest push, thresholds and residuals of the last test as one text, each as "joint 1 / joint 2"."""
+    """Return smallest push and thresholds of the last test, each as "joint 1 / joint 2", as one text.
+
+    With the largest ratio of a kept residual to its threshold, of all joints, in %.
+    """
     seen = np.cumsum(m.sight.seen, axis=0)
     worst_Nm = m.sight.seen_worst_Nm
     median, most = ([_quantile(seen[:, i], worst_Nm[i], share) for i in range(JOINTS)] for share in (0.5, 0.99))
@@ -177,7 +180,8 @@ def _why_dim(m: Memory, joint: int) -> str:
 def _quantile(seen: Vector, worst_Nm: float, share: float) -> float:
     """Return the threshold, Nm, that this share of the cycles doesn't exceed, at most worst_Nm.
 
-    seen (bins,): cycles up to each bin. The result is the upper end of a bin.
+    seen (bins,): cycles up to each bin. The result is the upper end of a bin, or worst_Nm if that is lower or the bin
+    is the last one.
     """
     place = int(np.searchsorted(seen, share * seen[-1]))
     if place == BINS - 1:

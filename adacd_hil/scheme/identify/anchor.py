@@ -177,10 +177,11 @@ def is_excluded(m: Memory, joint: int, offset_Nm: float) -> bool:
 
 @compiled
 def innovation(k: Constants, m: Memory, joint: int) -> float:
-    """Return (o - a) / (P_oo + sigma_a² + b² t) for the joint's best known anchor, 1/Nm; 0 without an anchor.
+    """Return (o - a) / (P_oo + sigma_a² + b² t) for the joint's anchor of least sigma_a, 1/Nm; 0 without an anchor.
 
-    o, P_oo: the fit's offset and its variance. theta less the offset's column of P times the result is the model
-    corrected by the anchor as by a measurement of the offset. joint: from 0.
+    For the reading at rest the divisor has holding_Nm² besides. o, P_oo: the fit's offset and its variance. theta less
+    the offset's column of P times the result is the model corrected by the anchor as by a measurement of the offset.
+    joint: from 0.
     """
     offset = int(k.first_offset) + joint
     kind = int(np.argmin(m.anchor.anchor_std[:, joint]))

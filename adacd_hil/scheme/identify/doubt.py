@@ -97,7 +97,7 @@ def causes_of(settings: Settings, count: int) -> Vector:
 
 @compiled
 def clear(m: Memory) -> None:
-    """Set the sums, the count of rows and the peak of the last contact to 0."""
+    """Set the sums, the count of rows and `peak`, the largest residual over its threshold, to 0."""
     own = m.doubt
     own.L[:] = 0.0
     own.b[:] = 0.0

@@ -3,11 +3,11 @@
 A hand that drags, or moves like a mass, has a column of the regressor, so a fit made during the touch explains it. Only
 the arm as it was known before, without the hand, reveals the touch.
 
-Over a touch the fit's earlier beliefs are *kept*, as rows of `evidence`. After an interrupting contact these are all of
-them, and the one at the contact. After a fit that no one model explains (`fit_check`) they are those from before the
-change; after a refuted test, all. The beginning of the touch is not known. So a later fit must agree with each kept
-belief, in each quantity c that a hand can imitate: a joint's friction at some speed, an inertia, an offset without an
-anchor:
+Over a touch the fit's earlier beliefs are *kept*, as rows of `evidence`. `fit_check` stores the last STEPS of them.
+After an interrupting contact the kept ones are all of these, and the one at the contact. After a fit that no one model
+explains they are those from before the change; after a refuted test, all. The first belief is not kept. The beginning
+of the touch is not known. So a later fit must agree with each kept belief, in each quantity c that a hand can imitate:
+a joint's friction at some speed, an inertia, an offset without an anchor:
 
     c (theta - theta_0) <= max(floor, SIGMAS sqrt(c (P_0 + P) c'))
 
@@ -94,7 +94,7 @@ def keep_fit(k: Constants, m: Memory) -> None:
 
 @compiled
 def keep_steps(k: Constants, m: Memory, last: int) -> None:
-    """Keep as evidence the fit's beliefs at its stored steps up to number `last`, from 0.
+    """Keep as evidence the fit's beliefs at its stored steps up to number `last`, counted from 0 since its begin.
 
     The first YOUNG_STEPS are not kept; -1 or less keeps none. Set the count of refused fits to 0. Do nothing if beliefs
     are kept already.
@@ -147,9 +147,9 @@ def _fill_source(k: Constants, m: Memory, s: int, theta: Vector, P: Vector, unit
 def is_no_more(k: Constants, m: Memory) -> bool:
     """Return whether the fit agrees with the kept beliefs: same friction and unanchored offsets, no more inertia.
 
-    Call `evidence.fit` before. Store the comparisons as evidence. Drop a kept belief whose offset contradicts an
-    anchor: it comes from a lean. Count a fit that contradicts the others; if enough such fits in a row agree, drop all
-    kept beliefs, set `has_lapsed` and return True. True also without kept beliefs.
+    Call `evidence.fit` before. Store the comparisons as evidence. Drop a kept belief that comes from a lean, see
+    `_is_leant_on`. Count a fit that contradicts the others; if enough such fits in a row agree, drop all kept beliefs,
+    set `has_lapsed` and return True. True also without kept beliefs.
     """
     is_no_more = True
     for s in range(KEPT, KEPT + int(m.earlier.kept_count)):

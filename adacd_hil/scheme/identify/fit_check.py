@@ -179,8 +179,9 @@ def _better_square(m: Memory, s: int) -> float:
 def last_step_before_change(k: Constants, m: Memory) -> int:
     """Return the number of the last step, from 0, before the fit contradicts itself; NONE if it doesn't.
 
-    First by `last_step_before_contradiction`. If that finds none, but the model of the samples after a step contradicts
-    the fit, return the last step of all; a payload's fit is not tested for that.
+    The number counts all steps since the fit began; a step is stored at its number modulo the STEPS that are stored.
+    First by `last_step_before_contradiction`. If that finds none, but the model of the samples after a stored step
+    contradicts the fit, return the last step of all; a payload's fit is not tested for that.
     """
     own = m.fit_check
     used, oldest = int(own.steps_used), max(int(own.steps_used) - own.steps_rows.shape[0], 0)
@@ -195,10 +196,10 @@ def last_step_before_change(k: Constants, m: Memory) -> int:
 
 @compiled
 def last_step_before_contradiction(k: Constants, m: Memory) -> int:
-    """Return the number, from 0, of the last step whose belief contradicts the fit's; NONE without a contradiction.
+    """Return the number, from 0, of the last stored step whose belief contradicts the fit's; NONE without one.
 
-    If no step does, but the fit doesn't explain a kept sample, return the last step before the first such sample; -1 if
-    the sample came before the first step.
+    The number counts all steps since the fit began. If no stored step does, but the fit doesn't explain a kept sample,
+    return the last step before the first such sample; -1 if the sample came before the first step.
     """
     changed = last_unsteady_step(m)
     first = first_unexplained(m)
@@ -238,7 +239,10 @@ def residual(m: Memory, s: int, joint: int) -> float:
 
 @compiled
 def last_unsteady_step(m: Memory) -> int:
-    """Return the number, from 0, of the last stored step whose belief contradicts the fit's; NONE if none does."""
+    """Return the number, from 0, of the last stored step whose belief contradicts the fit's; NONE if none does.
+
+    The number counts all steps since the fit began; the step is stored at that number modulo the STEPS stored ones.
+    """
     used, steps = int(m.fit_check.steps_used), m.fit_check.steps_rows.shape[0]
     for number in range(used - 1, max(used - steps, 0) - 1, -1):
         if not changed_share(m, number % steps) <= 1.0:

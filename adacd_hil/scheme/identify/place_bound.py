@@ -50,7 +50,7 @@ def _largest_Nm(k: Constants, m: Memory, joint: int) -> float:
 
 
 def describe(k: Constants, m: Memory) -> str:
-    """Return each joint's last checked torque by place, and its bound, as text; "" if the model has no such torque."""
+    """Return "; ", each joint's last checked torque by place, and its bound, as text; "" for a model without one."""
     if not k.position_torque_Nm:
         return ""
     largest, limit = _by_joint(m.place_bound.by_place_Nm), float(k.position_torque_Nm)

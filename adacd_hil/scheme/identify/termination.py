@@ -13,7 +13,7 @@ A fit is complete after its shortest time when
 
 - each joint has travelled and moved in both directions far and fast enough (a payload leaves friction as it was);
 - no combination of parameters stayed hidden: smallest eigenvalue and condition number of
-  D (∫ W_f' W_f) D; with a payload, earlier knowledge counts too, so only the next point is required;
+  D (∫ W_f' W_f) D; with a payload, earlier knowledge counts too, so only the next points are required;
 - each parameter is known: the standard deviation that the belief gives it is small enough;
 - the inertia is positive definite at every q.
 
@@ -72,7 +72,7 @@ def test(k: Constants, m: Memory, dq: Vector, tau_ext_hat: Vector) -> int:
     """Add a sample to the test; return -1 if the model is refuted, 1 if it has passed, 0 if the test goes on.
 
     Refuted: a joint's |tau_ext_hat| is over `test_limit_Nm`. Passed: `test_cycles` samples, and each joint has once
-    reached `velocity_rad_s` in either direction.
+    reached the speed `velocity_rad_s`; one direction is enough.
     """
     own = m.motion
     m.fit.tested += 1.0
@@ -121,7 +121,8 @@ def test_limit_Nm(k: Constants, square: float) -> float:
 def describe_missing(k: Constants, m: Memory, names: tuple[str, ...], units: dict[str, str]) -> list[str]:
     """Return a line for each unmet condition of `is_complete`, with the motion that fulfils it.
 
-    [] if the fit is complete. names: of the parameters, in the belief's order. units: by parameter's name.
+    The line on too few samples names no motion. [] if the fit is complete. names: of the parameters, in the belief's
+    order. units: by parameter's name.
     """
     own = m.motion
     lines = []

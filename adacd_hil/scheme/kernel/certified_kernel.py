@@ -103,7 +103,8 @@ def begin_test(constants: Structured, memory: Structured) -> None:
 def begin_refinement(constants: Structured, memory: Structured) -> None:
     """Store the model in use as certified, and begin to test candidates for a better one.
 
-    Drop the beliefs kept from before a touch, and the evidence of a torque that the model lacks.
+    From now on the lags are not learnt, see `belief.hold_lags`. Drop the beliefs kept from before a touch, and the
+    evidence of a torque that the model lacks.
     """
     k, m = constants[0], memory[0]
     belief.certify(k, m)
@@ -114,11 +115,12 @@ def begin_refinement(constants: Structured, memory: Structured) -> None:
 
 @compiled
 def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
-    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of an observation (`findings`).
+    """Process the block's q, dq, tau_J and fill its other fields; return bits of an observation (`findings`).
 
-    is_complete: 1 for a fresh sample; else the filters and the model stay. A fresh sample with a value that isn't
-    finite makes a gap. steps: periods since the fresh sample before it. mode: bits MEASURE to WEIGH; without WATCH the
-    thresholds are inf.
+    The caller sets q, dq, tau_J and period_s (0: `steps` nominal periods); `paper_*` stay, which
+    `paper_kernel.step_beside` fills. is_complete: 1 for a fresh sample; else the filters and the model stay. A fresh
+    sample with a value that isn't finite makes a gap. steps: periods since the fresh sample before it. mode: bits
+    MEASURE to WEIGH; without WATCH the thresholds are inf.
     """
     k, m, out = constants[0], memory[0], block[0]
     observation = observe(k.limits, k.period_s, block, steps, OVER_SPEED)
@@ -249,7 +251,8 @@ def improve(k: Constants, m: Memory, out: CertifiedBlock, is_touched: bool, mode
 
     The bits: FITTED, CERTIFIED, REFUTED, WITHHELD, with the contradiction in `withheld_by`. is_touched: a joint is over
     its threshold in this cycle. A touch pauses learning, but not a test. In LEARN and TEST its first cycle raises the
-    joints' thresholds and keeps the fit's beliefs as evidence; in REFINE it begins the evidence on the contact's cause.
+    joints' thresholds and keeps the fit's beliefs as evidence, unless learning was paused before; in REFINE a touch
+    begins the evidence on the contact's cause.
     """
     was_free = m.models.recovering_cycles == 0.0
     is_free = belief.is_free(k, m, is_touched)

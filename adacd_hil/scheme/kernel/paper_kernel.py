@@ -12,7 +12,8 @@ the quantities that count. T of eq. (15) is counted in cycles, whose grid keeps 
 `undone_filter.undo_filter` needs only the ends of the mean of five derivatives, and the five periods between them.
 
 **Beside.** Beside the certified scheme it takes the same samples by the same step (`step_beside`): it adapts until eq.
-(15) holds, then compares with its thresholds. Its results are in the block of the scheme in charge.
+(15) holds with enough excitation and motion, then compares with its thresholds. Its results are in the block of the
+scheme in charge.
 """
 
 from dataclasses import dataclass
@@ -53,8 +54,9 @@ line is within 2.1e-5 Nm s of a torque of 2 Nm at 5 Hz."""
 class PaperMemory:
     """The memory of the paper's scheme. mode: LEARN, then ARMED, of a step beside another scheme.
 
-    motion: evidence of the excitation. quiet_cycles: cycles in a row within beta, eq. (15). standstill, integral, peak,
-    wide_history: see `external_torque`. last, between: q, dq, tau_J of the sample before, and of an interpolated one.
+    motion: evidence of the excitation. quiet_cycles: cycles in a row within beta, eq. (15). standstill: see
+    `external_torque`; integral, peak, wide_history: see `undone_filter`. last, between: q, dq, tau_J of the sample
+    before, and of an interpolated one.
     """
 
     has_gap: float
@@ -141,7 +143,10 @@ def constants_of(settings: Settings) -> Structured:
 
 
 def new_memory(parameter_count: int) -> Structured:
-    """Return the memory before the first sample: a gap, with tau_f = 0, W_f = 0 and theta_hat = 0."""
+    """Return the memory (1,) before the first sample: a gap, all else 0; P, too, until `begin_adaptation`.
+
+    parameter_count: p.
+    """
     memory = zeros_of(PaperMemory, {"n": JOINTS, "p": parameter_count, "wide": undone_filter.WIDE_SAMPLES + 1})
     m: PaperMemory = memory[0]
     m.has_gap = 1.0
@@ -184,11 +189,12 @@ def begin_adaptation(constants: Structured, memory: Structured, block: Structure
 
 @compiled
 def step(constants: Structured, memory: Structured, block: Structured, is_complete: int, steps: int, mode: int) -> int:
-    """Process the block's q, dq, tau_J and fill the rest of the block; return bits of an observation (`findings`).
+    """Process the block's q, dq, tau_J and fill its other fields; return bits of an observation (`findings`).
 
-    is_complete: 1 for a fresh sample; else filters and estimate stay. A fresh sample with a value that isn't finite
-    makes a gap. steps: periods since the fresh sample before it. mode: LEARN, ARMED, REPORTING; without ARMED the
-    thresholds are inf, and the contact's impulse and peak 0.
+    The caller sets q, dq, tau_J and period_s (0: `steps` nominal periods). is_complete: 1 for a fresh sample; else
+    filters and estimate stay. A fresh sample with a value that isn't finite makes a gap. steps: periods since the fresh
+    sample before it. mode: LEARN, ARMED, REPORTING; without ARMED the thresholds are inf, and the contact's impulse and
+    peak torque 0.
     """
     c, m, out = constants[0], memory[0], block[0]
     period_s = c.period_s
@@ -268,7 +274,8 @@ def _advance(
 def _compare(c: PaperConstants, m: PaperMemory, dq: Vector, decay: float, out: SchemeBlock) -> None:
     """Fill the torques predicted by the estimate and by the CAD model, and the external torques by these.
 
-    Update each joint's share of standstill first; decay: the share of its old value that stays.
+    Also tau_ext_wide_hat, that by the estimate with the filter undone. Update each joint's share of standstill first;
+    decay: the share of its old value that stays.
     """
     external_torque.follow_standstill(dq, c.standstill_rad_s, decay, m.standstill)
     external_torque.predict(m.W_f, out.theta_hat, out.tau_f_hat)
@@ -330,8 +337,8 @@ def step_beside(
 ) -> None:
     """Process a sample in the paper's scheme while the certified scheme decides; write the results into `main`.
 
-    main: the certified scheme's block. The paper's scheme learns from `begin_adaptation` until eq. (15) holds, then its
-    thresholds are in force.
+    main: the certified scheme's block. The paper's scheme learns from `begin_adaptation` until `_learn` returns
+    ADAPTED, then its thresholds are in force.
     """
     m, own = memory[0], block[0]
     put_sample(block, sample, period_s)

@@ -115,9 +115,10 @@ SLOW_RAD_S = 0.02
 
 @compiled
 def fill(k: Constants, m: Memory, q: Vector, dq: Vector, tau_J: Vector, period_s: float) -> None:
-    """Fill the regressor of a sample in `m`: Y_p, Y_h (n, p) with all terms, and X, the columns of torque by position.
+    """Fill the regressor of a sample in `m`: Y_p, Y_h (n, p), and X, the columns of torque by position.
 
-    Fill M (n, n), the mass matrix of the model in use. Advance the friction's bristles by period_s.
+    The columns of the lags and of cross-talk stay 0, since `filter_bank` writes them into W_f. Fill M (n, n), the mass
+    matrix of the model in use. Advance the friction's bristles by period_s.
     """
     own = m.regressor
     base, count = int(k.first_offset), q.shape[0]

@@ -13,9 +13,9 @@ Filtered regressor, from the paper's eq. (5) with M dq = Y_p theta, and -C' dq +
 
 S(0) is the term -f(t) M(q(0)) dq(0) of eq. (5): L[Y_p] starts at (b / a) Y_p(0).
 
-**After a gap** (start-up, start of an adaptation, an overrun, a lost frame) the motion between two samples is unknown.
-tau_f = W_f theta + tau_ef holds for convolutions over any set of times, as it does for the equation of motion at each
-of them, so the gap is cut out of time: tau_f and W_f go on with the values they had, and S is set to
+**After a gap** (start-up, start of an adaptation, more missing samples than are interpolated) the motion between two
+samples is unknown. tau_f = W_f theta + tau_ef holds for convolutions over any set of times, as it does for the equation
+of motion at each of them, so the gap is cut out of time: tau_f and W_f go on with the values they had, and S is set to
 
     S = W_f - b Y_p(now).
 

@@ -96,11 +96,11 @@ class CertifiedPipeline(Pipeline):
         paper_kernel.step(constants, memory.copy(), block.copy(), 1, 1, paper_kernel.LEARN)
 
     def describe_missing(self) -> list[str]:
-        """Return the lines of a present refusal, and a line for each condition that the fit misses; [] without both."""
+        """Return the lines of a present refusal, and a line for each condition that the fit misses; [] without any."""
         return [*self._watch.describe(), *termination.describe_missing(self._k, self._m, self._names, PARAMETER_UNITS)]
 
     def describe_withheld(self) -> list[str]:
-        """Return the lines of a present refusal: its contradictions and the remedy; [] without a refusal."""
+        """Return the lines of a present refusal, see `CertificateWatch.describe`; [] without a refusal."""
         return self._watch.describe()
 
     @property
@@ -169,11 +169,11 @@ class CertifiedPipeline(Pipeline):
             self._warned = self._warned | {name} if warning else self._warned - {name}
 
     def _weigh(self, state: SchemeState, previous: SchemeState, cycle: int, is_touched: bool) -> SchemeState:
-        """Store the beginning or end of a contact in MONITOR; stop the arm if contacts have a common cause.
+        """Store the beginning or end of a contact in MONITOR, and the time of going on; return the state after that.
 
-        Return the state after that. A common cause takes the certificate back, unless the reaction lets the arm go on.
-        Without a common cause report a contact that followed soon on another, and let a joint over its threshold at the
-        stop be checked for a push FORGOTTEN_S later. is_touched: a joint is over its threshold in this cycle.
+        A common cause of contacts takes the certificate back and stops the arm, unless the reaction lets the arm go on.
+        Otherwise report a contact that followed soon on another, and let a joint over its threshold at the stop be
+        checked for a push FORGOTTEN_S later. is_touched: a joint is over its threshold in this cycle.
         """
         if previous is SchemeState.MONITOR and state is SchemeState.REACT:
             is_contradicted = self._course.supervisor.cause == SchemeEvent.CONTRADICTED

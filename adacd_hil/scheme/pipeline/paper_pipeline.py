@@ -1,4 +1,4 @@
-"""The paper's scheme: without a certificate; an adaptation waits for a single condition, eq. (15).
+"""The paper's scheme: without a certificate; an adaptation waits for eq. (15), with enough excitation and motion.
 
 The paper's `theta_hat` is the live estimate, after this cycle's correction; tau_f_hat of the same block was predicted
 before it.
@@ -20,7 +20,7 @@ class PaperPipeline(Pipeline):
     """Pipeline of the paper's scheme.
 
     A model is valid once an adaptation has finished with a mass matrix that is positive definite everywhere. It stays
-    so during later adaptations.
+    so during a later adaptation, unless the user has taken the model back (REVOKED).
     """
 
     _cycle, _end, _run = staticmethod(paper_cycle), staticmethod(end_paper), staticmethod(run_paper)

@@ -4,7 +4,7 @@ A cycle: the present state selects the kernel's tasks, the kernel's findings mov
 its actions: an adaptation begins or ends, a contact's report begins or becomes final. The actions
 that differ between the schemes are methods of `PaperPipeline` and `CertifiedPipeline`; `new_pipeline` chooses one.
 
-The cycle is compiled (`kernel.cycle`), the same live and in a replay. A few cycles have tasks for Python. `_attend`
+The cycle is compiled (`kernel.cycle`), the same live and in a replay. A few cycles have tasks for Python. `_finish`
 runs them in the same cycle, before the decision is issued.
 
 **The interval** between two samples is that between the SYNCs on which they were taken: a sample that arrives late was
@@ -79,7 +79,8 @@ class Pipeline(ABC):
     """Adaptation and contact detection for one run: the compiled cycle, and a scheme's rare tasks in Python.
 
     numbers: the kernel's arrays. tau_ext_hat (2,): external torque that is reported in each cycle, Nm, a view.
-    theta_ff: model from the last finished adaptation, for the feedforward; zeros before the first.
+    theta_ff: model for the feedforward, from the last finished adaptation, or refined since; zeros before the first,
+    and after REVOKED.
     """
 
     tau_ext_hat: Vector
@@ -139,7 +140,7 @@ class Pipeline(ABC):
     def describe_missing(self) -> list[str]:
         """Return the conditions that an adaptation still waits for, a line each.
 
-        [] in the paper's scheme, which waits for eq. (15) alone.
+        [] in the paper's scheme, also while it waits for eq. (15), excitation or motion.
         """
         return []
 

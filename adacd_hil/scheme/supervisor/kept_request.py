@@ -22,9 +22,10 @@ class KeptRequest:
         return carried
 
     def ask(self, request: Request, state: SchemeState) -> None:
-        """Keep a request to finish, or to change the payload in a state that serves it; ignore all others.
+        """Keep a request to finish, or to change the payload in a state in which it waits; ignore all others.
 
-        A request replaces the kept one, but nothing replaces FINISH. state: that of the cycle before.
+        Such states are in `KEPT_IN`. A request replaces the kept one, but nothing replaces FINISH. state: that of the
+        cycle before.
         """
         is_kept = request is Request.FINISH or (request is Request.PAYLOAD and state in KEPT_IN[request])
         if is_kept and self.request is not Request.FINISH:

@@ -5,8 +5,9 @@ ENABLE, ADAPT, CERTIFY, MONITOR and PAYLOAD -> REACT, and from there back; MONIT
 any -> FAULT, which is latched. A pair that is not in the table leaves the state as it is. Each cycle has one event:
 `_event` chooses a fault first, then a contact, then the progress of the state.
 
-A collision is latched: REACT -> STOPPED until the user acknowledges. So are a late host, a contact that has grown into
-a collision, and a contact that has lasted too long. Any other contact clears itself: REACT returns to the state before.
+A collision is latched: REACT -> STOPPED until the user acknowledges. So are a late host, a contradiction of the
+certificate, and a contact that has grown into a collision, has lasted too long, or that the user attributes to a
+changed payload. Any other contact clears itself: REACT returns to the state before.
 CERTIFY is the exception: REACT leads to ADAPT and the fit is forgotten, because an arm that still stands would pass the
 test without a model.
 
@@ -99,7 +100,7 @@ class SupervisorConstants:
 
     max_age_cycles: largest age of a value; blind_limit: cycles in a row without a new sample. clear_cycles: cycles
     without contact that clear it; patience_cycles: periods after which a contact is latched; rebound_cycles: first
-    periods of REACT, in which speed is no fault. limit_periods: longest stay, by state; only some states have one.
+    periods of REACT, in which OVER_SPEED is no fault. limit_periods: longest stay, by state; only some states have one.
     """
 
     has_gravity: int
@@ -308,9 +309,9 @@ def _event(
 ) -> int:
     """Return the event of this cycle: a fault, else a contact, else progress of the state; else NONE.
 
-    Faults of arm and finding count in the states that are checked; without any event, a state that has lasted too long
-    is a fault. Contact and progress change `m` also in a cycle with a fault. Store the fault's reason in `m.fault`;
-    without a fault keep it. observation: bits found. is_reporting, goes_on: as of `supervise`.
+    Faults of arm, finding and request count in the states that are checked; without any event, a state that has lasted
+    too long is a fault. Store the fault's reason in `m.fault`; without a fault keep it. observation: bits found.
+    is_reporting, goes_on: as of `supervise`.
     """
     fault = 0
     if _IS_CHECKED[m.state]:
@@ -456,7 +457,7 @@ def _is_commissioned(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, o
 def _overdue(k: SupervisorConstants, m: SupervisorMemory) -> int:
     """Return the fault of a state that has lasted too long, or NONE.
 
-    Learning states share one time limit, in which REACT doesn't count.
+    Learning states share one time limit, in which REACT and STOPPED don't count.
     """
     spent = m.learning_periods if IS_LEARNING[m.state] else m.phase_periods
     is_over = spent >= k.limit_periods[m.state]
@@ -468,8 +469,8 @@ def _check(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observation
     """Return the first fault in this cycle, or NONE.
 
     In this order: the arm's own; a value that isn't a number; a late host, except where the arm holds for it; old data;
-    no new sample for too long; position or speed over a limit, speed not in the first periods of REACT; drives that
-    aren't enabled in a powered state. observation: bits of the findings.
+    no new sample for too long; position or speed over a limit, OVER_SPEED not in the first periods of REACT; drives
+    that aren't enabled in a powered state. observation: bits of the findings.
     """
     state = m.state
     fault: int = FaultReason.NONE
