@@ -41,7 +41,7 @@ from adacd_hil.settings.scheme_settings import (
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything a run depends on, resolved. Attached to every log."""
+    """All settings of a run, resolved. Its log has them attached."""
 
     name: str = setting("", meaning="name of the configuration")
     scheme: str = setting("paper", choices=("paper", "certified"), meaning="the paper's scheme, or the one beyond it")
