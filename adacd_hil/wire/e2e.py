@@ -106,7 +106,8 @@ class E2eProfile:
     counter the low bits of the next byte, 8 at most. objects: number of a device's objects that carry the header.
     data_id_bytes: of one message; is_id_list: a list by counter, in the DBC attribute `E2EDataIdList`, else a number,
     in `E2EDataId`. crc: returns the CRC of a frame, its counter, and the data ids. is_growing: the largest tolerated
-    step is max_delta, and one more for each cycle since the last frame in sequence, the present cycle included.
+    step is max_delta, and one more for each cycle since the frame that the step is counted from, the present cycle
+    included.
     """
 
     crc_bits: int
