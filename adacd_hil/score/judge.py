@@ -32,10 +32,10 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Detection:
-    """An alarm of a scheme. is_armed: raised by armed detection, in MONITOR; is_known: the truth covers that time.
+    """An alarm of a scheme. is_armed: raised by armed detection, in MONITOR.
 
-    row: index in the run's cycles, -1: unknown. first, last: its report at the alarm, and the newest one of the same
-    contact; None without a report.
+    is_known: the truth covers that time, or there is no truth. row: index in the run's cycles, -1: unknown. first,
+    last: its report at the alarm, and the newest one of the same contact; None without a report.
     """
 
     t_ns: int

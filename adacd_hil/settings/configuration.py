@@ -79,7 +79,7 @@ class Settings:
     def commission_cycles(self) -> int:
         """Cycles in a row, with complete data, that must pass the checks at rest before the drives are enabled.
 
-        Those of `safety.commission_s`, at least one.
+        Those of `safety.commission_s`, at least one. A cycle with incomplete data that passes doesn't end the row.
         """
         return max(1, round(self.safety.commission_s / self.bus.period_s))
 

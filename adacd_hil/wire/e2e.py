@@ -84,7 +84,8 @@ class Tolerance:
     """Largest step of the counter that counts as loss; a larger one is a wrong sequence [MaxDeltaCounter, of Profile 2
     MaxDeltaCounterInit]."""
     max_missing: int
-    """Most cycles in a row without a new frame; after more, the sequence counts as lost [MaxNoNewOrRepeatedData]."""
+    """Most cycles in a row without a frame or with a repeated one; after more, the sequence counts as lost
+    [MaxNoNewOrRepeatedData]. A cycle with a wrong CRC neither counts nor ends the row."""
     sync_frames: int
     """Frames in sequence after the frame that shows a lost sequence, before values are used again [SyncCounterInit]."""
 
@@ -309,9 +310,9 @@ class ProtectedReceiver(E2eReceiver):
     def _accept(self, delta: int) -> E2eStatus:
         """Return the status of a frame whose counter advanced by `delta`, a tolerated step, and update the sequence.
 
-        SYNC for the first frame after more than `max_missing` cycles without a new one, and for the `sync_frames`
-        frames after that frame or after a wrong sequence. Other frames: OK for a step of 1, OK_SOME_LOST for a larger
-        one.
+        SYNC for the first frame after more than `max_missing` cycles without a frame or with a repeated one, and for
+        the `sync_frames` frames after that frame or after a wrong sequence. Other frames: OK for a step of 1,
+        OK_SOME_LOST for a larger one.
         """
         missing, self._missing = self._missing, 0
         if missing > self._tolerance.max_missing:

@@ -142,7 +142,7 @@ class LockstepBus(Bus):
             self._queue.append((can_id, self._count, now_ns, data))
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, with the clock at its end; or None with the clock after `timeout_s`.
+        """Return the next frame, with the clock at its end unless that is past; or None, the clock after `timeout_s`.
 
         Raises SilenceError if no device answers a SYNC, BusError if the bus behind fails.
         """
