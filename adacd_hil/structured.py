@@ -59,7 +59,8 @@ def zeros_of(kind: type[Any], sizes: Mapping[str, int]) -> Structured:
 def packed(values: Any) -> Structured:
     """Return one record (1,) with copies of the fields of an instance of a dataclass, all float64.
 
-    Its fields are numbers, arrays and such instances, which become records in it.
+    Its fields are numbers, arrays and such instances, which become records in it. Raises ValueError for a field whose
+    name is numpy's own.
     """
     record = np.zeros(1, _described_as(values))
     _fill(record[0], values)

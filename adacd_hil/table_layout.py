@@ -30,7 +30,7 @@ def fit_table(
 
     No line is wider than `width`, of at least 20; None: no limit. A wider table is returned in parts, an empty line
     between them. is_cut: each row is one line, its cells cut. names: number of columns that identify a row; each part
-    begins with them, if they leave room for others. [] without lines.
+    begins with them, or with the first alone if they leave no room for others. [] without lines.
     """
     if not lines:
         return []

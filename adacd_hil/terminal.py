@@ -64,8 +64,9 @@ _FIRST_FIELD = re.compile(r"\s*(?:\S+ )*\S+\s{2,}")
 def fold(text: str, width: int | None) -> str:
     """Return a text, its lines that are longer than `width` folded between words. None: nothing is folded.
 
-    If a line begins with a word and a gap, such as a time, its continuation is aligned below the text after the gap,
-    else it is indented by two letters. A longer word, such as a path, is left whole, so that it can be copied.
+    If a line begins with words and a gap, such as a time, within a third of the width, its continuation is aligned
+    below the text after the gap, else it is indented by two letters more than the line. A longer word, such as a path,
+    is left whole, so that it can be copied.
     """
     if width is None:
         return text
@@ -139,7 +140,10 @@ def painted(text: str, stream: "TextIO | Terminal") -> str:
 
 
 class Terminal(io.TextIOBase):
-    """A standard stream without a buffer, safe for threads. Once its reader has gone, writes are dropped."""
+    """A standard stream without a buffer, safe for threads.
+
+    Once its reader has gone, or a write has failed or given up, writes are dropped.
+    """
 
     encoding = "utf-8"
     """Whatever the locale."""
@@ -147,7 +151,7 @@ class Terminal(io.TextIOBase):
     """Characters that UTF-8 can't encode, as in file names, are written in hexadecimal."""
 
     def __init__(self, descriptor: int, name: str, is_needed: bool) -> None:
-        """Write to `descriptor`. is_needed: an error of writing, as of a full disk, is raised; otherwise it is ignored.
+        """Write to `descriptor`. is_needed: the first error of writing, as of a full disk, is raised, else ignored.
 
         name: of the stream, in errors.
         """
@@ -188,7 +192,8 @@ class Terminal(io.TextIOBase):
     def write_raw(self, text: str) -> None:
         """Write a text without escaping, for our own cursor movements; drop it once the reader has gone.
 
-        Raises OSError if the stream is needed and can't be written, unless its reader has gone.
+        Raises OSError if the stream is needed and can't be written, unless its reader has gone. After a write that
+        failed, later texts are dropped without an error.
         """
         data = text.encode(self.encoding, self.errors)
         if not data or self._is_gone or not self._acquire():
@@ -306,7 +311,8 @@ _LINE_END = "\n"
 def open_terminals() -> None:
     """Replace both standard streams of this process by `Terminal`s; Ctrl-C ends a wait for a blocked one.
 
-    A standard descriptor that is closed is opened to /dev/null, so that no file of ours gets its number.
+    A standard descriptor that is closed is opened to /dev/null, so that no file of ours gets its number. If SIGINT is
+    neither ignored nor handled by others, `_interrupt` handles it, and `_ask_again` is the hook for lost exceptions.
     """
     for descriptor in (0, 1, 2):
         try:

@@ -32,10 +32,10 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Detection:
-    """An alarm of a scheme. is_armed: raised by armed detection, in MONITOR; is_known: the truth covers that time.
+    """An alarm of a scheme. is_armed: raised by armed detection, in MONITOR.
 
-    row: index in the run's cycles, -1: unknown. first, last: its report at the alarm, and the newest one of the same
-    contact; None without a report.
+    is_known: the truth covers that time, or there is no truth. row: index in the run's cycles, -1: unknown. first,
+    last: its report at the alarm, and the newest one of the same contact; None without a report.
     """
 
     t_ns: int
@@ -49,7 +49,8 @@ class Detection:
 def begins_of(at: NDArray[Any], pause: float, last: float | None = None) -> NDArray[np.bool_]:
     """Return which samples over a threshold, at ascending times (n,), begin an alarm: those after more than a pause.
 
-    last: time of the sample before them, whose alarm they may continue; None: there is none. All times in one unit.
+    last: time of the sample before them, whose alarm they may continue; None: there is none, and the first sample
+    begins an alarm. All times in one unit.
     """
     begins = np.diff(at, prepend=at[:1] if last is None else [last]) > pause
     if last is None:
@@ -90,7 +91,7 @@ class TrueContact:
 
     @property
     def end(self) -> int:
-        """First cycle without the contact; its last one where the truth ends with it."""
+        """First cycle after the contact; its last one where the truth or the attempt ends with it."""
         return int(self.cycle[-1])
 
     @property
@@ -160,7 +161,7 @@ def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
 
 
 def contacts_of_alarms(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times:
-    """Return for each alarm (n,) the index of the contact that it is about; -1: of none, so that it is false.
+    """Return for each alarm (n,) the index of the contact that it is about; -1: it is about none.
 
     at (n,): times of the alarms. onsets (k,): of the contacts. until (k,): of `explained_until`.
     """
@@ -171,10 +172,11 @@ def contacts_of_alarms(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[An
 
 
 def judge(contacts: Sequence[TrueContact], alarms: Sequence[Detection], crossings_ns: Sequence[int] = ()) -> Score:
-    """Return which alarm found each true contact, and which alarms are false; contacts, alarms in the order of time.
+    """Return when each true contact was found, and which alarms are false or not judged; all in the order of time.
 
-    crossings_ns: times at which a scheme, replayed on another scheme's motion, first exceeds a threshold. While it
-    still reacts it can raise no alarm: then a crossing finds a contact that began meanwhile (`is_reacting`).
+    Alarms that the truth doesn't cover are not judged, even if they find a contact. crossings_ns: times at which a
+    scheme, replayed on another scheme's motion, first exceeds a threshold. While it still reacts it can raise no alarm:
+    then, if no alarm finds a contact that began meanwhile (`is_reacting`), a crossing does.
     """
     onsets, until = explained_times(contacts)
     about = contacts_of_alarms(np.array([alarm.t_ns for alarm in alarms], np.int64), onsets, until).tolist()

@@ -22,8 +22,8 @@ PUSH_WITHIN = f"{1e3 * sight.WITHIN_S:g} ms"
 class SmallestPush:
     """Percentiles, by PERCENTILE_NAMES, of each joint's smallest push found and of its threshold, Nm.
 
-    hours: time in MONITOR without a touch. tail_rate_per_h: false alarms to be expected if all channels' residuals have
-    the tail of a Gaussian.
+    hours: time in MONITOR without a touch. tail_rate_per_h: false alarms per hour to be expected, of all channels and
+    joints together, if their residuals have the tail of a Gaussian.
     """
 
     push_Nm: tuple[dict[str, float], ...]
@@ -53,7 +53,7 @@ class PushGatherer:
             self._threshold[joint].add_values(in_force[:, joint])
 
     def smallest_push(self) -> SmallestPush | None:
-        """Return the percentiles over all cycles gathered so far, by joint; None before the first."""
+        """Return percentiles by joint, time and rate of false alarms over all cycles so far; None before the first."""
         if not self._push[0].count:
             return None
         seen_s = self._push[0].count * self._period_s

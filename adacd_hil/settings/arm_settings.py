@@ -14,7 +14,7 @@ from adacd_hil.settings.stated import ARM_PROFILES, BITRATES
 UPRIGHT_DEG = 90.0
 """Tilt of a plane of motion in which all of gravity acts."""
 SLIGHT_TILT_DEG = 2.0
-"""Largest tilt at which the model may leave gravity out: 3 % of it acts, for `arm.position_torque_Nm` to cover."""
+"""Largest tilt at which the model may leave gravity out: 3.5 % of it acts, for `arm.position_torque_Nm` to cover."""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ from adacd_hil.settings.scheme_settings import (
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything a run depends on, resolved. Attached to every log."""
+    """All settings of a run, resolved. Its log has them attached."""
 
     name: str = setting("", meaning="name of the configuration")
     scheme: str = setting("paper", choices=("paper", "certified"), meaning="the paper's scheme, or the one beyond it")
@@ -79,7 +79,7 @@ class Settings:
     def commission_cycles(self) -> int:
         """Cycles in a row, with complete data, that must pass the checks at rest before the drives are enabled.
 
-        Those of `safety.commission_s`, at least one.
+        Those of `safety.commission_s`, at least one. A cycle with incomplete data that passes doesn't end the row.
         """
         return max(1, round(self.safety.commission_s / self.bus.period_s))
 

@@ -53,7 +53,7 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 class ConfigurationLayer(NamedTuple):
-    """Settings of one file, or of one profile in it; `origin` names it."""
+    """Settings of one file, of one profile in it, or of `--profile`; `origin` names it."""
 
     origin: str
     table: dict[str, Any]
@@ -104,7 +104,7 @@ def configuration_layers(name_or_file: str, profile: str | None = None) -> list[
 def profiles_of(name_or_file: str) -> list[str]:
     """Return the names of the `[profiles]` that a configuration's own file has, without those that it extends.
 
-    Raises ConfigError as `configuration_layers`.
+    Raises ConfigError for a file that can't be read, wrong `extends`, and `profiles` that is no table.
     """
     return [*_table_in(_load_chain(name_or_file)[-1].table, "profiles", "`profiles`")]
 
@@ -134,10 +134,11 @@ def _find_beside(table: dict[str, Any], folder: Path) -> None:
 
 
 def _load_chain(name_or_file: str, seen: tuple[str, ...] = ()) -> list[ConfigurationLayer]:
-    """Return the files of a configuration and of all that it extends, the base first.
+    """Return the files of a configuration and of all that it extends, the base first, each table with a `name`.
 
-    Relative paths start in the folder of the file that names them. `seen`: those that extend this one. Raises
-    ConfigError for a file that can't be read, and for `extends` that is no text, a circle or too long a chain.
+    A path with a suffix starts in the folder of the file that names it, in `devices` only if it exists there. `seen`:
+    those that extend this one. Raises ConfigError for a file that can't be read, and for `extends` that is no text, a
+    circle or too long a chain.
     """
     if name_or_file in seen:
         raise ConfigError(f"configuration {name_or_file} extends itself")

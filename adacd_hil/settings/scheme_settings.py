@@ -8,7 +8,7 @@ from adacd_hil.settings.schema import ConfigError, setting
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """Eq. (16): F(s) = b / (s + a)."""
+    """The torque filter, eq. (16): F(s) = b / (s + a)."""
 
     a_rad_s: float = setting(10.0, unit="rad/s", low=0.1, high=1000.0, meaning="cut-off of the torque filter")
     b_rad_s: float = setting(
@@ -22,7 +22,7 @@ _GRAVITY_P0 = (50.0, 50.0)
 
 @dataclass(frozen=True)
 class EstimatorSettings:
-    """Eq. (10)."""
+    """The adaptation law, eq. (10): its kind, its gain, and whether gravity is estimated."""
 
     law: str = setting(
         "least_squares", choices=("least_squares", "gradient"), meaning="P from P(0) by least squares, or constant"
@@ -52,7 +52,7 @@ class EstimatorSettings:
 
 @dataclass(frozen=True)
 class TerminationSettings:
-    """Eq. (15) and the evidence it needs."""
+    """The end of adaptation: eq. (15), the evidence it needs, and the longest time."""
 
     beta_Nm: float = setting(0.1, unit="Nm", low=0.001, high=100.0, meaning="bound on |tau_ext_hat| of each joint")
     hold_s: float = setting(5.0, unit="s", low=0.1, high=600.0, meaning="T: how long the bound must hold")
@@ -74,7 +74,7 @@ class TerminationSettings:
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """Eq. (14)."""
+    """Collision detection: thresholds of eq. (14), standstill, upper thresholds, time to decide on the link."""
 
     threshold_Nm: tuple[float, float] = setting((0.15, 0.15), unit="Nm", low=0.001, high=100.0, meaning="per joint")
     standstill_rad_s: float = setting(

@@ -36,7 +36,7 @@ def read_toml(path: Path, kind: str = "configuration") -> dict[str, Any]:
 
 
 def _instead(path: Path, kind: str) -> str:
-    """Return a hint for a missing file: the one with the nearest name beside it, else the command that writes it.
+    """Return a hint for a missing file: the TOML file with the nearest name beside it, else the command for a new one.
 
     "" without a near name if `kind` is no configuration.
     """

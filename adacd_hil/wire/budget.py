@@ -67,8 +67,8 @@ def response_time(
     """Return the longest time from the queueing of a message to the end of its frame.
 
     higher: messages of higher priority; blocking_ns: the longest frame of lower priority; bit_ns: one bit at the
-    nominal rate. If the bus is overloaded, or busy for longer than HORIZON_NS, the result is unbounded: a time over
-    `deadline_ns` (default: HORIZON_NS) that the response time reaches, see `_exceeded`.
+    nominal rate. If the bus is overloaded, or busy for longer than HORIZON_NS, the result is unbounded: a time that the
+    response time reaches, over `deadline_ns` (default: HORIZON_NS) if there is one within the horizon, see `_exceeded`.
     """
     if is_overloaded((*higher, stream)):
         return _exceeded(stream, higher, blocking_ns, bit_ns, HORIZON_NS if deadline_ns is None else deadline_ns)
@@ -282,7 +282,11 @@ class Budget:
 
     @property
     def line(self) -> str:
-        """The verdict in one line: the time left for the host, or a frame that misses its deadline and by how much."""
+        """The verdict in one line: the time left for the host, or a frame that misses its deadline and by how much.
+
+        Of several such frames it names a cyclic one before others, the one that is late by the most, and the number of
+        the rest. The line also has the duration of the cyclic frames if the contract fits or they exceed the period.
+        """
         where = f"{self.name} at {self.period_us} µs"
         if self.is_fit:
             left = f"{format_us(self.host_ns)} µs left for the host"
@@ -432,8 +436,9 @@ def _function(can_id: int, is_extended: bool) -> int:
 def _share_bus(frames: list[FrameBudget], contract: str, arms: int) -> list[FrameBudget]:
     """Return the frames of `arms` arms of one contract on a bus, frames without a node id only once.
 
-    The devices' node ids follow each other from 1, arm by arm; the hosts' go down from the contract's. contract: name
-    of the DBC, for errors. Raises CodecError for a 29-bit identifier and for a node id beyond 126.
+    One arm's frames are returned as they are. Of several, the devices' node ids follow each other from 1, arm by arm;
+    the hosts' go down from the contract's; names begin with `Arm1.` and so on. contract: name of the DBC, for errors.
+    Raises CodecError, if there are several arms, for a 29-bit identifier and for a node id beyond 126.
     """
     if arms == 1:
         return frames

@@ -125,7 +125,8 @@ class MessageCodec(MessageTable):
     def encode_raw(self, *raw: int) -> bytearray:
         """Return a frame of raw integers in the order of `values`, the end-to-end header left zero; for the hot path.
 
-        Raises CodecError if the message has bit fields, struct.error for an integer that doesn't fit its container.
+        Raises CodecError if `values` has bit fields, struct.error for a wrong number of integers, and for one that
+        doesn't fit its container.
         """
         if self._body is None:
             raise CodecError(f"{self.name} has bit fields: encode physical values instead")

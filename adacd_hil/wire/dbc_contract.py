@@ -52,8 +52,8 @@ def _check_length(message: Message) -> None:
 def _protection(message: Message) -> tuple[Protection, bytes]:
     """Return the protection by E2EProfile, and the data ids by E2EDataIdList or E2EDataId; b"" without protection.
 
-    A list alone means Profile 2. Raises CodecError for an unknown profile, missing or wrong data ids, or a message that
-    doesn't begin with the profile's header.
+    A list alone means Profile 2. Raises CodecError for an unknown profile, missing or wrong data ids, E2EDataId without
+    a profile, or a message that doesn't begin with the profile's header.
     """
     attributes = message.dbc.attributes if message.dbc else {}
     values = {name: attribute.value for name, attribute in attributes.items()}
@@ -121,7 +121,7 @@ def _lay_out(message: Message) -> tuple[SignalCodec, ...]:
     """Return the signals, placed in containers on byte borders that cover the frame without gaps.
 
     Raises CodecError, with the signal's name, for any other than little-endian integers of 8, 16, 32 or 64 bits on byte
-    borders and bit fields within one byte, and for overlaps and gaps.
+    borders and bit fields within one byte, and for overlaps and gaps; for a gap at the end with the message's name.
     """
     end_bit = 0
     containers = 0
@@ -168,7 +168,7 @@ def _check_messages(database: Database) -> None:
 
 
 def contract_folder() -> Path:
-    """Return the folder of the DBC and EDS files: beside the package when installed, else in the source tree."""
+    """Return the folder of the DBC and EDS files: in the package when installed, else beside it in the source tree."""
     package = Path(__file__).resolve().parent.parent
     installed = package / "dbc"
     return installed if installed.is_dir() else package.parent / "dbc"
@@ -199,8 +199,9 @@ def load_codec(path: Path | None = None) -> Codec:
 def parse_codec(text: bytes, path: Path) -> Codec:
     """Return the codec of the text of a DBC; `path`: its file, existing or not.
 
-    Raises CodecError, with `path` first, for a text that isn't a DBC, a WireVersion that is missing or no number, two
-    messages with the same name or identifier, and a message of a length, layout or protection that no contract has.
+    Raises CodecError, with `path` first, for a text that isn't a DBC, a WireVersion that is missing or no number, more
+    than _MOST_MESSAGES messages, two messages with the same name or identifier, and a message of a length, layout or
+    protection that no contract has.
     """
     database = parse_database(text, path)
     try:

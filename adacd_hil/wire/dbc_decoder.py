@@ -19,7 +19,7 @@ class MessageDecoder:
     is_protected = False
 
     def __init__(self, message: Message, is_exact: bool) -> None:
-        """Take cantools' message. is_exact: frames of another length are refused, as in a contract."""
+        """Take cantools' message. is_exact: `takes` refuses frames of another length, as in a contract."""
         self.name = message.name
         self.can_id = message.frame_id
         self.is_extended = message.is_extended_frame
@@ -68,7 +68,7 @@ class DbcDecoder:
 
     @property
     def is_contract(self) -> bool:
-        """Whether the DBC is marked as a contract; then frames of a wrong length are refused."""
+        """Whether the DBC is marked as a contract; then `MessageDecoder.takes` refuses frames of a wrong length."""
         return self.database.dbc is not None and WIRE_VERSION in self.database.dbc.attributes
 
 

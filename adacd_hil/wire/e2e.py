@@ -84,7 +84,8 @@ class Tolerance:
     """Largest step of the counter that counts as loss; a larger one is a wrong sequence [MaxDeltaCounter, of Profile 2
     MaxDeltaCounterInit]."""
     max_missing: int
-    """Most cycles in a row without a new frame; after more, the sequence counts as lost [MaxNoNewOrRepeatedData]."""
+    """Most cycles in a row without a frame or with a repeated one; after more, the sequence counts as lost
+    [MaxNoNewOrRepeatedData]. A cycle with a wrong CRC neither counts nor ends the row."""
     sync_frames: int
     """Frames in sequence after the frame that shows a lost sequence, before values are used again [SyncCounterInit]."""
 
@@ -106,7 +107,8 @@ class E2eProfile:
     counter the low bits of the next byte, 8 at most. objects: number of a device's objects that carry the header.
     data_id_bytes: of one message; is_id_list: a list by counter, in the DBC attribute `E2EDataIdList`, else a number,
     in `E2EDataId`. crc: returns the CRC of a frame, its counter, and the data ids. is_growing: the largest tolerated
-    step is max_delta, and one more for each cycle since the last frame in sequence, the present cycle included.
+    step is max_delta, and one more for each cycle since the frame that the step is counted from, the present cycle
+    included.
     """
 
     crc_bits: int
@@ -308,9 +310,9 @@ class ProtectedReceiver(E2eReceiver):
     def _accept(self, delta: int) -> E2eStatus:
         """Return the status of a frame whose counter advanced by `delta`, a tolerated step, and update the sequence.
 
-        SYNC for the first frame after more than `max_missing` cycles without a new one, and for the `sync_frames`
-        frames after that frame or after a wrong sequence. Other frames: OK for a step of 1, OK_SOME_LOST for a larger
-        one.
+        SYNC for the first frame after more than `max_missing` cycles without a frame or with a repeated one, and for
+        the `sync_frames` frames after that frame or after a wrong sequence. Other frames: OK for a step of 1,
+        OK_SOME_LOST for a larger one.
         """
         missing, self._missing = self._missing, 0
         if missing > self._tolerance.max_missing:

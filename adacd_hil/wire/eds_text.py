@@ -17,8 +17,8 @@ _COUNT = {"ParameterName": "Number of entries", "DataType": "5", "AccessType": "
 def readable_eds(text: str) -> str:
     """Return the text as canopen reads it, without `[Comments]` and unreadable numbers of `[DeviceInfo]`.
 
-    `[DummyUsage]`, if present, has exactly the dummies 1 to 7, each used or not as in the text. Raises
-    configparser.Error for a text that is no INI file.
+    Objects come before their sub-indices; CompactSubObj becomes sub-indices. `[DummyUsage]`, if present, has exactly
+    the dummies 1 to 7, each used or not as in the text. Raises configparser.Error for a text that is no INI file.
     """
     given, eds = _parser(), _parser()
     given.read_string(text, "object dictionary.eds")

@@ -165,7 +165,7 @@ class FrameReceiver:
         return lost if kind == _SO_RXQ_OVFL else self.frames_lost
 
     def _take_held(self) -> list[Frame]:
-        """Return the frames held from an earlier batch, up to the next drop, and set `frames_lost`."""
+        """Take frames out of `_held`, up to the next drop, and return them; set `frames_lost`."""
         self.frames_lost = max(self.frames_lost, self._held[0][0])
         frames = [frame for lost, frame in self._held if lost <= self.frames_lost]
         self._held = self._held[len(frames) :]

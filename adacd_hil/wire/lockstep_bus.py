@@ -142,7 +142,7 @@ class LockstepBus(Bus):
             self._queue.append((can_id, self._count, now_ns, data))
 
     def receive(self, timeout_s: float) -> Frame | None:
-        """Return the next frame, with the clock at its end; or None with the clock after `timeout_s`.
+        """Return the next frame, with the clock at its end unless that is past; or None, the clock after `timeout_s`.
 
         Raises SilenceError if no device answers a SYNC, BusError if the bus behind fails.
         """
@@ -220,7 +220,7 @@ class LockstepBus(Bus):
     def _forward(self, can_id: int, data: bytes) -> None:
         """Give a frame that the host has transmitted to the devices; after SYNC take their answers.
 
-        Raises SilenceError if answers to a SYNC are expected and none comes, BusError if the bus behind fails.
+        Raises SilenceError as `_take_answers`, BusError if the bus behind fails.
         """
         self._bus.send(can_id, data)
         if can_id == self._sync_id:
@@ -230,7 +230,7 @@ class LockstepBus(Bus):
     def _take_answers(self) -> None:
         """Take the devices' answers to the SYNC just sent, until all are in, END comes, or the patience is over.
 
-        Raises SilenceError when answers are expected and none comes.
+        Raises SilenceError when answers are expected and neither one nor a mark comes.
         """
         self._begin_wait()
         missing = count = len(self._answers)

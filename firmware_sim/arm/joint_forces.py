@@ -176,8 +176,8 @@ FORCES: Final = float_fields(
     {
         "viscous_drift": PAIR,  # factors of friction at this temperature
         "coulomb_drift": PAIR,
-        "link_Nm": PAIR,  # on the link side, less dry and viscous friction
-        "motor_Nm": PAIR,  # on the motor side of an elastic joint, less dry friction
+        "link_Nm": PAIR,  # on the link side, with the bristles' friction, without dry and viscous friction
+        "motor_Nm": PAIR,  # on the motor side of an elastic joint, with viscous friction, without dry friction
         "motor_level_Nm": PAIR,  # dry friction there
         "joint_Nm": PAIR,  # through the sensor; of a stiff joint before motor friction and rotor
         "external_Nm": PAIR,

@@ -84,7 +84,7 @@ class _StepWork(NamedTuple):
 
 
 def work_space(touch_size: int) -> Vector:
-    """Return zeros for a touch state of `touch_size` values, as memory that integration and `observe` overwrite."""
+    """Return the memory (k,) that integration and `observe` overwrite, zeros; touch_size: values of the touch state."""
     return np.zeros(_FORCES_END + _ROWS * touch_size)
 
 
