@@ -72,7 +72,7 @@ class Bench:
         self._order = SyncOrder(is_timed=self._is_wall)
         self._lost_syncs = 0  # before the last one
         self.is_scenario_started = False
-        """Whether both drives have been in Operation enabled at once."""
+        """Whether both drives have been ready for torque at the same SYNC, by `DriveNode.is_ready`."""
         self.injector = Injector(scenario, codec, self._outbox, on_event)
         self._plan = self.injector.plan
         self._body = arm or Body(scenario)
@@ -134,7 +134,7 @@ class Bench:
     def boot(self, t_ns: int = 0) -> None:
         """Set the time to `t_ns` and power on all devices, which send their boot-up messages.
 
-        Faults from power-on begin.
+        Faults from power-on begin after these messages, so they don't change or stop them.
         """
         self.time.begin(t_ns)
         self.injector.power_on(t_ns)

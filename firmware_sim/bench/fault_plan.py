@@ -135,7 +135,9 @@ class FaultPlan:
     def advance(self, scenario_ns: int, since_power_on_ns: int = _BEFORE_NS) -> list[Event]:
         """Set the time, begin and end the faults that are due, queue their actions.
 
-        Return an event for each beginning and end, fault by fault in the order of the plan; empty if none is due.
+        Return an event for each beginning and end, fault by fault in the order of the plan; empty if none is due. A
+        fault with a `duration_s` that begins and ends between two calls gives both events, but acts only if it is a
+        storm of EMCYs.
 
         scenario_ns: since both drives were enabled, negative before. since_power_on_ns: negative if no time counts from
         there. Neither may go back; this is not checked.

@@ -347,7 +347,7 @@ class EmulatedDevice(ObjectDictionary):
         self._errors.report_error(0, t_ns)
 
     def poll(self, t_ns: int) -> int:
-        """Send heartbeats and EMCYs that are due, and find a lost heartbeat; return when the next timer is due.
+        """Send heartbeats and EMCYs that are due, detect the master's silence; return when the next timer is due.
 
         Both times are ns on the device's own clock.
         """

@@ -52,7 +52,7 @@ _COUNTED = ("feedback", "torque", "command")
 
 
 class _Kind(NamedTuple):
-    """A kind of fault: its keys, besides those of its time, and the nodes and frames that it can affect.
+    """A kind of fault: its keys besides `kind`, `at_s` and `since`, and the nodes and frames that it can affect.
 
     is_timed: False: it lasts from power-on and has no `at_s`.
     """
