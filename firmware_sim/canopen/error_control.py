@@ -46,13 +46,13 @@ _COUNT_SUB = 2  # 0x2210: counts are at sub-index 2 + number
 class Watchdog(IntEnum):
     """Numbers of the watchdogs. A comment names the event that clears each."""
 
-    SYNC = 1  # a SYNC comes
+    SYNC = 1  # a SYNC comes while `SyncCounts.is_in_order`
     COMMAND = 2  # a valid command acts
     HEARTBEAT = 3  # the master's heartbeat comes, or monitoring ends
     OPERATIONAL = 4  # NMT start
     LENGTH = 5  # a command frame of the right length comes
     SYNC_ORDER = 6  # 100 SYNCs in a row are right
-    SYNC_LENGTH = 7  # a SYNC of the right length comes
+    SYNC_LENGTH = 7  # a right SYNC comes
     COMMAND_PDO = 8  # Enable operation is withdrawn, or can be obeyed
 
 
