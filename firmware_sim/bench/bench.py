@@ -7,9 +7,9 @@ the cyclic frames last: a host in lockstep goes on when it has them, and then it
 Time: `firmware_sim.bench.bench_time`; nodes: `firmware_sim.bench.bench_nodes`; faults: `firmware_sim.bench.injector`;
 truth: `firmware_sim.bench.bench_time`.
 
-The first SYNC after boot-up or an NMT reset communication (of all nodes or of drive 1) is cycle `counter` − 1, which is
-0 for a master that begins at 1; from there the counter 1…240 is unwrapped. SYNCs that come twice or out of order:
-`firmware_sim.canopen.error_control`.
+The first SYNC after `boot` or an NMT reset (node or communication, of all nodes or of drive 1) is cycle `counter` − 1,
+which is 0 for a master that begins at 1; from there the counter 1…240 is unwrapped. SYNCs that come twice or out of
+order: `firmware_sim.canopen.error_control`.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,14 +54,14 @@ class Bench:
 
         send: called with (identifier, data). clock_mode: the arm's time goes by SYNC ("sync"), or by the clock of
         `advance_to` and frames ("wall"). on_answer: called after each SYNC that devices answer, when all frames are
-        sent. on_truth: called with (cycle, t_ns, block by TRUTH_LAYOUT) for each SYNC that is answered or lost by a
-        fault, and for periods that pass without SYNC until the arm rests; t_ns is the time of the SYNC frame, in
-        lockstep the host's, and the block is valid until the next call. contract: which EDS files the devices have;
-        default: those that go with the codec's DBC. on_event: called with t_ns, level, name and text when a fault
-        begins or ends. arm: None: a body of the scenario's.
+        sent. on_truth: called with (cycle, t_ns, block by TRUTH_LAYOUT) for each SYNC that is answered or, in "sync",
+        lost by a fault; also for periods that pass by the clock until the arm rests, in "wall" from the fourth after a
+        SYNC on. t_ns is the time of the SYNC frame, in lockstep the host's, and the block is valid until the next call.
+        contract: which EDS files the devices have; default: those that go with the codec's DBC. on_event: called with
+        t_ns, level, name and text when a fault begins or ends. arm: None: a body of the scenario's.
 
-        Raises ConfigError when a fault is about a frame that the contract hasn't, or about an object or value that its
-        device can't have; CodecError when the DBC lacks a message; OSError when an EDS can't be read.
+        Raises ConfigError when a fault doesn't fit the contract or its device, as `find_frames` and `check_objects`;
+        CodecError when the DBC lacks a message; OSError when an EDS can't be read.
         """
         self.cycle = -1
         """Number of the last SYNC, -1 before the first."""
@@ -72,7 +72,7 @@ class Bench:
         self._order = SyncOrder(is_timed=self._is_wall)
         self._lost_syncs = 0  # before the last one
         self.is_scenario_started = False
-        """Whether both drives have been in Operation enabled at once."""
+        """Whether both drives have been ready for torque at the same SYNC, by `DriveNode.is_ready`."""
         self.injector = Injector(scenario, codec, self._outbox, on_event)
         self._plan = self.injector.plan
         self._body = arm or Body(scenario)
@@ -134,7 +134,7 @@ class Bench:
     def boot(self, t_ns: int = 0) -> None:
         """Set the time to `t_ns` and power on all devices, which send their boot-up messages.
 
-        Faults from power-on begin.
+        Faults from power-on begin after these messages, so they don't change or stop them.
         """
         self.time.begin(t_ns)
         self.injector.power_on(t_ns)
@@ -166,7 +166,8 @@ class Bench:
         """Take one frame from the bus: run a cycle on SYNC, and pass the others to the devices that receive them.
 
         Error frames have no effect. In clock mode `wall` every other frame first takes time and arm to the frame's
-        time; in `sync` a host's mark does so in lockstep. Devices ignore frames that they don't take.
+        time. In `sync` a SYNC advances both by its periods, and a host's mark advances the time as `advance_to` does.
+        Devices ignore frames that they don't take.
         """
         can_id, data, t_ns, is_error = frame
         if is_error:
@@ -186,7 +187,7 @@ class Bench:
             time.poll(time.now_ns)
 
     def _time_to_sync_ns(self, data: bytes) -> int:
-        """Return by how much this SYNC moves the bench's time if a device hears it, ns.
+        """Return by how much this SYNC moves the bench's time if a device hears it and its counter is in sequence, ns.
 
         0 in clock mode `wall` and before the first SYNC.
         """
@@ -317,10 +318,10 @@ class Bench:
         return is_undisturbed and self._nodes.has_all_answers
 
     def _sample_and_send(self, data: bytes, takers: Sequence[int]) -> None:
-        """Give the nodes their measured values at this SYNC, then send their answers.
+        """Give the nodes that hear this SYNC their measured values, let due timers act, then send the nodes' answers.
 
-        Starts the scenario at the first SYNC at which both drives are ready. takers: 1 for each device that takes this
-        SYNC, else 0.
+        In clock mode `sync`, drives that don't hear it count a lost SYNC. Starts the scenario at the first SYNC at
+        which both drives are ready. takers: 1 for each device that takes this SYNC, else 0.
         """
         now_ns = self.time.now_ns
         heard = self.injector.count_heard(self._sync_id, data)

@@ -21,7 +21,7 @@ TICK_NS = round(TICK_S * 1e9)
 _NODES = ("Drive1", "Drive2", "Sensor1", "Sensor2")
 _LONGEST_PERIOD_US = 100_000
 _UNTOLD_PERIOD_NS = 1_000_000
-"""Time that a SYNC stands for while 0x1006 is 0, as before a set-up."""
+"""Time that a SYNC stands for until 0x1006 of drive 1 is set, if the contract gives no period."""
 
 
 class BenchNodes:

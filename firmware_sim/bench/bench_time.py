@@ -248,8 +248,8 @@ class BenchTime:
     def advance_faults(self, stamp_ns: int, ahead_ns: int = 0) -> None:
         """Begin and end the faults that are due within `ahead_ns` of now, and queue the frames of babbling nodes.
 
-        Those frames are of the period from now on. Do nothing without faults in the scenario. stamp_ns: time of the
-        faults' events, unused in lockstep, where the host's time counts.
+        Those frames are of the period that begins `ahead_ns` from now. Do nothing without faults in the scenario.
+        stamp_ns: time of the faults' events, unused in lockstep, where the host's time counts.
         """
         is_paced = self._outbox.is_paced
         self._injector.advance(self.now_ns + ahead_ns, self.host_ns + ahead_ns if is_paced else stamp_ns)
@@ -258,7 +258,8 @@ class BenchTime:
     def take_mark(self, data: bytes, _t_ns: int) -> None:
         """On an ADVANCE mark, let time pass to the mark's time or until a frame is sent; then send a GRANT mark.
 
-        The first mark begins lockstep. Other data has no effect.
+        Time stays if frames have been sent since the last GRANT mark or `note_sent`. Lockstep begins with the first
+        mark, and anew with a mark that is earlier than the last grant. Other data has no effect.
         """
         mark = unpack_mark(data)
         if mark is None or mark[0] is not MarkKind.ADVANCE:
@@ -284,7 +285,8 @@ class BenchTime:
     def outlive_host(self) -> None:
         """In clock mode `sync`, advance the time without a host until the arm is at rest, at most LONGEST_ORPHANAGE_NS.
 
-        The drives then miss SYNC as in clock mode `wall`. Later calls do nothing until the next SYNC.
+        The drives then miss SYNC as in clock mode `wall`. Do nothing before the first SYNC, and in later calls until
+        the next SYNC.
         """
         if self._is_wall or not self.has_begun or self._has_outlived:
             return

@@ -75,7 +75,7 @@ class FaultPlan:
     ) -> None:
         """Begin before power-on. `torque_count_Nm`: torque of one count of each sensor.
 
-        Raises ConfigError for a fault on a frame that the contract hasn't.
+        Raises ConfigError for a fault that doesn't fit the contract, as `find_frames`.
         """
         self._torque_count_Nm = torque_count_Nm
         self.mask = 0
@@ -120,7 +120,10 @@ class FaultPlan:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether no fault acts on frames or values, no frame is held back, and no action on a node is left."""
+        """Whether no frame is held back, no action on a node is left, and no fault is active that the bench applies.
+
+        Active faults of the kinds `_NODES_OWN` don't count: the node keeps their effect by itself.
+        """
         is_acting = any(row.is_active and row.settings.kind not in _NODES_OWN for row in self._rows)
         return not (is_acting or self._actions or any(row.held for row in self._rows))
 
@@ -132,7 +135,9 @@ class FaultPlan:
     def advance(self, scenario_ns: int, since_power_on_ns: int = _BEFORE_NS) -> list[Event]:
         """Set the time, begin and end the faults that are due, queue their actions.
 
-        Return an event for each beginning and end, fault by fault in the order of the plan; empty if none is due.
+        Return an event for each beginning and end, fault by fault in the order of the plan; empty if none is due. A
+        fault with a `duration_s` that begins and ends between two calls gives both events, but acts only if it is a
+        storm of EMCYs.
 
         scenario_ns: since both drives were enabled, negative before. since_power_on_ns: negative if no time counts from
         there. Neither may go back; this is not checked.
@@ -190,17 +195,17 @@ class FaultPlan:
         return (position1, position2), (velocity1, velocity2), (torque1, torque2)
 
     def sync_delay_ns(self) -> int:
-        """Return the delay, ns, with which this SYNC reaches the devices: the sum of random delays.
+        """Return the delay, ns, with which this SYNC reaches the devices: the sum over the faults that hit it.
 
-        0 without an active fault. Call it once per SYNC.
+        0 if none hits it. Call it once per SYNC: each call uses up hits and random draws.
         """
         return sum(row.late_ns() for row in self._slowing if row.hit())
 
     def babble(self, period_ns: int) -> list[tuple[int, int, bytes]]:
         """Return the flood's frames within `period_ns` from the last `advance` on: offset in ns, identifier, data.
 
-        Each frame is counted and returned once, also by overlapping calls. While all nodes of a row are off the bus,
-        its frames are only counted.
+        Each frame is counted and returned once, also by overlapping calls. Frames that were due before that `advance`
+        are left out, uncounted. While all nodes of a row are off the bus, its frames are only counted.
         """
         frames = []
         for row in self._babbling:
@@ -221,7 +226,10 @@ class FaultPlan:
         return self._power_ns if row.settings.is_from_power_on else self._scenario_ns
 
     def _move(self, row: FaultRow) -> list[Event]:
-        """Begin or end a row if it is due, and return these events. Queue the EMCYs of its storm that are due."""
+        """Begin or end a row if it is due, and return these events. Queue the EMCYs of its storm that are due.
+
+        A row without hits left ends, too.
+        """
         events: list[Event] = []
         now_ns = self._now_ns(row)
         if not row.is_active and not row.is_over and row.begin_ns <= now_ns:

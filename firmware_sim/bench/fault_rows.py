@@ -38,8 +38,9 @@ Place = tuple[int, int]
 class FaultRow:
     """One of a scenario's faults, and its progress.
 
-    hits_left: frames or values that it may still hit. sent: frames of its flood so far. held: by identifier, frames to
-    be overtaken. kept: stuck counts by node, or frozen counters by identifier.
+    hits_left: frames or values that it may still hit. sent: frames of its flood so far; of a drive fault 1 once the
+    drive's failure is queued, 2 once its time is over. held: by identifier, frames to be overtaken. kept: stuck counts
+    by node, or frozen counters by identifier.
     """
 
     def __init__(self, index: int, settings: FaultSettings, seed: str) -> None:

@@ -130,7 +130,7 @@ class Injector:
     """Applies the faults of one bench to frames, measured values and nodes."""
 
     def __init__(self, scenario: Scenario, codec: Codec, outbox: Outbox, on_event: OnEvent | None) -> None:
-        """Begin before power-on. Raises ConfigError for a fault on a frame that the contract hasn't.
+        """Begin before power-on. Raises ConfigError for a fault that doesn't fit the contract, as `find_frames`.
 
         on_event: called with t_ns, level, name and text when a fault begins or ends; None: it isn't.
         """
@@ -231,9 +231,10 @@ class Injector:
                 self._outbox.put_later(self.now_ns + offset_ns, can_id, data)
 
     def count_heard(self, sync_id: int, data: bytes) -> tuple[int, ...]:
-        """Return how often each device hears one SYNC: 0 off the bus or if it is lost, 2 if it is doubled, else 1.
+        """Return how often each device hears one SYNC: 0 off the bus or if it is lost, else 1 or more.
 
-        Call it once per SYNC: it uses up hits of the faults. Faults of a SYNC to all devices at once don't count here.
+        Each fault that duplicates it doubles the number. Call it once per SYNC: it uses up hits of the faults. Faults
+        of a SYNC to all devices at once don't count here.
         """
         plan = self.plan
         return tuple(

@@ -43,7 +43,7 @@ class RecordedCycles:
     def __init__(self, path: Path, codec: Codec) -> None:
         """Open the recording and read its first cycle.
 
-        Raises LogError if it can't be read, CodecError if the DBC lacks Sync or Nmt.
+        Raises LogError if it can't be read, CodecError if the DBC lacks Sync, Nmt or one of `ANSWERS`.
         """
         self.attempt = -1
         """Number of the attempt in progress, -1 before the first."""

@@ -2,8 +2,8 @@
 
 Per SYNC k the device nodes `sample` (and record the `truth` of the same instant), then `advance` to SYNC k + 1 with
 the set-point that was latched at SYNC k; inside a period the body runs on the drives' 100 µs ticks
-(`firmware_sim.body.body_ticks`). All state lies in one vector, so a body is its state, scenario and seed. Bodies,
-hands and walls are a table for compiled code, with the rates at which they make the arm swing.
+(`firmware_sim.body.body_ticks`). The state lies in two vectors, that of the touches apart, and in the generators of
+noise. Bodies, hands and walls are a table for compiled code, with the rates at which they make the arm swing.
 """
 
 import math

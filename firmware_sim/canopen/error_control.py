@@ -46,13 +46,13 @@ _COUNT_SUB = 2  # 0x2210: counts are at sub-index 2 + number
 class Watchdog(IntEnum):
     """Numbers of the watchdogs. A comment names the event that clears each."""
 
-    SYNC = 1  # a SYNC comes
+    SYNC = 1  # a SYNC comes while `SyncCounts.is_in_order`
     COMMAND = 2  # a valid command acts
     HEARTBEAT = 3  # the master's heartbeat comes, or monitoring ends
     OPERATIONAL = 4  # NMT start
     LENGTH = 5  # a command frame of the right length comes
     SYNC_ORDER = 6  # 100 SYNCs in a row are right
-    SYNC_LENGTH = 7  # a SYNC of the right length comes
+    SYNC_LENGTH = 7  # a right SYNC comes
     COMMAND_PDO = 8  # Enable operation is withdrawn, or can be obeyed
 
 
@@ -207,9 +207,10 @@ class HeartbeatProducer:
         self._due_ns = t_ns + self._period_ns if self._period_ns else NEVER_NS
 
     def send_due(self, t_ns: int) -> int:
-        """Send a heartbeat if it is due, one for several missed periods; return when the next is due, ns.
+        """Send a heartbeat if it is due; return when the next is due, ns.
 
-        NEVER_NS without heartbeats. Both times are on the device's clock.
+        After several missed periods one more is due at once, the others are left out. NEVER_NS without heartbeats. Both
+        times are on the device's clock.
         """
         if t_ns >= self._due_ns:
             self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
@@ -236,7 +237,8 @@ class HeartbeatConsumer:
     ) -> None:
         """Watch 0x1016:1, which sets node and timeout.
 
-        `on_silence`, `on_return`: called with t_ns when the heartbeat stays away, and when it is there again.
+        `on_silence`, `on_return`: called with t_ns when the heartbeat stays away, and when it is there again or a write
+        of 0x1016:1 ends or restarts its monitoring.
         """
         self.is_lost = False
         """Whether the heartbeat is monitored and missing."""
@@ -305,7 +307,7 @@ class SyncKind(Enum):
 
 
 class SyncOrder:
-    """Judges every SYNC on the bus by its counter and, where time doesn't go by SYNC, by its time."""
+    """Judges each SYNC of the right length by its counter and, where time doesn't go by SYNC, by its time."""
 
     def __init__(self, is_timed: bool) -> None:
         """`is_timed`: judge the time of a SYNC, too; False where time goes by SYNC."""

@@ -329,16 +329,16 @@ class ObjectDictionary:
     def serve(self, index: int, subindex: int, read: Callable[[], int]) -> None:
         """Read an object's value by `read()` from now on.
 
-        A value set by `replace_value` has priority. Functions that `reader` returned earlier keep their source. An
-        object that the device lacks stays absent.
+        A value set by `replace_value` has priority. A function that `reader` returned earlier keeps the source that it
+        had, if any. An object that the device lacks stays absent.
         """
         self._readers[index, subindex] = read
 
     def reader(self, index: int, subindex: int) -> Callable[[], int]:
         """Return a function that reads a numeric object: its replaced value, its live value by `serve`, or as written.
 
-        It keeps the source of now: a later `serve` or `replace_value` doesn't reach it. It raises `Refusal` when it
-        reads an object that the device lacks.
+        It keeps a replaced or live value's source of now. Without one it reads by `value`: a later `serve` or
+        `replace_value` reaches it, and it raises `Refusal` for an object that the device lacks.
         """
         key = index, subindex
         return self._replaced.get(key) or self._readers.get(key) or (lambda: self.value(index, subindex))
@@ -346,8 +346,8 @@ class ObjectDictionary:
     def replace_value(self, index: int, subindex: int, value: int | None) -> None:
         """Give a numeric object a value in place of its own; None: its own again.
 
-        Reads by SDO and by `value` return it from now on; functions that `reader` returned before don't. Writes go to
-        the object's own value. An object that the device lacks stays absent.
+        Reads by SDO and by `value` return it from now on; a function that `reader` returned before keeps the source
+        that it had, if any. Writes go to the object's own value. An object that the device lacks stays absent.
         """
         if value is None:
             self._replaced.pop((index, subindex), None)

@@ -221,7 +221,7 @@ class Pdos:
         self.act: Callable[[int], None] = lambda _t_ns: None
         """Called when a frame that doesn't wait for SYNC has been written."""
         self.mind_length: Callable[[bool, int], None] = lambda _is_right, _t_ns: None
-        """Called when frames begin or cease to have a wrong length."""
+        """Called with (is_right, t_ns) for each frame of wrong length, and for the first right one after it."""
         self.header = bytes(4)
         """Header of the last protected frame, received or sent."""
         self.header_status: Callable[[], int] = int
@@ -231,7 +231,7 @@ class Pdos:
         self._is_commanded = False  # a command has acted since the last SYNC, without waiting for one
         self._writers: dict[tuple[int, int], Callable[[int], object]] = {}
         self.on_refresh: Callable[[], None] = lambda: None
-        """Called when other PDOs are exchanged than before."""
+        """Called at the end of each `refresh`: other PDOs may be exchanged than before."""
         self._is_operational = False
         self._now_ns = 0
         self.own_ns: Callable[[int], int] = lambda t_ns: t_ns
@@ -243,7 +243,7 @@ class Pdos:
         self._asynchronous: tuple[TransmitPdo, ...] = ()
         self._compared: tuple[TransmitPdo, ...] = ()
         self.has_compared = False
-        """Whether a PDO's events are the changes of its content."""
+        """Whether the events of an active PDO of type 254 or 255 are the changes of its content."""
         self._receiving: tuple[ReceivePdo, ...] = ()
         self._waiting: tuple[ReceivePdo, ...] = ()
         self._sending: frozenset[TransmitPdo] = frozenset()
@@ -291,7 +291,8 @@ class Pdos:
     def refresh(self) -> None:
         """Update which PDOs are active, after a change of the NMT state or of a PDO's objects; then call `on_refresh`.
 
-        TPDOs that become active are due at once; frames that wait in an RPDO no longer synchronous are dropped.
+        TPDOs that become active are due at once; frames that wait in an RPDO no longer active or no longer synchronous
+        are dropped. All active TPDOs begin to count SYNCs anew.
         """
         self._receiving = tuple(pdo for pdo in self.receive if self._is_operational and pdo.is_active)
         sending = tuple(pdo for pdo in self.transmit if self._is_operational and pdo.is_active)
@@ -324,7 +325,10 @@ class Pdos:
                 return
 
     def restart_sequences(self) -> None:
-        """Restart the counters of all protected frames, sent and received, and drop frames that wait for SYNC."""
+        """Restart the counters of all protected frames, sent and received; drop frames that wait for SYNC.
+
+        Stop the deadlines of RPDOs. The counters of TPDOs restart with their next `bind`.
+        """
         pdos: tuple[ReceivePdo | TransmitPdo, ...] = (*self.receive, *self.transmit)
         for pdo in pdos:
             pdo.restart_sequence()

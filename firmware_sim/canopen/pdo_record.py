@@ -59,8 +59,8 @@ class PdoRecord:
         """Read the defaults, and watch the record's objects.
 
         A default mapping that no master could write counts as empty. `longest`: the longest frame, bytes.
-        `message_ids`: identifiers of the contract. `refresh`: called after each change of the configuration except the
-        inhibit time. `message`: the contract's with the PDO's default COB-ID, None without one.
+        `message_ids`: identifiers of the contract. `refresh`: called after each write of the record except of inhibit
+        time and mapping entries. `message`: the contract's with the PDO's default COB-ID, None without one.
         """
         self._dictionary, self._longest, self._message_ids, self._refresh = dictionary, longest, message_ids, refresh
         self.layout = NOTHING

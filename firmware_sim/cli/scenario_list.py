@@ -52,7 +52,7 @@ def check(file: str, codec: Codec) -> ScenarioFinding:
     """Check a scenario file, and its faults' frames and objects against a contract.
 
     Return its problems, or a summary if it has none. A file that can't be read is a problem, too. Objects whose values
-    faults replace aren't looked up in the EDS.
+    faults replace are looked up in the EDS files of the contract that `contract_of` finds.
     """
     try:
         table = read_table(file)

@@ -49,8 +49,8 @@ class Service:
     ) -> None:
         """`departure`: where the bench puts its frames.
 
-        `is_once`: end also when the host has started the nodes and then stops or resets them, or is silent for
-        `_SILENCE_NS`.
+        `is_once`: end also when all nodes have been Operational and then one of them isn't, for whatever cause, or when
+        the host is silent for `_SILENCE_NS`.
         """
         self._bench = bench
         self._bus = bus
@@ -78,8 +78,8 @@ class Service:
     def run(self) -> None:
         """Carry frames and time until a stop is requested; `is_once` also ends it when the host has gone.
 
-        Then it waits until the arm is at rest. Waits for an interface that has gone down. Raises BusError for other
-        failures of the bus.
+        In the latter case it first waits until the arm is at rest, about `LONGEST_ORPHANAGE_NS` at most. Waits for an
+        interface that has gone down. Raises BusError for other failures of the bus.
         """
         while not self._stop.is_made:
             try:
@@ -188,7 +188,7 @@ def open_devices_end(interface: str, channel: str, clock: Clock, codec: Codec) -
     """Return the devices' end of a bus, open.
 
     It hears the host's frames, marks and possible RPDOs; CAN FD only if the contract has such frames. Raises
-    BusMissingError if the interface or channel is missing.
+    BusMissingError if the interface or channel is missing, down or unusable.
     """
     heard = {message.can_id for message in codec.messages.values() if "HOST" in message.senders} | LISTENED_IDS
     heard.add(HOST_MARK)

@@ -236,7 +236,8 @@ class EmulatedDevice(ObjectDictionary):
     def send_emergency(self, code: int, t_ns: int) -> None:
         """Add an error code to the history and send its EMCY at once, whatever the inhibit time.
 
-        No EMCY is sent off the bus, or if the NMT state or 0x1014 forbids it. t_ns: the bench's time.
+        The history gets the code in any case. No EMCY is sent off the bus, or if the NMT state or 0x1014 forbids it.
+        After it the inhibit time begins anew. t_ns: the bench's time.
         """
         self._errors.report_at_once(code, self.clock.own_ns(t_ns))
 
@@ -296,10 +297,10 @@ class EmulatedDevice(ObjectDictionary):
         self._application.find_heartbeat(t_ns)
 
     def note_sync(self, kind: SyncKind, lost: int, t_ns: int) -> None:
-        """Count a SYNC and the `lost` ones before it; trip or clear the watchdogs of SYNC. t_ns: the bench's time.
+        """Count a SYNC and the `lost` ones before it; trip or clear the watchdogs SYNC_ORDER and SYNC_LENGTH.
 
-        Outside Operational and off the bus do nothing. If more than TOLERATED were repeated, early or out of sequence,
-        call the application's `distrust_sync`.
+        Outside Operational and off the bus do nothing. If this one is repeated, early or out of sequence, and more than
+        TOLERATED were, call the application's `distrust_sync`. t_ns: the bench's time.
         """
         if not (self.is_operational and self.is_on_bus):
             return
@@ -346,7 +347,7 @@ class EmulatedDevice(ObjectDictionary):
         self._errors.report_error(0, t_ns)
 
     def poll(self, t_ns: int) -> int:
-        """Send heartbeats and EMCYs that are due, and find a lost heartbeat; return when the next timer is due.
+        """Send heartbeats and EMCYs that are due, detect the master's silence; return when the next timer is due.
 
         Both times are ns on the device's own clock.
         """
@@ -398,7 +399,8 @@ class EmulatedDevice(ObjectDictionary):
     def _reset(self, is_node_reset: bool) -> None:
         """Restore the EDS's values of all objects, or of the communication profile only, and reset the application.
 
-        is_node_reset: all objects; then tripped watchdogs and SYNC counts are forgotten, too.
+        is_node_reset: all objects; then tripped watchdogs and SYNC counts are forgotten, too. In both cases the PDOs
+        restart their sequences.
         """
         self.restore(0xFFFF if is_node_reset else 0x1FFF)
         self.pdos.restart_sequences()
@@ -470,7 +472,7 @@ class SyncListeners:
     def takers(self, data: bytes) -> tuple[int, ...]:
         """Return 1 for each device that takes SYNCs of this length, by its 0x1019; else 0.
 
-        All 0 for more than one byte.
+        A device whose EDS lacks 0x1019 takes both lengths, 0 and 1 byte. All 0 for more than one byte.
         """
         return self._takers.get(len(data), self._nobody)
 

@@ -316,7 +316,7 @@ class DriveNode(Application):
         self._failure = 0
 
     def _feel_failure(self, t_ns: int) -> None:
-        """Latch the fault of a failure that `fail` has set, if the drive has power."""
+        """Latch the fault of a failure that `fail` has set, if the drive has power. t_ns: the device's own time."""
         if self._failure and self.device.is_powered:
             self._latch(self._failure, None, t_ns)
 
@@ -440,7 +440,7 @@ class DriveNode(Application):
     def _apply(self, event: DriveEvent, t_ns: int) -> None:
         """Make the transition of an event and set the motor's mode by the new state; do nothing if this state has none.
 
-        Quick stop and fault reaction begin to brake by their option codes.
+        Quick stop and fault reaction begin to brake by their option codes; with code 0 they end at once.
         """
         state = TRANSITIONS.get((self.state, event))
         if state is None:
@@ -493,7 +493,8 @@ class DriveNode(Application):
     def _latch(self, code: int, cause: Watchdog | None, t_ns: int, is_found_by_time: bool = False) -> None:
         """Latch a fault, begin the fault reaction, and send the EMCY; do nothing while a fault is latched.
 
-        code: 0x603F. cause: None: no watchdog. is_found_by_time: a timeout, not a SYNC, showed the cause.
+        The target torque becomes 0. code: 0x603F. cause: None: no watchdog. is_found_by_time: a timeout, not a SYNC,
+        showed the cause.
         """
         if self.state in (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT):
             return
@@ -595,7 +596,10 @@ class DriveNode(Application):
             self._apply(DriveEvent.QUICK_STOP_DONE, t_ns)
 
     def _drive_motor(self) -> None:
-        """Set torque demand and set-point: 0 outside Operation enabled, in another mode than 10, in a ramp down."""
+        """Set torque demand, per mille, to that of `TorqueLimits`, and the set-point, Nm, to the same torque.
+
+        Both are 0 outside Operation enabled, in another mode than 10, and in a ramp down.
+        """
         self._demand = self._limits.demand if self._follows_target else 0
         self.torque_Nm = self._demand * self._rated_mNm * 1e-6
 

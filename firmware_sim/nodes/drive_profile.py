@@ -35,7 +35,7 @@ class DriveState(Enum):
     START = "start"  # by itself, at power-on or reset
     NOT_READY_TO_SWITCH_ON = "not ready to switch on"  # by itself, when initialised
     SWITCH_ON_DISABLED = "switch on disabled"  # shutdown
-    READY_TO_SWITCH_ON = "ready to switch on"  # switch on; back: disable voltage, quick stop
+    READY_TO_SWITCH_ON = "ready to switch on"  # switch on, enable operation; back: disable voltage, quick stop
     SWITCHED_ON = "switched on"  # enable operation; back: shutdown, disable voltage, quick stop
     OPERATION_ENABLED = "operation enabled"  # disable operation, shutdown, disable voltage, quick stop
     QUICK_STOP_ACTIVE = "quick stop active"  # at standstill, or as 0x605A says enable operation; disable voltage

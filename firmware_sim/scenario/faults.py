@@ -1,7 +1,7 @@
 """Faults of a scenario: one timed row each; its kind determines its keys.
 
 A row acts from `at_s` for `duration_s`, or until it has acted `count` times, or, with neither, to the end. `fault_plan`
-has the row's effect on frames, values and nodes. A reboot or drive fault with neither is active for one period.
+has the row's effect on frames, values and nodes. A reboot or drive fault without duration is active for 1 ms.
 
 Nodes are named drive1, drive2, sensor1, sensor2; frames by their content, as in the contract's DBC.
 """
@@ -52,7 +52,7 @@ _COUNTED = ("feedback", "torque", "command")
 
 
 class _Kind(NamedTuple):
-    """A kind of fault: its keys, besides those of its time, and the nodes and frames that it can affect.
+    """A kind of fault: its keys besides `kind`, `at_s` and `since`, and the nodes and frames that it can affect.
 
     is_timed: False: it lasts from power-on and has no `at_s`.
     """
@@ -182,7 +182,7 @@ class FaultSettings:
 
     @property
     def duration_ns(self) -> int | None:
-        """Time from onset to end, ns; None if `count` ends the fault or it has no end."""
+        """Time from onset to end, ns; None without `duration_s`."""
         return None if self.duration_s is None else round(self.duration_s * 1e9)
 
     @property

@@ -2,8 +2,8 @@
 
 The configuration is the one that the host reads. A missing value is assumed and reported in a line; a truth
 outweighs both. Inertia, in the words of `firmware_sim.arm.arms`, is that of masses in the truth, else of `arm.mass_kg`
-with its neighbours, which the host doesn't read, else of `arm.cad_theta`, else of uniform rods as heavy as the
-drives' rated torque suggests:
+with its neighbours, which the host doesn't read, else of `arm.cad_theta`, else, if no lengths are given either, of the
+profile, else of uniform rods as heavy as the drives' rated torque suggests:
 
     γ = m₂ l₂² / 3 = τ₂ γ_P / τ_P2        α + γ = τ₁ (α + γ)_P / τ_P1, with m₁ ≥ m₂ / 2        index P: profile P
 
@@ -195,7 +195,7 @@ def _by_place(truth: ArmTruth, what: str, by_joint: Pair) -> Pair:
 
 
 def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
-    """Return the links of truth or configuration, and append a line to `assumed` for each assumption.
+    """Return the links of truth, configuration or profile, and append a line to `assumed` for each assumption.
 
     Raises ConfigError if no links can have the inertia of `arm.cad_theta`.
     """
@@ -232,7 +232,7 @@ def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
 
 
 def _multiply(links: _Links, truth: ArmTruth) -> _Links:
-    """Return the links with lengths and masses multiplied by the truth's factors."""
+    """Return the links with lengths and masses multiplied by the truth's factors; centres and inertia follow."""
     (f1, f2), (m1, m2) = truth.factor.link_length, truth.factor.mass
     return _Links(
         _times(links.length_m, (f1, f2)),
@@ -310,9 +310,8 @@ def _joint_inertia(links: _Links) -> Pair:
 def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -> tuple[Pair, Pair]:
     """Return viscous, Nm s/rad, and Coulomb friction, Nm, by joint.
 
-    It is that of the truth, else of the configuration, `arm.cad_theta` or the profile.
-
-    Without any of these it is a share of the rated torque, with a line in `assumed`.
+    Each is that of the truth, else of the configuration, else of `arm.cad_theta`, else of the profile if the user has
+    set no geometry. Otherwise it is a share of the rated torque, with a line in `assumed`.
     """
     theta = told.settings.arm.cad_theta if "arm.cad_theta" in told.own_keys else ()
     known = theta[3:7] if any(theta[3:7]) else ()

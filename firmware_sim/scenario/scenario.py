@@ -1,8 +1,9 @@
 """A scenario: the arm, its contacts, its payload, its faults, and the expected outcome with a host; truths beside it.
 
-Times count from the moment both drives are in Operation enabled. Scenarios are TOML files; those that come with the
-package are in the folder `scenarios`. `about`, `group`, `lasts_s`, `acknowledge_faults`, `expect` and
-`expect_certified` are for the programs that play a scenario; they have no effect on the arm.
+Times count from the moment both drives are in Operation enabled, those of faults by their `since` also from power-on.
+Scenarios are TOML files; those that come with the package are in the folder `scenarios`. `about`, `group`, `lasts_s`,
+`acknowledge_faults`, `expect` and `expect_certified` are for the programs that play a scenario; they have no effect on
+the arm.
 
 Section `[expect]` of a scenario states the outcome with a healthy host of configuration `paper`, as that host is: where
 the host does badly, so does the expectation. `[expect_certified]` replaces `[expect]`, as a whole, for a host of
