@@ -396,7 +396,8 @@ def check_processor(host: Host) -> Finding:
 def check_isolation(host: Host) -> Finding:
     """Warn if the processor that `realtime.cpu` names isn't isolated, or if it names none and there are isolated ones.
 
-    It passes if `realtime.cpu` names none and none is isolated.
+    Also warn if it asks for any isolated one, and there is none. It passes if `realtime.cpu` names none and none is
+    isolated.
     """
     isolated = isolated_cpus(host.root / "sys/devices/system/cpu")
     names = ", ".join(map(str, isolated)) or "none"
