@@ -482,7 +482,7 @@ class Drafting:
         return names
 
     def _eds_files(self) -> list[tuple[Path, str]]:
-        """Return the given EDS files, each once, with the kind, "drive" or "sensor"; ask if 0x1000 names neither."""
+        """Return the given EDS files, each once, with the kind, "drive" or "sensor"; ask if `kind_of` finds none."""
         options = self.options
         found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
         for eds in options.eds:
