@@ -70,7 +70,8 @@ class InUseError(Exception):
 def create_file(path: Path) -> int:
     """Create a file and return its descriptor, locked for as long as that, or a copy of it, is open.
 
-    Raises FileExistsError if anything has that name, be it a dangling link; OSError if it can't be created.
+    On a file system without locks it isn't locked. Raises FileExistsError if anything has that name, be it a dangling
+    link; OSError if it can't be created.
     """
     descriptor = os.open(path, NEW, 0o666)
     with contextlib.suppress(OSError):  # a file system without locks: `check_unused` can't see the writer then

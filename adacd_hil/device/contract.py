@@ -151,9 +151,10 @@ def _move(codec: Codec, settings: Settings, devices: Sequence[PlacedDevice]) -> 
 
 
 def _compare(codec: Codec, composed: Codec, name: str) -> None:
-    """Raise ConfigError, with the first differing message, unless the DBC has the layout of the composed contract.
+    """Raise ConfigError unless the DBC has the layout of the composed contract.
 
-    `name`: of the DBC in the error.
+    The error names the first differing message, but none for data ids or places of signals. `name`: of the DBC in the
+    error.
     """
     if codec.layout_digest == composed.layout_digest:
         return

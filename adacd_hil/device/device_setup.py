@@ -160,10 +160,10 @@ TORQUE_UNITS_NM = {"mNm": 1e-3, "µNm": 1e-6, "Nm": 1.0}
 def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequence[PlacedDevice]) -> list[str]:
     """Check the drive, write its limits, option codes and mode; return values that nothing confirms, a line each.
 
-    Option codes, limits and watchdogs are written only if its profile names them. Objects that its EDS lacks are left
-    out, but a watchdog that is missing there is a DeviceError. `drives`: of all joints. Raises DeviceError for a drive
-    without cyclic synchronous torque, another rated torque, gear or unit than configured, or a value that it doesn't
-    take; BusError if the bus fails.
+    Option codes, limits and watchdogs are written only if its profile names them. Objects that its EDS lacks, or
+    doesn't let the host write, are left out, but a watchdog that is missing there is a DeviceError. `drives`: of all
+    joints. Raises DeviceError for a drive without cyclic synchronous torque, another rated torque, gear or unit than
+    configured, or a value that it doesn't take; BusError if the bus fails.
     """
     joint, profile = slave.device.joint, slave.device.settings
     if slave.has(0x6502):
@@ -293,7 +293,7 @@ def _enter_mode(slave: Slave, codec: Codec) -> None:
 
     0x6061 may show the mode later, once the drive is enabled: the cycle compares it. But if no frame carries it, 0x6061
     must show it within `patience.mode_s`. Raises DeviceError if it doesn't, or the drive refuses or doesn't answer;
-    BusError if the bus fails.
+    BusError if the bus fails. If 0x6060 can't be written, or the EDS lacks 0x6061, no mode is compared.
     """
     if not slave.can_write(0x6060):
         return
@@ -332,8 +332,8 @@ NEWTON_METRE = 0x00560100
 def check_sensor(slave: Slave, codec: Codec) -> str:
     """Compare unit and decimal digits with the contract; return the status as text, empty for 0 and without 0x6150.
 
-    Objects that the EDS doesn't list are not compared. Raises DeviceError for a unit other than Nm, with any power of
-    ten, for other decimal digits, and if an object can't be read; BusError if the bus fails.
+    Objects that the EDS doesn't list are not compared. The unit must be Nm, times any power of ten. Raises DeviceError
+    for another unit, for other decimal digits, and if an object can't be read; BusError if the bus fails.
     """
     torque = codec.message(f"{slave.name}Torque")
     scale = torque.values[torque.place("torque")].scale
@@ -529,7 +529,7 @@ def _write_pdo(slave: Slave, pdo: PdoSettings, event_timer_ms: int) -> None:
     """Write the objects of a PDO that can be written: invalid first, valid last.
 
     The mapping is emptied and written only if it differs, always if `rewritten`, never if `fixed`. Raises DeviceError
-    also for an inhibit time, event timer or mapped object for which the EDS has no sub-index.
+    also for an inhibit time or event timer other than 0, or a mapped object, for which the EDS has no sub-index.
     """
     index, mapping_index = pdo.communication_index, pdo.mapping_index
     kept = slave.read(index, _COB_ID) & RTR_NOT_ALLOWED

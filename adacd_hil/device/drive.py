@@ -167,7 +167,7 @@ class Drive(CyclicDevice):
         """Cycle in which the status in use came; -1 before the first."""
         self.state = Cia402State.NOT_READY_TO_SWITCH_ON
         self.statusword = 0
-        # If no frame shows the mode, the master has compared 0x6061 before the start.
+        # If no frame shows the mode, the master has compared 0x6061 before the start, if `_enter_mode` could.
         self.mode = 0 if shows_mode(codec, name) else MODE_CYCLIC_SYNCHRONOUS_TORQUE
         self.is_enabled = False
         """Whether the drive produces the commanded torque."""
@@ -257,8 +257,8 @@ class Drive(CyclicDevice):
     def _next_controlword(self) -> Controlword:
         """Return the controlword that leads one state nearer to Operation enabled; disable voltage if there is none.
 
-        In FAULT, fault reset and disable voltage alternate; in QUICK_STOP_ACTIVE, quick stop as long as the drive must
-        brake.
+        In OPERATION_ENABLED it is enable operation. In FAULT, fault reset and disable voltage alternate; in
+        QUICK_STOP_ACTIVE, quick stop as long as the drive must brake.
         """
         if self.state is Cia402State.OPERATION_ENABLED:  # nearly always
             return Controlword.ENABLE_OPERATION

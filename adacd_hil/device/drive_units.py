@@ -70,8 +70,8 @@ def read_drive_units(number: Number, gear_ratio: float = 1.0) -> DriveUnits:
     """Return the units of a drive's position and velocity by its objects; `number` returns an object's value or None.
 
     Increments come from 0x6092 if it has at least LEAST_INCREMENTS per revolution. Without that they come from 0x60A8
-    if its unit is an angle, and from 0x608F times the gear if it is none. `gear_ratio`: motor revolutions per
-    revolution of the joint, used if 0x6091 is missing or 0.
+    if its unit is an angle, else from 0x608F, both times the gear. `gear_ratio`: motor revolutions per revolution of
+    the joint, used if 0x6091 is missing or 0.
     """
     encoder, motor_revs = number(0x608F, 1), number(0x608F, 2)
     gear_in, gear_out = number(0x6091, 1), number(0x6091, 2)

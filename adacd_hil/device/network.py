@@ -111,8 +111,9 @@ class Master(EventSource):
     def reset(self) -> None:
         """Reset the communication of the arm's nodes and wait until each has booted.
 
-        Drop frames received earlier, forget the devices' EMCYs, and stop watching heartbeats. Raises DeviceError if a
-        node doesn't boot within `devices.boot_timeout_s`, BusError if the bus fails.
+        Unless `bus.is_shared`, all other nodes on the bus are reset, too. Drop frames received earlier, forget the
+        devices' EMCYs, and stop watching heartbeats. Raises DeviceError if a node doesn't boot within
+        `devices.boot_timeout_s`, BusError if the bus fails.
         """
         for _ in range(_MOST_OLD_FRAMES):  # from before the reset; a full queue has no room for new frames
             if self._bus.receive(0.0) is None:
@@ -169,7 +170,7 @@ class Master(EventSource):
     def _check_identity(slave: Slave, device_type: int, read: dict[int, int]) -> None:
         """Raise DeviceError if type, vendor or product isn't the EDS's, or the revision is none that the EDS covers.
 
-        Accept any value that the EDS leaves open. read: 0x1018 by sub-index.
+        Of the type, 0x1000, the low word counts. Accept any value that the EDS leaves open. read: 0x1018 by sub-index.
         """
         kind, name = slave.device.settings.kind, slave.device.profile.name
         another = (
@@ -207,8 +208,9 @@ class Master(EventSource):
     def configure(self) -> None:
         """Set up all devices over SDO: the profile's `setup`, then SYNC, heartbeats, EMCY, PDOs, drives and sensors.
 
-        Afterwards `parameters` watches the written values. Remarks become events. Raises DeviceError if a device
-        refuses a value or differs from its profile or the configuration; BusError if the bus fails.
+        Afterwards `parameters` watches the values that were written or compared. Remarks become events. Raises
+        DeviceError if a device refuses a value or differs from its profile or the configuration; BusError if the bus
+        fails.
         """
         for slave in self.slaves:
             for extra in slave.device.settings.setup:  # first: the host checks and writes on top of them
@@ -282,7 +284,7 @@ class Master(EventSource):
     def start(self) -> None:
         """Watch heartbeats, and send NMT start: to all nodes at once if `devices.start` is all, else sensors first.
 
-        Raises BusError if the bus refuses a frame.
+        If `bus.is_shared`, only this arm's nodes get it, one by one. Raises BusError if the bus refuses a frame.
         """
         self._heartbeats.start()
         if self._settings.devices.start == "all":
@@ -295,7 +297,8 @@ class Master(EventSource):
     def stop(self) -> None:
         """Send the NMT command to enter pre-operational to all nodes, and stop watching their heartbeats.
 
-        Drives that are still enabled then leave Operation enabled. Raises BusError if the bus refuses a frame.
+        If `bus.is_shared`, only this arm's nodes get it. Drives that are still enabled then leave Operation enabled.
+        Raises BusError if the bus refuses a frame.
         """
         self._heartbeats.stop()
         self._command(ENTER_PRE_OPERATIONAL)
@@ -315,8 +318,9 @@ class Master(EventSource):
     def failed_heartbeats(self, t_ns: int) -> list[str]:
         """Return the failures of the nodes' heartbeats now, one line per node; empty without a failure.
 
-        A node fails if it is silent for PATIENCE_PERIODS or isn't OPERATIONAL, only between `start` and `stop`. Nodes
-        are not watched if their EDS doesn't let the host write 0x1017.
+        A node fails if it is silent for PATIENCE_PERIODS, or was in another state than OPERATIONAL since the last call,
+        only between `start` and `stop`. A failure that begins, changes or ends adds an event. Nodes are not watched if
+        their EDS doesn't let the host write 0x1017.
         """
         return self._heartbeats.judge_nodes(t_ns)
 

@@ -32,8 +32,8 @@ FEATURES = (
 """Kinds of object that a profile may name; the host uses such an object only if the EDS lists it too.
 
 heartbeat_consumer 0x1016; sync_counter 0x1019; option_codes 0x605A, 0x605E; torque_limits 0x6072, 0x60E0, 0x60E1;
-sync_tolerance 0x2201; watchdog_in_emcy: EMCY byte 3 is the watchdog's number, bytes 4 to 7 the
-device's time in ms.
+sync_tolerance 0x2201, without which the set-up fails; watchdog_in_emcy: EMCY byte 3 is the watchdog's number, bytes 4
+to 7 the device's time in ms.
 """
 LAST_SYNCHRONOUS = 240
 RECEIVED, SENT, TO_MAPPING = 0x1400, 0x1800, 0x200
@@ -313,10 +313,12 @@ class ProfileSettings:
         self._check_assumed()
 
     def _check_frames(self) -> None:
-        """Raise ValueError unless all needed frames and signals are there once, in the right frame.
+        """Raise ValueError unless all needed frames and signals are there, signals in the right frame.
 
-        The frame Status may be missing. Each PDO has its own number. Signals of one sample or command share a frame,
-        and Feedback and Torque have transmission 1, on every SYNC.
+        The frame Status may be missing; no frame may be there twice. PDOs of one direction have different numbers. Each
+        PDO has signals, none twice. Position and velocity must be in Feedback, controlword and target torque in
+        Command, torque in Torque; of a signal in two frames the later one counts. The statusword may be in any frame.
+        Feedback and Torque have transmission 1, on every SYNC.
         """
         wanted = {"drive": ("Feedback", "Command"), "sensor": ("Torque",)}[self.kind]
         found = [pdo.message for pdo in self.pdo]

@@ -94,8 +94,8 @@ class Strangers(RateLimitedEvents):
     def judge_host_frame(self, frame: Frame, cycle: int) -> bool:
         """Judge a frame received in a cycle; return True if only this host may send its identifier.
 
-        Append an event, at a limited rate: a warning for an SDO request that only reads, else an error. NMT to nodes of
-        other arms gives no event.
+        Append an event, at a limited rate: a warning for an SDO request that only reads, else an error. The frame of an
+        error counts for `have_acted` and `describe_senders`. NMT to nodes of other arms gives no event.
         """
         doing = self._doing.get(frame.can_id)
         if doing is None:

@@ -127,7 +127,7 @@ class DraftFiles:
         return found._replace(mistakes=[line.replace(f"{folder}/", "") for line in found.mistakes])
 
     def write_files(self, text: str) -> None:
-        """Write the configuration, `text`, to `out`, and the added files; make the folder.
+        """Write the configuration, `text`, to `out`, and the added files, by name, into its folder, which is made.
 
         Existing files are replaced, as by `replace_files`. Raises CommandError if one can't be written.
         """
@@ -163,10 +163,11 @@ class Drafting:
     def draft(self) -> tuple[str, dict[str, Any]]:
         """Scan the bus, ask the user, derive the other values; return the text of a configuration, and a summary.
 
-        The summary is for JSON, but for the `Connection` under "bus". Writes no file; adds device profiles to
-        `writing`. Raises CommandError without an answer, for options that exclude each other, if the configuration
-        would have errors, or if the bus fails; ConfigError for a URDF, EDS or value that can't be used, BusMissingError
-        if the bus can't be opened.
+        The summary is for JSON, but for the `Connection` under "bus". The period is the first of `_PERIODS_US` in which
+        the frames meet their deadlines, else the last; profiles for 500 µs keep theirs. Writes no file; adds device
+        profiles to `writing`. Raises CommandError without an answer, for options that exclude each other, if the
+        configuration would have errors, or if the bus fails; ConfigError for a URDF, EDS or value that can't be used,
+        BusMissingError if the bus can't be opened.
         """
         facts = self._gather()
         title = f"Written by `adacd-hil init` {__version__} on {format_date(wall_ns())[:10]}"
@@ -240,7 +241,7 @@ class Drafting:
         """Raise CommandError if an option gives a value of `scale` other than a joint's profile has.
 
         The option would be without effect. names: profiles by kind. A unit may differ in one of both profiles; that of
-        velocity counts as used once it was asked for.
+        velocity counts as used once a draft has taken it.
         """
         for question in _QUESTIONS:
             if (given := question.given(self.options)) is None:
@@ -293,8 +294,9 @@ class Drafting:
     def _find_devices(self) -> dict[str, list[RecognisedDevice]]:
         """Scan the bus, if there is one; return the devices of joint 1 and 2 by kind, [] without a bus.
 
-        Sets `bus` and `bitrate`. Raises CommandError if fewer than two of a kind answer or the bus fails,
-        BusMissingError if it can't be opened.
+        Sets `bus` and `bitrate`; prints a line per node. Raises CommandError if fewer than two of a kind answer, an
+        option is missing or excludes another, or the bus fails; ConfigError for a wrong option, BusMissingError if the
+        bus can't be opened.
         """
         channel = self._ask_channel()
         if channel is None:
@@ -358,7 +360,8 @@ class Drafting:
         """Return the drives, or the sensors, of joint 1 and 2: as given, as the user answers, or by ascending node id.
 
         kind: "drive" or "sensor". channel: of the bus, for the error. A proposal that was taken is added to `warnings`.
-        Raises CommandError if fewer than two answer.
+        Raises CommandError if fewer than two answer, or nobody chooses among more than two; ConfigError for a wrong
+        option.
         """
         known = {device.node.node_id: device for device in devices if device.kind == kind}
         option, nodes = f"--{kind}-node", " ".join(map(str, known)) or "none"
@@ -387,10 +390,10 @@ class Drafting:
         return answer
 
     def _profiles(self, found: Mapping[str, Sequence[RecognisedDevice]]) -> dict[str, Fact]:
-        """Return the names of the profiles of both joints by kind, drafted from an EDS if one is given.
+        """Return the names of both joints' profiles by kind: given, else drafted from an EDS or recognised on the bus.
 
-        Without a bus and an EDS, they are the emulated devices' profiles, a guess. Raises CommandError if a device has
-        neither a profile nor an EDS.
+        On a terminal the user is asked for the EDS of an unknown device. Without a bus, an EDS or given profiles, they
+        are the emulated devices' profiles, a guess. Raises CommandError if a device has neither a profile nor an EDS.
         """
         drafted = self._draft_profiles(found)
         families = choose_family(*found.values()) if found[DRIVE] else (("",) * 2, ("",) * 2)
@@ -479,7 +482,7 @@ class Drafting:
         return names
 
     def _eds_files(self) -> list[tuple[Path, str]]:
-        """Return the given EDS files, each once, with the kind, "drive" or "sensor"; ask if 0x1000 names neither."""
+        """Return the given EDS files, each once, with the kind, "drive" or "sensor"; ask if `kind_of` finds none."""
         options = self.options
         found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
         for eds in options.eds:
@@ -528,7 +531,8 @@ class Drafting:
     ) -> dict[int, ProfileDraft]:
         """Return drafts of an EDS's profile by joint; ask for each guess, or only for those with keys in `among`.
 
-        ratings: by joint (0, 1) to draft for. A question is asked once; later drafts take the same answer.
+        ratings: by joint (0, 1) to draft for. A given option counts even where the EDS has a value. A question is asked
+        once; later drafts take the same answer.
         """
         answers: dict[int, dict[str, float]] = {joint: {} for joint in ratings}
 

@@ -52,8 +52,8 @@ def run_commtest(
     The status is SAFETY_STOP after a fault, INTERRUPTED by the user, FAILURE if the connection is not sufficient,
     PARTIAL if the log lacks data, else OK. is_enabling: enable the drives. out: folder for log and pictures, None:
     neither. Raises ConfigError, CodecError if configuration or contract can't be used, LogExistsError if `out` has a
-    log, LogError if a file can't be written, BusMissingError if the bus can't be opened, CommandError if the arm isn't
-    found or the bus fails.
+    log, LogError if a file can't be written, OSError if `out` can't be made, BusMissingError if the bus can't be
+    opened, CommandError if the arm isn't found or the bus fails.
     """
     settings, codec, devices = connection.load()
     clock = MonotonicClock()
@@ -250,7 +250,7 @@ def _warnings(test: CommunicationTest, scheduler: str) -> list[str]:
 
 
 def as_text(described: dict[str, Any]) -> str:
-    """Return the result of `run_commtest` as text: counts, each device, histograms of times, and last the verdict."""
+    """Return the result of `run_commtest` as text: counts, devices, histograms, warnings, faults, last the verdict."""
     lines = [
         f"cycles {described['cycles']}, complete {described['complete']}, overruns {described['overruns']}, "
         f"period {described['period_us']} µs, {described['scheduler']}, bus load {described['load_percent']:.1f} %"
@@ -272,7 +272,7 @@ def as_text(described: dict[str, Any]) -> str:
 
 
 def _timing_lines(described: dict[str, Any]) -> list[str]:
-    """Return lines of text with percentiles and bars of each time, then of queues and losses."""
+    """Return lines of text: percentiles and bars of each time, percentiles of queues, and counts of losses."""
     timing, lines = described["timing"], []
     for quantity in QUANTITIES:
         found = _percentile_text(timing["times_us"][quantity.name])

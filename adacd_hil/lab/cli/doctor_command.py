@@ -90,7 +90,7 @@ def as_json(findings: list[Finding]) -> dict[str, Any]:
 
 
 def as_text(findings: list[Finding]) -> str:
-    """Format the findings for people: one line each, its remedy below; failed ones again at the end."""
+    """Return the findings as text, each with its remedy; then the line of `summarise`, and the failed ones again."""
     rows = []
     for finding in findings:
         rows.append((_MARKS[finding.status], finding.name, finding.reason))

@@ -16,8 +16,8 @@ _EVERY = 100
 def different_logs(given: Iterable[Path]) -> list[Path]:
     """Return the paths of logs; a folder stands for the run log in it.
 
-    Raises LogError for a folder without one, CommandError if a log is given twice, even as a link or a copy, a
-    recovered or a cut one.
+    Raises LogError for a folder without one or a log that can't be read, CommandError if a log is given twice, even as
+    a link or a copy. A recovered or cut one is found if both have some of the same cycles of MONITOR.
     """
     paths = [log_in(each) for each in given]
     for first, second in itertools.combinations(paths, 2):

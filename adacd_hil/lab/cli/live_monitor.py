@@ -47,7 +47,7 @@ class LiveMonitor:
         self._events: deque[dict[str, Any]] = deque(maxlen=_EVENTS)
 
     def stop(self) -> None:
-        """Make the present and later `listen`s end after a message. Safe in a signal handler."""
+        """Make `listen` end after its next message or at its time, and later ones at once. Safe in a signal handler."""
         self._is_stopped = True
 
     def listen(self, duration_s: float) -> bool:

@@ -163,7 +163,7 @@ def merge(logs: tuple[str, ...]) -> ExitCode:  # noqa: ARG001
 
 
 def info_as_text(info: "LogInfo") -> str:
-    """Return the contents of a log as text: main facts, errors and problems, then attachments, topics and metadata.
+    """Return the contents of a log as text: main facts, errors and problems, then topics, attachments and metadata.
 
     Of the errors it has the first `_TOLD_FAULTS`, and the number of the others. Topics without messages are left out.
     """
@@ -210,7 +210,7 @@ def _bytes(count: int | None) -> str:
 
 
 def check_as_text(check: "LogCheck") -> str:
-    """Return the findings on a log as text, a line each, and a last line with the verdict and their number."""
+    """Return the findings on a log as text, a line each, the number of unlisted ones, and a line with the verdict."""
     lines = []
     for finding in check.findings:
         where = f"{finding.file}, byte {finding.offset}" if finding.offset >= 0 else finding.file

@@ -32,15 +32,16 @@ _NOT_TAKEN = {
     "realtime.sample_period": "",
     "safety.enable_timeout_s": "",
 }
-"""Keys that belong to the run and not to the arm, each with a warning."""
+"""Keys that belong to the run and not to the arm, each with a warning; "" without one."""
 
 
 def draft_from_log(log: Path, options: SimpleNamespace, files: DraftFiles) -> tuple[str, dict[str, Any]]:
     """Return the text of a configuration for the arm of a log, and a summary for JSON; write no file.
 
-    options: as of `Drafting`. Adds the device profiles to `files`, and checks the configuration with them. Raises
-    LogError if the log can't be read or lacks settings, CommandError for a configuration in place of a log, options
-    other than --drive and --sensor, a missing profile, or a configuration with errors.
+    options: as of `Drafting`. Adds the device profiles that are in the folder of `files.out` to `files`, and checks the
+    configuration with them. Raises LogError if the log can't be read or lacks settings, CommandError for a
+    configuration in place of a log, options other than --drive and --sensor, a missing profile, or a configuration with
+    errors; ConfigError for a profile that can't be read.
     """
     given = [name for name, value in vars(options).items() if value not in (None, (), False)]
     if further := [name for name in given if name not in ("drive", "sensor")]:
@@ -68,8 +69,9 @@ def draft_from_log(log: Path, options: SimpleNamespace, files: DraftFiles) -> tu
 
 
 def _differences(settings: Settings, base: str, path: Path, warnings: list[str]) -> list[Entry]:
-    """Return the settings of a run that differ from the configuration `base`, and those that are guesses.
+    """Return the settings of a run that differ from configuration `base` with the run's arm profile, and the guesses.
 
+    `arm.profile` is one of them if it isn't that of `base` alone. A setting without a value is one only as a guess.
     Settings of the run and not of the arm, `_NOT_TAKEN`, are left out; lines on them are added to `warnings`. path: of
     the log, for comments.
     """
@@ -92,9 +94,10 @@ def _differences(settings: Settings, base: str, path: Path, warnings: list[str])
 
 
 def _placed(entry: Entry, files: DraftFiles) -> Entry:
-    """Return an entry with paths as seen from the new configuration's folder; one not of `devices` unchanged.
+    """Return an entry with device profiles as seen from the new configuration's folder; any other entry unchanged.
 
-    A contract that isn't there is left out. Raises CommandError if a device profile isn't there.
+    But a contract that isn't there becomes "", composed from the profiles. Raises CommandError if a device profile
+    isn't there, ConfigError if it can't be read.
     """
     kind = entry.key.removeprefix("devices.")
     if entry.key in ("devices.drive", "devices.sensor"):

@@ -71,7 +71,8 @@ def report_logs(
 def _runs_in(given: Path) -> tuple[Path, tuple[Path, ...]]:
     """Return the given path, and the folders with a run below it, () for a file or a folder that itself has a run.
 
-    Raises LogError for a folder without a run.
+    Folders below it that can't be read are among them. Raises LogError for a folder without a run, OSError for one that
+    can't be listed.
     """
     if not given.is_dir() or (given / LOG_NAME).exists():
         return given, ()
@@ -84,7 +85,7 @@ def _runs_in(given: Path) -> tuple[Path, tuple[Path, ...]]:
 def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWindow, progress: Progress) -> Index:
     """Write a report of each run of a folder, and an index page of all in `out`; return the index.
 
-    A run that can't be read is listed with its problem. Raises LogError if the page can't be written.
+    A run that can't be reported is listed with its problem. Raises LogError if the page can't be written.
     """
     entries: list[tuple[ListedRun, Report | None]] = []
     for number, run in enumerate(runs, start=1):
@@ -109,7 +110,7 @@ def _report_runs(given: Path, runs: Sequence[Path], out: Path, stretch: TimeWind
 def as_json(reported: Sequence[Reported]) -> list[dict[str, Any]]:
     """Return the content of each report.json; in its place, for a run that can't be reported, its folder and problem.
 
-    The runs of an index are listed one by one.
+    The runs of an index are listed one by one, each with its folder.
     """
     tables = []
     for each in reported:

@@ -191,8 +191,8 @@ def _chosen(folder: Path, asked: "RunFilter", is_judging: bool, progress: Progre
     """Return the runs of a folder that meet the conditions `asked`, oldest first; [] if none does.
 
     is_judging: judge runs without a report by their logs, before the verdict is looked at; nothing is stored. Raises
-    LogError for a folder that is missing or has no run, CommandError if no run is of an arm in `asked`, or of a
-    scenario there that isn't built in either.
+    LogError for a folder that is missing or has no run, CommandError if one of the arms in `asked` has no run there, or
+    one of its scenarios has none and isn't built in either.
     """
     from adacd_hil.lab.runs import run_table
     from adacd_hil.lab.runs.run_summary import NOT_JUDGED, find_runs, judged, summarise

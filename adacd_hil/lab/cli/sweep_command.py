@@ -204,8 +204,8 @@ def _seeds(text: str) -> range:
 def simulate_task(task: "Task") -> "list[Values]":
     """Play a task's scenario with the settings of each row; return a row of results or of an error for each, in order.
 
-    The results are those of a replay of the run's log, which is then deleted. A run that didn't start, and errors of
-    configuration, contract or log, become rows; other errors are raised.
+    The results are those of a replay of the run's log, which is then deleted. A run that didn't start or broke off, and
+    errors of configuration, contract or log, become rows; other errors are raised.
     """
     return [_simulate(task, row) for row in task.rows]
 

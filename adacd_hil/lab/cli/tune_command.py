@@ -157,7 +157,8 @@ def _as_text(found: "Tuning") -> str:
 def _cells(checked: "Found") -> tuple[str, ...]:
     """Return the cells of a detector's row, a dash for a value that is unknown.
 
-    Contacts found, their share, median, 90 % and largest delay, alarms, bound of the alarm rate.
+    Contacts found, bounds of their share in %, at `CONFIDENCE`, median, 90 % and largest delay in ms, alarms, bound of
+    the alarm rate per hour.
     """
     from adacd_hil.lab.score.report_wording import delay_figures
 

@@ -243,7 +243,7 @@ def check_torque_scale(patient: ArmExamination) -> Finding:
 
 
 def check_position_scale(patient: ArmExamination) -> Finding:
-    """Describe each drive's increments per revolution of the joint; warn if no object tells them.
+    """Describe each drive's increments per revolution of the joint; warn if no object or a factory value tells them.
 
     Also warn of a polarity, 0x607E, that reverses some of position, velocity and torque, and not all. The set-up has
     compared the increments that an object tells. Raises DeviceError if a drive refuses a read or doesn't answer.
@@ -296,7 +296,7 @@ def _torque_of_count(slave: Slave) -> Finding:
 def _increments(slave: Slave) -> Finding:
     """Return the finding on a drive's increments per revolution of the joint: a warning if no object tells them.
 
-    Raises DeviceError if the drive refuses a read or doesn't answer.
+    So, too, if its objects have a factory value. Raises DeviceError if the drive refuses a read or doesn't answer.
     """
     scale = slave.device.settings.scale
     units = read_drive_units(lambda *place: slave.read(*place) if slave.has(*place) else None, scale.gear_ratio)
@@ -322,7 +322,7 @@ def _polarity(slave: Slave) -> Finding:
 
 
 def check_protection(patient: ArmExamination) -> Finding:
-    """Warn of cyclic frames, PDOs of the contract, without an end-to-end header, by name."""
+    """Warn of PDOs of the contract, event-driven ones too, without an end-to-end header, by name."""
     names = [
         message.name
         for message in patient.codec.messages.values()
@@ -417,7 +417,7 @@ def check_heartbeats(patient: ArmExamination) -> Finding:
 
 
 def check_devices(patient: ArmExamination) -> Finding:
-    """Fail if a value is outside `low` and `high` of its device's profile, or its status is missing or old.
+    """Fail if a value is outside `low` and `high` of its device's profile, or a status with bounds is missing or old.
 
     Warn of other faults of the drives, values that are too old, other senders, and EMCYs and other events of the
     devices, which are taken from the master. A sensor's status isn't looked at here.
@@ -581,8 +581,8 @@ def _judge_motion(joint: int, way: Vector, work_J: float) -> Finding:
     """Return the finding on a motion by hand toward +q: whether the right joint moved, with the right signs.
 
     joint: from 0. way (2,): travel of both joints, rad. work_J: of the joint, as of `_judge_work`. A failure if the
-    other joint moved further, or q decreased. A warning if it moved too little, the other joint moved along, or too
-    little torque tells the sign.
+    other joint moved further, q decreased, or the torque has the motion's sign. A warning if no joint moved far enough,
+    the other joint moved along, or too little torque tells the sign.
     """
     number, moved = joint + 1, int(np.argmax(np.abs(way)))
     text = "moved {:+.1f} and {:+.1f} deg, work {:+.4f} J".format(*np.degrees(way), work_J)

@@ -556,7 +556,9 @@ def _rest_torque(facts: ArmFacts) -> Entry:
 def _certified(facts: ArmFacts) -> Iterator[Entry]:
     """Yield the keys of `certified`, and `detector.collision_Nm`, that differ from the defaults for this arm.
 
-    They are the defaults, scaled by the arm's rated torque, inertia and gravity.
+    They are the defaults, scaled by the arm's rated torque and inertia. `prior_std` is at least twice the description's
+    inertia and gravity. With gravity, and unscaled torques, the offsets' `enough_std` is doubled. `collision_Nm` is
+    only lowered.
     """
     base = load_settings("certified")
     found, inertia = base.certified, _inertia(facts)
@@ -672,7 +674,7 @@ _POSES = {
 def draw_arm(mounting_deg: Pair) -> str:
     """Return a line of text that draws an arm at q = 0, joint 1 on the left, with an arrow along gravity.
 
-    mounting_deg: as `arm.mounting_deg`.
+    For a slight tilt the line says that gravity does not act on the joints. mounting_deg: as `arm.mounting_deg`.
     """
     tilt_deg, hangs_deg = mounting_deg
     arm = "at q = 0: [1]====[2]===>, +q counter-clockwise"

@@ -215,8 +215,8 @@ class CommunicationTest:
         """Return the results of each device, by its name and for JSON.
 
         share: of the periods with a fresh value; ages: number of cycles by age of the value in cycles, the last for all
-        older ones; never: cycles before the first frame; checks: number of frames by result of the end-to-end check,
-        and implausible ones.
+        older ones, from the first fresh value on; never: cycles before that; checks: number of frames by result of the
+        end-to-end check, and implausible ones; is_protected: whether it has that check.
         """
         devices: tuple[Drive | TorqueSensor, ...] = (*self.arm.drives, *self.arm.sensors)
         ages = np.array(self._ages, dtype=np.int64).reshape(self.cycles, len(devices)).T

@@ -86,7 +86,7 @@ def diagnose(
     """Run the checks in order; call `report` with each finding, and return all findings, with their names.
 
     A DeviceError or BusError fails its check; other errors are raised. A check is skipped if a check that it needs has
-    failed, or was skipped for that reason, here or in `earlier`, the findings of another table.
+    failed, here or in `earlier`, the findings of another table, or was skipped for that reason here.
     """
     findings: list[Finding] = []
     # failed or skipped check → the failed check that caused it
@@ -125,7 +125,7 @@ def configuration_checks(settings: Settings, layers: Sequence[ConfigurationLayer
     """Return doctor's checks of a configuration: one of its errors and likely mistakes, and one for each guessed value.
 
     The latter always warn. Guessed are keys in `assumed` of the configuration, and of its device profiles; unknown keys
-    of the configuration have no check. layers: as of `examine_settings`.
+    of the configuration have no check. layers: as of `examine_settings`. Raises ConfigError as `profile_guesses`.
     """
     known, guesses = known_keys(), dict[str, Finding]()
     for key in settings.assumed:
@@ -396,7 +396,8 @@ def check_processor(host: Host) -> Finding:
 def check_isolation(host: Host) -> Finding:
     """Warn if the processor that `realtime.cpu` names isn't isolated, or if it names none and there are isolated ones.
 
-    It passes if `realtime.cpu` names none and none is isolated.
+    Also warn if it asks for any isolated one, and there is none. It passes if `realtime.cpu` names none and none is
+    isolated.
     """
     isolated = isolated_cpus(host.root / "sys/devices/system/cpu")
     names = ", ".join(map(str, isolated)) or "none"

@@ -11,7 +11,7 @@ from adacd_hil.wire.frame_time import exact_frame
 
 
 class LoadMeter:
-    """Counts the bits of a bus's frames, and turns them into a load. For `monitor`, not for the control cycle.
+    """Counts the bits of a bus's frames, and turns them into a load. For `monitor` and `commtest`, not for a run.
 
     Error frames don't count: their duration is unknown. Identifiers above 0x7FF are extended ones.
     """

@@ -86,7 +86,7 @@ class DeviceRatings(NamedTuple):
     def position_limit_deg(self, scale: ScaleSettings) -> float | None:
         """Return the largest |q| within the limits 0x607D on both sides, deg.
 
-        None if they were not read, don't enclose 0, the scale is unknown, or the result is beyond any joint.
+        None if they were not read, don't enclose 0, the scale is unknown, or the result isn't plausible for a joint.
         """
         low, high = self.numbers.get((0x607D, 1)), self.numbers.get((0x607D, 2))
         if low is None or high is None or min(-low, high) <= 0 or not scale.increments_per_joint_rev:
@@ -98,7 +98,7 @@ class DeviceRatings(NamedTuple):
         """Return the joint's largest speed, deg/s, by 0x6080, rpm of the motor, and the gear, 0x6091 or `scale`'s.
 
         `scale`'s counts if 0x6091 was not read, or is 1 : 1, a factory value. None if 0x6080 was not read, or the
-        result is beyond any joint, as a factory's 50000 rpm.
+        result isn't plausible for a joint, as of a factory's 50000 rpm.
         """
         rpm = self.numbers.get((0x6080, 0))
         gear = read_drive_units(lambda *place: self.numbers.get(place)).gear_ratio
@@ -152,8 +152,8 @@ def is_of(identity: tuple[int | None, int | None], node: tuple[int | None, int |
 def kind_of(eds: Path) -> str:
     """Return "drive" or "sensor" by 0x1000 of an EDS; "" if that names another device profile.
 
-    If 0x1000 names no profile: the kind of a shipped profile of the same maker, "" without one. Raises ConfigError if
-    the EDS can't be read.
+    If 0x1000 names no profile: the kind of a shipped profile of the same maker with `assumed` keys, "" without one.
+    Raises ConfigError if the EDS can't be read.
     """
     number = _profile_number(eds)
     if not number:
@@ -278,7 +278,7 @@ class _Record(NamedTuple):
         return set(places) <= set(self.entries)
 
     def takes(self, *places: _Place) -> bool:
-        """Return whether all these objects can be mapped, or are in a mapping that is read-only."""
+        """Return whether the mapping has room for so many objects, or, if it is read-only, has all of these."""
         return self.room >= len(places) if self.room else self.carries(*places)
 
     @property
@@ -618,8 +618,8 @@ class _DriveWriter(_ProfileWriter):
         """Return the increments per revolution of the joint, and the profile's lines on them; store a guess.
 
         They are the user's answer, else the maker's, else the drive's own, else a guess. The drive's own are a guess,
-        too, if they are a factory value or coarser than `CREDIBLE_INCREMENTS`. gear: motor revolutions per joint
-        revolution.
+        too, if they are a factory value or coarser than `CREDIBLE_INCREMENTS`. Coarser ones count only if they were
+        read, and are at least `LEAST_INCREMENTS`. gear: motor revolutions per joint revolution.
         """
         units = read_drive_units(self._numbers_with_gear(), gear)
         found, text = units.increments_per_joint_rev, units.increments_text
