@@ -195,10 +195,11 @@ class Connection:
         return self.load()[1]
 
     def open(self, clock: Clock, codec: Codec, settings: Settings, devices: Iterable[PlacedDevice]) -> Bus:
-        """Open the bus for a run and return it; in real time it receives only the identifiers of `received_ids`.
+        """Open the bus for a run and return it; in real time SocketCAN receives only identifiers of `received_ids`.
 
-        A VirtualClock means lockstep: the bus then models the time. Raises BusMissingError if it can't be opened, in
-        lockstep CodecError if the contract has no message Sync, or lacks one of the devices' cyclic frames.
+        Other interfaces receive all. A VirtualClock means lockstep: the bus then models the time. Raises
+        BusMissingError if it can't be opened, in lockstep CodecError if the contract has no message Sync, or lacks one
+        of the devices' cyclic frames.
         """
         can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings, devices)
         bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)

@@ -359,8 +359,8 @@ def run_folder(out: Path | None, log_names: tuple[str, ...], name: str) -> Itera
     """Choose the folder of a run and yield it: `out`, or a new one by date below `runs` if that is None.
 
     log_names: file names of the logs that will be made. name: of the command, and of the link to its last run. When the
-    block ends, a folder that was made and is empty is removed. Raises LogExistsError if `out` has such a log, LogError
-    if that can't be examined, OSError if the new folder can't be made.
+    block ends, a folder that was made and is empty is removed. Raises LogExistsError if `out` has such a log, except of
+    a start that failed, LogError if that can't be examined, OSError if the new folder can't be made.
     """
     if out is not None:
         for log_name in log_names:

@@ -44,7 +44,7 @@ class ScriptedOperator:
         self._acknowledge_fault_after_s = settings.acknowledge_fault_after_s
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Return WAIT, then RECOVER at the time of the settings, for as many faults as they allow; END for later ones."""
+        """Return WAIT, then RECOVER at the time of the settings, for as many faults as they allow; END for others."""
         if self._faults_left == 0:
             return FaultAnswer.END
         if elapsed_s < self._acknowledge_fault_after_s:

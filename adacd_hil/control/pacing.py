@@ -180,7 +180,7 @@ class FollowingPacer:
     """Begins a cycle with each SYNC that another host sends. Of several that wait, the last one counts.
 
     The first SYNC heard is cycle 0; from there its counter 1…240 is unwrapped, with the help of the clock after a long
-    gap.
+    gap. Without a counter, the time between two SYNCs gives the number of periods.
     """
 
     def __init__(self, bus: Tap, clock: Clock, period_ns: int, sync_id: int, timeout_ns: int) -> None:
