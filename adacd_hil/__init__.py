@@ -7,7 +7,7 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str) -> str:
-        """Return `__version__`, looked up at its first use: the lookup takes longer than all of `start.py`.
+        """Return `__version__`, looked up only when it is used: the lookup takes longer than all of `start.py`.
 
         "0+unknown" if the package isn't installed. Raises AttributeError for any other name.
         """

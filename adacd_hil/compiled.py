@@ -291,7 +291,7 @@ class _SharedCache(FunctionCache):
     def save_overload(self, sig: Any, data: Any) -> None:
         """Save compiled code, one process after the other, and release the claim of `load_overload`.
 
-        On a full disk it isn't saved; the next process compiles.
+        If the disk refuses it, as a full one does, it isn't saved; the next process compiles.
         """
         try:
             with contextlib.suppress(OSError), (_FOLDER / "lock").open("wb") as lock:
@@ -353,7 +353,10 @@ class _Compilation(event.Listener):
         self._count.call_listeners()
 
     def on_end(self, event: Any) -> None:
-        """Count a compiled function; after the outermost one, resume garbage collection if it was on before."""
+        """Count a compiled function, unless it is numba's own, and call the listeners.
+
+        After the outermost function, resume garbage collection if it was on before.
+        """
         self._depth -= 1
         if self._depth == 0 and self._was_collecting:
             gc.enable()

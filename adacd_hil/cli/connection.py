@@ -36,8 +36,8 @@ def make_clock(name: str) -> Clock:
 def check_clock(name: str, interface: str, channel: str) -> None:
     """Raise CommandError for the lockstep clock on a channel that may be hardware, which can't wait for the host.
 
-    name: of the clock, as in `--clock`. A channel that doesn't exist passes, and so does an interface that can't be
-    used: opening them raises the error.
+    name: of the clock, as in `--clock`. A SocketCAN channel that doesn't exist passes, and so does an interface that
+    can't be used: opening them raises the error.
     """
     if name == LOCKSTEP and may_be_hardware(interface, channel):
         raise CommandError(
@@ -72,10 +72,10 @@ def may_be_hardware(interface: str, channel: str) -> bool:
 
 
 def check_autonomy(settings: Settings, interface: str, channel: str) -> None:
-    """Raise CommandError if settings let a real arm move without data, or acknowledge stops without a user.
+    """Raise CommandError if settings let a real arm move without data, or acknowledge stops or faults without a user.
 
     Any channel but vcan, vxcan and python-can's own virtual bus counts as a real arm. Without data: for more than
-    MOST_BLIND_CYCLES.
+    MOST_BLIND_CYCLES. Acknowledgement without a user passes with `operator.acknowledge_on_hardware`.
     """
     if is_virtual(interface, channel):
         return
@@ -195,10 +195,11 @@ class Connection:
         return self.load()[1]
 
     def open(self, clock: Clock, codec: Codec, settings: Settings, devices: Iterable[PlacedDevice]) -> Bus:
-        """Open the bus for a run and return it; in real time it receives only the identifiers of `received_ids`.
+        """Open the bus for a run and return it; in real time SocketCAN receives only identifiers of `received_ids`.
 
-        A VirtualClock means lockstep: the bus then models the time. Raises BusMissingError if it can't be opened, in
-        lockstep CodecError if the contract has no message Sync, or lacks one of the devices' cyclic frames.
+        Other interfaces receive all. A VirtualClock means lockstep: the bus then models the time. Raises
+        BusMissingError if it can't be opened, in lockstep CodecError if the contract has no message Sync, or lacks one
+        of the devices' cyclic frames.
         """
         can_ids = None if isinstance(clock, VirtualClock) else received_ids(codec, settings, devices)
         bus = open_bus(self.interface, self.channel, clock, can_ids, self.bitrate, codec.is_fd, settings.bus.is_shared)

@@ -33,7 +33,7 @@ class ConsoleOperator:
     """The user of a run at a terminal: the requests of typed words, else those of a script.
 
     A thread of its own reads the words, a line each. tell: prints a line for the user: which word a state waits for,
-    and that a word is unknown.
+    that a word is unknown, or that a state drops its request.
     """
 
     def __init__(
@@ -80,8 +80,8 @@ class ConsoleOperator:
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
         """Return RECOVER if the user has typed `ack` since the fault, END for `finish`, the first of both; else WAIT.
 
-        Drop other requests. After the terminal's end, if neither was typed, return the script's answer. elapsed_s:
-        since the fault.
+        A `finish` that was typed before the fault counts, too. Drop other requests. After the terminal's end, if
+        neither was typed, return the script's answer. elapsed_s: since the fault.
         """
         if self._state is not SchemeState.FAULT:  # the bus or the boot failed, without a cycle in FAULT
             self._enter(SchemeState.FAULT)
@@ -120,7 +120,7 @@ class ConsoleOperator:
 
 
 def _unknown(word: str) -> str:
-    """Return an error line for a word that is not in `CONSOLE_WORDS`, with the nearest known word."""
+    """Return an error line for a word that is not in `CONSOLE_WORDS`, with the nearest and all known words."""
     nearest = nearest_name(word, CONSOLE_WORDS)
     meant = f"; did you mean `{nearest}`?" if nearest else ""
     return f"unknown word {word[:_MOST_LETTERS]!r}{meant} (known: {', '.join(CONSOLE_WORDS)})"

@@ -58,12 +58,14 @@ class Cast(NamedTuple):
 def resolve(config: str, scenario_name: str, profile: str | None, seed: int | None, truth: str | None = None) -> Cast:
     """Return host settings and emulated arm of a run, by configuration and scenario.
 
-    If the configuration describes an arm of one's own, the emulator plays that arm, unless a profile is given.
-    Otherwise the profile is the given one, else the scenario's, else the configuration's. truth: name or file of the
-    emulated arm's true values. seed: None: the scenario's. A configuration without a script gets the demo's, and its
-    acknowledgement of stops unless it has one; in a scenario other than SCENARIO the user only asks to finish at its
-    end. A built-in arm gets its motors' holding torque from its data sheet; an arm of one's own keeps the value of its
-    file. Raises ConfigError or CodecError if configuration, scenario or contract can't be used.
+    The emulator plays the configured arm if there is a truth, or if the configuration describes an arm of one's own
+    and no profile is given. Otherwise it plays a built-in arm, and the host has its profile: the given one, else the
+    scenario's, else the configuration's. truth: name or file of the emulated arm's true values. seed: None: the
+    scenario's. A configuration without a script gets the demo's, and its acknowledgement of stops unless it has one; in
+    a scenario other than SCENARIO the script only asks to finish at its end, and faults are acknowledged as the
+    scenario sets it. A built-in arm gets its motors' holding torque from its data sheet, unless the configuration has
+    one; the configured arm keeps the value of its file. Raises ConfigError or CodecError if configuration, scenario or
+    contract can't be used.
     """
     contract: EmulatedContract | None = None
     assumed: list[str] = []

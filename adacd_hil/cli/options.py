@@ -138,7 +138,8 @@ def on_bus(command: Callable[..., ExitCode], is_required: bool = True) -> Callab
     """Return a command with the options of a bus; it receives a `Connection` as its first argument.
 
     It ends the process with its exit status, as `explained`. is_required: click refuses a call without --interface or
-    --channel; otherwise it ends with a CommandError, unless there is a --url: the command then receives that first.
+    --channel; otherwise it ends with a CommandError, unless there is a --url: the command then receives that first. A
+    --url together with one of the options of a bus is a CommandError, too.
     """
 
     @functools.wraps(command)

@@ -231,13 +231,16 @@ def answer(as_json: bool, described: Any, text: str, *next_commands: str) -> Non
 
 
 def as_called(command: str) -> str:
-    """Return a command with this program's name as its user typed it; a command of another program unchanged."""
+    """Return a command as its user can call it: with the path of this program if a shell doesn't find its name.
+
+    The path is that by which the user called the program. A command of another program is returned unchanged.
+    """
     called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
     return f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command
 
 
 def suggest(*next_commands: str) -> None:
-    """Print commands to run next on standard error, with this program's name as its user typed it."""
+    """Print commands to run next on standard error, each as by `as_called`, folded to the terminal there."""
     for place, command in enumerate(next_commands):
         line = _as_typed(f"{'next:' if place == 0 else '     '} {in_line(as_called(command))}")
         write_screen(painted(f"{line}\n", sys.stderr), sys.stderr)
@@ -356,8 +359,8 @@ def run_folder(out: Path | None, log_names: tuple[str, ...], name: str) -> Itera
     """Choose the folder of a run and yield it: `out`, or a new one by date below `runs` if that is None.
 
     log_names: file names of the logs that will be made. name: of the command, and of the link to its last run. When the
-    block ends, a folder that was made and is empty is removed. Raises LogExistsError if `out` has such a log, LogError
-    if that can't be examined, OSError if the new folder can't be made.
+    block ends, a folder that was made and is empty is removed. Raises LogExistsError if `out` has such a log, except of
+    a start that failed, LogError if that can't be examined, OSError if the new folder can't be made.
     """
     if out is not None:
         for log_name in log_names:

@@ -1,4 +1,4 @@
-"""Checks of a configuration without a bus: all errors and likely mistakes at once, a line each."""
+"""Checks of a configuration without a bus: errors and likely mistakes, a line each."""
 
 import functools
 import itertools
@@ -84,7 +84,7 @@ def examine_settings(settings: Settings, layers: Sequence[ConfigurationLayer] = 
     """Return errors and likely mistakes of settings. layers: of their configuration, () if unknown.
 
     Checked in turn are the motion's limits, the device profiles, the contract; if one of these has errors, the later
-    ones and the likely mistakes are left out.
+    ones and the likely mistakes are left out. Beside errors of the motion, values that look like radians are errors.
     """
     if problems := motion_problems(settings):
         return ConfigurationFindings([*problems, *_radians(settings)], [], None)
@@ -126,8 +126,9 @@ _MOST_NAMED = 4
 def guesses_in_brief(settings: Settings, measured: Collection[str] = ()) -> str:
     """Return a line that names up to _MOST_NAMED guessed values of a configuration, and the command to confirm them.
 
-    "" if there are none. Guessed: listed in `assumed`, of the settings or of a device profile. measured: keys of the
-    settings that are guesses no longer. Raises ConfigError as `profile_guesses`.
+    If there are more, it is the command that names all. "" if there are none. Guessed: listed in `assumed`, of the
+    settings or of a device profile. measured: keys of the settings that are guesses no longer. Raises ConfigError as
+    `profile_guesses`.
     """
     guesses = [f"`{key}`" for key in (*profile_guesses(settings), *settings.assumed) if key not in measured]
     more = f" and {len(guesses) - _MOST_NAMED} more" if len(guesses) > _MOST_NAMED else ""
@@ -200,7 +201,7 @@ _LOOKS: tuple[Callable[[Settings], Iterator[str]], ...] = (_over, _radians, _unk
 
 
 def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
-    """Yield a warning if only `paper` sets the scheme, and for a CAD model or gains inherited from an emulated arm.
+    """Yield a warning if no layer but `paper` sets the scheme, and for a CAD model or gains of an emulated arm.
 
     The latter if a file of the user's describes arm or devices. None for a built-in configuration. layers: the
     configuration and all that it extends, the base first.
@@ -242,7 +243,7 @@ _MEASURED = (
 def _misfits(codec: Codec, settings: Settings) -> Iterator[str]:
     """Yield a warning for each signal that can't carry its largest value, or has counts above `_COARSE_SHARE` of it.
 
-    Of a position, the size of `arm.zero_deg` is added to the largest value.
+    Of a position, the largest value to carry is that of `arm` plus the size of `arm.zero_deg`.
     """
     for joint, (device, frame, name, unit, limit, key) in itertools.product(range(JOINTS), _MEASURED):
         message = codec.message(f"{device}{joint + 1}{frame}")

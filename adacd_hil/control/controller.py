@@ -95,8 +95,8 @@ class Floating:
         tau_d = share (F_v dq + F_c tanh(dq / v_0)) + g(q) - D dq
 
     Part of the friction is compensated and D damps, so the arm comes to rest by itself. A joint that still moves from
-    before the contact is first braked, as hard as the controller can, until it stands or moves with the push. Beyond
-    the speed limit and near the position limits the controller's gains act against the motion.
+    before the contact is first braked, as hard as the controller can, until it stands or moves with the push. After
+    that, beyond the speed limit the controller's gains brake, and near a position limit they push back and brake.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -116,9 +116,10 @@ class Floating:
     def torque(self, q: Vector, dq: Vector, tau_ext_hat: Vector, theta: Vector, tau_d: Vector) -> None:
         """Fill the desired torque `tau_d` (2,), Nm: gravity and a share of the friction by theta, less damping.
 
-        A joint that still moves from before `begin` is only braked, until it stands or tau_ext_hat (2,) pushes it along
-        its motion. Over the speed limit, and near a position limit, the controller's gains act against the motion.
-        theta (p,): zeros for no model.
+        A joint that still moves from before `begin` is only held against gravity and braked, until it stands or
+        tau_ext_hat (2,) pushes it along its motion. After that, over the speed limit FIRM times the velocity gain
+        brakes the excess, and within the margin of a position limit the controller's gains push back and brake. theta
+        (p,): zeros for no model.
         """
         tau_d[:] = regressor.inverse_dynamics(q, np.zeros(JOINTS), np.zeros(JOINTS), theta, self._level_rad)
         friction = theta[regressor.F_V1 : regressor.F_C2 + 1]

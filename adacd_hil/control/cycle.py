@@ -221,9 +221,10 @@ class Cycle:
         return self._arm.cycle + 1, self._state
 
     def _look_after_devices(self, arm: ArmState, output: SchemeOutput) -> None:
-        """After a fault, stop drives by NMT that a quick stop has not stopped; else, with power, step `ParameterWatch`.
+        """After a fault, set drives that a quick stop has not stopped to Pre-operational; else step `ParameterWatch`.
 
-        The latter reads the devices' parameters again. Raises BusError if a frame can't be sent.
+        The latter, only in states with power, reads the devices' parameters again. Raises BusError if a frame can't be
+        sent.
         """
         if self._faulted_cycle is not None:
             self._escalation.step(arm.cycle - self._faulted_cycle, arm.t_ns, output.fault)

@@ -112,7 +112,8 @@ class Reading(NamedTuple):
     def allows(self, found: Sequence[TorqueRatio | None], error: float) -> bool:
         """Return whether this hypothesis predicts the found ratios of sensed to commanded torque, by node.
 
-        None: unknown. error: possible relative error of a torque constant or a scale, 0 to 1.
+        None: unknown. error: possible relative error of a torque constant or a scale, 0 to 1. A wrong scale of torque
+        predicts any ratio of the right sign.
         """
         for i in range(JOINTS):
             drive, sensor = 1 - i if self.is_drive_exchanged else i, 1 - i if self.is_sensor_exchanged else i
@@ -205,8 +206,8 @@ def add_block(
 def solve_readings(normals: Vector, count: int, blocks: int, shares: Vector, solutions: Vector) -> None:
     """Solve the normal equations (h, k, k) of each hypothesis; fill `shares` (h,), `solutions` (h, k - 1) in place.
 
-    count: parameters p. blocks: number in the equations. shares: unexplained part of the torques' squares. By Cholesky
-    factors of the equations, scaled to a diagonal of ones.
+    count: parameters p. blocks: number in the equations. shares: unexplained part of the squares of the torques less
+    their means. By Cholesky factors of the equations, scaled to a diagonal of ones.
     """
     size = normals.shape[1] - 1
     L, x, unit = np.zeros((size, size)), np.zeros(size), np.zeros(size)
@@ -264,9 +265,10 @@ class DeviceReadings:
     def judge_blocks(self, is_torque_known: bool) -> bool:
         """Return whether the configuration is refuted: another hypothesis was far better `_ROUNDS` times in a row.
 
-        Far better: it leaves at most `_BETTER` of the configuration's unexplained share, and at most `_EXPLAINED` of
-        all. Judge at every fourth block, return False between. is_torque_known: the commanded torques have confirmed
-        the sensors' scales; without that a wrong scale of torque as the best hypothesis doesn't count.
+        Far better: the configuration leaves `_UNEXPLAINED` or more, the other at most `_BETTER` of that, and at most
+        `_EXPLAINED`. Judge at every fourth block from `_FEWEST_BLOCKS` on, return False between. is_torque_known: the
+        commanded torques have confirmed the sensors' scales; without that a wrong scale of torque as the best
+        hypothesis gives False.
         """
         if self._blocks < _FEWEST_BLOCKS or self._blocks % _JUDGED_EVERY:
             return False
@@ -436,7 +438,7 @@ class DeviceReadings:
         return [may_be_arm(self._solutions[place], slack[row]) for row, place in enumerate(places)]
 
     def _solve(self, among: Iterable[int]) -> int:
-        """Solve all hypotheses anew; return that of the indices `among` that leaves least unexplained, 0 if empty."""
+        """Solve all hypotheses anew; return that of the indices `among` that has the least `_rank`, 0 if empty."""
         solve_readings(self._normals, self._count, max(self._blocks, 1), self._shares, self._solutions)
         return min(among, key=self._rank, default=0)
 

@@ -52,7 +52,8 @@ class Exchange:
     def read(self, tick: Tick) -> ArmState:
         """Send SYNC, unless another host does, take the devices' frames until all are in, and return the arm's state.
 
-        Stop to wait after FEEDBACK_SHARE of the period; the missing values are then old ones.
+        Wait no longer than FEEDBACK_SHARE of the period, nor beyond another host's next SYNC; the missing values are
+        then old ones.
 
         Raises BusError if sending or receiving fails; in lockstep its SilenceError, if no device answers.
         """

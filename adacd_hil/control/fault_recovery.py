@@ -62,8 +62,8 @@ class SelfChecks:
     def judge(self, arm: ArmState, state: SchemeState) -> Request:
         """Return the request to fault for changed parameters, wrong torque, wrong configuration or lagging motion.
 
-        Else NONE, and while the drives are not enabled. Store the first failure in `reason` and `line`. `state`: of the
-        scheme after the previous cycle. Call it once per cycle.
+        Else NONE, and while the drives are not enabled. Motion is not judged in a reaction or a stop. Store the first
+        failure in `reason` and `line`. `state`: of the scheme after the previous cycle. Call it once per cycle.
         """
         if not arm.is_enabled:
             return Request.NONE
@@ -179,7 +179,7 @@ class FaultReport:
     def count_cycle(self, state: SchemeState, arm: ArmState) -> None:
         """Count the reasons for which an arm in INIT or COMMISSION stays there in this cycle; else do nothing.
 
-        state: of the scheme after the cycle before.
+        Events go to `commission`. state: of the scheme after the cycle before.
         """
         self.commission.count_cycle(state, arm)
 
@@ -292,7 +292,7 @@ class Recovery:
         self._is_interrupted = is_interrupted
 
     def empty(self) -> bool:
-        """Drop all frames that wait to be received or sent; return whether that was possible, and if not log why."""
+        """Drop all frames that wait to be received or sent; log, print and return whether that was possible."""
         try:
             self._tap.recover()
         except BusError as error:

@@ -169,7 +169,7 @@ class FirstMotion(EventSource):
         """Compare the run's first certificate, if any, with the configured lengths; add the event of `geometry_event`.
 
         It is a warning of a contradiction, or an info if a smaller tilt explains that or torques can't check a length;
-        there is none if the lengths agree. Set `is_certified` to True, also without a certificate.
+        otherwise there is none. Set `is_certified` to True, also without a certificate.
         """
         self.is_certified = True
         event = geometry_event(self._settings, certificates[0]) if certificates else None
@@ -235,8 +235,8 @@ class FirstMotion(EventSource):
     def _take_block(self, block: "_Block") -> None:
         """Add a long block to the sums by which positions are judged, and for a moving joint also torques.
 
-        Moving: in one direction throughout, at _MOVING_RAD_S or more on average. Judge the joints at each fifth block,
-        while any is still to be judged.
+        Moving: at _MOVING_RAD_S or more on average, and in that direction at both ends of the block. Judge the joints
+        at each fifth block, while any is still to be judged.
         """
         self._path += block.travel * block.way, block.way * block.way, block.travel * block.travel
         self._way_rad += np.abs(block.way)
@@ -291,7 +291,7 @@ class FirstMotion(EventSource):
         """Return the contradiction of a torque sensor to the commands, "" without one; close joints that agree.
 
         A contradiction: both sensors measure the other joint's torque, or a ratio is surely outside the tolerance of
-        `safety.first_motion_error`.
+        `safety.first_motion_error`. The latter doesn't count while the ratio to the other joint's command is over 0.5.
         """
         found = self._ratios()
         first, second = found
@@ -357,7 +357,7 @@ class FirstMotion(EventSource):
 class _Block(NamedTuple):
     """Means over a block, (2,) each, and changes per second over it; `travel`: change of q, `way`: ∫ dq dt, rad.
 
-    least_speed: the smaller of the speeds at its ends, negative if the joint has reversed.
+    least_speed: the smaller product of the velocity at an end and `dq`, rad²/s²; negative if the joint has reversed.
     """
 
     q: Vector

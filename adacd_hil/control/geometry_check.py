@@ -34,7 +34,7 @@ def geometry_event(settings: Settings, certificate: Certificate) -> Event | None
     """Compare the configured link lengths with a certificate of the arm without payload; return the event to report.
 
     A warning if a length or the mounting contradicts the certificate, an info if a smaller tilt explains it or torques
-    can't check a length; None if the lengths agree.
+    can't check a length; else None.
     """
     theta, lengths = certificate.parameters, settings.arm.link_length_m
     cad, is_upright = settings.arm.cad_theta, len(theta) > A5

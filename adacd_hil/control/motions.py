@@ -183,7 +183,8 @@ class Admittance:
     def step(self, tau_ext_hat: Vector, q_d: Vector, dq_d: Vector, ddq_d: Vector) -> None:
         """Advance q_d, dq_d, ddq_d (2,) in place by one period under the external torque (2,), Nm.
 
-        Torque within the dead band counts as 0. The limits of the settings hold for each joint.
+        Torque within the dead band counts as 0. The limits of the settings hold for each joint; one that begins too
+        fast for the limit of speed or position exceeds it, and brakes at the limit of acceleration.
         """
         for i in range(JOINTS):
             speed, tau = float(dq_d[i]), float(tau_ext_hat[i])

@@ -44,7 +44,7 @@ class ScriptedOperator:
         self._acknowledge_fault_after_s = settings.acknowledge_fault_after_s
 
     def answer_fault(self, elapsed_s: float) -> FaultAnswer:
-        """Return RECOVER, after the time of the settings, for as many faults as they allow; WAIT before, END later."""
+        """Return WAIT, then RECOVER at the time of the settings, for as many faults as they allow; END for others."""
         if self._faults_left == 0:
             return FaultAnswer.END
         if elapsed_s < self._acknowledge_fault_after_s:
@@ -55,7 +55,7 @@ class ScriptedOperator:
     def request(self, elapsed_s: float | None, state: SchemeState) -> Request:
         """Return the script's next request if it is due, or ACKNOWLEDGE a given time after a stop, else NONE.
 
-        NONE before the drives are enabled, and in FAULT.
+        NONE before the drives are enabled, and in FAULT. A given time of 0 s: never acknowledge.
         """
         if elapsed_s is None or state is SchemeState.FAULT:
             return Request.NONE
@@ -159,7 +159,10 @@ class RunNarration:
         return f"{what}{found}: {_REACTIONS[contact.reaction]}"
 
     def contact(self, t_ns: int, contact: ContactReport) -> None:
-        """Print link and peak of a contact if its report is final; earlier reports may have the other link."""
+        """Print a contact's link and each joint's peak external torque, Nm, if its report is final.
+
+        Earlier reports may have the other link.
+        """
         if contact.is_final:
             first, second = contact.tau_ext_peak
             peak = f"{first:+.1f} / {second:+.1f} Nm at the joints"

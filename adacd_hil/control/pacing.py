@@ -180,7 +180,7 @@ class FollowingPacer:
     """Begins a cycle with each SYNC that another host sends. Of several that wait, the last one counts.
 
     The first SYNC heard is cycle 0; from there its counter 1…240 is unwrapped, with the help of the clock after a long
-    gap.
+    gap. Without a counter, the time between two SYNCs gives the number of periods.
     """
 
     def __init__(self, bus: Tap, clock: Clock, period_ns: int, sync_id: int, timeout_ns: int) -> None:
@@ -197,7 +197,7 @@ class FollowingPacer:
         self._periods_ns: list[float] = []
 
     def next(self) -> Tick:
-        """Wait for SYNC and return the cycle that it begins.
+        """Wait for SYNC and return the cycle that it begins; count skipped periods as overruns, unless after `resume`.
 
         Raises BusError if it doesn't come within the timeout, or if the first `_JUDGED_SYNCS` come at another period
         than configured.
@@ -316,9 +316,10 @@ def calibrate(clock: Clock, period_ns: int, cpu_count: int) -> SpinCalibration:
 
 
 def prepare_spin(pacer: Pacer, settings: Settings, clock: Clock, grant: RealtimeGrant) -> dict[str, str]:
-    """Set the pacer's `spin_ns` by the settings, or by a measurement; return both as text for a log's metadata.
+    """Set the pacer's `spin_ns` by the settings, or by a measurement; return entries for a log's metadata.
 
-    Call it once real-time priority has been granted. In virtual time, or if SYNC is followed, do nothing and return {}.
+    These are the spin and the measured times of waking up, µs: it measures in both cases, see `calibrate`. Call it once
+    real-time priority has been granted. In virtual time, or if SYNC is followed, do nothing and return {}.
     """
     if isinstance(clock, VirtualClock) or settings.bus.follows:
         return {}

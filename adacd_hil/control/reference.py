@@ -3,7 +3,7 @@
 MONITOR follows the trajectory, ADAPT and CERTIFY the excitation if there is one, else the trajectory. REACT carries out
 the reaction. STOPPED continues it, or holds the position. PAYLOAD and the end of a run park the arm in the trajectory's
 start corner. In other states the desired position is the measured one. If a run ends while the arm reacts or is
-stopped, the arm doesn't move: the run ends there, or the arm is parked once the stop has been acknowledged.
+stopped, the arm doesn't go to the corner: the run ends there, or the arm is parked once the stop is acknowledged.
 
 **Limits.** The desired motion stays within the arm's position and velocity limits and the reaction's acceleration limit
 by construction. Trajectory and excitation are checked before the run. On the way to the corner the arm first comes to
@@ -119,7 +119,7 @@ class Reference(EventSource):
     def park(self) -> None:
         """Begin the way to the start corner, where the arm stays.
 
-        While it reacts or is stopped, leave it in place; the way begins when it goes on afterwards.
+        While it reacts or is stopped, don't interfere; the way begins when it goes on afterwards.
         """
         self._is_parking = True
         if self._state not in REACTING:
@@ -186,7 +186,7 @@ class Reference(EventSource):
         """Fill the desired motion of FLOAT or ADMITTANCE and return True; return False for reactions along a path.
 
         If a blow has just thrown the arm, and `reaction.start` is `measured`, restart the reaction from the measured
-        motion; not in FLOAT.
+        motion; not in FLOAT, NONE and SLOW_DOWN.
         """
         if self._reaction is Reaction.FLOAT:
             self._stay(arm)
@@ -309,7 +309,10 @@ class Reference(EventSource):
         return float(np.max(ahead)) >= THROWN_rad_s
 
     def _follow_thrown(self, arm: ArmState) -> None:
-        """Restart the reaction from the measured motion; else the controller would pull the arm back to the contact."""
+        """Restart the reaction from the measured motion; do nothing in FLOAT, NONE and SLOW_DOWN.
+
+        Otherwise the controller would pull the arm back to the contact.
+        """
         if self._reaction is Reaction.ADMITTANCE:
             self._q_d[:], self._dq_d[:] = arm.q, arm.dq
             self._warn_beyond(self._stop_from(arm.q, arm.dq))

@@ -145,7 +145,8 @@ class Session:
 
         The summary describes an early end. The log is closed and readable in any case.
 
-        Raises LogExistsError if there is a log already, LogError if it can't be created.
+        Raises LogExistsError if there is a log already, except of a start that failed; LogError or OSError if log or
+        folder can't be created; ConfigError or CodecError for settings or a contract that can't be used.
         """
         if self.is_lockstep:  # a simulated arm moves by whole periods, however late the modelled host sends SYNC
             realtime = replace(self.settings.realtime, sample_period="nominal")
@@ -262,10 +263,10 @@ class Session:
         recorder.cycle(self.clock.now_ns(), [], tap.take_passed())
 
     def _run(self, cycle: Cycle, master: Master, recorder: Recorder, tap: Tap) -> RunResult:
-        """Set the devices to Operational, run the cycles, and stop the devices in any case; return the result.
+        """Set the devices to Operational, run the cycles, set them to Pre-operational in any case; return the result.
 
-        Before the first attempt call `on_started`. Raises BusError if sending or receiving fails, in lockstep if no
-        device answers.
+        Before they become Operational for the first time, call `on_started`. Raises BusError if sending or receiving
+        fails, in lockstep if no device answers.
         """
         if not self._has_started:
             self._has_started = True
@@ -278,7 +279,7 @@ class Session:
                 self._stop(master, recorder, tap)
 
     def _stop(self, master: Master, recorder: Recorder, tap: Tap) -> None:
-        """Stop the devices by NMT, and log the frames until then; log a BusError instead of raising it."""
+        """Set the devices to Pre-operational, and log the frames until then; log a BusError instead of raising it."""
         try:
             master.stop()
         except BusError as error:
@@ -288,8 +289,8 @@ class Session:
     def _open_log(self, grant: RealtimeGrant, spin: dict[str, str]) -> Recorder:
         """Create the log with its attachments and metadata, and the files beside it; return its recorder.
 
-        spin: entries for the metadata. Raises LogExistsError if there is a log already, LogError if it can't be
-        created.
+        spin: entries for the metadata. A log of a start that failed is renamed. Raises LogExistsError if there is
+        another log already, LogError if it can't be created, OSError if the folder can't.
         """
         self.out.mkdir(parents=True, exist_ok=True)
         is_lockstep = self.is_lockstep
@@ -317,9 +318,9 @@ class Session:
         return recorder
 
     def _write_beside(self, recorder: Recorder) -> None:
-        """Write the viewers' files and the contract beside the log, which contains them, too.
+        """Write the viewers' files, and a contract without a file, beside the log, which contains them, too.
 
-        A file that can't be written is reported and left out.
+        A file that can't be written is printed, logged and left out.
         """
         writes: list[Callable[[], object]] = [
             partial(write_new_file, self.out / name, content) for name, content in self.viewer_files.items()

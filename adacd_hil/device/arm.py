@@ -1,6 +1,6 @@
 """The arm: two drives and two torque sensors joined into `ArmState`, and `ArmCommand` turned into frames.
 
-The only place of sign, zeros and torque ratio. Every value carries its age in cycles.
+Sign, zeros and torque ratio are applied here. Every value carries its age in cycles.
 """
 
 from collections.abc import Callable, Sequence

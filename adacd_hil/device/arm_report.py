@@ -73,9 +73,10 @@ class DataWatch(EventSource):
     def count_cycle(self, state: ArmState) -> None:
         """Count a cycle and its missing frames and sample; compare the shares with their limits after each second.
 
-        Add a warning when MOST_IN_A_ROW cycles in a row have no sample. After each second of counted cycles, also add
-        an event for each share that now exceeds its limit, or no longer does. Call it once per cycle, after the cycle's
-        last frame. A cycle without enabled drives is not counted.
+        Add a warning when MOST_IN_A_ROW cycles in a row have no sample, again only after a second without that, which
+        is an event, too. After each second of counted cycles, also add an event for each share that now exceeds its
+        limit, or no longer does. Call it once per cycle, after the cycle's last frame. A cycle without enabled drives
+        is not counted.
         """
         if not state.is_enabled:
             return

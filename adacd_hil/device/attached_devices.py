@@ -22,6 +22,6 @@ def device_attachments(devices: Iterable[PlacedDevice]) -> dict[str, bytes]:
 
 
 def _free_name(device: PlacedDevice, eds: bytes, attachments: Mapping[str, bytes]) -> str:
-    """Return the file name of a device's EDS, after the device's if `attachments` has another EDS of that name."""
+    """Return the file name of a device's EDS, with the device's name before it if another EDS has that file name."""
     name = device.profile.eds.name
     return name if attachments.get(name, eds) == eds else f"{device.name}-{name}"

@@ -1,4 +1,4 @@
-"""canopen over our own bus: NMT, SDO, EMCY and heartbeats of any node. The host's only door to `canopen`.
+"""canopen over our own bus: NMT, SDO, EMCY and heartbeats of any node.
 
 No threads: a request is sent, then the bus is read until its answer is in. Other frames that arrive meanwhile are
 handed to their consumers. Source: CiA 301 (4.2), clauses 7.2.4 (SDO) and 7.2.8 (NMT).

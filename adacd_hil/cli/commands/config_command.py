@@ -97,7 +97,7 @@ def effective(name: str, profile: str | None, given: tuple[str, ...], keys: tupl
 @json_option
 @explained
 def check(names: tuple[str, ...], profile: str | None, as_json: bool) -> ExitCode:
-    """List all errors and likely mistakes of configurations, a line each."""
+    """List errors and likely mistakes of configurations, a line each."""
     from adacd_hil.control.configuration_check import examine_configuration
 
     findings = {name: examine_configuration(name, profile) for name in names}

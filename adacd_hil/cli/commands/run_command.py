@@ -49,6 +49,7 @@ from adacd_hil.wire.can_interface import CanInterface
 def rehearsed_settings(connection: Connection, scenario: str) -> Settings:
     """Return the settings of a connection with the user of a scenario, as `demo` does; the arm is emulated.
 
+    As by `resolve`, a built-in arm has the scenario's profile unless one is given, and its motors' holding torque.
     Raises CommandError if the channel may be hardware, ConfigError or CodecError for invalid settings or scenario.
     """
     from adacd_hil.cli.embedded_run import resolve
@@ -200,8 +201,8 @@ def ask_without_anchor(joints: list[int], arguments: str) -> None:
 def summarise(summary: SessionSummary) -> dict[str, Any]:
     """Return the result of a session by name, for JSON and `as_text`; print its error, if any, on standard error.
 
-    A run that broke off has `broke_off` in place of cycles, state, fault and data; one that didn't start has none of
-    these.
+    A run that broke off has `broke_off` in place of the entries from `cycles` to `data`; one that didn't start has
+    none of these.
     """
     described: dict[str, Any] = {"log": str(summary.log.path), "scheduler": summary.grant.scheduler}
     if summary.error:
