@@ -14,6 +14,7 @@ from adacd_hil.cli.embedded_run import resolve, run_embedded
 from adacd_hil.cli.output import ExitCode, exit_code
 from adacd_hil.device.device_files import load_profile
 from adacd_hil.log.log_walk import attachment
+from adacd_hil.log.reader import read_log
 from adacd_hil.settings.configuration_files import load_settings
 from adacd_hil.settings.setting_keys import apply_settings
 
@@ -242,3 +243,26 @@ def test_the_documented_example_has_the_documented_numbers(tmp_path: Path) -> No
     assert scale.velocity_rad_s == pytest.approx(math.pi / 30.0 / 30.0)
     assert (scale.increments_per_joint_rev, scale.rated_torque_count_Nm) == (122880.0, 1e-6)
     assert load_settings(str(tmp_path / "my-arm.toml")).arm.rated_torque_Nm == pytest.approx((9.12, 9.12))
+
+
+def fixed_mode(mode: int) -> EdsVariant:
+    eds = EdsVariant().with_value("ro", "6060", key="AccessType").with_value(mode, "6060", "6061")
+    return eds.with_value(0, "6061", key="PDOMapping")
+
+
+@pytest.mark.parametrize(
+    ("eds", "code", "said"),
+    [
+        (fixed_mode(8), ExitCode.BUS_MISSING, "0x6061 = 8, 10 expected"),
+        (fixed_mode(10), ExitCode.OK, ""),
+        (EdsVariant().without("6061"), ExitCode.OK, "lacks 0x6061"),
+    ],
+    ids=["another one that can't be written", "the right one", "one that can't be read"],
+)
+def test_a_mode_that_no_frame_shows_is_compared_or_said_to_be_unknown(
+    tmp_path: Path, eds: EdsVariant, code: ExitCode, said: str
+) -> None:
+    assert init(tmp_path, "--eds", str(eds.write(tmp_path / "drive.eds"))).exit_code == 0
+    assert rehearse(tmp_path) == code
+    events = [entry.event.message for entry in read_log(tmp_path / "run" / "run.mcap").events]
+    assert any((said or "0x6061") in line for line in events) == bool(said)

@@ -189,8 +189,7 @@ def set_up_drive(slave: Slave, settings: Settings, codec: Codec, drives: Sequenc
         slave.write_checked(0x2200, 0, settings.bus.command_patience_cycles, "SYNCs")
     if slave.device.can("sync_tolerance"):
         slave.write_checked(0x2201, 0, round(10 * settings.bus.sync_patience_periods), "tenths of a period")
-    _enter_mode(slave, codec)
-    return remarks
+    return remarks + _enter_mode(slave, codec)
 
 
 def _check_rated_torque(slave: Slave, settings: Settings, drives: Sequence[PlacedDevice]) -> None:
@@ -288,34 +287,37 @@ _HALT = 1 << 8  # of the controlword
 _MODE_POLL_S = 0.02
 
 
-def _enter_mode(slave: Slave, codec: Codec) -> None:
+def _enter_mode(slave: Slave, codec: Codec) -> list[str]:
     """Request cyclic synchronous torque, if 0x6060 can be written; end a halt under which the drive refuses it.
 
     0x6061 may show the mode later, once the drive is enabled: the cycle compares it. But if no frame carries it, 0x6061
-    must show it within `patience.mode_s`. Raises DeviceError if it doesn't, or the drive refuses or doesn't answer;
-    BusError if the bus fails. If 0x6060 can't be written, or the EDS lacks 0x6061, no mode is compared.
+    must show it within `patience.mode_s`. Return a remark if the EDS lacks 0x6061 then. A drive without 0x6060 and
+    0x6061 has one mode. Raises DeviceError if 0x6061 shows another mode, or the drive refuses or doesn't answer;
+    BusError if the bus fails.
     """
-    if not slave.can_write(0x6060):
-        return
-    try:
-        slave.write_object(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
-    except RefusedError:
-        if not (slave.can_write(0x6040) and slave.read(0x6040) & _HALT):
-            raise
-        slave.write_object(0x6040, 0, 0)  # some drives refuse another mode under halt
-        slave.known.pop((0x6040, 0))
-        slave.write_object(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+    if slave.can_write(0x6060):
+        try:
+            slave.write_object(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+        except RefusedError:
+            if not (slave.can_write(0x6040) and slave.read(0x6040) & _HALT):
+                raise
+            slave.write_object(0x6040, 0, 0)  # some drives refuse another mode under halt
+            slave.known.pop((0x6040, 0))
+            slave.write_object(0x6060, 0, MODE_CYCLIC_SYNCHRONOUS_TORQUE)
+    is_shown = shows_mode(codec, slave.name)
     if not slave.has(0x6061):
-        return
+        if is_shown or not slave.can_write(0x6060):
+            return []
+        return ["nothing shows its mode: no frame has `mode_display`, and its EDS lacks 0x6061"]
     for _ in range(_MODE_READS):
         if slave.read(0x6061) == MODE_CYCLIC_SYNCHRONOUS_TORQUE:
-            return
-    if shows_mode(codec, slave.name):
-        return
+            return []
+    if is_shown:
+        return []
     for _ in range(round(slave.device.settings.patience.mode_s / _MODE_POLL_S)):
         slave.wait(_MODE_POLL_S)
         if slave.read(0x6061) == MODE_CYCLIC_SYNCHRONOUS_TORQUE:
-            return
+            return []
     slave.expect(
         0x6061,
         0,
@@ -323,6 +325,7 @@ def _enter_mode(slave: Slave, codec: Codec) -> None:
         "mode of operation",
         remedy="no frame shows the mode, so it is compared before the drive is enabled: map 0x6061 as `mode_display`",
     )
+    return []
 
 
 NEWTON_METRE = 0x00560100
