@@ -93,9 +93,9 @@ def examine_settings(settings: Settings, layers: Sequence[ConfigurationLayer] = 
     try:
         devices = place_devices(settings)
         codec = load_contract(settings, devices)
+        excess = describe_excess(codec, settings)
     except (ConfigError, CodecError) as error:
         return ConfigurationFindings([str(error)], [], None)
-    excess = describe_excess(codec, settings)
     late = [excess] if excess else []
     mistakes = [line for look in _LOOKS for line in look(settings)]
     mistakes += [*_misfits(codec, settings), *_ranges(codec, settings, devices), *_unseen(devices), *_gears(devices)]

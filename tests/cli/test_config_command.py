@@ -10,6 +10,7 @@ from click.testing import Result
 from adacd_hil.lab.commission.host_checks import Status, configuration_checks
 from adacd_hil.settings.configuration_files import configuration_layers, load_settings
 from adacd_hil.settings.toml_files import builtin_names
+from adacd_hil.wire.dbc_contract import contract_folder
 
 USAGE = 2
 
@@ -50,6 +51,15 @@ def test_what_comes_with_the_package_has_no_error_and_no_unknown_warning(name):
     ]
     result = config("check", name)
     assert (result.exit_code, result.stdout.splitlines()) == (0, [*warned, f"{name}: 0 errors, {len(warned)} warnings"])
+
+
+def test_a_contract_without_a_bit_rate_is_an_error_of_its_configuration_alone(tmp_path):
+    dbc = (contract_folder() / "arm.dbc").read_text().replace('BA_ "Baudrate" 1000000;', 'BA_ "Baudrate" 0;')
+    (tmp_path / "slow.dbc").write_text(dbc)
+    (tmp_path / "slow.toml").write_text('extends = "certified"\n[devices]\ncontract = "slow.dbc"\n')
+    result = config("check", str(tmp_path / "slow.toml"), "certified")
+    assert result.exit_code == USAGE
+    assert ["Baudrate" in line for line in result.stdout.splitlines()] == [True, False, False]
 
 
 def test_all_errors_are_told_at_once(tmp_path):

@@ -206,6 +206,13 @@ def test_a_value_outside_the_bounds_of_its_profile_fails(tmp_path):
     assert finding.reason == "Sensor2: error_register 0, at least 1 allowed"
 
 
+def test_a_drive_without_a_status_is_named():
+    rig = Rig(is_wall=True)
+    rig.tamper = lambda cycle, can_id, data: None if can_id == 0x281 else data
+    finding = doctor(rig)["devices"]
+    assert (finding.status, finding.reason.split(":")[0]) == (Status.WARNING, "Drive1")
+
+
 @pytest.mark.parametrize(
     ("push", "has_noise", "name", "status", "text"),
     [

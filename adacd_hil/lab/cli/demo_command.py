@@ -73,4 +73,6 @@ def _ending(summary: SessionSummary) -> str:
         return summary.error or "no cycle was run"
     if result.state is SchemeState.FAULT:
         return f"the run ended in FAULT ({result.fault.name})"
+    if result.is_interrupted:
+        return "the run was interrupted"
     return f"log {summary.log.path} lacks something"

@@ -422,7 +422,7 @@ def check_devices(patient: ArmExamination) -> Finding:
     Warn of other faults of the drives, values that are too old, other senders, and EMCYs and other events of the
     devices, which are taken from the master. A sensor's status isn't looked at here.
     """
-    lines = [line for line in describe_faults(patient.arm) if ": status" not in line]
+    lines = [line for line in describe_faults(patient.arm) if ": status 0x" not in line]
     events = [f"{event.name}: {event.message}" for event in patient.master.take_events() if event.level != "info"]
     text = "; ".join([*lines, *events])
     if any(device.has_excess(patient.arm.cycle) for device in patient.arm.devices):
