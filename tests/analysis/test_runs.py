@@ -243,6 +243,7 @@ def many(one: Path) -> Path:
     (folder / "only a part" / "run_001.mcap").write_bytes(b"")
     (folder / "latest").symlink_to(one.name)
     (folder / "notes").mkdir()
+    (folder / "notes" / "other.mcap").write_bytes(b"")
     return folder
 
 

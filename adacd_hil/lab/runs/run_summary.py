@@ -26,8 +26,8 @@ from adacd_hil.file_access import InUseError, check_unused, read_input
 from adacd_hil.lab.logs.log_info import LogInfo, read_info
 from adacd_hil.lab.report.report_json import JSON_NAME, SCHEMA
 from adacd_hil.lab.stated_bounds import STATUSES
-from adacd_hil.log.log_files import CONFIG_NAME, EPOCH_KEY, LOG_NAME, SUFFIX, TRUTH_NAME, LogError
-from adacd_hil.log.log_parts import PLANNED_ENDINGS, parts_of
+from adacd_hil.log.log_files import CONFIG_NAME, EPOCH_KEY, LOG_NAME, SUFFIX, TRUTH_NAME, LogError, find_parts
+from adacd_hil.log.log_parts import PLANNED_ENDINGS
 from adacd_hil.log.log_walk import attachment
 from adacd_hil.log.logged_run import settings_of
 from adacd_hil.log.reader import LogStream
@@ -140,7 +140,7 @@ def find_runs(folder: Path) -> Iterator[Path]:
 
 def _has_run(folder: Path, names: Sequence[str]) -> bool:
     """Return whether a folder has the log of a run, or later parts of one. names: those of its files."""
-    return LOG_NAME in names or (any(name.endswith(SUFFIX) for name in names) and bool(parts_of(folder / LOG_NAME)))
+    return LOG_NAME in names or (any(name.endswith(SUFFIX) for name in names) and bool(find_parts(folder / LOG_NAME)))
 
 
 def summarise(folder: Path, name: str = "") -> RunSummary:
