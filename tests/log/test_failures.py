@@ -4,6 +4,7 @@ import os
 import re
 import resource
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -98,6 +99,18 @@ def test_a_killed_writer_costs_the_log_its_end_and_the_control_process_nothing(b
     assert lost <= summary.dropped <= lost + 300  # a chunk may be on the disk and not yet be counted
     assert log.scheme.block.tobytes() == run.blocks[:count].tobytes()
     assert log.attachments["run.toml"] == run.attachments["run.toml"]
+
+
+@pytest.mark.slow
+def test_a_dead_writer_whose_folder_is_gone_raises_nothing_at_the_end(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    recorder = Recorder(folder / "run.mcap")
+    os.kill(recorder.pid, signal.SIGKILL)
+    shutil.rmtree(folder)
+    summary = recorder.close()
+    assert (summary.is_complete, summary.parts) == (False, 1)
+    assert recorder.close() is summary
 
 
 @pytest.mark.slow
