@@ -16,6 +16,7 @@ import pytest
 from made_log import flipped
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
+from adacd_hil.error_texts import is_disk_full
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.record_layout import MAGIC
 from adacd_hil.log.reader import read_log
@@ -230,8 +231,9 @@ def test_a_disk_that_is_full_from_the_start_is_an_error_before_the_run(tmp_path,
         return os.open("/dev/full", os.O_WRONLY)
 
     monkeypatch.setattr(recorder_module, "create_file", create_full)
-    with pytest.raises(LogError, match=f"^log {path} can't be written: No space left on device after 0 bytes$"):
+    with pytest.raises(LogError, match=f"^log {path} can't be written: No space left on device after 0 bytes$") as said:
         Recorder(path)
+    assert is_disk_full(said.value)
     assert not path.exists()
 
 
