@@ -1,14 +1,18 @@
 """Texts and kinds of errors of the operating system."""
 
 import errno
+import os
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Return whether an error, or one that caused it, means that the disk or quota is full, or a file too large."""
+    """Return whether an error, or one that caused it, means that the disk or quota is full, or a file too large.
+
+    The text counts, too: a log's writer process reports its error as text.
+    """
     while error is not None:
-        if isinstance(error, OSError) and error.errno in _NO_ROOM:
+        if getattr(error, "errno", 0) in _NO_ROOM or any(os.strerror(number) in str(error) for number in _NO_ROOM):
             return True
         error = error.__cause__ or error.__context__
     return False

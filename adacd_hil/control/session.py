@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from threading import Timer
 from typing import NamedTuple, Protocol
 
 from adacd_hil import __version__
@@ -25,7 +26,7 @@ from adacd_hil.device.strangers import refuse_company
 from adacd_hil.file_access import write_new_file
 from adacd_hil.log.log_files import CONFIG_NAME, DBC_NAME, LAYOUT_NAME, LOG_NAME, SCRIPTED, arithmetic
 from adacd_hil.log.recording.processes import LiveService
-from adacd_hil.log.recording.recorder import LogSummary, Recorder
+from adacd_hil.log.recording.recorder import END_TIMEOUT_S, LogSummary, Recorder
 from adacd_hil.log.types.topics import CERTIFIED_MODEL
 from adacd_hil.records import Event, FaultReason, SchemeState
 from adacd_hil.scheduling import RealtimeGrant, frozen_garbage, request_realtime, scheduler_name
@@ -185,7 +186,10 @@ class Session:
                 attempt = self._prepare(tap, pacer)
                 attempt.cycle.carry(unserved)
         finally:
+            notice = Timer(1.0, self.progress, [f"waiting for the end of the log, {END_TIMEOUT_S:g} s at most"])
+            notice.start()
             log = recorder.close()
+            notice.cancel()
         elapsed_s = (stopwatch.now_ns() - start_ns) * 1e-9
         return SessionSummary(
             ending.result,

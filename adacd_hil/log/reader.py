@@ -271,7 +271,7 @@ class LogStream:
     def _find_parts(self) -> None:
         """Plan the reading: readable parts by ascending number, a problem for each missing, unreadable or foreign one.
 
-        Foreign: of another log. Raises the first part's LogError if no part can be read.
+        Foreign: of another log. Raises LogError if every part is unreadable or foreign.
         """
         parts = parts_of(self.path)
         self._is_alone = list(parts) == [0]
@@ -285,8 +285,8 @@ class LogStream:
                 self._plan.append(str(error))
                 continue
             self._plan_part(head, parts[number], number)
-        if first_error is not None and all(isinstance(step, str) for step in self._plan):
-            raise first_error
+        if all(isinstance(step, str) for step in self._plan):
+            raise first_error or LogError(f"log {self.path} can't be read: {'; '.join(map(str, self._plan))}")
         self._last = max(parts)
 
     def _plan_part(self, head: Extras, path: Path, number: int) -> None:

@@ -1,6 +1,8 @@
 """Whole runs against the emulator in one process, with something going wrong; torque is judged on the wire."""
 
+import os
 import re
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,8 @@ from adacd_hil.lab.live.live_view import LiveView
 from adacd_hil.lab.serial_arm.urdf import read_urdf
 from adacd_hil.log.log_files import LAYOUT_NAME, ROBOT_NAME
 from adacd_hil.log.reader import RunLog
+from adacd_hil.log.recording import recorder as recorder_module
+from adacd_hil.log.recording.recorder import LogSummary, Recorder
 from adacd_hil.log.viewer_layout import viewer_files
 from adacd_hil.records import JOINT_NAMES, FaultReason
 from adacd_hil.wire.e2e import E2eStatus
@@ -105,6 +109,23 @@ def test_a_second_interrupt_stops_at_once(tmp_path: Path) -> None:
     assert set(controlwords(log)[-20:].tolist()) == {QUICK_STOP}
     (said,) = messages(log, "run")
     assert said == "interrupted again before it was parked: the drives are disabled where the arm is"
+
+
+@pytest.mark.usefixtures("writer_process")
+def test_a_log_that_is_slow_to_end_is_announced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = SessionRig(tmp_path, finish_s=0.3)
+    said: list[str] = []
+    rig.session.progress = said.append
+    close = Recorder.close
+
+    def stop_writer(recorder: Recorder) -> LogSummary:
+        os.kill(recorder.pid, signal.SIGSTOP)
+        return close(recorder)
+
+    monkeypatch.setattr(Recorder, "close", stop_writer)
+    monkeypatch.setattr(recorder_module, "END_TIMEOUT_S", 1.5)
+    assert not rig.session.run().log.is_complete
+    assert ["the log" in line for line in said][-2:] == [False, True]
 
 
 @pytest.mark.long

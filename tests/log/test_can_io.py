@@ -175,6 +175,14 @@ def test_a_flipped_bit_outside_the_chunks_is_said(path, tmp_path):
     assert read_frames(path).problem == ""
 
 
+@pytest.mark.parametrize(("content", "cause"), [(b"", "empty"), (b"notes", "not an MCAP file")])
+def test_a_further_part_that_is_no_mcap_costs_only_itself(content, cause, messages, path, tmp_path):
+    (tmp_path / "x.mcap").write_bytes(path.read_bytes())
+    (tmp_path / "x_001.mcap").write_bytes(content)
+    log = read_frames(tmp_path / "x.mcap")
+    assert (len(log.frames), log.problem) == (len(messages), f"x_001.mcap is {cause}")
+
+
 def test_log_times_never_run_backwards_within_a_topic(tmp_path):
     times_ns = [5_000, 3_000, 4_000, 9_000]
     write(tmp_path / "x.mcap", [TimedMessage(t_ns) for t_ns in times_ns])

@@ -4,6 +4,7 @@ import os
 import re
 import resource
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 from made_log import flipped
 from recorded_run import feed, make_run, record, start, wait_until_taken
 
+from adacd_hil.error_texts import is_disk_full
 from adacd_hil.log.log_files import LogError
 from adacd_hil.log.mcap.record_layout import MAGIC
 from adacd_hil.log.reader import read_log
@@ -98,6 +100,18 @@ def test_a_killed_writer_costs_the_log_its_end_and_the_control_process_nothing(b
     assert lost <= summary.dropped <= lost + 300  # a chunk may be on the disk and not yet be counted
     assert log.scheme.block.tobytes() == run.blocks[:count].tobytes()
     assert log.attachments["run.toml"] == run.attachments["run.toml"]
+
+
+@pytest.mark.slow
+def test_a_dead_writer_whose_folder_is_gone_raises_nothing_at_the_end(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    recorder = Recorder(folder / "run.mcap")
+    os.kill(recorder.pid, signal.SIGKILL)
+    shutil.rmtree(folder)
+    summary = recorder.close()
+    assert (summary.is_complete, summary.parts) == (False, 1)
+    assert recorder.close() is summary
 
 
 @pytest.mark.slow
@@ -217,8 +231,9 @@ def test_a_disk_that_is_full_from_the_start_is_an_error_before_the_run(tmp_path,
         return os.open("/dev/full", os.O_WRONLY)
 
     monkeypatch.setattr(recorder_module, "create_file", create_full)
-    with pytest.raises(LogError, match=f"^log {path} can't be written: No space left on device after 0 bytes$"):
+    with pytest.raises(LogError, match=f"^log {path} can't be written: No space left on device after 0 bytes$") as said:
         Recorder(path)
+    assert is_disk_full(said.value)
     assert not path.exists()
 
 

@@ -233,7 +233,9 @@ def test_an_error_frame_of_a_trc_and_data_shorter_than_their_dlc_are_counted(tmp
     (tmp_path / "x.trc").write_text(f";$FILEVERSION=2.1\n;$STARTTIME=45000.0\n;$COLUMNS=N,O,T,I,d,L,D\n{rows}")
     head = "timestamp,arbitration_id,extended,remote,error,dlc,data\n"
     (tmp_path / "x.csv").write_text(f"{head}1.0,0x181,0,0,0,1,Bw==\n2.0,0x181,0,0,0,2,!!!\n")
-    for name, cause in (("x.trc", "'ER'"), ("x.csv", "0 bytes of data, its DLC is 2")):
+    fd = "CANFD 1 Rx 181 1 0 f 64 07"
+    (tmp_path / "x.asc").write_text(f"base hex timestamps absolute\n1.0 {fd}{' 00' * 63}\n2.0 {fd}{' 00' * 19}\n")
+    for name, cause in (("x.trc", "'ER'"), ("x.csv", " 0 bytes of data"), ("x.asc", " 20 bytes of data")):
         log = read_frames(tmp_path / name)
         assert log.frames["data"][:, 0].tolist() == [7]
         assert cause in log.problem

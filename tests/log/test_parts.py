@@ -10,7 +10,7 @@ from recorded_run import feed, make_run, payloads, record, start
 from topic_bytes import topic_bytes
 
 from adacd_hil.lab.logs.check.log_check import check_log
-from adacd_hil.log.log_files import LogExistsError, find_parts, part_path
+from adacd_hil.log.log_files import LogError, LogExistsError, find_parts, part_path
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.recording.recorder import Recorder
 from adacd_hil.settings.run_settings import LogSettings
@@ -171,6 +171,15 @@ def test_a_part_of_another_log_is_not_taken_for_ours(log_path, tmp_path):
         "run_900.mcap is a part of another log"
     )
     assert not log.is_complete
+
+
+def test_parts_that_are_all_of_another_log_are_refused(log_path):
+    parts = list(find_parts(log_path).values())
+    contents = [part.read_bytes() for part in parts]
+    for part, content in zip(parts, [*contents[1:], contents[0]], strict=True):
+        part.write_bytes(content)
+    with pytest.raises(LogError, match=r"run\.mcap is a part of another log.*run_002\.mcap is a part"):
+        read_log(log_path)
 
 
 def test_a_part_by_itself_says_that_it_is_one(log_path):

@@ -180,7 +180,10 @@ def value(number):
     return bytes((0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, number))
 
 
-@pytest.mark.parametrize("payload", [b"", b"text", pack_log(bytes(8), Event("info", "a", "b"))[:22], b"\xff" * 40])
+EVENT = pack_log(bytes(8), Event("info", "name", "b"))  # the name is its bytes 28 to 32
+
+
+@pytest.mark.parametrize("payload", [b"", b"text", EVENT[:22], EVENT[:30], b"\xff" * 40])
 def test_an_event_that_is_none_is_left_out_and_said(payload, tmp_path):
     path = tmp_path / "theirs.mcap"
     event = pack_log(bytes(8), Event("info", "node", "text"))

@@ -46,15 +46,15 @@ def to_frame(message: can.Message, start_ns: int = 0) -> RecordedFrame:
     """Convert a python-can message to a frame, and add `start_ns` to its time.
 
     Of remote and error frames, length and data are cut to the most that their kind of frame has. Raises ValueError for
-    more data in other frames, or less than their DLC says (above 8 bytes that isn't checked), an identifier of more
-    than 29 bits, or a time beyond `MOST_NS` or NaN.
+    more data in other frames, or less than their DLC says, an identifier of more than 29 bits, or a time beyond
+    `MOST_NS` or NaN.
     """
     most = MAX_DATA if message.is_fd else CLASSIC_BYTES
     data = bytes(message.data)
     length = len(data)
     if message.is_remote_frame or message.is_error_frame:  # their DLC goes up to 15
         data, length = data[:most], min(message.dlc, most)
-    if not min(message.dlc, CLASSIC_BYTES) <= length <= most:
+    if not min(message.dlc, most) <= length <= most:
         raise ValueError(f"frame 0x{message.arbitration_id:X} has {length} bytes of data, its DLC is {message.dlc}")
     if not 0 <= message.arbitration_id < 1 << 29:
         raise ValueError(f"identifier 0x{message.arbitration_id:X} has more than 29 bits")

@@ -60,8 +60,8 @@ class _Source(NamedTuple):
 class McapFrames:
     """The frames of a log with all its parts: iterate once; `channels`, `epoch_ns` and `problem` are complete after it.
 
-    problem: the first damage or file that can't be read; "" without one. Damage raises no error in the iteration, but a
-    further part that isn't MCAP raises LogError.
+    problem: the first damage or file that can't be read; "" without one. Neither damage nor a further part that can't
+    be read raises an error in the iteration.
     """
 
     def __init__(self, source: Path | IO[bytes]) -> None:
@@ -92,10 +92,10 @@ class McapFrames:
                 yield from self._read(source, "the file")
                 continue
             try:
-                with open_input(source) as file:
+                with failing_as(f"{source.name} can't be read"), open_input(source) as file:
                     yield from self._read(file, source.name)
-            except OSError as error:
-                self._note(f"{source.name} can't be read: {error.strerror or error}")
+            except LogError as error:
+                self._note(str(error))
 
     def _note(self, problem: str) -> None:
         self.problem = self.problem or problem

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 from adacd_hil.file_access import create_file
-from adacd_hil.log.log_files import LogError, LogExistsError, find_parts
+from adacd_hil.log.log_files import LogError, LogExistsError
+from adacd_hil.log.log_parts import parts_of
 from adacd_hil.log.recording import packet, processes
 from adacd_hil.log.recording.processes import LiveService, WriterSetup, start_module
 from adacd_hil.log.recording.ring import Ring, padded_bytes
@@ -213,10 +214,7 @@ class Recorder:
         return is_put
 
     def close(self) -> LogSummary:
-        """End the log and return its summary; a second call returns the same summary.
-
-        Raises OSError if the writer has died or is silent, and the log's folder can't be listed.
-        """
+        """End the log and return its summary; a second call returns the same summary. Raises no error."""
         if self._summary is None:
             self._socket.settimeout(END_TIMEOUT_S)
             with contextlib.suppress(OSError):
@@ -242,7 +240,7 @@ class Recorder:
             counts = int(word["frames"]), int(word["messages"]), self.dropped + int(word["lost"])
             return LogSummary(self.path, *counts, error, int(word["parts"]), peak)
         self.dropped += self._ring.packets - self._ring.written
-        return LogSummary(self.path, 0, 0, self.dropped, error, max(1, len(find_parts(self.path))), peak)
+        return LogSummary(self.path, 0, 0, self.dropped, error, len(parts_of(self.path)), peak)
 
     def _end_writer(self) -> str:
         """Return the error of a silent writer in words: its exit status if it ends within DEATH_TIMEOUT_S.

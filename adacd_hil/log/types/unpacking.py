@@ -52,7 +52,7 @@ def log_time_ns(payload: bytes) -> int:
 def unpack_log(payload: bytes) -> Event:
     """Return the event in a payload of foxglove_msgs/Log; an unknown level becomes "error".
 
-    Raises struct.error or IndexError if the payload is cut before the event's name; a cut name is returned as it is.
+    Raises struct.error or IndexError if the payload is cut before the end of the event's name.
     """
     level = _LEVEL_NAMES.get(payload[12], "error")
     position = 13
@@ -61,6 +61,7 @@ def unpack_log(payload: bytes) -> Event:
         position += -position % 4
         (size,) = struct.unpack_from("<I", payload, position)
         position += 4
-        texts.append(payload[position : position + size].rstrip(b"\0").decode("utf-8", "replace"))
+        (text,) = struct.unpack_from(f"{size}s", payload, position)
+        texts.append(text.rstrip(b"\0").decode("utf-8", "replace"))
         position += size
     return Event(level, texts[1], texts[0])
