@@ -116,11 +116,13 @@ def test_semicolons_decimal_commas_and_lines_above_the_head_are_found(tmp_path, 
     assert keys["units"] == {"q": "deg"}
 
 
-def test_dates_are_found(tmp_path, motion):
-    rows = table("", motion.q, motion.tau).splitlines()
+def test_dates_are_found_and_tell_the_interval_of_the_rows(tmp_path, motion):
+    rows = table("", motion.q, np.degrees(motion.dq), motion.tau).splitlines()
     dated = [f"2024-05-01T10:00:{0.005 * k:09.6f}Z,{row}" for k, row in enumerate(rows)]
-    _, keys = draft(tmp_path, "\n".join(["stamp,q1,q2,tau1,tau2", *dated]))
-    assert keys["units"] == {"time": "iso"}
+    _, keys = draft(tmp_path, "\n".join(["stamp,q1,q2,dq1,dq2,tau1,tau2", *dated]))
+    assert keys["units"] == {"time": "iso", "dq": "deg/s"}
+    _, keys = draft(tmp_path, "\n".join(dated))
+    assert keys["columns"] == {"time": "1", "q": ["2", "3"], "dq": ["4", "5"], "tau_J": ["6", "7"]}
 
 
 def test_a_period_that_nobody_says_is_left_to_be_written(tmp_path, motion):

@@ -19,6 +19,7 @@ from adacd_hil.lab.offline.csv_recording import (
     DELIMITERS,
     is_iso_time,
     is_number,
+    iso_seconds,
     opened_text,
     read_number,
     split_rows,
@@ -67,7 +68,7 @@ class TableGuess:
     form: CsvSection
     heads: tuple[str, ...]
     units_below: tuple[str, ...]
-    values: Vector  # (k, columns) of the rows that were read; nan for cells without a number
+    values: Vector  # (k, columns) of the rows that were read; dates in s since 1970; nan for cells without a number
     is_iso: bool = False
     columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
@@ -174,7 +175,7 @@ def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) ->
 
 
 def _values(rows: list[list[str]], count: int, decimal: str) -> tuple[Vector, bool]:
-    """Return the cells as numbers (k, count), nan for other cells, and whether the first column has dates.
+    """Return the cells as numbers (k, count), dates in s, nan for other cells, and whether the first column has dates.
 
     It has if the first cell of the first row with all cells is no number. Rows with fewer than `count` cells are left
     out; further cells of a row, and rows after `_SEEN_ROWS`, too.
@@ -189,7 +190,9 @@ def _values(rows: list[list[str]], count: int, decimal: str) -> tuple[Vector, bo
 
 
 def _number(cell: str, decimal: str) -> float:
-    return read_number(cell, decimal) if is_number(cell, decimal) else math.nan
+    if is_number(cell, decimal):
+        return read_number(cell, decimal)
+    return float(iso_seconds(cell)) if is_iso_time(cell) else math.nan
 
 
 # By heads.
