@@ -58,6 +58,7 @@ HEADS = {
         't,"position, 1","position, 2","velocity, 1","velocity, 2","torque, 1","torque, 2"',
         {},
     ),
+    "quoted, with a line break": ('"time\n(s)",q1,q2,dq1,dq2,tau1,tau2', {}),
     "by the joints' names": (
         "stamp,joint1/position,joint2/position,joint1/velocity,joint2/velocity,joint1/effort,joint2/effort",
         {},
@@ -69,7 +70,7 @@ HEADS = {
 def test_columns_and_units_are_found_by_their_heads(tmp_path, motion, kind):
     heads, units = HEADS[kind]
     _, keys = draft(tmp_path, table(heads, motion.t, motion.q, motion.dq, motion.tau))
-    (names,) = csv.reader([heads])
+    (names,) = csv.reader(heads.splitlines(keepends=True))
     assert keys["columns"] == {"time": names[0], "q": names[1:3], "dq": names[3:5], "tau_J": names[5:7]}
     assert keys.get("units", {}) == units
 

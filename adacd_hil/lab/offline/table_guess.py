@@ -101,7 +101,7 @@ def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
     form, heads, units, first = _form(path, lines)
-    values, is_iso = _values(_split(path, lines[first:], form.delimiter), len(heads), form.decimal)
+    values, is_iso = _values(_split(path, lines, form.delimiter)[first:], len(heads), form.decimal)
     guess = TableGuess(form, heads, units, values, is_iso)
     if form.has_header:
         _by_heads(guess, joint_names)
@@ -122,11 +122,11 @@ def _is_full(cells: list[str], decimal: str) -> bool:
 
 
 _Form = tuple[CsvSection, tuple[str, ...], tuple[str, ...], int]
-"""Form, heads, units below them, and the line where the data begin."""
+"""Form, heads, units below them, and the row where the data begin: a quoted head may have several lines."""
 
 
 def _form(path: Path, lines: list[str]) -> _Form:
-    """Return form, heads, units below them and first data line, from 0, by the first lines of a CSV file.
+    """Return form, heads, units below them and first data row, from 0, by the first lines of a CSV file.
 
     The delimiter and decimal sign are those that give the data the most columns; of equal ones the first in the order
     of `DELIMITERS`, "." before ",". Raises LogError unless `_FULL_ROWS` successive rows of numbers lie in the first
