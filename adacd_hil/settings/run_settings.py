@@ -115,20 +115,21 @@ class ExcitationSettings:
 
     period_s: float = setting(0.0, unit="s", low=0.0, high=600.0, meaning="its period; 0: adapt on the trajectory")
     cosine: tuple[tuple[float, ...], tuple[float, ...]] = setting(
-        ((), ()), low=-2.0, high=2.0, meaning="amplitudes by joint and harmonic, rad"
+        ((), ()), low=-2.0, high=2.0, meaning="multiples of `trajectory.amplitude_deg`, by joint and harmonic"
     )
     sine: tuple[tuple[float, ...], tuple[float, ...]] = setting(
-        ((), ()), low=-2.0, high=2.0, meaning="amplitudes by joint and harmonic, rad"
+        ((), ()), low=-2.0, high=2.0, meaning="multiples of `trajectory.amplitude_deg`, by joint and harmonic"
     )
 
     def __post_init__(self) -> None:
+        counts = [len(values) for values in (*self.cosine, *self.sine)]
+        if len(set(counts)) > 1:
+            raise ConfigError(
+                f"`excitation.cosine` has {counts[:JOINTS]} values by joint, `excitation.sine` {counts[JOINTS:]}; "
+                "the same number of all expected"
+            )
         for joint in range(JOINTS):
             cosine, sine = self.cosine[joint], self.sine[joint]
-            if len(cosine) != len(sine):
-                raise ConfigError(
-                    f"joint {joint + 1} has {len(cosine)} values in `excitation.cosine`, "
-                    f"{len(sine)} in `excitation.sine`"
-                )
             velocity = sum((n + 1) * value for n, value in enumerate(sine))
             acceleration = sum((n + 1) ** 2 * value for n, value in enumerate(cosine))
             if abs(velocity) > 1e-3 or abs(acceleration) > 1e-3:

@@ -14,6 +14,7 @@ from adacd_hil.lab.score.run_arrays import split_sections
 from adacd_hil.lab.score.run_judge import step_delay_s
 from adacd_hil.log.reader import LoggedEvent
 from adacd_hil.records import ContactKind, ContactLevel, Event, Location, Reaction, SchemeState
+from adacd_hil.score.wording import NONE
 
 
 def test_an_adaptation_lasts_until_its_model_is_certified():
@@ -129,6 +130,12 @@ def test_the_papers_scheme_is_armed_later_on_the_same_stream_or_never():
     assert beside(run).adaptation_s == pytest.approx({"A": 2.0, "D": 2.0})
     run.beside.is_armed[5551:] = False
     assert beside(run).adaptation_s == {"A": pytest.approx(2.0), "D": None}
+
+
+def test_a_scheme_that_did_not_run_beside_has_no_figures():
+    run = make_certified_run()
+    assert "5 s" in {row.beside for row in evaluate(run).paper}
+    assert {row.beside for row in evaluate(replace(run, beside=None)).paper} == {NONE}
 
 
 def certificates(*levels):

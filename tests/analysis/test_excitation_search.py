@@ -112,8 +112,7 @@ def test_without_a_model_of_the_arm_torque_has_no_limit_and_the_lag_no_column(se
     ("changes", "words"),
     [
         ({"trajectory": TrajectorySettings(amplitude_deg=(30.0, 0.0))}, r"\(30.0, 0.0\) leaves an excitation no room"),
-        ({"excitation": ExcitationSettings(2.4, ((0.0,), (0.0,)), ((0.0,), (0.0,)))}, r"\[1, 1\] harmonics"),
-        ({"excitation": ExcitationSettings(2.4, (TWO[0], ()), (NO_SINE[0], ()))}, r"\[2, 0\] harmonics"),
+        ({"excitation": ExcitationSettings(2.4, ((0.0,), (0.0,)), ((0.0,), (0.0,)))}, "has 1 harmonics"),
     ],
 )
 def test_what_leaves_nothing_to_search_is_said(changes, words):

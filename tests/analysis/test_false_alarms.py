@@ -74,6 +74,17 @@ def test_a_detector_of_channels_that_see_different_noise_alarms_as_often_as_want
     assert 34.0 < clusters(largest_ratio(peaks, thresholds), 1.0).size / 2.0 < 46.0
 
 
+@pytest.mark.parametrize(("rate_per_h", "low", "high"), [(300.0, 1.2, 1.3), (6000.0, 1.05, 1.15)])
+def test_alarms_that_merge_at_a_low_level_are_not_few(rate_per_h, low, high):
+    peaks = np.abs(np.random.default_rng(1).normal(1.0, 0.1, (3000, 1, 2)))
+    peaks[::600, 0, 0] = 1e-4
+    threshold = calibrate(peaks[:, 0, 0], rate_per_h).threshold
+    assert low < threshold < high
+    assert clusters(peaks[:, 0, 0], threshold).size <= rate_per_h * counted_hours(peaks[:, 0, 0])
+    thresholds, _ = calibrate_detector(peaks, 2.0 * rate_per_h)
+    assert low - 0.1 < thresholds.min() < thresholds.max() < high + 0.1
+
+
 @pytest.mark.parametrize("peaks", [np.random.default_rng(0).random(300), np.zeros(40_000)])
 def test_too_little_motion_is_said(peaks):
     with pytest.raises(TooLittleMotionError, match=r"contact-free motion|stand apart"):

@@ -58,6 +58,7 @@ HEADS = {
         't,"position, 1","position, 2","velocity, 1","velocity, 2","torque, 1","torque, 2"',
         {},
     ),
+    "quoted, with a line break": ('"time\n(s)",q1,q2,dq1,dq2,tau1,tau2', {}),
     "by the joints' names": (
         "stamp,joint1/position,joint2/position,joint1/velocity,joint2/velocity,joint1/effort,joint2/effort",
         {},
@@ -69,7 +70,7 @@ HEADS = {
 def test_columns_and_units_are_found_by_their_heads(tmp_path, motion, kind):
     heads, units = HEADS[kind]
     _, keys = draft(tmp_path, table(heads, motion.t, motion.q, motion.dq, motion.tau))
-    (names,) = csv.reader([heads])
+    (names,) = csv.reader(heads.splitlines(keepends=True))
     assert keys["columns"] == {"time": names[0], "q": names[1:3], "dq": names[3:5], "tau_J": names[5:7]}
     assert keys.get("units", {}) == units
 
@@ -116,11 +117,13 @@ def test_semicolons_decimal_commas_and_lines_above_the_head_are_found(tmp_path, 
     assert keys["units"] == {"q": "deg"}
 
 
-def test_dates_are_found(tmp_path, motion):
-    rows = table("", motion.q, motion.tau).splitlines()
+def test_dates_are_found_and_tell_the_interval_of_the_rows(tmp_path, motion):
+    rows = table("", motion.q, np.degrees(motion.dq), motion.tau).splitlines()
     dated = [f"2024-05-01T10:00:{0.005 * k:09.6f}Z,{row}" for k, row in enumerate(rows)]
-    _, keys = draft(tmp_path, "\n".join(["stamp,q1,q2,tau1,tau2", *dated]))
-    assert keys["units"] == {"time": "iso"}
+    _, keys = draft(tmp_path, "\n".join(["stamp,q1,q2,dq1,dq2,tau1,tau2", *dated]))
+    assert keys["units"] == {"time": "iso", "dq": "deg/s"}
+    _, keys = draft(tmp_path, "\n".join(dated))
+    assert keys["columns"] == {"time": "1", "q": ["2", "3"], "dq": ["4", "5"], "tau_J": ["6", "7"]}
 
 
 def test_a_period_that_nobody_says_is_left_to_be_written(tmp_path, motion):

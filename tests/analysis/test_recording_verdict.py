@@ -405,6 +405,7 @@ MISTAKES: dict[str, tuple[Callable[[Motion], Motion] | str, str, str]] = {
     ),
     "mNm that are none": ('[units]\ntau_J = "mNm"\n', "they are Nm", '`units.tau_J` = "Nm"'),
     "degrees that are none": ('[units]\nq = "deg"\n', "the positions are radians", '`units.q` = "rad"'),
+    "revolutions that are none": ('[units]\nq = "rev"\n', "the positions are radians", '`units.q` = "rad"'),
     "a torque that the map turns": (
         "[scale]\ntau_J = [1, -1]\n",
         "joint2 has the other sign",
@@ -426,6 +427,14 @@ def test_a_common_mistake_is_named_with_its_key(tmp_path, upright, mistake):
     assert said in verdict.reasons[0]
     assert verdict.remedy.startswith("in the map: ")
     assert remedy in verdict.remedy
+
+
+def test_factors_are_those_to_the_unit_of_the_map(tmp_path, upright):
+    in_revolutions = {"more": '[units]\nq = "rev"\n'}
+    mixed = times(q=[0.5 / math.pi, 1 / DEGREE])(upright)
+    assert "`scale.q` = [1, 0.00277778]" in judged(tmp_path, mixed, **in_revolutions).verdict.remedy
+    slow = record(urdf_text(1, LEVEL), amplitude_rad=0.2)
+    assert '`units.q` = "rad"' in judged(tmp_path, slow, LEVEL, **in_revolutions).verdict.remedy
 
 
 @pytest.mark.parametrize("mistake", ["torques exchanged", "positions exchanged", "joints exchanged"])

@@ -108,6 +108,8 @@ def test_every_row_is_computed_and_stands_in_the_order_of_the_plan_though_a_task
 
 def test_a_sweep_that_is_begun_again_computes_what_is_missing(tmp_path, client):
     sweep(tmp_path, client, Work(tmp_path), plan_of_runs(range(1, 4)))
+    for name in ("0a", "a0"):
+        (tmp_path / f"parts/{name}.parquet").write_text("no part of a sweep")
     work = Work(tmp_path)
     outcome, rows, _ = sweep(tmp_path, client, work)
     assert (outcome.computed, outcome.found, len(rows)) == (4, 6, 10)

@@ -13,11 +13,21 @@ import numpy as np
 import pytest
 from called import called
 
+from adacd_hil.lab.drawing import COLOURS
 from adacd_hil.lab.score.rates import least_rate_per_h, rate_bound_per_h, share_bounds
 from adacd_hil.lab.thresholds import free_motion
 from adacd_hil.lab.thresholds.false_alarms import TooLittleMotionError, calibrate_detector
 from adacd_hil.lab.tune import tune_candidates, tune_roc
-from adacd_hil.lab.tune.tune import base_of, best_of, problems_of, slowest_adaptation, suggested_toml, write_tuning
+from adacd_hil.lab.tune.tune import (
+    base_of,
+    best_of,
+    draw_delays,
+    draw_roc,
+    problems_of,
+    slowest_adaptation,
+    suggested_toml,
+    write_tuning,
+)
 from adacd_hil.lab.tune.tune_candidates import (
     ShownLog,
     candidates,
@@ -363,6 +373,17 @@ def test_the_report_has_the_figures_and_what_they_show(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(LogError, match="can't be written"):
         write_tuning(tuning_of(blind), tmp_path / "file")
+
+
+def test_every_detector_has_a_look_of_its_own():
+    best = candidate()
+    detectors = tuple(dataclasses.replace(best.choice, name=f"d{k}") for k in range(12))
+    tuning = tuning_of(best, detectors=detectors)
+    for figure in (draw_roc(tuning).figure, draw_delays(tuning).figure):
+        lines = [line for line in figure.axes[0].get_lines() if not line.get_label().startswith("_")]
+        assert [line.get_label() for line in lines[1:]] == [f"d{k}" for k in range(12)]
+        assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == 13
+        assert COLOURS["alarm"] not in {line.get_color() for line in lines[1:]}
 
 
 SECOND_ATTEMPT = 1200

@@ -141,6 +141,7 @@ BROKEN = {
     "summary-crc": (operated(put(Opcode.FOOTER, 16, "<I", 5), has_right_crcs=False), {"summary-crc"}),
     "attachment-crc": (operated(spoiled_attachment), {"attachment-crc"}),
     "no-crc": (operated(uncovered(every=True), has_right_crcs=False), {"no-crc"}),
+    "no-crc, cut": (operated(both(uncovered(every=True), without(Opcode.DATA_END)), has_right_crcs=False), None),
     "some-crc": (operated(uncovered(every=False), has_right_crcs=False), {"some-crc", "no-crc"}),
     "no-crc, summary": (operated(put(Opcode.FOOTER, 16, "<I", 0), has_right_crcs=False), {"no-crc"}),
     "schema-id": (operated(at_top(Schema(id=0, name="x", encoding="x", data=b"x"))), {"schema-id", "statistics"}),

@@ -23,6 +23,7 @@ from recorded_run import (
 from topic_bytes import topic_bytes
 
 from adacd_hil import __version__
+from adacd_hil.lab.logs.log_info import read_info
 from adacd_hil.log.reader import read_log
 from adacd_hil.log.types.topics import run_channels
 from adacd_hil.log.viewer_layout import viewer_layout
@@ -76,6 +77,13 @@ def test_the_summary_counts_what_was_written(run, recorded, log, others):
     assert sum(map(len, others.values())) == messages
     assert (log.problem, log.is_complete) == ("", True)
     assert (log.summary["ending"], log.summary["dropped"]) == ("closed", "0")
+
+
+def test_bytes_are_told_of_what_was_read(recorded):
+    brief, whole = (read_info(recorded[0], is_brief=is_brief) for is_brief in (True, False))
+    sizes = [next(each.bytes for each in info.topics if each.topic == "/events") for info in (brief, whole)]
+    assert sizes[0] is None
+    assert sizes[1] > 0
 
 
 def test_what_the_scheme_decided_is_read_back_bit_for_bit(run, log):

@@ -36,7 +36,8 @@ def certified(**sections):
         ({"cutoff_rad_s": [10.0]}, "did you mean `certified.cutoffs_rad_s`"),
         ({"sine": [[0.0], [0.002]], "cosine": [[0.0], [0.0]]}, "excitation of joint 2 does not begin at rest"),
         (AT_REST, "excitation of joint 1 does not begin at rest: .*of n² cosine_n = 0.1, each within 0.001"),
-        ({"cosine": [[], [0.0]]}, "joint 2 has 1 values in `excitation.cosine`, 0 in `excitation.sine`"),
+        ({"cosine": [[], [0.0]]}, r"`excitation.cosine` has \[0, 1\] values by joint, `excitation.sine` \[0, 0\]"),
+        ({"cosine": [[0.4, -0.1], []], "sine": [[0.0, 0.0], []]}, r"`excitation.cosine` has \[2, 0\] .*sine` \[2, 0\]"),
         ({"period_s": -1.0}, "`excitation.period_s` = -1.0 s is below 0 s"),
     ],
 )

@@ -123,7 +123,7 @@ class _InfoView:
         self._channels: dict[str, tuple[str, int | None]] = {}  # by topic: type and size of payloads
         self._counts: Counter[str] = Counter()
         self._bytes: Counter[str] = Counter()  # where they were seen
-        self._is_read: set[str] = set(_READ)  # topics of which every message was seen
+        self._is_read: set[str] = set(() if is_brief else _READ)  # topics of which every message was seen
         self._start_ns, self._end_ns = 2**64, 0
         self._contact_cycles: dict[int, int] = {}  # level, by the cycle of the contact
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from adacd_hil.lab.offline.recording_import import ForeignRecording, derivative_window, derive, samples
-from adacd_hil.lab.offline.recording_map import RecordingMap, units_by_slope
+from adacd_hil.lab.offline.recording_map import ANGLE_RAD, RecordingMap, units_by_slope
 from adacd_hil.lab.serial_arm.urdf import SerialArm
 from adacd_hil.lab.signal_noise import white_noise
 from adacd_hil.records import Vector
@@ -291,11 +291,12 @@ def _of_positions(described: RecordingMap, columns: _Columns) -> Iterator[Record
     for joint in np.flatnonzero(is_beyond)[:1].tolist():
         much = f"goes to {reach[joint]:.3g} rad" if goes_far[joint] else f"turns at {speed[joint]:.3g} rad/s"
         most = f"{bound[joint]:.3g} rad" if goes_far[joint] else f"{limit[joint]:g} rad/s"
+        factor = ANGLE_RAD["deg"] / ANGLE_RAD[described.units.q]
         yield RecordingFinding(
             f"{column_name(described, 'q', joint)} {much}, beyond the {most} of the URDF",
             CORRECT_UNITS
             if described.units.q == "deg"
-            else f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', math.pi / 180.0, is_beyond)}",
+            else f"if the positions are degrees: {_unit_or_scale(described, 'q', 'deg', factor, is_beyond)}",
         )
 
 

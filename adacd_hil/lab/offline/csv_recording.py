@@ -172,7 +172,7 @@ def _time_column(path: Path, heads: list[str], cells: int, described: RecordingM
     looks misspelt.
     """
     name, units = described.columns.time, described.units
-    read = _time_reader(_iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
+    read = _time_reader(iso_seconds if units.time == ISO else Decimal, described.csv.decimal)
     has_period = described.sampling.period_s > 0.0
     if name:
         try:
@@ -317,7 +317,7 @@ def _time_reader(read: Callable[[str], Decimal], decimal: str) -> Callable[[str]
     return read_time
 
 
-def _iso_seconds(text: str) -> Decimal:
+def iso_seconds(text: str) -> Decimal:
     """Parse a date and time of ISO 8601, UTC unless it has an offset, as s since 1970, to the µs.
 
     Raises ValueError if the text is none.
@@ -334,7 +334,7 @@ def is_number(text: str, decimal: str) -> bool:
 
 def is_iso_time(text: str) -> bool:
     """Return whether a text is a date, or a date and time, of ISO 8601."""
-    return _is_readable(text, _iso_seconds)
+    return _is_readable(text, iso_seconds)
 
 
 def _is_readable(text: str, read: Callable[[str], object]) -> bool:

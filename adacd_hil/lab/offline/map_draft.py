@@ -127,10 +127,11 @@ def _units_of_table(guess: TableGuess, arm: SerialArm) -> list[DraftedKey]:
         return unit
 
     step = 1e-3
+    if "time" in guess.columns:
+        step = float(np.nanmedian(np.diff(guess.of("time")[:, 0]))) or np.nan  # coarse times don't tell it
     if guess.is_iso:
         keys.append(DraftedKey("units", "time", ISO, ""))
     elif "time" in guess.columns:
-        step = float(np.nanmedian(np.diff(guess.of("time")[:, 0])))
         guessed = time_unit_of(step) or "s"
         step *= TIME_S[add_unit("time", "s", guessed, f"rows are {step:g} {guessed} apart")]
     angle = add_unit("q", "rad", *_angle_unit(guess.of("q"), arm))

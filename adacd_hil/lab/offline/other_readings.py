@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from adacd_hil.lab.offline.column_checks import BEYOND_EFFORT, torques_and_limits
-from adacd_hil.lab.offline.recording_map import RecordingMap
+from adacd_hil.lab.offline.recording_map import ANGLE_RAD, RecordingMap
 from adacd_hil.lab.serial_arm import offline
 from adacd_hil.lab.serial_arm.offline import ArmModel, OfflineSettings, Record
 from adacd_hil.lab.serial_arm.urdf import STANDARD_GRAVITY_M_S2
@@ -298,8 +298,9 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
     """
     n, straight, names = model.joints, np.eye(model.joints), described.urdf.joint_names
     yield _Motion("", "", model, straight)
-    for unit, factor in (("deg", math.pi / 180.0), ("rad", 180.0 / math.pi)):
+    for unit in UNITS:
         if unit != described.units.q:
+            factor = ANGLE_RAD[unit] / ANGLE_RAD[described.units.q]
             found = _Motion(f"the positions are {UNITS[unit]}", f'`units.q` = "{unit}"', model, factor * straight)
             yield found
             if described.columns.dq:

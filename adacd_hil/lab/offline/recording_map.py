@@ -21,13 +21,13 @@ from adacd_hil.settings.toml_files import read_toml
 
 ISO = "iso"
 TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, ISO: 1.0}
-_ANGLE = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
+ANGLE_RAD = {"rad": 1.0, "deg": math.pi / 180.0, "rev": 2.0 * math.pi}
 _SPEED = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0}
 _TORQUE = {"Nm": 1.0, "mNm": 1e-3, "A": 1.0, "mA": 1e-3}
-_UNITS = {"q": _ANGLE, "dq": _SPEED, "tau_J": _TORQUE}
+_UNITS = {"q": ANGLE_RAD, "dq": _SPEED, "tau_J": _TORQUE}
 _USUAL_PERIOD_S = (2e-4, 0.1)
 _SPELLINGS = {
-    **{unit.casefold(): unit for units in (TIME_S, _ANGLE, _SPEED, _TORQUE) for unit in units},
+    **{unit.casefold(): unit for units in (TIME_S, ANGLE_RAD, _SPEED, _TORQUE) for unit in units},
     **{"sec": "s", "seconds": "s", "msec": "ms", "\N{MICRO SIGN}s": "us", "\N{GREEK SMALL LETTER MU}s": "us"},
     **{"°": "deg", "degree": "deg", "degrees": "deg", "°/s": "deg/s", "degs": "deg/s", "rads": "rad/s", "amp": "A"},
     **{f"{milli}n{times}m": f"{milli}Nm" for milli in ("", "m") for times in ("*", "·", " ", ".", "-")},
@@ -78,7 +78,7 @@ class UnitsSection:
     time: str = setting(
         "s", choices=tuple(TIME_S), meaning="of the time; iso: a date and time such as 2024-05-01T10:00:00.005"
     )
-    q: str = setting("rad", choices=tuple(_ANGLE), meaning="of positions")
+    q: str = setting("rad", choices=tuple(ANGLE_RAD), meaning="of positions")
     dq: str = setting("rad/s", choices=tuple(_SPEED), meaning="of velocities")
     tau_J: str = setting("Nm", choices=tuple(_TORQUE), meaning="of torques; of currents, scale.tau_J has the gains")
 
@@ -135,7 +135,7 @@ def units_by_slope(units: UnitsSection, factor: float) -> list[tuple[str, str]]:
     present units.
     """
     found = [("dq", unit) for unit, value in _SPEED.items() if _is_near(factor * value / _SPEED[units.dq], 1.0)]
-    found += [("q", unit) for unit, value in _ANGLE.items() if _is_near(factor * _ANGLE[units.q] / value, 1.0)]
+    found += [("q", unit) for unit, value in ANGLE_RAD.items() if _is_near(factor * ANGLE_RAD[units.q] / value, 1.0)]
     return [(key, unit) for key, unit in found if getattr(units, key) != unit]
 
 

@@ -32,7 +32,7 @@ from adacd_hil.lab.offline.column_checks import (
 )
 from adacd_hil.lab.offline.other_readings import UNITS, find_readings, mass_rows
 from adacd_hil.lab.offline.recording_import import ForeignRecording, samples
-from adacd_hil.lab.offline.recording_map import RecordingMap
+from adacd_hil.lab.offline.recording_map import ANGLE_RAD, RecordingMap
 from adacd_hil.lab.serial_arm import offline
 from adacd_hil.lab.serial_arm.offline import ArmModel, ModelEstimate, OfflineCertificate, OfflineSettings
 from adacd_hil.lab.signal_noise import low_pass
@@ -348,8 +348,8 @@ def _of_scale(fit: Fitted, joints: Sequence[JointShare]) -> Iterator[RecordingFi
     if scale is not None and abs(scale) > _SIGMAS * sigma and least > _MOSTLY:
         text = f"the torques are {scale:.3g} times those that the masses of the URDF need"
         meant = _milli(abs(scale), mass_kg, units.tau_J)
-        turns = {"rad": 180.0 / math.pi, "deg": math.pi / 180.0}
-        angle = [unit for unit, factor in turns.items() if unit != units.q and 0.8 < abs(scale) / factor < 1.25]
+        turns = {unit: ANGLE_RAD[unit] / ANGLE_RAD[units.q] for unit in UNITS if unit != units.q}
+        angle = [unit for unit, factor in turns.items() if 0.8 < abs(scale) / factor < 1.25]
         if meant:
             yield RecordingFinding(f"{text}: they are {meant}", f'in the map: `units.tau_J` = "{meant}"')
             return

@@ -19,6 +19,7 @@ from adacd_hil.lab.offline.csv_recording import (
     DELIMITERS,
     is_iso_time,
     is_number,
+    iso_seconds,
     opened_text,
     read_number,
     split_rows,
@@ -67,7 +68,7 @@ class TableGuess:
     form: CsvSection
     heads: tuple[str, ...]
     units_below: tuple[str, ...]
-    values: Vector  # (k, columns) of the rows that were read; nan for cells without a number
+    values: Vector  # (k, columns) of the rows that were read; dates in s since 1970; nan for cells without a number
     is_iso: bool = False
     columns: dict[str, tuple[str, ...]] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
@@ -100,7 +101,7 @@ def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
     form, heads, units, first = _form(path, lines)
-    values, is_iso = _values(_split(path, lines[first:], form.delimiter), len(heads), form.decimal)
+    values, is_iso = _values(_split(path, lines, form.delimiter)[first:], len(heads), form.decimal)
     guess = TableGuess(form, heads, units, values, is_iso)
     if form.has_header:
         _by_heads(guess, joint_names)
@@ -121,11 +122,11 @@ def _is_full(cells: list[str], decimal: str) -> bool:
 
 
 _Form = tuple[CsvSection, tuple[str, ...], tuple[str, ...], int]
-"""Form, heads, units below them, and the line where the data begin."""
+"""Form, heads, units below them, and the row where the data begin: a quoted head may have several lines."""
 
 
 def _form(path: Path, lines: list[str]) -> _Form:
-    """Return form, heads, units below them and first data line, from 0, by the first lines of a CSV file.
+    """Return form, heads, units below them and first data row, from 0, by the first lines of a CSV file.
 
     The delimiter and decimal sign are those that give the data the most columns; of equal ones the first in the order
     of `DELIMITERS`, "." before ",". Raises LogError unless `_FULL_ROWS` successive rows of numbers lie in the first
@@ -174,7 +175,7 @@ def _form_at(rows: list[list[str]], first: int, delimiter: str, decimal: str) ->
 
 
 def _values(rows: list[list[str]], count: int, decimal: str) -> tuple[Vector, bool]:
-    """Return the cells as numbers (k, count), nan for other cells, and whether the first column has dates.
+    """Return the cells as numbers (k, count), dates in s, nan for other cells, and whether the first column has dates.
 
     It has if the first cell of the first row with all cells is no number. Rows with fewer than `count` cells are left
     out; further cells of a row, and rows after `_SEEN_ROWS`, too.
@@ -189,7 +190,9 @@ def _values(rows: list[list[str]], count: int, decimal: str) -> tuple[Vector, bo
 
 
 def _number(cell: str, decimal: str) -> float:
-    return read_number(cell, decimal) if is_number(cell, decimal) else math.nan
+    if is_number(cell, decimal):
+        return read_number(cell, decimal)
+    return float(iso_seconds(cell)) if is_iso_time(cell) else math.nan
 
 
 # By heads.

@@ -236,7 +236,7 @@ class PaperRow(NamedTuple):
     """One row of the table that compares the run with the paper, as texts.
 
     paper: the paper's value, None if the run is not of the paper's experiment; beside: that of the paper's scheme on
-    the same stream, None if the paper's scheme is the run's own.
+    the same stream, NONE of `wording` if it didn't run, None if the paper's scheme is the run's own.
     """
 
     quantity: str

@@ -353,6 +353,8 @@ def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
         PaperRow(push, NONE, NONE, _push_text(evidence)),
         PaperRow("Control rate", "1 kHz", rate, rate),
     ]
+    if beside is None:
+        rows = [row._replace(beside=NONE) for row in rows]
     return _of_what_was_played(run, rows)
 
 

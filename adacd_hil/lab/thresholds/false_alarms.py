@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import boxcox, inv_boxcox
 
 from adacd_hil.lab.score.rates import CONFIDENCE
@@ -40,7 +41,6 @@ _SHAPES: Final = (-0.5, 0.25)
 """Bounds of xi. Encoder counts and friction are bounded, so most tails end; a heavier tail than the upper bound has not
 been seen on contact-free motion and would make every extrapolation infinite."""
 _RESAMPLES: Final = 400
-_BISECTIONS: Final = 60
 _S_PER_H: Final = 3600.0
 
 
@@ -120,19 +120,22 @@ def counted_hours(peaks: Vector) -> float:
 
 
 def threshold_by_count(peaks: Vector, alarms: float) -> float:
-    """Return a threshold above which block maxima (B,) have at most `alarms` alarms, by bisection.
+    """Return a threshold above which block maxima (B,) have at most `alarms` alarms, searched from the largest down.
 
-    It need not be the best one: values above a low threshold lie close together and count as few alarms, so it may be
-    as low as the smallest block. NaN blocks don't count.
+    Of the levels before the first with more alarms it is the lowest with the most. Below those, alarms merge into few
+    long ones, down to a single one at the smallest block. NaN blocks don't count.
     """
-    low, high = float(np.nanmin(peaks)), float(np.nanmax(peaks))
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        if clusters(peaks, middle).size > alarms:
-            low = middle
-        else:
-            high = middle
-    return high
+    values = np.where(np.isnan(peaks), -np.inf, peaks)
+    near = round(CLUSTER_S / BLOCK_S)
+    before = sliding_window_view(np.r_[np.full(near, -np.inf), values[:-1]], near).max(axis=1)
+    levels = np.unique(peaks[~np.isnan(peaks)])[::-1]
+    # an alarm begins at a block above the level without another one just before it
+    above, begun = (
+        values.size - np.searchsorted(np.sort(each), levels, "right") for each in (values, np.minimum(values, before))
+    )
+    counts = above - begun
+    is_allowed = np.logical_and.accumulate(counts <= alarms)
+    return float(levels[is_allowed & (counts == counts[is_allowed].max())][-1])
 
 
 def fit_tail(peaks: Vector) -> Tail:

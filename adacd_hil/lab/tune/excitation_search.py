@@ -92,8 +92,7 @@ def _fill_regressors(q: Vector, dq: Vector, ddq: Vector, level_rad: float, W: Ve
 class Search:
     """The search for one configuration's excitation.
 
-    Raises ConfigError if its trajectory does not move a joint, or its excitation has fewer than 2 harmonics, or not
-    equally many for both joints.
+    Raises ConfigError if its trajectory does not move a joint, or its excitation has fewer than 2 harmonics.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -107,14 +106,9 @@ class Search:
         self.present = settings.excitation
         self._level_rad = settings.level_rad
         self._period_s = settings.excitation.period_s or PERIOD_S
-        counts = (
-            [len(row) for row in settings.excitation.sine] if settings.excitation.period_s else [HARMONICS] * JOINTS
-        )
-        harmonics = counts[0]
-        if harmonics < 2 or set(counts) != {harmonics}:
-            raise ConfigError(
-                f"`excitation` has {counts} harmonics; the same number for both joints, at least 2, expected"
-            )
+        harmonics = len(settings.excitation.sine[0]) if settings.excitation.period_s else HARMONICS
+        if harmonics < 2:
+            raise ConfigError(f"`excitation` has {harmonics} harmonics; at least 2 for each joint expected")
         self._amplitude = np.radians(settings.trajectory.amplitude_deg)
         self._limits = (
             self._amplitude,

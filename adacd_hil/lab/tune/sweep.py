@@ -252,7 +252,7 @@ class SweepStore:
         self._parts = folder / _PARTS
         self._parquet = _parquet()
         self._parts.mkdir(parents=True, exist_ok=True)
-        self._next = 1 + max((int(path.stem) for path in self._parts.glob("[0-9]*.parquet")), default=-1)
+        self._next = 1 + max((int(path.stem) for path in self._paths()), default=-1)
 
     def done(self) -> frozenset[str]:
         """Return the keys of all rows in the parts with status "ok". Raises LogError if a part can't be read."""
@@ -295,7 +295,7 @@ class SweepStore:
         return list(dict.fromkeys(noted))
 
     def _paths(self) -> list[Path]:
-        return sorted(self._parts.glob("[0-9]*.parquet"))
+        return sorted(path for path in self._parts.glob("*.parquet") if path.stem.isdecimal())
 
     def _read(self, path: Path, columns: list[str] | None = None) -> Any:
         try:

@@ -11,6 +11,7 @@ The suggestion names the configuration that it extends and the keys that change,
 show the share of contacts found against false alarms, and the delays.
 """
 
+import itertools
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -313,7 +314,10 @@ def outcome_in_words(candidate: Candidate) -> str:
     return text + f", {outcome.missed} missed, {outcome.false_alarms} false alarms{delays_phrase(outcome.delays_ms)}"
 
 
-_LOOKS: Final = ("identified", "cad", "joint1", "joint2", "bar", "beside", "alarm", "ink", "muted")
+_LOOKS: Final = tuple(
+    itertools.product(("-", "--", "-."), ("identified", "cad", "joint1", "joint2", "bar", "beside", "ink", "muted"))
+)
+"""Lines and colours of the detectors; the suggestion has its own colour."""
 
 _LEAST_RATE: Final = 1e-6
 """Per hour; predictions of the model below this are not drawn, because they can't be checked."""
@@ -334,12 +338,12 @@ def _axes(title: str) -> Iterator[tuple[Figure, Axes]]:
 def _curves(tuning: Tuning) -> Iterator[tuple[Choice, dict[str, Any]]]:
     """Yield each choice and its line's style and label: the suggestion first, then the detectors.
 
-    Without a suggestion, the logs' own filter comes first. There are at most 10 curves; further detectors are left out.
+    Without a suggestion, the logs' own filter comes first. Looks repeat if there are more detectors than `_LOOKS`.
     """
     scheme = tuning.best or tuning.candidates[0]
-    named = [(f"scheme: {scheme.name}", scheme.choice), *((choice.name, choice) for choice in tuning.detectors)]
-    for (name, choice), colour in zip(named, ("alarm", *_LOOKS), strict=False):
-        yield choice, {"color": COLOURS[colour], "linewidth": 2.0 if colour == "alarm" else 1.1, "label": name}
+    yield scheme.choice, {"color": COLOURS["alarm"], "linewidth": 2.0, "label": f"scheme: {scheme.name}"}
+    for choice, (line, colour) in zip(tuning.detectors, itertools.cycle(_LOOKS), strict=False):
+        yield choice, {"color": COLOURS[colour], "linestyle": line, "linewidth": 1.1, "label": choice.name}
 
 
 def draw_roc(tuning: Tuning) -> Drawing:
@@ -359,7 +363,7 @@ def draw_roc(tuning: Tuning) -> Drawing:
             shares = np.array([len(each.delays_ms) / max(each.contacts or 0, 1) for each in found])
             axes.plot(bounds, 100.0 * shares, marker="o", markersize=3.0, **look)
             predicted = [np.nan if rate is None or rate < _LEAST_RATE else rate for _, _, rate in choice.roc]
-            axes.plot(predicted, 100.0 * shares, linestyle=":", **(look | {"label": None}))
+            axes.plot(predicted, 100.0 * shares, **(look | {"linestyle": ":", "label": None}))
             if place == 0:
                 low, high = np.array([each.share_bounds for each in found]).T
                 axes.fill_between(bounds, 100.0 * low, 100.0 * high, color=look["color"], alpha=0.12, linewidth=0.0)

@@ -209,9 +209,10 @@ class _FileCheck:
     def _judge_missing_crcs(self) -> None:
         """Add a note on the parts that no CRC covers, and a warning if only some chunks have one.
 
-        The CRC of the data section covers all that is in it.
+        The CRC of the data section covers all that is in it; it is in the DataEnd, which a cut file lacks.
         """
         missing, chunks = self.findings.without_crc, len(self._chunks.facts)
+        missing[_DATA_SECTION] += not self.is_ended
         if not missing[_DATA_SECTION]:
             missing = Counter(summary=missing["summary"])
         elif 0 < missing["chunk"] < chunks:
