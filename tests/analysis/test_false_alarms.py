@@ -9,6 +9,7 @@ import scipy.stats
 
 from adacd_hil.lab.signal_noise import low_pass, resolution, white_noise
 from adacd_hil.lab.thresholds.false_alarms import (
+    BLOCK_S,
     Sensing,
     Tail,
     TooLittleMotionError,
@@ -17,6 +18,7 @@ from adacd_hil.lab.thresholds.false_alarms import (
     clusters,
     counted_hours,
     find_limits,
+    fit_tail,
     gains,
     largest_ratio,
     peak_factor,
@@ -164,3 +166,11 @@ def test_the_largest_ratio_of_an_hour_is_what_the_margin_says():
         watch.add_block(block)
     hourly = np.median(blocks.reshape(20, 3600).max(axis=1))
     np.testing.assert_allclose(1.0 / watch.margin[0], hourly, rtol=0.1)
+
+
+@pytest.mark.parametrize("burst_s", [3.0, 6.0, 12.0])
+def test_motion_in_bursts_has_the_tail_of_its_largest_values(burst_s):
+    """Low levels merge a burst into one cluster, so there are few of them, too."""
+    burst = np.arange(18_000) // round(burst_s / BLOCK_S) % 2 == 0
+    peaks = np.abs(np.random.default_rng(3).normal(1.0, 0.1, burst.size)) * np.where(burst, 1.0, 0.05)
+    assert np.mean(peaks > fit_tail(peaks).level) < 0.02

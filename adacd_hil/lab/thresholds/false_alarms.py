@@ -157,7 +157,9 @@ def fit_tail(peaks: Vector) -> Tail:
     level, found = math.inf, np.zeros(0)
     for place in np.unique(np.geomspace(least, min(levels.size - 1, 40 * wanted), 16).astype(int)):
         deeper = clusters(peaks, float(levels[place]))
-        if found.size < deeper.size <= wanted:
+        if deeper.size > wanted:
+            break
+        if found.size < deeper.size:
             level, found = float(levels[place]), deeper
     if found.size < least // 2:
         raise TooLittleMotionError(f"only {found.size} peaks stand apart in {hours:.2f} h: the tail can't be fitted")
