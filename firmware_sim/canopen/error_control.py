@@ -209,11 +209,11 @@ class HeartbeatProducer:
     def send_due(self, t_ns: int) -> int:
         """Send a heartbeat if it is due; return when the next is due, ns.
 
-        After several missed periods one more is due at once, the others are left out. NEVER_NS without heartbeats. Both
-        times are on the device's clock.
+        Of several missed periods it sends one; the next is due a whole number of periods after the first. NEVER_NS
+        without heartbeats. Both times are on the device's clock.
         """
         if t_ns >= self._due_ns:
-            self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
+            self._due_ns = t_ns + self._period_ns - (t_ns - self._due_ns) % self._period_ns
             self._send(self._can_id, bytes([self._state()]))
         return self._due_ns
 

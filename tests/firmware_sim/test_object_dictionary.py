@@ -111,6 +111,14 @@ def test_heartbeats_come_by_bench_time_with_the_nmt_state(host):
     assert host.take() == []
 
 
+def test_one_heartbeat_comes_after_missed_ones_and_the_next_in_its_place(host):
+    host.write(1, 0x1017, 0, 100)
+    host.take()
+    for t_ms, count in ((350, 1), (350, 0), (399, 0), (400, 1)):
+        host.bench.time.poll(t_ms * 1_000_000)
+        assert len(host.taken(0x701)) == count
+
+
 def test_what_an_eds_gives_error_control_counts_from_the_first_power_on():
     sent = []
     defaults = {(0x1015, 0): 700, (0x1016, 1): 127 << 16 | 50, (0x1017, 0): 100}
