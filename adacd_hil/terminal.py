@@ -219,7 +219,7 @@ class Terminal(io.TextIOBase):
         polls = 0
         while not self._lock.acquire(timeout=_POLL_MS / 1000):
             polls += 1
-            if 0 <= self._patience < polls:
+            if 0 <= self._patience <= polls:
                 return False
         return True
 
@@ -234,7 +234,7 @@ class Terminal(io.TextIOBase):
         while view and not self._is_gone:
             if not self._is_ready and not poll.poll(_POLL_MS):
                 polls += 1
-                self._is_gone = 0 <= self._patience < polls
+                self._is_gone = 0 <= self._patience <= polls
                 continue
             with contextlib.suppress(BlockingIOError):  # another process has made the descriptor non-blocking
                 view = view[os.write(self._descriptor, view if self._is_ready else view[:_PIECE]) :]

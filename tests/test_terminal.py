@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from experiment_runs import BIN, PAPER
@@ -21,7 +22,7 @@ from adacd_hil.log.reader import read_log
 from adacd_hil.printable import in_line, one_line, plain
 from adacd_hil.progress_lines import Progress
 from adacd_hil.table_layout import fit_table
-from adacd_hil.terminal import for_people, has_colour, terminal_columns
+from adacd_hil.terminal import Terminal, for_people, has_colour, terminal_columns
 from firmware_sim.bench.bench_time import TruthLog
 
 OK, USAGE, PARTIAL, INTERRUPTED = 0, 2, 3, 130
@@ -146,6 +147,21 @@ def test_an_output_that_blocks_ends_with_ctrl_c(command: list[str], is_both: boo
     expected = {"adacd-hil": (INTERRUPTED, b"adacd-hil: interrupted\n"), "firmware-sim": (OK, b"")}[command[0].name]
     assert process.returncode == expected[0]
     assert is_both or complaint.lstrip() == expected[1]
+
+
+@pytest.mark.parametrize("blocked", ["the output", "another thread"])
+def test_a_write_waits_for_half_a_second_after_the_request_to_end(blocked: str, small_pipe, monkeypatch) -> None:
+    waits_ms: list[float] = []
+    stream = Terminal(small_pipe[1], "output", is_needed=True)
+    stream.hurry()
+    if blocked == "the output":
+        poll = SimpleNamespace(register=lambda *_: None, poll=waits_ms.append)
+        monkeypatch.setattr(select, "poll", lambda: poll)
+    else:
+        lock = SimpleNamespace(acquire=lambda timeout: waits_ms.append(1e3 * timeout))
+        monkeypatch.setattr(stream, "_lock", lock)
+    stream.write("x")
+    assert sum(waits_ms) == 500.0
 
 
 @pytest.mark.slow

@@ -438,7 +438,7 @@ def _share_bus(frames: list[FrameBudget], contract: str, arms: int) -> list[Fram
 
     One arm's frames are returned as they are. Of several, the devices' node ids follow each other from 1, arm by arm;
     the hosts' go down from the contract's; names begin with `Arm1.` and so on. contract: name of the DBC, for errors.
-    Raises CodecError, if there are several arms, for a 29-bit identifier and for a node id beyond 126.
+    Raises CodecError, if there are several arms, for a 29-bit identifier, a node id beyond 126, and one of a host.
     """
     if arms == 1:
         return frames
@@ -455,6 +455,8 @@ def _share_bus(frames: list[FrameBudget], contract: str, arms: int) -> list[Fram
             else:
                 can_id = move_id(frame.can_id, 1 - first + arm * step, 0, f"DBC {contract}: {frame.name}")
             shared.append(replace(frame, name=f"Arm{arm + 1}.{frame.name}", can_id=can_id, responses={}))
+    if len({frame.can_id for frame in shared}) < len(shared):
+        raise CodecError(f"DBC {contract}: a device of {arms} arms has the node id of a host")
     return shared
 
 

@@ -24,6 +24,8 @@ def readable_eds(text: str) -> str:
     given.read_string(text, "object dictionary.eds")
     given.remove_section("Comments")
     for name in sorted(given.sections(), key=len):  # an object before its sub-indices
+        if name not in given:  # removed below
+            continue
         rows = dict(given[name])
         if name == "DeviceInfo":
             rows = {key: value for key, value in rows.items() if key in _DEVICE_NAMES or _number(value) is not None}

@@ -13,6 +13,7 @@ order: `firmware_sim.canopen.error_control`.
 """
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Literal
 
 from adacd_hil.log.types.truth_topic import TRUTH_LAYOUT
@@ -187,14 +188,15 @@ class Bench:
             time.poll(time.now_ns)
 
     def _time_to_sync_ns(self, data: bytes) -> int:
-        """Return by how much this SYNC moves the bench's time if a device hears it and its counter is in sequence, ns.
+        """Return by how much this SYNC moves the bench's time if a device hears it, ns.
 
-        0 in clock mode `wall` and before the first SYNC.
+        0 in clock mode `wall`, before the first SYNC, and if no device takes this one.
         """
-        if self._is_wall or not self.time.has_begun:
+        if self._is_wall or not self.time.has_begun or not any(self._nodes.listeners.takers(data)):
             return 0
-        overflow = self._nodes.listeners.overflow
-        return self._order.periods_to(data[0] if data else 0, overflow) * self._nodes.period_ns
+        order = copy(self._order)
+        self._compare(order, data, 0)
+        return order.is_taken * order.periods * self._nodes.period_ns
 
     def _on_nmt(self, data: bytes, t_ns: int) -> None:
         for place, device in enumerate(self.devices):
@@ -245,8 +247,7 @@ class Bench:
         """
         order = self._order
         last = order.counter
-        overflow = self._nodes.listeners.overflow if data else 0
-        order.judge(data[0] if data else 0, overflow, t_ns, self._nodes.told_period_ns)
+        self._compare(order, data, t_ns)
         if not order.is_taken:
             return False
         self._lost_syncs = order.periods - 1
@@ -257,6 +258,10 @@ class Bench:
             if not self._is_wall:  # time that passed without SYNC has been counted
                 self.cycle = max(self.cycle, self.rows.cycle + 1)
         return True
+
+    def _compare(self, order: SyncOrder, data: bytes, t_ns: int) -> None:
+        overflow = self._nodes.listeners.overflow if data else 0
+        order.judge(data[0] if data else 0, overflow, t_ns, self._nodes.told_period_ns)
 
     def _ignore_sync(self, data: bytes, takers: Sequence[int]) -> None:
         """Report a SYNC that is not answered to the devices that hear it, and let due timers act.

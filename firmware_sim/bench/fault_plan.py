@@ -136,8 +136,7 @@ class FaultPlan:
         """Set the time, begin and end the faults that are due, queue their actions.
 
         Return an event for each beginning and end, fault by fault in the order of the plan; empty if none is due. A
-        fault with a `duration_s` that begins and ends between two calls gives both events, but acts only if it is a
-        storm of EMCYs.
+        fault whose whole time lies between two calls begins at the second, and then lasts for its duration.
 
         scenario_ns: since both drives were enabled, negative before. since_power_on_ns: negative if no time counts from
         there. Neither may go back; this is not checked.
@@ -234,6 +233,8 @@ class FaultPlan:
         now_ns = self._now_ns(row)
         if not row.is_active and not row.is_over and row.begin_ns <= now_ns:
             row.is_active = True
+            if row.end_ns <= now_ns:  # else it would not act at all
+                row.begin_ns, row.end_ns = now_ns, now_ns + row.end_ns - row.begin_ns
             self._begin(row)
             events.append(Event("warning", f"fault {row.index}", f"begins: {row.settings.text}"))
         if row.is_active and row.settings.kind == "emcy_storm":

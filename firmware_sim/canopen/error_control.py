@@ -209,11 +209,11 @@ class HeartbeatProducer:
     def send_due(self, t_ns: int) -> int:
         """Send a heartbeat if it is due; return when the next is due, ns.
 
-        After several missed periods one more is due at once, the others are left out. NEVER_NS without heartbeats. Both
-        times are on the device's clock.
+        Of several missed periods it sends one; the next is due a whole number of periods after the first. NEVER_NS
+        without heartbeats. Both times are on the device's clock.
         """
         if t_ns >= self._due_ns:
-            self._due_ns = max(self._due_ns, t_ns - self._period_ns) + self._period_ns
+            self._due_ns = t_ns + self._period_ns - (t_ns - self._due_ns) % self._period_ns
             self._send(self._can_id, bytes([self._state()]))
         return self._due_ns
 
@@ -327,13 +327,6 @@ class SyncOrder:
         """Forget the last SYNC's counter, so that the next SYNC is judged as the first."""
         self.counter = 0
 
-    def periods_to(self, counter: int, overflow: int) -> int:
-        """Return the periods from the last SYNC taken to one with this counter.
-
-        1 before the first, or if a counter is missing. overflow: 0x1019, above 0.
-        """
-        return (counter - self.counter) % overflow if counter and self.counter else 1
-
     def judge(self, counter: int, overflow: int, t_ns: int, period_ns: int) -> None:
         """Set `kind`, `is_taken`, `counter` and `periods` by a SYNC of the right length.
 
@@ -352,7 +345,7 @@ class SyncOrder:
             self.kind, self.is_taken = SyncKind.REPEATED, False
             return
         else:
-            self.periods = self.periods_to(counter, overflow)
+            self.periods = (counter - last) % overflow if last else 1
         self.counter = counter
         if self._is_timed:
             self._judge_time(t_ns, period_ns, is_first=last == 0)

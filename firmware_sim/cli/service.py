@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from adacd_hil.clock import Clock
+from adacd_hil.records import JOINTS
 from adacd_hil.terminal import hurry
 from adacd_hil.wire.bus import Bus, BusError, Frame, InterfaceDownError
 from adacd_hil.wire.codec import Codec
@@ -49,7 +50,7 @@ class Service:
     ) -> None:
         """`departure`: where the bench puts its frames.
 
-        `is_once`: end also when all nodes have been Operational and then one of them isn't, for whatever cause, or when
+        `is_once`: end also when all nodes have been Operational and then neither drive is, for whatever cause, or when
         the host is silent for `_SILENCE_NS`.
         """
         self._bench = bench
@@ -152,7 +153,8 @@ class Service:
 
     def _is_host_gone(self) -> bool:
         is_silent = self._clock.now_ns() - self._heard_ns > _SILENCE_NS
-        return self._has_been_operational and (is_silent or not self._bench.is_operational)
+        is_left = not any(device.is_operational for device in self._bench.devices[:JOINTS])
+        return self._has_been_operational and (is_silent or is_left)
 
     def _is_settled(self) -> bool:
         """Return whether the arm of a host that has gone is at rest, or has had its time by wall clock.

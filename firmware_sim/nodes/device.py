@@ -155,6 +155,7 @@ class EmulatedDevice(ObjectDictionary):
         self.tripped = self._errors.tripped
         """Watchdogs that are tripped now."""
         self.sync_counts = SyncCounts(self)
+        self.restore(0x1FFF)  # error control gets the defaults of its objects
         self.is_locked = self._is_locked_at_work
         self.watch(0x1006, 0, check=self._check_period)
         self.sync_overflow = self.value(0x1019) if self.has(0x1019) else None

@@ -399,7 +399,10 @@ def test_a_babbling_node_floods_the_bus_at_its_rate():
     assert {(can_id, data) for _, can_id, data in frames} == {(0x10, b"\x01\x02")}
 
 
-@pytest.mark.parametrize(("end", "count"), [({"count": 7}, 7), ({"duration_s": 0.0025}, 13)])
+@pytest.mark.parametrize(
+    ("end", "count"),
+    [({"count": 7}, 7), ({"duration_s": 0.0025}, 13), ({"at_s": 0.0001, "duration_s": 0.0005}, 3)],
+)
 def test_a_flood_ends_by_count_or_time(end, count):
     plan = plan_of({"kind": "babble", "node": "drive1", "can_id": 0x10, "rate_Hz": 5000.0, "at_s": 0.0, **end})
     assert len(flood(plan, 10)) == count
@@ -431,7 +434,9 @@ ACTIONS = [
         [{"kind": "power_loss"} | FOR_3_MS],
         [(ms, kind, node, 0) for ms, kind in ((2, A.POWER_OFF), (5, A.POWER_ON)) for node in range(4)],
     ),
+    ([REBOOT | {"at_s": 0.0012, "duration_s": 5e-4}], [(2, A.POWER_OFF, 0, 0), (3, A.POWER_ON, 0, 0)]),
     ([FAULT], [(2, A.FAIL, 0, 0x2310), (2, A.MEND, 0, 0)]),
+    ([FAULT | {"at_s": 0.0012, "duration_s": 5e-4}], [(2, A.FAIL, 0, 0x2310), (3, A.MEND, 0, 0)]),
     ([FAULT | FOR_3_MS], [(2, A.FAIL, 0, 0x2310), (5, A.MEND, 0, 0)]),
     ([ERROR], [(2, A.SENSOR_STATUS, 2, 1)]),
     ([ERROR | FOR_3_MS | {"status": 5}], [(2, A.SENSOR_STATUS, 2, 5), (5, A.SENSOR_STATUS, 2, 0)]),

@@ -143,6 +143,7 @@ STOP, RESET = ((0x000, bytes([command, 0])) for command in (Nmt.STOP, Nmt.RESET_
         ([(100, *RESET), (3000, *START_ALL), (3500, *STOP)], 3500),
         ([(100, *RESET), (3000, *START_ALL), (3500, *RESET)], 3500),
         ([(100, *START_ALL), (101, 0x080, b"\x01"), (102, *STOP)], 102),  # without a pause
+        ([(0, *START_ALL), (500, 0x000, bytes([Nmt.RESET_NODE, 1])), (1500, *STOP)], 1500),  # one node has left
         ([(3000, *START_ALL), (4000, 0x080, b"\x01")], 6000),  # 2 s after the last word of a host that started them
     ],
 )

@@ -8,7 +8,8 @@ from bench_host import CODEC, EDS, Nmt
 
 from adacd_hil.wire.dbc_contract import contract_folder
 from firmware_sim.canopen.error_control import Watchdog
-from firmware_sim.nodes.device import NmtState
+from firmware_sim.canopen.object_dictionary import DeviceDescription
+from firmware_sim.nodes.device import EmulatedDevice, NmtState
 
 WRITE_ONLY, NO_DATA = 0x06010001, 0x08000024
 
@@ -108,6 +109,28 @@ def test_heartbeats_come_by_bench_time_with_the_nmt_state(host):
     host.take()
     host.bench.advance_to(1_000_000_000)
     assert host.take() == []
+
+
+def test_one_heartbeat_comes_after_missed_ones_and_the_next_in_its_place(host):
+    host.write(1, 0x1017, 0, 100)
+    host.take()
+    for t_ms, count in ((350, 1), (350, 0), (399, 0), (400, 1)):
+        host.bench.time.poll(t_ms * 1_000_000)
+        assert len(host.taken(0x701)) == count
+
+
+def test_what_an_eds_gives_error_control_counts_from_the_first_power_on():
+    sent = []
+    defaults = {(0x1015, 0): 700, (0x1016, 1): 127 << 16 | 50, (0x1017, 0): 100}
+    described = DeviceDescription(contract_folder() / "drive.eds", defaults)
+    device = EmulatedDevice(1, described, lambda can_id, _data: sent.append(can_id), CODEC.by_id, 8)
+    device.power_on(0)
+    device.on_heartbeat(127, 0)
+    device.report_fault(0x2310, 0)
+    device.report_no_error(0)
+    assert [device.poll(t_ms * 1_000_000) for t_ms in (0, 50, 70)] == [50_000_000, 70_000_000, 100_000_000]
+    device.poll(100_000_000)
+    assert sent == [0x701, 0x081, 0x081, 0x701]
 
 
 def test_a_reset_restores_the_communication_profile_or_everything(host):

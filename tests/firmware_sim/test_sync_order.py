@@ -3,7 +3,7 @@
 import struct
 
 import pytest
-from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, moving_host
+from bench_host import PERIOD_NS, BenchHost, Nmt, State, Word, moving_host, quiet_scenario
 
 from firmware_sim.canopen.error_control import SyncKind, SyncOrder, Watchdog
 
@@ -95,6 +95,18 @@ def test_a_counter_that_runs_backwards_is_odd_and_one_period_and_forward_it_is_l
     assert counts(host) == seen
     host.step(Word.ENABLE)
     assert (host.state_bits(1) == State.ENABLED, counts(host)) == (periods < 10, seen)
+
+
+@pytest.mark.parametrize("data", [b"\x09", b"\x00", b"\xf1", b"\x01\x02"])
+def test_an_odd_sync_begins_no_fault_before_its_time(data):
+    fault = {"kind": "drive_fault", "node": "drive1", "code": 0x2310, "since": "power_on", "at_s": 0.2}
+    host = BenchHost(quiet_scenario(faults=[fault]))
+    host.sync(11)
+    host.put(0x080, data)
+    assert host.bench.now_ns <= 11 * PERIOD_NS
+    assert host.read(1, 0x603F) == 0
+    host.sync(200)
+    assert host.read(1, 0x603F) == 0x2310
 
 
 @pytest.mark.parametrize(

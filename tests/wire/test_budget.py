@@ -188,6 +188,11 @@ def test_frames_of_two_arms_compete_by_their_identifiers() -> None:
     assert [entry.can_id for entry in shared.frames if entry.name.endswith("HostHeartbeat")] == [0x77E, 0x77F]
 
 
+def test_devices_and_hosts_of_a_shared_bus_have_no_node_id_in_common() -> None:
+    with pytest.raises(CodecError, match="26 arms"):  # devices up to 104, hosts down to 102
+        compute_budget(ARM, 2000, arms=26)
+
+
 def test_which_arm_of_a_shared_bus_asks_makes_no_difference() -> None:
     def times(node_offset: int) -> list[tuple[int, str]]:
         budget = compute_budget(move_contract(ARM, node_offset), 2000, arms=3)

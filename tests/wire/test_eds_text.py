@@ -31,7 +31,8 @@ ODD = {
     "sub-indices before their object": "[" + "[".join(sorted(EDS.split("[")[1:], reverse=True)),
     "keys and sub-indices in another case": re.sub("sub(?=.])", "SUB", EDS.replace("DefaultValue", "defaultvalue")),
     "an array in short form": EDS.partition("[9130]")[0] + "\n".join(("[9130]", "ParameterName=x", "ObjectType=8",
-        "DataType=4", "AccessType=ro", "PDOMapping=1", "CompactSubObj=1", "[9130Value]", "NrOfEntries=1", "1=0")),
+        "DataType=4", "AccessType=ro", "PDOMapping=1", "CompactSubObj=1", "[9130Value]", "NrOfEntries=1", "1=0",
+        "[9130Name]", "NrOfEntries=1", "1=a")),
 }  # fmt: skip
 
 
