@@ -56,8 +56,8 @@ def add_row(v: Vector, r: float, R: float, L: Vector, b: Vector) -> None:
 def factor(A: Vector, least: float) -> bool:
     """Replace the lower half of A by its Cholesky factor L, A = L L'; return whether A is positive definite.
 
-    Otherwise the lower half is of no use; so it is with NaN.
-    least: a squared pivot below this counts as this; 0: it makes A not positive definite.
+    Otherwise the lower half is of no use; so it is with NaN. least: a squared pivot below this counts as this, so that
+    only NaN gives False; 0: a squared pivot of 0 or less makes A not positive definite.
     """
     for j in range(A.shape[0]):
         for n in range(j + 1):

@@ -113,9 +113,10 @@ class PartWalk:
         self.problem = self.problem or problem
 
     def pieces(self, is_ahead: bool) -> Iterator[Piece]:
-        """Read the file; yield a piece whenever enough cycles are gathered; keep attachments, metadata and problems.
+        """Read the file; yield a piece whenever enough cycles are gathered; keep attachments, metadata, first problem.
 
-        is_ahead: a thread decompresses chunks in advance. Raises LogError if the file can't be read or isn't MCAP.
+        The cycles after the last full piece stay in the `PieceBuilder`. is_ahead: a thread decompresses chunks in
+        advance. Raises LogError if the file can't be read or isn't MCAP.
         """
         with failing_as(f"log {self._path} can't be read"), open_input(self._path) as file:
             for item in read_blocks(file, str(self._path), is_ahead=is_ahead):

@@ -269,9 +269,10 @@ class LogStream:
         self.epoch_ns = _number(self.metadata, EPOCH_KEY, 0)
 
     def _find_parts(self) -> None:
-        """Plan the reading: readable parts by ascending number, a problem for each missing, unreadable or foreign one.
+        """Plan the reading: readable parts by ascending number, and a problem for each unreadable or foreign one.
 
-        Foreign: of another log. Raises LogError if every part is unreadable or foreign.
+        Missing parts in a row are one problem. Foreign: of another log. Raises LogError if every part is unreadable or
+        foreign.
         """
         parts = parts_of(self.path)
         self._is_alone = list(parts) == [0]

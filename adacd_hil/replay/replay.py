@@ -148,8 +148,9 @@ class _Player:
     ) -> None:
         """Compare the decisions about a stretch's cycles with the log, and the requests and events in them.
 
-        Keep the contacts' reports for `compare_contacts`. Do nothing if the log lacks its decisions, or earlier cycles
-        of the attempt. asked: requests of the script (n,); None: each logged one that is a Request is believed.
+        Compare states that were decoded from frames, too. Keep the contacts' reports for `compare_contacts`. Do nothing
+        if this variant isn't compared, or the log lacks its decisions, requests, or earlier cycles of the attempt.
+        asked: requests of the script (n,); None: each logged one that is a Request is believed.
         """
         if self.comparison is None or not stretch.is_exact or stretch.scheme is None or stretch.requests is None:
             return
@@ -302,7 +303,7 @@ def _replay_part(
     bounds_ns: tuple[int, int],
     watch: Watch | None,
 ) -> int:
-    """Replay the cycles of a piece of the log with each player; return their number.
+    """Replay the cycles of a piece of the log with each player, compare its contacts' reports; return their number.
 
     bounds_ns: begin and end of the reported time, on the run's clock; cycles from the end on are not replayed, but
     count in the number. watch: called with each player's decisions.
@@ -379,6 +380,7 @@ class _ArmReader:
     def read(self, stretch: CycleStretch) -> list[ArmBatch]:
         """Return the arm's states in a stretch, for each of the variants.
 
+        Variants that decode as the log's settings get its own states, unless those are to be decoded or it has none.
         Call it for all stretches in the order of the log.
         """
         if stretch.is_begin:

@@ -280,7 +280,7 @@ def _started(log: Path, start_ns: int = 0) -> tuple[datetime | None, str]:
 def _report_of(folder: Path, info: LogInfo) -> dict[str, Any] | None:
     """Return report.json of a run; None without one.
 
-    Raises LogError if it is damaged, or of a stretch, another log or another layout.
+    Raises LogError if it can't be read or is damaged, or is of a stretch, another log or another layout.
     """
     path = folder / JSON_NAME
     if not path.exists():
@@ -310,7 +310,8 @@ def _damage(error: BaseException) -> str:
 def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
     """Return the summary as NOT_JUDGED, with contacts and certificate by the log's events; BROKEN for a damaged log.
 
-    problem: why the report is not used, "" without a report; it begins the verdict.
+    problem: why the report is not used, "" without a report; it begins the verdict of NOT_JUDGED. The first error, a
+    lack of cycles, and an ending that was not planned follow.
     """
     try:
         info = read_info(summary.log)
@@ -332,9 +333,10 @@ def _unjudged(summary: RunSummary, problem: str) -> RunSummary:
 
 
 def _told_certificate(info: LogInfo) -> CertificateState:
-    """Return the state of the last certificate by the log's events, and when that came; NO_CERTIFICATE without one.
+    """Return state and time of the last certificate by the log's events, and the number of all; else NO_CERTIFICATE.
 
     IDENTIFIED if MONITOR was entered from ADAPT, as by the paper's scheme. TAKEN_BACK has the time at which it was.
+    Times are in s since motion start, None without a motion start.
     """
     found = CertificateState(NO_CERTIFICATE, None)
     start_ns: int | None = None

@@ -82,7 +82,7 @@ class Trend:
     def by_key(self) -> dict[str, Any]:
         """Return the trend by the keys of `trend --json`: runs, margins, sentences, and values and changes by quantity.
 
-        Numbers that are not known are NaN.
+        "left_out" has the runs that are not judged, with their verdicts. Numbers that are not known are NaN.
         """
         names = [run.name for run in self.runs]
         return {

@@ -215,9 +215,10 @@ def _unproven(run: Run, number: int, sections: tuple[Section, ...], detection: D
 def _contact(
     run: Run, sections: tuple[Section, ...], contact: TrueContact, detection: Detection | None
 ) -> ReportedContact:
-    """Return a true contact with its delays, and whether its detection named link and direction rightly.
+    """Return a true contact with its delays and peaks, and whether its detection named link and direction rightly.
 
-    detection: None: it was not detected.
+    The detection's reports are in it, too. detection: None: it was not detected. The run must have the truth, and the
+    contact its `time_s`.
     """
     truth, time_s = run.truth, contact.time_s
     assert truth is not None

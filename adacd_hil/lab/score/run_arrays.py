@@ -349,6 +349,7 @@ def origins(state: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def split_sections(run: Run) -> tuple[Section, ...]:
     """Return the lettered sections of a run, in the order of time; () for a run without cycles.
 
+    A section is a stay in the states of one kind: adaptation (ADAPT, CERTIFY), detection (MONITOR), payload or fault.
     Cycles in INIT, COMMISSION and ENABLE belong to no section. REACT and STOPPED belong to the section that they
     interrupt.
     """

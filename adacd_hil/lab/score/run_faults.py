@@ -71,9 +71,9 @@ class Break(NamedTuple):
 
 
 def find_breaks(run: Run) -> tuple[Break, ...]:
-    """Return the breaks of a run in their order, each once; () without any.
+    """Return the breaks of a run, each once: logged errors of the run, interruptions, and `broken_off` as the last.
 
-    An interruption by the user counts only if a scenario played: the rest of its script is missing.
+    An interruption by the user counts only if a scenario played: the rest of its script is missing. () without any.
     """
     last_ns = int(run.t_ns[-1]) if run.t_ns.size else 0
     is_scripted = "scenario" in run.metadata

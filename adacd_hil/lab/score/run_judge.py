@@ -130,7 +130,8 @@ def channels_at(run: Run, time_s: float) -> list[tuple[float, float | None, Vect
 def judge_run(run: Run, contacts: Sequence[TrueContact], detections: Sequence[Detection]) -> Score:
     """Return which contacts a run's own scheme detected, and its false alarms.
 
-    Alarms about the weight of a changed payload are neither, see `is_payload_alarm`.
+    Alarms about the weight of a changed payload are neither, see `is_payload_alarm`, for which `run` is. contacts: of
+    `contacts_of`, with onsets and arming. detections: of `find_detections`.
     """
     return judge(contacts, [detection for detection in detections if not is_payload_alarm(run, detection.row)])
 

@@ -229,7 +229,8 @@ def identified_text(
     """Return a phrase with the times until the model was `done`, "identified" or "certified".
 
     adaptation_s: s by label, None: not done. payload_kg: true ones by label, None: unknown; their change is named
-    before a later time. anew: labels from `begun_anew`. More than LISTED adaptations are summed up.
+    behind a later time, unless the first model was not done. anew: labels from `begun_anew`. More than LISTED
+    adaptations are summed up.
     """
     if not adaptation_s:
         return "the arm never moved to adapt"
@@ -298,8 +299,8 @@ _PAPERS: Final = {
 def compare_with_paper(run: Run, metrics: Metrics) -> tuple[PaperRow, ...]:
     """Return a row per figure: measured, the paper's, and that of the paper's scheme on the same stream.
 
-    For a run that is not the paper's experiment, the paper's figures are None, and rows without another figure are left
-    out.
+    The last figure is None if the paper's scheme is the run's own. For a run that is not the paper's experiment, the
+    paper's figures are None, and rows without another figure are left out.
     """
     settings, evidence = run.settings, metrics.evidence
     detections = [section.label for section in metrics.sections if section.kind == "detection"]

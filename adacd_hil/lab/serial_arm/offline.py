@@ -348,10 +348,10 @@ def detect(
 def find_contacts(tau_ext_hat: Vector, threshold: Vector, window: int) -> tuple[tuple[int, int, tuple[int, ...]], ...]:
     """Return the contacts in samples of external torque and threshold (k, n): sample, link from 0, signs (n,) each.
 
-    The signs are those of tau_ext_hat where a joint crosses its threshold, 0 if it doesn't within the window. window:
-    samples from a detection until the link is isolated. A contact ends when every joint has stayed within
-    `ONSET_FRACTION` of its threshold for a whole window, so a push that sways around the threshold is one. NaN is over
-    the threshold.
+    The sample is the first over a threshold. The link is that of the last joint over its threshold within the window:
+    this sample and the next `window`. The signs are those of tau_ext_hat where a joint first crosses its threshold
+    there, 0 if it doesn't. A contact ends when every joint has stayed within `ONSET_FRACTION` of its threshold for a
+    whole window, so a push that sways around the threshold is one. NaN is over the threshold, with sign 0.
     """
     over = ~(np.abs(tau_ext_hat) <= threshold)
     touched = np.flatnonzero(np.any(~(np.abs(tau_ext_hat) <= undone_filter.ONSET_FRACTION * threshold), axis=1))
@@ -491,12 +491,12 @@ def _run(
     length: int,
     rows: tuple[Vector, Vector],
 ) -> None:
-    """Filter a record, write each sample's external torque to `trace`, and correct theta and P if is_learning.
+    """Filter a record, fill all columns of `trace` by sample, and correct theta and P if is_learning.
 
     columns: of the base parameters. smoothing: part that the second pole keeps over a period; 0 without one. noise_Nm
     (n,): of the filtered torque. R: variance of a sample of the fit in units of noise_Nm². passed_rad_s2: the
     velocity's noise behind the filter, still to be multiplied by the mass matrix, of theta_M. scores, at, length, rows:
-    as of `_trace`; arrays of size 0 stay unused, and so does an empty P.
+    as of `_trace`; arrays of size 0 stay unused, and so does an empty P: then the deviations stay as they are.
     """
     n, p, a = q.shape[1], theta.size, cutoff_rad_s
     F_v, F_c, offset = columns.size, columns.size + n, columns.size + 2 * n

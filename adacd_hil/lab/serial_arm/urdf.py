@@ -271,8 +271,8 @@ def _read_joint(joint: Element, name: str, links: Collection[str], is_locked: bo
     """Return one joint; of a fixed or, by `is_locked`, locked one only its place. links: names of all links.
 
     The axis is x without <axis>. A limit of speed or effort of 0 is none, and so are limits of position that are both
-    0, or of a continuous joint. Raises UrdfError for an unknown type or child link, a mimic that isn't locked, or a
-    value that is no number or impossible.
+    0, or of a continuous joint. Raises UrdfError for an unknown type or child link, a missing parent or child, a mimic
+    that isn't locked, or a value that is no number or impossible.
     """
     where = f'joint "{name}"'
     kind = "fixed" if is_locked else joint.get("type", "")

@@ -92,7 +92,7 @@ class Comparison:
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         """Return head and rows of a table for a terminal, best detector first.
 
-        A dash stands for the delay of a step that isn't found at half of its onsets or more.
+        A dash stands for the median delay of a step that is missed at half of its onsets or more.
         """
         head = ("detector", "joint", *(f"{torque:g} Nm" for torque in STEPS_NM), f"found at {STEPS_NM[0]:g} Nm")
         order = {name: place for place, name in enumerate(self.ranking)}

@@ -111,7 +111,10 @@ class LoggedMotion:
     false_alarms: int = 0
 
     def pieces(self) -> Iterator[Motion]:
-        """Yield the samples piece by piece, in the order of time. Raises LogError if the log can't be read."""
+        """Yield the samples piece by piece, in the order of time, q1 less `level_rad`.
+
+        Raises LogError if the log can't be read.
+        """
         place, before = 0, None
         for scheme in schemes(self.path, self.bounds_ns):
             end = place + len(scheme)

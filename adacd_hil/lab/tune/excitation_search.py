@@ -259,7 +259,8 @@ class Search:
     def _shown(self, dynamic: Vector) -> tuple[float, float, float]:
         """Return smallest and largest eigenvalue of the fit's information, and the smallest of the inertia's, Nm² s.
 
-        dynamic (N, 2, base): from `_regressors`.
+        The latter is of the shortest fit of a payload, on the inertia's parameters alone. dynamic (N, 2, base): from
+        `_regressors`.
         """
         W = np.zeros((self._fit, JOINTS, len(self._scale)))
         W[:, :, : self._base] = dynamic[: self._fit]

@@ -248,7 +248,7 @@ def suggested_toml(tuning: Tuning, best: Candidate, base_name: str, base: Settin
 
 
 def _provenance(tuning: Tuning, best: Candidate) -> list[str]:
-    """Return lines on the origin of a suggestion: date, logs, method, and its effect on both halves."""
+    """Return lines on the origin of a suggestion: date, logs, method, its effect on both halves, and in a replay."""
     date = datetime.fromtimestamp(wall_ns() // 1_000_000_000, tz=UTC).strftime("%Y-%m-%d %H:%M UTC")
     choice, tail = best.choice, best.choice.calibration
     lines = [

@@ -86,7 +86,10 @@ class McapFrames:
                 first.seek(0)
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """Yield the frames of each intact chunk that has some, in an array (n,) of RECORDED_FRAME_DTYPE."""
+        """Yield the frames of each intact chunk that has some, in an array (n,) of RECORDED_FRAME_DTYPE.
+
+        Keep the first damage, or part that can't be opened, in `problem`. Raises LogError for a part that isn't MCAP.
+        """
         for source in self._files:
             if not isinstance(source, Path):
                 yield from self._read(source, "the file")
@@ -103,7 +106,7 @@ class McapFrames:
     def _read(self, file: IO[bytes], name: str) -> Iterator[NDArray[Any]]:
         """Yield the frames of one file of the log, an array for each chunk; keep the first damage in `problem`.
 
-        name: of the file, for `problem`.
+        name: of the file, for `problem` and errors. Raises LogError if the file isn't MCAP.
         """
         self._definitions, self._sources = Definitions(), {}
         summary = summary_of(file)  # for the case that the chunk that defines channels is damaged
@@ -125,10 +128,10 @@ class McapFrames:
                 yield frames
 
     def _take(self, item: Block | RawRecord) -> NDArray[Any]:
-        """Return the frames in a chunk, none for a record outside chunks.
+        """Return the frames in a chunk, or in a message outside chunks; none for an attachment or metadata.
 
-        Keep definitions, and name and epoch of the run. Raises LogError for a damaged chunk or definition, ValueError
-        for a frame that is shorter than its type.
+        Keep definitions, and from the metadata CAN channel and epoch of the run. Raises LogError for a damaged chunk,
+        definition or metadata, ValueError for a frame that is shorter than its type.
         """
         if isinstance(item, Block):
             if item.problem or item.contents.breaks:

@@ -317,8 +317,9 @@ class _Packed(NamedTuple):
 def read_blocks(file: IO[bytes], name: str, block_bytes: int = BLOCK_BYTES, is_ahead: bool = True) -> Iterator[Item]:
     """Yield the contents of an MCAP file from front to end: blocks of chunks, attachments, metadata, and problems.
 
-    name: of the file, for errors. block_bytes: most decompressed bytes of the chunks in a block; 1: each chunk is a
-    block. is_ahead: a thread decompresses chunks in advance. Raises LogError if the file isn't MCAP.
+    A message or definition outside chunks counts as a chunk. name: of the file, for errors. block_bytes: most
+    decompressed bytes of the chunks in a block, unless it is one chunk; 1: each chunk is a block. is_ahead: a thread
+    decompresses chunks in advance. Raises LogError if the file isn't MCAP.
     """
     if not is_ahead:
         for item in _pack(file, name, block_bytes):
@@ -346,7 +347,8 @@ def _finished(item: Future[Block] | RawRecord | Problem) -> Item:
 def _pack(file: IO[bytes], name: str, block_bytes: int) -> Iterator[list[_Packed] | RawRecord | Problem]:
     """Yield lists of chunks, still compressed, and attachments, metadata and problems one by one.
 
-    The chunks of a list have at most `block_bytes` when opened, unless it is one chunk.
+    The chunks of a list have at most `block_bytes` when opened, unless it is one chunk. A message or definition outside
+    chunks counts as a chunk. Other records are left out.
     """
     packed: list[_Packed] = []
     size, crc = 0, crc32(MAGIC)

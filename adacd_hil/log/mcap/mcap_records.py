@@ -225,7 +225,8 @@ class FileEnd(NamedTuple):
 def read_end(file: IO[bytes]) -> FileEnd | None:
     """Return the end of a file: its data section's end and CRC, and its summary.
 
-    None if the file has no footer or an impossible offset in it, or no DataEnd before its summary.
+    None if the file has no footer or an impossible offset in it, or no DataEnd before its summary. The summary is [] if
+    its CRC doesn't fit, or, without a CRC, if a record's lengths don't.
     """
     found = _find(file)
     if found is None:

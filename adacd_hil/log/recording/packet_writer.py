@@ -100,8 +100,8 @@ class PacketWriter:
     def _add_frame(self, is_tx: bool, frame: Frame, publish_ns: int) -> None:
         """Add a frame, and its decoded message if the DBC has its identifier with this length.
 
-        is_tx: sent, not received, so that it goes to another topic. publish_ns: time of its cycle in the file. Error
-        frames are not decoded.
+        is_tx: sent, not received, so that it goes to another topic; so does a frame of more than CLASSIC_BYTES.
+        publish_ns: time of its cycle in the file. Error frames are not decoded.
         """
         self.frames += 1
         can_id, data, t_ns, is_error = frame

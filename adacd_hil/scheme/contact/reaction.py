@@ -82,8 +82,9 @@ class Withdrawal:
     ) -> None:
         """Plan from the present desired motion; without an external torque plan a stop.
 
-        start: joint positions at which the withdrawal began, if it is planned anew on the way; the distance moved since
-        then shortens it.
+        Each joint moves along its torque, by its `distance_deg` times its share of the largest torque; a position limit
+        shortens that. start: joint positions at which the withdrawal began, if it is planned anew on the way; the
+        distance moved since then shortens it.
         """
         distance = np.radians(settings.reaction.distance_deg)
         velocity_limit = np.minimum(

@@ -47,8 +47,8 @@ ASYMMETRY = 0.1
 def constants_of(settings: Settings) -> AnchorConstants:
     """Return the anchors' constants: `zero_drift_Nm2_s`, `rest_cycles`, and the following (n,).
 
-    `holding_Nm`; `zero_Nm`, `zero_std_Nm`: of the configuration; `last_zero_Nm`, `_std_Nm`: of the last certificate. A
-    deviation or holding torque that isn't known is inf.
+    `holding_Nm`; `zero_Nm`, `zero_std_Nm`: of the configuration; `last_zero_Nm`, `last_zero_std_Nm`: of the last
+    certificate, without one the configuration's zero and inf. A deviation or holding torque that isn't known is inf.
     """
     arm, history = settings.arm, settings.history
     return AnchorConstants(

@@ -146,7 +146,7 @@ def describe_more(m: Memory, date_utc: str) -> list[str]:
 def certificate_of(k: Constants, m: Memory, text: str) -> Certificate:
     """Return a certificate of the model in use: its parameters, frictions, inertias and offsets, with deviations.
 
-    text: of the event that reports the certificate.
+    The offsets include the configuration's zeros. text: of the event that reports the certificate.
     """
     base, first, theta, P = int(k.first_offset), FRICTIONS, m.models.theta, m.models.P
     rows = k.evidence.columns[:OFFSETS]
