@@ -128,8 +128,9 @@ def _form(path: Path, lines: list[str]) -> _Form:
     """Return form, heads, units below them and first data line, from 0, by the first lines of a CSV file.
 
     The delimiter and decimal sign are those that give the data the most columns; of equal ones the first in the order
-    of `DELIMITERS`, "." before ",". Raises LogError unless `_FULL_ROWS` successive rows of numbers lie in the first
-    `_HEAD_ROWS`.
+    of `DELIMITERS`, "." before ",". Data begin with `_FULL_ROWS` rows of equally many numbers, three or more; the first
+    of a row may be a date and time. Raises LogError without such rows in the first `_HEAD_ROWS`. Without a line of
+    heads these are "1", "2", ….
     """
     best: _Form | None = None
     for delimiter in DELIMITERS:
