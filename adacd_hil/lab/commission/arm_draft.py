@@ -475,7 +475,7 @@ def _devices(facts: ArmFacts) -> Iterator[Entry]:
 
 
 def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
-    """Draft trajectory, excitation, reaction, gains and the scheme's numbers; add lines to `warnings`.
+    """Draft trajectory, excitation, reaction, gains, rest torque and the scheme's numbers; add lines to `warnings`.
 
     Raises ConfigError for a joint without torque.
     """

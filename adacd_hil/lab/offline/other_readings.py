@@ -115,10 +115,10 @@ def find_readings(
 ) -> list[Reading]:
     """Return the interpretations that explain the test's torque far better than the map does, best first.
 
-    An arm can have their parameters, and they explain at least `EXPLAINED` of the torque. They leave at most `_BETTER`
-    of the share that the map leaves unexplained, unless no arm can have the map's parameters. Of nearly equal ones only
-    those with the fewest differences from the map are returned. At most `_MOST_S` of fit and of test are used. [] if
-    there is none, or the map's own can't be computed.
+    An arm can have their parameters, and they explain at least `EXPLAINED` of each joint's torque. They leave at most
+    `_BETTER` of the share that the map leaves unexplained, unless no arm can have the map's parameters. Of nearly equal
+    ones only those with the fewest differences from the map are returned. At most `_MOST_S` of fit and of test are
+    used. [] if there is none, or the map's own can't be computed.
     """
     fitted, tested = _thinned(fitted, settings), _thinned(tested, settings)
     step = _step(settings)
