@@ -240,7 +240,8 @@ def choose_topics(
 
     Raises LogError if one of `wanted` fits no topic.
 
-    raw: topics of frames, of which no table is made. owner: the source of the topics, for the error.
+    wanted: each with or without the first slash or `DECODED`. raw: topics of frames, of which no table is made. owner:
+    the source of the topics, for the error.
     """
     if not wanted:
         return list(topics)

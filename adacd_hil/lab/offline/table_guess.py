@@ -93,9 +93,9 @@ class _Head(NamedTuple):
 def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
     """Guess the form of a CSV file and the role of its columns, by their heads, or by their values if it has no heads.
 
-    Only the first `_SEEN_ROWS` rows are read. joint_names: of the arm, from the base; they also tell the number of
-    joints. A role without fitting columns is missing in the guess. Raises LogError if the file can't be read, or its
-    first `_HEAD_ROWS` hold no rows of numbers.
+    Only the first `_SEEN_ROWS` + `_HEAD_ROWS` lines are read. joint_names: of the arm, from the base; they also tell
+    the number of joints. A role without fitting columns is missing in the guess. Raises LogError if the file can't be
+    read, or its first `_HEAD_ROWS` hold no rows of numbers.
     """
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
