@@ -475,7 +475,7 @@ def _devices(facts: ArmFacts) -> Iterator[Entry]:
 
 
 def _motion(facts: ArmFacts, warnings: list[str]) -> Iterator[Entry]:
-    """Draft trajectory, excitation, reaction, gains and the scheme's numbers; add lines to `warnings`.
+    """Draft trajectory, excitation, reaction, gains, rest torque and the scheme's numbers; add lines to `warnings`.
 
     Raises ConfigError for a joint without torque.
     """
@@ -615,10 +615,10 @@ def _scaled(by_kind: Sequence[float], scale: float) -> list[float]:
 
 
 def _slowdown(facts: ArmFacts, amplitude: Sequence[float], warnings: list[str]) -> float:
-    """Return the factor, at least 1, by which the motion must be slower than P's to fit speed, acceleration, torque.
+    """Return the factor, at least 1, by which the motion must be slower than that of the emulated arm P.
 
-    amplitude: of both joints, deg. Adds a line to `warnings` if gravity leaves too little torque. Raises ConfigError
-    for a joint without torque.
+    Then it fits the limits of speed, acceleration and torque. amplitude: of both joints, deg. Adds a line to `warnings`
+    for each joint to which gravity leaves too little torque. Raises ConfigError for a joint without torque.
     """
     limit_Nm, speed = np.array((facts.torque_limit_Nm.value, facts.velocity_limit_deg_s.value))
     for i in np.flatnonzero(limit_Nm <= 0.0):

@@ -75,8 +75,9 @@ class ZeroTorqueLoop:
         """Run cycles for a duration, then disable the drives; return the fault that ended the cycles, NONE without one.
 
         observe: called with each cycle but those that disable. is_over: ends the cycles earlier when it returns True.
-        After `interrupt` only the cycles that disable are run. A fault counts only if the loop enables the drives.
-        Stores `device_faults`. Raises BusError if the bus fails; the drives are then not disabled.
+        After `interrupt` only the cycles that disable are run. A fault counts only if the loop enables the drives; then
+        a quick stop disables them. Stores `device_faults`. Raises BusError if the bus fails; the drives are then not
+        disabled.
         """
         last_ns = self._clock.now_ns() + round(duration_s * 1e9) - self._period_ns
         fault = FaultReason.NONE

@@ -295,9 +295,10 @@ def check_controller(_host: Host, link: InterfaceState) -> Finding:
 
 
 def check_queue(host: Host) -> Finding:
-    """Warn if the transmit queue holds `LONG_QUEUE_FRAMES` or more, outdated commands after a dead bus.
+    """Warn if the transmit queue has room for `LONG_QUEUE_FRAMES` or more.
 
-    An interface without a queue passes. The check is skipped without SocketCAN.
+    After a dead bus these would be outdated commands. The frames that wait are not counted. An interface without a
+    queue passes. The check is skipped without a SocketCAN interface.
     """
     if host.link is None:
         return skipped("no SocketCAN interface")

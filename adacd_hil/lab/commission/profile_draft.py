@@ -523,7 +523,11 @@ class _DriveWriter(_ProfileWriter):
     features = _SENSOR_FEATURES | {"option_codes": (0x605A, 0), "torque_limits": (0x6072, 0)}
 
     def _check(self) -> None:
-        """Raise ConfigError if the EDS lacks an object of the cycle, or the drive lacks cyclic synchronous torque."""
+        """Raise ConfigError if the EDS lacks an object of the cycle, or the drive can't be commanded by torque.
+
+        It can't if 0x6071 can't be in an RPDO, or 0x6502 has no cyclic synchronous torque. A 0x6502 that is missing, 0
+        or a factory value passes.
+        """
         target = self.find((0x6071, 0))
         if target is None:
             raise self.refuse("no 0x6071 (target torque): it can't be commanded by torque")

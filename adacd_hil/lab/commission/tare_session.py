@@ -85,9 +85,10 @@ class TareSession:
     def run(self) -> Tare:
         """Boot the devices, measure the poses, solve for the offsets; return the tare. Writes no file.
 
-        Once the devices are set up, stops the nodes at the end, also after an error. Raises TareRefusedError for data
-        or motion that allow no tare, DeviceError if a device is missing or refuses its set-up, BusError if the bus
-        fails, KeyboardInterrupt after `interrupt`.
+        With `is_auto_zeroing` the sensors set their own zero before the first pose. Once the devices are set up, stops
+        the nodes at the end, also after an error. Raises TareRefusedError for data or motion that allow no tare,
+        DeviceError if a device is missing or refuses its set-up, BusError if the bus fails, KeyboardInterrupt after
+        `interrupt`.
         """
         self.progress(f"looking for the arm on {self.bus.channel}")
         self._master.reset()
@@ -159,8 +160,8 @@ class TareSession:
     def _measure_next_pose(self, last: Pose, number: int) -> Pose:
         """Ask the user to move the arm, wait until it has left the last pose and rests, and measure a pose.
 
-        If the arm moves meanwhile, wait again. Raises TareRefusedError after `tare.move_timeout_s` of waiting, or as
-        `_measure`. number: of the pose, from 1.
+        If the arm moves meanwhile, wait again. Raises TareRefusedError after `tare.move_timeout_s` of waiting in all,
+        or as `_measure`. number: of the pose, from 1.
         """
         tare = self.settings.tare
         self.progress(

@@ -72,12 +72,12 @@ def likelihood_windows(
 ) -> Vector:
     """Return one joint's likelihood weights (N, L), the newest sample's first, from the covariance (L,) of its z.
 
-    N: number of `onset_samples`, the ages of the steps. With the covariance R of the last L samples and the step's
-    shape s, w = R^-1 s / sqrt(s' R^-1 s): noise of this covariance comes out with a standard deviation of 1, and no
-    other window gives the step more. The shape is the response of a critically damped loop to a step. lag_s: of that
-    loop. floor_Nm: slow errors of the model, added as a constant of unknown size; without them a window would trust
-    averages longer than any model deserves. Raises ValueError unless L is at least the largest age and the variance,
-    the covariance's first element, is positive.
+    N: number of `onset_samples`, the ages of the steps. With the covariance R of the last L samples, floor_Nm included,
+    and the step's shape s, w = R^-1 s / sqrt(s' R^-1 s): noise of the covariance R comes out with a standard deviation
+    of 1, and no other window gives the step more. The shape is the response of a critically damped loop to a step.
+    lag_s: of that loop. floor_Nm: slow errors of the model, added as a constant of unknown size; without them a window
+    would trust averages longer than any model deserves. Raises ValueError unless L is at least the largest age and the
+    variance, the covariance's first element, is positive.
     """
     length = autocovariance.shape[0]
     if length < max(onset_samples):

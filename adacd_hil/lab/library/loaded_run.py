@@ -173,10 +173,10 @@ def _extra(name: str) -> Any:
 def load(run: str | Path) -> LoadedRun:
     """Return the run in a log, all parts of the log as one. run: a folder with run.mcap, or the log's first part.
 
-    Cycles that lack a record of /scheme, /control or /cycle are left out; of a topic without any record, only its
-    fields. A cut or damaged log is read as far as it is intact. `problem` names the damage, else the cycles left out
-    and a lacking /contact or /events. Raises LogError, in one line, if it can't be read, has no cycle, or its times
-    don't grow.
+    Cycles that lack a record of /scheme, /control or /cycle are left out. If /control or /cycle has no record at all,
+    no cycle is left out for it, and `arrays` lacks its fields. A cut or damaged log is read as far as it is intact.
+    `problem` names the damage, else the cycles left out and a lacking /contact or /events. Raises LogError, in one
+    line, if it can't be read, has no cycle, or its times don't grow.
     """
     path = log_in(run)
     log = read_log(path, _READ)

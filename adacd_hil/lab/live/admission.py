@@ -110,9 +110,9 @@ class Admission:
         return origin.lower() in self._origins or _OWN_PAGE.fullmatch(origin.lower()) is not None
 
     def _is_own_host(self, host: str) -> bool:
-        """Return whether a Host header, `name:port` or `[::1]:port`, has an IP address or an allowed name, in any case.
+        """Return whether a Host header, `name:port` or `[::1]:port`, has an IP address or an allowed name.
 
-        The port may be missing. False for a header of another form.
+        The port may be missing. Upper and lower case are equal. False for a header of another form.
         """
         found = re.fullmatch(r"(?:\[([^\]]+)\]|([^:\[\]]+))(?::\d{1,5})?", host)
         if not found:

@@ -78,7 +78,7 @@ class LiveClient:
         """Return the next message from the connection; None after the timeout or at the server's end.
 
         At the end, set `is_open` to False. JSON from the server is obeyed on the way, its other binary data ignored.
-        Raises LogError for data that is no log of adacd-hil, as a message without a subscription.
+        Raises LogError for data that is no log of adacd-hil, such as a message without a subscription.
         """
         clock = MonotonicClock()
         end_ns = clock.now_ns() + round(timeout_s * 1e9)

@@ -185,7 +185,7 @@ def threshold_shares(scheme: Any) -> Vector:
 
 
 def draw_joints(state: SchemeState, tau_ext_hat: Vector, shares: Vector) -> tuple[Entity, ...]:
-    """Return three entities: a sphere and text at each joint, and the state's name above the base.
+    """Return three entities: at each joint a sphere with torque and share as text; the state's name above the base.
 
     Size and colour of a sphere show the joint's share: it grows up to a share of 1, and is smallest and grey for NaN.
     tau_ext_hat (2,), Nm; shares (2,): of `threshold_shares`.

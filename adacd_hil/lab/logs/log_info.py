@@ -130,7 +130,8 @@ class _InfoView:
     def add_file(self, path: Path, file: IO[bytes]) -> None:
         """Read one file of the log, by its summary or, if that can't be trusted, whole; add its counts and problems.
 
-        With `is_brief` a file is never read whole: only its metadata are added then.
+        With `is_brief` no file is read whole: if the summary can't be trusted, only run metadata and problems are
+        added.
         """
         self._info.ending = ""
         end = read_end(file)

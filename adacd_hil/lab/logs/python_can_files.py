@@ -97,7 +97,7 @@ class TimedMessage(can.Message):
 def to_messages(frames: NDArray[Any], channels: list[str], epoch_ns: int = 0) -> Iterator[TimedMessage]:
     """Yield a python-can message for each frame, a row of RECORDED_FRAME_DTYPE; `epoch_ns` is added to its time.
 
-    channels: name of each CAN channel, by its number in a row.
+    channels: name of each CAN channel, by its number in a row. In a message, a name of digits is an int, "" is None.
     """
     names = [int(name) if name.isdecimal() and len(name) < _MOST_DIGITS else name or None for name in channels]
     for row in frames:

@@ -276,7 +276,11 @@ class Salvage:
         self._is_explained = True
 
     def _sum_up(self) -> None:
-        """Fill in `losses` at the end of the file; by its statistics, if it has a sound summary."""
+        """Fill in `losses` at the end of the file: whether it is cut, and how many messages and other records are lost.
+
+        The numbers follow from the statistics of a sound summary. Without one, that of messages is None if bytes are
+        lost or the file is cut, else that of the messages left out; the others stay.
+        """
         losses, statistics = self.losses, self._statistics
         losses.is_cut = not self._has_data_end and not self._has_footer and statistics is None
         if losses.is_cut:

@@ -46,7 +46,8 @@ AddRows = Callable[[Columns], None]
 def series_columns(series: Series, epoch_ns: int) -> dict[str, Any]:
     """Return the columns of a topic's table by name; a field of n numbers becomes n columns.
 
-    epoch_ns: offset of the file's times from t_ns.
+    First come `t_ns`, and `cycle_t_ns`, the publish time on the same scale. epoch_ns: offset of the file's times from
+    t_ns.
     """
     columns: dict[str, Any] = {
         "t_ns": series.t_ns,
@@ -239,7 +240,8 @@ def choose_topics(
 
     Raises LogError if one of `wanted` fits no topic.
 
-    raw: topics of frames, of which no table is made. owner: the source of the topics, for the error.
+    wanted: each with or without the first slash or `DECODED`. raw: topics of frames, of which no table is made. owner:
+    the source of the topics, for the error.
     """
     if not wanted:
         return list(topics)

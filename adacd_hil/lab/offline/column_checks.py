@@ -108,9 +108,10 @@ def find_faults(
 
 
 def column_faults(described: RecordingMap, recordings: Sequence[ForeignRecording]) -> Iterator[RecordingFinding]:
-    """Yield the defects of torques and positions over all these recordings together. Velocities are not checked.
+    """Yield the defects of torques and positions over all these recordings together.
 
-    recordings: at least one, with the same period, and with stretches.
+    Defects of velocities are not sought. Velocities only show dead encoders, and joints beyond the URDF's limit of
+    speed. recordings: at least one, with the same period, and with stretches.
     """
     stretches = [stretch for recording in recordings for stretch in recording.stretches]
     period_s = recordings[0].period_s

@@ -122,8 +122,8 @@ def _rows(path: Path, described: RecordingMap) -> Iterator[tuple[int, list[str]]
 def opened_text(path: Path) -> Iterator[TextIO]:
     """Open a text file for the block, without its byte-order mark if it has one.
 
-    Raises LogError if the file can't be read or its first bytes are those of another format. Text that isn't UTF-8
-    raises LogError in the block. Any OSError of the block becomes a LogError, too.
+    Raises LogError if the file can't be read or its first bytes are those of another format. An OSError, and a
+    UnicodeDecodeError for text that isn't UTF-8, become a LogError when they leave the block.
     """
     try:
         with open_input(path) as file:
@@ -242,9 +242,9 @@ def _below_units(
 ) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows but comments, and but rows of units above the first row of numbers, which are noted in `into`.
 
-    A row is of units if one of its wanted cells is a unit, or if they are all empty or texts without digits; a comment
-    if all are texts, one of them a unit. Raises ConfigError if a text in a row of units isn't the column's unit in the
-    map.
+    A row is of units if one of its wanted cells is a unit, or if some are texts without digits, the others empty; a
+    comment if all are texts, one of them a unit. Raises ConfigError if a text in a row of units isn't the column's unit
+    in the map.
     """
     for number, cells in rows:
         is_comment = cells[0].startswith("#")

@@ -115,10 +115,10 @@ def find_readings(
 ) -> list[Reading]:
     """Return the interpretations that explain the test's torque far better than the map does, best first.
 
-    An arm can have their parameters, and they explain at least `EXPLAINED` of the torque. They leave at most `_BETTER`
-    of the share that the map leaves unexplained, unless no arm can have the map's parameters. Of nearly equal ones only
-    those with the fewest differences from the map are returned. At most `_MOST_S` of fit and of test are used. [] if
-    there is none, or the map's own can't be computed.
+    An arm can have their parameters, and they explain at least `EXPLAINED` of each joint's torque. They leave at most
+    `_BETTER` of the share that the map leaves unexplained, unless no arm can have the map's parameters. Of nearly equal
+    ones only those with the fewest differences from the map are returned. At most `_MOST_S` of fit and of test are
+    used. [] if there is none, or the map's own can't be computed.
     """
     fitted, tested = _thinned(fitted, settings), _thinned(tested, settings)
     step = _step(settings)
@@ -260,9 +260,9 @@ def _other_units(described: RecordingMap, tested: list[Record]) -> Iterator[tupl
 def _torques(described: RecordingMap, most_turned: int, units: list[tuple[int, float]]) -> Iterator[_Torques]:
     """Yield interpretations of the torques, the map's own first.
 
-    The others: some turned, all turned, one in another unit, two exchanged, and, beyond three joints, all in reverse
-    order. Signs are tried on the first `_MOST_SIGNS` joints only. most_turned: most torques that have the other sign,
-    unless all have. units: joints and the factors to try on their torques.
+    The others: some or all with the other sign, one in another unit, two exchanged, and, beyond three joints, all in
+    reverse order. Signs are tried on the first `_MOST_SIGNS` joints only. most_turned: most torques that have the other
+    sign, unless all have. units: joints and the factors to try on their torques.
     """
     n, names = described.joints, described.urdf.joint_names
     straight, ones = tuple(range(n)), np.ones(n)
@@ -291,10 +291,10 @@ def _torques(described: RecordingMap, most_turned: int, units: list[tuple[int, f
 def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
     """Yield interpretations of the motion, the map's own first, with texts "".
 
-    The others: positions in another unit, a joint turned, two exchanged, sums or differences of neighbours, torques
-    with or without rotors, gravity along another axis or none. Beyond two joints also positions that count from the
-    base, and beyond three joints all columns in reverse order. Where the map names velocities, another unit of the
-    positions is tried with and without that of the velocities.
+    The others: positions in another unit, a position with the other sign, two exchanged with and without their torques,
+    sums or differences of neighbours, the other `arm.has_rotors`, gravity along another axis or none. Beyond two joints
+    also positions that count from the base, and beyond three joints all columns in reverse order. Where the map names
+    velocities, another unit of the positions is tried with and without that of the velocities.
     """
     n, straight, names = model.joints, np.eye(model.joints), described.urdf.joint_names
     yield _Motion("", "", model, straight)

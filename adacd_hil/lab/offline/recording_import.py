@@ -175,11 +175,12 @@ def recording_of(
 ) -> ForeignRecording:
     """Make a recording from columns: drop rows that lack a value, resample at a fixed period, and split at gaps.
 
-    Velocities of all joints are derived from the positions if they are missing, or a moving joint's is constant. Jumps
-    of a revolute joint's position by one turn are removed. Stretches that are too short are dropped. path: of the
-    recording, named in errors. period_s: if the map gives none; 0: the median interval of the rows. Raises LogError if
-    too few rows have all values, no stretch without a gap has enough samples, or the samples are more than `MOST_ROWS`;
-    also if the median interval is used and is outside `SHORTEST_PERIOD_S` to `LONGEST_PERIOD_S`.
+    Velocities of all joints are derived from the positions if they are missing, or one joint's is constant although its
+    position changes. Jumps of a revolute joint's position by one turn are removed. Stretches that are too short are
+    dropped. path: of the recording, named in errors. period_s: if the map gives none; 0: the median interval of the
+    rows. Raises LogError if too few rows have all values, no stretch without a gap has enough samples, or the samples
+    are more than `MOST_ROWS`; also if the median interval is used and is outside `SHORTEST_PERIOD_S` to
+    `LONGEST_PERIOD_S`.
     """
     n = described.joints
     is_whole = np.isfinite(given.values).all(axis=1)
@@ -266,9 +267,10 @@ def _jitter(time_s: Vector, period_s: float) -> str:
 
 
 def _without_idle_velocities(values: Vector, described: RecordingMap) -> tuple[Vector, list[str]]:
-    """Return the values without the velocities of any joint, and a note, if a moving joint's velocity is constant.
+    """Return the values without all velocities, and a note, if a joint's is constant although its position changes.
 
-    Otherwise the values as given, and no note. Some drivers leave velocities empty.
+    Otherwise the values as given, and no note. A joint at rest removes no velocities. Some drivers leave velocities
+    empty. values: positions, torques and, if recorded, velocities, n columns each.
     """
     n = described.joints
     idle = np.ptp(values[:, 2 * n :], axis=0) == 0.0

@@ -219,8 +219,7 @@ def read_map(path: Path) -> RecordingMap:
 def parse_map(table: dict[str, Any], path: Path) -> RecordingMap:
     """Return a map by its TOML table, and read the URDF that it names. path: of the map; it need not exist.
 
-    Raises ConfigError if the URDF can't be read, a section, key or value is wrong, or a list's length isn't the number
-    of moving joints.
+    Raises ConfigError if the URDF can't be read, a section, key or value is wrong, or as `_check_lengths`.
     """
     unknown = [key for key in table if key not in (*_SECTIONS, "scheme")]
     if unknown:
@@ -261,7 +260,10 @@ def _read_arm(folder: Path, arm: ArmSection) -> SerialArm:
 
 
 def _check_lengths(found: RecordingMap) -> None:
-    """Raise ConfigError for a list that isn't empty and doesn't have a value per moving joint."""
+    """Raise ConfigError for a list of `columns`, `scale` or `scheme.noise_Nm` without a value per moving joint.
+
+    An empty list passes. A joint that is locked doesn't count as moving.
+    """
     lists: dict[str, tuple[Any, ...]] = {
         "columns.q": found.columns.q,
         "columns.tau_J": found.columns.tau_J,

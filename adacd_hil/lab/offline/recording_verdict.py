@@ -235,7 +235,10 @@ def _of_length(fit: Fitted) -> Iterator[RecordingFinding]:
 
 
 def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[RecordingFinding]:
-    """Report up to three mistakes of the map, if correcting one explains at least the share `least` of the torque."""
+    """Report, in one finding, the likeliest mistake of the map, with up to two alternatives.
+
+    Report nothing unless its correction explains at least the share `least` of each joint's torque.
+    """
     fitted = [record for recording in fit.fitted for record in recording.records]
     readings = find_readings(fit.described, fit.model, fit.settings, fitted, fit.tested.records)
     if not readings or 1.0 - readings[0].unexplained < least:

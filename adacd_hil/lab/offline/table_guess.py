@@ -94,9 +94,9 @@ class _Head(NamedTuple):
 def guess_table(path: Path, joint_names: Sequence[str]) -> TableGuess:
     """Guess the form of a CSV file and the role of its columns, by their heads, or by their values if it has no heads.
 
-    Only the first `_SEEN_ROWS` rows are read. joint_names: of the arm, from the base; they also tell the number of
-    joints. A role without fitting columns is missing in the guess. Raises LogError if the file can't be read, or its
-    first `_HEAD_ROWS` hold no rows of numbers.
+    Only the first `_SEEN_ROWS` + `_HEAD_ROWS` lines are read. joint_names: of the arm, from the base; they also tell
+    the number of joints. A role without fitting columns is missing in the guess. Raises LogError if the file can't be
+    read, or its first `_HEAD_ROWS` hold no rows of numbers.
     """
     with opened_text(path) as file:
         lines = list(islice(file, _SEEN_ROWS + _HEAD_ROWS))
@@ -129,8 +129,9 @@ def _form(path: Path, lines: list[str]) -> _Form:
     """Return form, heads, units below them and first data row, from 0, by the first lines of a CSV file.
 
     The delimiter and decimal sign are those that give the data the most columns; of equal ones the first in the order
-    of `DELIMITERS`, "." before ",". Raises LogError unless `_FULL_ROWS` successive rows of numbers lie in the first
-    `_HEAD_ROWS`.
+    of `DELIMITERS`, "." before ",". Data begin with `_FULL_ROWS` rows of equally many numbers, three or more; the first
+    of a row may be a date and time. Raises LogError without such rows in the first `_HEAD_ROWS`. Without a line of
+    heads these are "1", "2", ….
     """
     best: _Form | None = None
     for delimiter in DELIMITERS:

@@ -105,9 +105,9 @@ def write_report(
 ) -> Report:
     """Read a log, or a stretch of it, with the emulator's truth if there is one; write and return its report.
 
-    Raises LogError if a log can't be read or the report can't be written, ConfigError for the log's configuration.
-    progress: called with a line on the cycles read. config, scenario, truth: as of `ReportSource`, for the
-    next steps that are returned, which name the log by `log_path`.
+    Raises LogError as `read_run`, or if the report can't be written. progress: called with a line on the cycles read.
+    config, scenario, truth: as of `ReportSource`, for the next steps that are returned, which name the log by
+    `log_path`.
     """
     run, gathered, source = read_run(log_path, truth_path, stretch, progress)
     report = write_run_report(run, out_dir, source, gathered)

@@ -116,7 +116,7 @@ def further_table(evidence: CertifiedEvidence | None) -> Table | None:
 
 
 def sections_table(metrics: Metrics, run: Run) -> Table:
-    """Return the table of the first SECTIONS sections: kind, times, and largest residuals of the frozen models."""
+    """Return a table of the first SECTIONS sections: kind, times, largest residuals of frozen models, judged cycles."""
     threshold = run.settings.detector.threshold_Nm
     rows = []
     for section in metrics.sections[:SECTIONS]:

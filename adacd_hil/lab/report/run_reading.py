@@ -108,9 +108,10 @@ def read_run(
 ) -> ReadRun:
     """Return the run in a log, or in a stretch of it, with the emulator's truth if there is one.
 
-    The truth of another run is left out, and named as a problem of the source. Raises LogError if a file can't be read,
-    or if the stretch has no cycle; ConfigError for the log's configuration. progress: called with a line on the cycles
-    read. full_cycles: the run of a log with more cycles has only some of them.
+    A stretch is widened as by `_widened`. A truth that is of another run, or no log, is left out, and named as a
+    problem of the source. Raises LogError if the log can't be read or has no valid settings, or if the stretch has no
+    cycle. progress: called with a line on the cycles read. full_cycles: the run of a log with more cycles has only some
+    of them.
     """
     problem = "" if truth_path is None else foreign_truth(log_path, truth_path)
     truth = None if truth_path is None or problem else read_truth(truth_path)
@@ -632,7 +633,7 @@ def _arrays(columns: dict[str, NDArray[Any]], settings: Settings) -> dict[str, A
 
 
 def _widened(run: Run, shell: Run, stretch: TimeWindow, start_ns: int) -> tuple[Run, Bounds]:
-    """Widen a stretch so that it cuts no contact, reaction or adaptation.
+    """Widen a stretch so that it cuts no true contact, reaction or adaptation.
 
     Return `shell` for reading it, and its bounds, ns.
 

@@ -221,7 +221,8 @@ _TIMES: Final = ((LATENESS, "identified"), (COMPUTE, "joint1"), (SYNC_TO_COMMAND
 def timing_track(columns: CycleColumns, period_us: float, zero_ns: int, has_grid: bool) -> Track:
     """Return a track of the times of `_TIMES`, queues and skipped periods, as far as logged, over s since `zero_ns`.
 
-    Without a skipped period, these have no panel. has_grid: False in lockstep, where lateness and queues are left out.
+    Without a skipped period there is no panel of skipped periods. period_us: drawn as a level in the panels of times.
+    has_grid: False in lockstep, where lateness and queues are left out.
     """
     panels = []
     for quantity, colour in _TIMES:

@@ -274,7 +274,10 @@ class _Differences:
                 self._compare(name, first[name], second[name], since)
 
     def _compare(self, name: str, first: NDArray[Any], second: NDArray[Any], since: NDArray[np.int64]) -> None:
-        """Count the differences of one field in `found`; add it to `missing` if its sizes differ. NaN equals NaN."""
+        """Count the differences of one field in `found`; add it to `missing` if its sizes differ. NaN equals NaN.
+
+        first, second (n, ...): its values. since (n,): cycles since motion start.
+        """
         if first.shape != second.shape:
             self.missing.add(name)
             return

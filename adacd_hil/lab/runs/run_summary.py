@@ -230,7 +230,7 @@ def reported(folder: Path, name: str, table: Mapping[str, Any]) -> RunSummary:
 
 
 def _settings(log: Path) -> Settings | None:
-    """Return the settings in a log; None if it has none, or those of another version that can't be read."""
+    """Return the settings in a log; None if it has none, or they can't be read, such as those of another version."""
     text = attachment(log, CONFIG_NAME)
     try:
         return None if text is None else settings_of(log, {CONFIG_NAME: text})

@@ -41,10 +41,11 @@ class DefinitionCheck:
         self._read: set[int] = set()  # schemas whose text was read
 
     def schema(self, schema: Schema, offset: int, is_summary: bool) -> None:
-        """Check a schema by the rules and against the data section's of its number, and store it; add findings.
+        """Check a schema by the rules and against the data section's first one of its number; add findings.
 
-        The text is read if it is the first ros2msg schema of its number. offset: of its record or chunk in the
-        file. is_summary: it stands in the summary.
+        Stores the first schema of each number in the data section; of one in the summary only the number. The text is
+        read if it is the first ros2msg schema of its number. offset: of its record or chunk in the file. is_summary: it
+        stands in the summary.
         """
         name = f"schema {schema.id}"
         if schema.id == 0:
@@ -67,10 +68,11 @@ class DefinitionCheck:
                 self._findings.add_finding("schema-text", f"{name} ({schema.name}): {problem}", offset)
 
     def channel(self, channel: Channel, offset: int, is_summary: bool) -> None:
-        """Check a channel by the rules and against the data section's of its number, and store it; add findings.
+        """Check a channel by the rules and against the data section's first one of its number; add findings.
 
-        Its schema must be defined before. offset: of its record or chunk in the file. is_summary: it stands in the
-        summary.
+        Its schema must be defined before. Stores in `channels` the data section's first channel of each number, in
+        `all_channels` the data section's last one, or the summary's first one if that has none. offset: of its record
+        or chunk in the file. is_summary: it stands in the summary.
         """
         name = f"channel {channel.id}"
         known = self.channels.get(channel.id)

@@ -195,7 +195,7 @@ class _FileCheck:
             )
 
     def _finish(self) -> None:
-        """Add the findings on the file as a whole."""
+        """Add the findings on the file as a whole: missing records, its end, definitions, summary and missing CRCs."""
         for opcode, rule in _ONCE.items():
             if not self._counts[opcode]:
                 self.findings.add_finding(rule, f"there is no {name_of(opcode)}")
