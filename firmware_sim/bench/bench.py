@@ -291,8 +291,8 @@ class Bench:
     def _miss_sync(self, data: bytes, t_ns: int) -> None:
         """Advance to a SYNC that a fault keeps from all devices, send their other frames, and add a row of truth.
 
-        Only in clock mode `sync`. Time and `cycle` stay, and the row repeats `cycle`, before the first SYNC that devices
-        took, and if no device would take this one.
+        Only in clock mode `sync`. Time and `cycle` stay, and the row repeats `cycle`, before the first SYNC that
+        devices took, and if no device would take this one.
         """
         is_counted = self._order.counter != 0 and any(self._nodes.listeners.takers(data)) and self._judge(data, t_ns)
         if is_counted and self.time.has_begun:
