@@ -53,7 +53,10 @@ class PushGatherer:
             self._threshold[joint].add_values(in_force[:, joint])
 
     def smallest_push(self) -> SmallestPush | None:
-        """Return percentiles by joint, time and rate of false alarms over all cycles so far; None before the first."""
+        """Return percentiles of push and threshold by joint, and the rate of false alarms to be expected.
+
+        All cycles so far count; None before the first. `hours` is their time.
+        """
         if not self._push[0].count:
             return None
         seen_s = self._push[0].count * self._period_s

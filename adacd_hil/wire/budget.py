@@ -472,7 +472,8 @@ def _respond(
 ) -> ResponseTime:
     """Return the response time in a load case of the frame at index `place` of all, in arbitration order.
 
-    Each of `hosts` sends one request a period. A frame that the load case lacks is judged as a single one.
+    Each of `hosts` sends one request a period; a request itself is judged without other requests. A frame that the load
+    case lacks is judged as a single one.
     """
     entry = entries[place]
     above = [other for other in entries[:place] if _is_sent(other, traffic)]

@@ -273,8 +273,9 @@ class ProtectedReceiver(E2eReceiver):
     def _judge(self, frame: bytes) -> E2eStatus:
         """Return the status of a frame by its length, CRC and counter, and advance the sequence.
 
-        A wrong length is WRONG_CRC, too. A frame with a wrong CRC doesn't advance the sequence. A frame whose counter
-        stands still is REPEATED, and counts as a cycle without a new frame. The first right frame begins the sequence.
+        A wrong length is WRONG_CRC, too. A frame with a wrong CRC doesn't advance the sequence, nor does one beyond the
+        tolerance if that grows (`is_growing`) and `sync_frames` is 0. A frame whose counter stands still is REPEATED,
+        and counts as a cycle without a new frame. The first right frame begins the sequence.
         """
         is_growing = self._profile.is_growing
         self._max_delta += is_growing

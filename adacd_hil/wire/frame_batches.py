@@ -118,7 +118,7 @@ class FrameReceiver:
         self._last_ns = 0
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until `take_frames` has a frame; return False if there is none after `timeout_s`.
+        """Wait until `take_frames` has a frame or an error to raise; return False if it has none after `timeout_s`.
 
         A signal restarts the whole wait. Raises OSError if the socket can't be waited for.
         """

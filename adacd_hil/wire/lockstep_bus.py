@@ -228,9 +228,10 @@ class LockstepBus(Bus):
             self._take_answers()
 
     def _take_answers(self) -> None:
-        """Take the devices' answers to the SYNC just sent, until all are in, END comes, or the patience is over.
+        """Queue the frames that devices send on the SYNC just sent, until all answers are in or the patience is over.
 
-        Raises SilenceError when answers are expected and neither one nor a mark comes.
+        From a first mark on queue all up to END, see `_take_marked`. Raises SilenceError when answers are expected and
+        neither one nor a mark comes.
         """
         self._begin_wait()
         missing = count = len(self._answers)

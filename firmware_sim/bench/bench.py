@@ -296,8 +296,8 @@ class Bench:
     def _miss_sync(self, data: bytes, t_ns: int) -> None:
         """Advance to a SYNC that a fault keeps from all devices, send their other frames, and add a row of truth.
 
-        Only in clock mode `sync`. Time stays if no device would take the SYNC, and before the first one that devices
-        took.
+        Only in clock mode `sync`. Time and `cycle` stay, and the row repeats `cycle`, before the first SYNC that
+        devices took, and if no device would take this one.
         """
         is_counted = self._order.counter != 0 and any(self._nodes.listeners.takers(data)) and self._judge(data, t_ns)
         if is_counted and self.time.has_begun:
@@ -323,10 +323,11 @@ class Bench:
         return is_undisturbed and self._nodes.has_all_answers
 
     def _sample_and_send(self, data: bytes, takers: Sequence[int]) -> None:
-        """Give the nodes that hear this SYNC their measured values, let due timers act, then send the nodes' answers.
+        """Give the nodes that hear and take this SYNC their measured values, let due timers act, send their answers.
 
-        In clock mode `sync`, drives that don't hear it count a lost SYNC. Starts the scenario at the first SYNC at
-        which both drives are ready. takers: 1 for each device that takes this SYNC, else 0.
+        Power and faults decide which nodes hear it. Report its kind to these, or a wrong length to one that doesn't
+        take it. In clock mode `sync`, a drive that doesn't hear or take it counts a lost SYNC. Starts the scenario at
+        the first SYNC at which both drives are ready. takers: 1 for each device that takes this SYNC's length, else 0.
         """
         now_ns = self.time.now_ns
         heard = self.injector.count_heard(self._sync_id, data)

@@ -288,7 +288,10 @@ class FaultPlan:
                 self._sending[node, can_id] = tuple(sorted(both, key=lambda row: row.index))
 
     def _switch(self, active: list[FaultRow]) -> None:
-        """Queue the actions for changes of power, bus, failures, sensor status, clocks, objects."""
+        """Queue the actions for changes of power, bus, failures, sensor status, clocks, objects.
+
+        Not those of reboots and drive faults without a duration, see `_begin`.
+        """
         lasting = [row for row in active if row.settings.kind == "power_loss" or row.settings.duration_ns]
         off = _nodes_of(_of(lasting, "power_loss", "reboot"))
         off_bus = _nodes_of(_of(active, "bus_off"))
@@ -353,9 +356,10 @@ class FaultPlan:
             self._actions.append(NodeAction(ActionKind.EMERGENCY, node, row.settings.code or 0))
 
     def _change(self, rows: tuple[FaultRow, ...], can_id: int, data: bytes) -> Sent:
-        """Return the frames that rows make of one frame, one row after the other: delay in ns and data.
+        """Return the frames to send for one frame after each of the rows in turn has changed it: delay in ns and data.
 
-        [] if it is lost.
+        [] if it is lost, or held back by `reorder`; the result for the next frame then has both. Each call uses up hits
+        of the rows.
         """
         frames: Sent = [(0, data)]
         for row in rows:

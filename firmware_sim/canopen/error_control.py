@@ -157,7 +157,10 @@ class ErrorReporter:
         self._allowed_ns = 0
 
     def forget_trips(self) -> None:
-        """Clear the tripped watchdogs and all counts of trips without an EMCY, as a reset of the node does."""
+        """Clear the tripped watchdogs, the counts of all trips, and the last trip with its time; send no EMCY.
+
+        A reset of the node calls it.
+        """
         self.tripped.clear()
         self._last = self._last_ms = 0
         self._counts = dict.fromkeys(Watchdog, 0)
@@ -390,10 +393,10 @@ class SyncCounts:
         return self.odd <= TOLERATED
 
     def count_sync(self, kind: SyncKind, lost: int) -> None:
-        """Count a SYNC by its kind, and `lost` SYNCs before it.
+        """Count a SYNC that isn't right by its kind, and `lost` SYNCs before it, in 0x2211.
 
-        One that is repeated, early or out of sequence adds to `odd`; `CLEAN_SYNCS` right ones in a row set `odd` to 0.
-        The counts of 0x2211 stay. Lost SYNCs and those of wrong length change neither `odd` nor the row.
+        One that is repeated, early or out of sequence adds to `odd`; `CLEAN_SYNCS` right ones in a row set `odd` to 0,
+        but no count in 0x2211. Lost SYNCs and those of wrong length change neither `odd` nor the row.
         """
         self._counts[_LOST_SUB] += lost
         if kind is not SyncKind.RIGHT:

@@ -407,5 +407,8 @@ def _records(pdos: Pdos, first: int) -> list[int]:
 
 
 def _message(pdos: Pdos, messages: Mapping[int, MessageCodec], index: int) -> MessageCodec | None:
-    """Return the contract's message with a PDO's default COB-ID; None if the contract has none."""
+    """Return the contract's message with a PDO's present COB-ID; None if the contract has none.
+
+    index: of the PDO's communication object, 0x1400 or 0x1800 on. Raises `Refusal` if the device lacks its COB-ID.
+    """
     return messages.get(pdos.dictionary.value(index, 1) & 0x7FF)

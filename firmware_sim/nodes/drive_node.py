@@ -544,7 +544,10 @@ class DriveNode(Application):
         self._find_command_pdo(t_ns)
 
     def _find_command_pdo(self, t_ns: int) -> None:
-        """Clear the watchdog of the command PDO if nothing keeps the drive from Operation enabled."""
+        """Clear the watchdog of the command PDO, with an EMCY of code 0, if an active RPDO brings commands.
+
+        0x2212 is 0 then, which also needs NMT Operational. Do nothing if the watchdog isn't tripped.
+        """
         if not self._obstacle:
             self.device.clear(Watchdog.COMMAND_PDO, t_ns)
 

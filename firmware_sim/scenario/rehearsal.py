@@ -102,7 +102,7 @@ class ToldArm(NamedTuple):
 
 
 def told_arm(settings: Settings, layers: Sequence[ConfigurationLayer]) -> ToldArm:
-    """Return a configuration with those of its keys that the user has set: neither built in nor of an emulated profile.
+    """Return all settings, and the names of the keys that the user has set: neither built in nor an emulated profile's.
 
     `layers`: those that gave the settings.
     """
@@ -195,9 +195,10 @@ def _by_place(truth: ArmTruth, what: str, by_joint: Pair) -> Pair:
 
 
 def _place_links(told: ToldArm, truth: ArmTruth, assumed: list[str]) -> _Links:
-    """Return the links of truth, configuration or profile, and append a line to `assumed` for each assumption.
+    """Return the links of truth, configuration or profile, else rods, times the truth's factors.
 
-    Raises ConfigError if no links can have the inertia of `arm.cad_theta`.
+    Append a line to `assumed` for each assumption. Raises ConfigError if no links can have the inertia of
+    `arm.cad_theta`.
     """
     arm = told.settings.arm
     told_m = truth.arm.link_length_m or arm.link_length_m
@@ -310,8 +311,8 @@ def _joint_inertia(links: _Links) -> Pair:
 def _friction(told: ToldArm, truth: ArmTruth, rated: Pair, assumed: list[str]) -> tuple[Pair, Pair]:
     """Return viscous, Nm s/rad, and Coulomb friction, Nm, by joint.
 
-    Each is that of the truth, else of the configuration, else of `arm.cad_theta`, else of the profile if the user has
-    set no geometry. Otherwise it is a share of the rated torque, with a line in `assumed`.
+    Each is that of the truth, else of the configuration, else of the user's `arm.cad_theta` if that has any, else of
+    the profile if the user has set no geometry. Otherwise it is a share of the rated torque, with a line in `assumed`.
     """
     theta = told.settings.arm.cad_theta if "arm.cad_theta" in told.own_keys else ()
     known = theta[3:7] if any(theta[3:7]) else ()

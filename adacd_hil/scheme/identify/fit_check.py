@@ -299,8 +299,9 @@ def better_rms(m: Memory) -> float:
 def distance(m: Memory, s: int) -> float:
     """Return (theta - theta_0) (P_0 - P)^-1 (theta - theta_0)' of step s and the fit; inf if P_0 - P has no factor.
 
-    s: index at which the step is stored, with belief theta_0, P_0. Leave the Cholesky factor of P_0 - P in `factor`,
-    scaled by the square roots of P_0's diagonal, and in `apart` the vector whose square is the result.
+    s: index at which the step is stored, with belief theta_0, P_0, which is enlarged by REGULAR in the difference.
+    theta, P: the present belief. Leave the Cholesky factor of P_0 - P in `factor`, scaled by the square roots of P_0's
+    diagonal, and in `apart` the vector whose square is the result.
     """
     own = m.fit_check
     P_0, P, L, x = own.steps_P[s], m.models.P_belief, own.factor, own.apart

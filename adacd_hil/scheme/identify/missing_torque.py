@@ -166,7 +166,7 @@ def is_confirmed(k: Constants, m: Memory) -> bool:
     """Count a sample learnt while the arm monitors; return whether the model lacks a torque by position.
 
     Check after the first samples, then after stretches that double up to a limit; return False between checks. True if
-    the torque that an earlier stretch showed explains this stretch, too; `rms_Nm` (n,) is filled then, else 0. A check
+    the torque that an earlier stretch showed explains this stretch, too. A check sets `rms_Nm` (n,), to 0 if False,
     keeps the torque that this stretch shows for later checks, and empties the sums.
     """
     own = m.missing_torque

@@ -68,10 +68,10 @@ WEIGH = 32  # weigh the evidence for each cause of a contact of the certified mo
 def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool, is_first: bool) -> None:
     """Reset belief, filters, fit and residuals, to learn from the prior, or a payload on top of the certified arm.
 
-    is_first: the first attempt on the present arm. False: an earlier attempt failed; its samples stay as evidence of a
-    torque that depends on the position. The belief learnt before is dropped, so a contact on the way leaves no trace,
-    whenever it is detected. Filters that started with the old payload would mix the old theta into the new one for
-    about 4 / a.
+    is_first: the first attempt on the present arm. False: a fit or test has failed, or a contact has interrupted it;
+    the samples learnt before stay as evidence of a torque that depends on the position. The belief learnt before is
+    dropped, so a contact on the way leaves no trace in it, whenever it is detected. Filters that started with the old
+    payload would mix the old theta into the new one for about 4 / a.
     """
     k, m = constants[0], memory[0]
     if is_first:

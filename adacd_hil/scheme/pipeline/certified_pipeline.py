@@ -210,8 +210,9 @@ class CertifiedPipeline(Pipeline):
     def _begin_adaptation(self, previous: SchemeState) -> None:
         """Begin an adaptation: of a payload if the arm is certified, of the whole arm if not, or after a failed test.
 
-        If the user has taken the certificate back, revoke it first. The paper's scheme beside begins one with a first
-        attempt, too. After a contact an interrupted adaptation begins anew as it was.
+        At REVOKED, a request of the user or the acknowledgement of a doubted model, revoke the certificate first. The
+        paper's scheme beside begins one with a first attempt, too. After a contact an interrupted adaptation begins
+        anew as it was.
         """
         cause = self._course.supervisor.cause
         is_first = cause in (SchemeEvent.REVOKED, SchemeEvent.ENABLED, SchemeEvent.PAYLOAD_CHANGED)

@@ -186,7 +186,7 @@ class Pipeline(ABC):
         )
 
     def run(self, arms: ArmBatch, requests: NDArray[np.uint8]) -> SchemeBatch:
-        """Process n cycles and return their outputs as columns, the same as `step` on each.
+        """Process n cycles, the same as `step` on each, and return their outputs as columns, without `theta_ff`.
 
         requests (n,): values of `Request`.
         """

@@ -377,7 +377,8 @@ def _released(k: SupervisorConstants, m: SupervisorMemory, arm: Sample, observat
     """Return the event by which the user's request ends STOPPED in this cycle, or NONE.
 
     No request does while the host is late. A changed payload and RELEARN need an arm at rest (is_still), an
-    acknowledgement joints below their thresholds.
+    acknowledgement joints below their thresholds; it waits while one of the others does. In doubt of the model an
+    acknowledgement is REVOKED.
     """
     event: int = SchemeEvent.NONE
     if arm.is_late:
