@@ -233,13 +233,14 @@ class BenchTime:
         self._move_arm(self.now_ns + late_ns)
 
     def end_sync(self, cycle: int, stamp_ns: int) -> None:
-        """Latch the drives' set-points, and add the row of truth of a SYNC.
+        """Latch the drives' set-points, and add the row of truth of a SYNC, none before the first cycle (`cycle` -1).
 
         Call it also if no device has heard the SYNC. stamp_ns: time of the SYNC frame, unused in lockstep.
         """
         self._sync_ns, self._has_outlived = self.now_ns, False
         self._nodes.latch_motors()
-        self._rows.add_sync_row(cycle, self.host_ns if self._outbox.is_paced else stamp_ns)
+        if cycle >= 0:
+            self._rows.add_sync_row(cycle, self.host_ns if self._outbox.is_paced else stamp_ns)
 
     def poll(self, t_ns: int) -> None:
         """Let the nodes act on timers that are due at `t_ns`; set `due_ns` to the next timer, fault or held frame."""

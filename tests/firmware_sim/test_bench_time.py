@@ -29,6 +29,13 @@ def test_the_arm_goes_on_between_syncs_by_the_clock():
     assert host.true("q") - before == pytest.approx(host.true("dq") * 0.5e-3, rel=0.1)
 
 
+def test_a_sync_that_is_lost_before_the_first_cycle_has_no_truth():
+    lost = {"kind": "lose", "frame": "sync", "at_s": 0.0, "since": "power_on", "count": 3}
+    host = BenchHost(quiet_scenario(faults=[lost]))
+    host.sync(times=5)
+    assert [cycle for cycle, _, _ in host.truths] == [0, 1]
+
+
 def test_the_truth_of_a_sync_that_no_device_heard_is_that_of_its_own_period():
     lost = {"kind": "lose", "frame": "sync", "at_s": 0.03, "count": 1}
     host = moving_host(faults=[lost], **FREE)
