@@ -196,7 +196,7 @@ def judged(summary: RunSummary) -> RunSummary:
     try:
         run, gathered, source = read_run(summary.log, truth if truth.exists() else None)
         return _with_report(summary, report_json(evaluate(run, gathered), run.metadata, source))
-    except (LogError, ValueError) as error:  # a ConfigError is one
+    except (LogError, ValueError) as error:
         return dataclasses.replace(summary, status=BROKEN, verdict=one_line(error))
 
 
