@@ -176,7 +176,8 @@ def add_block(
     """Add a block's means (2,) to the normal equations (h, k, k) of each hypothesis on the devices, `readings` (h, 7).
 
     `normals`: these equations. k = p + 5, or p + 7 with gravity: theta (p = count), two offsets, two lags, a4 and a5 of
-    another direction, torque.
+    another direction, torque. Only a hypothesis with `is_turned` fills the columns of another direction. A row of
+    `readings` is a `Reading.row`. `level_rad`: q1 at which link 1 is level.
     """
     size = normals.shape[1]
     position, velocity, acceleration, row = np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(size)
