@@ -180,7 +180,8 @@ class FirstMotion(EventSource):
     def suspicion(self) -> str:
         """Return the likely causes of an arm that runs away in its first motion, as text; TOO_SHORT for unknown ones.
 
-        "" if the motion fits the configuration, is no longer judged, or `line` is set already.
+        "" if torques and motion have no contrary signs and give an inertia that an arm can have. Also if the motion
+        isn't judged, or no longer, or `line` is set already.
         """
         if self._readings is None or self.line:
             return ""
@@ -293,6 +294,7 @@ class FirstMotion(EventSource):
 
         A contradiction: both sensors measure the other joint's torque, or a ratio is surely outside the tolerance of
         `safety.first_motion_error`. The latter doesn't count while the ratio to the other joint's command is over 0.5.
+        A joint closes once its ratio's standard deviation is at most _KNOWN, and its way at least _LEAST_WAY_RAD.
         """
         found = self._ratios()
         first, second = found

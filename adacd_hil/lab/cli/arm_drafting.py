@@ -360,8 +360,8 @@ class Drafting:
         """Return the drives, or the sensors, of joint 1 and 2: as given, as the user answers, or by ascending node id.
 
         kind: "drive" or "sensor". channel: of the bus, for the error. A proposal that was taken is added to `warnings`.
-        Raises CommandError if fewer than two answer, or nobody chooses among more than two; ConfigError for a wrong
-        option.
+        Raises CommandError if fewer than two answer, if nobody chooses among more than two, or for two without option,
+        terminal and `--yes`; ConfigError for a wrong option.
         """
         known = {device.node.node_id: device for device in devices if device.kind == kind}
         option, nodes = f"--{kind}-node", " ".join(map(str, known)) or "none"
@@ -595,7 +595,8 @@ class Drafting:
         """Return the geometry, and the sources of lengths, masses and gravity's direction, "" for a guess.
 
         It is the URDF's, else that of given or asked lengths and masses; without masses `cad_theta` is (). Raises
-        CommandError for options that exclude each other, ConfigError for a URDF that can't be used.
+        CommandError for options that exclude each other, or without an answer; ConfigError for a URDF or an option that
+        can't be used.
         """
         options, interview = self.options, self.interview
         if options.urdf is not None:
@@ -647,7 +648,7 @@ class Drafting:
         """Return the tilt of the plane of motion and the q1 at which link 1 hangs down, deg, and their source.
 
         Options give them, else the user; a slight tilt gives `LEVEL_DEG`. The source is "" for a guess. Raises
-        CommandError for options that exclude each other.
+        CommandError for options that exclude each other, or without an answer; ConfigError for a wrong option.
         """
         options, interview = self.options, self.interview
         given = options.mounting
@@ -711,7 +712,7 @@ class Drafting:
         """Return the rated torque at both joints, Nm, and its source: the option, drives, their EDS, or the user.
 
         0x6076 of drives or EDS is taken only if no guess went into it; else it is a proposal, as is the effort of
-        `geometry`.
+        `geometry`. Raises ConfigError for a wrong value, CommandError without an answer.
         """
         scales = [profile.scale for profile in profiles]
         drafts = [draft for joint in range(2) if (draft := self._drafts.get((DRIVE, joint))) is not None]
