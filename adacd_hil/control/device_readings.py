@@ -280,7 +280,7 @@ class DeviceReadings:
         return self._refuted >= _ROUNDS and (is_torque_known or self._readings[best].kind != "torque")
 
     def left(self, found: Sequence[TorqueRatio | None], error: float) -> list[Reading]:
-        """Return the hypotheses that neither equation nor torques refute, best first; the best of each kind and joint.
+        """Return the hypotheses that no equation, inertia or torque refutes, best first, one of each kind and joint.
 
         found: ratios of the torque sensors, by node; None: unknown. error: possible relative error of a scale. Empty
         with fewer than _SUSPECT_BLOCKS blocks, or if the best hypothesis of all is refuted but explains far more than

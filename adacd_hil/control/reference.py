@@ -244,8 +244,8 @@ class Reference(EventSource):
 
         REACT: the reaction. STOPPED: brake, if the reaction kept the path. ADAPT, CERTIFY, MONITOR: go on with the
         path, or go to the corner if the arm was on none or changes from excitation to trajectory. PAYLOAD: go to the
-        corner. Other states: no path. While parking, go on in all other states with power, unless from REACT or
-        STOPPED.
+        corner. Other states: no path. While parking, go on in all states with power but REACT and STOPPED, unless from
+        one of these.
         """
         state, previous = output.state, self._state
         self._state = state

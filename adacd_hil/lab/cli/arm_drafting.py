@@ -482,7 +482,10 @@ class Drafting:
         return names
 
     def _eds_files(self) -> list[tuple[Path, str]]:
-        """Return the given EDS files, each once, with the kind, "drive" or "sensor"; ask if `kind_of` finds none."""
+        """Return the given EDS files, each once, with the kind, "drive" or "sensor"; ask if `kind_of` finds none.
+
+        Raises CommandError without an answer, ConfigError for an EDS that can't be read.
+        """
         options = self.options
         found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
         for eds in options.eds:
@@ -532,7 +535,8 @@ class Drafting:
         """Return drafts of an EDS's profile by joint; ask for each guess, or only for those with keys in `among`.
 
         ratings: by joint (0, 1) to draft for. A given option counts even where the EDS has a value. A question is asked
-        once; later drafts take the same answer.
+        once; later drafts take the same answer. Raises ConfigError for a wrong option or EDS, CommandError without an
+        answer.
         """
         answers: dict[int, dict[str, float]] = {joint: {} for joint in ratings}
 
