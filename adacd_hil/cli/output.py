@@ -311,9 +311,8 @@ def writable_folder(out: Path | None, extended: str | None = None) -> Iterator[N
 def print_and_write(text: str, out: Path | None, content: str, has_all: bool) -> None:
     """Print a result's text, and write `content` to the file `out`, unless that is None; make its folder if missing.
 
-    The file begins with RESULT_HEAD.
-    has_all: the text contains `content`. If the file can't be written, print `content` too, unless has_all, and raise
-    CommandError.
+    The file begins with RESULT_HEAD. has_all: the text contains `content`. If the file can't be written, print
+    `content` too, unless has_all, and raise CommandError.
     """
     failure = None
     if out is not None:

@@ -285,7 +285,7 @@ def _unseen(devices: Sequence[PlacedDevice]) -> Iterator[str]:
 
 
 def _gears(devices: Sequence[PlacedDevice]) -> Iterator[str]:
-    """Yield a warning for each drive whose gear by its profile isn't that of 0x6091 by its EDS."""
+    """Yield a warning for each drive whose gear by its profile contradicts 0x6091 by its EDS; a gear of 1 doesn't."""
     for device in devices:
         find = functools.partial(find_variable, device.objects)
         units = read_drive_units(lambda *at, find=find: getattr(find(*at), "default", None))

@@ -176,7 +176,8 @@ def add_block(
     """Add a block's means (2,) to the normal equations (h, k, k) of each hypothesis on the devices, `readings` (h, 7).
 
     `normals`: these equations. k = p + 5, or p + 7 with gravity: theta (p = count), two offsets, two lags, a4 and a5 of
-    another direction, torque.
+    another direction, torque. Only a hypothesis with `is_turned` fills the columns of another direction. A row of
+    `readings` is a `Reading.row`. `level_rad`: q1 at which link 1 is level.
     """
     size = normals.shape[1]
     position, velocity, acceleration, row = np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(JOINTS), np.zeros(size)
@@ -279,7 +280,7 @@ class DeviceReadings:
         return self._refuted >= _ROUNDS and (is_torque_known or self._readings[best].kind != "torque")
 
     def left(self, found: Sequence[TorqueRatio | None], error: float) -> list[Reading]:
-        """Return the hypotheses that neither equation nor torques refute, best first; the best of each kind and joint.
+        """Return the hypotheses that no equation, inertia or torque refutes, best first, one of each kind and joint.
 
         found: ratios of the torque sensors, by node; None: unknown. error: possible relative error of a scale. Empty
         with fewer than _SUSPECT_BLOCKS blocks, or if the best hypothesis of all is refuted but explains far more than

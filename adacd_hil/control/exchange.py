@@ -89,8 +89,8 @@ class Exchange:
     def _await_feedback(self, last_ns: int) -> int:
         """Take frames until all of this cycle are in, their time is over, or another host's next SYNC comes.
 
-        Return the time of the last frame, ns, or the present time if some are missing. `last_ns`: time of the last
-        frame taken so far.
+        At most MOST_FRAMES are taken. Return the time of the last frame, ns, or the present time if some are missing.
+        `last_ns`: time of the last frame taken so far.
         """
         bus, arm, sync_ns = self._bus, self._arm, self.sync_ns
         patience_s = self._patience_s
@@ -155,9 +155,9 @@ class Exchange:
         return record
 
     def _record(self, tick: Tick, arm: ArmState, log_queue_bytes: int) -> CycleRecord:
-        """Return the record of a cycle whose commands have just left: times since SYNC and counts of missing frames.
+        """Return the record of a cycle whose commands have just left: its times, counts of missing frames, and queues.
 
-        Report frames that the kernel has dropped since the last report.
+        Report frames that the kernel has dropped since the last report, at a limited rate.
         """
         command_ns = self._clock.now_ns()
         frames_lost = self._bus.frames_lost

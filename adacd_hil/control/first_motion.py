@@ -124,8 +124,8 @@ class FirstMotion(EventSource):
         """Add a cycle to the blocks, and judge the joints; put a contradiction in `line`, remarks in `events`.
 
         `tau_c` (2,): its commanded torque, Nm. `state`: of the scheme after the cycle before. A cycle without power,
-        with missing data, or with a drive at a limit discards the unfinished blocks. Stop judging after _LONGEST_S with
-        power.
+        with missing data or periods, or with a drive at a limit discards the unfinished blocks. Stop judging after
+        _LONGEST_S with power.
         """
         if not self.is_on:
             return
@@ -168,8 +168,9 @@ class FirstMotion(EventSource):
     def check_lengths(self, certificates: tuple[Certificate, ...]) -> None:
         """Compare the run's first certificate, if any, with the configured lengths; add the event of `geometry_event`.
 
-        It is a warning of a contradiction, or an info if a smaller tilt explains that or torques can't check a length;
-        otherwise there is none. Set `is_certified` to True, also without a certificate.
+        It is a warning if a length or the mounting contradicts the certificate, or an info if a smaller tilt explains
+        that or torques can't check a length; otherwise there is none. Set `is_certified` to True, also without a
+        certificate.
         """
         self.is_certified = True
         event = geometry_event(self._settings, certificates[0]) if certificates else None
@@ -179,7 +180,8 @@ class FirstMotion(EventSource):
     def suspicion(self) -> str:
         """Return the likely causes of an arm that runs away in its first motion, as text; TOO_SHORT for unknown ones.
 
-        "" if the motion fits the configuration, is no longer judged, or `line` is set already.
+        "" if torques and motion have no contrary signs and give an inertia that an arm can have. Also if the motion
+        isn't judged, or no longer, or `line` is set already.
         """
         if self._readings is None or self.line:
             return ""
@@ -292,6 +294,7 @@ class FirstMotion(EventSource):
 
         A contradiction: both sensors measure the other joint's torque, or a ratio is surely outside the tolerance of
         `safety.first_motion_error`. The latter doesn't count while the ratio to the other joint's command is over 0.5.
+        A joint closes once its ratio's standard deviation is at most _KNOWN, and its way at least _LEAST_WAY_RAD.
         """
         found = self._ratios()
         first, second = found

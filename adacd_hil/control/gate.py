@@ -33,9 +33,9 @@ class Gate:
     def limit(self, tau_d: Vector, is_open: bool, tau_c: Vector, age: int = 0) -> GateFlag:
         """Fill `tau_c` (2,) with the commanded torque for `tau_d` (2,), Nm; return the changes that were made.
 
-        is_open: False makes it zero at once; after that it rises at the limited rate. A `tau_d` that isn't finite makes
-        it zero, too. `age`: of the feedback in cycles; beyond 1 the torque can't grow, beyond MOST_BLIND_CYCLES it
-        fades. Call it once per cycle.
+        `arm.torque_limit_Nm` limits the torque, `arm.torque_rate_limit_Nm_s` its rate. is_open: False makes it zero at
+        once; after that it rises at the limited rate. A `tau_d` that isn't finite makes it zero, too. `age`: of the
+        feedback in cycles; beyond 1 the torque can't grow, beyond MOST_BLIND_CYCLES it fades. Call it once per cycle.
         """
         desired = tau_d.tolist()
         if not all(map(math.isfinite, desired)):

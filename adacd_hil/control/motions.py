@@ -110,9 +110,10 @@ class Pace:
         self.lag_s += (1.0 - self.share) * self._period_s
 
     def _phase_step(self, dq: Vector, ddq: Vector) -> float:
-        """Return the part, 0 to 1, of the present change of pace that the acceleration limits allow in this period.
+        """Return the part, 0 to 1, of the present change of pace to make in this period.
 
-        dq, ddq (2,): planned velocity and acceleration.
+        The whole change takes CHANGE_S, and longer where the acceleration limits allow less. dq, ddq (2,): planned
+        velocity and acceleration.
         """
         step, x = self._period_s / CHANGE_S, self._phase
         steepest = min(max(x, 0.5), x + step)  # where d(share)/dx is largest in this period

@@ -244,7 +244,8 @@ class Reference(EventSource):
 
         REACT: the reaction. STOPPED: brake, if the reaction kept the path. ADAPT, CERTIFY, MONITOR: go on with the
         path, or go to the corner if the arm was on none or changes from excitation to trajectory. PAYLOAD: go to the
-        corner. Other states: no path. While parking, go on in all states with power, unless from a reaction.
+        corner. Other states: no path. While parking, go on in all states with power but REACT and STOPPED, unless from
+        one of these.
         """
         state, previous = output.state, self._state
         self._state = state
@@ -273,8 +274,9 @@ class Reference(EventSource):
     def _react(self, output: SchemeOutput, arm: ArmState) -> None:
         """Begin the reaction to a contact: STOP brakes, WITHDRAW takes a new path, FLOAT and ADMITTANCE have none.
 
-        NONE and SLOW_DOWN keep the path. Store the cycle; for the others also place and external torque, by which
-        `_is_thrown` judges. Report joints that can't stop within their limit, except in FLOAT.
+        NONE and SLOW_DOWN keep the path. Store the cycle; for the others also the external torque, for `_is_thrown`,
+        and the desired position, for `_follow_thrown`. These others, but not FLOAT, report the joints that can't stop
+        within their position limit.
         """
         self._reaction = output.reaction
         self._contact_cycle = arm.cycle

@@ -316,9 +316,8 @@ class Arm:
     def _device_fault(self, is_enabled: bool) -> FaultReason:
         """Return the arm's first fault, NONE without one, and store whether the drives have been enabled.
 
-        is_enabled: both drives are enabled now.
-        In order: DRIVE if the drives are no longer enabled; a sensor's or drive's own fault; DRIVE or SENSOR for a kept
-        EMCY; FOREIGN_FRAMES for another sender.
+        is_enabled: both drives are enabled now. In order: DRIVE if the drives are no longer enabled; a sensor's or
+        drive's own fault; DRIVE or SENSOR for a kept EMCY; FOREIGN_FRAMES for another sender.
         """
         has_dropped_out = self.was_enabled and not is_enabled
         self.was_enabled |= is_enabled

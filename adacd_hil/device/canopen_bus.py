@@ -118,7 +118,7 @@ def find_variable(objects: Any, index: int, sub: int) -> EdsVariable | None:
 
 
 def _bounds(entry: Any, is_signed: bool, is_float: bool) -> tuple[float, float]:
-    """Return the bounds of an object by its data type, and by LowLimit and HighLimit unless they leave no range.
+    """Return the bounds of an object by its data type, and by LowLimit and HighLimit if they leave more than one value.
 
     (0, -1) for an object that is no number.
     """

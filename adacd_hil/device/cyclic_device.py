@@ -91,7 +91,7 @@ class CyclicDevice(ABC):
     def accept_status(self, data: bytes, cycle: int) -> bool:
         """Take one status frame of `cycle`; return False, and ignore it, if its length or end-to-end header is wrong.
 
-        False also for a device without a status frame.
+        The receiver counts a wrong header. False also for a device without a status frame.
         """
         message, receiver = self.status_message, self._status_receiver
         if message is None or receiver is None or len(data) != message.length:

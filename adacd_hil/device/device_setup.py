@@ -242,7 +242,8 @@ def torque_unit(scale: ScaleSettings) -> str:
 def _check_units(slave: Slave, codec: Codec) -> list[str]:
     """Raise DeviceError if increments, velocity unit or gear in the drive differ from the contract's and the profile's.
 
-    Objects that its EDS lacks are not compared. Return a line for increments of a factory value, which confirm nothing.
+    Objects that its EDS lacks are not compared; a gear of 1 by 0x6091 or the profile contradicts no other gear. Return
+    a line for increments of a factory value, which confirm nothing.
     """
 
     def number(index: int, sub: int) -> int | None:
@@ -292,8 +293,8 @@ def _enter_mode(slave: Slave, codec: Codec) -> list[str]:
 
     0x6061 may show the mode later, once the drive is enabled: the cycle compares it. But if no frame carries it, 0x6061
     must show it within `patience.mode_s`. Return a remark if the EDS lacks 0x6061 then. A drive without 0x6060 and
-    0x6061 has one mode. Raises DeviceError if 0x6061 shows another mode, or the drive refuses or doesn't answer;
-    BusError if the bus fails.
+    0x6061 has one mode. Raises DeviceError if 0x6061 doesn't show the mode though it must, or the drive refuses or
+    doesn't answer; BusError if the bus fails.
     """
     if slave.can_write(0x6060):
         try:

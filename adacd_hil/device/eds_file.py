@@ -64,7 +64,10 @@ def parse_eds(data: bytes, path: Path, node_id: int | None) -> Any:
 
 @functools.lru_cache(maxsize=32)
 def _parse(data: bytes, node_id: int | None) -> Any:
-    """Check an EDS; return canopen's object dictionary of it, the same one for the same arguments."""
+    """Check an EDS; return canopen's object dictionary of it, the same one for the same arguments.
+
+    Raises ConfigError for a control character, and as `_check_numbers`; errors of configparser and canopen pass.
+    """
     text = data.decode("utf-8", "replace").removeprefix("\ufeff")
     if found := _EDS_CONTROL.search(text):
         line = text.count("\n", 0, found.start()) + 1

@@ -282,9 +282,10 @@ class Master(EventSource):
             slave.write_checked(0x1016, 1, entry if self._watch_host else 0)
 
     def start(self) -> None:
-        """Watch heartbeats, and send NMT start: to all nodes at once if `devices.start` is all, else sensors first.
+        """Watch heartbeats, and send NMT start: to all nodes at once if `devices.start` is all, else to this arm's.
 
-        If `bus.is_shared`, only this arm's nodes get it, one by one. Raises BusError if the bus refuses a frame.
+        This arm's nodes get it one by one, sensors first. With all and `bus.is_shared`, they alone get it, in the order
+        of `slaves`. Raises BusError if the bus refuses a frame.
         """
         self._heartbeats.start()
         if self._settings.devices.start == "all":

@@ -48,7 +48,7 @@ def config() -> None:
 def show_settings(
     keys: tuple[str, ...], name: str, profile: str | None, changes: tuple[str, ...], is_changed: bool, as_json: bool
 ) -> ExitCode:
-    """Show the effective settings and the origin of each: the default, a file or a profile in it, or --set.
+    """Show the effective settings and the origin of each: the default, a file or a profile in it, --profile or --set.
 
     GROUP or KEY: these only.
     """

@@ -360,8 +360,8 @@ class Drafting:
         """Return the drives, or the sensors, of joint 1 and 2: as given, as the user answers, or by ascending node id.
 
         kind: "drive" or "sensor". channel: of the bus, for the error. A proposal that was taken is added to `warnings`.
-        Raises CommandError if fewer than two answer, or nobody chooses among more than two; ConfigError for a wrong
-        option.
+        Raises CommandError if fewer than two answer, if nobody chooses among more than two, or for two without option,
+        terminal and `--yes`; ConfigError for a wrong option.
         """
         known = {device.node.node_id: device for device in devices if device.kind == kind}
         option, nodes = f"--{kind}-node", " ".join(map(str, known)) or "none"
@@ -482,7 +482,10 @@ class Drafting:
         return names
 
     def _eds_files(self) -> list[tuple[Path, str]]:
-        """Return the given EDS files, each once, with the kind, "drive" or "sensor"; ask if `kind_of` finds none."""
+        """Return the given EDS files, each once, with the kind, "drive" or "sensor"; ask if `kind_of` finds none.
+
+        Raises CommandError without an answer, ConfigError for an EDS that can't be read.
+        """
         options = self.options
         found = [(eds, DRIVE) for eds in options.drive_eds] + [(eds, SENSOR) for eds in options.sensor_eds]
         for eds in options.eds:
@@ -532,7 +535,8 @@ class Drafting:
         """Return drafts of an EDS's profile by joint; ask for each guess, or only for those with keys in `among`.
 
         ratings: by joint (0, 1) to draft for. A given option counts even where the EDS has a value. A question is asked
-        once; later drafts take the same answer.
+        once; later drafts take the same answer. Raises ConfigError for a wrong option or EDS, CommandError without an
+        answer.
         """
         answers: dict[int, dict[str, float]] = {joint: {} for joint in ratings}
 
@@ -595,7 +599,8 @@ class Drafting:
         """Return the geometry, and the sources of lengths, masses and gravity's direction, "" for a guess.
 
         It is the URDF's, else that of given or asked lengths and masses; without masses `cad_theta` is (). Raises
-        CommandError for options that exclude each other, ConfigError for a URDF that can't be used.
+        CommandError for options that exclude each other, or without an answer; ConfigError for a URDF or an option that
+        can't be used.
         """
         options, interview = self.options, self.interview
         if options.urdf is not None:
@@ -647,7 +652,7 @@ class Drafting:
         """Return the tilt of the plane of motion and the q1 at which link 1 hangs down, deg, and their source.
 
         Options give them, else the user; a slight tilt gives `LEVEL_DEG`. The source is "" for a guess. Raises
-        CommandError for options that exclude each other.
+        CommandError for options that exclude each other, or without an answer; ConfigError for a wrong option.
         """
         options, interview = self.options, self.interview
         given = options.mounting
@@ -711,7 +716,7 @@ class Drafting:
         """Return the rated torque at both joints, Nm, and its source: the option, drives, their EDS, or the user.
 
         0x6076 of drives or EDS is taken only if no guess went into it; else it is a proposal, as is the effort of
-        `geometry`.
+        `geometry`. Raises ConfigError for a wrong value, CommandError without an answer.
         """
         scales = [profile.scale for profile in profiles]
         drafts = [draft for joint in range(2) if (draft := self._drafts.get((DRIVE, joint))) is not None]

@@ -50,7 +50,7 @@ def run_commtest(
     """Boot the arm, run cycles at zero torque, and judge the connection; return the result for JSON, and exit status.
 
     The status is SAFETY_STOP after a fault, INTERRUPTED by the user, FAILURE if the connection is not sufficient,
-    PARTIAL if the log lacks data, else OK. is_enabling: enable the drives. out: folder for log and pictures, None:
+    PARTIAL if the log lacks data, else OK. is_enabling: enable the drives. out: folder for log and commtest.html, None:
     neither. Raises ConfigError, CodecError if configuration or contract can't be used, LogExistsError if `out` has a
     log, LogError if a file can't be written, OSError if `out` can't be made, BusMissingError if the bus can't be
     opened, CommandError if the arm isn't found or the bus fails.
@@ -139,10 +139,10 @@ def _exit_code(test: CommunicationTest, fault: FaultReason, is_interrupted: bool
 
 
 def open_log(out: Path, settings: Settings, codec: Codec, connection: Connection, achieved: dict[str, str]) -> Recorder:
-    """Create the log of a test in the folder `out`, and the folder; attach contract and settings; return its recorder.
+    """Create the log of a test in the folder `out`, and the folder; return its recorder.
 
-    achieved: metadata on the host. Raises LogExistsError if a log is there, LogError if it can't be created, OSError if
-    the folder can't be.
+    Attach contract, settings and the viewers' layout. achieved: metadata on the host. Raises LogExistsError if a log is
+    there, LogError if it can't be created, OSError if the folder can't be.
     """
     out.mkdir(parents=True, exist_ok=True)
     return Recorder(

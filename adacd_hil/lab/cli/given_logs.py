@@ -41,7 +41,7 @@ def _have_one_motion(first: Path, second: Path) -> bool:
 
 
 def _watched(path: Path) -> set[tuple[int, bytes]]:
-    """Return time and joint torques of one in `_EVERY` cycles of MONITOR in a log, its bits."""
+    """Return pairs of time, ns, and bits of the joint torques, of each cycle in MONITOR that `_EVERY` divides."""
     from adacd_hil.lab.thresholds.free_motion import schemes
     from adacd_hil.log.logged_run import is_armed_in
 

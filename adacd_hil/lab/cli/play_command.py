@@ -161,9 +161,9 @@ class Playback:
                     yield Frame(can_id, data[:length].tobytes(), t_ns)
 
     def _pieces(self) -> "Iterator[NDArray[Any]]":
-        """Yield arrays of the chosen frames that are sent; add the others to the counts.
+        """Yield arrays of the chosen frames that are sent; count the other chosen ones, `unsendable` and `withheld`.
 
-        At the end, store `problem`.
+        At the end, store the recording's `problem`.
         """
         import numpy as np
 

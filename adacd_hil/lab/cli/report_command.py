@@ -42,8 +42,9 @@ def report_logs(
     """Write a report of each log, or of a stretch of it, beside it or in `out`; return reports, errors, exit status.
 
     Reports of several logs are in subfolders of `out`. A folder stands for the run log in it, or without one for the
-    runs in its folders. An error doesn't stop the others. The exit status is PARTIAL if a report is incomplete, or a
-    run in a folder has none, else OK; the returned errors, those of given logs, don't change it.
+    runs in its folders: these give one `Index`, which has a page, and each run's report or problem. An error doesn't
+    stop the others. The exit status is PARTIAL if a report is incomplete, or a run in a folder has none, else OK; the
+    returned errors, those of given logs, don't change it.
 
     Raises CommandError if two reports would go to one folder.
     """

@@ -65,7 +65,7 @@ def _end_of_date(text: str) -> datetime:
 def _filtered(command: Callable[..., ExitCode]) -> Callable[..., Any]:
     """Return a command with added options that choose runs; it receives them as `asked`, a `RunFilter`.
 
-    The command fails with a CommandError if --since is after --until.
+    It ends the process with its exit status, as `explained`. A --since after --until is a CommandError.
     """
 
     @functools.wraps(command)

@@ -260,9 +260,10 @@ def _together(findings: Sequence[Finding]) -> Finding:
 
 
 def _rated_torque(slave: Slave, rated_Nm: float) -> Finding:
-    """Return the finding on a motor's rated torque, 0x6076, and that of its joint, `rated_Nm`.
+    """Return the finding that states a motor's rated torque, 0x6076, and that of its joint, `rated_Nm`.
 
-    A warning if the EDS has no 0x6076. Raises DeviceError if the drive refuses the read or doesn't answer.
+    They are not compared here: `Master.configure` has done that. A warning if the EDS has no 0x6076. Raises DeviceError
+    if the drive refuses the read or doesn't answer.
     """
     if not slave.has(0x6076):
         return warning(
