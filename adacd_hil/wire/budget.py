@@ -28,7 +28,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import NamedTuple
 
-from cantools.database.can import Message
+from cantools.database.can import Database, Message
 
 from adacd_hil.settings.configuration import Settings
 from adacd_hil.wire.codec import Codec, CodecError
@@ -385,10 +385,19 @@ def compute_budget(
 
 def _given(codec: Codec, attribute: str, chosen: int | None) -> int:
     """Return `chosen`, or if it is None the value of a DBC's attribute. Raises CodecError unless that is above 0."""
-    value = int(read_attribute(codec.database, attribute)) if chosen is None else chosen
+    value = _number(codec.database, attribute, codec.path.name) if chosen is None else chosen
     if value <= 0:
         raise CodecError(f"DBC {codec.path.name} has no {attribute}, and none is given")
     return value
+
+
+def _number(owner: Database | Message, attribute: str, contract: str) -> int:
+    """Return an attribute's value, as by `read_attribute`. Raises CodecError for a text that is no whole number."""
+    value = read_attribute(owner, attribute)
+    try:
+        return int(value)
+    except ValueError:
+        raise CodecError(f"DBC {contract}: {attribute} = {value!r} is no whole number") from None
 
 
 def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, data_bitrate: int) -> FrameBudget:
@@ -406,7 +415,7 @@ def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, d
     except ValueError:
         known = ", ".join(trigger.value for trigger in Trigger)
         raise CodecError(f"DBC {contract}: {message.name}: Trigger = {chosen!r}; known: {known}") from None
-    cycle_ms, inhibit_ms = (int(read_attribute(message, f"GenMsg{name}Time")) for name in ("Cycle", "Delay"))
+    cycle_ms, inhibit_ms = (_number(message, f"GenMsg{name}Time", contract) for name in ("Cycle", "Delay"))
     length, is_extended = message.length, message.is_extended_frame
     worst = worst_case_frame(length, is_extended)
     interval_ns, deadline_ns = period_ns, period_ns if trigger is not Trigger.REQUEST else None

@@ -58,8 +58,16 @@ def test_sets_of_frames(
             r"DBC x: Nmt: Trigger = 'never'; known: sync, command, event, request",
         ),
         ([('BA_ "BusPeriod_us" 1000;', 'BA_ "BusPeriod_us" 0;')], "DBC x has no BusPeriod_us, and none is given"),
+        (
+            [
+                ('BA_DEF_ "BusPeriod_us" INT 0 1000000;', 'BA_DEF_ "BusPeriod_us" STRING ;'),
+                ('BA_DEF_DEF_ "BusPeriod_us" 1000;', 'BA_DEF_DEF_ "BusPeriod_us" "";'),
+                ('BA_ "BusPeriod_us" 1000;', 'BA_ "BusPeriod_us" "1 ms";'),
+            ],
+            "DBC x: BusPeriod_us = '1 ms'",
+        ),
     ],
-    ids=["no trigger", "an unknown trigger", "no period"],
+    ids=["no trigger", "an unknown trigger", "no period", "a period in words"],
 )
 def test_a_contract_that_does_not_say_when_is_refused(edits: list[tuple[str, str]], reason: str) -> None:
     with pytest.raises(CodecError, match=reason):
