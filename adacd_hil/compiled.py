@@ -353,7 +353,7 @@ class _Compilation(event.Listener):
         self._count.call_listeners()
 
     def on_end(self, event: Any) -> None:
-        """Count a compiled function, unless it is numba's own, and call the listeners.
+        """Count a compiled function and call the listeners; do neither for one of numba's own.
 
         After the outermost function, resume garbage collection if it was on before.
         """
@@ -364,7 +364,7 @@ class _Compilation(event.Listener):
             self._count.count_function(event.data["dispatcher"])
 
     def call_listeners(self) -> None:
-        """Call the listeners with the present count."""
+        """Call the listeners, each with a function that returns the present count as a line."""
         self._count.call_listeners()
 
     @contextmanager

@@ -155,7 +155,7 @@ class SignalSettings:
 
     @property
     def name(self) -> ObjectName:
-        """The object."""
+        """Index and sub-index of `object`."""
         return parse_object(self.object)
 
 
@@ -266,7 +266,7 @@ class WriteSettings:
 
     @property
     def name(self) -> ObjectName:
-        """The object."""
+        """Index and sub-index of `object`."""
         return parse_object(self.object)
 
 
