@@ -165,7 +165,7 @@ class _Claims:
             self._descriptor = os.open(_FOLDER / "claims", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
 
     def claim(self, what: str) -> bool:
-        """Lock a function, by its full name, for this process; wait, 120 s at most, while another one holds it.
+        """Lock `what`, a function's full name and types, for this process; wait, 120 s at most, while another holds it.
 
         Return whether another process held the lock, and so may have compiled the function; after 120 s return True
         without the lock. Without file locks: False.
@@ -178,7 +178,7 @@ class _Claims:
         return True
 
     def release(self, what: str) -> None:
-        """Release the claim on a function."""
+        """Release the claim on a function; `what`: as of `claim`."""
         self._lock(what, fcntl.LOCK_UN)
 
     def _lock(self, what: str, operation: int) -> bool:
