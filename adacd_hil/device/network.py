@@ -96,7 +96,7 @@ class Master(EventSource):
         self._canopen.accept(frame)
 
     def _let_pass(self, duration_s: float) -> None:
-        """Read the bus for so long, and hand its frames to their consumers."""
+        """Read the bus for `duration_s`, or up to twice that if frames come; hand its frames to their consumers."""
         self._canopen.pump(lambda _: False, duration_s)
 
     def describe_checks(self) -> list[str]:
