@@ -89,7 +89,7 @@ class CompileCount:
         self.call_listeners()
 
     def call_listeners(self) -> None:
-        """Call the listeners with the present count."""
+        """Call the listeners, each with a function that returns the present count as a line."""
         for listener in _listeners:
             listener(self._line)
 

@@ -165,7 +165,7 @@ class _Claims:
             self._descriptor = os.open(_FOLDER / "claims", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
 
     def claim(self, what: str) -> bool:
-        """Lock a function, by its full name, for this process; wait, 120 s at most, while another one holds it.
+        """Lock `what`, a function's full name and types, for this process; wait, 120 s at most, while another holds it.
 
         Return whether another process held the lock, and so may have compiled the function; after 120 s return True
         without the lock. Without file locks: False.
@@ -178,7 +178,7 @@ class _Claims:
         return True
 
     def release(self, what: str) -> None:
-        """Release the claim on a function."""
+        """Release the claim on a function; `what`: as of `claim`."""
         self._lock(what, fcntl.LOCK_UN)
 
     def _lock(self, what: str, operation: int) -> bool:
@@ -353,7 +353,7 @@ class _Compilation(event.Listener):
         self._count.call_listeners()
 
     def on_end(self, event: Any) -> None:
-        """Count a compiled function, unless it is numba's own, and call the listeners.
+        """Count a compiled function and call the listeners; do neither for one of numba's own.
 
         After the outermost function, resume garbage collection if it was on before.
         """
@@ -364,7 +364,7 @@ class _Compilation(event.Listener):
             self._count.count_function(event.data["dispatcher"])
 
     def call_listeners(self) -> None:
-        """Call the listeners with the present count."""
+        """Call the listeners, each with a function that returns the present count as a line."""
         self._count.call_listeners()
 
     @contextmanager

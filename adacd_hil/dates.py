@@ -10,7 +10,7 @@ MOST_AHEAD_H = 0.1
 
 
 def format_date(t_ns: int) -> str:
-    """Return wall-clock time, ns since 1970, as ISO 8601 in UTC, whole seconds."""
+    """Return wall-clock time, ns since 1970, as ISO 8601 in UTC, such as "2026-01-31T08:00:00Z", cut to seconds."""
     return datetime.fromtimestamp(t_ns // _NS_PER_S, tz=UTC).strftime(_DATE)
 
 

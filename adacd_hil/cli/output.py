@@ -54,7 +54,7 @@ _MEANINGS = {
 
 
 def epilog(**own: str) -> str:
-    """Return the exit statuses for a command's help; own: meanings that this command alone has."""
+    """Return the exit statuses for a command's help; own: meanings that this command alone has, by ExitCode's names."""
     return explain_statuses(**_MEANINGS | own)
 
 
@@ -146,7 +146,7 @@ _REMEDY = "; give another place, or let its owner change the rights"
 
 
 def _is_forbidden(error: BaseException) -> bool:
-    """Return whether an error, or its cause, is the system's refusal to let this user access a file."""
+    """Return whether an error, or its cause, refuses access to a file: no permission, or a read-only file system."""
     causes = (error, error.__cause__)
     return any(isinstance(one, OSError) and one.errno in (errno.EACCES, errno.EPERM, errno.EROFS) for one in causes)
 
@@ -233,7 +233,8 @@ def answer(as_json: bool, described: Any, text: str, *next_commands: str) -> Non
 def as_called(command: str) -> str:
     """Return a command as its user can call it: with the path of this program if a shell doesn't find its name.
 
-    The path is that by which the user called the program. A command of another program is returned unchanged.
+    The path is that by which the user called the program; if it doesn't end in the program's name, as with `python -m`,
+    the command is returned unchanged. So is a command of another program.
     """
     called = PROGRAM if shutil.which(PROGRAM) or not sys.argv[0].endswith(PROGRAM) else sys.argv[0]
     return f"{quoted(Path(called))}{command.removeprefix(PROGRAM)}" if command.startswith(PROGRAM) else command

@@ -221,7 +221,10 @@ def _layer_warnings(layers: Sequence[ConfigurationLayer]) -> Iterator[str]:
 
 
 def origins_of(layers: Sequence[ConfigurationLayer]) -> dict[str, str]:
-    """Return, by key such as `arm.sign`, the origin of the layer that decides its value: the last one that sets it."""
+    """Return, by key, the origin of the layer that decides its value: the last one that sets it.
+
+    A key is like `arm.sign`; that of a setting outside sections is its name, like `scheme`.
+    """
     found = {}
     for origin, table in layers:
         for section, content in table.items():

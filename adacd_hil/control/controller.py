@@ -39,7 +39,7 @@ class Controller:
     def feed_forward(self, theta: Vector) -> None:
         """Begin to blend the feedforward to theta (p,) over HANDOVER_S.
 
-        Do nothing for the same array as in the last call, or if the settings have no feedforward.
+        Do nothing for the same array object as in the last call, or if the settings have no feedforward.
         """
         if theta is self._new or not self._has_feedforward:
             return

@@ -235,7 +235,7 @@ class Cycle:
         """Return this cycle's request for the scheme: FINISH after an interruption, a carried one, or the operator's.
 
         An interruption requests once, a carried request is made as soon as the drives have been enabled. Store PAYLOAD
-        and FINISH until they are served. On FINISH begin to park the arm.
+        and FINISH until they are served, but no FINISH of an interruption. On FINISH begin to park the arm.
         """
         if self._interrupts and not self._is_finishing:
             return self._finish()
@@ -260,7 +260,8 @@ class Cycle:
     def _follow(self, arm: ArmState, output: SchemeOutput) -> None:
         """Fill `_tau_d` with the torque of the floating law while the arm floats, else with the controller's.
 
-        If the scheme's model is valid, first begin to blend the controller's feedforward to it.
+        If the scheme's model is valid, first begin to blend the controller's feedforward to it. While the arm doesn't
+        float, prepare the floating law to brake all joints first.
         """
         if output.is_model_valid:
             self._controller.feed_forward(output.theta_ff)

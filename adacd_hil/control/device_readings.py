@@ -395,7 +395,7 @@ class DeviceReadings:
     def _hangs_deg(self) -> float:
         """Return the q1, deg in [-180, 180), at which link 1 hangs down if the configured mounting is wrong.
 
-        It is the mounting's angle, turned as the last solution turns gravity.
+        It is the mounting's angle, turned as the hypothesis of a wrong mounting turns gravity in its last solution.
         """
         return (self._settings.mounting_deg[1] + self._turned_deg + 180.0) % 360.0 - 180.0
 
@@ -423,7 +423,10 @@ class DeviceReadings:
 
     @property
     def _turned_deg(self) -> float:
-        """Return the angle, deg, toward +q, by which the last solution turns gravity against the configuration."""
+        """Return the angle, deg, toward +q, by which the hypothesis of a wrong mounting turns gravity.
+
+        It is the last hypothesis; its solution is the last one of `_solve`.
+        """
         mounted = self._solutions[-1]
         return math.degrees(math.atan2(mounted[-2:].sum(), mounted[A4 : A5 + 1].sum()))
 

@@ -80,7 +80,10 @@ class Exchange:
         return arm.state()
 
     def _say_late(self, cycle: int) -> None:
-        """Report commands that still wait when the SYNC at which they act goes out; they act one SYNC later."""
+        """Report, at a limited rate, that `_commands_late` commands still wait when their SYNC, of `cycle`, goes out.
+
+        They act one SYNC later.
+        """
         count, from_cycle = self._commands_late, cycle - self._acts_after
         what = f"1 command of cycle {from_cycle}" if count == 1 else f"{count} commands of cycle {from_cycle}"
         text = f"{what} missed SYNC {cycle}, so acting one later"
@@ -113,7 +116,7 @@ class Exchange:
         return self._clock.now_ns()
 
     def _take_late_frames(self) -> None:
-        """Take the frames that have arrived by now, before this cycle's SYNC: they belong to the cycle before."""
+        """Take the frames, at most MOST_FRAMES, that wait before this cycle's SYNC: they belong to the cycle before."""
         for _ in range(MOST_FRAMES):
             late = self._bus.receive(0.0)
             if late is None:

@@ -321,7 +321,10 @@ class Recovery:
         return False
 
     def _await_bus(self) -> bool:
-        """Try to empty the bus, each _RETRY_NS; return True once it is empty, False if the run is interrupted."""
+        """Log and print that the fault is acknowledged; then try to empty the bus, each _RETRY_NS.
+
+        Return True once it is empty, False if the run is interrupted.
+        """
         self._say("info", "fault acknowledged")
         while not self._is_interrupted():
             if self.empty():

@@ -331,7 +331,10 @@ class FirstMotion(EventSource):
         self.events.append(Event("warning" if is_off else "info", "first motion", text))
 
     def _scales(self, joint: int) -> str:
-        """Return, as text, the settings that scale a joint's torque, most with their values."""
+        """Return, as text, the settings that scale a joint's torque, and the motor's torque constant.
+
+        Only gear ratio and rated torque have their values; `scale.gear_efficiency` is left out if the gear ratio is 1.
+        """
         gear, rated_Nm = self._arm.gear_ratios[joint], self._settings.arm.rated_torque_Nm[joint]
         gear_text = f"scale.gear_ratio = {gear:g} of devices.drive[{joint}]"
         text = f"scale.torque_Nm of devices.sensor[{joint}], arm.rated_torque_Nm[{joint}] = {rated_Nm:g} Nm"

@@ -83,7 +83,10 @@ class CertificateRecord:
         )
 
     def digest_after(self, before: str) -> str:
-        """Return the SHA-256 of `before`, the predecessor's digest, and of this record without its own."""
+        """Return the SHA-256, in hexadecimal, of `before` and this record without its digest, in one text.
+
+        before: the predecessor's digest, or `devices_digest` for the first.
+        """
         return _digest(before + to_toml(dataclasses.replace(self, digest="")))
 
 
@@ -118,7 +121,7 @@ class History:
 
 
 def devices_digest(devices: Sequence[DeviceRecord]) -> str:
-    """Return the SHA-256 of the devices, which stands in for a predecessor's digest before the first certificate."""
+    """Return the SHA-256, in hexadecimal, of the devices: it stands in for the digest before the first certificate."""
     return _digest("\n".join(map(to_toml, devices)))
 
 

@@ -90,7 +90,7 @@ class Pace:
 
     @property
     def is_planned(self) -> bool:
-        """Whether the arm moves along the path as planned."""
+        """Whether the arm moves along the path at the planned speed; `lag_s` may still be above 0."""
         return self.share == 1.0 and self.change == 0.0
 
     def step(self, wanted: float, dq: Vector, ddq: Vector) -> None:

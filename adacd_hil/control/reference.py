@@ -350,7 +350,10 @@ class Reference(EventSource):
         self._arrival_cycle, self._is_stopping = None, True
 
     def _stop(self, cycle: int) -> None:
-        """Start the way to the corner if the desired motion is at rest; brake if it moves without a path."""
+        """Start the way to the corner if the desired motion is at rest; brake if it moves without a path.
+
+        Do nothing while it moves on a path: `_pace` brakes it.
+        """
         if self._pace.share == 0.0 or not (np.any(self._dq_d) or np.any(self._ddq_d)):
             self._go(cycle)
         elif self._path is None:

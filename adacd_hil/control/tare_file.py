@@ -109,7 +109,7 @@ class Tare:
 
 
 def read_tare(path: Path) -> Tare:
-    """Return the tare of a file. Raises ConfigError if it is missing, no TOML, or has an invalid key or value."""
+    """Return the tare of a file. Raises ConfigError if it can't be read, is no TOML, or has an invalid key or value."""
     if not path.exists():
         raise ConfigError(f"tare {path} does not exist; `adacd-hil tare` makes one")
     table = read_toml(path, "tare")

@@ -96,7 +96,7 @@ class DataWatch(EventSource):
             self._end_window()
 
     def _note_row(self) -> None:
-        """Count MOST_IN_A_ROW cycles in a row without a sample; add a warning, unless the last one still holds.
+        """Count one row of MOST_IN_A_ROW cycles without a sample; add a warning, unless the last one still holds.
 
         It holds until a window has ended in which this didn't happen.
         """

@@ -8,7 +8,7 @@ from adacd_hil.settings.toml_text import to_toml
 
 
 def device_attachments(devices: Iterable[PlacedDevice]) -> dict[str, bytes]:
-    """Return the content of each device's profile, by a name such as `Drive1.toml`, and of its EDS, by its file name.
+    """Return each device's profile as TOML, by a name such as `Drive1.toml`, and its EDS, unchanged, by its file name.
 
     If two devices have different EDS files of one name, the second gets another name, which its profile then names.
     """

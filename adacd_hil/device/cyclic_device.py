@@ -118,14 +118,14 @@ class CyclicDevice(ABC):
         return lines
 
     def describe_known_excess(self) -> list[str]:
-        """Return a line per bounded value that came and is outside its bounds."""
+        """Return a line per bounded value that is outside its bounds in the newest valid frame; none before one."""
         return [f"{self.name}: {bound.describe(values)}" for bound, values in self._excesses()]
 
     def _is_status_old(self, cycle: int) -> bool:
         return bool(self._status_bounds) and cycle - self._status_came > self.status_age_limit
 
     def _excesses(self) -> Iterator[tuple[ValueBound, Sequence[float]]]:
-        """Yield (bound, values of its frame) for each bound that the newest values exceed, if any came."""
+        """Yield (bound, values of its frame) for each bounded value outside its bounds in the newest valid frame."""
         for bounds, values in (
             (self._cyclic_bounds, self._cyclic_values),
             (self._status_bounds, self._status_values),

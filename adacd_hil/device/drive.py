@@ -208,9 +208,10 @@ class Drive(CyclicDevice):
         return bool(self.statusword & _INTERNAL_LIMIT)
 
     def position_error(self, data: bytes, periods: int) -> float:
-        """Return by how much a frame's position misses the last frame's plus `periods` of travel at its velocity, rad.
+        """Return by how much a frame's position misses the last frame's plus `periods` of travel, rad.
 
-        At least 0; 0 before the first frame, for a protected drive, and for a wrong length. The frame is not stored.
+        The travel is that at this frame's velocity. At least 0; 0 before the first frame, for a protected drive, and
+        for a wrong length. The frame is not stored.
         """
         if self._received is None or len(data) != self.cyclic_length:
             return 0.0

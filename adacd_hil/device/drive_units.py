@@ -101,7 +101,11 @@ def _angle_rad(unit: int | None) -> float | None:
 
 
 def _velocity_rad_s(unit: int | None, increments: float | None, gear_ratio: float) -> float | None:
-    """Return one count of a velocity unit at the joint, rad/s; None for another unit, or increments of unknown size."""
+    """Return one count of a velocity unit at the joint, rad/s; None for another unit, or increments of unknown size.
+
+    increments: per revolution of the joint; None or 0: unknown. gear_ratio: for units of an angle, which are the
+    motor's.
+    """
     if not unit or (time_s := _TIMES_S.get(unit >> 8 & 0xFF)) is None:
         return None
     if unit >> 16 & 0xFF == _INCREMENTS:
@@ -111,7 +115,7 @@ def _velocity_rad_s(unit: int | None, increments: float | None, gear_ratio: floa
 
 
 def unit_prefix(unit: int) -> int:
-    """Return the power of ten of a unit's code."""
+    """Return the exponent of ten of a unit's code, such as -3 for milli."""
     prefix = unit >> 24 & 0xFF
     return prefix - 256 if prefix > 127 else prefix
 

@@ -96,7 +96,7 @@ class Master(EventSource):
         self._canopen.accept(frame)
 
     def _let_pass(self, duration_s: float) -> None:
-        """Read the bus for so long, and hand its frames to their consumers."""
+        """Read the bus for `duration_s`, or up to twice that if frames come; hand its frames to their consumers."""
         self._canopen.pump(lambda _: False, duration_s)
 
     def describe_checks(self) -> list[str]:
@@ -320,8 +320,9 @@ class Master(EventSource):
         """Return the failures of the nodes' heartbeats now, one line per node; empty without a failure.
 
         A node fails if it is silent for PATIENCE_PERIODS, or was in another state than OPERATIONAL since the last call,
-        only between `start` and `stop`. A failure that begins, changes or ends adds an event. Nodes are not watched if
-        their EDS doesn't let the host write 0x1017.
+        only between `start` and `stop`. For PATIENCE_PERIODS after the first call, a node that hasn't been OPERATIONAL
+        yet passes. A failure that begins, changes or ends adds an event. Nodes are not watched if their EDS doesn't let
+        the host write 0x1017.
         """
         return self._heartbeats.judge_nodes(t_ns)
 

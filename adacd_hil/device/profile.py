@@ -155,7 +155,7 @@ class SignalSettings:
 
     @property
     def name(self) -> ObjectName:
-        """The object."""
+        """Index and sub-index of `object`."""
         return parse_object(self.object)
 
 
@@ -266,7 +266,7 @@ class WriteSettings:
 
     @property
     def name(self) -> ObjectName:
-        """The object."""
+        """Index and sub-index of `object`."""
         return parse_object(self.object)
 
 
@@ -531,7 +531,7 @@ class PlacedDevice:
     def mapping(self, pdo: PdoSettings) -> list[int]:
         """Return the mapping entries of a PDO, CiA 301 figure 70: each index, sub-index and bits in one number.
 
-        Raises ConfigError for an object that `variable` refuses.
+        Those of the end-to-end header come first. Raises ConfigError for an object that `variable` refuses.
         """
         names = [signal.name for signal in self.header(pdo)] + [signal.name for signal in pdo.signals]
         return [name.index << 16 | name.sub << 8 | self.variable(name).bits for name in names]
