@@ -237,7 +237,10 @@ def explained_times(contacts: Sequence[TrueContact]) -> tuple[Times, Times]:
 
 
 def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
-    """Return the earliest of the times about each contact, by the contact's index; about: that index, -1: none."""
+    """Return the earliest of the times about each contact, by the contact's index.
+
+    about: that index for each time, -1: none. times_ns: ascending.
+    """
     first = dict(zip(reversed(about), reversed(times_ns), strict=True))
     first.pop(-1, None)
     return first
