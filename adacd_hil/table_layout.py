@@ -98,7 +98,7 @@ def _shrunk(natural: list[int], least: list[int], width: int) -> list[int]:
 
 
 def _rows(line: Sequence[str], widths: Sequence[int]) -> list[tuple[str, ...]]:
-    """Return the rows of a line with its cells wrapped.
+    """Return the rows of a line with its cells wrapped; each row has a cell per column, "" below a shorter cell.
 
     Continued lines of the first cell are indented, to tell them from a new row.
     """
