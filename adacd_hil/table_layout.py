@@ -98,7 +98,7 @@ def _shrunk(natural: list[int], least: list[int], width: int) -> list[int]:
 
 
 def _rows(line: Sequence[str], widths: Sequence[int]) -> list[tuple[str, ...]]:
-    """Return the rows of a line with its cells wrapped.
+    """Return the rows of a line with its cells wrapped; each row has a cell per column, "" below a shorter cell.
 
     Continued lines of the first cell are indented, to tell them from a new row.
     """
@@ -115,7 +115,7 @@ def _cut(line: Sequence[str], widths: Sequence[int]) -> list[list[str]]:
 
 
 def _wrapped(text: str, width: int, indent: str) -> list[str]:
-    """Return the lines of a cell, wrapped to a width; `indent` begins each but the first."""
+    """Return the lines of a cell, wrapped to a width; `indent`, if narrower, begins each but the first."""
     if len(text) <= width:
         return [text]
     indent = indent if len(indent) < width else ""
@@ -126,7 +126,10 @@ def _wrapped(text: str, width: int, indent: str) -> list[str]:
 
 
 def _broken(word: str, room: int) -> str:
-    """Return a word that doesn't fit into a line, with spaces where it may split: at the joints of a path or a key."""
+    """Return a word longer than `room` with a space where it is split: at joints of a path or a key, as few as needed.
+
+    A piece without a joint may stay longer than `room`.
+    """
     parts = [""]
     for piece in _JOINT.split(word):
         if len(parts[-1]) + len(piece) > room:

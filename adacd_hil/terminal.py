@@ -74,7 +74,7 @@ def fold(text: str, width: int | None) -> str:
 
 
 def _parts(line: str, width: int) -> list[str]:
-    """Return the lines into which `fold` folds a line; a space at its end, as of a prompt, stays."""
+    """Return the lines into which `fold` folds a line; a space at its end, as of a prompt, stays if it fits."""
     if len(line.expandtabs()) <= width:
         return [line]
     field = _FIRST_FIELD.match(line, 0, width // 3)
@@ -256,7 +256,10 @@ def hurry() -> None:
 
 
 def write_screen(text: str, stream: TextIO | None = None) -> None:
-    """Write escape sequences of ours and escaped text to a stream (default: standard output)."""
+    """Write a text to a stream (default: standard output) as it is: the caller has escaped all but our own sequences.
+
+    Raises OSError as `Terminal.write_raw`.
+    """
     stream = stream or sys.stdout
     if isinstance(stream, Terminal):
         stream.write_raw(text)

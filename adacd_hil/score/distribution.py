@@ -44,7 +44,10 @@ _LOW, _HIGH = 2.0**-30, 2.0**63
 
 
 def _code(size: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return exponent and first bits of the mantissa, which number the bins in the order of the sizes."""
+    """Return exponent and first bits of the mantissa as a number (k,), in the order of the sizes (k,).
+
+    Sizes must be at least 0. Those with the same number share a bin.
+    """
     return np.ascontiguousarray(size).view(np.int64) >> _SHIFT
 
 
@@ -95,14 +98,22 @@ class Distribution:
         self._bins[_SIDE + low : _SIDE + low + counts.size] += counts
 
     def percentiles(self) -> dict[str, float]:
-        """Return PERCENTILES by PERCENTILE_NAMES; {} without a value."""
+        """Return PERCENTILES by PERCENTILE_NAMES; {} without a value.
+
+        Up to `exact` values each is one that occurred. Of more, all but the smallest and the largest value are the ends
+        of their bins that are nearer to 0.
+        """
         if self._bins is None:
             return percentiles(self._values())
         ranks = [int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]
         return dict(zip(PERCENTILE_NAMES, map(self._at, ranks), strict=True))
 
     def low_percentiles(self) -> dict[str, float]:
-        """Return the mirrored PERCENTILES by LOW_PERCENTILE_NAMES, for values that mustn't be small; {} without any."""
+        """Return the mirrored PERCENTILES by LOW_PERCENTILE_NAMES, for values that mustn't be small; {} without any.
+
+        Up to `exact` values each is one that occurred. Of more, all but the smallest and the largest value are the ends
+        of their bins that are nearer to 0.
+        """
         if self._bins is None:
             return low_percentiles(self._values())
         ranks = [self.count - 1 - int(np.ceil(share / 100.0 * (self.count - 1))) for share in PERCENTILES]

@@ -104,7 +104,7 @@ class _TruthRows:
         self._begin()
 
     def _begin(self) -> None:
-        """Begin the next contact."""
+        """Begin the next contact: no row waits. Its first cycles are all kept; fewer of them after `_PLENTY` rows."""
         self._key: tuple[int, float] | None = None  # attempt and index of the contact in progress
         self._whole = _BEGINNING[self._kept_rows > _PLENTY]  # rows of it that are kept as they are
         self._waiting = np.zeros(0, _ROW)

@@ -163,7 +163,7 @@ def explained_until(onsets: NDArray[Any], forgotten: NDArray[Any]) -> Times:
 def contacts_of_alarms(at: NDArray[Any], onsets: NDArray[Any], until: NDArray[Any]) -> Times:
     """Return for each alarm (n,) the index of the contact that it is about; -1: it is about none.
 
-    at (n,): times of the alarms. onsets (k,): of the contacts. until (k,): of `explained_until`.
+    at (n,): times of the alarms. onsets (k,): of the contacts, ascending. until (k,): of `explained_until`.
     """
     places = np.searchsorted(onsets, at, side="right") - 1
     if not len(onsets):
@@ -231,13 +231,19 @@ class StreamJudge:
 
 
 def explained_times(contacts: Sequence[TrueContact]) -> tuple[Times, Times]:
-    """Return onsets of contacts (k,), and the last instants at which they explain an alarm, ns."""
+    """Return onsets of contacts (k,), and the last instants at which they explain an alarm (k,), ns.
+
+    contacts: in the order of time.
+    """
     onsets = np.array([contact.onset_ns for contact in contacts], np.int64)
     return onsets, explained_until(onsets, np.array([contact.forgotten_ns for contact in contacts], np.int64))
 
 
 def _first(about: Sequence[int], times_ns: Sequence[int]) -> dict[int, int]:
-    """Return the earliest of the times about each contact, by the contact's index; about: that index, -1: none."""
+    """Return the earliest of the times about each contact, by the contact's index.
+
+    about: that index for each time, -1: none. times_ns: ascending.
+    """
     first = dict(zip(reversed(about), reversed(times_ns), strict=True))
     first.pop(-1, None)
     return first
@@ -274,7 +280,8 @@ def filtered(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float) -> 
 def forgotten_after_s(tau_ext: Vector, cycle: Times, period_s: float, a_rad_s: float, threshold: Vector) -> float:
     """Return how long after a contact's end an alarm may still stem from it, s.
 
-    One time constant after its true torque (k, 2), filtered with `a_rad_s`, is back within the threshold (2,).
+    One time constant after its true torque (k, 2), filtered with `a_rad_s`, is back within the threshold (2,). cycle
+    (k,): of the torque's samples, in periods, the last at the contact's end.
     """
     response = filtered(tau_ext, cycle, period_s, a_rad_s)[-1]
     excess = float(np.max(np.abs(response) / threshold))

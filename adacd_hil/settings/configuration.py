@@ -87,7 +87,8 @@ class Settings:
     def further_names(self) -> tuple[str, ...]:
         """Names of the certified scheme's parameters after the dynamic ones; () for the paper's.
 
-        Offsets, lags, friction terms, cross-talk and torques by position, as far as the settings ask for them.
+        Kind by kind, a name per joint, such as "offset1", "offset2". Offsets and lags are always there; the settings
+        add friction terms, cross-talk and torques by position.
         """
         if self.scheme == "paper":
             return ()

@@ -221,14 +221,15 @@ def parse_changes(given: Sequence[str]) -> dict[str, str]:
 def parse_variations(given: Sequence[str]) -> list[dict[str, str]]:
     """Return every combination of values of `key=a,b,c` texts, each as text by key; [{}] without any text.
 
-    Raises ConfigError for a text without `=` or without a key, and for a key in two texts.
+    Commas within [], {} or quotes part nothing, so a value may be an array. The last key varies fastest. Raises
+    ConfigError for a text without `=` or without a key, and for a key in two texts.
     """
     lists = [[(key, value) for value in split_list(text)] for key, text in parse_changes(given).items()]
     return [dict(choice) for choice in itertools.product(*lists)]
 
 
 def split_list(text: str) -> list[str]:
-    """Return the parts of a text between its commas outside brackets and quotes, without spaces around them."""
+    """Return the parts of a text between its commas outside [], {} and quotes, without spaces around them."""
     parts, depth, quote, start = [], 0, "", 0
     for place, letter in enumerate(text):
         if quote:

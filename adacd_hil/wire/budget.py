@@ -438,7 +438,7 @@ def _read_frame(message: Message, contract: str, period_ns: int, bitrate: int, d
 
 
 def _function(can_id: int, is_extended: bool) -> int:
-    """Return an identifier without its node id, the function code of CiA 301; -1 for an extended frame."""
+    """Return an identifier with node id 0, such as 0x700 for a heartbeat; -1 for an extended frame."""
     return -1 if is_extended else can_id & ~NODE_MASK
 
 
@@ -470,7 +470,7 @@ def _share_bus(frames: list[FrameBudget], contract: str, arms: int) -> list[Fram
 
 
 def _is_sent(entry: FrameBudget, traffic: LoadCase) -> bool:
-    """Return whether a load case has the frame on the bus; no case has NMT commands."""
+    """Return whether a load case has the frame on the bus; no case has NMT commands of Trigger request."""
     if entry.trigger is Trigger.REQUEST:
         return traffic is not LoadCase.OPERATION and entry.can_id != NMT_ID
     return not entry.is_emergency or traffic is LoadCase.EMERGENCIES

@@ -171,7 +171,10 @@ class Tap(Bus):
         self._unread = frame
 
     def take_passed(self) -> list[tuple[bool, Frame]]:
-        """Return the frames recorded since the last call, and forget them."""
+        """Return the frames recorded since the last call, oldest first, and forget them.
+
+        In a pair with the frame: True if it was sent, False if received.
+        """
         passed, self._passed = self._passed, []
         return passed
 

@@ -298,7 +298,8 @@ def _kind_of(folder: Path) -> str:
 def carried_frames(name: str) -> int | None:
     """Return the number of frames that an interface has carried, both ways; None if the kernel doesn't report it.
 
-    Of a virtual interface only the received ones are counted: they include those that it has sent.
+    Of an interface without a device (vcan, vxcan, slcan) only the received ones are counted. Only those of vcan include
+    the sent ones.
     """
     folder = _INTERFACES / name / "statistics"
     try:

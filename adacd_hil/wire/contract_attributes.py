@@ -13,7 +13,10 @@ DEFAULT_BITRATE = 1_000_000
 
 
 def read_bitrates(codec: "Codec | DbcDecoder") -> tuple[int, int]:
-    """Return the nominal (default: 1 Mbit/s) and the data bit rate, bit/s; the data bit rate of a classic bus is 0."""
+    """Return the nominal and the data bit rate, bit/s; without a valid value in the DBC they are 1 Mbit/s and 0.
+
+    The data bit rate of a classic bus is 0, too.
+    """
     nominal, data = (str(read_attribute(codec.database, name)) for name in ("Baudrate", "BaudrateCANFD"))
     return int(nominal) if nominal.strip("0").isdecimal() else DEFAULT_BITRATE, int(data) if data.isdecimal() else 0
 

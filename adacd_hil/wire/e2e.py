@@ -250,9 +250,10 @@ class ProtectedReceiver(E2eReceiver):
         return self._mask + 1
 
     def step_of(self, frame: bytes) -> int | None:
-        """Return the counter's step from the last frame with a right CRC, modulo its range; 0: it stands still.
+        """Return the counter's step from the last frame that advanced the sequence, modulo its range; 0: no step.
 
-        None before the first frame, or for another length. This frame's CRC is not checked; nothing is stored.
+        None before the first frame with a right CRC, also after `restart_sequence`, and for another length. This
+        frame's CRC is not checked; nothing is stored.
         """
         if self._last is None or len(frame) != self._length:
             return None

@@ -102,7 +102,7 @@ class LockstepBus(Bus):
     def waiting_frames(self) -> tuple[int, ...]:
         """Identifiers of the host's frames that SYNC would overtake now, oldest first; in a fifo always empty.
 
-        Frames that start before now are transmitted first.
+        Frames that start before now are transmitted first. Raises SilenceError or BusError as `send`.
         """
         if self._is_fifo or not self._queue:
             return ()

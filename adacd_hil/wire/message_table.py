@@ -86,6 +86,6 @@ def plain_tables(messages: Iterable[MessageTable]) -> tuple[MessageTable, ...]:
 
 
 def container_struct(signals: Iterable[SignalCodec]) -> struct.Struct:
-    """Return the little-endian struct of the integers, in the order of their containers, that hold these signals."""
+    """Return the little-endian struct of the integers that hold these signals; signals: in the order of containers."""
     formats = {signal.container: _FORMATS[signal.size, signal.is_signed and not signal.mask] for signal in signals}
     return struct.Struct("<" + "".join(formats.values()))

@@ -71,8 +71,8 @@ def begin_test(k: Constants, m: Memory, square: float) -> None:
 def test(k: Constants, m: Memory, dq: Vector, tau_ext_hat: Vector) -> int:
     """Add a sample to the test; return -1 if the model is refuted, 1 if it has passed, 0 if the test goes on.
 
-    Refuted: a joint's |tau_ext_hat| is over `test_limit_Nm`. Passed: `test_cycles` samples, and each joint has once
-    reached the speed `velocity_rad_s`; one direction is enough.
+    Refuted: a joint's |tau_ext_hat| is over `test_limit_Nm`, or NaN. Passed: `test_cycles` samples, and each joint has
+    once reached the speed `velocity_rad_s`; one direction is enough.
     """
     own = m.motion
     m.fit.tested += 1.0

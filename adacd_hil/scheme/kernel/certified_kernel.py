@@ -92,7 +92,11 @@ def begin_adaptation(constants: Structured, memory: Structured, is_payload: bool
 
 @compiled
 def begin_test(constants: Structured, memory: Structured) -> None:
-    """Use the belief, without negative friction, as the model, and begin its test, with all counts at 0."""
+    """Use the belief, without negative friction, as the model, and begin its test, with all counts at 0.
+
+    Drop the samples that wait in the ring. The fit's late residuals give the test's limit, see
+    `termination.begin_test`.
+    """
     k, m = constants[0], memory[0]
     belief.freeze(m)
     sight.begin_sight(m)

@@ -261,9 +261,10 @@ def end_paper(
     course_constants: Structured,
     course_memory: Structured,
 ) -> int:
-    """End a cycle of the paper's scheme: follow the contact's reports and reaction, and fill the decision.
+    """End a cycle of the paper's scheme: follow the contact's reports and reaction, and complete the decision.
 
-    Return REPORT if a report is due, else 0. place: index of the cycle.
+    `decide` has filled the decision's other fields, see `follow_contact`. Return REPORT if a report is due, else 0.
+    place: index of the cycle.
     """
     tau_ext_hat = block[0].tau_ext_hat
     return follow_contact(
@@ -300,10 +301,10 @@ def decide(k: RunConstants, m: RunMemory, sample: Sample, observation: int, deci
 def follow_contact(
     k: RunConstants, m: RunMemory, sample: Sample, decision: Decision, tau_ext_hat: Vector, tau_ext: Vector
 ) -> int:
-    """Follow a contact's reports and reaction by one cycle, and fill the decision; return REPORT if a report is due.
+    """Follow a contact's reports and reaction by one cycle; return REPORT if a report is due, else 0.
 
-    Else return 0. tau_ext_hat (2,): for the reaction; tau_ext (2,): gives the direction of a joint when it crosses its
-    threshold.
+    Fill state, fault, reaction and `is_model_valid` of `decision`. tau_ext_hat (2,): for the reaction; tau_ext (2,):
+    gives the direction of a joint when it crosses its threshold.
     """
     is_due = course.follow(
         k.contact,
@@ -328,7 +329,8 @@ def run_certified(
 ) -> tuple[int, int]:
     """Run cycles of the certified scheme from `first` until one has a task for Python; return its place and its bits.
 
-    place: samples.size without such a cycle. arrays: arguments of `certified_cycle` from `constants` on, in its order.
+    Without such a cycle return (samples.size, 0). After a bit of BEFORE_CONTACT that cycle is not over, see
+    `certified_cycle`. arrays: arguments of `certified_cycle` from `constants` on, in its order.
     """
     for place in range(first, samples.size):
         asked = certified_cycle(samples, decisions, blocks, place, *arrays)
@@ -343,7 +345,8 @@ def run_paper(
 ) -> tuple[int, int]:
     """Run cycles of the paper's scheme from `first` until one has a task for Python; return its place and its bits.
 
-    place: samples.size without such a cycle. arrays: arguments of `paper_cycle` from `constants` on, in its order.
+    Without such a cycle return (samples.size, 0). After a bit of BEFORE_CONTACT that cycle is not over, see
+    `paper_cycle`. arrays: arguments of `paper_cycle` from `constants` on, in its order.
     """
     for place in range(first, samples.size):
         asked = paper_cycle(samples, decisions, blocks, place, *arrays)

@@ -58,7 +58,10 @@ def filter_of(channel: int, filters: int) -> int:
 
 
 def channels_of(settings: Settings) -> tuple[tuple[float, float | None], ...]:
-    """Return cut-off and smoothing, rad/s, of the channels, in their order; smoothing None for a bare one."""
+    """Return (cut-off, smoothing), rad/s, of each channel; smoothing None for a bare one.
+
+    First the smoothed ones of all filters, then the bare ones of all but the slow filter.
+    """
     cutoffs, smoothing = settings.certified.cutoffs_rad_s, settings.certified.smoothing_rad_s
     return (*((cutoff, smoothing) for cutoff in cutoffs), *((cutoff, None) for cutoff in cutoffs[1:]))
 

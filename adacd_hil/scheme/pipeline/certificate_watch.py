@@ -250,7 +250,10 @@ class CertificateWatch:
         return Event("warning", _CONTRADICTIONS[refusal.cause][0], text)
 
     def describe(self) -> list[str]:
-        """Return the lines of the present refusal: causes, number of refused fits, remedy; [] without a refusal."""
+        """Return the lines of the present refusal: causes, number of refused fits, remedy; [] without a refusal.
+
+        A refused reading at rest has no such number.
+        """
         if self._refusal is None:
             return []
         is_reading = self._refusal.cause == certificate.READING

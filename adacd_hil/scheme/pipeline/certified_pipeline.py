@@ -157,9 +157,10 @@ class CertifiedPipeline(Pipeline):
             self._events.append(event)
 
     def _judge_margin(self) -> None:
-        """Add the last second's largest residuals to the margin.
+        """Add the last second's largest residuals over their thresholds to the margin, and set these shares to 0.
 
-        Report a margin or a smallest push that has become worse. A warning is reported once, until it has ended.
+        Report a margin that has shrunk, see `MarginWatch.warning`, or smallest pushes over those of the test, see
+        `sight.describe_dim`. A warning is reported once, until it has ended.
         """
         self._margin.add_block(sensitivity.take_peak_shares(self._m))
         dim = "; ".join(sight.describe_dim(self._m))

@@ -270,8 +270,8 @@ def _is_announced(m: SupervisorMemory) -> bool:
 def _is_payload_announced(k: SupervisorConstants, m: SupervisorMemory) -> bool:
     """Return whether the user has announced a changed payload to which the contact is attributed.
 
-    It is if the model is in doubt; with gravity also if the user announced the weight since the contact began: an
-    earlier announcement cannot exclude a person's touch.
+    PAYLOAD_CHANGED must be pending. The model must be in doubt, or, with gravity, the weight announced since the
+    contact began: an earlier announcement cannot exclude a person's touch.
     """
     is_weight = k.has_gravity and m.is_weight_announced
     return bool((m.is_doubted or is_weight) and _is_pending(m, Request.PAYLOAD_CHANGED))

@@ -136,5 +136,5 @@ def next_state(state: int, event: int, origin: int) -> int:
 
 @compiled
 def leads_on(state: int, event: int) -> bool:
-    """Return whether the event moves the scheme out of the state, by the table."""
+    """Return whether the table has a next state for the event in the state; for FAULT in FAULT that is FAULT again."""
     return bool(_NEXT[state, event] != STAYS)
