@@ -240,8 +240,8 @@ class HeartbeatConsumer:
     ) -> None:
         """Watch 0x1016:1, which sets node and timeout.
 
-        `on_silence`, `on_return`: called with t_ns when the heartbeat stays away, and when it is there again or a write
-        of 0x1016:1 ends or restarts its monitoring.
+        `on_silence`: called with t_ns when the heartbeat stays away. `on_return`: called with t_ns when a lost one is
+        there again, or when a write of 0x1016:1 ends or restarts its monitoring.
         """
         self.is_lost = False
         """Whether the heartbeat is monitored and missing."""
