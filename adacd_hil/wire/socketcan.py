@@ -70,7 +70,8 @@ class SocketCanBus(Bus):
         """Open `channel`, receiving only `can_ids` if given. `is_fd`: for CAN FD, too. `is_shared`: see `recover`.
 
         Without `can_ids` the receive buffer is a listener's, or as large as the system allows an unprivileged user.
-        Raises BusMissingError if the interface is absent, down, or carries no CAN FD although `is_fd`.
+        Raises BusMissingError if the kernel has no SocketCAN, or the interface is absent, down, or carries no CAN FD
+        although `is_fd`.
         """
         self._is_shared = is_shared
         self.channel = channel

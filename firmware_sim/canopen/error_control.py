@@ -50,7 +50,7 @@ class Watchdog(IntEnum):
     COMMAND = 2  # a valid command acts
     HEARTBEAT = 3  # the master's heartbeat comes, or monitoring ends
     OPERATIONAL = 4  # NMT start
-    LENGTH = 5  # a command frame of the right length comes
+    LENGTH = 5  # a right frame of an RPDO comes after one of wrong length
     SYNC_ORDER = 6  # 100 SYNCs in a row are right
     SYNC_LENGTH = 7  # a right SYNC comes
     COMMAND_PDO = 8  # Enable operation is withdrawn, or can be obeyed
