@@ -70,7 +70,8 @@ class SocketCanBus(Bus):
         """Open `channel`, receiving only `can_ids` if given. `is_fd`: for CAN FD, too. `is_shared`: see `recover`.
 
         Without `can_ids` the receive buffer is a listener's, or as large as the system allows an unprivileged user.
-        Raises BusMissingError if the interface is absent, down, or carries no CAN FD although `is_fd`.
+        Raises BusMissingError if the kernel has no SocketCAN, or the interface is absent, down, or carries no CAN FD
+        although `is_fd`.
         """
         self._is_shared = is_shared
         self.channel = channel
@@ -127,7 +128,7 @@ class SocketCanBus(Bus):
             self._send_patiently(packed)
 
     def send_all(self, frames: Sequence[tuple[int, bytes]]) -> None:
-        """Queue several frames in this order, in one system call if there is room for all.
+        """Queue several frames in this order, in one system call if they are 64 at most and there is room for all.
 
         Wait for room as `send`. Raises TransmitQueueError, InterfaceDownError or BusError as `send`.
         """
@@ -210,9 +211,10 @@ class SocketCanBus(Bus):
             self._fail("receiving", error)
 
     def _fail(self, doing: str, error: OSError) -> NoReturn:
-        """Raise an error of the socket as BusError; as InterfaceDownError, and close the socket, if that is the cause.
+        """Raise an error of the socket as BusError, or as InterfaceDownError if the interface is down or absent.
 
-        doing: the failed action, for the message.
+        The latter closes the socket, and until `recover` every further error is one. doing: the failed action, for the
+        message.
         """
         if error.errno in _DOWN:
             self._is_down = True
@@ -266,7 +268,7 @@ class SocketCanBus(Bus):
         self._open()
 
     def _carries_frames(self) -> bool:
-        """Return whether a frame passes within 0.25 s, from the bus or from another program of this machine."""
+        """Return whether a frame passes within 0.25 s, from the bus or from any program of this machine, also this."""
         with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as listener:
             listener.bind((self.channel,))
             return bool(select.select([listener], [], [], _LIVE_S)[0])

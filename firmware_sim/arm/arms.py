@@ -133,8 +133,8 @@ class EmulatedArm:
     def wiring(self) -> "Wiring":
         """Joints (0, 1), signs and zeros of Drive1 and Drive2, Sensor1 and Sensor2.
 
-        The sign of a drive's torque is `drive_sign` times `motor_sign`. The zeros are rounded to 2^-20 revolutions,
-        their unit.
+        The sign of a drive's torque is `drive_sign` times `motor_sign`. Only drives have zeros; they are rounded to
+        2^-20 revolutions, their unit.
         """
         drive, sensor = (tuple(joint - 1 for joint in places) for places in (self.drive_joint, self.sensor_joint))
         torque = tuple(turn * up for turn, up in zip(self.drive_sign, self.motor_sign, strict=True))

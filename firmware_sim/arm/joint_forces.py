@@ -109,7 +109,7 @@ def bristle_rate(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, leve
 def advance_bristle(sigma0_Nm_rad: float, z_rad: float, velocity_rad_s: float, level_Nm: float, step_s: float) -> float:
     """Return the bristle deflection z after a step of constant velocity, rad: exact, stable at any stiffness.
 
-    level_Nm: g(v).
+    level_Nm: g(v). It and the stiffness of the bristles, `sigma0_Nm_rad`, must be above 0.
     """
     if velocity_rad_s == 0.0:
         return z_rad

@@ -145,7 +145,8 @@ def _set_stage(rates: int, length_s: float, mechanics: np.void, work: _StepWork)
 def _set_bristles(row: int, length_s: float, mechanics: np.void, work: _StepWork) -> None:
     """Set the bristle deflections of row number `row` by the mean velocity since the start row, `length_s` before.
 
-    Joints without bristles stay as they are, and all do if `length_s` is 0.
+    Joints without bristles stay as they are, and all do if `length_s` is 0. Needs `bristle_level_Nm` in the work
+    space's forces.
     """
     start, now = work.rows[_START], work.rows[row]
     for joint in range(2):

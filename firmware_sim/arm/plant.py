@@ -248,7 +248,7 @@ def external_torque(
 def follow_target(tau_Nm: float, target_Nm: float, turn: float) -> tuple[float, float]:
     """Return the motor torque in the middle and at the end of a step, Nm, for a lag of first order.
 
-    turn: length of the step in time constants of the torque loop.
+    turn: length of the step in time constants of the torque loop, above 0.
 
     The torque's distance from its target decays. In the middle of the step stands the value with which Simpson's rule
     gives the exact impulse; the torque at the midpoint itself would be wrong by 1e-7 rad/s after a step of 3 Nm.

@@ -112,7 +112,7 @@ def _own(state: Vector, row: int) -> np.void:
 
 @compiled
 def _cosines(q1: float, q2: float) -> tuple[float, float, float, float]:
-    """Return the pose that the functions below take: cosine and sine of the angle of link 1, then of link 2."""
+    """Return the pose for the functions below: cosine and sine of link 1's angle q1, then of link 2's, q1 + q2."""
     return math.cos(q1), math.sin(q1), math.cos(q1 + q2), math.sin(q1 + q2)
 
 

@@ -148,7 +148,8 @@ class Bench:
         """Advance the time to `t_ns` without frames: heartbeats, event timers and watchdogs act when they are due.
 
         Faults and held frames do, too. An earlier time changes nothing. The arm moves in clock mode `wall`; in `sync`
-        only while a drive brakes as it has lost its host.
+        only while a drive brakes as it has lost its host. While it moves, rows of truth are added, as the constructor
+        describes for `on_truth`.
         """
         self.time.advance_to(t_ns)
 
@@ -190,7 +191,7 @@ class Bench:
     def _time_to_sync_ns(self, data: bytes) -> int:
         """Return by how much this SYNC moves the bench's time if a device hears it, ns.
 
-        0 in clock mode `wall`, before the first SYNC, and if no device takes this one.
+        0 in clock mode `wall`, before the first SYNC, and if no device takes this one, for its length or its counter.
         """
         if self._is_wall or not self.time.has_begun or not any(self._nodes.listeners.takers(data)):
             return 0
@@ -317,7 +318,8 @@ class Bench:
     def _is_plain(self) -> bool:
         """Whether just the contract's cyclic frames answer this SYNC.
 
-        Then no fault acts, and no held frame is due within a period.
+        Then no fault is active but those whose effect a node keeps by itself (see `FaultPlan.is_quiet`), and no held
+        frame is due within a period.
         """
         is_undisturbed = self._plan.is_quiet and self._outbox.due_ns >= self.time.now_ns + self._nodes.period_ns
         return is_undisturbed and self._nodes.has_all_answers

@@ -201,7 +201,8 @@ class BenchTime:
         """Advance the bench's time to `t_ns` without letting timers act; an earlier time changes nothing.
 
         In clock mode `wall` the arm moves. In `sync` it waits, except while a drive brakes as it has lost its host, or
-        in `outlive_host`.
+        in `outlive_host`. Where it moves, set-points are latched and rows of truth added, as `_advance_without_sync`
+        does.
         """
         dt_ns = max(0, t_ns - self.now_ns)
         if self._is_wall or self._is_orphaned or any(drive.is_left_alone for drive in self._nodes.drives):
@@ -260,7 +261,8 @@ class BenchTime:
         """On an ADVANCE mark, let time pass to the mark's time or until a frame is sent; then send a GRANT mark.
 
         Time stays if frames have been sent since the last GRANT mark or `note_sent`. Lockstep begins with the first
-        mark, and anew with a mark that is earlier than the last grant. Other data has no effect.
+        ADVANCE mark, anew with the next one after `Bench.release`, and with one that is earlier than the last grant.
+        Other data has no effect.
         """
         mark = unpack_mark(data)
         if mark is None or mark[0] is not MarkKind.ADVANCE:

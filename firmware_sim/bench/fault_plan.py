@@ -155,8 +155,9 @@ class FaultPlan:
     def transmit(self, node: int, can_id: int, data: bytes) -> list[tuple[int, int, bytes]]:
         """Return the frames that faults make of a node's frame: delay in ns, identifier, data; [] if it is not sent.
 
-        It isn't sent if the node is silent, or if the frame is lost or waits until the next one overtakes it, which
-        then brings both. Each call uses up hits and random draws. node: index in NODES.
+        Without a fault it is the frame itself, with delay 0. It isn't sent if the node is silent, or if the frame is
+        lost or waits until the next one overtakes it, which then brings both. Each call uses up hits and random draws.
+        node: index in NODES.
         """
         if node in self._silent:
             return []
@@ -168,9 +169,9 @@ class FaultPlan:
     def receive(self, node: int, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
         """Return the frames that faults make of a host's frame to a node: delay in ns and data; [] if it is lost.
 
-        It is [] also while the frame waits to be overtaken by the next one, which then brings both. Each call uses up
-        hits and random draws. node: index in NODES. For a frame to all devices call it with `EVERYBODY` first, then
-        with each of the returned frames for each node.
+        Without a fault it is the frame itself, with delay 0. It is [] also while the frame waits to be overtaken by the
+        next one, which then brings both. Each call uses up hits and random draws. node: index in NODES. For a frame to
+        all devices call it with `EVERYBODY` first, then with each of the returned frames for each node.
         """
         rows = self._receiving.get((node, can_id))
         return self._change(rows, can_id, data) if rows else [(0, data)]

@@ -229,7 +229,10 @@ def check_objects(rows: Sequence[FaultSettings], devices: Sequence[ObjectDiction
 
 
 def _message_name(row: FaultSettings, node: int) -> str:
-    """Return the DBC's name of a fault's frame: from `sdo_request` of drive 1, for example, `Drive1SdoRequest`."""
+    """Return the DBC's name of a fault's frame: from `sdo_request` of drive 1, for example, `Drive1SdoRequest`.
+
+    Frames of BROADCAST have no sender in their name: `Sync`. node: place in NODES, not used for those and the host's.
+    """
     sender = HOST if row.node == HOST else NODES[node]
     name = (row.frame or "").title().replace("_", "")
     return name if row.frame in BROADCAST else f"{sender.capitalize()}{name}"

@@ -165,7 +165,7 @@ class Injector:
 
     @property
     def due_ns(self) -> int:
-        """Time at which a fault next begins, ends or sends, ns; far in the future (NEVER_NS later) if none will."""
+        """Time, ns, at which a fault next begins, ends, sends an EMCY or needs `flood` again; NEVER_NS if none will."""
         return min(self.now_ns + self.plan.wait_ns, self._flooded_ns if self.plan.is_flooding else NEVER_NS)
 
     def sender(self, place: int) -> Send:

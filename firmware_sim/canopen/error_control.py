@@ -50,7 +50,7 @@ class Watchdog(IntEnum):
     COMMAND = 2  # a valid command acts
     HEARTBEAT = 3  # the master's heartbeat comes, or monitoring ends
     OPERATIONAL = 4  # NMT start
-    LENGTH = 5  # a command frame of the right length comes
+    LENGTH = 5  # a right frame of an RPDO comes after one of wrong length
     SYNC_ORDER = 6  # 100 SYNCs in a row are right
     SYNC_LENGTH = 7  # a right SYNC comes
     COMMAND_PDO = 8  # Enable operation is withdrawn, or can be obeyed
@@ -240,8 +240,8 @@ class HeartbeatConsumer:
     ) -> None:
         """Watch 0x1016:1, which sets node and timeout.
 
-        `on_silence`, `on_return`: called with t_ns when the heartbeat stays away, and when it is there again or a write
-        of 0x1016:1 ends or restarts its monitoring.
+        `on_silence`: called with t_ns when the heartbeat stays away. `on_return`: called with t_ns when a lost one is
+        there again, or when a write of 0x1016:1 ends or restarts its monitoring.
         """
         self.is_lost = False
         """Whether the heartbeat is monitored and missing."""

@@ -271,7 +271,7 @@ class _DictionaryNode(canopen.LocalNode):
     def _find_object(self, index: int, subindex: int) -> ODVariable:
         """Return an object.
 
-        Raise `Refusal` if the EDS lacks its index or sub-index, also for those that canopen would add.
+        Raise `Refusal` if the device lacks its index or sub-index, also for those that canopen would add.
         """
         if index < _FIRST_INDEX or index not in self.object_dictionary:
             refuse(Abort.NO_OBJECT)

@@ -389,7 +389,10 @@ class Pdos:
                 pdo.is_due = True
 
     def compare(self) -> bool:
-        """Check the TPDOs whose events are changes of their content, and return whether one of them is due."""
+        """Check the TPDOs whose events are changes of their content, and return whether one of them is due.
+
+        Those of type 0 are left out: they check at SYNC by themselves.
+        """
         for pdo in self._compared:
             pdo.compare()
         return any(pdo.is_due for pdo in self._compared)

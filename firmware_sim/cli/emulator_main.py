@@ -319,7 +319,10 @@ def _log_truth(truth: TruthLog, bench: Bench, epoch_ns: int) -> None:
 
 
 def _serve(service: Service) -> None:
-    """Request real-time priority, announce the nodes, print "ready" on stderr, and serve until the end."""
+    """Request real-time priority, announce the nodes, print "ready" on stderr, and serve until the end.
+
+    Print a line on stderr for each part of the priority that isn't granted. Raises BusError as `Service.run`.
+    """
     # As a host does: with less, on a processor that both share and fill, the arm would never answer in time.
     for line in request_realtime().missing:
         _complain(f"not granted: {line}")

@@ -196,9 +196,9 @@ class DriveNode(Application):
 
     @property
     def statusword(self) -> int:
-        """0x6041, by state, warning of the command PDO, and limits.
+        """0x6041, by state, warning of the command PDO, whether torque follows the target (bit 12), and limits.
 
-        Target reached (bit 10) has no meaning in mode 10 and stays 0.
+        Limits (bit 11) show only with bit 12. Target reached (bit 10) has no meaning in mode 10 and stays 0.
         """
         word = STATE_BITS[self.state] | _REMOTE
         if Watchdog.COMMAND_PDO in self._tripped:
@@ -257,9 +257,10 @@ class DriveNode(Application):
         self._drive_motor()
 
     def mind_length(self, is_right: bool, t_ns: int) -> None:
-        """Trip the length watchdog if an RPDO's frame has a wrong length, else clear it.
+        """Trip the length watchdog if an RPDO's frame has a wrong length, else clear it if it is tripped.
 
-        It is a warning: the drive doesn't fault. t_ns: the device's own time.
+        EMCYs and the error register show it, the statusword doesn't, and the drive doesn't fault. t_ns: the device's
+        own time.
         """
         if not is_right:
             self.device.trip(Watchdog.LENGTH, t_ns)

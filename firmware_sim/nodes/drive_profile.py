@@ -190,7 +190,10 @@ class TorqueLimits:
         self._take(_TARGET, 0)
 
     def _take(self, index: int, permille: int) -> None:
-        """Store a value, and set the demand; in each direction the smaller of its own limit and of 0x6072 counts."""
+        """Store the value of object `index`, and set `demand` and `is_limiting`.
+
+        In each direction the smaller of its own limit and of 0x6072 counts.
+        """
         values = self._values
         values[index] = permille
         wanted, most = values[_TARGET] + values[_OFFSET], values[_MOST]

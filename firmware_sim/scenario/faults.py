@@ -307,8 +307,8 @@ def device_ids(rows: Iterable[FaultSettings], right_ids: Sequence[int]) -> tuple
 def own_messages(messages: Mapping[int, MessageCodec], right_id: int, node_id: int) -> Mapping[int, MessageCodec]:
     """Return the messages, by identifier, as a device with a wrong node id expects them.
 
-    Its own frames are at the identifiers that follow from the wrong id, but keep their data ids; other messages
-    at the wrong id are left out.
+    Its own frames are at the identifiers that follow from the wrong id, but keep their data ids; other messages at the
+    wrong id are left out. If `node_id` is the right id, all are unchanged.
     """
     if node_id == right_id:
         return messages
