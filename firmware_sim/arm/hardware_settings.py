@@ -148,7 +148,7 @@ class MechanicsSettings:
     def check(self, arm: EmulatedArm, start_deg: Pair, payloads: Sequence[PayloadBody]) -> None:
         """Raise ConfigError when these mechanics do not go with the arm, its start pose or its payloads.
 
-        Causes: static friction above 0 but below Coulomb friction; bristles in a joint without static and Coulomb
+        Causes: static friction above 0 but below Coulomb friction; bristles in a joint without Coulomb
         friction; a start pose beyond the joint stops; an eigenvalue too fast to integrate with LARGEST_SUBSTEPS.
         """
         for joint in range(2):
@@ -158,8 +158,8 @@ class MechanicsSettings:
                     f"`mechanics.static_Nm[{joint}]` = {static_Nm:g} Nm is below the Coulomb friction of profile "
                     f"{arm.name}, {coulomb_Nm:g} Nm"
                 )
-            if self.sigma0_Nm_rad[joint] > 0.0 and max(static_Nm, coulomb_Nm) == 0.0:
-                raise ConfigError(f"`mechanics.sigma0_Nm_rad[{joint}]` needs Coulomb or static friction above 0 Nm")
+            if self.sigma0_Nm_rad[joint] > 0.0 and coulomb_Nm == 0.0:  # static friction vanishes with speed
+                raise ConfigError(f"`mechanics.sigma0_Nm_rad[{joint}]` needs Coulomb friction above 0 Nm")
             low_deg, high_deg = (stops[joint] for stops in self._stops_deg(arm))
             if not low_deg <= start_deg[joint] <= high_deg:
                 raise ConfigError(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from general_arm import GeneralArm, one_joint
 
+from adacd_hil.settings.schema import ConfigError
 from firmware_sim.arm.hardware_settings import MechanicsSettings
 from firmware_sim.arm.joint_forces import advance_bristle, bristle_rate
 from firmware_sim.arm.touch_settings import TICK_S
@@ -51,6 +52,12 @@ def test_a_joint_that_has_broken_away_accelerates_by_what_friction_falls():
     history = moved.run(1_000, STATIC_NM)
     acceleration = (history["dq"][-1, 0] - history["dq"][500, 0]) / (499 * TICK_S)
     assert acceleration == pytest.approx((STATIC_NM - COULOMB_NM) / inertia, rel=1e-6)
+
+
+def test_bristles_need_a_friction_that_stays_at_speed():
+    frictionless, _ = one_joint(0.0)
+    with pytest.raises(ConfigError, match=r"sigma0_Nm_rad\[0\]"):
+        MechanicsSettings(**LUGRE).check(frictionless, (0.0, 0.0), ())
 
 
 def test_a_bristled_joint_is_a_spring_before_it_slides():
