@@ -49,7 +49,7 @@ def find_faults(run: Run) -> tuple[Fault, ...]:
 
 
 def _cause(run: Run, t_ns: int) -> str:
-    """Return the supervisor's words for the fault at `t_ns`, without state and reason.
+    """Return the supervisor's words for the fault at `t_ns`, without state and reason, cut at `_MOST_LETTERS`.
 
     "" if the log has no event of it within `_NEAR_NS`.
     """
