@@ -167,7 +167,7 @@ def last_row(run: Run, section: Section) -> int:
 def _tests(run: Run, section: Section) -> list[float]:
     """Return the length of each stay in CERTIFY within a section, s, in the order of time; [] without one.
 
-    A stay that goes on beyond the section is cut at its end.
+    A longer stay is cut at the section's end.
     """
     time_s = run.time_s()
     rows = rows_of(time_s, section, float(time_s[-1]))

@@ -132,7 +132,8 @@ class CyclicDataGatherer:
     def _add_windows(self, cycles: Cycles) -> None:
         """Store the worst share so far of incomplete cycles in one second; a gap in the cycle numbers ends a second.
 
-        The last second, which may go on, is kept for the next call. cycles (2, k): numbers, and whether incomplete.
+        The last second, which may go on, is kept for the next call. cycles (2, k), k > 0: numbers, and whether
+        incomplete.
         """
         cycles = np.concatenate((self._present, cycles), axis=1)
         begins = np.flatnonzero(np.diff(cycles[0], prepend=-2) != 1)
