@@ -34,7 +34,7 @@ def log_in(given: str | Path) -> Path:
 
 
 def parts_of(path: Path) -> dict[int, Path]:
-    """Return the existing parts of the log `path` by number; without any {0: path}, which can't be opened."""
+    """Return the existing parts of the log `path` by number; {0: path} if none is found or can be listed."""
     try:
         return find_parts(path) or {0: path}
     except OSError:

@@ -171,7 +171,7 @@ def _of_model(fit: Fitted, joints: Sequence[JointShare], columns: Sequence[Recor
 
 
 def _is_noise(fit: Fitted, joints: Sequence[JointShare]) -> list[bool]:
-    """Return, per joint, whether its filtered torque is at most `_NOISE_TIMES` the filtered noise of the settings."""
+    """Return, per joint, whether its `torque_Nm` is at most `_NOISE_TIMES` the filtered noise of the settings."""
     noise = offline.filtered_noise_Nm(fit.settings)
     return [joint.torque_Nm <= _NOISE_TIMES * noise[i] for i, joint in enumerate(joints)]
 
@@ -237,7 +237,8 @@ def _of_length(fit: Fitted) -> Iterator[RecordingFinding]:
 def _of_readings(fit: Fitted, joints: Sequence[JointShare], least: float) -> Iterator[RecordingFinding]:
     """Report, in one finding, the likeliest mistake of the map, with up to two alternatives.
 
-    Report nothing unless its correction explains at least the share `least` of each joint's torque.
+    Report nothing if no other reading explains the test's torque far better than the map, see `find_readings`, or if
+    the likeliest explains less than the share `least` of a joint's torque.
     """
     fitted = [record for recording in fit.fitted for record in recording.records]
     readings = find_readings(fit.described, fit.model, fit.settings, fitted, fit.tested.records)

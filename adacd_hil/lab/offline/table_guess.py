@@ -152,7 +152,7 @@ def _trimmed(cells: list[str]) -> list[str]:
 
 
 def _begins(rows: list[list[str]], decimal: str) -> bool:
-    """Return whether these are `_FULL_ROWS` rows of equally many numbers, at least three each."""
+    """Return whether these are `_FULL_ROWS` rows of equally many cells, at least three each, all as of `_is_full`."""
     count = len(rows[0]) if rows else 0
     return len(rows) == _FULL_ROWS and count >= 3 and all(len(row) == count and _is_full(row, decimal) for row in rows)
 

@@ -115,7 +115,10 @@ def _configuration(run: Run, source: ReportSource) -> str:
 
 
 def _scenario(run: Run, source: ReportSource) -> str:
-    """Return a run's scenario for `demo`, quoted for the shell; where the source lacks it, as of `_configuration`."""
+    """Return a run's scenario for `demo`, quoted for the shell.
+
+    Where the source lacks it, the name in the log's metadata, which must have one; with ".toml" unless it is built in.
+    """
     name = run.metadata["scenario"]
     is_builtin = name in toml_names(resources.files("firmware_sim") / "scenarios")
     return _quoted(source.scenario or (name if is_builtin else f"{name}.toml"))
@@ -124,7 +127,8 @@ def _scenario(run: Run, source: ReportSource) -> str:
 def _truth(run: Run, source: ReportSource) -> str:
     """Return a run's truth for `demo`, quoted for the shell.
 
-    Where the source lacks it, the name in the log's metadata, with ".toml" if a digest stands behind it.
+    Where the source lacks it, the name in the log's metadata, which must have one; with ".toml" if a digest stands
+    behind it.
     """
     name, *digest = run.metadata["truth"].split()
     return _quoted(source.truth or (f"{name}.toml" if digest else name))

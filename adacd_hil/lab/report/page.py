@@ -182,8 +182,8 @@ def has_paper(metrics: Metrics) -> bool:
 def shown_beside(metrics: Metrics) -> Beside | None:
     """Return the result of the paper's scheme on the same stream for the page.
 
-    None if the run didn't play the paper's experiment, or was not certified; report.json has it even without the
-    experiment.
+    None if the run didn't play the paper's experiment, was not certified, or had no paper's scheme beside. report.json
+    has it even without the experiment.
     """
     return metrics.evidence.paper_beside if metrics.evidence is not None and has_paper(metrics) else None
 

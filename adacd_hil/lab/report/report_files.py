@@ -116,7 +116,10 @@ def write_report(
 
 
 def _placed(step: NextStep) -> NextStep:
-    """Return a next step whose text names the TOML files of its command that aren't where it is typed."""
+    """Return a next step whose text names the TOML files of its command that aren't where it is typed.
+
+    Unchanged if all are there.
+    """
     missing = [word for word in shlex.split(step.command) if word.endswith(".toml") and not exists(Path(word))]
     return step._replace(text=f"{step.text} In the folder of {' and '.join(missing)}:") if missing else step
 

@@ -88,7 +88,10 @@ def counted_sentence(metrics: Metrics) -> str:
 
 
 def _first_and_worst(evidence: CertifiedEvidence) -> dict[str, tuple[ChannelMargin, ...]]:
-    """Return the margins of the first SECTIONS sections, and of the one with the smallest margin, by label."""
+    """Return the margins of the first SECTIONS sections, and of the one with the smallest margin, by label.
+
+    evidence: with margins of at least one section.
+    """
     labels = list(evidence.margins)
     worst = min(labels, key=lambda label: min(min(row.margin) for row in evidence.margins[label]))
     shown = {*labels[:SECTIONS], worst}

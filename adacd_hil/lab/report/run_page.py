@@ -194,8 +194,8 @@ def contacts_table(metrics: Metrics) -> Table | None:
 def contact_cards(metrics: Metrics, run: Run) -> list[dict[str, Any]]:
     """Return the cards of the first CARDS contacts: report with uncertainty, truth, and drawing of the arm.
 
-    Keys: number, link, at_s, is_wrong, kind: words; entries: (name, text); arm: drawing or None; stretch_s: from and to
-    which time, s since motion start, the traces of a card show.
+    Keys: number; link: the reported one, else the true one; at_s; is_wrong; kind: words; entries: (name, text); arm:
+    drawing or None; stretch_s: from and to which time, s since motion start, the traces of a card show.
     """
     contacts = metrics.contacts[:CARDS]
     strongest_N = max((abs(contact.force_N) for contact in contacts if contact.force_N is not None), default=0.0)

@@ -249,7 +249,7 @@ def _with_ending(
 def _count(summary: Mapping[str, str], key: str) -> int | None:
     """Return a number of the log's summary.
 
-    None if it is missing, as in a cut file, or no number, as in a damaged one.
+    None if it is missing, as in a cut file, or no number of up to `_MOST_DIGITS` digits, as in a damaged one.
     """
     text = summary.get(key, "")
     return int(text) if text.isdecimal() and len(text) <= _MOST_DIGITS else None
@@ -427,7 +427,7 @@ class RunReading:
                 yield self._times.column(name)[rows].astype(np.float64)
 
     def _curves(self, shell: Run, rows: slice) -> Iterator[NDArray[np.float64]]:
-        """Yield the curves (n,) that the report draws over the whole run, in these rows."""
+        """Yield the curves (n,) that the report draws over /scheme, in these of the kept rows; shell: as of `run`."""
         for panel in panels_of(self._rows.run(shell, rows)):
             for trace in panel.traces:
                 yield trace.values

@@ -111,7 +111,10 @@ def notices_of(run: Run, metrics: Metrics) -> list[Notice]:
 
 
 def certificates_of(run: Run) -> list[tuple[float, bool, list[str]]]:
-    """Return, per certificate given or taken back: s since motion start, whether it was taken back, its clauses."""
+    """Return an entry per certificate given, and one more if it was taken back.
+
+    Each is: s since motion start, whether this is the taking back, the clauses of its message.
+    """
     return [
         ((t_ns - run.zero_ns) * 1e-9, event.name == "revoked", event.message.split("; "))
         for t_ns, event in run.events
@@ -177,7 +180,7 @@ def _drawn_stays(stays: list[Stay], scale: _Scale) -> Iterator[list[Stay]]:
 
 
 def _rank(stay: Stay) -> int:
-    """Return the rank of a stay's state: of stays that share a mark, the highest gives the colour."""
+    """Return the rank of a stay's state: of stays that share a mark, the highest gives the colour; 0: no colour."""
     order = list(STATE_COLOURS)
     return 1 + order.index(stay.state) if stay.state in order else 0
 

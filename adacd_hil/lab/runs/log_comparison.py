@@ -205,13 +205,17 @@ class LogComparison:
     def is_same(self) -> bool:
         """Whether no field that both logs have of /scheme and /contact differs, and no cycle is in one log only.
 
-        Settings, metadata and timing may differ. Fields that only one log has are named in `notes`.
+        Settings, metadata and timing may differ. Fields that only one log has, or that differ in size, don't count;
+        `notes` names them.
         """
         return not self.fields and self.only == (0, 0)
 
     @property
     def is_same_where_whole(self) -> bool:
-        """Whether cycles were compared, no field that both logs have differs, and only damaged logs lack cycles."""
+        """Whether cycles were compared, no field that both logs have differs, and only damaged logs lack cycles.
+
+        Fields that differ in size don't count, see `is_same`.
+        """
         damages = self.second.problem, self.first.problem
         lacks = any(count and not damage for count, damage in zip(self.only, damages, strict=True))
         return self.cycles > 0 and not self.fields and not lacks
@@ -265,7 +269,7 @@ class _Differences:
     def take(self, first: NDArray[Any], second: NDArray[Any], since: NDArray[np.int64]) -> None:
         """Compare records of the same cycles, and count differences in `found`; since (n,): cycles since motion start.
 
-        Fields that one of both lacks are added to `missing`, not to `found`.
+        Fields that one of both lacks, or that differ in size, are added to `missing`, not to `found`.
         """
         names, others = _fields(first), _fields(second)
         self.missing |= set(names) ^ set(others)

@@ -380,9 +380,10 @@ def _with_report(summary: RunSummary, table: Mapping[str, Any]) -> RunSummary:
 
 
 def _reported_certificate(summary: RunSummary, table: Mapping[str, Any]) -> CertificateState:
-    """Return the state of a run's last certificate by its report, and when that came, s since motion start.
+    """Return the last certificate of a run, by its report: state, when that came, s since motion start, their number.
 
-    By the log's events if a certificate was taken back; raises LogError if they can't be read.
+    It came with the last complete adaptation; NO_CERTIFICATE without one. If a certificate was taken back, return it by
+    the log's events; raises LogError if they can't be read.
     """
     certified = table["certified"]
     if certified is not None and certified["revoked"]:
@@ -405,7 +406,7 @@ def _first_adaptation(table: Mapping[str, Any]) -> str | None:
 def _threshold(table: Mapping[str, Any]) -> Pair | None:
     """Return by joint the smallest of the channels' median thresholds in the first detection section with margins, Nm.
 
-    None if no detection section has margins.
+    None if no detection section has margins. table: of a run of the certified scheme.
     """
     margins = table["certified"]["margins"]
     for section in _sections(table, "detection"):
@@ -416,7 +417,7 @@ def _threshold(table: Mapping[str, Any]) -> Pair | None:
 
 
 def _first_model(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return friction and offsets, by field of RunSummary, of the first certificate without a payload.
+    """Return friction and offsets with deviations, by field of RunSummary, of the first certificate without a payload.
 
     A run of the paper's scheme has the friction of its first complete adaptation only, None if unknown. {} for a
     certified run without such a certificate.

@@ -164,7 +164,10 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def as_csv(runs: Sequence[RunSummary]) -> str:
-    """Return the table of runs as CSV, with a head and a line per run; unknown values are empty."""
+    """Return the table of runs as CSV, with a head and a line per run; unknown values are empty.
+
+    A value per joint takes two columns, see `_flat`.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(_flat(COLUMNS))

@@ -131,7 +131,10 @@ def evaluate(run: Run, gathered: RunGatherer | None = None) -> Metrics:
 
 
 def _model_in(run: Run, row: int) -> tuple[dict[str, float], float | None]:
-    """Return the true parameters in a cycle by name, and the true payload, kg; {} and None without the truth."""
+    """Return the true parameters in the cycle of a row by name, and the true payload, kg.
+
+    {} and None without the truth, or if it has no parameters.
+    """
     place = None if run.truth is None else run.truth.model_row(int(run.cycle[row]))
     if run.truth is None or place is None:
         return {}, None

@@ -22,7 +22,10 @@ def log_counts(values: Values) -> NDArray[np.int64]:
 
 
 def histogram_by_key(counts: NDArray[np.int64]) -> dict[str, Any]:
-    """Return a histogram by the keys of report.json, without the empty bins at both ends; counts: of `log_counts`."""
+    """Return a histogram by the keys of report.json, without the empty bins at both ends; counts: of `log_counts`.
+
+    "counts" are those between the remaining "edges", "below" and "above" those outside of all EDGES.
+    """
     below, *inside, above = counts.tolist()
     filled = np.flatnonzero(inside)
     first, end = (int(filled[0]), int(filled[-1]) + 1) if filled.size else (0, 0)

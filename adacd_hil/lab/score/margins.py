@@ -165,7 +165,10 @@ def last_row(run: Run, section: Section) -> int:
 
 
 def _tests(run: Run, section: Section) -> list[float]:
-    """Return the length of each stay in CERTIFY within a section, s, in the order of time; [] without one."""
+    """Return the length of each stay in CERTIFY within a section, s, in the order of time; [] without one.
+
+    A longer stay is cut at the section's end.
+    """
     time_s = run.time_s()
     rows = rows_of(time_s, section, float(time_s[-1]))
     inside = np.concatenate(([False], run.state[rows] == SchemeState.CERTIFY, [False]))

@@ -49,7 +49,7 @@ def find_faults(run: Run) -> tuple[Fault, ...]:
 
 
 def _cause(run: Run, t_ns: int) -> str:
-    """Return the supervisor's words for the fault at `t_ns`, without state and reason.
+    """Return the supervisor's words for the fault at `t_ns`, without state and reason, cut at `_MOST_LETTERS`.
 
     "" if the log has no event of it within `_NEAR_NS`.
     """
@@ -132,7 +132,8 @@ class CyclicDataGatherer:
     def _add_windows(self, cycles: Cycles) -> None:
         """Store the worst share so far of incomplete cycles in one second; a gap in the cycle numbers ends a second.
 
-        The last second, which may go on, is kept for the next call. cycles (2, k): numbers, and whether incomplete.
+        The last second, which may go on, is kept for the next call. cycles (2, k), k > 0: numbers, and whether
+        incomplete.
         """
         cycles = np.concatenate((self._present, cycles), axis=1)
         begins = np.flatnonzero(np.diff(cycles[0], prepend=-2) != 1)

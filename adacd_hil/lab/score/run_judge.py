@@ -39,7 +39,10 @@ def find_detections(run: Run) -> tuple[Detection, ...]:
 
 
 def uncovered_watch(run: Run) -> Mask:
-    """Return for each cycle (n,) whether it is in MONITOR and not covered by the truth; all False without a truth."""
+    """Return for each cycle (n,) whether it is in MONITOR and not covered by the truth.
+
+    All False without a truth, or if the truth has no `span`.
+    """
     watched = is_armed_in(run.state)
     if run.truth is None or run.truth.span is None:
         return np.zeros_like(watched)

@@ -101,7 +101,10 @@ def shows_nothing(run: Run, metrics: Metrics) -> bool:
 
 
 def _judged_adaptations(run: Run, metrics: Metrics) -> dict[str, float | None]:
-    """Return the adaptations of a run; of a cut only those that came to their end, as the cut may have ended others."""
+    """Return the adaptations of a run by label: their time, s, None for one without an end.
+
+    Of a cut log only those that came to their end, as the cut may have ended others.
+    """
     times_s = metrics.adaptation_s
     return {label: time_s for label, time_s in times_s.items() if time_s is not None or not run.is_cut}
 
@@ -207,7 +210,7 @@ def _beside_text(times_s: list[float | None]) -> str:
 def _summary(times_s: list[float | None], failed: str) -> str:
     """Return a phrase on many adaptations: the shortest and the longest time, and how many have None: no end.
 
-    failed: words for the latter, such as "not identified".
+    times_s: at least one isn't None. failed: words for the latter, such as "not identified".
     """
     took_s = [time_s for time_s in times_s if time_s is not None]
     text = f"{min(took_s):.2f} to {max(took_s):.2f} s, {len(took_s)} times"
@@ -383,7 +386,7 @@ def _figures(
 def _of_what_was_played(run: Run, rows: Sequence[PaperRow]) -> tuple[PaperRow, ...]:
     """Return the rows; for a run that is not the paper's experiment without the paper's figures.
 
-    Rows that are then empty are left out.
+    Then quantities have their names of `_ELSEWHERE`, and empty rows are left out.
     """
     if is_papers_experiment(run):
         return tuple(rows)

@@ -420,11 +420,11 @@ def _trace(
 ) -> FilteredRecord:
     """Run a record through the smoothed filter of the fit, or without theta_M through the one of detection.
 
-    Returns external torque, deviation and friction of each sample. is_learning: correct theta and P of `estimate`,
-    which must be contiguous, in place. theta_M (p,): of the mass matrix that carries the velocity's noise. scores (B,
-    p): the sums of `parameter_deviation` are added to it, `length` samples a part; at: samples that were before this
-    record. rows: overwritten by regressor and torque of the samples that a fit uses. Raises ValueError if the numbers
-    of joints differ.
+    Fills all columns of the FilteredRecord. is_learning: correct theta and P of `estimate`, which must be contiguous,
+    in place. theta_M (p,): of the mass matrix that carries the velocity's noise. scores (B, p): the sums of
+    `parameter_deviation` are added to it, `length` samples a part; at: samples that were before this record. rows:
+    overwritten by regressor and torque of the samples that a fit uses. Raises ValueError if record or `noise_Nm` and
+    model differ in their number of joints.
     """
     n = model.joints
     if record.q.shape[1] != n or len(settings.noise_Nm) != n:

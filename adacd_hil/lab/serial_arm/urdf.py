@@ -366,7 +366,8 @@ def _only(element: Element, tag: str, where: str) -> Element | None:
 def _number(element: Element, key: str, where: str, default: float | None = None) -> float:
     """Return an attribute as a finite number, `default` if it is missing.
 
-    Raises UrdfError if it is no such number, above LARGEST, or missing without a default. where: name in errors.
+    Raises UrdfError if it is no such number, its size is above LARGEST, or it is missing without a default. where: name
+    in errors.
     """
     text = element.get(key)
     if text is None:
@@ -379,8 +380,8 @@ def _number(element: Element, key: str, where: str, default: float | None = None
 def _numbers(element: Element, key: str, where: str, default: float | None = None) -> Vector:
     """Return an attribute as three finite numbers (3,); three times `default` if it is missing.
 
-    Raises UrdfError if it isn't three such numbers, one is above LARGEST, or it is missing without a default. where:
-    name in errors.
+    Raises UrdfError if it isn't three such numbers, the size of one is above LARGEST, or it is missing without a
+    default. where: name in errors.
     """
     text = element.get(key)
     if text is None:
@@ -393,7 +394,7 @@ def _numbers(element: Element, key: str, where: str, default: float | None = Non
 
 
 def _parse(word: str, where: str) -> float:
-    """Return a word as a finite number, at most LARGEST. Raises UrdfError if it isn't one; where: name in errors."""
+    """Return a word as a number from -LARGEST to LARGEST. Raises UrdfError if it isn't one; where: name in errors."""
     try:
         value = float(word)
     except ValueError:

@@ -66,7 +66,7 @@ class Comparison:
     def ranking(self) -> tuple[str, ...]:
         """Names of the detectors, best first, by the geometric mean of their median delays over all steps and joints.
 
-        A delay below 0.1 ms counts as 0.1 ms. A step that isn't found at half of its onsets or more counts as ten times
+        A delay below 0.1 ms counts as 0.1 ms. A step that is missed at half of its onsets or more counts as ten times
         `HORIZON_S`.
         """
         scores: dict[str, list[float]] = {}
@@ -92,7 +92,8 @@ class Comparison:
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         """Return head and rows of a table for a terminal, best detector first.
 
-        A dash stands for the median delay of a step that is missed at half of its onsets or more.
+        Each detector has a row per joint: its median delay per step, ms, and the share of the first step's onsets that
+        was found. A dash stands for the median delay of a step that is missed at half of its onsets or more.
         """
         head = ("detector", "joint", *(f"{torque:g} Nm" for torque in STEPS_NM), f"found at {STEPS_NM[0]:g} Nm")
         order = {name: place for place, name in enumerate(self.ranking)}
@@ -192,7 +193,8 @@ def _ratios(
 def _delays_ms(ratios: Vector, phases_s: Vector, period_s: float) -> Vector:
     """Return delays (..., onsets, n), ms, from the largest ratios since the onset (..., onsets, after, n).
 
-    inf where the ratio never exceeds 1.
+    inf where the ratio never exceeds 1. phases_s (onsets,): time from the first of these samples to the onset; a delay
+    is 0 at least.
     """
     over = ratios > 1.0
     first = over.argmax(axis=-2) * period_s - phases_s[:, None]

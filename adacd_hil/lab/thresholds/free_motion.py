@@ -286,7 +286,10 @@ def _begins(motion: LoggedMotion, index: _Index) -> list[int]:
 
 
 def logged_settings(path: Path) -> Settings | None:
-    """Return the settings in a log, None if the log has none. Raises LogError if they can't be read."""
+    """Return the settings in a log; None if it has none, or its head can't be read.
+
+    Raises LogError if the settings can't be read.
+    """
     text = attachment(path, CONFIG_NAME)
     return None if text is None else settings_of(path, {CONFIG_NAME: text})
 

@@ -216,7 +216,8 @@ def base_of(settings: Settings, config: str | None) -> tuple[str, Settings]:
     """Return name and settings of the configuration that a suggestion extends.
 
     settings: of the log. config: as the user named it; None: the one that `settings` name. In both cases it gets the
-    arm profile of `settings`. Raises ConfigError if that isn't built in, or a configuration can't be read.
+    arm profile of `settings`. Raises ConfigError if `config` is None and the one that `settings` name isn't built in,
+    or if the configuration can't be read.
     """
     name = settings.name if config is None else config
     if config is None and name not in builtin_names():

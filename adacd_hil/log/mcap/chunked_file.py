@@ -126,7 +126,7 @@ class _Stream:
         return self._position
 
     def flush(self) -> None:
-        """Keep the parts for `take`."""
+        """Do nothing: the parts stay for `take`."""
 
     def take(self) -> bytes:
         data = b"".join(self._parts)
