@@ -212,8 +212,8 @@ class AttemptSplitter:
     def _read_periods(self, number: Places, arm: NDArray[Any], is_begin: NDArray[np.bool_]) -> tuple[Places, Places]:
         """Return each cycle's periods by /arm (n,), and the number of cycles before it that the log lacks (n,).
 
-        Behind a gap within an attempt the periods are the steps of the cycle's number, at least 1. The number is
-        negative where the log goes back. Call it once per piece, in the log's order.
+        Behind a gap within an attempt the periods are the steps of the cycle's number, at least 1. The number of
+        missing cycles is negative where the log goes back. Call it once per piece, in the log's order.
         """
         periods = np.asarray(arm["periods"], np.int64)
         steps = np.diff(number, prepend=self._last_cycle)

@@ -233,7 +233,7 @@ def limit_Nm(m: Memory) -> float:
 
 @compiled
 def residual(m: Memory, s: int, joint: int) -> float:
-    """Return the belief's residual of kept sample s in a joint, both from 0, Nm."""
+    """Return the belief's residual of kept sample s in a joint, both from 0: measured less predicted torque, Nm."""
     return float(-linalg.misfit(m.fit_check.samples_W[s, joint], m.models.belief, m.fit_check.samples_tau[s, joint]))
 
 
