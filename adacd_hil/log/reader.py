@@ -105,7 +105,7 @@ class RunLog:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the file is whole, no packet was dropped on the way to it, and a recovered log had lost nothing."""
+        """Whether all parts are there and whole, no packet was dropped, and a recovered log had lost nothing."""
         return not self.problem
 
     @property
@@ -336,9 +336,9 @@ class LogStream:
 
     @property
     def problem(self) -> str:
-        """Missing and damaged parts, dropped packets, and the losses of a recovered log, in one line.
+        """Missing, foreign and damaged parts, dropped packets, and the losses of a recovered log, in one line.
 
-        As far as it was read; "" for a whole log, and before.
+        Also topics that have another type in a later part. As far as it was read; "" for a whole log, and before.
         """
         dropped, lost = self.summary.get(DROPPED_KEY, "0"), self.summary.get(LOST_KEY, "")
         said = (

@@ -265,7 +265,7 @@ def _sync_counters(frames: NDArray[Any]) -> NDArray[np.uint8]:
 def _skipped(counters: NDArray[np.uint8], last: int) -> int:
     """Return the number of periods skipped between a cycle and the last of the SYNCs after it; 0 without a SYNC.
 
-    last: number of that cycle. counters: those of the SYNCs.
+    last: number of that cycle. counters: those of the SYNCs, so that whole turns of SYNC_OVERFLOW periods don't count.
     """
     if counters.size == 0:
         return 0

@@ -2,8 +2,8 @@
 
 In real time a packet costs no system call: it goes into shared memory that the writer polls. If the ring is full (the
 writer is behind, stopped or dead) packets are lost and counted in `dropped`; the cycle neither waits nor gets an
-exception. In lockstep (`blocking`) the recorder wakes the writer now and then, waits while the ring is full, and loses
-no packet.
+exception. In lockstep (`blocking`) the recorder wakes the writer now and then, and waits while the ring is full; it
+loses a packet only if the writer is dead or the ring too small for it.
 """
 
 import contextlib

@@ -149,7 +149,7 @@ def _withdraw(
 ) -> JointWay:
     """Return one joint's motion over `displacement`, cut off at the position limit, but never against its direction.
 
-    A joint that can't stop by then brakes at once, and so does one without displacement.
+    A joint too fast to stop there brakes at once, and so does one without displacement.
     """
     sign = math.copysign(1.0, displacement or velocity)  # a joint that is not pushed just stops
     room = position_limit - sign * position
