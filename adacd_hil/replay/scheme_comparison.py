@@ -109,7 +109,8 @@ class SchemeComparison:
     def _is_near(self, name: str, logged: Vector, replayed: Vector) -> NDArray[np.bool_]:
         """Return where a field's values (n, k) are equal, or differ by no more than the tolerance; two NaN are equal.
 
-        The tolerance is a share of the column's largest logged value so far, at least of 1.
+        The tolerance is a share of the largest finite size that the column's logged values have had so far, at least
+        of 1.
         """
         finite = np.where(np.isfinite(logged), np.abs(logged), 0.0)
         scale = np.maximum(self._scales.get(name, np.ones(logged.shape[1])), finite.max(axis=0, initial=0.0))

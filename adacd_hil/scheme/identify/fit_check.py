@@ -252,7 +252,7 @@ def last_unsteady_step(m: Memory) -> int:
 
 @compiled
 def changed_share(m: Memory, s: int) -> float:
-    """Return the squared `distance` of a step from the whole fit over its limit; over 1: the fit has changed since.
+    """Return a step's `distance` from the whole fit, a square, over its limit; over 1: the fit has changed since.
 
     s: index at which the step is stored.
     """
