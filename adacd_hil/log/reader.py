@@ -105,7 +105,7 @@ class RunLog:
 
     @property
     def is_complete(self) -> bool:
-        """Whether the file is whole, no packet was dropped on the way to it, and a recovered log had lost nothing."""
+        """Whether all parts are there and whole, no packet was dropped, and a recovered log had lost nothing."""
         return not self.problem
 
     @property
@@ -130,7 +130,7 @@ class RunLog:
 
     @property
     def truth(self) -> Series:
-        """The emulator's truth, truth_topic.TRUTH_LAYOUT."""
+        """The emulator's truth, truth_topic.TRUTH_LAYOUT; empty except in the emulator's own log."""
         return self.topics[TRUTH.name]
 
 
@@ -328,7 +328,7 @@ class LogStream:
         return _own_layout(MessageType(schema.name, text, tuple(channel.metadata.get(FIELDS_KEY, "").split())))
 
     def empty(self) -> Piece:
-        """Return a piece without messages, with all of our own topics."""
+        """Return a piece without messages, with an empty series for each of our own topics, see `_own_topics`."""
         own = {
             name: Series(np.empty(0, topic.dtype), self.epoch_ns) for name, topic in _own_topics(self.metadata).items()
         }
@@ -336,9 +336,9 @@ class LogStream:
 
     @property
     def problem(self) -> str:
-        """Missing and damaged parts, dropped packets, and the losses of a recovered log, in one line.
+        """Missing, foreign and damaged parts, dropped packets, and the losses of a recovered log, in one line.
 
-        As far as it was read; "" for a whole log, and before.
+        Also topics that have another type in a later part. As far as it was read; "" for a whole log, and before.
         """
         dropped, lost = self.summary.get(DROPPED_KEY, "0"), self.summary.get(LOST_KEY, "")
         said = (
@@ -348,7 +348,7 @@ class LogStream:
         return "; ".join(filter(None, (*self._problems, *said)))
 
     def events(self, piece: Piece) -> list[LoggedEvent]:
-        """Return the events of a piece; [] for a log without events."""
+        """Return the events of a piece; [] for a log without events, or if /events is not among the read topics."""
         topic = self.topics.get(EVENTS.name)
         if topic is None or topic.type_name != LOG.name:
             return []

@@ -277,7 +277,9 @@ class RecordingAlone:
     def _stretches(self) -> Iterator[CycleStretch]:
         """Yield the cycles of each attempt, without those at its end that disable the drives.
 
-        An attempt begins with the host's reset of the devices' communication.
+        An attempt begins with the host's reset of the devices' communication. If the recording has none before its
+        first cycle, the first attempt begins with that cycle, and `_is_headless` is set. Attempts with no cycle left
+        are skipped.
         """
         recording = self._recording
         number, t_ns = recording.number, self._t_ns()

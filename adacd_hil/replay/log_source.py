@@ -212,8 +212,8 @@ class AttemptSplitter:
     def _read_periods(self, number: Places, arm: NDArray[Any], is_begin: NDArray[np.bool_]) -> tuple[Places, Places]:
         """Return each cycle's periods by /arm (n,), and the number of cycles before it that the log lacks (n,).
 
-        Behind a gap within an attempt the periods are the steps of the cycle's number, at least 1. The number is
-        negative where the log goes back. Call it once per piece, in the log's order.
+        Behind a gap within an attempt the periods are the steps of the cycle's number, at least 1. The number of
+        missing cycles is negative where the log goes back. Call it once per piece, in the log's order.
         """
         periods = np.asarray(arm["periods"], np.int64)
         steps = np.diff(number, prepend=self._last_cycle)
@@ -265,7 +265,7 @@ def _sync_counters(frames: NDArray[Any]) -> NDArray[np.uint8]:
 def _skipped(counters: NDArray[np.uint8], last: int) -> int:
     """Return the number of periods skipped between a cycle and the last of the SYNCs after it; 0 without a SYNC.
 
-    last: number of that cycle. counters: those of the SYNCs.
+    last: number of that cycle. counters: those of the SYNCs, so that whole turns of SYNC_OVERFLOW periods don't count.
     """
     if counters.size == 0:
         return 0

@@ -54,9 +54,10 @@ Watch = Callable[[int, Ticks, SchemeBatch], None]
 def replay(path: Path, script_of: ScriptOf | None = None) -> Replay:
     """Replay a log with its own settings, compare the decisions with the log's, and return the outcome.
 
-    Behind missing cycles, decisions of the same attempt are not compared. script_of: plays the user of a configuration;
-    with it, the requests of a run without typed requests are compared. Raises LogError, ConfigError or CodecError if
-    the log, its attachments or a device can't be read.
+    Behind missing cycles, decisions of the same attempt are not compared. The emulator's own log beside the log, if
+    there is one, gives the true contacts for the score. script_of: plays the user of a configuration; with it, the
+    requests of a run without typed requests are compared. Raises LogError, ConfigError or CodecError if the log, its
+    attachments or a device can't be read.
     """
     source, remarks = LogSource(path), list[str]()
     truth = contacts_beside(path, remarks.append)

@@ -119,7 +119,10 @@ class OutcomeGatherer:
         self._kept.append(HostCycles(ticks.cycle[rows], ticks.t_ns[rows], batch.previous_state[rows], threshold))
 
     def _watch(self, batch: SchemeBatch, is_quiet: NDArray[np.bool_]) -> None:
-        """Gather residuals and thresholds of the cycles in MONITOR in which no joint is over its threshold."""
+        """Gather thresholds of the cycles in MONITOR in which no joint is over its threshold, where `is_quiet` (n,).
+
+        In the certified scheme gather the residuals of these cycles, too.
+        """
         monitors = is_armed_in(batch.state) & is_armed_in(batch.previous_state)
         block = batch.block[monitors & is_quiet]
         if not len(block):

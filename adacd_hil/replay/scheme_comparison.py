@@ -109,7 +109,8 @@ class SchemeComparison:
     def _is_near(self, name: str, logged: Vector, replayed: Vector) -> NDArray[np.bool_]:
         """Return where a field's values (n, k) are equal, or differ by no more than the tolerance; two NaN are equal.
 
-        The tolerance is a share of the column's largest logged value so far, at least of 1.
+        The tolerance is a share of the largest finite size that the column's logged values have had so far, at least
+        of 1.
         """
         finite = np.where(np.isfinite(logged), np.abs(logged), 0.0)
         scale = np.maximum(self._scales.get(name, np.ones(logged.shape[1])), finite.max(axis=0, initial=0.0))
@@ -309,7 +310,7 @@ class Asking:
         self._kept = KeptRequest()
 
     def begin_attempt(self) -> None:
-        """Begin another attempt: the drives are not enabled yet; a request not served yet will be made again."""
+        """Begin another attempt: the drives are not enabled yet; a kept request not served yet will be made again."""
         self._enabled = None
         self._was_stopped = False
         self._kept = KeptRequest(self._kept.request)
@@ -324,9 +325,10 @@ class Asking:
         return carried or self._script.request(elapsed_s, state)
 
     def note_request(self, cycle: int, request: Request, previous: SchemeState, state: SchemeState) -> None:
-        """Keep a request that the scheme hasn't served; store the cycle in which the drives were enabled.
+        """Keep a request to finish or to change the payload; store the cycle in which the drives were enabled.
 
-        Call it after each `ask`. previous, state: states before and after the cycle.
+        A request to change the payload is dropped once it is served; other requests are not kept. Call it after each
+        `ask`. previous, state: states before and after the cycle.
         """
         self._kept.ask(request, previous)
         self._kept.serve((state,))
@@ -336,8 +338,8 @@ class Asking:
     def requests(self, ticks: Ticks, batch: SchemeBatch) -> NDArray[np.uint8]:
         """Return the user's requests in a stretch (n,), as `ask` does, given the scheme's states in it.
 
-        NONE until the drives are enabled. Keep a request that the scheme hasn't served, for the next attempt. Call it
-        for all stretches of an attempt, in the order of time.
+        NONE until the drives are enabled. Keep a request to finish or to change the payload for the next attempt if the
+        scheme hasn't served it. Call it for all stretches of an attempt, in the order of time.
         """
         asked = np.zeros(len(ticks.cycle), np.uint8)
         if self._enabled is None:

@@ -46,7 +46,7 @@ LEAST_MESSAGE = 22
 
 
 def has_shape(opcode: int) -> bool:
-    """Return whether records of this kind contain lengths that must add up to the length of the record."""
+    """Return whether the fields of this kind of record must fill it exactly; False for messages, unknown kinds."""
     return opcode in _SHAPES
 
 
@@ -91,7 +91,7 @@ class RawRecord(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Offset of the next record."""
+        """Offset of the next record; too low for a record that came without its whole body, see `walk`."""
         return self.offset + HEAD.size + len(self.body)
 
 
@@ -124,9 +124,9 @@ _READERS: dict[int, Any] = {opcode: getattr(records, name_of(opcode)).read for o
 
 
 def parse(opcode: int, body: bytes) -> Any:
-    """Parse a record's body to mcap's class for its kind.
+    """Parse a record's body to mcap's class for its kind; ignore bytes after its last field.
 
-    Raises LogError for a body that isn't one of that kind; KeyError for a kind without a class.
+    Raises LogError for a body that can't be read as that kind; KeyError for a message or an unknown kind.
     """
     try:
         return _READERS[opcode](ReadDataStream(io.BytesIO(body)))
@@ -247,7 +247,7 @@ def read_end(file: IO[bytes]) -> FileEnd | None:
 def _has_shape(record: RawRecord) -> bool:
     """Return whether the lengths in a record add up to the size of its body.
 
-    False for a kind of record without lengths in its body, such as a message.
+    False for a message, and for a record of an unknown kind.
     """
     body = record.body
     return has_shape(record.opcode) and fits(record.opcode, len(body), lambda place, count: body[place : place + count])
@@ -268,7 +268,8 @@ def summary_of(file: IO[bytes]) -> list[RawRecord]:
 def _find(file: IO[bytes]) -> tuple[int, int, Footer] | None:
     """Return the offset of the footer, that of the summary, and the footer.
 
-    None for a file that ends without a footer, or whose footer has an impossible offset.
+    Without a summary both offsets are the footer's. None for a file that ends without a footer, or whose footer has an
+    impossible offset.
     """
     size = file.seek(0, os.SEEK_END)
     place = size - len(MAGIC) - _FOOTER

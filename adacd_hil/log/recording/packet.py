@@ -79,7 +79,7 @@ class Packet(NamedTuple):
 
 
 def unpack(data: bytes) -> Packet | None:
-    """Return the content of a packet; None if its sizes are inconsistent or its kind is unknown."""
+    """Return the content of a packet; None for inconsistent sizes, a frame over MAX_DATA bytes, or an unknown kind."""
     try:
         content, end = (_unpack_cycle if data[0] == CYCLE else _unpack_event)(data)
     except (struct.error, IndexError, ValueError):

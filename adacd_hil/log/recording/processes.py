@@ -99,7 +99,7 @@ def read_setup() -> Any:
 
 
 def _module_path() -> str:
-    """Return a PYTHONPATH with this package's folder before the environment's."""
+    """Return a PYTHONPATH: the folder that contains `adacd_hil`, then those of the environment's PYTHONPATH."""
     own = str(Path(__file__).resolve().parents[3])
     return os.pathsep.join(filter(None, (own, os.environ.get("PYTHONPATH", ""))))
 

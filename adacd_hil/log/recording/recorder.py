@@ -2,8 +2,8 @@
 
 In real time a packet costs no system call: it goes into shared memory that the writer polls. If the ring is full (the
 writer is behind, stopped or dead) packets are lost and counted in `dropped`; the cycle neither waits nor gets an
-exception. In lockstep (`blocking`) the recorder wakes the writer now and then, waits while the ring is full, and loses
-no packet.
+exception. In lockstep (`blocking`) the recorder wakes the writer now and then, and waits while the ring is full; it
+loses a packet only if the writer is dead or the ring too small for it.
 """
 
 import contextlib
@@ -171,8 +171,8 @@ class Recorder:
     ) -> None:
         """Hand a cycle to the writer. messages: (ChannelId, body); frames: oldest first, each with True if it was sent.
 
-        If the ring is full, wait in lockstep; in real time, or if the writer is dead, drop the cycle and count it in
-        `dropped`.
+        If the ring is full, wait in lockstep; in real time, or if the writer is dead or the ring too small for the
+        cycle, drop the cycle and count it in `dropped`.
         """
         self._put(packet.pack_cycle(t_ns, self.dropped, messages, frames))
 
@@ -189,7 +189,8 @@ class Recorder:
     def _put(self, data: bytes) -> None:
         """Put a packet into the ring; if that is full, wait in lockstep, in real time count the packet in `dropped`.
 
-        In lockstep wake the writer after each WAKE_BYTES. Count also a packet that the writer can't take any more.
+        In lockstep wake the writer after each WAKE_BYTES, and count a packet if the writer is dead or the ring too
+        small for it.
         """
         if not self._ring.put_packet(data) and not (self._is_blocking and self._put_patiently(data)):
             self.dropped += 1
@@ -231,7 +232,7 @@ class Recorder:
         """Wait for the end of the writer's process, and return the summary.
 
         word: the writer's last message, None if it died or is silent. Without it the writer is ended, the log is
-        incomplete, its counts are 0, and the packets that it had not written count as dropped.
+        incomplete, `frames` and `messages` are 0, and the packets that it had not written count as dropped.
         """
         error = self._end_writer() if word is None else word["error"]
         self._process.wait()

@@ -104,7 +104,7 @@ class WriterProcess:
             return processes.NOTHING
 
     def _take(self) -> None:
-        """Take and write all packets waiting in the ring; in real time also write a chunk that is due by the clock."""
+        """Take and write all packets waiting in the ring; in real time also call `_look_at_clock`, at least once."""
         while True:
             self._write(self._ring.take_packets(TAKEN_BYTES))
             if not self._setup.is_blocking:
@@ -113,7 +113,10 @@ class WriterProcess:
                 return
 
     def _look_at_clock(self) -> None:
-        """Each FLUSH_PERIOD_NS write the chunk in progress, and try a disk again that failed long enough ago."""
+        """Each FLUSH_PERIOD_NS write the chunk in progress, and try a disk again that failed long enough ago.
+
+        If the part is full, begin the next one, see `_flush`.
+        """
         now_ns = self._clock.now_ns()
         if now_ns - self._flushed_ns >= FLUSH_PERIOD_NS:
             self._flush(now_ns)

@@ -170,9 +170,10 @@ def is_plain(frames: NDArray[Any]) -> NDArray[np.bool_]:
 
 
 def is_sendable(frames: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return for each frame (n,) whether a bus end of ours can send it as it is.
+    """Return for each frame (n,) whether a bus end of ours can send it.
 
-    Error frames, FD frames of up to 8 bytes and frames that are not plain, see `is_plain`, can't be sent.
+    Error frames, FD frames of up to 8 bytes and frames that are not plain, see `is_plain`, can't be sent. An FD frame
+    that was recorded without bit rate switch counts as sendable, but is sent with it.
     """
     is_short_fd = frames["is_fd"] & (frames["length"] <= CLASSIC_BYTES)
     return np.asarray(is_plain(frames) & ~frames["is_error"] & ~is_short_fd)

@@ -116,7 +116,7 @@ class Withdrawal:
     def beyond_limits(self) -> list[int]:
         """Indices, from 0, of the joints that can't stop within their position limit: [] if all can.
 
-        They brake at the acceleration limit from their position and velocity at the start of the withdrawal.
+        They brake at the acceleration limit from their position and velocity at the plan's start.
         """
         limit = self._settings.arm.position_limit_rad
         return [i for i in range(JOINTS) if abs(self._soonest_stop(i)) > limit[i]]
@@ -149,7 +149,7 @@ def _withdraw(
 ) -> JointWay:
     """Return one joint's motion over `displacement`, cut off at the position limit, but never against its direction.
 
-    A joint that can't stop before that limit brakes at once.
+    A joint too fast to stop there brakes at once, and so does one without displacement.
     """
     sign = math.copysign(1.0, displacement or velocity)  # a joint that is not pushed just stops
     room = position_limit - sign * position

@@ -113,7 +113,10 @@ def rate_per_h(excursions_Hz: float, seen_s: float, largest_share: float) -> flo
 
 
 def largest_share(m: Memory) -> float:
-    """Return the largest ratio of a kept residual (`peak`) to its present threshold, of all channels and joints."""
+    """Return the largest ratio of a kept residual (`peak`) to its present threshold, of all channels and joints.
+
+    The threshold is taken without the part for rest.
+    """
     return float(np.max(m.tail.peak.max(axis=0) / np.maximum(np.maximum(m.sensitivity.h_model, m.tail.tail_Nm), 1e-12)))
 
 

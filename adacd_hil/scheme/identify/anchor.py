@@ -198,7 +198,8 @@ def innovation(k: Constants, m: Memory, joint: int) -> float:
 def accept(m: Memory, offset_Nm: Vector, std_Nm: Vector) -> None:
     """Drop all anchors, and set anchor ACCEPTED to the offsets (n,) that the user accepts as the sensors' zero.
 
-    std_Nm (n,): their standard deviations.
+    The offsets count from the configuration's zero, as a fit's do. std_Nm (n,): their standard deviations. Set the age
+    of all anchors to 0.
     """
     m.anchor.anchor_std[:] = np.inf
     m.anchor.anchor_Nm[ACCEPTED] = offset_Nm

@@ -84,7 +84,10 @@ def forget(m: Memory) -> None:
 
 
 def is_compared(m: Memory) -> bool:
-    """Return whether the fit is compared with a last certificate: there is one, and no payload was announced."""
+    """Return whether the fit is compared with a last certificate.
+
+    It is if there is one, `forget` hasn't emptied its source of evidence, and no payload was announced.
+    """
     return bool(m.evidence.variance[LAST, 0] != np.inf and not m.models.is_payload)
 
 

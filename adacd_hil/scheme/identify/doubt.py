@@ -371,10 +371,10 @@ class Doubt:
 
 
 def _weighed(m: Memory, waited_s: float, now_s: float) -> _Weighed:
-    """Return a contact's sums without the torque that joints held at rest, and without the residual of a good model.
+    """Return a contact's sums, without the torque that joints held at rest, and the peak of its residual.
 
-    At least LEAST_SHARE of the squared residual stays. waited_s: from going on to the contact's beginning. now_s: time
-    of its end since the run's start.
+    From `rr` the squared residual of a good model is subtracted, too; at least LEAST_SHARE stays. waited_s: from going
+    on to the contact's beginning. now_s: time of its end since the run's start.
     """
     own, squares = m.doubt, m.doubt.L.diagonal()
     ss, rs, ws = np.maximum(squares[CAUSES:], 1e-12), own.b[CAUSES:], own.L[CAUSES:, :CAUSES].T

@@ -160,7 +160,7 @@ def of_belief(k: Constants, q: int, theta: Vector, P: Vector, unit: float) -> tu
 def split(variance: float, prior: float, unit: float) -> float:
     """Return a variance after scaling the samples' part of it by `unit`, and not the prior's part.
 
-    The inverses of both parts add up to the inverse of `variance`. If that is over `prior`, return `prior`.
+    The inverses of both parts add up to the inverse of `variance`. If `variance` is over `prior`, return `prior`.
     """
     return 1.0 / (1.0 / prior + max(1.0 / variance - 1.0 / prior, 0.0) / unit)
 

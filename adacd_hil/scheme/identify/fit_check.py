@@ -233,7 +233,7 @@ def limit_Nm(m: Memory) -> float:
 
 @compiled
 def residual(m: Memory, s: int, joint: int) -> float:
-    """Return the belief's residual of kept sample s in a joint, both from 0, Nm."""
+    """Return the belief's residual of kept sample s in a joint, both from 0: measured less predicted torque, Nm."""
     return float(-linalg.misfit(m.fit_check.samples_W[s, joint], m.models.belief, m.fit_check.samples_tau[s, joint]))
 
 
@@ -252,7 +252,7 @@ def last_unsteady_step(m: Memory) -> int:
 
 @compiled
 def changed_share(m: Memory, s: int) -> float:
-    """Return the squared `distance` of a step from the whole fit over its limit; over 1: the fit has changed since.
+    """Return a step's `distance` from the whole fit, a square, over its limit; over 1: the fit has changed since.
 
     s: index at which the step is stored.
     """

@@ -253,7 +253,7 @@ def _is_found_again(k: Constants, m: Memory) -> bool:
 
 @compiled
 def _fill_missing(m: Memory) -> None:
-    """Fill `rms_Nm` (n,) with each joint's torque by which `full` and `basic` differ."""
+    """Fill `rms_Nm` (n,) with the rms of each joint's torque by which `full` and `basic` differ, see `_rms_Nm`."""
     for i in range(m.missing_torque.rms_Nm.shape[0]):
         m.missing_torque.rms_Nm[i] = _rms_Nm(m, i)
 
