@@ -191,7 +191,7 @@ class CommunicationTest:
 
     @property
     def periods(self) -> int:
-        """Number of periods, skipped ones included."""
+        """Number of periods, including those skipped after the first cycle."""
         return self.cycles + self.overruns
 
     @property

@@ -249,7 +249,10 @@ def _judge(
 
 
 def _other_units(described: RecordingMap, tested: list[Record]) -> Iterator[tuple[int, float]]:
-    """Yield (joint, factor), factors 0.001 and 1000, that leave all torques within `BEYOND_EFFORT` times the effort."""
+    """Yield (joint, factor), factors 0.001 and 1000, that leave all torques within `BEYOND_EFFORT` times the effort.
+
+    The 99 % quantile of each joint's torque counts; a joint without an effort in the URDF is always within.
+    """
     largest, effort = torques_and_limits(np.concatenate([record.tau_J for record in tested]), described.urdf)
     for joint, factor in itertools.product(range(described.joints), (1e-3, 1e3)):
         scaled = np.where(np.arange(described.joints) == joint, factor * largest, largest)
