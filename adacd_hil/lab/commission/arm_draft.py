@@ -172,7 +172,7 @@ def planar_from_urdf(text: bytes, locked: Collection[str] = (), pitch_deg: float
 
 
 def _angle_deg(start: Vector, end: Vector, axis: Vector) -> float:
-    """Return the angle about `axis` from direction `start` to `end`, deg in [-180, 180]."""
+    """Return the angle about the unit vector `axis` from `start`, which is across it, to `end`, deg in [-180, 180]."""
     return math.degrees(math.atan2(float(np.cross(start, end) @ axis), float(start @ end)))
 
 

@@ -148,8 +148,8 @@ class CommunicationTest:
     """Collects the cycles of a test, by `observe_cycle`, and judges them.
 
     Bitrate, data_bitrate: bit/s, 0 without CAN FD. is_enabling: whether the drives shall be enabled. complete: number
-    of cycles with complete fresh data. overruns: number of skipped periods. enabled: number of cycles with both drives
-    enabled.
+    of cycles with complete fresh data. overruns: number of periods skipped after the first cycle. enabled: number of
+    cycles with both drives enabled.
     """
 
     settings: Settings

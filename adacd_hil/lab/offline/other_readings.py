@@ -351,7 +351,7 @@ def _motions(described: RecordingMap, model: ArmModel) -> Iterator[_Motion]:
 
 
 def _late(described: RecordingMap, model: ArmModel, period_s: float) -> Iterator[_Motion]:
-    """Yield interpretations with one or all positions, or torques, late by `_LATE` samples."""
+    """Yield interpretations with one or all positions, or torques, late by each number of samples in `_LATE`."""
     n, names = model.joints, described.urdf.joint_names
     for samples, (first, what) in itertools.product(_LATE, ((0, "position"), (n, "torque"))):
         for joints in [*((i,) for i in range(n)), *([tuple(range(n))] if n > 1 else [])]:
