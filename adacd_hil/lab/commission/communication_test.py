@@ -63,7 +63,10 @@ class ZeroTorqueLoop:
         self._max_age_cycles = settings.bus.max_age_cycles
 
     def interrupt(self) -> None:
-        """Make `run` end after the present cycle, and every later `run` before its first. Safe in a signal handler."""
+        """Make `run` after the present cycle, and every later `run` at once, disable the drives and end.
+
+        Safe in a signal handler.
+        """
         self.is_interrupted = True
 
     def run(
